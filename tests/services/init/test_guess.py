@@ -1,45 +1,33 @@
-"""Categories by pattern, units and the axis that is up, guessed for a folder of meshes."""
+"""Categories by pattern, units and the axis that is up, guessed for a folder of meshes; and the job that says so."""
 
-import pytest
+from collections import Counter
 
-from services.init.collection import Item
-from services.init.guess import (
-    category_of,
-    guess_scales,
-    guess_ups,
-    is_category,
-    map_categories,
-    plain_axis,
-)
+from schemas.job.assets import FolderSource
+from services.init.collection import Guess, Item, drop_doubles
+from services.init.command import write_job
+from services.init.guess import category_of, guess_scales, guess_ups, is_category, map_categories, plain_axis
+from services.job.bounded_yaml import parse_yaml
+from services.job.job_file import validate_job
 from workers.assets.external.placement import Measured
 
-
-@pytest.mark.parametrize(
-    ("path", "source", "category"),
-    [
-        ("mug/a.obj", None, "mug"),
-        ("mug/b/c.obj", None, "mug"),
-        ("002_master_chef_can/google_16k/textured.obj", None, "002_master_chef_can"),
-        ("mug_03.obj", None, "mug"),
-        ("mug 3.obj", "folder", "mug"),
-        ("Blue Cup-12.glb", None, "Blue-Cup"),
-        ("mug/a_7.obj", "file", "a"),
-        ("mug/a_7.obj", "thing", "thing"),
-        ("007.obj", None, "n007"),
-        ("12/a.obj", None, "n12"),
-        ("table/a.obj", None, "table_mesh"),
-        ("Assets/a.obj", None, "Assets_mesh"),
-        ("ä/ö.obj", None, "object"),
-        ("näme/a.obj", None, "n-me"),
-        (f"{'long' * 40}/a.obj", None, "long" * 16),
-    ],
+CATEGORIES = (
+    ("mug/a.obj", None, "mug"),
+    ("mug/b/c.obj", None, "mug"),
+    ("002_master_chef_can/google_16k/textured.obj", None, "002_master_chef_can"),
+    ("mug_03.obj", None, "mug"),
+    ("mug 3.obj", "folder", "mug"),
+    ("Blue Cup-12.glb", None, "Blue-Cup"),
+    ("mug/a_7.obj", "file", "a"),
+    ("mug/a_7.obj", "thing", "thing"),
+    ("007.obj", None, "n007"),
+    ("12/a.obj", None, "n12"),
+    ("table/a.obj", None, "table_mesh"),
+    ("Assets/a.obj", None, "Assets_mesh"),
+    ("ä/ö.obj", None, "object"),
+    ("näme/a.obj", None, "n-me"),
+    (f"{'long' * 40}/a.obj", None, "long" * 16),
 )
-def test_a_category_follows_from_where_a_file_lies(path, source, category):
-    assert category_of(path, source) == category
-    assert is_category(category)
-
-
-CASES = {
+FOLDERS = {
     "one folder each": ({"mug/a.obj": "mug", "mug/b.obj": "mug", "can/a.obj": "can"}, (), ()),
     "deep": ({"mug/1/m.obj": "mug", "mug/2/m.obj": "mug", "mug/2/x/n.obj": "mug"}, (), ()),
     "flat": ({"mug_1.obj": "mug", "mug_2.obj": "mug", "mugtree.obj": "mugtree"}, (), ()),
@@ -53,18 +41,23 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_patterns_find_the_files_of_their_category_and_no_others(tmp_path, name):
-    items, others, harmless = CASES[name]
-    for path in (*items, *others):
-        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / path).touch()
-    found: dict[str, str] = {}
-    for pattern, category in map_categories(items, others, harmless).items():
-        for path in tmp_path.glob(pattern):
-            if path.is_file():
-                found.setdefault(path.relative_to(tmp_path).as_posix(), category)
-    assert {path: category for path, category in found.items() if path not in harmless} == items
+def test_a_category_follows_from_where_a_file_lies():
+    for path, source, category in CATEGORIES:
+        assert category_of(path, source) == category and is_category(category)
+
+
+def test_patterns_find_the_files_of_their_category_and_no_others(tmp_path):
+    for name, (items, others, harmless) in FOLDERS.items():
+        folder = tmp_path / name
+        for path in (*items, *others):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).touch()
+        found: dict[str, str] = {}
+        for pattern, category in map_categories(items, others, harmless).items():
+            for path in folder.glob(pattern):
+                if path.is_file():
+                    found.setdefault(path.relative_to(folder).as_posix(), category)
+        assert {path: category for path, category in found.items() if path not in harmless} == items, name
 
 
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure"):
@@ -75,59 +68,85 @@ def cubes(*diagonals, suffix=".obj"):
     return [item(f"{k}{suffix}", (d / 3**0.5,) * 3) for k, d in enumerate(diagonals)]
 
 
-@pytest.mark.parametrize(
-    ("diagonals", "factor", "words"),
-    [
-        ((0.2, 0.3), 1.0, "metres"),
-        ((250.0,), 0.001, "millimetres, 25 cm"),
-        ((25.0,), 0.01, "centimetres, 25 cm (as millimetres, 0.001, it would be 2.5 cm)"),
-        ((1.0, 0.4, 0.7), 1.0, "metres"),
-        ((0.0001,), 1.0, "very small"),
-        ((3000.0, 150.0, 200.0), 0.001, "millimetres"),
-    ],
-)
-def test_the_unit_is_one_that_things_on_a_table_have(diagonals, factor, words):
-    (scale,) = guess_scales(cubes(*diagonals))
-    assert (scale.factor, scale.diagonal_m) == (factor, None) and words in scale.why
-
-
-def test_shapes_that_are_normalised_are_resized_and_a_single_one_is_not():
-    (scale,) = guess_scales(cubes(1.0, 1.0, 1.001))
-    assert scale.diagonal_m == 0.25 and "all alike" in scale.why
-    assert guess_scales(cubes(1.0))[0].diagonal_m is None
-    assert guess_scales(cubes(0.12, 0.12, 0.12))[0].diagonal_m is None, "three cups of one size"
-
-
-def test_formats_with_different_units_are_different_sources():
+def test_the_unit_is_one_that_things_on_a_table_have_and_what_is_normalised_is_resized():
+    for diagonals, factor, diagonal_m, words in (
+        ((0.2, 0.3), 1.0, None, "metres"),
+        ((250.0,), 0.001, None, "millimetres, 25 cm"),
+        ((25.0,), 0.01, None, "centimetres, 25 cm (as millimetres, 0.001, it would be 2.5 cm)"),
+        ((1.0, 0.4, 0.7), 1.0, None, "metres"),
+        ((0.0001,), 1.0, None, "very small"),
+        ((3000.0, 150.0, 200.0), 0.001, None, "millimetres"),
+        ((1.0, 1.0, 1.001), 1.0, 0.25, "all alike"),
+        ((1.0,), 1.0, None, "metres"),  # a single one
+        ((0.12, 0.12, 0.12), 1.0, None, "metres"),  # three cups of one size
+    ):
+        (scale,) = guess_scales(cubes(*diagonals))
+        assert (scale.factor, scale.diagonal_m) == (factor, diagonal_m) and words in scale.why
     scales = guess_scales([*cubes(250.0), *cubes(0.2, suffix=".glb"), *cubes(300.0, suffix=".stl")])
     assert {scale.suffixes: scale.factor for scale in scales} == {(".glb",): 1.0, (".obj", ".stl"): 0.001}
 
 
-def ups(*items):
-    return {rule.pattern: rule.axis for rule in guess_ups(items)}
+def test_up_follows_the_files_that_are_sure_and_others_are_named_apart():
+    def ups(*items):
+        return {rule.pattern: rule.axis for rule in guess_ups(items)}
 
-
-def test_a_format_follows_its_files_that_are_sure_and_one_that_is_sure_of_another_axis_is_named():
     sure = [item(f"{k}.obj", up="y") for k in range(5)]
-    assert ups(*sure, item("box.obj")) == {"**/*.obj": "y"}
+    assert ups(*sure, item("box.obj")) == {"**/*.obj": "y"} and plain_axis(guess_ups(sure)) == "y"
     assert ups(*sure, item("odd [1].obj", up="z")) == {"odd [[]1].obj": "z", "**/*.obj": "y"}
-    assert plain_axis(guess_ups(sure)) == "y"
-
-
-def test_a_folder_that_is_sure_of_another_axis_has_a_line_of_its_own():
-    mine = [item(f"mine/{k}.obj", up="z") for k in range(6)]
-    theirs = [item(f"theirs/{k}.obj", up="y") for k in range(2)]
-    assert ups(*mine, *theirs, item("theirs/box.obj")) == {"theirs/**/*.obj": "y", "**/*.obj": "z"}
-
-
-def test_gltf_has_y_up_unless_its_shapes_are_sure_of_another():
+    mine, theirs = (
+        [item(f"{name}/{k}.obj", up=up) for k in range(n)] for name, up, n in (("a", "z", 6), ("b", "y", 2))
+    )
+    assert ups(*mine, *theirs, item("b/box.obj")) == {"b/**/*.obj": "y", "**/*.obj": "z"}, "a folder has a line"
     assert ups(item("box.glb"), item("a.gltf", up="z", confidence="likely")) == {"**/*.glb": "y", "**/*.gltf": "y"}
-    assert ups(item("mug.glb", up="z")) == {"**/*.glb": "z"}
-
-
-def test_what_is_only_likely_counts_where_nothing_is_sure_and_nothing_at_all_is_said_to_be_unknown():
-    (rule,) = guess_ups([item("a.obj", up="y", confidence="likely"), item("b.obj")])
-    assert rule.axis == "y" and rule.why.startswith("likely: 1 of 2")
-    (rule,) = guess_ups([item("a.obj"), item("b.obj")])
-    assert rule.axis == "z" and rule.why.startswith("not known")
+    assert ups(item("mug.glb", up="z")) == {"**/*.glb": "z"}, "by the specification, unless the shapes are sure"
     assert ups(item("a.obj", up="y"), item("b.obj", up="x")) == {"a.obj": "y", "b.obj": "x", "**/*.obj": "z"}
+    for confidence, axis, why in (("likely", "y", "likely: 1 of 2"), (None, "z", "not known")):
+        (rule,) = guess_ups([item("a.obj", up=confidence and "y", confidence=confidence), item("b.obj")])
+        assert rule.axis == axis and rule.why.startswith(why)
+
+
+def test_of_one_mesh_in_several_formats_the_first_stays_and_different_names_are_different_meshes():
+    items = [item(f"a/m{suffix}") for suffix in (".stl", ".obj", ".glb")] + [item("a/n.obj"), item("b/m.obj")]
+    kept, left_out = drop_doubles(items)
+    assert [one.path for one in kept] == ["a/m.glb", "a/n.obj", "b/m.obj"]
+    assert {one.path for one in left_out} == {"a/m.stl", "a/m.obj"}
+
+
+# ------------------------------------------------------------------------------------------------ the text of the job
+
+
+def job_of(items, folder="meshes", category_map=None):
+    found = category_map or {one.path: "thing" for one in items}
+    guess = Guess(tuple(guess_scales(items)), tuple(guess_ups(items)), found)
+    counts, suffixes = Counter(found.values()), Counter(one.suffix for one in items)
+    text = write_job("mine", "mine.yaml", folder, "s.jpg", counts, suffixes, guess)
+    return text, validate_job(parse_yaml(text), "j")
+
+
+def test_it_is_a_job_with_its_guesses_and_the_reasons_beside_them():
+    text, job = job_of(cubes(250.0, 300.0))
+    (source,) = job.assets.objects
+    assert isinstance(source, FolderSource)
+    assert (source.scale, source.up, source.folder, source.copy_assets) == (0.001, "z", "meshes", False)
+    assert job.categories == {"thing": 1.0} and job.scenes == 64
+    assert "# .obj: 275 units across (the middle one): taken for millimetres, 27.5 cm" in text
+    assert "# **/*.obj: not known: the shapes stand on several axes or on none" in text
+    assert "look at the pictures (s.jpg)" in text
+
+
+def test_axes_that_differ_are_a_map_by_pattern_and_units_that_differ_are_sources_of_their_own():
+    items = [item(f"{k}.obj", up="z") for k in range(4)] + [item("odd: {1}.obj", up="y"), item("a.glb", up="y")]
+    text, job = job_of(items)
+    assert job.assets.objects[0].up == {"odd: {1}.obj": "y", "**/*.glb": "y", "**/*.obj": "z"}
+    assert '# stands on this axis alone, unlike its neighbours\n        "odd: {1}.obj": y' in text
+    _, job = job_of([*cubes(250.0, 260.0), *cubes(0.2, suffix=".glb")])
+    maps = {tuple(source.category_map): (source.scale, source.weight) for source in job.assets.objects}
+    assert maps == {("0.glb",): (1.0, 1.0), ("0.obj", "1.obj"): (0.001, 2.0)}, "which weigh as many as they have"
+
+
+def test_strange_names_are_written_as_they_are():
+    for name in ("~", "null", "a b", "ü", "a'b\"c", "[x]", "#1", "yes", "a\\b", "- x", "1e3", "%x", "&a", "*", "0_1"):
+        _, job = job_of([item(f"{name}.obj")], folder=name)
+        assert job.assets.objects[0].folder == name and list(job.assets.objects[0].category_map) == [f"{name}.obj"]
+    for category in ("no", "null", "0_1e", "1_000a", "on", "1e3", "thing"):
+        assert list(job_of(cubes(0.2), category_map={"*.obj": category})[1].categories) == [category]

@@ -1,0 +1,278 @@
+"""`verso init`: a folder of meshes becomes a job and a page of pictures; and docs/own_meshes.md, whose commands are run."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.dataset as ds
+import pytest
+import trimesh
+from PIL import Image
+
+from schemas.errors import AssetSourceError, MachineError
+from schemas.job.assets import Assets, FolderSource, ProceduralSource
+from services.cli.main import main
+from services.init import collection, command, shown
+from services.init.collection import SUFFIXES, Candidate, LeftOut, read_folder, walk_folder
+from services.init.shown import MOST_ROWS, TILE, Tile, draw_left_out, draw_object, draw_sheet, draw_table, show_items
+from services.job.bounded_yaml import parse_yaml
+from services.job.job_file import load_job
+from tests.services.init.own_meshes import cup, mixed_folder, write_mesh
+from tests.workers.assets.oracles import write
+from workers.assets.builtin.make import make_asset
+from workers.assets.catalogue import open_catalogue
+from workers.assets.external.mesh import transform_shape
+from workers.geometry.frames import pose
+from workers.render.raster.gbuffer import shared_renderer
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def init(*words, capsys):
+    code = main(["init", *map(str, words)])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+@pytest.mark.minute
+def test_a_mixed_folder_becomes_a_job_that_offers_exactly_what_was_shown(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "90")
+    folder, out = mixed_folder(tmp_path / "mixed meshes"), tmp_path / "mine.yaml"
+    code, told, _ = init(folder, "--out", out, "--json", capsys=capsys)
+    answer = json.loads(told.splitlines()[-1])
+    assert (code, answer["ok"], answer["job"], answer["sheet"]) == (0, True, str(out), str(tmp_path / "mine.jpg"))
+    table = told.partition("mine.yaml")[0].splitlines()[:-1]
+    assert all(len(line) <= 90 for line in table), "it fits the terminal"
+    assert f"verso run {out} --scenes 8" in told and "2 meshes not offered by themselves" in told
+
+    job = load_job(out)
+    catalogue = open_catalogue(job.assets, out.parent, tuple(job.categories))
+    offered = {
+        entry.files[0].path: category
+        for listing in catalogue.objects
+        for category, entries in listing.entries.items()
+        for number, entry in enumerate(entries)
+        if number not in listing.refused.get(category, ())
+    }
+    assert offered == {one["path"]: one["category"] for one in answer["objects"]} and len(offered) == 10
+    categories = {"002_can", "bottles", "gltf-cup", "mugs", "robot", "standing", "table_mesh"}
+    assert set(offered.values()) == set(job.categories) == categories
+    assert all(not listing.doubts for listing in catalogue.objects), "nothing lies on its side"
+    assert job.assets.objects[0].folder == "mixed meshes", "relative to the job file"
+    heights = {one["path"]: one["size_m"][2] for one in answer["objects"]}
+    true = {"mugs/mug_2.glb": 0.12, "standing.glb": 0.09, "bottles/bottle 0.stl": 0.2, "gltf cup/model.gltf": 0.1}
+    assert {path: heights[path] for path in true} == pytest.approx(true, abs=1e-6)
+    left_out = {one["path"]: (one["reason"], one["why"]) for one in answer["left_out"]}
+    assert left_out.pop("broken.obj")[0] == "index_out_of_range"
+    assert left_out == {
+        "002_can/google_16k/nontextured.ply": ("double", "is 002_can/google_16k/textured.obj in another format"),
+        "002_can/google_16k/textured.obj": ("double", "has the content of 002_can/copy/textured.obj"),
+        "huge.stl": (
+            "size",
+            "would be 1.73e+03 m across at scale 0.001: put it into a folder of its own, and init that",
+        ),
+        "mugs/out.glb": ("link", "leads out of the folder: copy it there"),
+        "robot/collision.obj": ("part", "is a part of robot/model.urdf"),
+        "robot/textured.obj": ("part", "is a part of robot/model.urdf"),
+        "scene.dae": ("format", ".dae is not read: export it as .glb or .obj"),
+        "torn.gltf": ("missing", "its buffer gone.bin is missing"),
+    }
+    with Image.open(tmp_path / "mine.jpg") as page:
+        assert page.size[0] > 1500 and np.asarray(page).std() > 20
+
+
+WRONG = (
+    (("none",), "none is not there"),
+    (("file",), "file is a file"),
+    (("empty",), "empty is empty"),
+    (("other",), "other has no mesh"),
+    (("broken",), "none of its 1 meshes can be used"),
+    (("good", "--category-from", "a/b"), "--category-from a/b: write folder, file, or a name"),
+    (("good", "--category-from", "table"), "--category-from table"),
+    (("good", "--sheet", "a.gif"), "must end in .jpg or .png"),
+    (("good", "--out", "file/a.yaml"), "cannot be written"),
+    (("good", "--out", "mine.yaml"), "mine.yaml is there already"),
+    (("good", "--sheet", "mine.jpg"), "mine.jpg is there already"),
+)
+
+
+def test_wrong_input_is_one_clear_line_and_leaves_and_overwrites_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    write_mesh(Path("good/a.stl"), cup())
+    for name, text in (("broken/a.obj", "v 0 0 0\n"), ("other/readme.txt", ""), ("file", ""), ("mine.yaml", "mine")):
+        write(Path(name), text)
+    write(Path("mine.jpg"), "mine")
+    before = {path: path.is_file() and path.read_bytes() for path in sorted(tmp_path.rglob("*"))}
+    for words, says in WRONG:
+        code, _, err = init(*words, capsys=capsys)
+        assert code == 2 and says in err.splitlines()[-1] and err.splitlines()[-1].startswith("verso: "), words
+        assert len(err.splitlines()) <= 3 and "Traceback" not in err
+        for path in set(tmp_path.rglob("*")) - set(before):
+            assert path.suffix == ".jpg" and "cannot be written" in says  # the pictures were drawn before the job
+            path.unlink()
+        assert before == {path: path.is_file() and path.read_bytes() for path in sorted(tmp_path.rglob("*"))}
+
+
+def test_without_opengl_there_is_a_job_and_no_picture_unless_one_was_asked_for(tmp_path, capsys, monkeypatch):
+    def no_gl():
+        raise MachineError("no OpenGL here: install libegl1")
+
+    monkeypatch.setattr(command, "shared_renderer", no_gl)
+    write_mesh(tmp_path / "m/x/cup_1.stl", cup())
+    words = tmp_path / "m", "--category-from", "thing"
+    code, _, err = init(*words, "--out", tmp_path / "a.yaml", capsys=capsys)
+    assert code == 0 and err == "verso: no pictures: no OpenGL here: install libegl1\n"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.yaml", "m"]
+    assert set(load_job(tmp_path / "a.yaml").categories) == {"thing"}
+    code, _, err = init(*words, "--out", tmp_path / "b.yaml", "--sheet", tmp_path / "b.png", capsys=capsys)
+    assert code == 1 and "install libegl1" in err
+
+
+@pytest.mark.minute
+@pytest.mark.shared_data
+def test_scanned_meshes_offer_their_urdfs_and_a_bottle_that_lies_is_stood_up(tmp_path, capsys):
+    code, told, _ = init(ROOT.parent / "shared/data/meshes", "--out", tmp_path / "j.yaml", "--json", capsys=capsys)
+    objects = {one["category"]: one for one in json.loads(told.splitlines()[-1])["objects"]}
+    assert code == 0 and set(objects) == {"blue_cup", "bowl", "cracker_box", "mug", "shampoo"}
+    assert {name: one["up"] for name, one in objects.items()} == dict.fromkeys(objects, "z") | {"shampoo": "y"}
+    assert objects["shampoo"]["size_m"][2] == pytest.approx(0.1686, abs=1e-3)
+    assert "20000" in told and "0 of 1" in told
+    assert objects["mug"]["missing_textures"] == 1 and objects["blue_cup"]["textures"] == 1
+
+
+# ------------------------------------------------------------------------------------------------ what is found and shown
+
+
+def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path, monkeypatch):
+    names = "b.obj", "a/b/c.GLB", "a/x.urdf", ".h/a.obj", "a/.b.obj", "__MACOSX/a.obj", "a/skin.png", "bad\nname.obj"
+    for name in (*names, "../out.obj", os.fsdecode(b"bad\xff.obj"), "locked.obj"):
+        write(tmp_path / "in" / name, "")
+    for link, target in (("link.obj", "../out.obj"), ("dead.obj", "none.obj"), ("inner.obj", "b.obj")):
+        (tmp_path / "in" / link).symlink_to(target)
+    # The system is asked through `os`, because root may read everything.
+    monkeypatch.setattr(collection.os, "access", lambda path, how: "locked" not in str(path))
+    found = walk_folder(tmp_path / "in")
+    assert found.paths == ("a/b/c.GLB", "a/x.urdf", "b.obj")
+    reasons = {"bad\\nname.obj": "name", "bad\\udcff.obj": "name", "dead.obj": "missing", "link.obj": "link"}
+    assert {one.path: one.reason for one in found.left_out} == {**reasons, "locked.obj": "permission"}
+    with pytest.raises(AssetSourceError, match=r"bad\\nname is not there"):
+        walk_folder(tmp_path / "bad\nname")
+
+    def deny(self):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(collection.Path, "iterdir", deny)
+    with pytest.raises(AssetSourceError, match="cannot be listed: Permission denied"):
+        walk_folder(tmp_path / "in")
+
+
+def test_sizes_are_those_of_the_asset_that_is_loaded_and_of_another_library(tmp_path):
+    mesh = cup(0.12, 0.03)
+    mesh.apply_scale((1, 0.8, 1))
+    for up in "yz":
+        path = write_mesh(tmp_path / up / "cup.stl", mesh, turned=up == "y", scale=1000)
+        (item,) = read_folder(path.parent, [Candidate(path.name, "cup")], lambda *_: None).items
+        theirs = trimesh.load_mesh(path)
+        assert item.measured.extents == pytest.approx(tuple(theirs.extents))
+        assert (item.measured.faces, item.measured.watertight) == (len(theirs.faces), theirs.is_watertight)
+        assert item.diagonal == pytest.approx(float((theirs.extents**2).sum() ** 0.5))
+        source = FolderSource(source="urdf", folder=str(path.parent), category_map={"*": "cup"}, up=up, scale=0.001)
+        catalogue = open_catalogue(Assets(objects=(source,)), tmp_path, ("cup",))
+        ((one, ref),) = show_items(catalogue, [item])
+        assert one.size_m == pytest.approx(tuple(catalogue.load(ref).extents_m)), "the loaded asset is the judge"
+        assert one.up == up and one.shape_says == ("y" if up == "y" else "z") and one.confidence == "sure"
+        assert one.row[:2] == ("cup.stl", "cup") and one.row[4] == "yes"
+        assert any("up: " in line for line in one.caption)
+
+
+ROW = (
+    *("a_folder/of_a_long_name/and_a_mesh.obj", "category", "12.3 x 4.5 x 67.8", "20000", "yes", "1", "y sure"),
+    "note " * 30,
+)
+
+
+def test_tables_fit_the_terminal_and_what_is_cut_or_not_shown_is_told():
+    for width in (60, 80, 100, 140, 400):
+        lines = draw_table([ROW, ROW], width)
+        assert len(lines) == 3 and all(len(line) <= width for line in lines)
+        assert ("…" in lines[1]) == (width < 400) and lines[0].split()[0] == "file"
+    assert draw_table([ROW] * (MOST_ROWS + 5), 100)[-1] == "and 5 more: --json lists all"
+    left = [LeftOut(f"{k}.obj", "format", "why") for k in range(MOST_ROWS + 3)]
+    lines = draw_left_out([*left, LeftOut("p.obj", "part", "is a part of x.urdf")], 100)
+    assert lines[0] == f"left out: {MOST_ROWS + 3} files" and lines[1] == "  0.obj (format): why"
+    assert lines[-2:] == ["  and 3 more: --json lists all", "1 mesh not offered by themselves: parts of the URDFs"]
+    assert draw_left_out([], 100) == []
+
+
+def bottle(scale=1.0, turned=False):
+    made = make_asset("bottle", ProceduralSource(source="procedural"), 0, 600.0)
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if turned else np.eye(3)
+    return replace(made, shape=transform_shape(made.shape, pose(scale * turn, np.zeros(3))))
+
+
+def test_an_object_of_any_size_fills_its_picture_and_stands_in_it_or_is_seen_to_lie():
+    pictures = {}
+    for scale, turned in ((0.001, False), (1.0, False), (50.0, False), (1.0, True)):
+        picture = pictures[scale, turned] = np.asarray(draw_object(bottle(scale, turned), shared_renderer()), float)
+        assert picture.shape[1::-1] == TILE
+        rows, columns = np.nonzero(np.abs(picture - picture[5, 5]).max(axis=2) > 45)
+        assert rows.min() > 2 and rows.max() < TILE[1] - 2, "nothing is cut off"
+        assert abs(np.median(columns) - TILE[0] / 2) < 0.2 * TILE[0]
+        assert turned or np.ptp(rows) > 0.5 * TILE[1]
+    assert (np.abs(pictures[1.0, False] - pictures[1.0, True]).max(axis=2) > 40).mean() > 0.05
+
+
+def test_as_many_as_fit_are_drawn_and_the_rest_is_counted(monkeypatch):
+    monkeypatch.setattr(shown, "MOST", 2)
+    loaded = []
+    tiles = [Tile(lambda: loaded.append(1) or bottle(), ("näme", "mug"), ("a warning " * 20,))] * 5
+    page, two = (draw_sheet("title", some, ["left out: x"], shared_renderer()) for some in (tiles, tiles[:2]))
+    assert len(loaded) == 4 and page.height > two.height, "a line says how many are not drawn"
+    assert page.width >= 2 * TILE[0] and (np.asarray(page) < 128).any()
+
+
+# ------------------------------------------------------------------------------------------------ its page
+
+PAGE = (ROOT / "docs" / "own_meshes.md").read_text()
+LINES = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
+COMMANDS = [shlex.split(line)[1:] for line in LINES]
+
+
+def test_every_format_that_is_read_has_its_line_and_the_example_of_up_is_one():
+    rows = "".join(line.split("|")[1] for line in PAGE.splitlines() if line.startswith("| `."))
+    assert set(re.findall(r"`(\.\w+)`", rows)) == set(SUFFIXES)
+    assert parse_yaml(re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0])["up"]["**/*.glb"] == "y"
+
+
+@pytest.mark.ray
+@pytest.mark.minute
+def test_its_commands_run_as_printed_and_make_a_dataset_in_which_everything_stands(tmp_path, capsys, monkeypatch):
+    mixed_folder(tmp_path / "meshes")
+    monkeypatch.chdir(tmp_path)
+    assert len(COMMANDS) == 5
+    for words in COMMANDS:
+        if words[0] == "init" or "--dry-run" in words:
+            assert main(words) == 0, words
+    assert "categories: 002_can 1, bottles 1" in capsys.readouterr().out
+    names = "meshes", "meshes.yaml", "meshes.jpg", "by_file.yaml", "by_file.jpg", "one.yaml", "one.png"
+    assert {path.name for path in tmp_path.iterdir()} == set(names)
+    assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    whole = [sys.executable, "-m", "services.cli.main", *COMMANDS[2]]
+    subprocess.run(whole, env=environment, check=True, capture_output=True)
+    tables = [
+        ds.dataset(tmp_path / f"data/meshes/manifest/{name}", partitioning="hive") for name in ("scenes", "assets")
+    ]
+    scenes, assets = (table.to_table().to_pylist() for table in tables)
+    assert len(scenes) == 8 and len({row["category"] for row in scenes}) > 2
+    heights = {row["path"]: row["extents_m"][2] for row in assets if row["source"] == "urdf"}
+    true = {"mugs/mug_0.glb": 0.08, "mugs/mug_1.glb": 0.1, "mugs/mug_2.glb": 0.12, "gltf cup/model.gltf": 0.1}
+    drawn = {path: height for path, height in heights.items() if path in true}
+    assert drawn == pytest.approx({path: true[path] for path in drawn}, abs=1e-6)
