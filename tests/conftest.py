@@ -122,7 +122,7 @@ LONGEST_FIRST = (
     "services/run/test_several_objects.py",
     "effects/test_random_scenes.py",
     "effects/test_physics_effects.py",
-    "services/bench/test_command.py",
+    "services/bench/test_rounds.py",
     "kit/test_energy_minimum.py",
 )
 """Files of a minute or so: a process that begins one last works on alone."""

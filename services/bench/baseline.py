@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +100,7 @@ def build(
     return scene, colors
 
 
-def render(
-    scene: Any, colors: dict, renderer: Any, k: dict[str, float], T_world_cam: NDArray, look: str = "plain"
-) -> Images:
+def render(scene: Any, colors: dict, renderer: Any, k: dict[str, float], T_world_cam: NDArray, look: str) -> Images:
     """Colour, depth and segmentation from one camera."""
     flags = pyrender.RenderFlags.SHADOWS_DIRECTIONAL if look == "same" else pyrender.RenderFlags.NONE
     camera = pyrender.IntrinsicsCamera(k["fx"], k["fy"], k["cx"], k["cy"], znear=0.05, zfar=100.0)
@@ -150,34 +149,31 @@ def write(views: dict[str, Images], images: list[dict[str, Any]], units: float, 
         cv2.imwrite(str(path), pixels)
 
 
-class Script:
-    """The script's state between scenes: its renderer and PyBullet's world."""
+@cache
+def renderer_of(width: int, height: int) -> Any:
+    """Pyrender's renderer, which is made in the first scene."""
+    return pyrender.OffscreenRenderer(width, height)
 
-    def __init__(self) -> None:
-        pybullet.connect(pybullet.DIRECT)
-        self._renderer: Any = None
 
-    def make(self, loaded: tuple[dict[str, Any], Path, dict[str, Any]], asked: dict[str, str]) -> dict[str, float]:
-        """One scene's images; seconds by stage."""
-        (description, folder, meshes), out, look = loaded, Path(asked["out"]), asked["look"]
-        seconds: dict[str, float] = {}
-        k = description["intrinsics"]
-        if self._renderer is None:
-            self._renderer = pyrender.OffscreenRenderer(k["width"], k["height"])
-        with _timed(seconds, "physics"):
-            T_world_obj = simulate(description, folder)
-        with _timed(seconds, "scene"):
-            scene, colors = build(description, meshes, T_world_obj, look)
-        for pair in description["pairs"]:
-            cameras = {role: np.array(T) for role, T in pair["cameras"].items()}
-            with _timed(seconds, "render"):
-                views = {role: render(scene, colors, self._renderer, k, T, look) for role, T in cameras.items()}
-            T_mirror_input = np.linalg.inv(cameras["mirror"]) @ cameras["input"]
-            with _timed(seconds, "projection"):
-                views["projected"] = project(views["input"], k, T_mirror_input)
-            with _timed(seconds, "write"):
-                write(views, pair["images"], description["depth_units_per_m"], out)
-        return seconds
+def make(description: dict[str, Any], folder: Path, meshes: dict[str, Any], out: Path, look: str) -> dict[str, float]:
+    """One scene's images; seconds by stage."""
+    seconds: dict[str, float] = {}
+    k = description["intrinsics"]
+    renderer = renderer_of(k["width"], k["height"])
+    with _timed(seconds, "physics"):
+        T_world_obj = simulate(description, folder)
+    with _timed(seconds, "scene"):
+        scene, colors = build(description, meshes, T_world_obj, look)
+    for pair in description["pairs"]:
+        cameras = {role: np.array(T) for role, T in pair["cameras"].items()}
+        with _timed(seconds, "render"):
+            views = {role: render(scene, colors, renderer, k, T, look) for role, T in cameras.items()}
+        T_mirror_input = np.linalg.inv(cameras["mirror"]) @ cameras["input"]
+        with _timed(seconds, "projection"):
+            views["projected"] = project(views["input"], k, T_mirror_input)
+        with _timed(seconds, "write"):
+            write(views, pair["images"], description["depth_units_per_m"], out)
+    return seconds
 
 
 @contextmanager
@@ -193,14 +189,14 @@ def answer_scenes() -> None:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     print(json.dumps({"ready": True}), file=answers)
-    script = Script()
+    pybullet.connect(pybullet.DIRECT)
     for line in sys.stdin:
         asked = json.loads(line)
         path, before = Path(asked["scene"]), time.perf_counter()
         description = json.loads(path.read_text())
         meshes = load_meshes(description, path.parent, asked["look"])
         wall, cpu = time.perf_counter(), time.process_time()
-        stages = script.make((description, path.parent, meshes), asked)
+        stages = make(description, path.parent, meshes, Path(asked["out"]), asked["look"])
         answer = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu, "stages_s": stages}
         print(json.dumps(answer | {"load_s": wall - before}), file=answers)
 

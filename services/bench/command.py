@@ -4,17 +4,19 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import mean, median
 from typing import Any
 
 from schemas.errors import InputError, MachineError
 from schemas.job.job import Job
 from schemas.job.physics import ONE_OBJECT
-from services.bench import effects, report
-from services.bench.measure import bench_folder, measure
-from services.bench.scaling import measure_memory
+from services.bench import effects
+from services.bench.figures import Lap, by_clock, by_processor, format_spread, slope_ratio, stage_table, with_loading
+from services.bench.measure import Look, Measured, bench_folder, measure, measure_memory
 from services.job.job_file import change_key, load_job, validate_job
 from workers.store.file_system import file_system_of
 
@@ -47,16 +49,16 @@ def main(options: argparse.Namespace) -> int:
     refuse_unmatched(job)
     with bench_folder(options.folder) as folder:
         if options.nodes is not None:
-            from services.bench import simulated  # loads Ray
+            from services.bench import scaling  # loads Ray
 
-            laps = simulated.measure_simulated(job, folder, options.nodes, simulated.SHARD_S)
-            return _print(options, job, {"simulated": laps}, simulated.describe)
+            laps = scaling.measure_simulated(job, folder, options.nodes, scaling.SHARD_S)
+            return _print(options, job, {"simulated": laps}, scaling.describe)
         # Printed before the folder is deleted, which takes a while on a busy disk.
-        return _print(options, job, _measure_all(options, job, job_folder, folder), report.describe)
+        return _print(options, job, _measure_all(options, job, job_folder, folder), describe)
 
 
 def _measure_all(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> dict[str, Any]:
-    rounds = report.summarise(measure(job, job_folder, folder, options.scenes))
+    rounds = summarise(measure(job, job_folder, folder, options.scenes))
     memory = options.memory and measure_memory(job, job_folder, folder / "memory", options.memory)
     scaling = None
     if options.workers is not None:
@@ -91,3 +93,134 @@ def refuse_unmatched(job: Job) -> None:
     }
     if off := [name for name, on in switches.items() if not on]:
         raise InputError(f"{', '.join(off)} is off: the benchmark compares whole pairs, leave it on")
+
+
+# ---------------------------------------------------------------------------------------------- the report
+
+
+def summarise(measured: Measured) -> dict[str, Any]:
+    """The figures of the rounds: plain numbers, milliseconds per scene, ratios of slopes."""
+    laps = measured.laps
+    ours, bound = laps["ours"], laps["floor"]
+    scenes = sum(lap.scenes for lap in ours)
+    return {
+        "machine": measured.machine,
+        "core": measured.core,
+        "scenes": scenes,
+        "rounds": len(ours),
+        "bytes_per_scene": measured.bytes / scenes,
+        "startup_s": measured.startup_s,
+        "ours": _side(ours),
+        "floor": _side(bound) | {"encoders": measured.encoders, "upload_ms": _apart(bound)},
+        "times_floor": asdict(slope_ratio(ours, bound)),
+        "times_floor_cpu": asdict(slope_ratio(ours, bound, by_processor)),
+        "others": {look.name: _other(look, laps[look.name], ours) for look in measured.looks.values()},
+    }
+
+
+def _other(look: Look, laps: Sequence[Lap], ours: Sequence[Lap]) -> dict[str, Any]:
+    """A look of the script; a ratio is how many times as many scenes we make in the same time."""
+    return _side(laps) | {
+        "title": look.title,
+        "makes": look.makes,
+        "load_ms": _apart(laps),
+        "ratio": asdict(slope_ratio(laps, ours)),
+        "ratio_cpu": asdict(slope_ratio(laps, ours, by_processor)),
+        "ratio_with_loading": asdict(slope_ratio(laps, ours, with_loading)),
+    }
+
+
+def _apart(laps: Sequence[Lap]) -> float:
+    return median(lap.apart_s / lap.scenes for lap in laps) * 1e3
+
+
+def _side(laps: Sequence[Lap]) -> dict[str, Any]:
+    return {
+        "ms_per_scene": median(map(by_clock, laps)) * 1e3,
+        "cpu_ms_per_scene": median(map(by_processor, laps)) * 1e3,
+        "stages_ms": stage_table(laps),
+        "stages_mean_ms": stage_table(laps, mean),
+    }
+
+
+def describe(figures: dict[str, Any]) -> list[str]:
+    """The figures as text, line by line."""
+    machine = figures["machine"]
+    others, floor = figures["others"].values(), figures["floor"]
+    threads = machine["threads_per_core"]
+    lines = [
+        f"machine    {machine['usable_cores']} of {machine['cores']} cores"
+        + (f" ({threads} thread{'s' * (threads > 1)} each)" if threads else "")
+        + f", {machine['cpu']}, load {machine['load_1min']:.1f}",
+        f"           {machine['gl_renderer']}",
+        f"           Python {machine['python']}, " + ", ".join(f"{k} {v}" for k, v in machine["versions"].items()),
+        f"command    {figures['command']}",
+        f"measured   {figures['scenes']} scenes in {figures['rounds']} rounds, each side in turn on core "
+        f"{figures['core']}, a commit a round, {figures['bytes_per_scene'] / 1e3:.0f} kB a scene on {figures['file_system']}",
+        "start-up   "
+        + ", ".join(f"{name} {s:.1f} s" for name, s in figures["startup_s"].items())
+        + ", the first scenes included; not counted below",
+        "",
+        *_table("ours", figures["ours"]),
+        *_table("floor: bare passes, fastest encoder, durable writes", floor),
+        f"  before its clock each scene's shapes go to the GPU: {floor['upload_ms']:.1f} ms a scene",
+        f"  encoders: {', '.join(f'{kind} {name}' for kind, name in floor['encoders'].items())}",
+    ]
+    for other in others:
+        lines += _table(f"{other['title']} ({other['makes']})", other)
+        lines.append(f"  before its clock it reads its files: {other['load_ms']:.1f} ms a scene")
+    lines += ["", f"{'as many scenes as':24} {'by the clock':24} {'by processor time':24} its reading counted"]
+    lines += [
+        f"  {other['title']:22} {_times(other['ratio']):24} {_times(other['ratio_cpu']):24} "
+        f"{_times(other['ratio_with_loading'])}"
+        for other in others
+    ]
+    lines += [f"{'times the lower bound':24} {_times(figures['times_floor']):24} {_times(figures['times_floor_cpu'])}"]
+    lines += _describe_memory(figures["memory"]) if figures["memory"] else []
+    lines += _describe_scaling(figures["scaling"]) if figures["scaling"] else []
+    return lines
+
+
+def _table(what: str, side: dict[str, Any]) -> list[str]:
+    total = side["ms_per_scene"]
+    cost = f"{total:.1f} ms a scene, {1e3 / total:.2f} scenes/s ({side['cpu_ms_per_scene']:.1f} ms of processor)"
+    stages = sorted(side["stages_ms"].items(), key=lambda stage: (stage[0] == "rest", -stage[1]))
+    means = side["stages_mean_ms"]
+    return [
+        what,
+        f"  {cost}",
+        *(f"    {name:22} {ms:8.2f} ms {ms / total:6.1%}, mean {means[name]:.2f} ms" for name, ms in stages),
+    ]
+
+
+def _times(spread: dict[str, float]) -> str:
+    return format_spread(spread, unit=" x")
+
+
+def _describe_memory(memory: dict[str, Any]) -> list[str]:
+    settled, scenes = memory["settled_after"], memory["scenes"]
+    return [
+        "",
+        f"one worker over {scenes} scenes",
+        f"  memory                 {memory['settled_mb']:.0f} MB after {settled}, {memory['last_mb']:.0f} MB at the end: "
+        f"{memory['grown']:+.1%}; at most {memory['peak_mb']:.0f} MB",
+        f"  processor for a scene  {memory['first_ms']:.1f} ms in the first {settled}, {memory['last_ms']:.1f} ms in the "
+        f"last: {memory['last_to_first']:.3f} times",
+    ]
+
+
+def _describe_scaling(scaling: dict[str, Any]) -> list[str]:
+    return [
+        "",
+        f"{scaling['workers']} at once against one     {'as many scenes':24} {'processor for a scene':24} scenes/s",
+        *(
+            f"  {name:22} {_times(gain['speedup']):24} {_times(gain['inflation']):24} "
+            f"{gain['one_scenes_per_s']:.2f} and {gain['all_scenes_per_s']:.2f}, {gain['scenes']} scenes"
+            for name, gain in (("through Ray", scaling["ray"]), ("plain processes", scaling["bare"]))
+        ),
+        f"  {'empty loops':22} {_times(scaling['loops'])}",
+        f"  Ray gives {scaling['share_of_bare']:.1%} of what plain processes gain",
+        f"  Ray's share of time    {format_spread(scaling['ray_share_one'], '.1%')} with one worker, "
+        f"{format_spread(scaling['ray_share'], '.1%')} with {scaling['workers']}, their uneven end included; "
+        f"ranges of {scaling['range']}",
+    ]

@@ -14,8 +14,7 @@ from schemas.base import Array
 from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan
-from services.bench.figures import Spread, describe_machine, format_spread, pinned
-from services.bench.report import describe_head
+from services.bench.figures import Spread, describe_head, describe_machine, format_spread, pinned
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.settle import settle_scene

@@ -6,18 +6,19 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 LIBRARIES = ("numpy", "opencv-contrib-python-headless", "pybullet", "pyrender", "pyarrow", "trimesh", "PyOpenGL", "ray")
 
 
 @contextlib.contextmanager
-def pinned(core: int | None = None) -> Iterator[int]:
-    """Pins this thread, and the processes that it starts, to one core: by default the last that it may use."""
+def pinned() -> Iterator[int]:
+    """Pins this thread, and the processes that it starts, to the last core that it may use."""
     before = os.sched_getaffinity(0)
-    chosen = max(before) if core is None else core
+    chosen = max(before)
     os.sched_setaffinity(0, {chosen})
     try:
         yield chosen
@@ -38,16 +39,8 @@ def describe_machine(renderer: str) -> dict[str, object]:
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.release()}",
         "load_1min": os.getloadavg()[0],
-        "versions": {name: found for name in LIBRARIES if (found := installed(name)) is not None},
+        "versions": {name: version(name) for name in LIBRARIES},
     }
-
-
-def installed(package: str) -> str | None:
-    """Version of a package, None where it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def threads_per_core(topology: Path = Path("/sys/devices/system/cpu/cpu0/topology/thread_siblings_list")) -> int | None:
@@ -132,11 +125,7 @@ def stage_table(laps: Sequence[Lap], middle: Callable[[list[float]], float] = me
     return table
 
 
-def idle_share(shard_wall_s: float, slots: int, run_wall_s: float) -> float:
-    """Share of the slots' time in which no shard ran: the cost of handing out work, and of its uneven end."""
-    return 1.0 - shard_wall_s / (slots * run_wall_s)
-
-
-def growth(samples: Sequence[float], window: int) -> float:
-    """Relative growth from the first `window` samples to the last, by medians: 0.05 is 5 % more."""
-    return median(samples[-window:]) / median(samples[:window]) - 1.0
+def describe_head(figures: Mapping[str, Any]) -> list[str]:
+    """Processor, load and command: the first lines of the shorter reports."""
+    machine = figures["machine"]
+    return [f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}", f"command    {figures['command']}"]

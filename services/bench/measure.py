@@ -1,19 +1,24 @@
 """The rounds of the benchmark: whole scenes of a job by the production code onto a real disk, beside the other sides."""
 
+import multiprocessing
 import tempfile
 import time
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
+from statistics import median
+from typing import NamedTuple
 
 from schemas.dataset.commit import Span
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import OutputError, RunError, SceneError
 from schemas.job.job import MOST, Job
-from services.bench.figures import Lap, describe_machine, pinned, process_age_s
-from services.bench.lower_bound import choose_encoders, images_of, run_lower_bound
-from services.bench.script import Look, hand_over, looks_of, start_script
+from services.bench.figures import Lap, by_processor, describe_machine, pinned, process_age_s
+from services.bench.sides import Look, choose_encoders, hand_over, images_of, looks_of, run_lower_bound, start_script
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
@@ -26,6 +31,16 @@ from workers.store.local import LocalStore
 
 LOOP_TURNS = 10_000
 """Turns of an empty loop, 0.2 ms, between two looks at the clock."""
+
+WARM_UP = 8
+"""Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
+
+ROUND = MOST
+"""Scenes of a round where the job does not give its range's: as in a job of 512 scenes or more, whose ranges they are. A
+smaller job commits more often."""
+
+SETTLED = 200
+"""Scenes after which every cache is full and every shader compiled."""
 
 
 @dataclass(eq=False)
@@ -107,14 +122,6 @@ def count_for(seconds: float) -> Lap:
     return Lap(turns, time.perf_counter() - wall, time.process_time() - cpu, {})
 
 
-WARM_UP = 8
-"""Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
-
-ROUND = MOST
-"""Scenes of a round where the job does not give its range's: as in a job of 512 scenes or more, whose ranges they are. A
-smaller job commits more often."""
-
-
 @dataclass(frozen=True)
 class Measured:
     """The laps of each side, one a round in which all make the same scenes, and the bytes that ours committed."""
@@ -182,3 +189,61 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
 def _hand_over(scenes: Sequence[Scene], job: Job, folder: Path) -> list[Path]:
     """The same scenes as files for the script."""
     return [hand_over(scene, job, folder / str(scene.plan.scene_id)) for scene in scenes]
+
+
+# ---------------------------------------------------------------------------------------------- one worker over many scenes
+
+
+class Sample(NamedTuple):
+    """One range: its scenes, resident MB after it, and seconds of processor a scene."""
+
+    scenes: int
+    mb: float
+    cpu_s: float
+
+
+def measure_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> dict[str, float]:
+    """Make that many scenes in one fresh worker; returns the figures of `memory_figures`."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return memory_figures(*pool.submit(sample_memory, job, job_folder, folder, scenes).result())
+
+
+def sample_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> tuple[list[Sample], float]:
+    """A sample for each range, and the peak MB of this process."""
+    bench = open_workbench(job, job_folder, folder)
+    stop, samples = job.first_scene + scenes, []
+    while bench.next_scene < stop:
+        span = bench.next_span(min(job.range_size, stop - bench.next_scene))
+        lap = bench.run(span)
+        samples.append(Sample(len(span.scene_ids), resident_mb("VmRSS"), by_processor(lap)))
+    return samples, resident_mb("VmHWM")
+
+
+def resident_mb(field: str) -> float:
+    """Resident memory of this process, MB: `VmRSS` now, `VmHWM` the peak; a child inherits `ru_maxrss` from its parent."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(field)) * 1024 / 1e6
+
+
+def memory_figures(samples: list[Sample], peak_mb: float) -> dict[str, float]:
+    """Resident memory and pace over the scenes; below ten times `SETTLED` scenes, the first tenth counts as settling.
+
+    grown: growth of the memory since it settled, 0.05 for 5 %. peak_mb: the peak of the process. first_ms and last_ms: of
+    processor a scene in the first `settled_after` scenes and in as many at the end, medians over ranges, which other
+    processes disturb little; last_to_first: their ratio.
+    """
+    counts, megabytes, paces = zip(*samples, strict=True)
+    scenes = list(accumulate(counts))
+    settled = bisect_left(scenes, min(SETTLED, scenes[-1] // 10 or 1))
+    window = settled + 1
+    return {
+        "scenes": scenes[-1],
+        "settled_after": scenes[settled],
+        "settled_mb": megabytes[settled],
+        "last_mb": megabytes[-1],
+        "peak_mb": max(peak_mb, *megabytes),
+        "grown": megabytes[-1] / megabytes[settled] - 1.0,
+        "first_ms": median(paces[:window]) * 1e3,
+        "last_ms": median(paces[-window:]) * 1e3,
+        "last_to_first": median(paces[-window:]) / median(paces[:window]),
+    }
