@@ -24,7 +24,7 @@ from schemas.scene.view import Camera
 from services.export.source import ExportScene, unchanged_sources
 from services.job.record import JobRecord
 from workers.assets.catalogue import Catalogue, load_asset
-from workers.assets.external.formats import read_visual
+from workers.assets.external.plain import read_visual
 from workers.geometry.camera import project_bounds
 from workers.geometry.frames import transform
 from workers.geometry.raycast import NEAR_M, cast_view

@@ -20,14 +20,6 @@ PART = "part"
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A file that may be an object: its path below the folder, and the category that it would have."""
-
-    path: str
-    category: str
-
-
-@dataclass(frozen=True)
 class Item:
     """A file that can be used, what was measured of it, and one digest over all files that it reads."""
 
@@ -107,18 +99,10 @@ MOST_FILES = 100_000
 """More files are no folder of meshes that a person looks at."""
 
 
-@dataclass(frozen=True)
-class Walk:
-    """Paths below the folder of files that may be objects, in order, and what was left out already."""
+def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
+    """Paths of every mesh and URDF below the folder, in order, and what was left out already; hidden names are left aside.
 
-    paths: tuple[str, ...]
-    left_out: tuple[LeftOut, ...]
-
-
-def walk_folder(folder: Path) -> Walk:
-    """Every mesh and URDF below the folder, hidden names left aside. Links to folders are not followed.
-
-    Raises AssetSourceError where the folder is none, cannot be listed, or has nothing that looks like a mesh.
+    Links to folders are not followed. AssetSourceError where the folder is none, cannot be listed, or has no mesh.
     """
     name = plain_line(str(folder), 300)
     if not folder.is_dir():
@@ -140,10 +124,8 @@ def walk_folder(folder: Path) -> Walk:
             if file.startswith(".") or suffix not in (*SUFFIXES, *FOREIGN):
                 continue
             path = Path(parent, file)
-            shown = _relative(str(path), root)
-            why = _unusable(path, root)
-            if why is not None:
-                left_out.append(LeftOut(shown, *why))
+            if (why := _unusable(path, root)) is not None:
+                left_out.append(LeftOut(_relative(str(path), root), *why))
             else:
                 paths[path.resolve().relative_to(root).as_posix()] = None
         if len(paths) + len(left_out) > MOST_FILES:
@@ -151,7 +133,7 @@ def walk_folder(folder: Path) -> Walk:
     if not paths and not left_out:
         what = "is empty" if empty else f"has no mesh ({', '.join(SUFFIXES)})"
         raise AssetSourceError(f"{name} {what}: name a folder that has some")
-    return Walk(tuple(sorted(paths)), tuple(left_out))
+    return sorted(paths), left_out
 
 
 def _unusable(path: Path, root: Path) -> tuple[str, str] | None:
@@ -182,73 +164,42 @@ DONE: Mapping[Kind, str] = {"names": "URDFs read", "list": "files listed", "meas
 Watch = Callable[[str, int, int], None]
 
 
-def read_folder(folder: Path, candidates: Sequence[Candidate], watch: Watch) -> Reading:
-    """What every candidate is, in the order given; `folder` is resolved."""
+def read_folder(folder: Path, categories: Mapping[str, str], watch: Watch) -> Reading:
+    """What every file is, in the order given, by its path below the folder with its category; `folder` is resolved."""
     source = FolderSource(source="urdf", folder=str(folder))
     request = Request(source, folder, Assets(limits=ANY_SIZE), ())
-    parts = _parts_of_urdfs(request, candidates, watch)
-    left_out = [LeftOut(path, PART, f"is a part of {urdf}") for path, urdf in parts.items()]
-    rest = [one for one in candidates if one.path not in parts]
-    entries, refused = _list(request, rest, watch)
-    items, more = _measure(request, entries, watch)
-    refused += more
-    kept, doubled = drop_doubles(items)
-    unread = frozenset(one.path for one in refused)
-    return Reading(tuple(kept), (*refused, *left_out, *doubled), unread)
 
+    def ask(kind: Kind, entries: Mapping[str, Entry | None]) -> Iterator[tuple[str, bytes | MeshError]]:
+        tasks = tuple(Task(kind, folder / path, categories[path], entry) for path, entry in entries.items())
+        answers = ask_all(replace(request, tasks=tasks), partial(watch, DONE[kind]))
+        return zip(entries, (answer for _, answer in answers), strict=True)
 
-def _parts_of_urdfs(request: Request, candidates: Sequence[Candidate], watch: Watch) -> dict[str, str]:
-    """Meshes that a URDF of the folder refers to, and the first URDF that does."""
-    urdfs = [one for one in candidates if one.path.lower().endswith(".urdf")]
     parts: dict[str, str] = {}
-    for task, answer in _ask(request, "names", urdfs, [], watch):
-        if not isinstance(answer, MeshError):
-            for path in json.loads(answer):
-                parts.setdefault(path, task.path.relative_to(request.folder).as_posix())
-    return parts
-
-
-def _list(
-    request: Request, candidates: Sequence[Candidate], watch: Watch
-) -> tuple[list[tuple[Candidate, Entry]], list[LeftOut]]:
-    """The files of each candidate with their digests."""
-    entries, left_out = list[tuple[Candidate, Entry]](), list[LeftOut]()
-    answers = _ask(request, "list", candidates, [], watch)
-    for one, (_, answer) in zip(candidates, answers, strict=True):
+    for urdf, answer in ask("names", {path: None for path in categories if path.lower().endswith(".urdf")}):
+        for part in [] if isinstance(answer, MeshError) else json.loads(answer):
+            parts.setdefault(part, urdf)
+    entries, items, refused = dict[str, Entry | None](), list[Item](), list[LeftOut]()
+    digests: dict[str, str] = {}
+    for path, answer in ask("list", {path: None for path in categories if path not in parts}):
         if isinstance(answer, MeshError):
-            left_out.append(_refusal(one, request.folder, answer))
+            refused.append(_refusal(path, folder, answer))
         else:
             files = tuple(SourceFile(*file) for file in json.loads(answer))
-            entries.append((one, Entry("", files, "")))
-    return entries, left_out
-
-
-def _measure(
-    request: Request, entries: Sequence[tuple[Candidate, Entry]], watch: Watch
-) -> tuple[list[Item], list[LeftOut]]:
-    items, left_out = list[Item](), list[LeftOut]()
-    candidates = [one for one, _ in entries]
-    answers = _ask(request, "measure", candidates, [entry for _, entry in entries], watch)
-    for (one, entry), (_, answer) in zip(entries, answers, strict=True):
+            entries[path] = Entry("", files, "")
+            digests[path] = hashlib.sha256("".join(file.sha256 for file in files).encode()).hexdigest()
+    for path, answer in ask("measure", entries):
         if isinstance(answer, MeshError):
-            left_out.append(_refusal(one, request.folder, answer))
+            refused.append(_refusal(path, folder, answer))
         else:
-            digest = hashlib.sha256("".join(file.sha256 for file in entry.files).encode()).hexdigest()
-            items.append(Item(one.path, one.category, read_measured(answer), digest))
-    return items, left_out
+            items.append(Item(path, categories[path], read_measured(answer), digests[path]))
+    kept, doubled = drop_doubles(items)
+    left_out = [LeftOut(path, PART, f"is a part of {urdf}") for path, urdf in parts.items()]
+    return Reading(tuple(kept), (*refused, *left_out, *doubled), frozenset(one.path for one in refused))
 
 
-def _ask(
-    request: Request, kind: Kind, candidates: Sequence[Candidate], entries: Sequence[Entry | None], watch: Watch
-) -> Iterator[tuple[Task, bytes | MeshError]]:
-    asked = zip(candidates, entries or [None] * len(candidates), strict=True)
-    tasks = tuple(Task(kind, request.folder / one.path, one.category, entry) for one, entry in asked)
-    return ask_all(replace(request, tasks=tasks), partial(watch, DONE[kind]))
-
-
-def _refusal(one: Candidate, folder: Path, error: MeshError) -> LeftOut:
-    why = error.detail.replace(f"{folder}/", "").removeprefix(one.path).lstrip(": ")
-    return LeftOut(one.path, error.reason, plain_line(why, 300))
+def _refusal(path: str, folder: Path, error: MeshError) -> LeftOut:
+    why = error.detail.replace(f"{folder}/", "").removeprefix(path).lstrip(": ")
+    return LeftOut(path, error.reason, plain_line(why, 300))
 
 
 def drop_doubles(items: Sequence[Item]) -> tuple[list[Item], list[LeftOut]]:

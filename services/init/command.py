@@ -18,13 +18,11 @@ from schemas.job.job import Job
 from services.init.collection import (
     LARGEST,
     SMALLEST,
-    Candidate,
     Guess,
     Item,
     LeftOut,
     Reading,
     Scale,
-    UpRule,
     read_folder,
     walk_folder,
 )
@@ -38,11 +36,11 @@ from services.init.guess import (
     map_categories,
     plain_axis,
 )
-from services.init.shown import Shown, Tile, draw_left_out, draw_sheet, draw_table, show_items
+from services.init.shown import Tile, draw_left_out, draw_sheet, draw_table, show_items
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import MOST_BYTES, MOST_KEYS, validate_job
 from services.run.progress import ProgressLine
-from workers.assets.catalogue import Catalogue, InstanceRef, open_catalogue
+from workers.assets.catalogue import open_catalogue
 from workers.render.raster.gbuffer import shared_renderer
 
 SCENES = 64
@@ -103,25 +101,18 @@ SOURCE = """\
 
 
 def write_job(
-    name: str,
-    job: str,
-    folder: str,
-    sheet: str | None,
-    counts: Mapping[str, int],
-    suffix_counts: Mapping[str, int],
-    guess: Guess,
+    name: str, job: str, folder: str, sheet: str | None, items: Sequence[tuple[str, str]], guess: Guess
 ) -> str:
     """The text of the job file.
 
-    name: of the dataset; job: what the file will be called; folder: as the job file names it; counts: files by category;
-    suffix_counts: files by the end of their names, in small letters.
+    name: of the dataset; job: what the file will be called; folder: as the job file names it; items: category and end of
+    the name, in small letters, of each file.
     """
-    several = len(guess.scales) > 1
+    counts, suffixes = Counter(category for category, _ in items), Counter(suffix for _, suffix in items)
     sources = [
-        _source(folder, scale, guess, sum(suffix_counts[suffix] for suffix in scale.suffixes), several)
-        for scale in guess.scales
+        _source(folder, scale, guess, sum(suffixes[suffix] for suffix in scale.suffixes)) for scale in guess.scales
     ]
-    total, kinds = sum(counts.values()), len(counts)
+    total, kinds = counts.total(), len(counts)
     return HEAD.format(
         objects=f"{total} object{'s' * (total != 1)}",
         categories=f"{kinds} categor{'ies' if kinds != 1 else 'y'}",
@@ -137,32 +128,28 @@ def write_job(
     )
 
 
-def _source(folder: str, scale: Scale, guess: Guess, count: int, several: bool) -> str:
-    ours = [(p, c) for p, c in guess.category_map.items() if not several or _suffix_of(p) in scale.suffixes]
-    ups = [rule for rule in guess.ups if not several or _suffix_of(rule.pattern) in scale.suffixes]
-    size = f"      scale: {scale.factor:g}" + (f"\n      diagonal_m: {scale.diagonal_m:g}" if scale.diagonal_m else "")
+def _source(folder: str, scale: Scale, guess: Guess, count: int) -> str:
+    """A source of `count` files: all of the folder, or where scales differ those of some formats."""
+
+    def mine(pattern: str) -> bool:
+        return len(guess.scales) == 1 or pattern[pattern.rfind(".") :].lower() in scale.suffixes
+
+    rules = [rule for rule in guess.ups if mine(rule.pattern)]
+    if (axis := plain_axis(rules)) is not None:
+        up = [*(f"      # {_comment(rule.pattern)}: {_comment(rule.why)}." for rule in rules), f"      up: {axis}"]
+    else:
+        by_pattern = (f"        # {_comment(rule.why)}\n        {_quoted(rule.pattern)}: {rule.axis}" for rule in rules)
+        up = ["      up: # by file pattern; the first match wins", *by_pattern]
+    patterns = [(pattern, category) for pattern, category in guess.category_map.items() if mine(pattern)]
     return SOURCE.format(
         folder=_quoted(folder),
         weight=count,
         scale_why=_comment(scale.why),
-        scale=size,
-        up=_up(ups),
-        category_map="\n".join(f"        {_quoted(pattern)}: {_quoted(category)}" for pattern, category in ours),
+        scale=f"      scale: {scale.factor:g}"
+        + (f"\n      diagonal_m: {scale.diagonal_m:g}" if scale.diagonal_m else ""),
+        up="\n".join(up),
+        category_map="\n".join(f"        {_quoted(pattern)}: {_quoted(category)}" for pattern, category in patterns),
     )
-
-
-def _up(rules: Sequence[UpRule]) -> str:
-    axis = plain_axis(rules)
-    if axis is not None:
-        reasons = "\n".join(f"      # {_comment(rule.pattern)}: {_comment(rule.why)}." for rule in rules)
-        return f"{reasons}\n      up: {axis}"
-    lines = [f"        # {_comment(rule.why)}\n        {_quoted(rule.pattern)}: {rule.axis}" for rule in rules]
-    return "\n".join(["      up: # by file pattern; the first match wins", *lines])
-
-
-def _suffix_of(pattern: str) -> str:
-    """The end of the names that a pattern finds: its own, in small letters."""
-    return pattern[pattern.rfind(".") :].lower()
 
 
 def _quoted(text: str) -> str:
@@ -194,32 +181,33 @@ def main(options: argparse.Namespace) -> int:
     out: Path = options.out or Path(f"{dataset_name(folder)}.yaml")
     sheet: Path = options.sheet or out.with_suffix(".jpg")
     _check_targets(out, sheet)
-    walk = walk_folder(folder)
-    reading = _read(folder.resolve(), [Candidate(path, category_of(path, by)) for path in walk.paths])
+    paths, unusable = walk_folder(folder)
+    reading = _read(folder.resolve(), {path: category_of(path, by) for path in paths})
     guess, items, wrong_size = make_guess(reading)
-    left_out = sorted((*walk.left_out, *reading.left_out, *wrong_size), key=lambda one: one.path)
+    left_out = sorted((*unusable, *reading.left_out, *wrong_size), key=lambda one: one.path)
     width = shutil.get_terminal_size((100, 24)).columns
     if not items:
         print("\n".join(draw_left_out(left_out, width)), file=sys.stderr)
         raise AssetSourceError(f"{plain_line(str(folder), 300)}: none of its {len(left_out)} meshes can be used")
-    text = _job_text(folder, out, sheet, items, guess)
+    near = os.path.relpath(folder.resolve(), out.parent.resolve())
+    far = near.split("/")[: MOST_UPS + 1] == [".."] * (MOST_UPS + 1)
+    named, kinds = str(folder.resolve()) if far else near, [(item.category, item.suffix) for item in items]
+    text = write_job(dataset_name(folder), str(out), named, sheet.name, kinds, guess)
     job = check_text(text)
     catalogue = open_catalogue(job.assets, out.parent, tuple(job.categories))
     shown = show_items(catalogue, items)
     print("\n".join([*draw_table([one.row for one, _ in shown], width), *draw_left_out(left_out, width)]))
-    tiles = [_tile(catalogue, one, ref) for one, ref in shown]
+    tiles = [Tile(partial(catalogue.load, ref), one.caption, one.warnings) for one, ref in shown]
     drawn = _draw(sheet, options.sheet is not None, f"{folder}: {len(items)} objects", tiles, left_out)
     _write(out, text.encode(), "--out")
     print(f"{out}: {len(items)} objects in {len(job.categories)} categories")
     print("\n".join(f"  {line}" for line in describe_guess(guess)))
-    print(
-        f"  look at {sheet}, and change in {out} what is wrong; then" if drawn else "then",
-        f"verso run {out} --scenes 8",
-    )
-    told = {"job": str(out), "sheet": str(sheet) if drawn else None, "categories": list(job.categories)}
-    objects = [asdict(one) for one, _ in shown]
+    look = f"  look at {sheet}, and change in {out} what is wrong; then" if drawn else "then"
+    print(look, f"verso run {out} --scenes 8")
     if options.json:
-        print(json.dumps({"ok": True, **told, "objects": objects, "left_out": [asdict(one) for one in left_out]}))
+        told = {"job": str(out), "sheet": str(sheet) if drawn else None, "categories": list(job.categories)}
+        objects, others = [asdict(one) for one, _ in shown], [asdict(one) for one in left_out]
+        print(json.dumps({"ok": True, **told, "objects": objects, "left_out": others}))
     return 0
 
 
@@ -275,24 +263,17 @@ def check_text(text: str) -> Job:
     return validate_job(parse_yaml(text, MOST_KEYS), "the new job")
 
 
-def _read(folder: Path, candidates: list[Candidate]) -> Reading:
+def _read(folder: Path, categories: Mapping[str, str]) -> Reading:
     lines = dict[str, ProgressLine]()
 
     def watch(what: str, done: int, asked: int) -> None:
         lines.setdefault(what, ProgressLine(asked, what, "file")).show(done)
 
     try:
-        return read_folder(folder, candidates, watch)
+        return read_folder(folder, categories, watch)
     finally:
         for line in lines.values():
             line.close()
-
-
-def _job_text(folder: Path, out: Path, sheet: Path, items: list[Item], guess: Guess) -> str:
-    near = os.path.relpath(folder.resolve(), out.parent.resolve())
-    named = str(folder.resolve()) if near.split("/")[: MOST_UPS + 1] == [".."] * (MOST_UPS + 1) else near
-    counts, suffixes = Counter(item.category for item in items), Counter(item.suffix for item in items)
-    return write_job(dataset_name(folder), str(out), named, sheet.name, counts, suffixes, guess)
 
 
 def _draw(sheet: Path, asked: bool, title: str, tiles: list[Tile], left_out: list[LeftOut]) -> bool:
@@ -308,14 +289,6 @@ def _draw(sheet: Path, asked: bool, title: str, tiles: list[Tile], left_out: lis
     page.save(data, "PNG" if sheet.suffix.lower() == ".png" else "JPEG", quality=88)
     _write(sheet, data.getvalue(), "--sheet")
     return True
-
-
-def _tile(catalogue: Catalogue, shown: Shown, ref: InstanceRef) -> Tile:
-    """The picture of a file, with what asks for attention."""
-    other = shown.shape_says not in (None, shown.up)
-    doubt = f"by its shape {shown.shape_says} is up ({shown.confidence})" if other else "which way is up is not known"
-    warnings = (doubt,) * (other or shown.shape_says is None) + shown.notes
-    return Tile(partial(catalogue.load, ref), shown.caption, warnings)
 
 
 def _write(path: Path, data: bytes, option: str) -> None:

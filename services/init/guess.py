@@ -72,18 +72,19 @@ def map_categories(items: Mapping[str, str], others: Collection[str], harmless: 
 def _cover(paths: Sequence[str], everything: Iterable[str], allowed: Collection[str]) -> list[str]:
     """One pattern that finds all of the paths and otherwise only what is allowed; else a pattern for each."""
     if len(paths) > 1:
-        wanted, near = set(paths), _below(_common_folder(paths), everything)
-        for pattern in _patterns(paths):
+        start = _common_start(paths)
+        folder = start[: start.rfind("/") + 1]
+        near = [path for path in everything if path.startswith(folder)]
+        for pattern in _patterns(paths, escape(folder)):
             hit = {path for path in near if matches(path, pattern)}
-            if wanted <= hit and hit <= set(allowed):
+            if set(paths) <= hit <= set(allowed):
                 return [pattern]
     return [escape(path) for path in paths]
 
 
-def _patterns(paths: Sequence[str]) -> Iterator[str]:
-    """Patterns that may find the paths, the plainest first."""
-    folder, suffix = escape(_common_folder(paths)), escape(PurePosixPath(paths[0]).suffix)
-    names = [PurePosixPath(path).name for path in paths]
+def _patterns(paths: Sequence[str], folder: str) -> Iterator[str]:
+    """Patterns below a folder that may find the paths, the plainest first."""
+    suffix, names = escape(PurePosixPath(paths[0]).suffix), [PurePosixPath(path).name for path in paths]
     start = escape(_common_start([PurePosixPath(name).stem for name in names]))
     for between in ("", "*/", "**/"):
         if len(set(names)) == 1:
@@ -94,20 +95,10 @@ def _patterns(paths: Sequence[str]) -> Iterator[str]:
             yield f"{folder}{between}{start}*[0-9]{suffix}"
 
 
-def _common_folder(paths: Sequence[str]) -> str:
-    """The folder that all paths lie in, with a slash at its end; empty for the uppermost."""
-    start = _common_start(paths)
-    return start[: start.rfind("/") + 1]
-
-
 def _common_start(words: Sequence[str]) -> str:
     first, last = min(words), max(words)
     same = (k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
     return first[: next(same, min(len(first), len(last)))]
-
-
-def _below(folder: str, paths: Iterable[str]) -> list[str]:
-    return [path for path in paths if path.startswith(folder)]
 
 
 METRIC = frozenset({".glb", ".gltf", ".urdf"})
@@ -169,22 +160,19 @@ def guess_ups(items: Sequence[Item]) -> list[UpRule]:
     files, folders, formats = list[UpRule](), list[UpRule](), list[UpRule]()
     for suffix in sorted({PurePosixPath(item.path).suffix for item in items}):
         group = [item for item in items if item.path.endswith(suffix)]
-        whole = _decide(group, suffix.lower())
-        formats.append(UpRule(f"**/*{escape(suffix)}", *whole))
+        whole = UpRule(f"**/*{escape(suffix)}", *_decide(group, suffix.lower()))
+        formats.append(whole)
         for first in sorted({item.path.split("/")[0] for item in group if "/" in item.path}):
-            inside = [item for item in group if item.path.startswith(f"{first}/")]
-            axis = _majority(inside)
-            if axis not in (None, whole[0]) and len(_sure(inside)) > 1:
-                assert axis is not None
-                told = f"{_told(inside, axis)}, unlike other {suffix} files"
-                folders.append(UpRule(f"{escape(first)}/**/*{escape(suffix)}", axis, told))
-        for item in _sure(group):
-            held = next((rule.axis for rule in folders if matches(item.path, rule.pattern)), whole[0])
-            if item.measured.up not in (None, held):
+            axis, sure, told = _majority([item for item in group if item.path.startswith(f"{first}/")])
+            if axis is not None and axis != whole.axis and sure > 1:
+                pattern = f"{escape(first)}/**/*{escape(suffix)}"
+                folders.append(UpRule(pattern, axis, f"{told}, unlike other {suffix} files"))
+        for item in group:
+            held = next((rule.axis for rule in folders if matches(item.path, rule.pattern)), whole.axis)
+            if item.measured.confidence == "sure" and item.measured.up not in (None, held):
                 assert item.measured.up is not None
-                files.append(
-                    UpRule(escape(item.path), item.measured.up, "stands on this axis alone, unlike its neighbours")
-                )
+                why = "stands on this axis alone, unlike its neighbours"
+                files.append(UpRule(escape(item.path), item.measured.up, why))
     return [*files, *folders, *formats]
 
 
@@ -196,34 +184,25 @@ def plain_axis(rules: Sequence[UpRule]) -> UpAxis | None:
 
 def _decide(items: Sequence[Item], suffix: str) -> tuple[UpAxis, str]:
     """The axis that is up in the files of one format, and why."""
-    axis = _majority(items)
+    axis, _, told = _majority(items)
     if axis is not None:
-        return axis, _told(items, axis)
+        return axis, told
     if suffix in (".glb", ".gltf"):
         return "y", "by the format's specification; nothing in the shapes speaks against it"
     likely = Counter(item.measured.up for item in items if item.measured.up is not None)
-    if likely:
-        found, count = likely.most_common(1)[0]
-        if found is not None and count >= AGREE * likely.total():
+    for found, count in likely.most_common(1):
+        if count >= AGREE * likely.total():
             return found, f"likely: {count} of {len(items)} stand firmer so than upside down; look at the pictures"
     return "z", "not known: the shapes stand on several axes or on none; look at the pictures"
 
 
-def _sure(items: Sequence[Item]) -> list[Item]:
-    return [item for item in items if item.measured.confidence == "sure"]
-
-
-def _majority(items: Sequence[Item]) -> UpAxis | None:
-    """The axis that enough of those files name that are sure; None where none does."""
-    votes = Counter(item.measured.up for item in _sure(items))
+def _majority(items: Sequence[Item]) -> tuple[UpAxis | None, int, str]:
+    """The axis that enough of those files name that are sure, None where none does; how many are sure; and the reason."""
+    votes = Counter(item.measured.up for item in items if item.measured.confidence == "sure")
     axis, count = votes.most_common(1)[0] if votes else (None, 0)
-    return axis if count >= AGREE * votes.total() else None
-
-
-def _told(items: Sequence[Item], axis: UpAxis) -> str:
-    count = sum(item.measured.up == axis for item in _sure(items))
-    return (
+    told = (
         f"sure: {count} of {len(items)} stand on this axis alone"
         if len(items) > 1
         else "sure: it stands on this axis alone"
     )
+    return axis if count >= AGREE * votes.total() else None, votes.total(), told

@@ -16,7 +16,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Materi
 from schemas.scene.view import Camera, Intrinsics
 from services.init.collection import PART, Item, LeftOut
 from workers.assets.appearance import draw_appearance
-from workers.assets.catalogue import Catalogue, InstanceRef
+from workers.assets.catalogue import AnySource, Catalogue, InstanceRef
 from workers.assets.external.mesh import transform_shape
 from workers.geometry.frames import pose, translation
 from workers.render.raster.gbuffer import Renderer
@@ -27,23 +27,6 @@ MOST_ROWS = 40
 HEADINGS = ("file", "category", "size, cm", "faces", "closed", "pictures", "up", "notes")
 LEAST = (12, 8, 19, 5, 6, 6, 4, 5)
 """Widths to which columns may shrink."""
-
-
-def describe_size(extents_m: Sequence[float]) -> str:
-    """Width x depth x height as it will stand, centimetres."""
-    return " x ".join(f"{100 * extent:.3g}" for extent in extents_m)
-
-
-def missing_pictures(notes: Sequence[str]) -> int:
-    """Pictures or material files that are missing or cannot be read, by the notes on a file."""
-    return sum(note.endswith("plain base colour used") for note in notes)
-
-
-def describe_up(axis: str, shape_says: str | None, confidence: str | None) -> str:
-    """The axis that the job has up, and what the shape says to it."""
-    if shape_says is None:
-        return f"{axis}?"
-    return f"{axis} {confidence}" if shape_says == axis else f"{axis} (or {shape_says})"
 
 
 def draw_table(rows: Sequence[Sequence[str]], width: int) -> list[str]:
@@ -87,7 +70,8 @@ def shorten(text: str, most: int) -> str:
 class Shown:
     """A file as the table, the pictures and `--json` have it. size_m: width, depth and height as it will stand.
 
-    up: the axis that the job has up; shape_says, confidence: what the shape tells about it.
+    missing_textures: pictures or material files that are missing or cannot be read, by the notes on the file; up: the axis
+    that the job has up; shape_says, confidence: what the shape tells about it.
     """
 
     path: str
@@ -104,61 +88,75 @@ class Shown:
     notes: tuple[str, ...]
 
     @property
-    def pictures(self) -> str:
-        """How many pictures were found, of how many where some are missing or cannot be read."""
-        return f"{self.textures}" + (f" of {self.textures + self.missing_textures}" if self.missing_textures else "")
+    def told(self) -> tuple[str, str, str, str]:
+        """Size as width x depth x height in centimetres; whether it is closed; pictures found, of how many; up, as judged."""
+        size = " x ".join(f"{100 * extent:.3g}" for extent in self.size_m)
+        pictures = f"{self.textures}" + (
+            f" of {self.textures + self.missing_textures}" if self.missing_textures else ""
+        )
+        if self.shape_says is None:
+            up = f"{self.up}?"
+        else:
+            up = f"{self.up} {self.confidence}" if self.shape_says == self.up else f"{self.up} (or {self.shape_says})"
+        return size, "yes" if self.watertight else "no", pictures, up
 
     @property
     def row(self) -> tuple[str, ...]:
         """Its line of the table."""
-        closed = "yes" if self.watertight else "no"
-        size, up = describe_size(self.size_m), describe_up(self.up, self.shape_says, self.confidence)
-        return self.path, self.category, size, str(self.faces), closed, self.pictures, up, "; ".join(self.notes)
+        size, closed, pictures, up = self.told
+        return self.path, self.category, size, str(self.faces), closed, pictures, up, "; ".join(self.notes)
 
     @property
     def caption(self) -> tuple[str, ...]:
         """Its lines below the picture."""
+        size, _, pictures, up = self.told
         closed = "closed" if self.watertight else "not closed"
-        up = describe_up(self.up, self.shape_says, self.confidence)
         return (
             self.path,
-            f"{self.category}, {describe_size(self.size_m)} cm, up: {up}",
-            f"{self.faces} faces, {closed}, pictures: {self.pictures}",
+            f"{self.category}, {size} cm, up: {up}",
+            f"{self.faces} faces, {closed}, pictures: {pictures}",
         )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The lines that ask for attention."""
+        if self.shape_says is None:
+            return "which way is up is not known", *self.notes
+        doubt = f"by its shape {self.shape_says} is up ({self.confidence})"
+        return (doubt,) * (self.shape_says != self.up) + self.notes
 
 
 def show_items(catalogue: Catalogue, items: Sequence[Item]) -> list[tuple[Shown, InstanceRef]]:
     """The items as the job's catalogue has them, and how each is loaded."""
-    places = {
-        entry.files[0].path: (source, category, index)
+    refs = {
+        entry.files[0].path: catalogue.refer(source, category, index)
         for source, listing in enumerate(catalogue.objects)
         for category, entries in (listing.entries.items() if listing is not None else ())
         for index, entry in enumerate(entries)
     }
-    return [_show(catalogue, item, *places[item.path]) for item in items]
+    return [(_show(item, catalogue.settings(refs[item.path])), refs[item.path]) for item in items]
 
 
-def _show(catalogue: Catalogue, item: Item, source: int, category: str, index: int) -> tuple[Shown, InstanceRef]:
-    settings, measured = catalogue.assets.objects[source], item.measured
+def _show(item: Item, settings: AnySource) -> Shown:
+    measured = item.measured
     assert isinstance(settings, FolderSource)
     up = settings.up_of(item.path)
     scale = settings.scale if settings.diagonal_m is None else settings.diagonal_m / item.diagonal
     x, y, z = (scale * extent for extent in measured.extents)
-    shown = Shown(
+    return Shown(
         path=item.path,
-        category=category,
+        category=item.category,
         size_m={"x": (z, y, x), "y": (x, z, y), "z": (x, y, z)}[up],
         vertices=measured.vertices,
         faces=measured.faces,
         watertight=measured.watertight,
         textures=measured.textures,
-        missing_textures=missing_pictures(measured.notes),
+        missing_textures=sum(note.endswith("plain base colour used") for note in measured.notes),
         up=up,
         shape_says=measured.up,
         confidence=measured.confidence,
         notes=measured.notes,
     )
-    return shown, catalogue.refer(source, category, index)
 
 
 MOST = 60

@@ -17,7 +17,7 @@ from services.job.record import require_job
 from services.read.dataset_reader import StoredRange, find_scene
 from services.read.replay import open_context
 from workers.assets.catalogue import Catalogue
-from workers.assets.external.formats import read_visual
+from workers.assets.external.plain import read_visual
 from workers.assets.glb import linear_bytes, mesh_of_part
 from workers.scene.plan import SceneChance, plan_scene
 from workers.store.store import Store

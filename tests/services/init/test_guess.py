@@ -1,7 +1,5 @@
 """Categories by pattern, units and the axis that is up, guessed for a folder of meshes; and the job that says so."""
 
-from collections import Counter
-
 from schemas.job.assets import FolderSource
 from services.init.collection import Guess, Item, drop_doubles
 from services.init.command import write_job
@@ -118,8 +116,8 @@ def test_of_one_mesh_in_several_formats_the_first_stays_and_different_names_are_
 def job_of(items, folder="meshes", category_map=None):
     found = category_map or {one.path: "thing" for one in items}
     guess = Guess(tuple(guess_scales(items)), tuple(guess_ups(items)), found)
-    counts, suffixes = Counter(found.values()), Counter(one.suffix for one in items)
-    text = write_job("mine", "mine.yaml", folder, "s.jpg", counts, suffixes, guess)
+    kinds = [(found.get(one.path, next(iter(found.values()))), one.suffix) for one in items]
+    text = write_job("mine", "mine.yaml", folder, "s.jpg", kinds, guess)
     return text, validate_job(parse_yaml(text), "j")
 
 

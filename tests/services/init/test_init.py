@@ -19,7 +19,7 @@ from schemas.errors import AssetSourceError, MachineError
 from schemas.job.assets import Assets, FolderSource, ProceduralSource
 from services.cli.main import main
 from services.init import collection, command, shown
-from services.init.collection import SUFFIXES, Candidate, LeftOut, read_folder, walk_folder
+from services.init.collection import SUFFIXES, LeftOut, read_folder, walk_folder
 from services.init.shown import MOST_ROWS, TILE, Tile, draw_left_out, draw_object, draw_sheet, draw_table, show_items
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import load_job
@@ -158,10 +158,10 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
         (tmp_path / "in" / link).symlink_to(target)
     # The system is asked through `os`, because root may read everything.
     monkeypatch.setattr(collection.os, "access", lambda path, how: "locked" not in str(path))
-    found = walk_folder(tmp_path / "in")
-    assert found.paths == ("a/b/c.GLB", "a/x.urdf", "b.obj")
+    paths, left_out = walk_folder(tmp_path / "in")
+    assert paths == ["a/b/c.GLB", "a/x.urdf", "b.obj"]
     reasons = {"bad\\nname.obj": "name", "bad\\udcff.obj": "name", "dead.obj": "missing", "link.obj": "link"}
-    assert {one.path: one.reason for one in found.left_out} == {**reasons, "locked.obj": "permission"}
+    assert {one.path: one.reason for one in left_out} == {**reasons, "locked.obj": "permission"}
     with pytest.raises(AssetSourceError, match=r"bad\\nname is not there"):
         walk_folder(tmp_path / "bad\nname")
 
@@ -178,7 +178,7 @@ def test_sizes_are_those_of_the_asset_that_is_loaded_and_of_another_library(tmp_
     mesh.apply_scale((1, 0.8, 1))
     for up in "yz":
         path = write_mesh(tmp_path / up / "cup.stl", mesh, turned=up == "y", scale=1000)
-        (item,) = read_folder(path.parent, [Candidate(path.name, "cup")], lambda *_: None).items
+        (item,) = read_folder(path.parent, {path.name: "cup"}, lambda *_: None).items
         theirs = trimesh.load_mesh(path)
         assert item.measured.extents == pytest.approx(tuple(theirs.extents))
         assert (item.measured.faces, item.measured.watertight) == (len(theirs.faces), theirs.is_watertight)

@@ -8,7 +8,7 @@ from schemas.capture import Reconstruction
 from schemas.job.assets import Assets
 from schemas.job.captures import Board
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
-from workers.assets.external.formats import read_visual
+from workers.assets.external.plain import read_visual
 from workers.assets.glb import asset_glb
 
 NAMES = CaptureNames("box-00003", "box", "CC0-1.0", "capture")

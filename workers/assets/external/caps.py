@@ -2,7 +2,6 @@
 
 import io
 import re
-import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from trimesh.resolvers import Resolver
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 
-_PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
 _IMAGE_KINDS = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG"}
+_UNDECODABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError)
+"""What reading a stranger's picture may raise."""
 LONGEST_NAME = 1024
 """Letters of a file name that are looked at."""
 MOST_NOTES = 20
@@ -35,24 +34,6 @@ def check_nodes(path: Path, count: int, what: str, limits: MeshLimits) -> None:
     """MeshError `too_large` where an asset has more nodes, or parts, or links than the cap."""
     if count > limits.max_nodes:
         raise MeshError("too_large", f"{path} has {count} {what}, over max_nodes = {limits.max_nodes}")
-
-
-def declared_counts(kind: str, data: bytes) -> tuple[int, int]:
-    """Vertices and faces that a file declares, found without parsing it; (0, 0) where it declares none."""
-    if kind == ".obj":
-        return data.count(b"\nv "), data.count(b"\nf ")
-    if kind == ".ply":
-        counts = {name: int(count) for name, count in _PLY_ELEMENT.findall(data[: data.find(b"end_header")][:65536])}
-        if any(count > len(data) for count in counts.values()):
-            raise MeshError(
-                "unreadable",
-                f"the PLY header promises {min(max(counts.values()), 10**18)} elements in {len(data)} bytes",
-            )
-        return counts.get(b"vertex", 0), counts.get(b"face", 0)
-    if kind == ".stl" and len(data) >= 84 and len(data) == 84 + 50 * struct.unpack_from("<I", data, 80)[0]:
-        faces = (len(data) - 84) // 50
-        return 3 * faces, faces
-    return 0, data.count(b"endfacet")
 
 
 def find_inside(root: Path, *candidates: Path) -> Path | None:
@@ -95,8 +76,8 @@ class Budget:
         return None
 
 
-class FolderResolver(Resolver):
-    """Hands trimesh the material files and PNG or JPEG textures of one folder, and nothing else.
+class FolderResolver:
+    """Hands a reader the material files and PNG or JPEG textures of one folder, and nothing else; a resolver of trimesh's.
 
     Names are relative to the mesh, may use either slash, and must stay below `root`. A file that is refused or missing
     leaves a note in `notes`, and the mesh is loaded without it.
@@ -116,6 +97,8 @@ class FolderResolver(Resolver):
         if not name.lower().endswith(".mtl") and (why := self.budget.take_image(data)) is not None:
             raise self.refuse(name, why)
         return data
+
+    __getitem__ = get
 
     def read(self, name: str) -> bytes:
         """The bytes of a file of any kind; FileNotFoundError, and a note, where it is missing or refused."""
@@ -148,22 +131,16 @@ class FolderResolver(Resolver):
         if len(self.notes) < MOST_NOTES:
             self.notes.append(one_line(f"{name:.{LONGEST_NAME}} {why}: plain base colour used"))
 
-    def write(self, name: str, data: object) -> None:
-        """Refused: reading never writes."""
-        raise PermissionError(name)
-
-    def namespaced(self, namespace: str) -> "FolderResolver":
-        """This resolver itself."""
-        return self
-
-    def keys(self) -> list[str]:
-        """Nothing is listed."""
-        return []
-
 
 def describe_error(error: Exception) -> str:
     """Kind and message of an error without addresses in memory, because notes on meshes are stored in the dataset."""
     return _ADDRESS.sub("", repr(error))
+
+
+def unreadable(path: Path, error: Exception) -> MeshError:
+    """What a reader raised, as a verdict on the file."""
+    kind = path.suffix.lower()[1:]
+    return MeshError("unreadable", f"{path} is not a {kind} file that can be read: {describe_error(error):.200}")
 
 
 def one_line(text: str, most: int = 1000) -> str:
@@ -183,27 +160,27 @@ def open_image(data: bytes, limits: MeshLimits) -> tuple[tuple[int, int], str | 
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=(kind,)) as image:
                 size = image.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+    except _UNDECODABLE as error:
         return (0, 0), f"cannot be opened ({describe_error(error)})"
     if max(size) > limits.max_texture_px:
         return size, f"has {max(size)} px, over max_texture_px = {limits.max_texture_px}"
     return size, None
 
 
-def decode_picture(data: bytes, notes: list[str]) -> NDArray[np.uint8] | None:
-    """[h, w, 3 or 4] uint8, read-only, of bytes that `Budget.take_image` let pass; None with a note where they are damaged."""
+def decode_picture(source: bytes | Image.Image, notes: list[str]) -> NDArray[np.uint8] | None:
+    """[h, w, 3 or 4] uint8, read-only, with alpha where it has some; None with a note where it is damaged.
+
+    source: bytes that `Budget.take_image` let pass, or a picture that was opened from such.
+    """
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(data), formats=tuple(_IMAGE_KINDS.values())) as image:
+        with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            return picture_pixels(image)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+            kinds = tuple(_IMAGE_KINDS.values())
+            image = source if isinstance(source, Image.Image) else Image.open(io.BytesIO(source), formats=kinds)
+            alpha = "A" in image.getbands() or "transparency" in image.info
+            pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
+    except _UNDECODABLE as error:
         notes.append(f"a texture cannot be decoded ({describe_error(error)}): plain base colour used")
         return None
-
-
-def picture_pixels(image: Image.Image) -> NDArray[np.uint8]:
-    """[h, w, 3 or 4] uint8, read-only: the pixels of a picture, with alpha where it has some."""
-    alpha = "A" in image.getbands() or "transparency" in image.info
-    pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
     pixels.setflags(write=False)
     return pixels

@@ -31,7 +31,7 @@ from workers.assets.external.caps import (
     check_counts,
     check_nodes,
     decode_picture,
-    describe_error,
+    unreadable,
 )
 from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, make_material
 from workers.assets.glb import split_glb
@@ -60,7 +60,7 @@ def named_by_gltf(path: Path, data: bytes) -> list[str]:
         uris = [item["uri"] for item in (*tree.get("buffers", []), *images) if isinstance(item.get("uri"), str)]
         return list(dict.fromkeys(unquote(uri) for uri in uris if not uri.startswith("data:") and not _is_address(uri)))
     except MALFORMED as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
 
 
 def read_gltf(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
@@ -76,7 +76,7 @@ def read_gltf(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh
         with np.errstate(all="ignore"):  # what is not finite is refused where the mesh is placed
             return list(_File(path, tree, chunk, resolver).meshes())
     except MALFORMED as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
 
 
 def _parse(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -154,20 +154,20 @@ class _File:
         indices = primitive.get("indices")
         corners = np.arange(len(vertices)) if indices is None else self._accessor(indices, 1)[:, 0].astype(np.int64)
         normals = self._accessor(attributes["NORMAL"], 3) if "NORMAL" in attributes else None
-        number, uv, colors = primitive.get("material"), None, None
+        number, uv, colors, material = primitive.get("material"), None, None, DEFAULT
         if number is not None:
             reference = _colour(self.tree["materials"][number]) or {}
             name = f"TEXCOORD_{int(reference.get('texCoord', 0))}"
             uv = self._accessor(attributes[name], 2) if name in attributes else None
             if uv is not None and (uv.shape != (len(vertices), 2) or not np.isfinite(uv).all()):
                 uv = None
-            if uv is not None:
-                uv = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])  # glTF's v runs down
         if "COLOR_0" in attributes:
             colors = _colors(self._accessor(attributes["COLOR_0"], None), len(vertices))
-        material = WHITE if colors is not None else DEFAULT
+            material = DEFAULT if colors is None else WHITE
         if number is not None:
             material = self._material(number, uv is not None)
+        if uv is not None:
+            uv = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])  # glTF's v runs down
         visual = MeshVisual(material, uv, colors)
         return RawMesh(vertices, _triangles(corners, primitive.get("mode", _TRIANGLES)), normals, visual, matrix)
 
@@ -178,20 +178,15 @@ class _File:
             rough, gloss = source.get("pbrMetallicRoughness", {}), source.get("extensions", {}).get(_GLOSS)
             reference = _colour(source)
             picture = self._picture(reference) if reference and textured else None
+            factor, metallic = rough.get("baseColorFactor"), float(rough.get("metallicFactor", 1.0))
+            roughness = float(rough.get("roughnessFactor", 1.0))
             if gloss is not None and not rough:
-                factor, metallic, roughness = (
-                    gloss.get("diffuseFactor"),
-                    0.0,
-                    1.0 - float(gloss.get("glossinessFactor", 1.0)),
-                )
-            else:
-                factor, metallic = rough.get("baseColorFactor"), float(rough.get("metallicFactor", 1.0))
-                roughness = float(rough.get("roughnessFactor", 1.0))
+                factor, metallic = gloss.get("diffuseFactor"), 0.0
+                roughness = 1.0 - float(gloss.get("glossinessFactor", 1.0))
             linear = np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64).reshape(4)
             color = np.append(encode_srgb(np.clip(linear[:3], 0.0, 1.0)), linear[3])
-            made, notes = make_material(color, metallic, roughness, picture)
+            self._materials[number, textured], notes = make_material(color, metallic, roughness, picture)
             self.resolver.notes += notes
-            self._materials[number, textured] = made
         return self._materials[number, textured]
 
     def _picture(self, reference: dict[str, Any]) -> NDArray[np.uint8] | None:
@@ -244,14 +239,10 @@ class _File:
 
     def _elements(self, place: dict[str, Any], component: int, width: int, count: int, stride: int) -> NDArray:
         """[count, width] of a view, of the component's type."""
-        kind = np.dtype(_TYPES[component])
-        step, offset = stride or width * kind.itemsize, int(place.get("byteOffset", 0))
-        data = self._view(place["bufferView"])
-        if (
-            offset < 0
-            or step < width * kind.itemsize
-            or offset + step * (count - 1) + width * kind.itemsize > len(data)
-        ):
+        kind, data = np.dtype(_TYPES[component]), self._view(place["bufferView"])
+        size, offset = width * kind.itemsize, int(place.get("byteOffset", 0))
+        step = stride or size
+        if offset < 0 or step < size or offset + step * (count - 1) + size > len(data):
             raise ValueError("an accessor beyond its view")
         return np.ndarray((count, width), kind, data.tobytes(), offset, (step, kind.itemsize))
 
@@ -346,8 +337,3 @@ def _read(uri: str, resolver: FolderResolver) -> bytes:
     if not comma or not head.endswith(";base64"):
         raise ValueError(f"{head!r:.60} is not data in base64")
     return base64.b64decode(text, validate=True)
-
-
-def _unreadable(path: Path, error: Exception) -> MeshError:
-    kind = path.suffix.lower()[1:]
-    return MeshError("unreadable", f"{path} is not a {kind} file that can be read: {describe_error(error):.200}")
