@@ -1,4 +1,4 @@
-"""docker-compose.yml as users type it: the plain case, workers that are killed, who can reach it, and what is left behind."""
+"""A cluster of docker-compose.yml as users type it: workers that are killed, who can reach it, and what is left behind."""
 
 import json
 import socket
@@ -8,40 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.containers import (
-    IMAGE,
-    JOB,
-    SCENES,
-    Compose,
-    copy_checkout,
-    digest_in,
-    digest_of,
-    docker,
-    must,
-    owner_of_checkouts,
-    run,
-    wait_for,
-)
+from tests.kit.containers import IMAGE, JOB, digest_in, docker, must, owner_of_checkouts, run, wait_for
 
-pytestmark = [pytest.mark.docker, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.docker, pytest.mark.slow, pytest.mark.timeout(900)]
 
 SMALL_RANGES = ("--shard-size", "1", "--set", "run.range_size=2")
 
 PORTS = (6379, 8265, 10001, 52365)
 """Of the GCS, the dashboard with its job API, Ray's client and the agent of each node."""
-
-
-@pytest.fixture(scope="module")
-def compose(image, tmp_path_factory):
-    """A checkout whose example job is small, and nothing of it left afterwards."""
-    checkout = copy_checkout(tmp_path_factory.mktemp("compose") / "checkout")
-    job = checkout / JOB
-    job.write_text(job.read_text().replace("scenes: 64\n", f"scenes: {SCENES}\n"))
-    compose = Compose(checkout, f"{IMAGE}-compose")
-    try:
-        yield compose
-    finally:
-        compose("down", "--volumes", "--timeout", "0")
 
 
 @pytest.fixture(scope="module")
@@ -52,31 +26,6 @@ def cluster(compose):
     # A worker that joins when the ranges are given away already gets none of them.
     wait_for(lambda: all(_health(name) == "healthy" for name in names), 180, "three healthy workers")
     return compose
-
-
-def test_the_plain_command_makes_the_dataset_and_ends(compose, expected_digest):
-    assert not (compose.checkout / "data").exists()
-    done = compose("up", "--exit-code-from", "job")
-    must(done)
-    out = compose.checkout / "data" / "tabletop"
-    assert digest_of(out) == expected_digest
-    assert {file.lstat().st_uid for file in [out.parent, *out.rglob("*")]} == {owner_of_checkouts()}
-    assert f"{SCENES} in all, 0 failed" in done.stdout + done.stderr
-    assert f"{SCENES}" in must(compose("run", "--rm", "--no-deps", "job", "status", "data/tabletop"))
-
-
-@pytest.mark.slow
-def test_the_plain_command_returns_the_exit_code_of_the_job(compose):
-    job = compose.checkout / JOB
-    right = job.read_text()
-    job.write_text(right.replace(f"scenes: {SCENES}\n", "scenes: none\n"))
-    try:
-        done = compose("up", "--exit-code-from", "job")
-    finally:
-        job.write_text(right)
-        must(compose("down"))
-    assert done.returncode == 2
-    assert "scenes" in done.stdout + done.stderr
 
 
 def test_three_workers_make_the_same_bytes_also_where_one_is_told_to_leave(cluster, expected_digest):
@@ -245,13 +194,9 @@ def _name_of(container: str) -> str:
 def _hosts(out: Path) -> set[str]:
     """Names of the hosts that made the ranges of a dataset, from the names of their attempts."""
     commits = [json.loads(path.read_text()) for path in (out / "manifest" / "_commits").glob("*.json")]
-    return {_host_of(commit["attempt"]) for commit in commits}
-
-
-def _host_of(attempt: str) -> str:
-    return attempt.split("-")[2]
+    return {commit["attempt"].split("-")[2] for commit in commits}
 
 
 def _begun(out: Path) -> set[str]:
     """Names of the hosts that are making a range, from the names of their attempts."""
-    return {_host_of(path.name) for path in out.glob("_staging/*/*-*-*-*")}  # beside temporary files
+    return {path.name.split("-")[2] for path in out.glob("_staging/*/*-*-*-*")}  # beside temporary files

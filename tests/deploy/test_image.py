@@ -1,10 +1,10 @@
-"""The container image, and a first start on a bare Debian, run with Docker."""
+"""The container image, the plain compose command, and a first start on a bare Debian, run with Docker."""
 
 import pytest
 
 from schemas.environment import X86_64_V3
 from services.run.worker_entry import processor_flags
-from tests.kit.containers import copy_checkout, docker, must
+from tests.kit.containers import JOB, SCENES, copy_checkout, digest_of, docker, must, owner_of_checkouts
 
 PYTHON_IMAGE = "python:3.11-slim-bookworm"
 DEBIAN_IMAGE = "debian:bookworm-slim"
@@ -26,23 +26,44 @@ def checkout(tmp_path_factory):
     return copy_checkout(tmp_path_factory.mktemp("image") / "checkout")
 
 
-def test_the_image_runs_verso_and_not_as_root(image):
+def test_the_image_runs_verso_not_as_root_stays_small_and_carries_neither_tests_nor_history(image, record_figure):
     assert "0.1.0" in must(docker("run", "--rm", image, "--version"))
     assert must(docker("run", "--rm", "--entrypoint", "id", image, "-u")).strip() == "1000"
-
-
-def test_the_image_carries_neither_tests_nor_history(image):
     listing = must(docker("run", "--rm", "--entrypoint", "ls", image, "-A", "/opt/verso")).split()
     assert {"schemas", "services", "workers"} <= set(listing)
     assert not {".git", ".venv", "tests"} & set(listing)
 
-
-def test_the_image_stays_small(image, record_figure):
     size = float(must(docker("image", "inspect", "--format", "{{.Size}}", image)))
     record_figure("image_bytes", "passed", size, MOST_BYTES)
     assert size < MOST_BYTES
 
 
+def test_the_plain_command_makes_the_dataset_and_ends(compose, expected_digest):
+    assert not (compose.checkout / "data").exists()
+    done = compose("up", "--exit-code-from", "job")
+    must(done)
+    out = compose.checkout / "data" / "tabletop"
+    assert digest_of(out) == expected_digest
+    assert {file.lstat().st_uid for file in [out.parent, *out.rglob("*")]} == {owner_of_checkouts()}
+    assert f"{SCENES} in all, 0 failed" in done.stdout + done.stderr
+    assert f"{SCENES}" in must(compose("run", "--rm", "--no-deps", "job", "status", "data/tabletop"))
+
+
+@pytest.mark.slow
+def test_the_plain_command_returns_the_exit_code_of_the_job(compose):
+    job = compose.checkout / JOB
+    right = job.read_text()
+    job.write_text(right.replace(f"scenes: {SCENES}\n", "scenes: none\n"))
+    try:
+        done = compose("up", "--exit-code-from", "job")
+    finally:
+        job.write_text(right)
+        must(compose("down"))
+    assert done.returncode == 2
+    assert "scenes" in done.stdout + done.stderr
+
+
+@pytest.mark.slow
 def test_every_python_in_the_image_has_the_kernels_of_its_processor_and_writes_nothing_beside_the_code(image):
     asks = (
         "import os, sys; from services.cli.environment import processor_flags as flags; "
@@ -53,6 +74,7 @@ def test_every_python_in_the_image_has_the_kernels_of_its_processor_and_writes_n
     assert answer.strip() == "{} true True"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not processor_flags() >= X86_64_V3, reason="the processor is below x86-64-v3")
 def test_the_first_scenes_of_a_container_find_their_loops_compiled(image):
     run = ("run", "--rm", "--read-only", "--tmpfs", "/tmp:mode=1777", "--entrypoint", "python", image, "-c")
@@ -61,6 +83,7 @@ def test_the_first_scenes_of_a_container_find_their_loops_compiled(image):
     assert int(without) > 50
 
 
+@pytest.mark.slow
 def test_without_python_it_stops_with_both_ways_on(checkout):
     done = docker("run", "--rm", "-v", f"{checkout}:/repo", DEBIAN_IMAGE, "/repo/verso", "--version")
     assert done.returncode == 1

@@ -13,7 +13,7 @@ import pytest
 
 from tests.kit.containers import IMAGE, JOB, SCENES, Done, digest_of, docker, must, wait_for
 
-pytestmark = [pytest.mark.docker, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.docker, pytest.mark.slow, pytest.mark.timeout(600)]
 
 NETWORK = f"{IMAGE}-pods"
 HEAD = f"{NETWORK}-head"

@@ -1,5 +1,8 @@
+"""The environment that bytes depend on, and what importing descriptions of data must not load."""
+
 import ast
 import os
+import pkgutil
 import platform
 import re
 import subprocess
@@ -30,27 +33,27 @@ def no_huge_pages() -> bool:
     return too_old or not setting.exists() or "[madvise]" not in setting.read_text()
 
 
-def test_nothing_changes_where_the_environment_is_right_already():
+def test_settings_are_changed_only_where_they_must_and_only_for_a_processor_that_has_all_that_they_use():
     assert settings_to_change(RIGHT, frozenset()) == {}
     assert settings_to_change({**RIGHT, "LP_NUM_THREADS": "4"}, frozenset()) == {"LP_NUM_THREADS": "0"}
-
-
-def test_kernels_and_code_for_a_processor_are_asked_for_only_where_it_has_all_that_they_use():
     assert settings_to_change(RIGHT, X86_64_V3 | {"sse2"}) == dict(ON_X86_64_V3)
     for flag in X86_64_V3:
         assert settings_to_change(RIGHT, X86_64_V3 - {flag}) == {}
+    assert settings_to_change(STACK_ENVIRONMENT, frozenset()) == dict(FOR_SPEED)
+    assert settings_to_change({**STACK_ENVIRONMENT, "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}, frozenset()) == {}
+
+
+def python(asks: str, *options: str, **environ: str) -> str:
+    """What a fresh interpreter prints; nothing on standard error."""
+    run = [sys.executable, *options, "-c", asks]
+    done = subprocess.run(run, cwd=ROOT, env={**os.environ, **environ}, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return done.stdout
 
 
 def test_numba_compiles_for_the_level_and_not_for_the_processor():
     asks = "from numba.core.registry import cpu_target as c; print(c.target_context.codegen().magic_tuple()[1:])"
-    environ = {**os.environ, **ON_X86_64_V3}
-    done = subprocess.run([sys.executable, "-c", asks], env=environ, capture_output=True, text=True, check=True)
-    assert ast.literal_eval(done.stdout) == ("x86-64-v3", "+avx2")
-
-
-def test_what_is_for_speed_alone_is_set_only_where_the_user_has_not():
-    assert settings_to_change(STACK_ENVIRONMENT, frozenset()) == dict(FOR_SPEED)
-    assert settings_to_change({**STACK_ENVIRONMENT, "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}, frozenset()) == {}
+    assert ast.literal_eval(python(asks, **ON_X86_64_V3)) == ("x86-64-v3", "+avx2")
 
 
 @pytest.mark.skipif(no_huge_pages(), reason="no huge pages on request")
@@ -68,14 +71,18 @@ def test_numpy_runs_without_avx512_and_does_not_complain():
         "import numpy._core._multiarray_umath as m; "
         "print({name: m.__cpu_features__[name] for name in m.__cpu_dispatch__ if '512' in name or name == 'X86_V4'})"
     )
-    environ = {**os.environ, **STACK_ENVIRONMENT}
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", asks], env=environ, capture_output=True, text=True, check=True
-    )
-    groups = ast.literal_eval(done.stdout)
+    groups = ast.literal_eval(python(asks, "-W", "error", **STACK_ENVIRONMENT))
     assert set(groups) == set(STACK_ENVIRONMENT["NPY_DISABLE_CPU_FEATURES"].split(","))  # numpy knows no others
     assert not any(groups.values())
-    assert done.stderr == ""
+
+
+def test_importing_schemas_loads_neither_gl_nor_physics_nor_ray():
+    heavy = {"OpenGL", "pyrender", "pyglet", "pybullet", "ray", "cv2", "trimesh", "scipy"}
+    names = [module.name for module in pkgutil.walk_packages([str(ROOT / "schemas")], "schemas.")]
+    assert len(names) > 15
+    told = "; import sys; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    assert heavy.isdisjoint(python(f"import {', '.join(names)}{told}").split())
+    assert "pybullet" in python(f"import workers.physics.settle{told}").split()  # it would be found
 
 
 def test_the_image_sets_the_same_environment():

@@ -1,4 +1,4 @@
-"""What the network may see holds nothing of the answer; planes, unseen parts and scores are what they say."""
+"""No object of a training pair is in a test pair, and what the network may see holds nothing of the answer."""
 
 import dataclasses
 
@@ -6,9 +6,31 @@ import mirror_depth
 import numpy as np
 import pytest
 from mirror_depth import CHANNELS, CROP, is_unseen, make_example, ms_ssim, score
+from splits import instances_of, pairs_of_split
 
 from services.dataset.dataset import open_dataset
 from services.dataset.pair import View
+from tests.datasets import make_dataset
+
+
+def test_no_instance_is_in_two_splits_also_where_a_scene_has_several_objects(few, tmp_path):
+    sources = {"objects": [{"source": "procedural", "instances": 3}], "split": {"train": 0.6, "val": 0.1, "test": 0.3}}
+    small = {"scenes": 16, "seed": 3, "objects_per_scene": 2, "categories": ["box", "can", "bowl", "jar"]}
+    dataset = open_dataset(make_dataset(tmp_path, **small, assets=sources)[0].root)
+    shown: dict[int, set[str]] = {}  # instances by pair, from the text file: even ids are pairs
+    for words in map(str.split, (tmp_path / "objects.dat").read_text().splitlines()):
+        if words[1] != "table" and int(words[0]) % 2 == 0:
+            shown.setdefault(int(words[0]), set()).add(words[2])
+    assert {pair.pose_id: instances_of(pair) for pair in dataset.pairs()} == shown
+    chosen = {split: [pair.pose_id for pair in pairs_of_split(dataset, split)] for split in ("train", "val", "test")}
+    seen = {split: set().union(*(shown[number] for number in ids)) for split, ids in chosen.items()}
+    assert not seen["train"] & seen["test"] and not seen["train"] & seen["val"] and not seen["val"] & seen["test"]
+    assert seen["train"] and seen["test"]
+    mixed = set(shown) - {number for ids in chosen.values() for number in ids}
+    assert mixed, "no scene mixes the splits: the test would not see a leak"
+    single = open_dataset(few.root)  # of one object: each pair is in exactly one split
+    ids = [pair.pose_id for split in ("train", "val", "test") for pair in pairs_of_split(single, split)]
+    assert sorted(ids) == [pair.pose_id for pair in single.pairs()]
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +59,11 @@ def test_features_and_baseline_hold_nothing_of_the_mirror_view(pairs, examples, 
         assert not again.mask.any()
 
 
-def test_an_example_has_the_shape_that_it_says(examples):
+def test_an_example_has_the_shape_that_it_says_and_the_planes_of_the_truth(examples):
     for one in examples:
         assert one.features.shape == (CHANNELS, *CROP) and np.isfinite(one.features).all()
         assert one.mask.any() and (one.unseen & one.mask).sum() == one.unseen.sum() > 0
         assert (one.baseline > 0).all()
-
-
-def test_the_planes_are_the_table_and_the_floor_of_the_truth(examples):
-    for one in examples:
         beside = ~one.mask & (one.depth > 0)
         error = np.abs(one.background - one.depth)[beside]
         assert np.median(error) < 2e-4 and (error < 0.002).mean() > 0.8

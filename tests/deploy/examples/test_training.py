@@ -58,22 +58,15 @@ assert answer.shape == example.depth.shape and (answer == example.background).an
 def python(*arguments: str) -> str:
     """What a Python with the examples' folder and the project on its path prints."""
     path = os.pathsep.join([str(ROOT), str(EXAMPLES), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    environ = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, *arguments], env=environ, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_a_loader_stacks_the_split_and_a_network_learns_from_it(few):
+@pytest.mark.minute
+def test_a_loader_stacks_the_split_a_network_learns_from_it_and_the_script_prints_all_scores(few):
     python("-c", CHECKS, few.name)
-
-
-def test_the_script_prints_the_scores_of_all_answers(few):
     *lines, last = python(str(EXAMPLES / "train_mirror_depth.py"), few.name, "--epochs", "1").splitlines()
     assert list(json.loads(last)) == ["network", "baseline", "half turn", "planes alone"]
     assert any("MS-SSIM" in line for line in lines)

@@ -1,21 +1,42 @@
-"""What the commands print of a dataset, for people and, in the last line, for programs."""
+"""The commands as typed: exit codes, what they print for people and, in the last line, for programs, and refusals in one line."""
 
 import argparse
 import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+from schemas.dataset.commit import CommitTerms, Span
+from schemas.dataset.layout import JOB_FILE
+from schemas.environment import KEEP, STACK_ENVIRONMENT
 from services.cli import doctor
 from services.cli.commands import default_page
 from services.cli.doctor import Finding
 from services.cli.main import main
+from services.job.job_file import validate_job
+from services.job.record import encode_job, record_job
+from services.run.lock import read_holder
 from tests.datasets import make_dataset
+from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 
+ROOT = Path(__file__).resolve().parents[3]
+TABLETOP = str(ROOT / "deploy" / "jobs" / "tabletop.yaml")
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> LocalStore:
-    return make_dataset(tmp_path_factory.mktemp("made"))[0]
+
+def told(capsys, *arguments: str) -> tuple[int, str]:
+    """Exit code and everything that was written."""
+    try:
+        code = main(list(arguments))
+    except SystemExit as exit_:  # argparse's own
+        code = int(exit_.code or 0)
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.out + captured.err
+    return code, captured.out + captured.err
 
 
 def answer(capsys, *arguments: str) -> tuple[int, list[str], dict]:
@@ -25,65 +46,238 @@ def answer(capsys, *arguments: str) -> tuple[int, list[str], dict]:
     return code, lines, json.loads(last)
 
 
-def test_status_of_a_finished_dataset(made, capsys):
-    code, lines, told = answer(capsys, "status", made.name)
-    assert (code, told["ok"], told["made"], told["missing"]) == (0, True, 2, 0)
-    assert lines[0] == f"{made.name}: 2 of 2 scenes done, 0 missing"
-    assert lines[-1] == f"  digest: {told['digest']}"
+def verso(*arguments: str, cwd: Path = ROOT, **more: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-P", "-m", "services.cli.main", *arguments]
+    environ = {**os.environ, "PYTHONPATH": str(ROOT), **more}
+    return subprocess.run(command, cwd=cwd, env=environ, capture_output=True, text=True, check=False, timeout=120)
 
 
-def test_verify_with_the_second_derivation(made, capsys):
-    code, lines, told = answer(capsys, "verify", made.name, "--independent", "1")
-    assert (code, told["ok"], told["scenes"], told["pairs"]) == (0, True, 2, 2)
-    assert (told["independent"]["scenes"], told["independent"]["faults"]) == (1, [])
+# ------------------------------------------------------------------------------------------------ what is refused
+
+REFUSED = (
+    (["run", "nowhere.yaml"], ["nowhere.yaml", "no such file", "deploy/jobs"]),
+    (["run", TABLETOP, "--set", "physcs.step_hz=3"], ["physcs", "did you mean 'physics'"]),
+    (["run", TABLETOP, "--set", "categories=[sofa]"], ["categories.sofa", "laptop, mug, bowl"]),
+    (["run", TABLETOP, "--set", "assets.objects.0={source: urdf, folder: /nowhere/at/all}"], ["/nowhere/at/all"]),
+    (["run", TABLETOP, "--set", "assets.objects.0={source: shapenet, folder: .}"], ["deploy/jobs", "synset folders"]),
+    (["run", TABLETOP, "--address", "nonsense"], ["HOST:PORT"]),
+    (["query", "nowhere", "select 1"], ["nowhere", "job.yaml"]),
+    (["verify", "nowhere"], ["nowhere", "job.yaml"]),
+    (["replay", "nowhere", "x"], ["'x'"]),
+    (["status", str(ROOT)], ["job.yaml"]),
+    (["extra", "audit"], ["pip install 'verso-data[audit]'"]),
+    (["lock"], ["type ./verso lock there"]),
+)
+
+
+def test_bad_input_is_told_by_key_value_and_remedy(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for arguments, words in REFUSED:
+        out = ["--out", str(tmp_path / "out")] if arguments[0] == "run" else []
+        code, text = told(capsys, *arguments, *out)
+        assert code == 2 and all(word in text for word in words), text
+        assert list(tmp_path.iterdir()) == []
+    assert answer(capsys, "run", "nowhere.yaml")[2]["kind"] == "JobError"
+
+
+def test_a_folder_without_a_usable_mesh_is_refused_with_what_was_found(capsys, tmp_path):
+    (tmp_path / "broken.obj").write_text("f 1 2 3\n")
+    source = f"assets.objects.0={{source: urdf, folder: {tmp_path}, category_map: {{'*.obj': mug}}}}"
+    asked = ["run", TABLETOP, "--set", source, "--set", "categories=[mug]", "--out", str(tmp_path / "out")]
+    code, text = told(capsys, *asked)
+    assert code == 2 and (str(tmp_path) in text or "broken" in text)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_ray_that_does_not_answer_is_told_at_once(capsys, tmp_path):
+    code, text = told(capsys, "run", TABLETOP, "--address", "127.0.0.1:1", "--out", str(tmp_path / "out"))
+    assert code == 1 and "127.0.0.1:1" in text and "ray start" in text
+
+
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(capsys, tmp_path):
+    code, text = told(capsys, "run", TABLETOP, "--dry-run", "--scenes", "5", "--out", str(tmp_path / "out"))
+    assert code == 0 and "scenes 0 to 4" in text
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------------------------------------ output folders
+
+
+def run_without_privileges(out: Path) -> subprocess.CompletedProcess[str]:
+    """A run of this user; root without the right to write where nobody may."""
+    command = [sys.executable, "-m", "services.cli.main", "run", TABLETOP, "--scenes", "1", "--out", str(out)]
+    if os.geteuid() == 0:
+        command = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", *command]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.mark.parametrize("prepared", [pytest.param(False, marks=pytest.mark.minute), True])
+def test_a_folder_that_this_user_may_not_write_is_told_with_the_user(tmp_path, prepared):
+    out = tmp_path / "out"
+    LocalStore(out).prepare() if prepared else out.mkdir()
+    for folder in [out, *out.rglob("*")]:
+        folder.chmod(0o555)
+    done = run_without_privileges(out)
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"verso: {out} cannot be written: permission denied for user ")
+    assert f"({os.geteuid()})" in line and "file system" not in line
+
+
+@pytest.mark.root
+def test_a_file_system_that_is_mounted_read_only_is_told_as_that(tmp_path):
+    run = f"{sys.executable} -m services.cli.main run {TABLETOP} --out {tmp_path}"
+    command = ["unshare", "-m", "sh", "-c", f"mount -t tmpfs -o ro none {tmp_path} && exec {run}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120)
+    (line,) = done.stderr.splitlines()
+    assert line == f"verso: {tmp_path} cannot be written: the file system is mounted read-only; or choose another --out"
+    assert done.returncode == 2
+
+
+def test_a_folder_with_somebodys_files_is_refused_not_filled(tmp_path, capsys):
+    for name in ("thesis.tex", ".hidden", "RGB00000.png"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).write_text("mine")
+        code, text = told(capsys, "run", TABLETOP, "--scenes", "1", "--out", str(tmp_path / name))
+        assert code == 2 and f"{tmp_path / name} holds {name}, and no job.yaml" in text
+        assert [path.name for path in (tmp_path / name).iterdir()] == [name]
+    code, text = told(capsys, "run", TABLETOP, "--out", str(tmp_path / "thesis.tex" / "thesis.tex" / "out"))
+    assert code == 2 and "thesis.tex/out" in text
+
+
+HOLD = """
+import sys, time
+from services.run.lock import hold_lock
+from workers.store.local import LocalStore
+with hold_lock(LocalStore(sys.argv[1])):
+    print(flush=True)
+    time.sleep(600)
+"""
+
+
+def test_status_tells_a_run_that_was_killed_from_one_that_runs(tmp_path, capsys):
+    store, job = LocalStore(tmp_path), validate_job({"name": "small", "scenes": 8}, "test")
+    store.prepare()
+    store.put(JOB_FILE, encode_job(record_job(job, "c" * 64, Path())))
+    terms = CommitTerms(job_digest="j" * 64, fingerprint="f" * 64, pairs_per_scene=1)
+    begin_attempt(store, Span(start=0, stop=8), terms).begin_scene(3)
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE)
+    with holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        alive = told(capsys, "status", str(tmp_path))
+        holder.send_signal(signal.SIGKILL)
+    dead = told(capsys, "status", str(tmp_path))
+    assert alive[0] == dead[0] == 1
+    assert "  running: range from 0, scene 3" in alive[1] and "gone" not in alive[1]
+    assert "  was running: range from 0, scene 3" in dead[1] and "  running" not in dead[1]
+    assert f"held by process {holder.pid} on " in dead[1] and ", which is gone: start the run again" in dead[1]
+    assert read_holder(store) is not None
+
+
+# ------------------------------------------------------------------------------------------------ of a dataset
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> LocalStore:
+    return make_dataset(tmp_path_factory.mktemp("made") / "small")[0]
+
+
+def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
+    code, lines, found = answer(capsys, "status", made.name)
+    assert (code, found["ok"], found["made"], found["missing"]) == (0, True, 2, 0)
+    assert lines[0] == f"{made.name}: 2 of 2 scenes done, 0 missing" and lines[-1] == f"  digest: {found['digest']}"
+    code, lines, found = answer(capsys, "verify", made.name, "--independent", "1")
+    assert (code, found["ok"], found["scenes"], found["pairs"]) == (0, True, 2, 2)
+    assert (found["independent"]["scenes"], found["independent"]["faults"]) == (1, [])
     assert "2 scenes, labels of 2 pairs derived again: nothing off" in lines[0]
     assert lines[1].startswith("labels of 1 pairs of 1 scenes derived from the article's definitions, and ")
     assert "their rest from contact forces: nothing off" in lines[1]
+    assert told(capsys, "query", made.name, "select scene_id from scenes", "--format", "csv")[1].split()[1:] == [
+        "0",
+        "1",
+    ]
+    assert answer(capsys, "replay", made.name, "1")[2]["differences"] == []
+    found = answer(capsys, "report", made.name, "--scenes", "1")[2]
+    page = Path(f"{made.name}-report.html")
+    assert (found["file"], found["bytes"]) == (str(page), page.stat().st_size) and default_page(f"{made.name}/") == page
+    assert (found["scenes"], len(found["shown"])) == (2, 1)
+    assert str(default_page("s3://bucket/sets/small")) == "small-report.html"
 
 
 def test_verify_exits_1_where_a_file_is_gone(capsys, tmp_path):
     store, _ = make_dataset(tmp_path, scenes=1)
     next(tmp_path.glob("*/depth0*.png")).unlink()
-    code, lines, told = answer(capsys, "verify", store.name)
-    assert (code, told["ok"]) == (1, False)
+    code, lines, found = answer(capsys, "verify", store.name)
+    assert (code, found["ok"]) == (1, False)
     assert any("is committed and missing: `verso replay" in line for line in lines)
 
 
-def test_query_and_replay(made, capsys):
-    assert main(["query", made.name, "select scene_id from scenes order by 1", "--format", "csv"]) == 0
-    assert capsys.readouterr().out.split() == ["scene_id", "0", "1"]
-    assert answer(capsys, "replay", made.name, "1")[2]["differences"] == []
+@pytest.mark.ray
+@pytest.mark.minute
+def test_the_first_command_of_the_readme_makes_a_dataset_and_the_others_read_it(tmp_path):
+    """From the shell, as a user would, with a small job."""
+    (tmp_path / "services").mkdir()  # a folder of the user's that has one of our generic names
+    (tmp_path / "services" / "__init__.py").write_text("raise RuntimeError('somebody else')")
+    run = ("run", TABLETOP, "--out", "out", "--scenes", "3", "--json")
+    made = verso(*run, cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    first = json.loads(made.stdout.splitlines()[-1])
+    assert first["scenes"] == {"made": 3, "intrinsic": 0, "environmental": 0}
+    assert "pybullet build time" not in made.stdout + made.stderr
+    assert len((tmp_path / "out" / "camPoses.csv").read_text().splitlines()) == 1 + 6
+    assert "nothing off" in verso("verify", "out", cwd=tmp_path).stdout
+    assert "none differ" in verso("replay", "out", "1", cwd=tmp_path).stdout
+    assert verso("export", "out", "two", "--format", "gltf", "--scenes", "2", cwd=tmp_path).returncode == 0
+    (scene,) = (tmp_path / "two").rglob("*.glb")
+    assert scene.read_bytes()[:4] == b"glTF"
+    again = verso(*run, cwd=tmp_path)
+    assert json.loads(again.stdout.splitlines()[-1])["digest"] == first["digest"]
+    other = verso(*run, "--set", "seed=1", cwd=tmp_path)
+    assert other.returncode == 2 and "seed: 2024 there, 1 here" in other.stderr
 
 
-def test_a_report_says_what_it_wrote_and_what_it_shows(tmp_path, capsys):
-    store, _ = make_dataset(tmp_path / "small", scenes=2, categories=["box"])
-    assert main(["report", str(store.root), "--scenes", "1", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out.splitlines()[-1])
-    page = tmp_path / "small-report.html"
-    assert answer["file"] == str(page) and answer["bytes"] == page.stat().st_size
-    assert (answer["scenes"], len(answer["shown"])) == (2, 1)
+# ------------------------------------------------------------------------------------------------ the machine
 
 
-def test_the_page_lies_beside_its_dataset_and_never_in_it(tmp_path):
-    assert default_page(f"{tmp_path}/small/") == tmp_path / "small-report.html"
-    assert str(default_page("s3://bucket/sets/small")) == "small-report.html"
+@pytest.mark.minute
+def test_a_machine_without_gl_is_told_what_to_install():
+    done = verso("doctor", __EGL_VENDOR_LIBRARY_DIRS="/nowhere")
+    assert done.returncode == 1 and "no off-screen OpenGL" in done.stdout
+    assert "apt-get install -y libgl1 libegl1 libgl1-mesa-dri" in done.stdout
+    assert "Traceback" not in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "told"), [(["extra", "audit"], "pip install 'verso-data[audit]'"), (["lock"], "type ./verso lock there")]
-)
-def test_the_launcher_is_named(words, told, capsys):
-    assert main(words) == 2
-    assert told in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("suffices", "code"), [(True, 0), (False, 1)])
-def test_a_missing_part_is_told_with_its_remedy_and_exits_1(monkeypatch, capsys, suffices, code):
+def test_a_missing_part_is_told_with_its_remedy_and_exits_1(monkeypatch, capsys):
     for name in ("_python", "_cores", "_memory", "_disk", "_shared_memory", "_ray", "_stack"):
         monkeypatch.setattr(doctor, name, lambda name=name: Finding(name, True, "there"))
-    monkeypatch.setattr(doctor, "_renderer", lambda: Finding("GL", suffices, "found", "install it"))
-    assert doctor.main(argparse.Namespace(json=True)) == code
-    lines = capsys.readouterr().out.splitlines()
-    assert any("install it" in line for line in lines[:-1]) is not suffices
-    answer = json.loads(lines[-1])
-    assert answer["ok"] is suffices and len(answer["findings"]) == 8
+    for suffices, code in ((True, 0), (False, 1)):
+        monkeypatch.setattr(doctor, "_renderer", lambda ok=suffices: Finding("GL", ok, "found", "install it"))
+        assert doctor.main(argparse.Namespace(json=True)) == code
+        *lines, last = capsys.readouterr().out.splitlines()
+        assert any("install it" in line for line in lines) is not suffices
+        assert json.loads(last)["ok"] is suffices and len(json.loads(last)["findings"]) == 8
+
+
+PRINT_ENVIRONMENT = """
+import json, os, sys
+from services.cli.environment import enter_stack_environment
+enter_stack_environment()
+print(json.dumps([dict(os.environ), sys.argv, hash("verso"), sys.flags.safe_path]))
+"""
+
+
+def test_a_command_starts_itself_again_in_the_stacks_environment_unless_asked_not_to(tmp_path):
+    (tmp_path / "script.py").write_text(PRINT_ENVIRONMENT)
+
+    def start(*args: str, **environ: str) -> list:
+        command = [sys.executable, "-P", str(tmp_path / "script.py"), *args]
+        bare = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), **environ}
+        return json.loads(subprocess.run(command, env=bare, capture_output=True, text=True, check=True).stdout)
+
+    environ, argv, first, safe_path = start("a b", "--c=*", OMP_NUM_THREADS="64", OTHER="kept", PYTHONHASHSEED="random")
+    assert {name: environ[name] for name in STACK_ENVIRONMENT} == dict(STACK_ENVIRONMENT)
+    assert (environ["OTHER"], argv[1:], safe_path) == ("kept", ["a b", "--c=*"], True)
+    assert start(PYTHONHASHSEED="1")[2] == first
+    environ, *_ = start(OMP_NUM_THREADS="64", **{KEEP: "1"})
+    assert environ["OMP_NUM_THREADS"] == "64" and "PYGLET_HEADLESS" not in environ

@@ -22,11 +22,8 @@ ROOT = Path(__file__).resolve().parents[3]
 def commands() -> Iterator[tuple[list[str], Command]]:
     """Every command that has a handler, with its words."""
     for name, command in COMMANDS.items():
-        yield from (
-            (([name, below], one) for below, one in command.commands.items())
-            if command.commands
-            else (([name], command),)
-        )
+        yield from (([name, below], one) for below, one in command.commands.items())
+        yield from () if command.commands else (([name], command),)
 
 
 def parse(*words: str) -> argparse.Namespace:
@@ -62,11 +59,12 @@ def test_the_page_is_the_one_that_the_table_makes():
 
 def test_help_loads_nothing_heavy():
     code = (
-        "import sys\nfrom services.cli.parser import build_parser\n"
+        "import sys, services.cli.main\nfrom services.cli.parser import build_parser\n"
         "try: build_parser().parse_args(['capture', '--help'])\nexcept SystemExit: pass\n"
-        "assert not {'numpy', 'cv2', 'scipy', 'ray', 'pydantic', 'av'} & set(sys.modules)"
+        "heavy = {'numpy', 'cv2', 'scipy', 'ray', 'pydantic', 'pyarrow', 'av', 'OpenGL', 'pybullet', 'trimesh'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, timeout=60)
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, stdout=subprocess.DEVNULL, timeout=60)
 
 
 HOSTILE = (
@@ -77,34 +75,32 @@ HOSTILE = (
     (["verify", "o", "--audit", "x"], "whole number"),
     (["report", "o", "--scenes", "0"], "0 is not a whole number from 1 up"),
     (["run", "j", "--out", "a\0b"], "'a\\x00b'"),
-    (["run", "j", "--out", "a\udcff"], "'a\\udcff'"),
     (["run", "j", "--out", ""], "''"),
     (["run", "j", "--out", "\x1b[31m"], "\\x1b[31m"),
     (["run", "x" * 100_000], "'xxx"),
     (["status", "a\0b"], "'a\\x00b'"),
     (["run", "j", "--address", "x" * 70 + ":6379"], "HOST:PORT"),
     (["run", "j", "--address", "localhost:99999"], "HOST:PORT"),
-    (["run", "j", "--address", "localhost:²"], "HOST:PORT"),
     (["run", "j", "--address", "a\0b:6379"], "HOST:PORT"),
-    (["run", "j", "--address", "nonsense"], "HOST:PORT"),
     (
-        ["run", "j", "--address", "ray://head:10001"],
-        "HOST:PORT (port 6379 by default) on a machine of the cluster, or `ray submit",
+        ["run", "j", "--address", "ray://h:10001"],
+        "HOST:PORT (port 6379 by default) on a machine of the cluster, or `ray su",
     ),
     (["run", "j", "--metrics", "9464"], "HOST:PORT"),
-    (["run", "j", "--metrics", "auto"], "HOST:PORT"),
     (["\x1b[31m" * 10_000], "\\x1b[31m"),
+    (["run"], "JOB.yaml"),
+    (["fly"], "invalid choice: 'fly'"),
+    (["export", "d", "new"], "--format"),
+    (["export", "d", "new", "--format", "nosuch"], "invalid choice"),
     (["capture"], "COMMAND"),
     (["capture", "board", "b.pdf", "--tiles", "a3"], "a3"),
     (["capture", "simulate", "--views", "4"], "--out"),
     (["capture", "simulate", "--out", "d", "--views", "0"], "whole number"),
-    (["capture", "import", "r.mkv"], "--out"),
     (["capture", "process", "d", "--estimate", "best"], "best"),
     (["capture", "synthesize", "d"], "--pose --mirror"),
     (["capture", "synthesize", "d", "--mirror", "--pose", "p.txt"], "not allowed"),
     (["logs", "../../etc"], "error: argument"),
     (["cancel", "j0a1b2c3"], "error: argument"),
-    (["cancel", "J0A1B2C3D"], "error: argument"),
     (["logs", "$(touch x)"], "error: argument"),
     (["submit", "j.yaml", "--priority", "high"], "error: argument"),
     (["submit", "j.yaml", "--priority", "1001"], "error: argument"),

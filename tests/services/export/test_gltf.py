@@ -12,7 +12,6 @@ import trimesh
 from services.export.gltf import NO_SOURCES
 from services.job.record import require_job
 from tests.exported import export_to, source_poses, source_rows
-from workers.assets.glb import split_glb
 from workers.store.local import LocalStore
 
 
@@ -105,23 +104,14 @@ def test_another_reader_finds_the_meshes_where_the_table_stands(pile, exported):
     assert 0.3 < highest < 1.5  # metres above the floor, along y
 
 
-def test_captures_have_their_board_and_mesh(captures, tmp_path):
+def test_captures_have_their_board_and_scenes_whose_sources_are_gone_are_left_out(captures, pile, tmp_path):
     export_to(captures, tmp_path / "new", "gltf")
     paths = sorted((tmp_path / "new" / "mug").glob("*.glb"))
     assert [path.name for path in paths] == ["000000.glb", "000001.glb"]
     names = placed(read_glb(paths[0])[0])
     assert any(name.startswith("board ") for name in names) and any(name.startswith("mug ") for name in names)
-
-
-def test_scenes_whose_sources_are_gone_are_left_out(pile, tmp_path):
     shutil.copytree(pile.name, tmp_path / "copy")
     job, catalogue = tmp_path / "copy" / "job.yaml", require_job(pile).catalogue
     job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
-    manifest = export_to(LocalStore(tmp_path / "copy"), tmp_path / "new", "gltf").manifest
+    manifest = export_to(LocalStore(tmp_path / "copy"), tmp_path / "none", "gltf").manifest
     assert (manifest["pairs"], manifest["left_out"]) == (0, {NO_SOURCES: 1})
-
-
-def test_the_container_is_split_where_its_json_ends(exported):
-    tree, rest = split_glb(exported[0].read_bytes())
-    assert tree == read_glb(exported[0])[0]
-    assert rest == read_glb(exported[0])[1]

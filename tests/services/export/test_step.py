@@ -1,7 +1,9 @@
-"""Exports that are killed, repeated, narrowed, refused, or made while the dataset is."""
+"""Exports of any format: killed, repeated, narrowed, refused, of tars and buckets, or made while the dataset is."""
 
 import contextlib
+import dataclasses
 import itertools
+import json
 import os
 import shutil
 import signal
@@ -10,16 +12,35 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from obstore.store import MemoryStore
 
-from schemas.errors import CorruptError, InputError, OutputError
+from schemas.errors import CorruptError, InputError, InUseError, OutputError
+from schemas.job.job import Job
+from schemas.scene.shape import Material, Part, Shape
+from services.cli.main import main
+from services.export.folder import ExportFolder, Rounds
+from services.export.shapes import Shapes, color_vertices
+from services.export.source import iter_ranges, scenes_of, unchanged_sources
 from services.export.table import FORMATS
-from tests.exported import contents, export_to
+from services.job.record import require_job
+from tests.exported import contents, export_to, source_rows
+from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
 ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def copy(files, tmp_path) -> LocalStore:
+    """A dataset that a test may damage."""
+    shutil.copytree(files.name, tmp_path / "copy")
+    return LocalStore(tmp_path / "copy")
+
+
+# ------------------------------------------------------------------------------------------------ the same bytes
 
 
 class Killed(BaseException):
@@ -27,7 +48,9 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("name", FORMATS)
-@pytest.mark.parametrize("points", [2, pytest.param(24, marks=pytest.mark.minute)])
+@pytest.mark.parametrize(
+    "points", [1, pytest.param(6, marks=pytest.mark.minute), pytest.param(24, marks=pytest.mark.slow)]
+)
 def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, name, files, tmp_path, monkeypatch):
     replace, calls = os.replace, itertools.count()
 
@@ -65,16 +88,31 @@ def test_a_process_that_is_killed_is_gone_on_with(files, tmp_path):
     export_to(files, tmp_path / "whole", "mirror-recon")
     command = [sys.executable, "-m", "services.cli.main", "export", files.name, str(tmp_path / "killed")]
     command += ["--format", "mirror-recon"]
-    for delay in (0.0, 0.02):
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while process.poll() is None and not (tmp_path / "killed" / "_export" / "progress.json").exists():
-            time.sleep(0.001)
-        time.sleep(delay)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert "8 pairs of 4 scenes" in done.stdout
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while process.poll() is None and not (tmp_path / "killed" / "_export" / "progress.json").exists():
+        time.sleep(0.001)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert main(command[3:]) == 0
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, files, tars, tmp_path):
+    bucket = MemoryStore()
+    for path, data in contents(Path(tars.name)).items():
+        bucket.put(path, data)
+    sources = {"files": files, "tars": tars, "bucket": ObjectStore(bucket, "memory://dataset")}
+    for place, store in sources.items():
+        export_to(store, tmp_path / place, name, shard_mb=0)
+    plain, tarred, far = (contents(tmp_path / place) for place in sources)
+    assert tarred == far
+    assert {key for key in {*plain, *tarred} if plain.get(key) != tarred.get(key)} == {
+        "export.json"
+    }  # other job digest
+
+
+# ------------------------------------------------------------------------------------------------ the folder
 
 
 def test_a_finished_export_is_left_as_it_is_and_another_one_refused(files, tmp_path):
@@ -90,50 +128,217 @@ def test_a_finished_export_is_left_as_it_is_and_another_one_refused(files, tmp_p
 def test_a_folder_that_is_not_an_exports_is_refused(files, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").touch()
-    with pytest.raises(OutputError, match=r"holds thesis\.tex: .* choose another DIR"):
-        export_to(files, tmp_path / "mine", "mirror-recon")
+    (tmp_path / "file").touch()
+    for target, told in (
+        (tmp_path / "mine", r"holds thesis\.tex: .* choose another DIR"),
+        (Path(files.name) / "export", "lies in the dataset"),
+        (tmp_path / "file", "cannot be written"),
+        (tmp_path / "file" / "below", "cannot be written"),
+    ):
+        with pytest.raises(OutputError, match=told):
+            export_to(files, target, "mirror-recon")
     assert contents(tmp_path / "mine") == {"thesis.tex": b""}
-    with pytest.raises(OutputError, match="lies in the dataset"):
-        export_to(files, Path(files.name) / "export", "mirror-recon")
 
 
-def test_only_the_chosen_scenes_are_exported(files, tmp_path):
-    def scenes(name, **asked):
-        export_to(files, tmp_path / name, "mirror-recon", **asked)
-        lines = (tmp_path / name / "pairs.csv").read_text().splitlines()[1:]
+def test_what_was_appended_after_the_last_checkpoint_is_taken_back(tmp_path):
+    folder, place = ExportFolder(tmp_path / "new"), tmp_path / "new"
+    with folder.claimed({"format": "x", "dataset_digest": None}) as progress:
+        assert progress is None
+        folder.append("a/list.txt", b"one\n")
+        folder.checkpoint({"next_scene": 1})
+        folder.append("a/list.txt", b"two\n")
+        folder.append("b.txt", b"b")
+    (part,) = (place / "_export" / "parts").iterdir()
+    part.write_bytes(part.read_bytes() + b"tw")
+    again = ExportFolder(place)
+    with again.claimed({"format": "x", "dataset_digest": "of the run that went on"}) as progress:
+        assert progress is not None and progress["next_scene"] == 1 and not (place / "a").exists()
+        again.append("a/list.txt", b"three\n")
+        again.checkpoint({"next_scene": 2})
+        again.finish({"pairs": 1})
+    assert (place / "a" / "list.txt").read_bytes() == b"one\nthree\n"
+    assert sorted(path.name for path in place.iterdir()) == ["a", "export.json"]
+    assert ExportFolder(place).finished() == {"pairs": 1}
+
+
+def test_an_unfinished_export_that_is_anothers_or_damaged_is_refused(tmp_path):
+    place = tmp_path / "new"
+    folder = ExportFolder(place)
+    with folder.claimed({"format": "x"}):
+        folder.append("list.txt", b"one\n")
+        folder.checkpoint({})
+
+    def refused(error, told, **plan):
+        with pytest.raises(error, match=told), ExportFolder(place).claimed({"format": "x", **plan}):
+            pass
+
+    refused(OutputError, "format: x there, y here", format="y")
+    (place / "_export" / "parts" / "list.txt").write_bytes(b"o")
+    refused(CorruptError, "shorter than the export left it")
+    (place / "_export" / "plan.json").write_text("{")
+    refused(CorruptError, "remove the folder")
+
+
+def test_two_processes_do_not_write_one_export(tmp_path):
+    holder = (
+        "import sys\nfrom pathlib import Path\nfrom services.export.folder import ExportFolder\n"
+        f"with ExportFolder(Path({str(tmp_path / 'new')!r})).claimed({{}}):\n    print('held', flush=True)\n    sys.stdin.read()"
+    )
+    with subprocess.Popen([sys.executable, "-c", holder], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"held\n"
+        with pytest.raises(InUseError, match="another export writes into"), ExportFolder(tmp_path / "new").claimed({}):
+            pass
+        process.kill()
+    with ExportFolder(tmp_path / "new").claimed({}):
+        pass
+
+
+class Lines:
+    def __init__(self, path: Path) -> None:
+        self.file, self.bytes = path.open("wb"), 0
+
+    def add(self, data: bytes) -> None:
+        self.bytes += self.file.write(data)
+
+    def close(self) -> None:
+        self.file.close()
+
+
+def test_a_round_ends_for_every_split_when_one_shard_is_full(tmp_path):
+    folder = ExportFolder(tmp_path / "new")
+    with folder.claimed({}):
+        rounds = Rounds(folder, Lines, "{split}-{number:02d}.txt", 4, None)
+        rounds.shard("train").add(b"abc")
+        rounds.end_if_full()
+        assert rounds.state() is None
+        rounds.shard("test").add(b"x")
+        rounds.shard("train").add(b"d")
+        rounds.end_if_full()
+        assert rounds.state() == {"next": {"test": 1, "train": 1}}
+        again = Rounds(folder, Lines, "{split}-{number:02d}.txt", 4, rounds.state())
+        again.shard("train").add(b"e")
+        again.end()
+        again.shard("val").add(b"not ended")
+        again.close()
+    files = {path.name: path.read_bytes() for path in (tmp_path / "new").glob("*.txt")}
+    assert files == {"train-00.txt": b"abcd", "test-00.txt": b"x", "train-01.txt": b"e"}
+
+
+# ------------------------------------------------------------------------------------------------ which scenes
+
+
+def test_only_the_chosen_scenes_are_exported(files, captures, tmp_path):
+    def scenes(store=files, **asked):
+        target = tmp_path / str(len(list(tmp_path.iterdir())))
+        export_to(store, target, "mirror-recon", **asked)
+        lines = (target / "pairs.csv").read_text().splitlines()[1:]
         return {int(line.split(",")[2]) for line in lines}
 
-    assert scenes("span", first_scene=1, last_scene=2) == {1, 2}
-    cans, boxes = scenes("cans", categories=("can",)), scenes("boxes", categories=("box",))
+    assert scenes(first_scene=1, last_scene=2) == {1, 2}
+    cans, boxes = scenes(categories=("can",)), scenes(categories=("box",))
     assert cans and boxes and cans | boxes == {0, 1, 2, 3} and not cans & boxes
-    assert scenes("where", where="category = 'can' -- mine") == cans
-    seen = "exists (select 1 from views v where v.scene_id = scenes.scene_id and v.role = 'mirror')"
-    assert scenes("views", where=seen) == {0, 1, 2, 3}
-    with pytest.raises(InputError, match="nosuch"):
-        scenes("wrong", where="nosuch > 3")
+    assert scenes(where="category = 'can' -- mine") == cans
+    assert scenes(categories=("can",), where="scene_id > 1") == {one for one in cans if one > 1}
+    assert scenes(where="scene_id in (select scene_id from views where role = 'input' and pose_id >= 8)") == {2, 3}
+    assert scenes(captures, where="capture.views < 1") == set()
+
+
+@pytest.mark.parametrize("where", ["nosuch = 1", "category =", "scene_id in (select * from read_csv('/etc/passwd'))"])
+def test_a_condition_that_cannot_be_asked_is_refused_before_anything_is_written(where, files, tmp_path):
+    with pytest.raises(InputError, match="cannot be asked"):
+        export_to(files, tmp_path / "wrong", "mirror-recon", where=where)
     assert not (tmp_path / "wrong").exists()
 
 
-def test_a_dataset_that_is_being_made_is_exported_as_far_as_it_is_committed(files, tmp_path):
-    shutil.copytree(files.name, tmp_path / "making")
+def test_a_dataset_that_is_being_made_is_exported_as_far_as_it_is_committed(copy, tmp_path):
     for path in ("_SUCCESS", "manifest/_commits/0000000002.json"):
-        (tmp_path / "making" / path).unlink()
-    manifest = export_to(LocalStore(tmp_path / "making"), tmp_path / "new", "mirror-recon").manifest
-    assert (manifest["scenes"], manifest["dataset_digest"]) == (2, None)
+        (tmp_path / "copy" / path).unlink()
+    (image,) = (tmp_path / "copy").glob("*/RGB00000.png")  # committed, and not yet published
+    staged = tmp_path / "copy" / "_staging" / "0000000000" / read_record(copy, 0).attempt / image.parent.name
+    staged.mkdir(parents=True)
+    image.rename(staged / image.name)
+    manifest = export_to(copy, tmp_path / "new", "mirror-recon").manifest
+    assert (manifest["scenes"], manifest["pairs_left_out"], manifest["dataset_digest"]) == (2, 0, None)
 
 
-def test_an_image_that_is_lost_is_an_error_and_never_left_out(files, tmp_path):
-    shutil.copytree(files.name, tmp_path / "copy")
+def test_an_image_that_is_lost_is_an_error_and_never_left_out(copy, tmp_path):
     next((tmp_path / "copy").glob("*/depth00003.png")).unlink()
     with pytest.raises(CorruptError, match=r"depth00003\.png is committed and missing"):
-        export_to(LocalStore(tmp_path / "copy"), tmp_path / "new", "mirror-recon")
+        export_to(copy, tmp_path / "new", "mirror-recon")
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_bucket_is_exported_to_the_same_bytes_as_a_folder(name, tars, tmp_path):
-    bucket = MemoryStore()
-    for path, data in contents(Path(tars.name)).items():
-        bucket.put(path, data)
-    export_to(ObjectStore(bucket, "memory://dataset"), tmp_path / "far", name)
-    export_to(tars, tmp_path / "near", name)
-    assert contents(tmp_path / "far") == contents(tmp_path / "near")
+def first_scene(store):
+    (scene,) = scenes_of(store, next(iter_ranges(store, list_codes(store), 0)), [0])
+    return scene
+
+
+def test_the_split_of_a_scene_is_the_strictest_of_its_objects(pile):
+    scene = first_scene(pile)
+    assert set(scene.instances) == {3, 4, 5}
+    for position, (_, name) in enumerate(scene.instances.values()):
+        scene.assets[name] = {**scene.assets[name], "split": ("val", "test", "train")[position]}
+    assert scene.split == "test"
+
+
+# ------------------------------------------------------------------------------------------------ shapes
+
+
+def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_path):
+    def load(store):
+        scene = first_scene(store)
+        return Shapes(store, require_job(store)).load(scene, scene.row["instance_id"])
+
+    for path in (tmp_path / "copy" / "assets").rglob("*.glb"):
+        path.write_bytes(b"glTF")
+    with pytest.raises(CorruptError, match="--repair"):
+        load(copy)
+    shutil.rmtree(tmp_path / "copy" / "assets")
+    stored, made = load(files), load(copy)
+    assert stored is not None and made is not None
+    np.testing.assert_allclose(stored.shape.vertices, made.shape.vertices, atol=1e-7)
+    np.testing.assert_array_equal(stored.shape.faces, made.shape.faces)
+    assert np.abs(stored.colors.astype(int) - made.colors).max() <= 1
+    extents = next(row["extents_m"] for row in source_rows(files.root, "assets") if row["category"] != "table")
+    assert np.ptp(stored.shape.vertices, axis=0).max() < 2 * max(extents)
+    record = require_job(copy)
+    gone = {"objects": [{"source": "urdf", "folder": "gone", "category_map": {"*.obj": "mug"}}]}
+    job = Job.model_validate({"name": "t", "assets": gone})
+    assert unchanged_sources(dataclasses.replace(record, job=job, folder=str(tmp_path))) is None
+
+
+def test_a_vertex_has_the_colour_of_its_texel_times_the_base_colour():
+    texture = np.zeros((2, 2, 3), np.uint8)
+    texture[0, 1], texture[1, 0] = (200, 100, 0), (0, 100, 200)  # upper right, lower left
+    uv = np.array([[0.75, 0.75], [0.25, 0.25], [1.75, -0.25]])
+    material = Material(base_color=(1.0, 0.5, 1.0, 1.0), texture=texture)
+    part = Part("a", np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32), material, uv=uv)
+    plain = Part("b", np.zeros((1, 3)), np.zeros((0, 3), np.int32), Material((0.2, 0.4, 0.6, 1.0)))
+    colors = color_vertices(Shape((part, plain))).colors
+    assert colors.tolist() == [[200, 50, 0], [0, 50, 200], [200, 50, 0], [51, 102, 153]]
+
+
+# ------------------------------------------------------------------------------------------------ the command
+
+
+def test_the_command_says_what_is_there_and_what_was_left_out(files, pile, tmp_path, capsys):
+    asked = ["export", files.name, str(tmp_path / "new"), "--format", "mirror-recon"]
+    assert main([*asked, "--scenes", "0-1", "--json"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"{tmp_path / 'new'}: mirror-recon, 4 pairs of 2 scenes (4 now, in ")
+    answer = json.loads(lines[-1])
+    assert (answer["ok"], answer["pairs"], answer["pairs_now"]) == (True, 4, 4)
+    assert answer["choice"] == {"first_scene": 0, "last_scene": 1}
+    assert main(["export", pile.name, str(tmp_path / "pile"), *asked[3:]]) == 1
+    told = capsys.readouterr()
+    assert "left out: 1 pairs, several objects" in told.out and "left_out.csv" in told.out
+    assert "holds no pair: every pair was left out" in told.err
+
+
+def test_what_cannot_be_exported_is_refused_in_a_line_with_exit_code_2(files, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    for place, target, told in (("empty", "new", "job.yaml"), (files.name, "s3://bucket/new", "on this machine")):
+        assert main(["export", place, target, "--format", "mirror-recon"]) == 2
+        line = capsys.readouterr().err
+        assert line.count("\n") == 1 and told in line
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.exported import contents, export_to, source_image, source_poses, source_rows
+from tests.exported import export_to, source_image, source_poses, source_rows
 
 WORDS = {
     "input": ("RGB", "depth", "segment", 0),
@@ -69,18 +69,9 @@ def test_splits_are_those_of_the_objects_and_shards_are_bounded(files, exported)
     assert len(shards) == sum(manifest["shards"].values()) == 4  # full after each scene
 
 
-def test_small_shards_hold_the_same_samples_as_one(files, tmp_path, exported):
+def test_small_shards_hold_the_same_samples_as_one_and_captures_are_samples_too(files, captures, tmp_path, exported):
     export_to(files, tmp_path / "one", "webdataset")
     assert samples_of(tmp_path / "one") == samples_of(exported[0])
-
-
-def test_tars_export_the_same_bytes_as_files(files, tars, exported, tmp_path):
-    export_to(tars, tmp_path / "new", "webdataset", shard_mb=0)
-    theirs, ours = contents(tmp_path / "new"), contents(exported[0])
-    assert {key for key in {*ours, *theirs} if ours.get(key) != theirs.get(key)} == {"export.json"}
-
-
-def test_captures_are_samples_too(captures, tmp_path):
     assert export_to(captures, tmp_path / "new", "webdataset").manifest["pairs"] == 4
     for sample in samples_of(tmp_path / "new").values():
         assert set(np.load(io.BytesIO(sample["depth.npz"]))) == {"input", "mirror", "projected"}

@@ -52,12 +52,14 @@ def test_captures_whose_files_changed_are_named_by_their_folders(store):
     assert "shots/mug" not in str(caught.value)
 
 
-def test_a_folder_that_is_no_dataset_is_refused(store, tmp_path):
+def test_a_folder_that_is_no_dataset_is_refused_unless_a_run_or_a_file_system_left_what_it_holds(store, tmp_path):
+    store.prepare()
+    (tmp_path / "lost+found").mkdir()
+    (tmp_path / "_lock.json").write_text("{}")
     refuse_foreign(store)
     with pytest.raises(OutputError, match="holds no job"):
         require_job(store)
     (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "a.png").touch()
     with pytest.raises(OutputError, match="photos, and no job"):
         refuse_foreign(store)
 

@@ -1,0 +1,194 @@
+"""Jobs: names of categories, patterns of files, sizes of ranges, presets, captures, and which keys make a job the same."""
+
+import math
+
+import pytest
+from pydantic import ValidationError
+
+from schemas.job.assets import CATEGORIES, FolderSource, matches, offered_by
+from schemas.job.identity import compare_jobs, dataset_keys, job_digest, settings_digest
+from schemas.job.job import PRESETS, Job, with_preset
+from tests.datasets import overlaid
+
+FRUIT = {"source": "urdf", "folder": "fruit", "category_map": {"*.obj": "banana", "*.glb": "Pear-2", "t.obj": "table"}}
+URDF = {"source": "urdf", "folder": "/somewhere"}
+BASE = {"name": "t", "assets": {"objects": [URDF]}}
+FOLDERS = {"name": "t", "captures": {"source": "folders", "folders": ["a", "b", "c"]}}
+SIMULATED = {"name": "t", "captures": {}}
+
+
+def job(base: dict | None = None, **changes) -> Job:
+    return Job.model_validate(overlaid(base or {"name": "t"}, changes))
+
+
+# ------------------------------------------------------------------------------------------------ assets
+
+
+def test_without_categories_a_job_has_all_that_its_sources_offer_once():
+    assert tuple(job().categories) == CATEGORIES
+    assert job(assets={"objects": [FRUIT]}).categories == {"banana": 1.0, "Pear-2": 1.0}
+    mixed = {"objects": [FRUIT, {"source": "procedural"}, FRUIT]}
+    assert list(job(assets=mixed).categories) == ["banana", "Pear-2", *CATEGORIES]
+    assert "box" not in job(assets={"objects": [{"source": "shapenet", "folder": "s"}]}).categories
+    packaged = {"source": "urdf", "folder": "pybullet_data"}  # may offer anything until it is listed
+    assert tuple(job(assets={"objects": [packaged]}).categories) == CATEGORIES
+    assert job(assets={"objects": [packaged]}, categories=["brick"]).categories == {"brick": 1.0}
+    assert offered_by([{}, {"source": 3}, {"source": "urdf", "category_map": 7}, {"source": "urdf"}]) == ()
+
+
+def test_a_name_that_cannot_be_is_refused_with_the_remedy():
+    sources = {"objects": [FRUIT, {"source": "procedural"}]}
+    for name, words in (
+        ("mugg", "no source offers it; did you mean 'mug'[?] offered: banana, Pear-2, bottle"),
+        ("zebra", "no source offers it; offered: banana"),
+        ("../x", "1 to 64 letters, digits, - and _"),
+        ("", "letters, digits"),
+        ("x" * 65, "1 to 64"),
+        ("002", "write a letter too, such as n002"),
+        ("table", "what objects stand on"),
+        ("Manifest", "a folder of this name"),
+    ):
+        with pytest.raises(ValidationError, match=words) as refusal:
+            job(assets=sources, categories=[name])
+        assert "[A-Za-z" not in str(refusal.value)
+    with pytest.raises(ValidationError, match="names a folder"):
+        job(assets={"objects": [{**FRUIT, "category_map": {"*.obj": "a b"}}]})
+
+
+FILES = ("a.obj", "b.OBJ", "x/a.obj", "x/y/a.obj", "x/y/z/b.obj", "x[1]/a b.obj", ".h/a.obj", "x/ü.glb", "xy/a.obj")
+PATTERNS = (
+    *("*.obj", "**/*.obj", "x/*.obj", "x/**/*.obj", "*/*.obj", "**/y/**/*.obj", "x*/*", "**/*", "**", "x/**", "?.obj"),
+    *("[ab].obj", "[!a].*", "x[[]1]/*", "x[1]/*", "./a.obj", "x//a.obj", "**/**/a.obj", "*", "x/?.glb", "X/a.obj"),
+)
+
+
+def test_a_pattern_matches_what_pathlibs_glob_finds_and_many_stars_take_no_time(tmp_path):
+    for name in FILES:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    for pattern in PATTERNS:
+        found = {path.relative_to(tmp_path).as_posix() for path in tmp_path.glob(pattern) if path.is_file()}
+        assert {name for name in FILES if matches(name, pattern)} == found, pattern
+    assert not matches("a/" * 200 + "b", "**/a/" * 100 + "*/c")
+
+
+def test_the_axis_that_is_up_is_one_letter_or_that_of_the_first_pattern():
+    def source(**keys):
+        return FolderSource(source="urdf", folder="m", **keys)
+
+    mixed = source(up={"odd/a.glb": "x", "**/*.glb": "y"})
+    assert [mixed.up_of(name) for name in ("odd/a.glb", "odd/b.glb", "c.glb", "c.obj")] == ["x", "y", "y", "z"]
+    assert [source(up="y").up_of(name) for name in ("a.obj", "b/c.glb")] == ["y", "y"]
+    assert source().up_of("a.obj") == "z"
+    for up in ("w", "Y", {}, {"*.glb": "up"}, {"*.glb": None}, ["y"], 3, None, {"*.glb": ["y"]}):
+        with pytest.raises(ValidationError) as caught:
+            source(up=up)
+        (fault,) = caught.value.errors()
+        assert "must be x, y or z, or a map" in fault["msg"]
+
+
+# ------------------------------------------------------------------------------------------------ ranges, presets
+
+
+def test_ranges_give_every_worker_one_and_take_ten_seconds_at_most():
+    assert job(scenes=2, run={"range_size": 40}).range_size == 40
+    for scenes in (1, 2, 31, 32, 64, 500, 10_000):
+        assert math.ceil(scenes / job(scenes=scenes).range_size) >= min(scenes, 32)
+    assert job(scenes=10**6).range_size == 16
+    assert job(scenes=10**6, objects_per_scene=[1, 16]).range_size < 16
+    piles = {"objects_per_scene": 8, "start": {"pose": "tumbled", "arrange": "pile"}}  # 1.7 s each
+    assert job(scenes=16, **piles).range_size == 1
+    assert 1 < job(scenes=10**6, **piles).range_size <= 10 / 1.7
+    traced = [job(scenes=10**4, render={"tier": "pathtraced", "path_samples": n}).range_size for n in (4, 16, 256)]
+    assert traced[0] > traced[1] >= traced[2] == 1
+    assert job(SIMULATED).range_size == 1
+
+
+def test_a_preset_fills_the_keys_that_the_job_does_not_give():
+    given = {"preset": "exact", "render": {"samples": 1}}
+    filled = with_preset(given)
+    assert filled["render"] == {"samples": 1, "tier": "raster"}
+    assert filled["physics"] == {"step_hz": PRESETS["exact"]["physics.step_hz"]}
+    assert given == {"preset": "exact", "render": {"samples": 1}}
+    for name in ("unknown", 3, None, ["fast"]):
+        assert with_preset({"preset": name}) == {"preset": name}
+    assert with_preset({"physics": 3})["physics"] == 3
+
+
+# ------------------------------------------------------------------------------------------------ captures
+
+
+def test_what_follows_from_captures_unless_the_job_says_otherwise():
+    assert (job(FOLDERS).scenes, job(FOLDERS, scenes=2).stop_scene) == (3, 2)
+    made = job(SIMULATED, captures={"most_views": 50})
+    assert (made.pairs_per_scene, made.cameras.depth.enabled, made.scenes) == (50, False, 64)
+    assert (made.run.range_size, made.run.scene_timeout_s) == (1, 1800.0)
+    assert job(SIMULATED, run={"range_size": 4}).run.range_size == 4
+    for base in (FOLDERS, SIMULATED):
+        assert Job.model_validate(job(base).model_dump(mode="json")) == job(base)
+    assert "captures" not in job().model_dump(mode="json") and "captures" not in job().model_dump_json()
+
+
+def test_what_a_capture_cannot_have_is_refused_with_its_key():
+    for changes, words in (
+        ({"scenes": 4}, "3 folders"),
+        ({"first_scene": 1, "scenes": 2}, "first_scene must be 0"),
+        ({"pairs_per_scene": 2}, "most_views"),
+        ({"cameras": {"depth": {"enabled": True}}}, "registered"),
+        ({"objects_per_scene": [1, 3]}, "one object"),
+        ({"sensor": {"depth_noise": {}}}, "captures.simulate"),
+        ({"render": {"rgb": False}}, "render.rgb"),
+        ({"captures": {"source": "simulate"}}, "folders must be named"),
+        ({"captures": {"category": "a/b"}}, "letters, digits, - and _"),
+        ({"captures": {"board": {"columns": 9}}}, "width_m is 0.6, and 9 markers with their gaps need"),
+    ):
+        with pytest.raises(ValidationError, match=words):
+            job(FOLDERS, **changes)
+
+
+# ------------------------------------------------------------------------------------------------ identity
+
+
+def test_a_key_belongs_to_the_dataset_to_its_scenes_or_to_neither():
+    for changes, same_dataset, same_scene in (
+        ({"scenes": 7}, True, True),
+        ({"run": {"workers": 3, "fingerprint": "record"}}, True, True),
+        ({"assets": {"objects": [{**URDF, "folder": "/elsewhere"}]}}, True, True),
+        ({"name": "u"}, False, True),
+        ({"first_scene": 4}, False, True),
+        ({"output": {"layout": "tar"}}, False, True),
+        ({"preset": "exact", "physics": {"step_hz": 960}, "render": {"samples": 1}}, False, True),
+        ({"seed": 1}, False, False),
+        ({"cameras": {"mirror": {"T_z_m": 1.4}}}, False, False),
+        ({"sensor": {"rgb_noise": {}}}, False, False),
+        ({"assets": {"objects": [{**URDF, "scale": 2.0}]}}, False, False),
+    ):
+        before, after = job(BASE), job(BASE, **changes)
+        assert (job_digest(before, "c") == job_digest(after, "c")) is same_dataset, changes
+        assert (settings_digest(before, "c") == settings_digest(after, "c")) is same_scene, changes
+        assert (compare_jobs(before, after) == []) is same_dataset, changes
+    assert job_digest(job(), "c") != job_digest(job(), "d") and settings_digest(job(), "c") != settings_digest(
+        job(), "d"
+    )
+    differing = compare_jobs(job(), job(seed=2, start={"pose": "tumbled"}))
+    assert differing == [("seed", 0, 2), ("start.pose", "upright", "tumbled")]
+
+
+def test_settings_of_captures_belong_to_the_dataset_and_paths_and_what_the_source_does_not_use_do_not():
+    before, moved = job(FOLDERS), job(FOLDERS, captures={"folders": ["x/a", "x/b", "x/c"]})
+    assert compare_jobs(before, moved) == [] and job_digest(before, "c") == job_digest(moved, "c")
+    finer = job(FOLDERS, captures={"fusion": {"voxel_m": 0.001}})
+    assert compare_jobs(before, finer) == [("captures.fusion.voxel_m", 0.002, 0.001)]
+    assert settings_digest(before, "c") != settings_digest(finer, "c")
+    assert "folders" not in dataset_keys(before)["captures"]
+    views = {"simulate": {"views": 9}}
+    assert job_digest(before, "c") == job_digest(job(FOLDERS, captures=views), "c")
+    assert job_digest(job(SIMULATED), "c") != job_digest(job(SIMULATED, captures=views), "c")
+
+
+def test_digests_of_jobs_are_those_of_datasets_that_were_made_before():
+    assert job_digest(job(), "c")[:16] == "d3ee8e0fe9559a68"
+    assert settings_digest(job(), "c")[:16] == "938ee36c17800eba"
+    mapped = {"source": "urdf", "folder": "m", "category_map": {"*.obj": "mug"}, "up": "y"}
+    before_maps_of_axes = job_digest(Job(name="j", assets={"objects": [mapped]}), "c" * 64)
+    assert before_maps_of_axes == "2a98cd36192d5711e6a2502d718b8a394dcd9aed87ac5985e007aab10ed1d3f3"
