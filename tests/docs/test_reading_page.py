@@ -1,4 +1,4 @@
-"""Every block of docs/reading.md runs as it is printed, and answers what plain files say."""
+"""Every block of README.md and docs/reading.md runs as it is printed, and answers what plain files say."""
 
 import json
 import shlex
@@ -24,10 +24,17 @@ def here(tmp_path_factory) -> Path:
     return root
 
 
-def camera_poses(root: Path) -> dict[int, np.ndarray]:
-    """Poses by id, from the text file."""
-    lines = (root / "data/tabletop/camPoses.csv").read_text().splitlines()[1:]
-    return {int(line.split(",")[0]): np.array(line.split(",")[2:], float).reshape(4, 4) for line in lines}
+def check_images_of_mugs(names: dict) -> None:
+    paths = sorted(str(path) for path in Path("data/tabletop/mug").glob("RGB0*[02468].png"))  # every mug is seen whole
+    assert sorted(f"data/tabletop/{path}" for path in names["files"]) == paths and len(paths) > 1
+    pixels = [cv2.imread(f"data/tabletop/{path}")[..., ::-1] for path in names["files"]]
+    assert np.array_equal(names["images"], pixels)
+
+
+def test_the_readme_reads_every_mug_and_can_be_read_in_a_few_minutes(here, monkeypatch):
+    monkeypatch.chdir(here)
+    check_images_of_mugs(run_blocks(DOCS.parent / "README.md"))
+    assert len((DOCS.parent / "README.md").read_text().splitlines()) <= 120
 
 
 def test_the_python_of_the_page_answers(here, monkeypatch, capsys):
@@ -39,19 +46,15 @@ def test_the_python_of_the_page_answers(here, monkeypatch, capsys):
     printed = capsys.readouterr().out.splitlines()
     assert sum("(120, 160, 3)" in line for line in printed) == 6
     assert "Columns of a pair" in printed[-1]
-    paths = sorted(
-        str(path.relative_to("data/tabletop")) for path in Path("data/tabletop/mug").glob("RGB0*[02468].png")
-    )
-    assert names["files"] == paths and len(paths) > 1  # every mug is seen whole
-    pixels = [cv2.imread(f"data/tabletop/{path}")[..., ::-1] for path in paths]
-    assert np.array_equal(names["images"], pixels)
+    check_images_of_mugs(names)
     assert 0 < names["rows"].num_rows <= 6
     dat = [line.split() for line in Path("data/tabletop/objects.dat").read_text().splitlines()]
     places = {(int(w[0]), w[2], int(w[4]), int(w[5])) for w in dat if w[3] != "2" and int(w[0]) % 2}
     joined = names["joined"].to_pylist()
     assert {(row["pose_id"], row["instance_id"], row["u"], row["v"]) for row in joined} == places
-    poses = camera_poses(here)
-    assert all(any(np.allclose(T, pose) for T in names["T_world_cam"]) for pose in poses.values())
+    lines = Path("data/tabletop/camPoses.csv").read_text().splitlines()[1:]
+    poses = [np.array(line.split(",")[2:], float).reshape(4, 4) for line in lines]
+    assert all(any(np.allclose(T, pose) for T in names["T_world_cam"]) for pose in poses)
 
 
 def test_the_commands_of_the_page_answer(here, monkeypatch, capfdbinary):

@@ -20,7 +20,7 @@ from services.study import command, study
 from services.study.command import check_captures, errors_of, fewer_views, measure_capture, rows_of, run_capture_study
 from services.study.model import Plan, Setting, Sizes
 from services.study.study import JOURNAL_FILE, Journal
-from tests.services.cli.test_main import TABLETOP, told
+from tests.services.cli.test_commands import TABLETOP, told
 from tests.services.study.made_up import read_study
 from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import open_folder
