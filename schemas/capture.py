@@ -1,11 +1,4 @@
-"""What the steps of a capture hand to one another: cameras, views, detections, estimates, results.
-
-- The depth camera of an RGB-D sensor, with its place in the colour camera's frame.
-- A capture: its camera, the images of one view, and the markers that were found in it.
-- A folder of a capture as a job found it: where it lies, and the digest of what is in it.
-- Estimated camera poses of a capture, with their uncertainty and residuals.
-- A processed capture: all that its dataset is made of, and what it was scored with.
-"""
+"""What the steps of a capture hand to one another: cameras, views, detections, estimates, results."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -14,7 +14,6 @@ JOBS: Final = "jobs"
 REQUEST: Final = "request.json"
 
 ID_PATTERN: Final = r"^j[0-9a-f]{8}$"
-SUBMISSION_PATTERN: Final = r"^verso-j[0-9a-f]{8}-[0-9]{1,6}$"
 
 MOST_JOB_CHARACTERS: Final = 250_000
 """As many as a job file may have bytes."""

@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from services.cli.parser import build_parser
+from services.cli.main import build_parser
 from services.cli.rows import QUEUE_COMMANDS
 from services.queue.queue import RESTARTS, JobState
 from services.queue.supervise import PAUSES_S

@@ -1,8 +1,4 @@
-"""Commits: the record that a range of scenes is done, and the ledger of all records.
-
-- A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share.
-- The ledger: what planning and status need of every commit, in columns, about 40 bytes for each.
-"""
+"""Commits: the record that a range of scenes is done, and the ledger of all records."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -178,40 +174,23 @@ class CommitSummary:
 
 def summarize(record: CommitRecord) -> CommitSummary:
     """The part of the record that planning needs."""
-    span = record.span
+    span, terms = record.span, record.terms
     failed = tuple((one.scene_id, one.outcome, one.reason or "") for one in record.scenes if one.outcome != "made")
-    terms = record.terms
-    return CommitSummary(
-        start=span.start,
-        stop=span.stop,
-        retry=span.retry,
-        made=span.count - len(failed),
-        failed=failed,
-        scenes=span.scenes,
-        fingerprint=terms.fingerprint,
-        job_digest=terms.job_digest,
-    )
+    counts = (span.start, span.stop, span.retry, span.count - len(failed))
+    return CommitSummary(*counts, failed, span.scenes, terms.fingerprint, terms.job_digest)
 
 
-_failure = pa.struct(
-    [
-        pa.field("scene_id", pa.int64(), nullable=False),
-        pa.field("kind", pa.string(), nullable=False),
-        pa.field("reason", pa.string(), nullable=False),
-    ]
-)
-_name = pa.dictionary(pa.int32(), pa.string())
+def _fields(**kinds: pa.DataType) -> list[pa.Field]:
+    return [pa.field(name, kind, nullable=False) for name, kind in kinds.items()]
+
+
+_FAILURE = pa.struct(_fields(scene_id=pa.int64(), kind=pa.string(), reason=pa.string()))
+_NAME = pa.dictionary(pa.int32(), pa.string())
 
 LEDGER_SCHEMA = pa.schema(
     [
-        pa.field("start", pa.int64(), nullable=False),
-        pa.field("stop", pa.int64(), nullable=False),
-        pa.field("retry", pa.int32(), nullable=False),
-        pa.field("made", pa.int32(), nullable=False),
-        pa.field("failed", pa.list_(_failure), nullable=False),
-        pa.field("scenes", pa.list_(pa.int64()), nullable=False),
-        pa.field("fingerprint", _name, nullable=False),
-        pa.field("job_digest", _name, nullable=False),
+        *_fields(start=pa.int64(), stop=pa.int64(), retry=pa.int32(), made=pa.int32(), failed=pa.list_(_FAILURE)),
+        *_fields(scenes=pa.list_(pa.int64()), fingerprint=_NAME, job_digest=_NAME),
     ]
 )
 """Fields of `CommitSummary`."""

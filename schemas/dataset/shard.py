@@ -1,8 +1,4 @@
-"""Messages that cross Ray (orders and reports of shards, never an image), and the fingerprint of a stack.
-
-- The fingerprint of a stack of software and hardware: versions, and the bytes that it makes.
-- Messages that cross Ray: the order to make a shard, and the report of it. Never an image.
-"""
+"""Messages that cross Ray (orders and reports of shards, never an image), and the fingerprint of a stack."""
 
 import hashlib
 from typing import Literal

@@ -71,375 +71,219 @@ class Column:
         return self.null or self.of != "both"
 
 
-_CATEGORY = "What the object is: mug, can, ...; in `scenes` and `views` the first object."
-_INSTANCE = "Which shape of its category it is: the key of `assets`; in `scenes` the first object."
-_SOURCE = "Kind of source of the shape: procedural, shapenet, urdf, or of a capture."
-_SCENE_ID = "The scene, or the capture; ids count from the job's first_scene."
-_POSE_ID = "The view's pose: even of input, aligned and projected views, odd of mirror views."
-_ROLE = "Which view of its pair: input, aligned (the depth camera), mirror, or projected."
-_REGION = "The value of its pixels in segment images: 2 the table, 3 and up the objects."
-_PATCH = "Share of the patch that shows its object; null where there is no patch."
+_SHARED = {
+    "category": "What the object is: mug, can, ...; in `scenes` and `views` the first object.",
+    "instance": "Which shape of its category it is: the key of `assets`; in `scenes` the first object.",
+    "source": "Kind of source of the shape: procedural, shapenet, urdf, or of a capture.",
+    "scene_id": "The scene, or the capture; ids count from the job's first_scene.",
+    "pose_id": "The view's pose: even of input, aligned and projected views, odd of mirror views.",
+    "role": "Which view of its pair: input, aligned (the depth camera), mirror, or projected.",
+    "region": "The value of its pixels in segment images: 2 the table, 3 and up the objects.",
+    "patch": "Share of the patch that shows its object; null where there is no patch.",
+    "scale": "Factor from the source's coordinates to metres.",
+    "overlap": "Deepest overlap of the true meshes at rest.",
+    "gap": "Gap between the object and what carries it.",
+    "margin": "How far the centre of mass lies inside the hull of the contacts, seen from above.",
+    "drift": "Drift of the farthest point in the simulation's last window, before correction.",
+    "move": "Motion when it was let go again, until 0.2 mm; null where it was not.",
+    "turn": "Turn when it was let go again; null where it was not.",
+    "balance": "Share of its weight that the contact forces cannot balance.",
+    "centre": "Principal point, where the centre of the first pixel is at 0.5.",
+    "centre_opencv": "Principal point, where the centre of the first pixel is at 0, as in OpenCV.",
+    "to_world": "takes object coordinates to world coordinates; 4 x 4, row by row.",
+    "by_row": "; 4 x 4, row by row.",
+    "share_seen": "unoccluded and also outside the frame",
+}
+"""Meanings, and parts of some, that several columns have: `{name}` in the table below."""
+
+_ROWS = {
+    "scenes": """
+scene_id | int64 | id | - | {scene_id}
+category | string | - | - | {category}
+instance_id | string | - | - | {instance}
+source | string | - | - | {source}
+table_id | string | - | - | The table's shape: the key of `assets`.
+object_scale | double | 1 | - | {scale}
+T_world_obj | double[16] | m | world, object | Pose of the first object at rest: {to_world}
+T_world_table | double[16] | m | world, object | Pose of the table: takes table coordinates to world coordinates{by_row}
+pose | string, scenes | - | - | How the objects started: upright, tumbled or placed.
+redraws | int64 | count | - | How often the start position was drawn again before one was valid.
+effects | list of string | - | - | Names of the effects that ran.
+skipped | list of struct | - | - | Effects that did not run.
+skipped[].effect | string | - | - | Name of the effect.
+skipped[].why | string | - | - | Why it was not needed.
+penetration_mm | double, scenes | mm | - | {overlap}
+hover_gap_mm | double, scenes | mm | - | {gap}
+support_margin_mm | double, scenes | mm | - | {margin}
+residual_speed_mm_s | double, scenes | mm/s | - | {drift}
+recheck_move_mm | double?, scenes | mm | - | {move}
+recheck_turn_deg | double?, scenes | deg | - | {turn}
+equilibrium_residual | double, scenes | 1 | - | {balance}
+settle_s | double, scenes | s | - | Simulated time until rest; the longest of all objects.
+raycast_checked | bool | - | - | Whether every view was checked against the ray caster.
+settings_digest | string | - | - | SHA-256 of the settings and sources that shape a scene.
+bodies | list of struct, scenes | - | - | Every object of the scene.
+bodies[].region_id | int64 | id | - | {region}
+bodies[].category | string | - | - | {category}
+bodies[].instance_id | string | - | - | {instance}
+bodies[].source | string | - | - | {source}
+bodies[].object_scale | double | 1 | - | {scale}
+bodies[].T_world_obj | double[16] | m | world, object | Pose at rest: {to_world}
+bodies[].redraws | int64 | count | - | How often its start position was drawn again.
+bodies[].penetration_mm | double | mm | - | {overlap}
+bodies[].hover_gap_mm | double | mm | - | {gap}
+bodies[].support_margin_mm | double | mm | - | {margin}
+bodies[].residual_speed_mm_s | double | mm/s | - | {drift}
+bodies[].recheck_move_mm | double? | mm | - | {move}
+bodies[].recheck_turn_deg | double? | deg | - | {turn}
+bodies[].equilibrium_residual | double | 1 | - | {balance}
+bodies[].mass_kg | double | kg | - | Mass, from volume (or surface, where open) and density.
+bodies[].com | double[3] | m | world | Centre of mass at rest.
+bodies[].contacts | list of struct | - | - | Contacts that carry it; their forces balance the weight.
+bodies[].contacts[].with_region | int64 | id | - | The region that it touches there.
+bodies[].contacts[].point | double[3] | m | world | Where it touches.
+bodies[].contacts[].normal | double[3] | 1 | world | Unit normal towards the object.
+bodies[].contacts[].force | double[3] | N | world | Force on the object.
+capture | struct, captures | - | - | Quality of the capture.
+capture.name | string | - | - | Name of its folder.
+capture.estimate | string | - | - | Which estimate of the camera poses was taken: markers, article or joint.
+capture.input_sha256 | string? | - | - | SHA-256 of its input files; null where it was simulated.
+capture.views | int64 | count | - | Photographs that are used.
+capture.markers | int64 | count | - | Markers that were found, over the used photographs.
+capture.reprojection_before_px | double? | px | - | Median distance of corners, estimate from markers alone.
+capture.reprojection_px | double? | px | - | Median distance of corners, estimate that was taken.
+capture.depth_mm | double? | mm | - | Median distance of board points, measured by depth, from the board's plane.
+capture.depth_offset_m | double | m | - | Constant error of depth that was found.
+capture.depth_scale | double | 1 | - | Factor of depth that was found.
+capture.print_scale | double | 1 | - | Size of the printed board over its nominal size.
+capture.identified | list of string | - | - | Parameters of the depth correction that the capture determines.
+capture.depth_corrected | bool | - | - | Whether stored depth is corrected by them.
+capture.undistorted | bool | - | - | Whether the lens' distortion was taken out of the images.
+capture.converged | bool | - | - | Whether the estimate converged.
+capture.iterations | int64 | count | - | Steps of the estimate.
+capture.cloud_points | int64 | count | - | Points of the merged cloud.
+capture.measured_share | double? | 1 | - | Median over the mirror views of the share that is measured and not filled.
+capture.left_out | list of struct | - | - | Photographs that are not used.
+capture.left_out[].number | int64 | id | - | Number in the photograph's name.
+capture.left_out[].status | string | - | - | Short word for why.
+capture.left_out[].why | string | - | - | Why, in words.
+capture.notes | list of string | - | - | What else is worth knowing of the capture.
+capture.pose_mm | double? | mm | - | Median error of camera positions against truth; null where there is none.
+capture.pose_deg | double? | deg | - | Median error of camera directions against truth.
+capture.cloud_median_mm | double? | mm | - | Median distance of the cloud from the true surface.
+capture.cloud_p95_mm | double? | mm | - | 95th percentile of that distance.
+capture.completeness | double? | 1 | - | Share of the true surface that the cloud covers.
+capture.depth_median_mm | double? | mm | - | Median over the views of the error of the depth that the other views give.
+""",
+    "views": """
+pose_id | int64 | id | - | {pose_id}
+parent_id | int64 | id | - | The pair: the pose id of its input view.
+role | string | - | - | {role}
+scene_id | int64 | id | - | {scene_id}
+category | string | - | - | {category}
+T_world_cam | double[16] | m | world, camera | Pose of the camera: takes camera coordinates to world coordinates{by_row}
+inclination_rad | double | rad | world | Angle of the optical axis below the horizontal.
+yaw_rad | double | rad | world | Direction from the scene to the camera about the vertical axis, from the x axis.
+width | int64 | px | - | Columns of the image.
+height | int64 | px | - | Rows of the image.
+fx | double | px | - | Focal length along u.
+fy | double | px | - | Focal length along v.
+cx | double | px | image | {centre}
+cy | double | px | image | {centre}
+cx_opencv | double | px | image | {centre_opencv}
+cy_opencv | double | px | image | {centre_opencv}
+depth_units_per_m | double | 1/m | - | Units of its depth images in a metre; depth is z along the optical axis.
+d_z_m | double | m | - | Distance of the input camera from the object's front along the axis: places the mirror camera.
+files | list of struct | - | - | Its images and patches.
+files[].path | string | - | - | Path below the dataset's folder; in tars the member of that name.
+files[].bytes | int64 | byte | - | Size of the file.
+files[].sha256 | string | - | - | SHA-256 of the file.
+object_pixels | int64? | count | - | Pixels of all objects; null in projected views.
+visible_fraction | double? | 1 | - | Share that is seen of the first object's pixels, {share_seen}; null in projected views.
+mirror_agreement | struct? | - | - | Input depth carried into the mirror view, against mirror depth; null below 50 pixels.
+mirror_agreement.median_mm | double | mm | - | Median difference on the object.
+mirror_agreement.share | double | 1 | - | Share of pixels within the job's bound.
+projected_filled_share | double? | 1 | - | Share of the mirror image that the projection fills; of projected views.
+projected_hidden_share | double? | 1 | - | Share of the filled pixels that show what the mirror camera cannot see.
+patch_object_fraction | double? | 1 | - | {patch}
+capture | struct, captures | - | - | The photograph.
+capture.number | int64 | id | - | Number in the photograph's name.
+capture.markers | int64 | count | - | Markers that were found in it.
+capture.reprojection_before_px | double? | px | - | Median distance of its corners, estimate from markers alone.
+capture.reprojection_px | double? | px | - | Median distance of its corners, estimate that was taken.
+capture.depth_mm | double? | mm | - | Median distance of board points in its depth from the board's plane.
+capture.pose_mm | double? | mm | - | Error of its position against truth; null where there is none.
+capture.pose_deg | double? | deg | - | Error of its direction against truth.
+capture.measured_share | double? | 1 | - | Of mirror views: share that is measured and not filled.
+capture.depth_median_mm | double? | mm | - | Of input views: error of the depth that the other views give for it.
+capture.sources | list of int64? | id | - | Of mirror views: numbers of the photographs that it is made of.
+""",
+    "objects": """
+pose_id | int64 | id | - | {pose_id}
+role | string | - | - | {role}
+region_id | int64 | id | - | {region}
+scene_id | int64 | id | - | {scene_id}
+category | string | - | - | {category}
+instance_id | string | - | - | {instance}
+u | int64 | px | image | Column of the object's origin; -1 outside the image or behind the camera.
+v | int64 | px | image | Row of the object's origin; -1 outside the image or behind the camera.
+T_cam_obj | double[16] | m | camera, object | Pose: takes object coordinates to camera coordinates{by_row}
+bbox_xywh | int64[4] | px | image | Bounding box of its pixels: left, top, width, height.
+pixels | int64 | count | - | Pixels of it that are seen.
+visible_fraction | double | 1 | - | Share that is seen of its own pixels, {share_seen}.
+patch_object_fraction | double? | 1 | - | {patch}
+""",
+    "assets": """
+instance_id | string | - | - | {instance}
+category | string | - | - | What the shape is: mug, can, ..., or table.
+source | string | - | - | {source}
+licence | string | - | - | Licence of the shape; `unknown` where nobody said.
+path | string? | - | - | File within its source; null where the shape was generated.
+sha256 | string | - | - | SHA-256 of the source file, or of the generated arrays.
+extents_m | double[3] | m | object | Size of the bounding box along the axes.
+volume_m3 | double? | m3 | - | Volume; null where the mesh is open.
+watertight | bool | - | - | Whether the mesh bounds a volume.
+T_source_to_object | double[16] | m | object, source | Takes scaled source coordinates to object coordinates{by_row}
+scale | double | 1 | - | {scale}
+split | string | - | - | train, val or test, by the instance's id: no shape is in two.
+notes | list of string? | - | - | What was repaired or left out.
+""",
+    "failures": """
+scene_id | int64 | id | - | {scene_id}
+category | string | - | - | {category}
+stage | string | - | - | The step that refused: assets, plan, settle, views, check, ...
+kind | string | - | - | intrinsic (of job and seed) or environmental (killed, time, memory).
+reason | string | - | - | A short stable word.
+detail | string | - | - | A sentence, with the number that was measured.
+attempts | int64 | count | - | How often it was tried.
+""",
+    "timings": """
+scene_id | int64 | id | - | {scene_id}
+category | string | - | - | {category}
+stages | list of struct | - | - | Time by stage.
+stages[].name | string | - | - | The stage.
+stages[].seconds | double | s | - | Time it took.
+effects | list of struct | - | - | Time by effect, of those that have one; part of the stages' time.
+effects[].name | string | - | - | The effect.
+effects[].seconds | double | s | - | Time it took.
+total_s | double | s | - | Sum over the stages.
+""",
+}
+"""A line is a column: path | type, with a ? where it may be missing, and the kind of dataset if only one has it | unit |
+frame | meaning."""
 
 
-def _rest(inside: str, of: Of = "both") -> tuple[Column, ...]:
-    """Quality of rest: of one object, or of the worst of a scene."""
-    rows = (
-        ("penetration_mm", "mm", "Deepest overlap of the true meshes at rest."),
-        ("hover_gap_mm", "mm", "Gap between the object and what carries it."),
-        (
-            "support_margin_mm",
-            "mm",
-            "How far the centre of mass lies inside the hull of the contacts, seen from above.",
-        ),
-        (
-            "residual_speed_mm_s",
-            "mm/s",
-            "Drift of the farthest point in the simulation's last window, before correction.",
-        ),
-        ("recheck_move_mm", "mm", "Motion when it was let go again, until 0.2 mm; null where it was not."),
-        ("recheck_turn_deg", "deg", "Turn when it was let go again; null where it was not."),
-        ("equilibrium_residual", "1", "Share of its weight that the contact forces cannot balance."),
-    )
-    return tuple(
-        Column(inside + name, "double", meaning, unit, null=name.startswith("recheck"), of=of)
-        for name, unit, meaning in rows
-    )
+def _read(line: str) -> Column:
+    """The column of a line of `_ROWS`."""
+    path, kind, unit, frame, meaning = line.split(" | ")
+    type_, _, of = kind.partition(", ")
+    unit, frame = ("" if word == "-" else word for word in (unit, frame))
+    null = type_.endswith("?")
+    return Column(path, type_.rstrip("?"), meaning.format_map(_SHARED), unit, frame, null, of or "both")  # type: ignore[arg-type]
 
 
 COLUMNS: dict[str, tuple[Column, ...]] = {
-    "scenes": (
-        Column("scene_id", "int64", _SCENE_ID, "id"),
-        Column("category", "string", _CATEGORY),
-        Column("instance_id", "string", _INSTANCE),
-        Column("source", "string", _SOURCE),
-        Column("table_id", "string", "The table's shape: the key of `assets`."),
-        Column("object_scale", "double", "Factor from the source's coordinates to metres.", "1"),
-        Column(
-            "T_world_obj",
-            "double[16]",
-            "Pose of the first object at rest: takes object coordinates to world coordinates; 4 x 4, row by row.",
-            "m",
-            "world, object",
-        ),
-        Column(
-            "T_world_table",
-            "double[16]",
-            "Pose of the table: takes table coordinates to world coordinates; 4 x 4, row by row.",
-            "m",
-            "world, object",
-        ),
-        Column("pose", "string", "How the objects started: upright, tumbled or placed.", of="scenes"),
-        Column("redraws", "int64", "How often the start position was drawn again before one was valid.", "count"),
-        Column("effects", "list of string", "Names of the effects that ran."),
-        Column("skipped", "list of struct", "Effects that did not run."),
-        Column("skipped[].effect", "string", "Name of the effect."),
-        Column("skipped[].why", "string", "Why it was not needed."),
-        *_rest("", of="scenes"),
-        Column("settle_s", "double", "Simulated time until rest; the longest of all objects.", "s", of="scenes"),
-        Column("raycast_checked", "bool", "Whether every view was checked against the ray caster."),
-        Column("settings_digest", "string", "SHA-256 of the settings and sources that shape a scene."),
-        Column("bodies", "list of struct", "Every object of the scene.", of="scenes"),
-        Column("bodies[].region_id", "int64", _REGION, "id"),
-        Column("bodies[].category", "string", _CATEGORY),
-        Column("bodies[].instance_id", "string", _INSTANCE),
-        Column("bodies[].source", "string", _SOURCE),
-        Column("bodies[].object_scale", "double", "Factor from the source's coordinates to metres.", "1"),
-        Column(
-            "bodies[].T_world_obj",
-            "double[16]",
-            "Pose at rest: takes object coordinates to world coordinates; 4 x 4, row by row.",
-            "m",
-            "world, object",
-        ),
-        Column("bodies[].redraws", "int64", "How often its start position was drawn again.", "count"),
-        *_rest("bodies[]."),
-        Column("bodies[].mass_kg", "double", "Mass, from volume (or surface, where open) and density.", "kg"),
-        Column("bodies[].com", "double[3]", "Centre of mass at rest.", "m", "world"),
-        Column("bodies[].contacts", "list of struct", "Contacts that carry it; their forces balance the weight."),
-        Column("bodies[].contacts[].with_region", "int64", "The region that it touches there.", "id"),
-        Column("bodies[].contacts[].point", "double[3]", "Where it touches.", "m", "world"),
-        Column("bodies[].contacts[].normal", "double[3]", "Unit normal towards the object.", "1", "world"),
-        Column("bodies[].contacts[].force", "double[3]", "Force on the object.", "N", "world"),
-        Column("capture", "struct", "Quality of the capture.", of="captures"),
-        Column("capture.name", "string", "Name of its folder."),
-        Column(
-            "capture.estimate", "string", "Which estimate of the camera poses was taken: markers, article or joint."
-        ),
-        Column("capture.input_sha256", "string", "SHA-256 of its input files; null where it was simulated.", null=True),
-        Column("capture.views", "int64", "Photographs that are used.", "count"),
-        Column("capture.markers", "int64", "Markers that were found, over the used photographs.", "count"),
-        Column(
-            "capture.reprojection_before_px",
-            "double",
-            "Median distance of corners, estimate from markers alone.",
-            "px",
-            null=True,
-        ),
-        Column(
-            "capture.reprojection_px", "double", "Median distance of corners, estimate that was taken.", "px", null=True
-        ),
-        Column(
-            "capture.depth_mm",
-            "double",
-            "Median distance of board points, measured by depth, from the board's plane.",
-            "mm",
-            null=True,
-        ),
-        Column("capture.depth_offset_m", "double", "Constant error of depth that was found.", "m"),
-        Column("capture.depth_scale", "double", "Factor of depth that was found.", "1"),
-        Column("capture.print_scale", "double", "Size of the printed board over its nominal size.", "1"),
-        Column(
-            "capture.identified", "list of string", "Parameters of the depth correction that the capture determines."
-        ),
-        Column("capture.depth_corrected", "bool", "Whether stored depth is corrected by them."),
-        Column("capture.undistorted", "bool", "Whether the lens' distortion was taken out of the images."),
-        Column("capture.converged", "bool", "Whether the estimate converged."),
-        Column("capture.iterations", "int64", "Steps of the estimate.", "count"),
-        Column("capture.cloud_points", "int64", "Points of the merged cloud.", "count"),
-        Column(
-            "capture.measured_share",
-            "double",
-            "Median over the mirror views of the share that is measured and not filled.",
-            "1",
-            null=True,
-        ),
-        Column("capture.left_out", "list of struct", "Photographs that are not used."),
-        Column("capture.left_out[].number", "int64", "Number in the photograph's name.", "id"),
-        Column("capture.left_out[].status", "string", "Short word for why."),
-        Column("capture.left_out[].why", "string", "Why, in words."),
-        Column("capture.notes", "list of string", "What else is worth knowing of the capture."),
-        Column(
-            "capture.pose_mm",
-            "double",
-            "Median error of camera positions against truth; null where there is none.",
-            "mm",
-            null=True,
-        ),
-        Column("capture.pose_deg", "double", "Median error of camera directions against truth.", "deg", null=True),
-        Column(
-            "capture.cloud_median_mm", "double", "Median distance of the cloud from the true surface.", "mm", null=True
-        ),
-        Column("capture.cloud_p95_mm", "double", "95th percentile of that distance.", "mm", null=True),
-        Column("capture.completeness", "double", "Share of the true surface that the cloud covers.", "1", null=True),
-        Column(
-            "capture.depth_median_mm",
-            "double",
-            "Median over the views of the error of the depth that the other views give.",
-            "mm",
-            null=True,
-        ),
-    ),
-    "views": (
-        Column("pose_id", "int64", _POSE_ID, "id"),
-        Column("parent_id", "int64", "The pair: the pose id of its input view.", "id"),
-        Column("role", "string", _ROLE),
-        Column("scene_id", "int64", _SCENE_ID, "id"),
-        Column("category", "string", _CATEGORY),
-        Column(
-            "T_world_cam",
-            "double[16]",
-            "Pose of the camera: takes camera coordinates to world coordinates; 4 x 4, row by row.",
-            "m",
-            "world, camera",
-        ),
-        Column("inclination_rad", "double", "Angle of the optical axis below the horizontal.", "rad", "world"),
-        Column(
-            "yaw_rad",
-            "double",
-            "Direction from the scene to the camera about the vertical axis, from the x axis.",
-            "rad",
-            "world",
-        ),
-        Column("width", "int64", "Columns of the image.", "px"),
-        Column("height", "int64", "Rows of the image.", "px"),
-        Column("fx", "double", "Focal length along u.", "px"),
-        Column("fy", "double", "Focal length along v.", "px"),
-        Column("cx", "double", "Principal point, where the centre of the first pixel is at 0.5.", "px", "image"),
-        Column("cy", "double", "Principal point, where the centre of the first pixel is at 0.5.", "px", "image"),
-        Column(
-            "cx_opencv",
-            "double",
-            "Principal point, where the centre of the first pixel is at 0, as in OpenCV.",
-            "px",
-            "image",
-        ),
-        Column(
-            "cy_opencv",
-            "double",
-            "Principal point, where the centre of the first pixel is at 0, as in OpenCV.",
-            "px",
-            "image",
-        ),
-        Column(
-            "depth_units_per_m",
-            "double",
-            "Units of its depth images in a metre; depth is z along the optical axis.",
-            "1/m",
-        ),
-        Column(
-            "d_z_m",
-            "double",
-            "Distance of the input camera from the object's front along the axis: places the mirror camera.",
-            "m",
-        ),
-        Column("files", "list of struct", "Its images and patches."),
-        Column("files[].path", "string", "Path below the dataset's folder; in tars the member of that name."),
-        Column("files[].bytes", "int64", "Size of the file.", "byte"),
-        Column("files[].sha256", "string", "SHA-256 of the file."),
-        Column("object_pixels", "int64", "Pixels of all objects; null in projected views.", "count", null=True),
-        Column(
-            "visible_fraction",
-            "double",
-            "Share that is seen of the first object's pixels, unoccluded and also outside the frame; null in projected views.",
-            "1",
-            null=True,
-        ),
-        Column(
-            "mirror_agreement",
-            "struct",
-            "Input depth carried into the mirror view, against mirror depth; null below 50 pixels.",
-            null=True,
-        ),
-        Column("mirror_agreement.median_mm", "double", "Median difference on the object.", "mm"),
-        Column("mirror_agreement.share", "double", "Share of pixels within the job's bound.", "1"),
-        Column(
-            "projected_filled_share",
-            "double",
-            "Share of the mirror image that the projection fills; of projected views.",
-            "1",
-            null=True,
-        ),
-        Column(
-            "projected_hidden_share",
-            "double",
-            "Share of the filled pixels that show what the mirror camera cannot see.",
-            "1",
-            null=True,
-        ),
-        Column("patch_object_fraction", "double", _PATCH, "1", null=True),
-        Column("capture", "struct", "The photograph.", of="captures"),
-        Column("capture.number", "int64", "Number in the photograph's name.", "id"),
-        Column("capture.markers", "int64", "Markers that were found in it.", "count"),
-        Column(
-            "capture.reprojection_before_px",
-            "double",
-            "Median distance of its corners, estimate from markers alone.",
-            "px",
-            null=True,
-        ),
-        Column(
-            "capture.reprojection_px",
-            "double",
-            "Median distance of its corners, estimate that was taken.",
-            "px",
-            null=True,
-        ),
-        Column(
-            "capture.depth_mm",
-            "double",
-            "Median distance of board points in its depth from the board's plane.",
-            "mm",
-            null=True,
-        ),
-        Column(
-            "capture.pose_mm",
-            "double",
-            "Error of its position against truth; null where there is none.",
-            "mm",
-            null=True,
-        ),
-        Column("capture.pose_deg", "double", "Error of its direction against truth.", "deg", null=True),
-        Column(
-            "capture.measured_share",
-            "double",
-            "Of mirror views: share that is measured and not filled.",
-            "1",
-            null=True,
-        ),
-        Column(
-            "capture.depth_median_mm",
-            "double",
-            "Of input views: error of the depth that the other views give for it.",
-            "mm",
-            null=True,
-        ),
-        Column(
-            "capture.sources",
-            "list of int64",
-            "Of mirror views: numbers of the photographs that it is made of.",
-            "id",
-            null=True,
-        ),
-    ),
-    "objects": (
-        Column("pose_id", "int64", _POSE_ID, "id"),
-        Column("role", "string", _ROLE),
-        Column("region_id", "int64", _REGION, "id"),
-        Column("scene_id", "int64", _SCENE_ID, "id"),
-        Column("category", "string", _CATEGORY),
-        Column("instance_id", "string", _INSTANCE),
-        Column(
-            "u", "int64", "Column of the object's origin; -1 outside the image or behind the camera.", "px", "image"
-        ),
-        Column("v", "int64", "Row of the object's origin; -1 outside the image or behind the camera.", "px", "image"),
-        Column(
-            "T_cam_obj",
-            "double[16]",
-            "Pose: takes object coordinates to camera coordinates; 4 x 4, row by row.",
-            "m",
-            "camera, object",
-        ),
-        Column("bbox_xywh", "int64[4]", "Bounding box of its pixels: left, top, width, height.", "px", "image"),
-        Column("pixels", "int64", "Pixels of it that are seen.", "count"),
-        Column(
-            "visible_fraction",
-            "double",
-            "Share that is seen of its own pixels, unoccluded and also outside the frame.",
-            "1",
-        ),
-        Column("patch_object_fraction", "double", _PATCH, "1", null=True),
-    ),
-    "assets": (
-        Column("instance_id", "string", _INSTANCE),
-        Column("category", "string", "What the shape is: mug, can, ..., or table."),
-        Column("source", "string", _SOURCE),
-        Column("licence", "string", "Licence of the shape; `unknown` where nobody said."),
-        Column("path", "string", "File within its source; null where the shape was generated.", null=True),
-        Column("sha256", "string", "SHA-256 of the source file, or of the generated arrays."),
-        Column("extents_m", "double[3]", "Size of the bounding box along the axes.", "m", "object"),
-        Column("volume_m3", "double", "Volume; null where the mesh is open.", "m3", null=True),
-        Column("watertight", "bool", "Whether the mesh bounds a volume."),
-        Column(
-            "T_source_to_object",
-            "double[16]",
-            "Takes scaled source coordinates to object coordinates; 4 x 4, row by row.",
-            "m",
-            "object, source",
-        ),
-        Column("scale", "double", "Factor from the source's coordinates to metres.", "1"),
-        Column("split", "string", "train, val or test, by the instance's id: no shape is in two."),
-        Column("notes", "list of string", "What was repaired or left out.", null=True),
-    ),
-    "failures": (
-        Column("scene_id", "int64", _SCENE_ID, "id"),
-        Column("category", "string", _CATEGORY),
-        Column("stage", "string", "The step that refused: assets, plan, settle, views, check, ..."),
-        Column("kind", "string", "intrinsic (of job and seed) or environmental (killed, time, memory)."),
-        Column("reason", "string", "A short stable word."),
-        Column("detail", "string", "A sentence, with the number that was measured."),
-        Column("attempts", "int64", "How often it was tried.", "count"),
-    ),
-    "timings": (
-        Column("scene_id", "int64", _SCENE_ID, "id"),
-        Column("category", "string", _CATEGORY),
-        Column("stages", "list of struct", "Time by stage."),
-        Column("stages[].name", "string", "The stage."),
-        Column("stages[].seconds", "double", "Time it took.", "s"),
-        Column("effects", "list of struct", "Time by effect, of those that have one; part of the stages' time."),
-        Column("effects[].name", "string", "The effect."),
-        Column("effects[].seconds", "double", "Time it took.", "s"),
-        Column("total_s", "double", "Sum over the stages.", "s"),
-    ),
+    table: tuple(_read(line) for line in text.strip().splitlines()) for table, text in _ROWS.items()
 }
 """Every column of every table, in the order of the schema."""
 

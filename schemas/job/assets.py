@@ -1,9 +1,4 @@
-"""The `assets` branch of a job, the names of categories, and patterns of file names.
-
-- Patterns of file names, as `Path.glob` reads them, for paths that are already known.
-- Names of categories: what a user may call them, and which ones the sources of a job offer.
-- The `assets` branch of a job: where objects and tables come from.
-"""
+"""The `assets` branch of a job, the names of categories, and patterns of file names."""
 
 import itertools
 import math
@@ -101,9 +96,8 @@ def _usable(name: str) -> str:
     if name.lower() in _TAKEN:
         raise ValueError("a dataset has a folder of this name: choose another")
     if name.isdigit():
-        raise ValueError(
-            f"digits alone would be read as a number by those who query the dataset: write a letter too, such as n{name}"
-        )
+        told = f"write a letter too, such as n{name}"
+        raise ValueError(f"digits alone would be read as a number by those who query the dataset: {told}")
     return name
 
 

@@ -3,9 +3,7 @@
 A job with this branch makes captures in place of scenes: capture number n is the scene with id first_scene + n.
 """
 
-import copy
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -23,7 +21,7 @@ from schemas.base import (
     Text,
 )
 from schemas.job.assets import CategoryName
-from schemas.job.keys import set_key
+from schemas.job.keys import with_defaults
 from schemas.job.views import Distortion, Exposure, RgbNoise
 
 Estimate = Literal["markers", "article", "joint"]
@@ -107,9 +105,7 @@ class HiddenMarkers(Frozen):
 class RegistrationError(Frozen):
     """Error of the depth camera's assumed place: what registers depth to colour uses this wrong pose."""
 
-    shift_m: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
-        default_factory=lambda: [0.010, 0.0, 0.0]
-    )
+    shift_m: Annotated[list[float], Field(min_length=3, max_length=3, default_factory=lambda: [0.010, 0.0, 0.0])]
     """Error of the assumed place along the axes of the colour camera."""
     turn_deg: float = 0.0
     """Error of the assumed orientation, about the vertical axis of the colour camera."""
@@ -218,9 +214,8 @@ class Captures(Frozen):
         if (self.source == "folders") != bool(self.folders):
             raise ValueError("folders must be named for source: folders, and for it alone")
         if self.source == "simulate" and self.simulate.views > self.most_views:
-            raise ValueError(
-                f"simulate.views is {self.simulate.views}, and most_views is {self.most_views}: raise most_views"
-            )
+            told = f"simulate.views is {self.simulate.views}, and most_views is {self.most_views}: raise most_views"
+            raise ValueError(told)
         return self
 
 
@@ -231,19 +226,10 @@ def with_capture_keys(tree: Mapping[str, Any]) -> dict[str, Any]:
     is registered to its colour camera. A capture takes as long as dozens of scenes, so each is committed by itself.
     """
     captures = tree.get("captures")
-    filled = copy.deepcopy(dict(tree))
     if not isinstance(captures, Mapping):
-        return filled
+        return with_defaults(tree, {})
+    usual = {"pairs_per_scene": captures.get("most_views", Captures.model_fields["most_views"].default)}
+    usual |= {"cameras.depth.enabled": False, "run.range_size": 1, "run.scene_timeout_s": 1800.0}
     if isinstance(folders := captures.get("folders"), list) and folders:
-        filled.setdefault("scenes", len(folders))
-    most_views = captures.get("most_views", Captures.model_fields["most_views"].default)
-    usual = {
-        "pairs_per_scene": most_views,
-        "cameras.depth.enabled": False,
-        "run.range_size": 1,
-        "run.scene_timeout_s": 1800.0,
-    }
-    for path, value in usual.items():
-        with suppress(ValueError):
-            set_key(filled, path, value, keep=True)
-    return filled
+        usual["scenes"] = len(folders)
+    return with_defaults(tree, usual)

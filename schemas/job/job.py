@@ -1,32 +1,20 @@
 """The job file: one tree of frozen models, parsed once.
 
-- The `check`, `output` and `run` branches of a job: what is checked, how files are laid out, how the work is driven.
-- The number of scenes in a range, where the job does not give it.
-- Presets: defaults for several keys at once, chosen from the measurement in docs/tradeoff.
-
 Every key but `name` has a default, and an unknown key is an error.
 """
 
-import copy
 import math
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    SerializerFunctionWrapHandler,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, field_validator, model_serializer, model_validator
+from pydantic import SerializerFunctionWrapHandler as Dump
 
 from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight
 from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknown, offered_by, with_categories
 from schemas.job.captures import Captures, with_capture_keys
-from schemas.job.keys import set_key
+from schemas.job.keys import with_defaults
 from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
 from schemas.job.views import Cameras, Images, Render, SensorEffects
 
@@ -113,12 +101,8 @@ def with_preset(tree: Mapping[str, Any]) -> dict[str, Any]:
 
     An unknown preset is left to validation; a branch that is no mapping is left as it is.
     """
-    filled = copy.deepcopy(dict(tree))
-    chosen = next((keys for name, keys in PRESETS.items() if name == filled.get("preset", "balanced")), {})
-    for path, value in chosen.items():
-        with suppress(ValueError):
-            set_key(filled, path, value, keep=True)
-    return filled
+    preset = tree.get("preset", "balanced")
+    return with_defaults(tree, next((keys for name, keys in PRESETS.items() if name == preset), {}))
 
 
 MOST_SCENE_IDS = 10**10
@@ -200,9 +184,8 @@ class Job(Frozen):
     @model_validator(mode="after")
     def _has_ids(self) -> "Job":
         if self.stop_scene > MOST_SCENE_IDS:
-            raise ValueError(
-                f"first_scene + scenes is {self.stop_scene}, and names of files have room for ids below {MOST_SCENE_IDS}"
-            )
+            told = f"and names of files have room for ids below {MOST_SCENE_IDS}"
+            raise ValueError(f"first_scene + scenes is {self.stop_scene}, {told}")
         return self
 
     @model_validator(mode="after")
@@ -214,27 +197,19 @@ class Job(Frozen):
         return self
 
     @model_validator(mode="after")
-    def _suits_captures(self) -> "Job":
+    def _agrees(self) -> "Job":
         if self.captures is not None and (unfit := _unfit_for_captures(self, self.captures)):
             raise ValueError(unfit)
-        return self
-
-    @model_validator(mode="after")
-    def _agrees(self) -> "Job":
         if self.images.projection.enabled and not self.cameras.mirror.enabled:
-            raise ValueError(
-                "images.projection.enabled is true and cameras.mirror.enabled is false: what is projected is what the "
-                "mirror camera would see; set images.projection.enabled: false too"
-            )
+            told = "what is projected is what the mirror camera would see; set images.projection.enabled: false too"
+            raise ValueError(f"images.projection.enabled is true and cameras.mirror.enabled is false: {told}")
         if self.sensor.changes_rgb and not self.render.rgb:
-            raise ValueError(
-                "render.rgb is false and sensor asks for an effect on RGB: leave out sensor.distortion, sensor.rgb_noise "
-                "and sensor.exposure"
-            )
+            told = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
+            raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {told}")
         return self
 
     @model_serializer(mode="wrap")
-    def _leave_out_absent_captures(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _leave_out_absent_captures(self, dump: Dump) -> dict[str, Any]:
         """A job of scenes is written, and digested, as it was before there were captures."""
         keys: dict[str, Any] = dump(self)
         if self.captures is None:
@@ -244,19 +219,15 @@ class Job(Frozen):
     @property
     def drawn(self) -> Render:
         """How images are drawn: `render`, with the tier of virtual captures where the job makes those."""
-        virtual = self.captures is not None and not self.captures.folders
-        return (
-            self.render.model_copy(update={"tier": self.captures.simulate.tier})
-            if virtual and self.captures
-            else self.render
-        )
+        if self.captures is None or self.captures.folders:
+            return self.render
+        return self.render.model_copy(update={"tier": self.captures.simulate.tier})
 
     @property
     def range_size(self) -> int:
         """Scenes in a range: `run.range_size`, or what follows from the job."""
-        most = self.objects_per_scene.high
-        given = self.run.range_size
-        return given or choose_range_size(self.scenes, most, self.pairs_per_scene, self.start, self.render)
+        most, pairs = self.objects_per_scene.high, self.pairs_per_scene
+        return self.run.range_size or choose_range_size(self.scenes, most, pairs, self.start, self.render)
 
     @property
     def stop_scene(self) -> int:

@@ -1,6 +1,18 @@
 """Dotted keys of a job tree, such as `physics.rest.speed_mm_s` or `assets.objects.0.weight`."""
 
+import copy
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
+
+
+def with_defaults(tree: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a tree with values by dotted key where it has none; a path through a value without keys is left out."""
+    filled = copy.deepcopy(dict(tree))
+    for path, value in defaults.items():
+        with suppress(ValueError):
+            set_key(filled, path, value, keep=True)
+    return filled
 
 
 def set_key(tree: dict[str, Any], path: str, value: object, keep: bool = False) -> None:

@@ -1,10 +1,4 @@
-"""The branches of a job that shape its images: `cameras`, `images`, `render` and `sensor`.
-
-- The `cameras` branch of a job: where cameras stand and what their intrinsics are.
-- The `images` branch of a job: encodings, patches, and the projection of the input cloud.
-- The `render` branch of a job: how RGB is made.
-- The `sensor` branch of a job: effects of a real sensor on images, each off by default.
-"""
+"""The branches of a job that shape its images: `cameras`, `images`, `render` and `sensor`."""
 
 import math
 from typing import Annotated, Literal
@@ -131,10 +125,10 @@ class Images(Frozen):
     def _fits_16_bits(self) -> "Images":
         units = self.depth_range_m.high * self.depth_units_per_m
         if units > 65_535:
-            raise ValueError(
-                f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {units:.0f} "
-                f"units of depth_units_per_m {self.depth_units_per_m:g}: a 16-bit image holds at most 65535"
+            told = (
+                f"{units:.0f} units of depth_units_per_m {self.depth_units_per_m:g}: a 16-bit image holds at most 65535"
             )
+            raise ValueError(f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {told}")
         return self
 
 

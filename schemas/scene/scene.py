@@ -1,8 +1,4 @@
-"""A scene from its plan to its output: effects, plan, settled objects, posed geometry.
-
-- Which effects a scene runs: what the plan decides, and what every step asks.
-- The plan of a scene: all that is random, drawn before anything moves.
-"""
+"""A scene from its plan to its output: effects, plan, settled objects, posed geometry."""
 
 import hashlib
 from collections.abc import Mapping

@@ -1,7 +1,4 @@
-"""What is in a scene: region ids, shapes with materials and mass, lights and background. Arrays are read-only.
-
-- Region ids: the pixel values of segment images; objects count from REGION_FIRST_OBJECT.
-"""
+"""What is in a scene: region ids, shapes with materials and mass, lights and background. Arrays are read-only."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,4 @@
-"""Cameras and views of a scene: raw buffers, stored views with their labels, pairs of views.
-
-- A camera: intrinsics and a pose in the optical frame (x right, y down, z forward).
-"""
+"""Cameras and views of a scene: raw buffers, stored views with their labels, pairs of views."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -26,10 +26,15 @@ class Parser(argparse.ArgumentParser):
         super().error(plain_line(message, 400))
 
 
+def refusal(text: str, told: str) -> argparse.ArgumentTypeError:
+    """What was typed, short and printable, and what is wrong with it."""
+    return argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}{told}")
+
+
 def read_index(text: str) -> int:
     """A whole number from 0 up. Raises argparse.ArgumentTypeError."""
     if not (text.isdecimal() and len(text) <= 18):
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)} is not a whole number from 0 up")
+        raise refusal(text, " is not a whole number from 0 up")
     return int(text)
 
 
@@ -68,12 +73,9 @@ def read_job(text: str) -> Path:
 
 def read_place(text: str) -> str:
     """A folder or the address of a bucket. Raises argparse.ArgumentTypeError where none can have that name."""
-    if (
-        not text
-        or len(text) > MOST_PATH_CHARACTERS
-        or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text)
-    ):
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)} cannot be the name of a file, folder or bucket")
+    hostile = any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text)
+    if hostile or not 0 < len(text) <= MOST_PATH_CHARACTERS:
+        raise refusal(text, " cannot be the name of a file, folder or bucket")
     return text
 
 
@@ -82,12 +84,12 @@ def read_address(text: str) -> str:
     if text.startswith("ray://"):
         told = "Verso runs beside a node of the cluster and not through Ray's client: write HOST:PORT (port 6379 by default) on"
         told += " a machine of the cluster, or `ray submit CLUSTER.yaml deploy/submit.py JOB` from elsewhere"
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+        raise refusal(text, f": {told}")
     host = r"[\w-]{1,63}(?:\.[\w-]{1,63})*|\[[0-9a-fA-F:.]{2,45}\]"
     found = re.fullmatch(rf"(?:{host}):(\d{{1,5}})", text, re.ASCII)
     if text != "auto" and not (found and 0 < int(found[1]) < 65536):
         told = "write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+        raise refusal(text, f": {told}")
     return text
 
 
@@ -99,7 +101,7 @@ def read_listener(text: str) -> str:
     try:
         return read_address(text)
     except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}") from None
+        raise refusal(text, f": {told}") from None
 
 
 def read_port(text: str) -> int:
@@ -114,7 +116,7 @@ def read_host(text: str) -> str:
     bare = text.removeprefix("[").removesuffix("]")
     if not re.fullmatch(r"[\w-]{1,63}(?:\.[\w-]{1,63})*|[0-9a-fA-F:.]{2,45}", bare, re.ASCII):
         told = "write a name or an address without a port, such as 127.0.0.1 or 0.0.0.0"
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+        raise refusal(text, f": {told}")
     return bare
 
 
@@ -122,7 +124,7 @@ def read_http(text: str) -> str:
     """The address of an HTTP server. Raises argparse.ArgumentTypeError."""
     if not re.fullmatch(r"https?://[^\s/?#@]+(?:/[^\s?#]*)?", text, re.ASCII):
         told = "write it as http://HOST:PORT, as `ray start` prints it for the dashboard (port 8265 by default)"
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+        raise refusal(text, f": {told}")
     return text.rstrip("/")
 
 
@@ -130,28 +132,44 @@ def read_job_id(text: str) -> str:
     """The id of a job in a queue. Raises argparse.ArgumentTypeError."""
     if not re.fullmatch(JOB_ID, text, re.ASCII):
         told = "an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+        raise refusal(text, f": {told}")
     return text
 
 
 def read_priority(text: str) -> int:
     """A whole number from -1000 to 1000. Raises argparse.ArgumentTypeError."""
     if not re.fullmatch(r"[+-]?[0-9]{1,4}", text, re.ASCII) or abs(int(text)) > 1000:
-        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)} is not a whole number from -1000 to 1000")
+        raise refusal(text, " is not a whole number from -1000 to 1000")
     return int(text)
 
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
 
 
-def option(*names: str, **settings: Any) -> Option:
-    """An argument of `add_argument`."""
-    return names, settings
+def option(name: str, shown: str | None, text: str | None = None, kind: Any = None, **settings: Any) -> Option:
+    """An argument of `add_argument`: its name, what stands for its value, its help, and what reads it."""
+    usual = {"metavar": shown, "help": text, "type": kind}
+    return (name,), {key: value for key, value in usual.items() if value is not None} | settings
 
 
 def number(name: str, text: str, default: int | None = None) -> Option:
     """An option that takes a whole number from 1 up."""
-    return option(name, type=read_count, metavar="N", default=default, help=text)
+    return option(name, "N", text, read_count, default=default)
+
+
+def path(name: str, shown: str, text: str | None = None, **settings: Any) -> Option:
+    """A file or folder."""
+    return option(name, shown, text, read_path, **settings)
+
+
+def choice(name: str, choices: tuple[str, ...], text: str | None = None, **settings: Any) -> Option:
+    """One of some words."""
+    return option(name, None, text, choices=choices, **settings)
+
+
+def flag(name: str, text: str) -> Option:
+    """An option that is there or not."""
+    return option(name, None, text, action="store_true")
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,19 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from schemas.dataset.layout import COMMITS
 from schemas.errors import InputError, RunError, VersoError
+from schemas.job.job import Job
 from services.cli.environment import host_place
 from services.job.job_file import load_job, pack_job
+from services.job.record import read_job, require_dataset, require_job
+from services.read.verdict import explain_damage
+from services.run.progress import ProgressLine
+from workers.store.local import open_store
+from workers.store.store import Store
 
 if TYPE_CHECKING:
-    from schemas.job.job import Job
     from services.run.run_job import RunResult
-    from workers.store.store import Store
 
 
 def extra(options: argparse.Namespace) -> int:
@@ -44,8 +49,11 @@ Found = TypeVar("Found")
 
 def run(options: argparse.Namespace) -> int:
     """`verso run`."""
-    job = load_job(options.job, _changes(options))
-    from services.run.run_job import RunRequest, run_job
+    named = {"scenes": options.scenes, "first_scene": options.first_scene}
+    named |= {"run.workers": options.workers, "run.shard_size": options.shard_size}
+    changes = [f"{key}={value}" for key, value in named.items() if value is not None]
+    job = load_job(options.job, [*changes, *options.changes])
+    from services.run.run_job import RunRequest, run_job  # takes seconds: a job file that is wrong is told before
 
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
@@ -61,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     return 0 if complete else 1
 
 
-def tell_result(out: str, job: "Job", result: "RunResult") -> tuple[bool, dict[str, Any]]:
+def tell_result(out: str, job: Job, result: "RunResult") -> tuple[bool, dict[str, Any]]:
     """Prints what a run made, where, and what to do next; whether it is complete, and the answer for programs."""
     merged = result.merged
     made, failed = merged.scenes["made"], merged.scenes["intrinsic"] + merged.scenes["environmental"]
@@ -81,13 +89,6 @@ def tell_result(out: str, job: "Job", result: "RunResult") -> tuple[bool, dict[s
     return complete, {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
 
 
-def _changes(options: argparse.Namespace) -> list[str]:
-    """`key=value` of the options that set a key of the job, then those of --set."""
-    named = {"scenes": options.scenes, "first_scene": options.first_scene}
-    named |= {"run.workers": options.workers, "run.shard_size": options.shard_size}
-    return [f"{key}={value}" for key, value in named.items() if value is not None] + options.changes
-
-
 def answer_json(options: argparse.Namespace, answer: dict) -> None:
     """Prints what `--json` asks for: one object in the last line; nothing without it."""
     if options.json:
@@ -104,9 +105,7 @@ def pack(options: argparse.Namespace) -> int:
 
 def status(options: argparse.Namespace) -> int:
     """`verso status`."""
-    from services.job.record import require_job
     from services.read.status import read_status
-    from services.read.verdict import explain_damage
     from services.run.lock import shows_life
 
     store = _dataset(options.out)
@@ -137,7 +136,6 @@ def status(options: argparse.Namespace) -> int:
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
     from services.read.audit import audit, describe_audit, describe_independent, verify_independently
-    from services.read.verdict import explain_damage
     from services.read.verify import verify as read_back
 
     store = _committed(options.out)
@@ -173,10 +171,8 @@ def verify(options: argparse.Namespace) -> int:
     return 1 if faults else 0
 
 
-def _scenes_asked(store: "Store") -> int:
+def _scenes_asked(store: Store) -> int:
     """Scenes of a dataset's job; 0 where job.yaml is damaged."""
-    from services.job.record import read_job
-
     try:
         record = read_job(store)
     except VersoError:
@@ -186,8 +182,6 @@ def _scenes_asked(store: "Store") -> int:
 
 def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]], Found]) -> Found:
     """The result of `work`, which reports how many scenes are done and what is off as it goes."""
-    from services.run.progress import ProgressLine
-
     with closing(ProgressLine(scenes, what)) as line:
         return work(lambda now: line.show(now.scenes, len(now.faults)))
 
@@ -217,7 +211,6 @@ def columns(options: argparse.Namespace) -> int:
 def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
     from services.read.replay import replay_scene
-    from services.read.verdict import explain_damage
 
     if options.repair:
         return _repair(options)
@@ -239,7 +232,6 @@ def replay(options: argparse.Namespace) -> int:
 def _repair(options: argparse.Namespace) -> int:
     """`verso replay --repair`."""
     from services.read.repair import repair
-    from services.read.verdict import explain_damage
 
     store = _committed(options.out)
     with explain_damage(store):
@@ -254,19 +246,13 @@ def _repair(options: argparse.Namespace) -> int:
     return 1 if off else 0
 
 
-def _dataset(out: str) -> "Store":
+def _dataset(out: str) -> Store:
     """The store of an output folder. Raises OutputError where it is none."""
-    from services.job.record import require_dataset
-    from workers.store.local import open_store
-
     return require_dataset(open_store(out))
 
 
-def _committed(out: str) -> "Store":
+def _committed(out: str) -> Store:
     """The store of an output folder, also of one that lost its job.yaml. Raises OutputError where it is none."""
-    from schemas.dataset.layout import COMMITS
-    from workers.store.local import open_store
-
     store = open_store(out)
     return store if next(iter(store.files(COMMITS)), None) is not None else _dataset(out)
 
@@ -274,8 +260,6 @@ def _committed(out: str) -> "Store":
 def report(options: argparse.Namespace) -> int:
     """`verso report`."""
     from services.look.report import write_report
-    from services.read.verdict import explain_damage
-    from workers.store.local import open_store
 
     began = time.monotonic()
     store = open_store(options.out)
@@ -294,7 +278,6 @@ def serve(options: argparse.Namespace) -> int:
     """`verso serve`."""
     from services.look.live import Follower
     from services.look.server import choose_place, ended_by_signal, serving
-    from workers.store.local import open_store
 
     place = choose_place(options.host, options.port, options.token)
     follower = Follower(open_store(options.out), options.scenes)

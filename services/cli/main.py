@@ -1,16 +1,22 @@
-"""The command line: runs the handler of one command and turns errors into exit codes."""
+"""The command line: makes the parser from the table of commands, runs a handler, and turns errors into exit codes."""
 
 import argparse
 import importlib
 import json
 import sys
+from collections.abc import Mapping
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
 
 from schemas.errors import VersoError
+from services.cli.arguments import Command, Parser
 from services.cli.environment import enter_stack_environment
-from services.cli.parser import build_parser
-from services.cli.rows import KEPT
+from services.cli.rows import COMMANDS, JSON, KEPT
 from services.run.supervisor import supervise
+
+if TYPE_CHECKING:
+    Commands = argparse._SubParsersAction[Parser]
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -51,6 +57,54 @@ def _run(options: argparse.Namespace) -> int:
             raise
         print(f"verso: {error.filename or 'a file'}: {remedy}", file=sys.stderr)
         return 1
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Every command and option.
+
+    `options.handler` names the function of a command as `module:function`; `options.starts_ray(options)` tells whether
+    it starts Ray, `options.kept` what remains of its work where it dies, and `options.quiet` whether the terminal is
+    spared what C++ code says.
+    """
+    parser = Parser(
+        prog="verso",
+        description="View-dependent RGB-D datasets for reconstructing objects from a single view.",
+        epilog="`verso COMMAND --help` explains a command and gives an example.",
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    _add_commands(parser.add_subparsers(title="commands", metavar="COMMAND", required=True), COMMANDS)
+    return parser
+
+
+def _add_commands(parsers: "Commands", commands: Mapping[str, Command], above: str = "") -> None:
+    """Adds a parser for each command and, below it, for each of its own commands; `above` are the words before them."""
+    for name, entry in commands.items():
+        words = f"{above}{name}"
+        command = parsers.add_parser(
+            name,
+            help=entry.what,
+            description=entry.what[0].upper() + entry.what[1:] + ".",
+            epilog=f"example: verso {words} {entry.example}".rstrip(),
+        )
+        if entry.commands:
+            below = command.add_subparsers(title="commands", metavar="COMMAND", required=True)
+            _add_commands(below, entry.commands, f"{words} ")
+            continue
+        for names, settings in (JSON, *entry.options):
+            command.add_argument(*names, **settings)
+        if entry.one_of:
+            group = command.add_mutually_exclusive_group(required=True)
+            for names, settings in entry.one_of:
+                group.add_argument(*names, **settings)
+        handler = entry.handler or f"services.cli.commands:{name}"
+        command.set_defaults(handler=handler, starts_ray=entry.starts_ray, kept=entry.kept, quiet=entry.quiet)
+
+
+def _version() -> str:
+    try:
+        return f"verso {version('verso-data')}"
+    except PackageNotFoundError:
+        return "verso (a checkout that is not installed)"
 
 
 if __name__ == "__main__":

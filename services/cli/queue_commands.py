@@ -9,15 +9,14 @@ import urllib.parse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, JobError, RunError, plain_line
+from schemas.errors import InputError, RunError
 from schemas.queue import JobRequest
 from services.cli.commands import answer_json, tell_result
 from services.cli.environment import default_queue
-from services.job.job_file import folders_of, load_job, read_text
+from services.job.job_file import load_job, name_of, read_text, refuse_folders
 from services.queue.queue import Queue, make_queue, new_id, open_queue
 
 if TYPE_CHECKING:
-    from schemas.job.job import Job
     from services.queue.drivers import Ending
     from services.queue.supervise import Drivers
 
@@ -26,8 +25,9 @@ def submit(options: argparse.Namespace) -> int:
     """`verso submit`."""
     changes = [*([f"scenes={options.scenes}"] if options.scenes else []), *options.changes]
     job = load_job(options.job, changes)
-    _refuse_relative_folders(job, options.job)
-    queue = make_queue(_absolute(_named_queue(options)))
+    told = "a job of the queue runs on a cluster: write the whole path, from / on, as all its hosts see it"
+    refuse_folders(job, name_of(options.job), lambda folder: folder.startswith("/") or "://" in folder, told)
+    queue = make_queue(_place(options))
     request = JobRequest(
         id=new_id(),
         name=job.name,
@@ -53,7 +53,7 @@ def jobs(options: argparse.Namespace) -> int:
     """`verso jobs`."""
     from services.queue.listing import as_tree, format_rows, list_jobs
 
-    queue = _open(options)
+    queue = open_queue(_place(options))
     rows = list_jobs(queue)
     print("\n".join(format_rows(rows)) if rows else f"{queue.name} has no jobs")
     if any(row.state in ("queued", "waiting", "running", "cancelling") for row in rows):
@@ -66,7 +66,7 @@ def logs(options: argparse.Namespace) -> int:
     """`verso logs`."""
     from services.queue.listing import follow_logs, header, read_logs
 
-    queue, drivers = _open(options), _drivers(options)
+    queue, drivers = open_queue(_place(options)), _drivers(options)
     view = queue.read(options.id)
     if options.follow:
         if not view.ended:
@@ -88,7 +88,7 @@ def logs(options: argparse.Namespace) -> int:
 
 def cancel(options: argparse.Namespace) -> int:
     """`verso cancel`."""
-    queue = _open(options)
+    queue = open_queue(_place(options))
     view = queue.append(options.id, "cancel")
     if view is None:
         view = queue.read(options.id)
@@ -106,7 +106,7 @@ def supervise(options: argparse.Namespace) -> int:
     """`verso supervise`."""
     from services.queue.supervise import Rules, supervise
 
-    queue = make_queue(_absolute(_named_queue(options)))
+    queue = make_queue(_place(options))
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     rules = Rules(options.at_once, _driver_command(options))
     try:
@@ -122,7 +122,7 @@ def drive(options: argparse.Namespace) -> int:
     from services.queue.drivers import Ending, Sharing, drive
     from services.run.run_job import RunRequest, run_job
 
-    queue = _open(options)
+    queue = open_queue(_place(options))
 
     def work(asked: JobRequest) -> "Ending":
         with tempfile.TemporaryDirectory(prefix="verso-job-") as folder:
@@ -139,16 +139,12 @@ def drive(options: argparse.Namespace) -> int:
     return drive(queue, options.id, options.attempt, work)
 
 
-def _named_queue(options: argparse.Namespace) -> str:
+def _place(options: argparse.Namespace) -> str:
     """The queue that was asked for. Raises InputError where none is."""
     queue = options.queue or default_queue()
     if queue is None:
         raise InputError("which queue? name it by --queue URL or in the environment variable VERSO_QUEUE")
-    return str(queue)
-
-
-def _open(options: argparse.Namespace) -> Queue:
-    return open_queue(_absolute(_named_queue(options)))
+    return _absolute(str(queue))
 
 
 def _drivers(options: argparse.Namespace) -> "Drivers":
@@ -169,16 +165,6 @@ def _driver_command(options: argparse.Namespace) -> list[str]:
 
 def _absolute(place: str) -> str:
     return place.rstrip("/") if "://" in place else str(Path(place).resolve())
-
-
-def _refuse_relative_folders(job: "Job", file: Path) -> None:
-    """Raises JobError for a folder of assets or captures that only this host, or this user, can find."""
-    from workers.assets.external.listing import PYBULLET_DATA
-
-    for key, folder in folders_of(job).items():
-        if folder not in ("", PYBULLET_DATA) and not folder.startswith("/") and "://" not in folder:
-            told = "a job of the queue runs on a cluster: write the whole path, from / on, as all its hosts see it"
-            raise JobError(f"{plain_line(str(file), 300)}: {key}: {plain_line(repr(folder))}: {told}")
 
 
 def _describe_supervisor(queue: Queue) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import shtab
 
 from services.cli.arguments import Command, Option, read_job, read_path, read_place
-from services.cli.parser import build_parser
+from services.cli.main import build_parser
 from services.cli.rows import COMMANDS
 
 

@@ -3,57 +3,32 @@
 from pathlib import Path
 from typing import Final
 
-from services.cli.arguments import (
-    Command,
-    number,
-    option,
-    read_address,
-    read_count,
-    read_counts,
-    read_host,
-    read_http,
-    read_index,
-    read_job,
-    read_job_id,
-    read_listener,
-    read_path,
-    read_place,
-    read_port,
-    read_priority,
-    read_span,
-)
+from services.cli import arguments as read
+from services.cli.arguments import Command, choice, flag, number, option, path
 from services.export.table import FORMATS
-
-"""Those of services/export/formats.py, which a test compares."""
 
 KEPT: Final = "what is committed is kept, the same command goes on from there"
 
-JSON = option("--json", action="store_true", help="print one JSON object as the last line of standard output")
-JOB = option("job", type=read_job, metavar="JOB.yaml")
-OUT = option("out", type=read_place, metavar="OUT")
-SCENE = option("scene", type=read_index, metavar="SCENE")
-SET = option(
-    "--set",
-    action="append",
-    default=[],
-    metavar="KEY=VALUE",
-    dest="changes",
-    help="change a key of the job, for example physics.step_hz=480 (docs/job.md)",
-)
-
-FOLDER: Final = option("folder", type=read_path, metavar="DIR", help="folder of the capture")
-BOARD: Final = option(
-    "--board", type=read_path, metavar="board.json", help="the board's sizes and dictionary (default: 7 x 5 of 60 mm)"
-)
-CATEGORY_HELP: Final = "folder that the capture has in a dataset"
+JSON = flag("--json", "print one JSON object as the last line of standard output")
+JOB = option("job", "JOB.yaml", kind=read.read_job)
+OUT = option("out", "OUT", kind=read.read_place)
+OUT_DIR = option("--out", "DIR", "output folder (default: data/<job name>)", read.read_place)
+NEW_DIR = path("--out", "DIR", "folder of the capture, new or empty", required=True)
+FOLDER = path("folder", "DIR", "folder of the capture")
+BOARD = path("--board", "board.json", "the board's sizes and dictionary (default: 7 x 5 of 60 mm)")
+MORE_SCENES = number("--scenes", "how many scenes; more than before extends the dataset")
+PICTURES = number("--scenes", "scenes with pictures, equally many of each category (default: 24)", 24)
+RETRY = flag("--retry-failed", "try scenes again that failed for environmental reasons")
+SET_HELP = "change a key of the job, for example physics.step_hz=480 (docs/job.md)"
+SET = option("--set", "KEY=VALUE", SET_HELP, action="append", default=[], dest="changes")
 
 CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     "board": Command(
         "write the marker board for printing, at true scale and with a ruler to check the print",
         "board.pdf --tiles a4",
         (
-            option("file", type=read_path, metavar="FILE.pdf", help="or FILE.png, for a printer's shop"),
-            option("--tiles", choices=("a4",), help="several sheets to glue together instead of one large one"),
+            path("file", "FILE.pdf", "or FILE.png, for a printer's shop"),
+            choice("--tiles", ("a4",), "several sheets to glue together instead of one large one"),
             BOARD,
             number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
         ),
@@ -63,10 +38,10 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         "make a virtual capture with known truth",
         "--out data/mug --views 40 --category mug --set captures.simulate.depth_noise.times=1",
         (
-            option("--out", type=read_path, required=True, metavar="DIR", help="folder of the capture, new or empty"),
+            NEW_DIR,
             number("--views", "viewpoints (default: captures.simulate.views, 40)"),
-            option("--seed", type=read_index, metavar="N", default=0, help="seed of all that is random (default: 0)"),
-            option("--category", default="mug", metavar="NAME", help="what is captured (default: mug)"),
+            option("--seed", "N", "seed of all that is random (default: 0)", read.read_index, default=0),
+            option("--category", "NAME", "what is captured (default: mug)", default="mug"),
             SET,
         ),
         "services.capture:simulate",
@@ -75,12 +50,14 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         "make a capture from an Azure Kinect recording, without its SDK",
         "recording.mkv --out data/mug --frames 40 --board board.json --name mug-1 --category mug",
         (
-            option("recording", type=read_path, metavar="RECORDING.mkv"),
-            option("--out", type=read_path, required=True, metavar="DIR", help="folder of the capture, new or empty"),
+            path("recording", "RECORDING.mkv"),
+            NEW_DIR,
             number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
             BOARD,
-            option("--name", metavar="NAME", help="of the object (default: the name of DIR)"),
-            option("--category", default="object", metavar="NAME", help=f"{CATEGORY_HELP} (default: object)"),
+            option("--name", "NAME", "of the object (default: the name of DIR)"),
+            option(
+                "--category", "NAME", "folder that the capture has in a dataset (default: object)", default="object"
+            ),
         ),
         "services.capture:import_recording",
     ),
@@ -89,10 +66,10 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         "data/mug --estimate joint",
         (
             FOLDER,
-            option(
+            choice(
                 "--estimate",
-                choices=("markers", "article", "joint"),
-                help="what the cloud is made with (default: captures.estimation.estimate, joint); all three are reported",
+                ("markers", "article", "joint"),
+                "what the cloud is made with (default: captures.estimation.estimate, joint); all three are reported",
             ),
             SET,
         ),
@@ -101,24 +78,20 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     "synthesize": Command(
         "make RGB, depth and mask of a processed capture from other poses",
         "data/mug --pose pose.txt --out data/mug/views",
-        (
-            FOLDER,
-            option("--out", type=read_path, metavar="DIR", help="where the views go (default: DIR/views)"),
-        ),
+        (FOLDER, path("--out", "DIR", "where the views go (default: DIR/views)")),
         "services.capture:synthesize",
         one_of=(
-            option("--pose", type=read_path, metavar="FILE", help="T_board_cam, 4 lines of 4 numbers"),
-            option("--mirror", action="store_true", help="the mirror view of every captured view"),
+            path("--pose", "FILE", "T_board_cam, 4 lines of 4 numbers"),
+            flag("--mirror", "the mirror view of every captured view"),
         ),
     ),
     "evaluate": Command(
         "score a processed capture against its truth or a given mesh",
         "data/mug --json",
-        (FOLDER, option("--mesh", type=read_path, metavar="FILE", help="the object's mesh, metres, in its own frame")),
+        (FOLDER, path("--mesh", "FILE", "the object's mesh, metres, in its own frame")),
         "services.capture:evaluate",
     ),
 }
-
 
 REPORT_COMMANDS: Final[dict[str, Command]] = {
     "report": Command(
@@ -126,71 +99,56 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
         "data/tabletop --out tabletop.html",
         (
             OUT,
-            option(
-                "--out",
-                type=read_path,
-                metavar="FILE.html",
-                dest="file",
-                help="the page to write (default: OUT-report.html, beside the dataset)",
-            ),
-            number("--scenes", "scenes with pictures, equally many of each category (default: 24)", 24),
+            path("--out", "FILE.html", "the page to write (default: OUT-report.html, beside the dataset)", dest="file"),
+            PICTURES,
             option(
                 "--beside",
-                type=read_place,
-                metavar="OUT",
-                help="another dataset to show at the side of this one: captures beside scenes, say",
+                "OUT",
+                "another dataset to show at the side of this one: captures beside scenes, say",
+                read.read_place,
             ),
         ),
-        "services.cli.commands:report",
     ),
     "serve": Command(
         "the same page live while a job runs: progress, rate, latest pictures, failures; read-only",
         "data/tabletop --port 8722",
         (
             OUT,
-            option("--port", type=read_port, metavar="N", default=8722, help="default: 8722; 0: any that is free"),
+            option("--port", "N", "default: 8722; 0: any that is free", read.read_port, default=8722),
             option(
                 "--host",
-                type=read_host,
-                metavar="ADDR",
+                "ADDR",
+                "listen there (default: 127.0.0.1, this machine alone); where others can reach it, a token is needed",
+                read.read_host,
                 default="127.0.0.1",
-                help="listen there (default: 127.0.0.1, this machine alone); where others can reach it, a token is needed",
             ),
             option(
                 "--token",
-                metavar="T|auto",
-                help="answer only who has it: at least 16 characters, or `auto` for a random one, printed in the address",
+                "T|auto",
+                "answer only who has it: at least 16 characters, or `auto` for a random one, printed in the address",
             ),
-            number("--scenes", "scenes with pictures, equally many of each category (default: 24)", 24),
+            PICTURES,
         ),
-        "services.cli.commands:serve",
     ),
 }
 
-
-STUDY_COMMANDS: dict[str, Command] = {
+STUDY_COMMANDS: Final[dict[str, Command]] = {
     "bench": Command(
         "time by stage on one core, beside the script that people write today and the least that is possible",
         "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
         (
-            option("job", type=read_path, metavar="JOB.yaml", nargs="?", help="default: a job of built-in shapes"),
+            path("job", "JOB.yaml", "default: a job of built-in shapes", nargs="?"),
             number("--scenes", "how many scenes each side makes", 80),
-            option(
-                "--folder",
-                type=read_path,
-                metavar="DIR",
-                default=Path("data"),
-                help="on the disk to measure (default: data)",
-            ),
+            path("--folder", "DIR", "on the disk to measure (default: data)", default=Path("data")),
             number("--memory", "also watch one worker's memory over N scenes"),
             number("--workers", "also compare N workers with one, beside N plain processes"),
             number("--scaling-scenes", "how many scenes that comparison makes", 512),
             SET,
             option(
                 "--nodes",
-                type=read_counts,
-                metavar="N,N,...",
-                help="measure the coordinator instead, on so many simulated nodes whose scenes only take their time",
+                "N,N,...",
+                "measure the coordinator instead, on so many simulated nodes whose scenes only take their time",
+                read.read_counts,
             ),
             number(
                 "--effects",
@@ -206,13 +164,13 @@ STUDY_COMMANDS: dict[str, Command] = {
         "deploy/jobs/tabletop.yaml --out data/tradeoff --target penetration_mm=0.1,depth_mm=0.5",
         (
             JOB,
-            option("--out", type=read_path, required=True, metavar="DIR", help="goes on there where it stopped"),
+            path("--out", "DIR", "goes on there where it stopped", required=True),
             option(
                 "--target",
-                metavar="ERROR=MOST,...",
-                help="write DIR/job.yaml: the job with the cheapest setting that keeps these errors",
+                "ERROR=MOST,...",
+                "write DIR/job.yaml: the job with the cheapest setting that keeps these errors",
             ),
-            option("--knobs", metavar="NAME,...", help="default: all that are known"),
+            option("--knobs", "NAME,...", "default: all that are known"),
             number("--scenes", "scenes with images (default: 48)", 48),
             number("--physics-scenes", "scenes that only come to rest (default: 500)", 500),
             number("--laps", "rounds of timing (default: 3)", 3),
@@ -223,24 +181,14 @@ STUDY_COMMANDS: dict[str, Command] = {
     ),
 }
 
-
 DASHBOARD: Final = "http://127.0.0.1:8265"
 """Where Ray's job API answers by default."""
 
-QUEUE: Final = option(
-    "--queue",
-    type=read_place,
-    metavar="URL",
-    help="the queue: a folder that all hosts see, or a bucket (default: $VERSO_QUEUE)",
-)
-ADDRESS: Final = option(
-    "--address",
-    type=read_http,
-    metavar="HTTP",
-    default=DASHBOARD,
-    help=f"Ray's job API (default: {DASHBOARD}); a token is taken from RAY_AUTH_MODE and RAY_AUTH_TOKEN",
-)
-ID: Final = option("id", type=read_job_id, metavar="ID")
+QUEUE_HELP = "the queue: a folder that all hosts see, or a bucket (default: $VERSO_QUEUE)"
+QUEUE = option("--queue", "URL", QUEUE_HELP, read.read_place)
+ADDRESS_HELP = f"Ray's job API (default: {DASHBOARD}); a token is taken from RAY_AUTH_MODE and RAY_AUTH_TOKEN"
+ADDRESS = option("--address", "HTTP", ADDRESS_HELP, read.read_http, default=DASHBOARD)
+ID = option("id", "ID", kind=read.read_job_id)
 
 QUEUE_COMMANDS: Final[dict[str, Command]] = {
     "submit": Command(
@@ -249,19 +197,11 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
         (
             JOB,
             QUEUE,
-            option("--out", type=read_place, metavar="DIR", help="output folder (default: data/<job name>)"),
-            option(
-                "--priority",
-                type=read_priority,
-                metavar="N",
-                default=0,
-                help="-1000 to 1000; higher ones first (default: 0)",
-            ),
-            number("--scenes", "how many scenes; more than before extends the dataset"),
+            OUT_DIR,
+            option("--priority", "N", "-1000 to 1000; higher ones first (default: 0)", read.read_priority, default=0),
+            MORE_SCENES,
             SET,
-            option(
-                "--retry-failed", action="store_true", help="try scenes again that failed for environmental reasons"
-            ),
+            RETRY,
         ),
         "services.cli.queue_commands:submit",
     ),
@@ -274,7 +214,7 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
     "logs": Command(
         "what a job wrote, also after the cluster is gone",
         "j0a1b2c3d --queue /shared/queue --follow",
-        (ID, QUEUE, ADDRESS, option("--follow", action="store_true", help="go on until the job has ended")),
+        (ID, QUEUE, ADDRESS, flag("--follow", "go on until the job has ended")),
         "services.cli.queue_commands:logs",
     ),
     "cancel": Command(
@@ -290,11 +230,10 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
             QUEUE,
             ADDRESS,
             number("--at-once", "jobs that run at once, and share the cluster evenly (default: 2)", 2),
-            option(
+            path(
                 "--driver",
-                type=read_path,
-                metavar="PROGRAM",
-                help="the program `verso` on the cluster's head (default: this one where HTTP is on this machine, else verso)",
+                "PROGRAM",
+                "the program `verso` on the cluster's head (default: this one where HTTP is on this machine, else verso)",
             ),
         ),
         "services.cli.queue_commands:supervise",
@@ -302,7 +241,7 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
     "drive": Command(
         "one attempt at a job of the queue, as `supervise` has it started on the cluster's head",
         "j0a1b2c3d 1 --queue /shared/queue",
-        (ID, option("attempt", type=read_count, metavar="ATTEMPT"), QUEUE),
+        (ID, option("attempt", "ATTEMPT", kind=read.read_count), QUEUE),
         "services.cli.queue_commands:drive",
         starts_ray=lambda options: True,
         kept="what is committed is kept, the queue's supervisor starts the job again",
@@ -310,22 +249,18 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
     ),
 }
 
-COMMANDS: dict[str, Command] = {
+COMMANDS: Final[dict[str, Command]] = {
     "init": Command(
         "write a job file for a folder of your own meshes, with pictures of what was read",
         "~/my_meshes --out my_meshes.yaml",
         (
-            option("folder", type=read_path, metavar="FOLDER"),
-            option(
-                "--out", type=read_path, metavar="JOB.yaml", help="default: the folder's name, here; never overwritten"
-            ),
-            option(
-                "--sheet", type=read_path, metavar="FILE", help="the pictures, .jpg or .png (default: beside the job)"
-            ),
+            path("folder", "FOLDER"),
+            path("--out", "JOB.yaml", "default: the folder's name, here; never overwritten"),
+            path("--sheet", "FILE", "the pictures, .jpg or .png (default: beside the job)"),
             option(
                 "--category-from",
-                metavar="folder|file|NAME",
-                help="name categories after the first folder, or after the file without its number, or call all NAME "
+                "folder|file|NAME",
+                "name categories after the first folder, or after the file without its number, or call all NAME "
                 "(default: folder, and file where there is none)",
             ),
         ),
@@ -336,28 +271,26 @@ COMMANDS: dict[str, Command] = {
         "deploy/jobs/tabletop.yaml --scenes 128 --set start.pose=tumbled",
         (
             JOB,
-            option("--out", type=read_place, metavar="DIR", help="output folder (default: data/<job name>)"),
-            number("--scenes", "how many scenes; more than before extends the dataset"),
-            option("--first-scene", type=read_index, metavar="N", help="id of the first scene"),
+            OUT_DIR,
+            MORE_SCENES,
+            option("--first-scene", "N", "id of the first scene", read.read_index),
             number("--workers", "default: the cores this container may use, or the cluster's"),
             number("--shard-size", "scenes in a Ray task, rounded up to whole ranges"),
             option(
                 "--address",
-                type=read_address,
-                metavar="HOST:PORT",
-                help="a Ray cluster that runs already (default: a private Ray here)",
+                "HOST:PORT",
+                "a Ray cluster that runs already (default: a private Ray here)",
+                read.read_address,
             ),
             SET,
             option(
                 "--metrics",
-                type=read_listener,
-                metavar="HOST:PORT",
-                help="serve what the run counts to Prometheus there (default: not at all)",
+                "HOST:PORT",
+                "serve what the run counts to Prometheus there (default: not at all)",
+                read.read_listener,
             ),
-            option("--dry-run", action="store_true", help="check everything and say what would be done"),
-            option(
-                "--retry-failed", action="store_true", help="try scenes again that failed for environmental reasons"
-            ),
+            flag("--dry-run", "check everything and say what would be done"),
+            RETRY,
         ),
         starts_ray=lambda options: not options.dry_run,
         kept=KEPT,
@@ -366,7 +299,7 @@ COMMANDS: dict[str, Command] = {
     "pack": Command(
         "print a job file as one word that no shell changes, to give it to a cluster in place of the file",
         "deploy/jobs/tabletop.yaml",
-        (option("job", type=read_path, metavar="JOB.yaml"),),
+        (path("job", "JOB.yaml"),),
     ),
     "status": Command("scenes done, failed and missing; rate; what is running", "data/tabletop", (OUT,)),
     "verify": Command(
@@ -388,27 +321,22 @@ COMMANDS: dict[str, Command] = {
     "query": Command(
         "SQL over the manifests, also while the job runs",
         'data/tabletop "select category, count(*) from scenes group by category"',
-        (
-            OUT,
-            option("sql", metavar="SQL"),
-            option("--format", choices=("table", "csv", "parquet", "json"), default="table"),
-        ),
+        (OUT, option("sql", "SQL"), choice("--format", ("table", "csv", "parquet", "json"), default="table")),
     ),
     "columns": Command(
         "every column of the tables, with type, unit, frame and meaning",
         "views",
-        (option("table", metavar="TABLE", nargs="?", help="scenes, views, objects, ... (default: all)"),),
+        (option("table", "TABLE", "scenes, views, objects, ... (default: all)", nargs="?"),),
     ),
     "replay": Command(
         "make one scene again and compare it with what is stored, or put back what was lost",
         "data/tabletop 17",
         (
             OUT,
-            option("scene", type=read_index, metavar="SCENE", nargs="*"),
-            option(
+            option("scene", "SCENE", kind=read.read_index, nargs="*"),
+            flag(
                 "--repair",
-                action="store_true",
-                help="put back what is missing or damaged (with SCENEs: in their ranges) where it comes out as it was",
+                "put back what is missing or damaged (with SCENEs: in their ranges) where it comes out as it was",
             ),
         ),
     ),
@@ -418,22 +346,12 @@ COMMANDS: dict[str, Command] = {
         "data/tabletop data/recon --format mirror-recon --category mug",
         (
             OUT,
-            option("dir", type=read_place, metavar="DIR", help="a new or an empty folder, or one to go on in"),
-            option("--format", choices=tuple(FORMATS), required=True, help="docs/export.md describes each"),
-            option(
-                "--category", action="append", default=[], metavar="NAME", help="only scenes of it; may be repeated"
-            ),
-            option(
-                "--scenes", type=read_span, metavar="FIRST-LAST", help="only scenes with these ids; one id is one scene"
-            ),
-            option("--where", metavar="SQL", help="only scenes for which this holds, such as 'support_margin_mm > 5'"),
-            option(
-                "--shard-mb",
-                type=read_count,
-                metavar="N",
-                default=256,
-                help="size of a file of webdataset and huggingface, 10^6 bytes (default: 256)",
-            ),
+            option("dir", "DIR", "a new or an empty folder, or one to go on in", read.read_place),
+            choice("--format", tuple(FORMATS), "docs/export.md describes each", required=True),
+            option("--category", "NAME", "only scenes of it; may be repeated", action="append", default=[]),
+            option("--scenes", "FIRST-LAST", "only scenes with these ids; one id is one scene", read.read_span),
+            option("--where", "SQL", "only scenes for which this holds, such as 'support_margin_mm > 5'"),
+            number("--shard-mb", "size of a file of webdataset and huggingface, 10^6 bytes (default: 256)", 256),
         ),
         "services.export.export:main",
     ),
@@ -447,11 +365,11 @@ COMMANDS: dict[str, Command] = {
         "style, types, layer rules and tests of a checkout; says what was skipped, and why",
         "tests/hard_cases --figures f.json",
         (
-            option("paths", nargs="*", metavar="PATH", help="only the tests in this file, folder or FILE::TEST"),
-            option("--ci", action="store_true", help="also what takes a minute, and what needs root or Docker"),
-            option("--all", action="store_true", help="also that, and what takes minutes"),
-            option("--figures", type=read_path, metavar="FILE", help="write what the tests measured there, as JSON"),
-            option("-k", metavar="EXPR", help="only tests whose name matches, as in pytest"),
+            option("paths", "PATH", "only the tests in this file, folder or FILE::TEST", nargs="*"),
+            flag("--ci", "also what takes a minute, and what needs root or Docker"),
+            flag("--all", "also that, and what takes minutes"),
+            path("--figures", "FILE", "write what the tests measured there, as JSON"),
+            option("-k", "EXPR", "only tests whose name matches, as in pytest"),
         ),
     ),
     **STUDY_COMMANDS,
@@ -459,20 +377,14 @@ COMMANDS: dict[str, Command] = {
     "completion": Command(
         'print what completes commands and options in a shell: eval "$(verso completion bash)"',
         "bash",
-        (option("shell", choices=("bash", "zsh", "tcsh")),),
+        (choice("shell", ("bash", "zsh", "tcsh")),),
         "services.cli.reference:main",
     ),
     "extra": Command(
         "install what only some commands need: Mitsuba, MuJoCo as a referee, or the plots of studies",
         "pathtraced",
-        (option("name", choices=("pathtraced", "audit", "study")),),
-        "services.cli.commands:extra",
+        (choice("name", ("pathtraced", "audit", "study")),),
     ),
-    "lock": Command(
-        "make the lock files of a checkout anew, with the newest versions that pyproject.toml allows",
-        "",
-        (),
-        "services.cli.commands:lock",
-    ),
+    "lock": Command("make the lock files of a checkout anew, with the newest versions that pyproject.toml allows", ""),
 }
 """In the order of `verso --help`."""

@@ -1,8 +1,5 @@
 """Format `bop`: the scenewise layout of the BOP benchmark (6-D object pose), one BOP scene for each scene of the dataset.
 
-- One scene of a BOP export: its images, masks, and the three files that describe them.
-- The object models of a BOP export: numbered as they first appear, one PLY file each, in a constant amount of memory.
-
 Images of a scene are the input, aligned and mirror views of its pairs. Poses are model to camera in millimetres, K has
 pixel centres on integers, as OpenCV has them. A scene's folder appears whole.
 """
@@ -13,8 +10,9 @@ import json
 import shutil
 import sqlite3
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import trimesh
@@ -26,43 +24,65 @@ from schemas.dataset.codec import Row, read_matrix
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part
 from schemas.scene.view import Role
 from services.export.folder import ExportFolder
-from services.export.formats import Added, ExportRequest, LeftOut
+from services.export.formats import Added, ExportRequest, Writer
 from services.export.shapes import ColoredShape, Shapes, Silhouette, box_of, whole_silhouette
 from services.export.source import ExportPair, ExportScene
-from services.job.record import JobRecord
 from workers.geometry.frames import invert
 from workers.geometry.hull import convex_hull
 from workers.store.images import decode_png, encode_mask
 
+ROLES: Final[tuple[Role, ...]] = ("input", "aligned", "mirror")
+"""Pair k has the images 3 k, 3 k + 1 and 3 k + 2 of its scene."""
 
-class Bop:
+NO_SHAPE: Final = "an object is hidden in part, and its shape is neither stored nor here"
+_MM = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """An image of a scene: its number, its row of `views`, its files by path, and what is said of each object in it."""
+
+    number: int
+    view: Row
+    files: dict[str, bytes]
+    poses: list[Row] = field(default_factory=list)
+    infos: list[Row] = field(default_factory=list)
+
+
+class Bop(Writer):
     """Writes train/, val/ and test/ with a folder for each scene, and models/."""
 
-    def __init__(
-        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
-    ) -> None:
-        self._folder = folder
-        self._shapes = Shapes(request.store, record)
-        self._models = BopModels(folder, None if state is None else state["models"])
-        self._camera: dict[str, Any] | None = None if state is None else state["camera"]
-        self._splits: dict[str, int] = {} if state is None else dict(state["splits"])
-        self._images = 0 if state is None else int(state["images"])
+    FRESH: ClassVar = {"models": None, "camera": None, "splits": {}, "images": 0}
+
+    def begin(self, request: ExportRequest, fresh: bool) -> None:
+        """Opens the list of objects."""
+        self._shapes = Shapes(self.store, self.record)
+        self._models = BopModels(self.folder, self.kept["models"])
 
     def add(self, scene: ExportScene) -> Added:
         """Writes the scene's folder with its pairs that are whole."""
+        place = self.folder.temporary("scene")
+        shutil.rmtree(place, ignore_errors=True)
         numbers = {region: self._number(scene, name) for region, (_, name) in scene.instances.items()}
-        draft = SceneDraft(self._folder, scene, numbers, self._shapes)
+        written: list[_Shot] = []
         left_out = []
         for pair in scene.pairs:
-            if reason := draft.add(pair):
-                left_out.append(LeftOut(scene.scene_id, pair.pose_id, reason))
-        written = len(scene.pairs) - len(left_out)
+            shots = [self._shot(scene, pair, role, numbers) for role in ROLES if role in pair.views]
+            if reason := next((shot for shot in shots if isinstance(shot, str)), None):
+                left_out.append((pair.pose_id, reason))
+                continue
+            for shot in (shot for shot in shots if isinstance(shot, _Shot)):
+                for path, data in shot.files.items():
+                    (place / path).parent.mkdir(parents=True, exist_ok=True)
+                    (place / path).write_bytes(data)
+                shot.files.clear()
+                written.append(shot)
         if written:
-            draft.install(f"{scene.split}/{scene.scene_id:06d}")
-            self._splits[scene.split] = self._splits.get(scene.split, 0) + 1
-            self._images += len(draft.cameras)
-            self._camera = self._camera or draft.sensor
-        return Added(written, tuple(left_out))
+            self._install(place, f"{scene.split}/{scene.scene_id:06d}", written)
+            self.count("splits", scene.split, 1)
+            self.kept["images"] += len(written)
+            self.kept["camera"] = self.kept["camera"] or _sensor(written[0].view)
+        return Added(len(scene.pairs) - len(left_out), tuple(left_out))
 
     def _number(self, scene: ExportScene, instance_id: str) -> int:
         known = self._models.number(instance_id)
@@ -70,15 +90,47 @@ class Bop:
             return known
         return self._models.add(scene.assets[instance_id], self._shapes.load(scene, instance_id))
 
+    def _shot(self, scene: ExportScene, pair: ExportPair, role: Role, numbers: dict[int, int]) -> _Shot | str:
+        """An image with its masks, or a reason why there is none."""
+        rgb, region, depth = pair.image(role, "rgb"), pair.pixels(role, "region"), pair.image(role, "depth")
+        if rgb is None or region is None or depth is None:
+            return f"no {'rgb' if rgb is None else 'labels'} of the {role} view"
+        number, view, pixels = len(ROLES) * pair.number + ROLES.index(role), pair.views[role], decode_png(depth)
+        shot = _Shot(number, view, {f"rgb/{number:06d}.png": rgb, f"depth/{number:06d}.png": depth})
+        for label in pair.labels(role):
+            if label["region_id"] < REGION_FIRST_OBJECT:
+                continue
+            visible, hidden = region == label["region_id"], label["visible_fraction"] < 1.0
+            colored = self._shapes.load(scene, label["instance_id"]) if hidden else None
+            whole = whole_silhouette(label, view, visible, None if colored is None else colored.shape)
+            if whole is None:
+                return NO_SHAPE
+            name = f"{number:06d}_{len(shot.poses):06d}.png"
+            shot.files[f"mask/{name}"], shot.files[f"mask_visib/{name}"] = encode_mask(whole.mask), encode_mask(visible)
+            shot.poses.append(_pose(numbers[label["region_id"]], label))
+            shot.infos.append(_info(whole, visible, pixels))
+        return shot
+
+    def _install(self, place: Path, path: str, shots: list[_Shot]) -> None:
+        """Gives a scene's folder its name, unless a killed export did."""
+        trees = {
+            "camera": {shot.number: _camera(shot.view) for shot in shots},
+            "gt": {shot.number: shot.poses for shot in shots},
+            "gt_info": {shot.number: shot.infos for shot in shots},
+        }
+        for name, tree in trees.items():
+            (place / f"scene_{name}.json").write_bytes(encode_json(tree))
+        if not (self.folder.root / path).exists():
+            self.folder.install(place, path)
+
     def state(self) -> dict[str, Any]:
         """Numbers of objects, and counts."""
-        models = self._models.state()
-        return {"models": models, "camera": self._camera, "splits": self._splits, "images": self._images}
+        return {**self.kept, "models": self._models.state()}
 
     def finish(self) -> None:
         """Writes camera.json and ends the list of models."""
         self._models.finish()
-        self._folder.put("camera.json", encode_json(self._camera or {}))
+        self.folder.put("camera.json", encode_json(self.kept["camera"] or {}))
 
     def close(self) -> None:
         """Closes the list of objects."""
@@ -88,8 +140,8 @@ class Bop:
         """Counts, units and frames."""
         missing = self._models.without
         return {
-            "bop_scenes": dict(sorted(self._splits.items())),
-            "images": self._images,
+            "bop_scenes": dict(sorted(self.kept["splits"].items())),
+            "images": self.kept["images"],
             "models": self._models.count - missing,
             "not_exported": [
                 *([f"{missing} models: neither their shapes nor the job's sources are here"] if missing else []),
@@ -100,103 +152,6 @@ class Bop:
             "pixels": "cam_K has pixel centres on integers, as OpenCV has them",
             "depth": "millimetres are the stored value times depth_scale, z along the optical axis",
         }
-
-
-ROLES: Final[tuple[Role, ...]] = ("input", "aligned", "mirror")
-"""Pair k has the images 3 k, 3 k + 1 and 3 k + 2 of its scene."""
-
-NO_SHAPE: Final = "an object is hidden in part, and its shape is neither stored nor here"
-_MM = 1000.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Thing:
-    """An object in an image: its row of `objects`, what is seen of it [H, W], and its whole silhouette."""
-
-    label: Row
-    visible: NDArray[np.bool_]
-    whole: Silhouette
-
-
-@dataclass(frozen=True, eq=False)
-class _Shot:
-    """An image of a scene: its number, its row of `views`, two PNG files, and the objects in it."""
-
-    number: int
-    view: Row
-    rgb: bytes
-    depth: bytes
-    things: tuple[_Thing, ...]
-
-
-class SceneDraft:
-    """The folder of one scene while it is written."""
-
-    def __init__(self, folder: ExportFolder, scene: ExportScene, numbers: dict[int, int], shapes: Shapes) -> None:
-        self._folder, self._scene, self._numbers, self._shapes = folder, scene, numbers, shapes
-        self._place = folder.temporary("scene")
-        shutil.rmtree(self._place, ignore_errors=True)
-        self.cameras: dict[int, Row] = {}
-        self.sensor: dict[str, Any] | None = None
-        self._poses: dict[int, list[Row]] = {}
-        self._infos: dict[int, list[Row]] = {}
-
-    def add(self, pair: ExportPair) -> str:
-        """Writes the images of a pair; a reason why not, empty where it was written."""
-        shots = []
-        for place, role in enumerate(ROLES):
-            if role in pair.views:
-                shot = self._shot(len(ROLES) * pair.number + place, pair, role)
-                if isinstance(shot, str):
-                    return shot
-                shots.append(shot)
-        for shot in shots:
-            self._write(shot)
-        return ""
-
-    def _shot(self, number: int, pair: ExportPair, role: Role) -> "_Shot | str":
-        """An image with its masks, or a reason why there is none."""
-        rgb, region, depth = pair.image(role, "rgb"), pair.pixels(role, "region"), pair.image(role, "depth")
-        if rgb is None or region is None or depth is None:
-            return f"no {'rgb' if rgb is None else 'labels'} of the {role} view"
-        things = []
-        for label in pair.labels(role):
-            if label["region_id"] >= REGION_FIRST_OBJECT:
-                visible = region == label["region_id"]
-                whole = self._silhouette(label, pair.views[role], visible)
-                if whole is None:
-                    return NO_SHAPE
-                things.append(_Thing(label, visible, whole))
-        return _Shot(number, pair.views[role], rgb, depth, tuple(things))
-
-    def install(self, path: str) -> None:
-        """Gives the folder its name, unless a killed export did."""
-        for name, tree in (("camera", self.cameras), ("gt", self._poses), ("gt_info", self._infos)):
-            (self._place / f"scene_{name}.json").write_bytes(encode_json(tree))
-        if not (self._folder.root / path).exists():
-            self._folder.install(self._place, path)
-
-    def _silhouette(self, label: Row, view: Row, visible: NDArray[np.bool_]) -> Silhouette | None:
-        hidden = label["visible_fraction"] < 1.0
-        colored = self._shapes.load(self._scene, label["instance_id"]) if hidden else None
-        return whole_silhouette(label, view, visible, None if colored is None else colored.shape)
-
-    def _write(self, shot: "_Shot") -> None:
-        self.cameras[shot.number] = _camera(shot.view)
-        self.sensor = self.sensor or _sensor(shot.view)
-        self._write_file(f"rgb/{shot.number:06d}.png", shot.rgb)
-        self._write_file(f"depth/{shot.number:06d}.png", shot.depth)
-        depth = decode_png(shot.depth)
-        for number, thing in enumerate(shot.things):
-            self._write_file(f"mask/{shot.number:06d}_{number:06d}.png", encode_mask(thing.whole.mask))
-            self._write_file(f"mask_visib/{shot.number:06d}_{number:06d}.png", encode_mask(thing.visible))
-        self._poses[shot.number] = [_pose(self._numbers[one.label["region_id"]], one.label) for one in shot.things]
-        self._infos[shot.number] = [_info(one, depth) for one in shot.things]
-
-    def _write_file(self, path: str, data: bytes) -> None:
-        target = self._place / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(data)
 
 
 def encode_json(tree: object) -> bytes:
@@ -227,12 +182,12 @@ def _pose(number: int, label: Row) -> Row:
     return {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (_MM * T[:3, 3]).tolist(), "obj_id": number}
 
 
-def _info(thing: "_Thing", depth: NDArray) -> Row:
+def _info(whole: Silhouette, visible: NDArray[np.bool_], depth: NDArray) -> Row:
     """An entry of scene_gt_info.json; pixels and box of the whole silhouette count what lies outside the image too."""
-    whole, seen = thing.whole, int(thing.visible.sum())
+    seen = int(visible.sum())
     return {
         "bbox_obj": list(whole.box),
-        "bbox_visib": list(box_of(thing.visible)),
+        "bbox_visib": list(box_of(visible)),
         "px_count_all": whole.pixels,
         "px_count_valid": int((depth[whole.mask] > 0).sum()),
         "px_count_visib": seen,
@@ -308,14 +263,9 @@ def model_info(vertices_mm: Array) -> dict[str, float]:
     low, high = vertices_mm.min(axis=0), vertices_mm.max(axis=0)
     sizes = dict(zip(("min_x", "min_y", "min_z"), low.tolist(), strict=True))
     sizes |= dict(zip(("size_x", "size_y", "size_z"), (high - low).tolist(), strict=True))
-    return {"diameter": _diameter(vertices_mm), **sizes}
-
-
-def _diameter(points: Array) -> float:
-    """The largest distance between two of the points [N, 3]."""
-    corners = convex_hull(points).vertices
+    corners = convex_hull(vertices_mm).vertices
     blocks = (corners[first : first + _AT_ONCE] for first in range(0, len(corners), _AT_ONCE))
-    return float(max(cdist(block, corners).max() for block in blocks))
+    return {"diameter": float(max(cdist(block, corners).max() for block in blocks)), **sizes}
 
 
 def ply_lines(colored: ColoredShape) -> Iterator[bytes]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import OutputError
 from services.export.folder import ExportFolder
-from services.export.formats import Added, Choice, Chooser, ExportRequest, open_writer
+from services.export.formats import Added, Choice, Chooser, ExportRequest, Writer
 from services.export.source import iter_ranges, scenes_of
 from services.export.table import FORMATS
 from services.job.record import JobRecord, require_dataset, require_job
@@ -51,7 +51,9 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
     Raises OutputError where the folder is not this export's, InputError for a condition that cannot be asked, CorruptError
     where a stored file is missing or damaged.
     """
-    _refuse_inside(request)
+    root = request.store.root
+    if root is not None and request.target.resolve().is_relative_to(Path(root).resolve()):  # it would be a foreign file
+        raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
     record = require_job(request.store)
     chooser = Chooser(request.choice)
     folder = ExportFolder(request.target)
@@ -80,9 +82,8 @@ class _Export:
         begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
         self._finished: bool = begun["finished"]
         self._next_scene: int = begun["next_scene"]
-        self._counts = Counter(begun["counts"])
-        self._left_out = Counter(begun["left_out"])
-        self._writer = open_writer(request.format, request, record, folder, begun["writer"])
+        self._counts, self._left_out = Counter(begun["counts"]), Counter(begun["left_out"])
+        self._writer: Writer = FORMATS[request.format].load()(request, record, folder, begun["writer"])
         if progress is None:
             folder.append(LEFT_OUT, b"scene_id,pose_id,reason\n")
 
@@ -95,7 +96,9 @@ class _Export:
                 self._writer.finish()
                 self._finished = True
                 self._checkpoint(self._next_scene)
-            manifest = self._manifest()
+            counts = {name: self._counts[name] for name in ("scenes", "pairs", "pairs_left_out")}
+            told = {"left_out": dict(sorted(self._left_out.items())), **self._writer.describe()}
+        manifest = {**self._folder.plan, "ranges": len(self._codes), **counts, **told}
         self._folder.finish(manifest)
         return ExportResult(manifest, self._counts["pairs"] - before)
 
@@ -104,51 +107,35 @@ class _Export:
         for stored in iter_ranges(store, self._codes, self._next_scene):
             chosen = [scene for scene in self._chooser.choose(stored) if scene >= self._next_scene]
             for scene in scenes_of(store, stored, chosen):
-                self._count(self._writer.add(scene))
+                self._count(scene.scene_id, self._writer.add(scene))
                 self._checkpoint(scene.scene_id + 1)
             self._checkpoint(max(self._next_scene, stored.stop))
             report(stored.stop, self._record.job.stop_scene)
 
-    def _count(self, added: Added) -> None:
-        self._counts["scenes"] += bool(added.pairs)
-        self._counts["pairs"] += added.pairs
-        self._counts["pairs_left_out"] += len(added.left_out)
+    def _count(self, scene_id: int, added: Added) -> None:
+        self._counts.update(scenes=bool(added.pairs), pairs=added.pairs, pairs_left_out=len(added.left_out))
         text = io.StringIO()
-        lines = csv.writer(text, lineterminator="\n")
-        for one in added.left_out:
-            self._left_out[one.reason] += 1
-            lines.writerow((one.scene_id, one.pose_id, one.reason))
-        if added.left_out:
-            self._folder.append(LEFT_OUT, text.getvalue().encode())
+        for pose_id, reason in added.left_out:
+            self._left_out[reason] += 1
+            csv.writer(text, lineterminator="\n").writerow((scene_id, pose_id, reason))
+        self._folder.append(LEFT_OUT, text.getvalue().encode())
 
     def _checkpoint(self, next_scene: int) -> None:
         self._next_scene = next_scene
         if (state := self._writer.state()) is not None:
-            counts = {"counts": dict(self._counts), "left_out": dict(self._left_out)}
-            now = {"next_scene": next_scene, "finished": self._finished, **counts, "writer": state}
-            self._folder.checkpoint(now)
-
-    def _manifest(self) -> dict[str, Any]:
-        counts = {name: self._counts[name] for name in ("scenes", "pairs", "pairs_left_out")}
-        return {
-            **self._folder.plan,
-            "ranges": len(self._codes),
-            **counts,
-            "left_out": dict(sorted(self._left_out.items())),
-            **self._writer.describe(),
-        }
+            now = {"next_scene": next_scene, "finished": self._finished}
+            self._folder.checkpoint({**now, "counts": self._counts, "left_out": self._left_out, "writer": state})
 
 
 def _plan(request: ExportRequest, record: JobRecord) -> dict[str, Any]:
     """What makes two exports the same: nothing of this machine."""
-    choice = request.choice.model_dump(mode="json", exclude_defaults=True)
     return {
         "verso_export": VERSION,
         "format": request.format,
         "dataset": record.job.name,
         "job_digest": record.digest,
         "dataset_digest": (read_success(request.store) or {}).get("digest"),
-        "choice": choice,
+        "choice": request.choice.model_dump(mode="json", exclude_defaults=True),
         **({"shard_mb": request.shard_mb} if FORMATS[request.format].sharded else {}),
     }
 
@@ -165,13 +152,6 @@ def _snapshot(request: ExportRequest, folder: ExportFolder, fresh: bool) -> NDAr
     if not len(codes):
         raise OutputError(f"{request.store.name} has no finished scene yet: there is nothing to export")
     return codes
-
-
-def _refuse_inside(request: ExportRequest) -> None:
-    """Raises OutputError for a folder in the dataset, where it would be a foreign file."""
-    root = request.store.root
-    if root is not None and request.target.resolve().is_relative_to(Path(root).resolve()):
-        raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
 
 
 def main(options: argparse.Namespace) -> int:
@@ -209,10 +189,5 @@ def _tell(options: argparse.Namespace, result: ExportResult, seconds: float) -> 
         told = "no scene was chosen" if not manifest["pairs_left_out"] else "every pair was left out"
         print(f"verso: {options.dir} holds no pair: {told}", file=sys.stderr)
     if options.json:
-        answer: dict[str, Any] = {
-            "ok": manifest["pairs"] > 0,
-            "dir": options.dir,
-            "pairs_now": result.pairs_now,
-            **manifest,
-        }
-        print(json.dumps(answer))
+        answer = {"ok": manifest["pairs"] > 0, "dir": options.dir, "pairs_now": result.pairs_now}
+        print(json.dumps({**answer, **manifest}))

@@ -1,7 +1,5 @@
 """The folder that an export writes: claimed, filled whole file by whole file, and gone on with after a kill.
 
-- Files that many pairs share: one open for each split, all ended together, so that a killed export goes on at an end.
-
 While it is being made, `_export/` in it holds what was asked, how far it came, and files that are not finished.
 `export.json`, written last, says what is there and what was left out. A file has its final name only when it is whole.
 """
@@ -170,7 +168,7 @@ def _read_tree(path: Path) -> Tree | None:
     """The object in a JSON file, None where there is no file. Raises CorruptError where it holds something else."""
     try:
         tree = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except ValueError:
         tree = None

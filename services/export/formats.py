@@ -1,23 +1,18 @@
-"""What an export is: its request and choice of scenes, and what every format has.
+"""What is asked of an export (a dataset, a place, a format, a choice of scenes), and what a writer of a format has."""
 
-- Which scenes of a dataset are exported: by id, by category, and by an SQL condition.
-- What an export is asked for: a dataset, a place, a format by name, and a choice of scenes.
-- What every format is: a writer that takes scenes in order and says which pairs it leaves out, and why.
-"""
-
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final
 
 import duckdb
 
 from schemas.base import Frozen
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import InputError
-from services.export.folder import ExportFolder
+from services.export.folder import ExportFolder, Rounds
 from services.export.source import ExportScene
-from services.export.table import FORMATS
 from services.job.record import JobRecord
 from services.read.dataset_reader import StoredRange
 from workers.store.manifest import table_of_rows
@@ -62,24 +57,19 @@ class Chooser:
 
     def choose(self, stored: StoredRange) -> Sequence[int]:
         """The ids of the chosen scenes of a range, in order."""
-        choice, rows = self._choice, stored.rows["scenes"]
+        choice, rows = self._choice, stored.rows
         low, high = choice.first_scene or 0, choice.last_scene
         ids = [
             int(row["scene_id"])
-            for row in rows
+            for row in rows["scenes"]
             if (not choice.categories or row["category"] in choice.categories)
             and low <= row["scene_id"]
             and (high is None or row["scene_id"] <= high)
         ]
         if choice.where is None or not ids:
             return ids
-        fit = self._ask(
-            {table: table_of_rows(table, stored.rows[table]).select(names) for table, names in self._names()}
-        )
+        fit = self._ask({table: table_of_rows(table, rows[table]).select(SCHEMAS[table].names) for table in _TABLES})
         return [scene_id for scene_id in ids if scene_id in fit]
-
-    def _names(self) -> list[tuple[str, list[str]]]:
-        return [(table, SCHEMAS[table].names) for table in _TABLES]
 
     def _ask(self, tables: dict) -> set[int]:
         """The ids of the scenes in `tables` that the condition holds for."""
@@ -89,8 +79,7 @@ class Chooser:
             found = self._db.execute(f"SELECT scene_id FROM scenes WHERE ({self._choice.where}\n)").fetchall()
         except duckdb.Error as error:
             line = str(error).splitlines()[0]
-            told = f"--where {self._choice.where!r} cannot be asked: {line}"
-            raise InputError(f"{told}; {_EXAMPLE}") from error
+            raise InputError(f"--where {self._choice.where!r} cannot be asked: {line}; {_EXAMPLE}") from error
         return {scene_id for (scene_id,) in found}
 
 
@@ -106,53 +95,97 @@ class ExportRequest:
     shard_mb: int = 256
     """Size that ends a shard, of formats that have shards; 10^6 bytes."""
 
-    @property
-    def most_bytes(self) -> int:
-        """The same in bytes."""
-        return 1_000_000 * self.shard_mb
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A pair that a format cannot hold."""
-
-    scene_id: int
-    pose_id: int
-    reason: str
-    """The same words for every pair of a kind."""
-
 
 @dataclass(frozen=True)
 class Added:
-    """What became of a scene."""
+    """What became of a scene: how many of its pairs were written, and (pose id, reason) of those that were left out.
+
+    A reason is the same words for every pair of a kind.
+    """
 
     pairs: int
-    """How many of its pairs were written."""
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[tuple[int, str], ...] = ()
 
 
-class Writer(Protocol):
-    """Writes one format into an `ExportFolder`."""
+class Writer:
+    """Writes one format into an `ExportFolder`.
+
+    `kept` is what a new writer must know to go on from here, as JSON holds it; FRESH is that of the beginning.
+    """
+
+    FRESH: ClassVar[dict[str, Any]]
+
+    def __init__(
+        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, kept: dict[str, Any] | None
+    ) -> None:
+        self.store, self.record, self.folder = request.store, record, folder
+        self.kept = copy.deepcopy(self.FRESH) if kept is None else kept
+        self.begin(request, fresh=kept is None)
+
+    def begin(self, request: ExportRequest, fresh: bool) -> None:
+        """Opens what the writer needs."""
 
     def add(self, scene: ExportScene) -> Added:
         """Takes the next scene."""
+        raise NotImplementedError
 
     def state(self) -> dict[str, Any] | None:
-        """What a new writer must know to go on from here; None while something that it took is not whole in the folder."""
+        """`kept`; None while something that the writer took is not whole in the folder."""
+        return self.kept
 
     def finish(self) -> None:
         """Writes what is still waiting. Afterwards `state` is not None."""
 
     def describe(self) -> dict[str, Any]:
         """What the manifest says of this format: units, frames, counts."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Lets go of what is open; what is not in the last state may be lost."""
 
+    def count(self, name: str, key: str, more: int) -> None:
+        """Adds to the count of `key` in `kept[name]`."""
+        self.kept[name][key] = self.kept[name].get(key, 0) + more
 
-def open_writer(
-    name: str, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
-) -> Writer:
-    """The writer of a format; `state` is what it said at the last checkpoint, None where it begins."""
-    writer: Writer = FORMATS[name].load()(request, record, folder, state)
-    return writer
+
+OF_SCENE: Final = ("scene_id", "category", "instance_id", "source", "table_id", "T_world_obj", "T_world_table")
+"""Columns of `scenes` that a pair in a shared file has."""
+
+
+class ShardedWriter(Writer):
+    """A format whose pairs share files, `rounds`, by split."""
+
+    PATTERN: ClassVar[str]
+    """The name of a file, with places for `split` and `number`."""
+    rounds: Rounds
+
+    def begin(self, request: ExportRequest, fresh: bool) -> None:
+        """Goes on behind the last files that were ended."""
+        most_bytes = 1_000_000 * request.shard_mb
+        self.rounds = Rounds(self.folder, self.open_shard, self.PATTERN, most_bytes, self.kept["rounds"])
+
+    def open_shard(self, path: Path) -> Any:
+        """A file with `add`, `bytes` and `close`."""
+        raise NotImplementedError
+
+    def state(self) -> dict[str, Any] | None:
+        """None within a round."""
+        rounds = self.rounds.state()
+        return None if rounds is None else {**self.kept, "rounds": rounds}
+
+    def finish(self) -> None:
+        """Ends the last files."""
+        self.rounds.end()
+
+    def close(self) -> None:
+        """Closes open files."""
+        self.rounds.close()
+
+    def conventions(self, depth: str) -> dict[str, Any]:
+        """What the manifest says of every such format; `depth` describes the encoding of depth."""
+        return {
+            "not_exported": ["patches, shapes of objects, the quality figures of scenes"],
+            "depth": f"{depth}, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
+            "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
+            "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
+        }

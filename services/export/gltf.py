@@ -5,21 +5,18 @@ glTF's y is up, the world's z is: a root node turns one into the other. Below it
 
 import math
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import SceneError
 from schemas.scene.view import ROLES
-from services.export.folder import ExportFolder
-from services.export.formats import Added, ExportRequest, LeftOut
+from services.export.formats import Added, Writer
 from services.export.source import ExportScene, unchanged_sources
-from services.job.record import JobRecord
 from services.read.scene_geometry import captured_scene, planned_scene
 from workers.assets.catalogue import Catalogue
 from workers.assets.glb import join_glb, split_glb
-from workers.store.store import Store
 
 NO_SOURCES = "the sources of the shapes are not here, or have changed"
 
@@ -30,52 +27,37 @@ _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 _NEAR_M = 0.05
 
 
-class Gltf:
+class Gltf(Writer):
     """Writes <category>/<scene id>.glb."""
 
-    def __init__(
-        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
-    ) -> None:
-        self._store: Store = request.store
-        self._record, self._folder = record, folder
-        self._files: dict[str, int] = dict((state or {}).get("files", {}))
+    FRESH: ClassVar = {"files": {}}
 
     def add(self, scene: ExportScene) -> Added:
         """Writes the scene's file."""
-        if self._record.job.captures is not None:
-            posed = captured_scene(self._store, scene.stored, scene.row)
+        if self.record.job.captures is not None:
+            posed = captured_scene(self.store, scene.stored, scene.row)
         elif self._catalogue is None:
             return _left_out(scene, NO_SOURCES)
         else:
             try:
-                posed = planned_scene(self._record.job, self._catalogue, scene.scene_id, scene.row)
+                posed = planned_scene(self.record.job, self._catalogue, scene.scene_id, scene.row)
             except SceneError as error:
                 return _left_out(scene, f"its shapes cannot be made again: {error.reason}")
         data: bytes = posed.export(file_type="glb")
         views = [pair.views[role] for pair in scene.pairs for role in ROLES if role in pair.views]
         seen = with_cameras(data, [view for view in views if view["role"] != "projected"])
-        self._folder.put(f"{scene.category}/{scene.scene_id:06d}.glb", seen)
-        self._files[scene.category] = self._files.get(scene.category, 0) + 1
+        self.folder.put(f"{scene.category}/{scene.scene_id:06d}.glb", seen)
+        self.count("files", scene.category, 1)
         return Added(len(scene.pairs))
 
     @cached_property
     def _catalogue(self) -> Catalogue | None:
-        return unchanged_sources(self._record)
-
-    def state(self) -> dict[str, Any]:
-        """How many files there are by category."""
-        return {"files": self._files}
-
-    def finish(self) -> None:
-        """Nothing waits."""
-
-    def close(self) -> None:
-        """Nothing is open."""
+        return unchanged_sources(self.record)
 
     def describe(self) -> dict[str, Any]:
         """Files by category, and the frame."""
         return {
-            "files": dict(sorted(self._files.items())),
+            "files": dict(sorted(self.kept["files"].items())),
             "not_exported": ["images and labels: the cameras stand where the views were taken from"],
             "frame": "metres; below the root node the world frame of the dataset, z up, turned to glTF's y up by that node",
             "cameras": "named by role and pose id; a field of view and an aspect ratio, without the principal point",
@@ -83,7 +65,7 @@ class Gltf:
 
 
 def _left_out(scene: ExportScene, reason: str) -> Added:
-    return Added(0, tuple(LeftOut(scene.scene_id, pair.pose_id, reason) for pair in scene.pairs))
+    return Added(0, tuple((pair.pose_id, reason) for pair in scene.pairs))
 
 
 def with_cameras(glb: bytes, views: list[Row]) -> bytes:

@@ -1,15 +1,14 @@
 """Format `huggingface`: Parquet files with embedded images that `datasets.load_dataset(DIR)` reads, and a dataset card.
 
-- What Hugging Face wants beside the columns: the features in the metadata of a Parquet schema, and the dataset card.
-
 A row is a pair. Its columns come from the manifest's schemas: what a view has is a struct `<role>_view`, its images are
 the columns `<role>_rgb`, `<role>_depth` and `<role>_region`, PNG files as they are stored.
 """
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,10 +17,8 @@ from schemas.dataset.codec import Row
 from schemas.dataset.layout import stored_images, stored_roles
 from schemas.dataset.tables import SCHEMAS
 from schemas.job.job import Job
-from services.export.folder import ExportFolder, Rounds
-from services.export.formats import Added, ExportRequest
+from services.export.formats import OF_SCENE, Added, ShardedWriter
 from services.export.source import ExportPair, ExportScene
-from services.job.record import JobRecord
 
 SPLITS: Final = {"train": "train", "val": "validation", "test": "test"}
 """Ours, and Hugging Face's name for it."""
@@ -31,70 +28,51 @@ ROW_GROUP: Final = 16
 IMAGE: Final = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])
 """An image as Hugging Face stores it."""
 
-_PATTERN: Final = "data/{split}-{number:05d}.parquet"
-_OF_SCENE: Final = ("scene_id", "category", "instance_id", "source", "table_id", "T_world_obj", "T_world_table")
 _NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "role", "capture")
 _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
 
 
-class HuggingFace:
+class HuggingFace(ShardedWriter):
     """Writes data/train-00000.parquet and so on, and README.md."""
 
-    def __init__(
-        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
-    ) -> None:
-        self._folder, self._job = folder, record.job
-        self._schema = schema_of_pairs(record.job)
-        self._rounds = Rounds(folder, self._open, _PATTERN, request.most_bytes, state and state["rounds"])
-        self._rows: dict[str, int] = dict(state["rows"]) if state else {}
-        self._licences: set[str] = set(state["licences"]) if state else set()
+    FRESH: ClassVar = {"rounds": None, "rows": {}, "licences": []}
+    PATTERN = "data/{split}-{number:05d}.parquet"
 
-    def _open(self, path: Path) -> "_Parquet":
+    @cached_property
+    def _schema(self) -> pa.Schema:
+        return schema_of_pairs(self.record.job)
+
+    def open_shard(self, path: Path) -> "_Parquet":
+        """A Parquet file."""
         return _Parquet(path, self._schema)
 
     def add(self, scene: ExportScene) -> Added:
         """Writes a row for each pair of the scene."""
         split = SPLITS[scene.split]
-        shard = self._rounds.shard(split)
+        shard = self.rounds.shard(split)
         for pair in scene.pairs:
             shard.add(row_of(self._schema, scene, pair))
-        self._rows[split] = self._rows.get(split, 0) + len(scene.pairs)
+        self.count("rows", split, len(scene.pairs))
         names = (scene.row["table_id"], *(name for _, name in scene.instances.values()))
-        self._licences |= {scene.assets[name]["licence"] for name in names}
-        self._rounds.end_if_full()
+        self.kept["licences"] = sorted({*self.kept["licences"], *(scene.assets[name]["licence"] for name in names)})
+        self.rounds.end_if_full()
         return Added(len(scene.pairs))
-
-    def state(self) -> dict[str, Any] | None:
-        """Numbers of files and rows, and licences; None within a round."""
-        rounds = self._rounds.state()
-        return None if rounds is None else {"rounds": rounds, "rows": self._rows, "licences": sorted(self._licences)}
 
     def finish(self) -> None:
         """Ends the last files, and writes the card."""
-        self._rounds.end()
-        text = card_text(self._job.name, self._schema, self._rows, sorted(self._licences))
-        self._folder.put("README.md", text.encode())
-
-    def close(self) -> None:
-        """Closes open files."""
-        self._rounds.close()
+        super().finish()
+        text = card_text(self.record.job.name, self._schema, self.kept["rows"], self.kept["licences"])
+        self.folder.put("README.md", text.encode())
 
     def describe(self) -> dict[str, Any]:
         """Files and rows by split, and the conventions."""
-        return {
-            "files": self._rounds.counts,
-            "rows": dict(sorted(self._rows.items())),
-            "licences": sorted(self._licences),
-            "not_exported": ["patches, shapes of objects, the quality figures of scenes"],
-            "depth": "16-bit PNG, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
-            "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
-            "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
-        }
+        counts = {"files": self.rounds.counts, "rows": dict(sorted(self.kept["rows"].items()))}
+        return {**counts, "licences": self.kept["licences"], **self.conventions("16-bit PNG")}
 
 
 def schema_of_pairs(job: Job) -> pa.Schema:
     """The columns of a pair, of the types that the manifest gives them; only views and images that the job stores."""
-    fields = [SCHEMAS["scenes"].field(name) for name in _OF_SCENE]
+    fields = [SCHEMAS["scenes"].field(name) for name in OF_SCENE]
     fields += [pa.field("split", pa.string()), pa.field("pose_id", pa.int64())]
     views = pa.struct([field for field in SCHEMAS["views"] if field.name not in _NOT_OF_VIEWS])
     for role in stored_roles(job):
@@ -102,12 +80,12 @@ def schema_of_pairs(job: Job) -> pa.Schema:
         fields.append(pa.field(f"{role}_view", views))
     objects = pa.struct([field for field in SCHEMAS["objects"] if field.name not in _NOT_OF_OBJECTS])
     schema = pa.schema([*fields, pa.field("objects", pa.list_(objects))])
-    return schema.with_metadata(features_metadata(schema, IMAGE))
+    return schema.with_metadata(features_metadata(schema))
 
 
 def row_of(schema: pa.Schema, scene: ExportScene, pair: ExportPair) -> Row:
     """The row of a pair."""
-    row: Row = {name: scene.row[name] for name in _OF_SCENE}
+    row: Row = {name: scene.row[name] for name in OF_SCENE}
     row |= {"split": SPLITS[scene.split], "pose_id": pair.pose_id, "objects": list(pair.objects)}
     for name in schema.names:
         role, _, kind = name.partition("_")
@@ -147,24 +125,21 @@ class _Parquet:
         self._writer.close()
 
 
-_CC0 = "CC0-1.0"
-
-
-def features_metadata(schema: pa.Schema, image: pa.DataType) -> dict[bytes, bytes]:
+def features_metadata(schema: pa.Schema) -> dict[bytes, bytes]:
     """Schema metadata that tells `datasets` which columns are images."""
-    features = {field.name: _feature(field.type, image) for field in schema}
+    features = {field.name: _feature(field.type) for field in schema}
     return {b"huggingface": json.dumps({"info": {"features": features}}).encode()}
 
 
-def _feature(kind: pa.DataType, image: pa.DataType) -> dict[str, Any]:
-    if kind == image:
+def _feature(kind: pa.DataType) -> dict[str, Any]:
+    if kind == IMAGE:
         return {"_type": "Image"}
     if pa.types.is_struct(kind):
-        return {field.name: _feature(field.type, image) for field in kind}
+        return {field.name: _feature(field.type) for field in kind}
     if pa.types.is_fixed_size_list(kind):
-        return {"feature": _feature(kind.value_type, image), "length": kind.list_size, "_type": "List"}
+        return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
     if pa.types.is_list(kind):
-        return {"feature": _feature(kind.value_type, image), "_type": "List"}
+        return {"feature": _feature(kind.value_type), "_type": "List"}
     names = {pa.int64(): "int64", pa.float64(): "float64", pa.string(): "string", pa.bool_(): "bool"}
     return {"dtype": names[kind], "_type": "Value"}
 
@@ -175,7 +150,7 @@ def card_text(name: str, schema: pa.Schema, rows: Mapping[str, int], licences: S
     counts = "".join(f"- {split}: {count} pairs\n" for split, count in sorted(rows.items()))
     columns = "".join(f"- `{field.name}`: {_describe(field)}\n" for field in schema)
     return f"""---
-license: {"cc0-1.0" if set(licences) <= {_CC0} else "other"}
+license: {"cc0-1.0" if set(licences) <= {"CC0-1.0"} else "other"}
 pretty_name: {json.dumps(name)}
 task_categories:
 - depth-estimation
@@ -214,7 +189,7 @@ pairs = datasets.load_dataset("path/to/this/folder", split="train")
 
 
 def _describe(field: pa.Field) -> str:
-    if pa.types.is_struct(field.type) and field.type.num_fields == 2 and field.type.field(0).name == "bytes":
+    if field.type == IMAGE:
         return "image"
     if pa.types.is_list(field.type):
         return "list of " + ", ".join(f"`{one.name}`" for one in field.type.value_type)

@@ -5,7 +5,7 @@ mirror pose. Depth in 5000 units a metre, camera poses camera to world, object p
 """
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -15,10 +15,8 @@ from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
-from services.export.folder import ExportFolder
-from services.export.formats import Added, ExportRequest, LeftOut
+from services.export.formats import Added, ExportRequest, Writer
 from services.export.source import ExportPair, ExportScene
-from services.job.record import JobRecord
 from services.merge.tables import escaped
 from workers.store.images import decode_png, encode_png
 
@@ -31,17 +29,16 @@ _VIEWS: tuple[tuple[Role, int, str], ...] = (("input", 0, "yaw0"), ("mirror", 1,
 _KINDS: tuple[tuple[PixelKind, str], ...] = (("rgb", "rgb"), ("depth", "depth"), ("region", "segment"))
 
 
-class MirrorRecon:
+class MirrorRecon(Writer):
     """Writes pairs of scenes with one object, whose every image and patch exists."""
 
-    def __init__(
-        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
-    ) -> None:
-        self._folder = folder
-        self._next: dict[str, int] = dict((state or {}).get("next", {}))
-        """The next even id by category."""
-        if state is None:
-            folder.append(_PAIRS, b"category,id,scene_id,pose_id\n")
+    FRESH: ClassVar = {"next": {}}
+    """The next even id by category."""
+
+    def begin(self, request: ExportRequest, fresh: bool) -> None:
+        """Begins the list of pairs."""
+        if fresh:
+            self.folder.append(_PAIRS, b"category,id,scene_id,pose_id\n")
 
     def add(self, scene: ExportScene) -> Added:
         """Writes the scene's pairs that are whole."""
@@ -49,36 +46,26 @@ class MirrorRecon:
         for pair in scene.pairs:
             images, reason = _images_of(scene, pair)
             if reason:
-                left_out.append(LeftOut(scene.scene_id, pair.pose_id, reason))
+                left_out.append((pair.pose_id, reason))
             else:
                 self._write(scene, pair, images)
         return Added(len(scene.pairs) - len(left_out), tuple(left_out))
 
     def _write(self, scene: ExportScene, pair: ExportPair, images: dict[str, bytes]) -> None:
-        even = self._next.get(scene.category, 0)
-        self._next[scene.category] = even + 2
+        even = self.kept["next"].get(scene.category, 0)
+        self.count("next", scene.category, 2)
         for name, data in images.items():
-            self._folder.put(f"{scene.category}/{name.format(even=even, odd=even + 1)}.png", data)
+            self.folder.put(f"{scene.category}/{name.format(even=even, odd=even + 1)}.png", data)
         for role, more, _ in _VIEWS:
             lines = "".join(_object_line(row) for row in pair.labels(role))
-            self._folder.put(f"{scene.category}/objects{even + more:05d}.dat", lines.encode())
-            self._folder.append(f"{scene.category}/{_CAM_POSES}", _pose_line(even, more, pair.views[role]).encode())
-        self._folder.append(_PAIRS, f"{scene.category},{even},{scene.scene_id},{pair.pose_id}\n".encode())
-
-    def state(self) -> dict[str, Any]:
-        """The next ids."""
-        return {"next": self._next}
-
-    def finish(self) -> None:
-        """Nothing waits."""
-
-    def close(self) -> None:
-        """Nothing is open."""
+            self.folder.put(f"{scene.category}/objects{even + more:05d}.dat", lines.encode())
+            self.folder.append(f"{scene.category}/{_CAM_POSES}", _pose_line(even, more, pair.views[role]).encode())
+        self.folder.append(_PAIRS, f"{scene.category},{even},{scene.scene_id},{pair.pose_id}\n".encode())
 
     def describe(self) -> dict[str, Any]:
         """Views by category, and the conventions."""
         return {
-            "views": dict(sorted(self._next.items())),
+            "views": dict(sorted(self.kept["next"].items())),
             "depth_units_per_m": UNITS_PER_M,
             "camera_poses": "camera to world, optical frame (x right, y down, z forward), metres; pitch, yaw in radians",
             "object_poses": "object to camera, optical frame, metres",

@@ -1,17 +1,12 @@
-"""Shapes of a dataset's instances with a colour for each vertex, and whole silhouettes of objects in views.
-
-- Shapes of a dataset's instances with a colour for each vertex: from the stored GLB files, or else from the job's
-  sources.
-- The whole silhouette of an object in a view: what is seen of it, what others hide, and what lies outside the image.
-"""
+"""Shapes of a dataset's instances, and silhouettes of objects: what is seen, what others hide, what is outside the image."""
 
 import io
-from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import trimesh
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from schemas.base import Array
@@ -44,12 +39,12 @@ class ColoredShape:
 
 
 class Shapes:
-    """Loads shapes by instance; keeps the last few."""
+    """Loads shapes by instance; keeps those that were asked for last."""
 
     def __init__(self, store: Store, record: JobRecord) -> None:
         self._store = store
         self._record = record
-        self._kept: OrderedDict[str, ColoredShape | None] = OrderedDict()
+        self._kept: LRUCache[str, ColoredShape | None] = LRUCache(_KEPT)
 
     def load(self, scene: ExportScene, instance_id: str) -> ColoredShape | None:
         """The shape of an instance of this scene; None where it is not stored and the job's sources are not here.
@@ -66,8 +61,6 @@ class Shapes:
             else:
                 shape = self._decode(path, data)
             self._kept[instance_id] = None if shape is None else color_vertices(shape)
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
         return self._kept[instance_id]
 
     def _decode(self, path: str, data: bytes) -> Shape:

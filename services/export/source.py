@@ -1,7 +1,4 @@
-"""What an export reads: the scenes and pairs of a dataset that were chosen, and the sources of their shapes.
-
-- The sources of shapes of a stored job, as far as they are still what they were.
-"""
+"""What an export reads: the scenes and pairs of a dataset that were chosen, and the sources of their shapes."""
 
 import contextlib
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,6 @@
 """The table of export formats: one row a format. It loads no writer, so that the command line starts at once.
 
-To add a format: write its file, a class that is made of (request, record, folder, state) and is a
-`services.export.formats.Writer`, and add its row here.
+To add a format: write its file, a subclass of `services.export.formats.Writer`, and add its row here.
 """
 
 import importlib

@@ -10,77 +10,47 @@ import json
 import tarfile
 import zipfile
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.scene.view import MODALITIES, ROLES
-from services.export.folder import ExportFolder, Rounds
-from services.export.formats import Added, ExportRequest
+from services.export.formats import OF_SCENE, Added, ShardedWriter
 from services.export.source import ExportPair, ExportScene
-from services.job.record import JobRecord
 
-_PATTERN: Final = "{split}-{number:06d}.tar"
 _PICTURES: Final = tuple(name for name in MODALITIES if name != "depth")
 """Modalities that are stored as PNG files; depth is an array."""
-_OF_SCENE: Final = (
-    "scene_id",
-    "category",
-    "instance_id",
-    "source",
-    "table_id",
-    "T_world_obj",
-    "T_world_table",
-    "effects",
-)
+_OF_SCENE: Final = (*OF_SCENE, "effects")
 _NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "capture")
 _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id", "role")
 
 
-class WebDataset:
+class WebDataset(ShardedWriter):
     """Writes train-000000.tar and so on; every pair that the dataset has is a sample."""
 
-    def __init__(
-        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
-    ) -> None:
-        self._rounds = Rounds(folder, _Tar, _PATTERN, request.most_bytes, state and state["rounds"])
-        self._samples: dict[str, int] = dict(state["samples"]) if state else {}
+    FRESH: ClassVar = {"rounds": None, "samples": {}}
+    PATTERN = "{split}-{number:06d}.tar"
+
+    def open_shard(self, path: Path) -> "_Tar":
+        """A tar."""
+        return _Tar(path)
 
     def add(self, scene: ExportScene) -> Added:
         """Writes a sample for each pair of the scene."""
-        shard = self._rounds.shard(scene.split)
+        shard = self.rounds.shard(scene.split)
         for pair in scene.pairs:
             for name, data in members_of(scene, pair):
                 shard.add(f"{pair.pose_id:09d}.{name}", data)
-        self._samples[scene.split] = self._samples.get(scene.split, 0) + len(scene.pairs)
-        self._rounds.end_if_full()
+        self.count("samples", scene.split, len(scene.pairs))
+        self.rounds.end_if_full()
         return Added(len(scene.pairs))
-
-    def state(self) -> dict[str, Any] | None:
-        """Numbers of shards and samples; None within a round."""
-        rounds = self._rounds.state()
-        return None if rounds is None else {"rounds": rounds, "samples": self._samples}
-
-    def finish(self) -> None:
-        """Ends the last shards."""
-        self._rounds.end()
-
-    def close(self) -> None:
-        """Closes open shards."""
-        self._rounds.close()
 
     def describe(self) -> dict[str, Any]:
         """Shards and samples by split, and the conventions."""
-        return {
-            "shards": self._rounds.counts,
-            "samples": dict(sorted(self._samples.items())),
-            "not_exported": ["patches, shapes of objects, the quality figures of scenes"],
-            "depth": "uint16, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
-            "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
-            "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
-        }
+        samples = dict(sorted(self.kept["samples"].items()))
+        return {"shards": self.rounds.counts, "samples": samples, **self.conventions("uint16")}
 
 
 def members_of(scene: ExportScene, pair: ExportPair) -> list[tuple[str, bytes]]:

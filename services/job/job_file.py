@@ -1,6 +1,6 @@
 """Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed, in plain words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +13,33 @@ from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.packed import is_packed, pack, unpack
 from services.job.reference import allowed_keys
 
-_KEYS, _NUMBER, _WHOLE, _TEXT = (
-    "must hold keys with values",
-    "must be a number",
-    "must be a whole number",
-    "must be text: write it in quotes",
-)
+MOST_BYTES = 250_000
+"""Longest job file; the longest example has 2,000 bytes."""
+
+MOST_KEYS = 20_000
+"""Most keys and values of a job file: half of what a text may have, because filling in defaults adds more."""
+
+MOST_KEY_CHARACTERS = 400
+"""Longest path of a key in `--set`."""
+
+MOST_FAULTS = 20
+"""Most faults that one message tells."""
 
 _WORDS: Mapping[str, str] = {
-    "model_type": _KEYS,
-    "model_attributes_type": _KEYS,
-    "dict_type": _KEYS,
-    "list_type": "must be a list: [a, b]",
-    "tuple_type": "must be a list: [a, b]",
-    "named_tuple_type": "must be two numbers: [low, high]",
-    "int_type": _WHOLE,
-    "int_parsing": _WHOLE,
-    "int_from_float": _WHOLE,
-    "float_type": _NUMBER,
-    "float_parsing": _NUMBER,
-    "finite_number": "must be a finite number",
-    "bool_type": "must be true or false",
-    "bool_parsing": "must be true or false",
-    "string_type": _TEXT,
+    kind: words
+    for words, kinds in (
+        ("must hold keys with values", ("model_type", "model_attributes_type", "dict_type")),
+        ("must be a list: [a, b]", ("list_type", "tuple_type")),
+        ("must be two numbers: [low, high]", ("named_tuple_type",)),
+        ("must be a whole number", ("int_type", "int_parsing", "int_from_float")),
+        ("must be a number", ("float_type", "float_parsing")),
+        ("must be a finite number", ("finite_number",)),
+        ("must be true or false", ("bool_type", "bool_parsing")),
+        ("must be text: write it in quotes", ("string_type",)),
+    )
+    for kind in kinds
 }
 """By the validator's kind of fault, in place of its own words, which name classes."""
-
-_COUNTS = {"too_short": "at least", "too_long": "at most"}
 
 _BOUNDS: Mapping[str, tuple[str, str]] = {
     "greater_than_equal": ("ge", "must be at least"),
@@ -57,9 +57,7 @@ def describe_fault(fault: Any) -> str:
         allowed = allowed_keys(words)
         return f"{key}: there is no such key; {did_you_mean(words[-1], allowed)}Allowed here: {', '.join(allowed) or 'nothing'}"
     if fault["type"] == "missing":
-        return (
-            f"{key}: is missing, and has no default" if not key.rpartition(".")[2].isdigit() else f"{key}: is missing"
-        )
+        return f"{key}: is missing{'' if words[-1].isdigit() else ', and has no default'}"
     message = plain_line(_message(fault), 300)
     if not words:
         return message  # of several keys, which it names
@@ -77,8 +75,10 @@ def _message(fault: Any) -> str:
         return f"its {context['discriminator']} {_one_of(context['tag'], context['expected_tags'])}"
     if kind == "literal_error":
         return _one_of(fault["input"], context["expected"])
-    if kind in ("too_short", "too_long"):
-        return f"must have {_COUNTS[kind]} {context['min_length' if kind == 'too_short' else 'max_length']} of them"
+    if kind == "too_short":
+        return f"must have at least {context['min_length']} of them"
+    if kind == "too_long":
+        return f"must have at most {context['max_length']} of them"
     return str(_WORDS.get(kind, fault["msg"].removeprefix("Value error, ")))
 
 
@@ -92,19 +92,6 @@ def _written(place: Sequence[str | int]) -> list[str | int]:
     """The parts of a place that the job file has: not the kind that follows a source's position, nor the mark of a key."""
     parts = [part for before, part in zip((None, *place), place, strict=False) if not isinstance(before, int)]
     return parts[:-1] if parts[-1:] == ["[key]"] else parts
-
-
-MOST_BYTES = 250_000
-"""Longest job file; the longest example has 2,000 bytes."""
-
-MOST_KEYS = 20_000
-"""Most keys and values of a job file: half of what a text may have, because filling in defaults adds more."""
-
-MOST_KEY_CHARACTERS = 400
-"""Longest path of a key in `--set`."""
-
-MOST_FAULTS = 20
-"""Most faults that one message tells."""
 
 
 def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
@@ -144,16 +131,19 @@ def folders_of(job: Job) -> dict[str, str]:
     return sources | {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
 
 
-def _check_absolute(job: Job, name: str) -> None:
-    """Raises JobError for a folder that is meant from the job file's own, which a packed job has not."""
+def refuse_folders(job: Job, name: str, fits: Callable[[str], bool], told: str) -> None:
+    """Raises JobError for a folder of the job that does not fit where the job is to run; `told` says why, and the remedy."""
     from workers.assets.external.listing import PYBULLET_DATA
 
     for key, folder in folders_of(job).items():
-        if folder not in ("", PYBULLET_DATA) and not folder.startswith(("/", "~")):
-            raise JobError(
-                f"{name}: {key}: {plain_line(repr(folder))}: a packed job has no folder of its own: write the whole path, the "
-                "same on every node"
-            )
+        if folder not in ("", PYBULLET_DATA) and not fits(folder):
+            raise JobError(f"{name}: {key}: {plain_line(repr(folder))}: {told}")
+
+
+def _check_absolute(job: Job, name: str) -> None:
+    """Raises JobError for a folder that is meant from the job file's own, which a packed job has not."""
+    told = "a packed job has no folder of its own: write the whole path, the same on every node"
+    refuse_folders(job, name, lambda folder: folder.startswith(("/", "~")), told)
 
 
 def _check_homes(job: Job, name: str) -> None:
@@ -205,9 +195,8 @@ def change_key(tree: dict[str, Any], change: str) -> None:
     if not equals or not path:
         raise JobError(f"{name}: write it as path.to.key=value, for example --set physics.step_hz=480")
     if len(path) > MOST_KEY_CHARACTERS or path.count(".") >= MOST_LEVELS:
-        raise JobError(
-            f"{name}: there is no such key: none has over {MOST_LEVELS} parts or {MOST_KEY_CHARACTERS} characters"
-        )
+        bounds = f"{MOST_LEVELS} parts or {MOST_KEY_CHARACTERS} characters"
+        raise JobError(f"{name}: there is no such key: none has over {bounds}")
     try:
         set_key(tree, path, parse_yaml(text))
     except (JobError, ValueError) as error:

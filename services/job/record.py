@@ -93,8 +93,13 @@ def encode_job(record: JobRecord) -> bytes:
 
 def read_job(store: Store) -> JobRecord | None:
     """The job that a folder belongs to, None where it has none. Raises CorruptError with one line."""
-    data = _read_bytes(store)
-    return None if data is None else decode_job(data, f"{store.name}/{JOB_FILE}")
+    name = f"{store.name}/{JOB_FILE}"
+    try:
+        return decode_job(store.read(JOB_FILE), name)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise CorruptError(f"{name} cannot be read: {error.strerror or error}; {REMEDY}") from error
 
 
 def decode_job(data: bytes, name: str) -> JobRecord:
@@ -103,43 +108,26 @@ def decode_job(data: bytes, name: str) -> JobRecord:
         raise CorruptError(f"{name} has {len(data)} bytes, and a job has less than {MAX_BYTES}: {REMEDY}")
     try:
         tree = parse_yaml(data.decode())
-        job = validate_job(tree["job"], name)
-        record = JobRecord(
-            job, tree["digest"], tree["catalogue"], _folder(tree["folder"]), tuple(tree.get("inputs", ()))
-        )
-        if wrong := [name for name in ("digest", "catalogue", "folder") if not isinstance(tree[name], str)]:
-            raise TypeError(f"{wrong[0]} is no text")
-        if not all(isinstance(digest, str) for digest in record.inputs):
-            raise TypeError("inputs holds what is no text")
+        job, inputs = validate_job(tree["job"], name), tuple(tree.get("inputs", ()))
+        texts = {key: tree[key] for key in ("digest", "catalogue", "folder")}
+        for key, value in (*texts.items(), *(("inputs", digest) for digest in inputs)):
+            if not isinstance(value, str):
+                raise TypeError(f"{key} is no text")
+        folder = texts["folder"]
+        if not folder.startswith("/") or any(unicodedata.category(letter) == "Cc" for letter in folder):
+            raise TypeError(f"folder: {folder!r} is not an absolute path")
+        return JobRecord(job, **texts, inputs=inputs)
     except JobError as error:
         told = str(error).splitlines()[0].removeprefix(f"{name}: ")
         raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         told = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
-    return record
 
 
 def is_job_sealed(data: bytes) -> bool:
     """Whether the bytes of a job.yaml are those that a run wrote."""
     return is_sealed(data, SEAL)
-
-
-def _read_bytes(store: Store) -> bytes | None:
-    """The bytes of job.yaml, None where there is none. Raises CorruptError where it is no file that can be read."""
-    try:
-        return store.read(JOB_FILE)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise CorruptError(f"{store.name}/{JOB_FILE} cannot be read: {error.strerror or error}; {REMEDY}") from error
-
-
-def _folder(path: str) -> str:
-    """The path itself. Raises TypeError where it is not absolute or holds a control character."""
-    if not path.startswith("/") or any(unicodedata.category(letter) == "Cc" for letter in path):
-        raise TypeError(f"folder: {path!r} is not an absolute path")
-    return path
 
 
 def require_dataset(store: Store) -> Store:

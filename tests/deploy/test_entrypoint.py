@@ -45,7 +45,9 @@ class Stage:
 
     def start(self, *args: str, **environ: str) -> subprocess.Popen[str]:
         pipe, environ = subprocess.PIPE, {**self.environ, **environ}
-        return subprocess.Popen([str(ENTRYPOINT), *args], env=environ, stdout=pipe, stderr=pipe, text=True)
+        # A shell cannot trap a signal that was ignored when it began, as Ctrl-C is behind `nohup ... &`.
+        command = ["env", "--default-signal=INT", str(ENTRYPOINT), *args]
+        return subprocess.Popen(command, env=environ, stdout=pipe, stderr=pipe, text=True)
 
     def __call__(self, *args: str, **environ: str) -> tuple[int, str, str]:
         with self.start(*args, **environ) as process:

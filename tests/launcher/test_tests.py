@@ -99,6 +99,7 @@ def run_suite(project, *words):
     return done.returncode, done.stdout
 
 
+@pytest.mark.minute
 def test_skips_are_told_by_reason_and_one_that_is_not_expected_fails_in_ci(project):
     code, out = run_suite(project)
     assert code == 0
@@ -113,6 +114,7 @@ def test_skips_are_told_by_reason_and_one_that_is_not_expected_fails_in_ci(proje
     assert code == 0 and "although" not in out and "slow" not in out
 
 
+@pytest.mark.minute
 def test_figures_of_all_processes_come_in_one_list_and_a_failed_case_says_so(project):
     (project / "tests" / "test_failing.py").write_text(FAILING)
     code, _ = run_suite(project, "-n", "2", "--figures", "figures.json")

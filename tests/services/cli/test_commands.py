@@ -89,6 +89,7 @@ def test_a_folder_without_a_usable_mesh_is_refused_with_what_was_found(capsys, t
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.minute
 def test_a_ray_that_does_not_answer_is_told_at_once(capsys, tmp_path):
     code, text = told(capsys, "run", TABLETOP, "--address", "127.0.0.1:1", "--out", str(tmp_path / "out"))
     assert code == 1 and "127.0.0.1:1" in text and "ray start" in text

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from services.cli.arguments import Command, read_span
-from services.cli.parser import build_parser
+from services.cli.main import build_parser
 from services.cli.reference import page, script_for
 from services.cli.rows import COMMANDS
 
@@ -59,7 +59,7 @@ def test_the_page_is_the_one_that_the_table_makes():
 
 def test_help_loads_nothing_heavy():
     code = (
-        "import sys, services.cli.main\nfrom services.cli.parser import build_parser\n"
+        "import sys\nfrom services.cli.main import build_parser\n"
         "try: build_parser().parse_args(['capture', '--help'])\nexcept SystemExit: pass\n"
         "heavy = {'numpy', 'cv2', 'scipy', 'ray', 'pydantic', 'pyarrow', 'av', 'OpenGL', 'pybullet', 'trimesh'}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
