@@ -1,0 +1,163 @@
+"""Formats whose pairs share files, read back with nothing but tarfile or pyarrow, and with the packages that they are for."""
+
+import io
+import json
+import tarfile
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+from schemas.dataset.tables import SCHEMAS
+from services.export.huggingface import card_text
+from tests.exported import export_to, source_image, source_poses, source_rows
+
+WORDS = {
+    "input": {"rgb": "RGB", "depth": "depth", "region": "segment"},
+    "aligned": {"rgb": "RGBaligned", "depth": "depthAligned", "region": "segmentAligned"},
+    "mirror": {"rgb": "RGB", "depth": "depth", "region": "segment"},
+    "projected": {"rgb": "RGBprojected", "depth": "depthProjected"},
+}
+POSE_IDS = [0, 2, 4, 6, 8, 10, 12, 14]
+
+
+@pytest.fixture(scope="module")
+def exported(files, tmp_path_factory):
+    """(folder, manifest) by format; a shard ends after each scene."""
+    place = tmp_path_factory.mktemp("sharded")
+    names = ("webdataset", "huggingface")
+    return {name: (place / name, export_to(files, place / name, name, shard_mb=0).manifest) for name in names}
+
+
+def check_pixels(files, category, pose_id, read):
+    """`read(role, kind)` are the pixels that the dataset stores."""
+    for role, kind, word in ((role, *one) for role, words in WORDS.items() for one in words.items()):
+        stored = source_image(files.root, category, word, pose_id + (role == "mirror"))
+        np.testing.assert_array_equal(read(role, kind), stored)
+
+
+def decode(data):
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return pixels[..., ::-1] if pixels.ndim == 3 else pixels
+
+
+def check_poses(files, pose_id, input_view, mirror_view):
+    poses = source_poses(files.root)
+    for view, number in ((input_view, pose_id), (mirror_view, pose_id + 1)):
+        np.testing.assert_allclose(np.reshape(view["T_world_cam"], (4, 4)), poses[number], atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------ WebDataset
+
+
+def samples_of(folder):
+    """Members by key, as WebDataset groups them: up to the first point of the name."""
+    samples = {}
+    for path in sorted(folder.glob("*.tar")):
+        with tarfile.open(path) as archive:
+            for member in archive:
+                key, _, name = member.name.partition(".")
+                samples.setdefault((path.name.rpartition("-")[0], key), {})[name] = archive.extractfile(member).read()
+    return samples
+
+
+def test_every_pair_is_a_sample_with_the_pixels_poses_and_split_of_the_dataset(files, exported):
+    folder, manifest = exported["webdataset"]
+    samples = samples_of(folder)
+    splits = {row["instance_id"]: row["split"] for row in source_rows(files.root, "assets")}
+    assert sorted(int(key) for _, key in samples) == POSE_IDS
+    assert (manifest["pairs"], manifest["pairs_left_out"], sum(manifest["samples"].values())) == (8, 0, 8)
+    assert len(list(folder.glob("*.tar"))) == sum(manifest["shards"].values()) == 4  # full after each scene
+    for (split, key), sample in samples.items():
+        told, depths = json.loads(sample["json"]), np.load(io.BytesIO(sample["depth.npz"]))
+        assert (told["pose_id"], told["split"], splits[told["instance_id"]]) == (int(key), split, split)
+        check_poses(files, int(key), told["views"]["input"], told["views"]["mirror"])
+
+        def read(role, kind, sample=sample, depths=depths):
+            return depths[role] if kind == "depth" else decode(sample[f"{role}.{kind}.png"])
+
+        check_pixels(files, told["category"], int(key), read)
+
+
+def test_small_shards_hold_the_same_samples_as_one_and_captures_are_samples_too(files, captures, tmp_path, exported):
+    export_to(files, tmp_path / "one", "webdataset")
+    assert samples_of(tmp_path / "one") == samples_of(exported["webdataset"][0])
+    assert export_to(captures, tmp_path / "new", "webdataset").manifest["pairs"] == 4
+    for sample in samples_of(tmp_path / "new").values():
+        assert set(np.load(io.BytesIO(sample["depth.npz"]))) == {"input", "mirror", "projected"}
+
+
+# The package leaves it to the garbage collector to close the shards that it opened.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+def test_the_webdataset_package_reads_every_sample(files, exported):
+    webdataset = pytest.importorskip("webdataset")
+    urls = [str(path) for path in sorted(exported["webdataset"][0].glob("*.tar"))]
+    samples = list(webdataset.WebDataset(urls, shardshuffle=False, empty_check=False).decode("rgb8"))
+    assert sorted(int(one["__key__"]) for one in samples) == POSE_IDS
+    for one in samples:
+
+        def read(role, kind, one=one):
+            if kind == "depth":
+                return one["depth.npz"][role]
+            return one[f"{role}.rgb.png"] if kind == "rgb" else one[f"{role}.region.png"][..., 0]
+
+        check_pixels(files, one["json"]["category"], one["json"]["pose_id"], read)
+
+
+# ------------------------------------------------------------------------------------------------ Hugging Face
+
+
+def rows_of(folder):
+    return [row for path in sorted(folder.glob("data/*.parquet")) for row in pq.read_table(path).to_pylist()]
+
+
+def test_every_pair_is_a_row_with_the_pixels_poses_and_objects_of_the_dataset(files, captures, exported, tmp_path):
+    folder, manifest = exported["huggingface"]
+    rows, objects = rows_of(folder), source_rows(files.root, "objects")
+    assert sorted(row["pose_id"] for row in rows) == POSE_IDS
+    assert (manifest["pairs"], manifest["pairs_left_out"], sum(manifest["rows"].values())) == (8, 0, 8)
+    for row in rows:
+        pose_id = row["pose_id"]
+        check_pixels(
+            files, row["category"], pose_id, lambda role, kind, row=row: decode(row[f"{role}_{kind}"]["bytes"])
+        )
+        check_poses(files, pose_id, row["input_view"], row["mirror_view"])
+        own = {(one["role"], one["region_id"]): one["T_cam_obj"] for one in row["objects"]}
+        for one in objects:
+            if (one["pose_id"], one["role"]) in ((pose_id, "input"), (pose_id + 1, "mirror")):
+                np.testing.assert_allclose(own[one["role"], one["region_id"]], one["T_cam_obj"], atol=1e-6)
+    assert export_to(captures, tmp_path / "new", "huggingface").manifest["pairs"] == 4
+    assert all(row["mirror_rgb"]["bytes"] and "aligned_rgb" not in row for row in rows_of(tmp_path / "new"))
+
+
+def test_the_card_names_the_files_the_licence_and_every_column(exported):
+    folder, manifest = exported["huggingface"]
+    _, head, body = (folder / "README.md").read_text().split("---\n", 2)
+    told = yaml.safe_load(head)
+    assert told["license"] == "cc0-1.0" and manifest["licences"] == ["CC0-1.0"]
+    named = {entry["split"]: entry["path"] for entry in told["configs"][0]["data_files"]}
+    assert named.keys() == manifest["rows"].keys() and all(list(folder.glob(path)) for path in named.values())
+    schema = pq.read_schema(next(folder.glob("data/*.parquet")))
+    assert all(f"`{name}`" in body for name in schema.names)
+    views = {field.name: field.type for field in schema.field("mirror_view").type}
+    assert all(SCHEMAS["views"].field(name).type.equals(kind) for name, kind in views.items())
+    assert {"T_world_cam", "cx_opencv", "depth_units_per_m"} <= views.keys()
+    for licences, licence in ((["CC0-1.0", "ShapeNet"], "other"), ([], "cc0-1.0")):
+        text = card_text("a: b", schema, {}, licences)
+        head = yaml.safe_load(text.split("---\n")[1])
+        assert (head["license"], head["pretty_name"], head["configs"][0]["data_files"]) == (licence, "a: b", [])
+        assert ", ".join(licences) in text
+
+
+def test_the_datasets_package_reads_every_image(files, exported, tmp_path):
+    datasets = pytest.importorskip("datasets")
+    folder, manifest = exported["huggingface"]
+    loaded = datasets.load_dataset(str(folder), cache_dir=str(tmp_path / "cache"))
+    assert {name: len(rows) for name, rows in loaded.items()} == manifest["rows"]
+    for rows in loaded.values():
+        assert isinstance(rows.features["input_depth"], datasets.Image)
+        for row in rows:
+            images = {name: np.asarray(cell) for name, cell in row.items() if name.partition("_")[0] in WORDS}
+            check_pixels(files, row["category"], row["pose_id"], lambda *names, of=images: of["_".join(names)])
