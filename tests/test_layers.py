@@ -61,8 +61,8 @@ def lint(project: Path, imports: tuple[tuple[str, ...], ...]) -> subprocess.Comp
         for file in (ROOT / top).rglob("*.py"):
             (project / file.relative_to(ROOT)).touch()
     for module, imported, *_ in imports:
-        with (project / (module.replace(".", "/") + ".py")).open("a") as file:
-            file.write(f"import {imported}\n")
+        with (project / (module.replace(".", "/") + ".py")).open("a") as written:
+            written.write(f"import {imported}\n")
     command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]
     return subprocess.run(command, cwd=project, capture_output=True, text=True, check=False)
 

@@ -105,7 +105,9 @@ class HiddenMarkers(Frozen):
 class RegistrationError(Frozen):
     """Error of the depth camera's assumed place: what registers depth to colour uses this wrong pose."""
 
-    shift_m: Annotated[list[float], Field(min_length=3, max_length=3, default_factory=lambda: [0.010, 0.0, 0.0])]
+    shift_m: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+        default_factory=lambda: [0.010, 0.0, 0.0]
+    )
     """Error of the assumed place along the axes of the colour camera."""
     turn_deg: float = 0.0
     """Error of the assumed orientation, about the vertical axis of the colour camera."""

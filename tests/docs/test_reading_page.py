@@ -24,7 +24,7 @@ def here(tmp_path_factory) -> Path:
     return root
 
 
-def check_images_of_mugs(names: dict) -> None:
+def check_images_of_mugs(names):
     paths = sorted(str(path) for path in Path("data/tabletop/mug").glob("RGB0*[02468].png"))  # every mug is seen whole
     assert sorted(f"data/tabletop/{path}" for path in names["files"]) == paths and len(paths) > 1
     pixels = [cv2.imread(f"data/tabletop/{path}")[..., ::-1] for path in names["files"]]
