@@ -12,7 +12,7 @@ from schemas.errors import AssetSourceError, MeshError, plain_line
 from schemas.job.assets import Assets, FolderSource, MeshLimits, UpAxis
 from workers.assets.external.formats import FORMATS
 from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import ASSEMBLIES, Measured, read_measured
+from workers.assets.external.placement import URDF, Measured, read_measured
 from workers.assets.external.reader import Kind, Request, Task, ask_all
 
 PART = "part"
@@ -86,7 +86,7 @@ class Guess:
     """Category by pattern; the first match wins."""
 
 
-SUFFIXES = (*ASSEMBLIES, *FORMATS)
+SUFFIXES = (URDF, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
 
 FOREIGN = (
@@ -175,7 +175,7 @@ def read_folder(folder: Path, categories: Mapping[str, str], watch: Watch) -> Re
         return zip(entries, (answer for _, answer in answers), strict=True)
 
     parts: dict[str, str] = {}
-    for urdf, answer in ask("names", {path: None for path in categories if path.lower().endswith(".urdf")}):
+    for urdf, answer in ask("names", {path: None for path in categories if path.lower().endswith(URDF)}):
         for part in [] if isinstance(answer, MeshError) else json.loads(answer):
             parts.setdefault(part, urdf)
     entries, items, refused = dict[str, Entry | None](), list[Item](), list[LeftOut]()

@@ -6,7 +6,7 @@ file (`measure_asset`).
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -36,24 +36,16 @@ OBJECT_SCALE, TABLE_SCALE = 0.25, 1.5
 """The article's factors on ShapeNetCore's normalised units."""
 
 
-@dataclass(frozen=True)
-class Assembly:
-    """How a kind of file that poses mesh files is read: which files it shows, and its shape; both MeshError."""
-
-    meshes: Callable[[Path, Path, MeshLimits], list[Path]]
-    load: Callable[[Path, MeshLimits, Path], LoadedMesh]
-
-
-ASSEMBLIES: Mapping[str, Assembly] = {".urdf": Assembly(seen_meshes, load_urdf)}
-"""The formats of files that pose meshes, by suffix."""
+URDF = ".urdf"
+"""The end of the name of a file that poses mesh files."""
 
 
 def list_files(
     settings: ShapeNetSource | FolderSource, folder: Path, path: Path, limits: MeshLimits
 ) -> tuple[Path, ...]:
     """A candidate and every file that it refers to, each once; MeshError where one of them, or all together, is refused."""
-    if (assembly := ASSEMBLIES.get(path.suffix.lower())) is not None:
-        meshes = assembly.meshes(path, folder, limits)
+    if path.suffix.lower() == URDF:
+        meshes = seen_meshes(path, folder, limits)
         files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits))]
     else:
         files = list_mesh_files(path, mesh_root(settings, folder, path), limits)
@@ -73,8 +65,8 @@ def load_entry(
     """One instance, cleaned, z up, scaled; MeshError where its mesh is refused or has changed."""
     check_unchanged(folder, entry)
     path = folder / entry.files[0].path
-    if (assembly := ASSEMBLIES.get(path.suffix.lower())) is not None:
-        loaded = assembly.load(path, assets.limits, folder)
+    if path.suffix.lower() == URDF:
+        loaded = load_urdf(path, assets.limits, folder)
     else:
         loaded = load_shape(path, assets.limits, mesh_root(settings, folder, path))
     return place_asset(loaded, entry, category, settings, assets)
@@ -84,21 +76,21 @@ def place_asset(
     loaded: LoadedMesh, entry: Entry, category: str, settings: ShapeNetSource | FolderSource, assets: Assets
 ) -> Asset:
     """The asset of a cleaned shape in its source's frame; MeshError `no_size` or `size` where its extent is not allowed."""
-    diagonal_m = None
+    path = entry.files[0].path
     if isinstance(settings, ShapeNetSource):
         axes, scale = UP_AXES["y"], settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE)
     else:
-        axes, scale = UP_AXES[settings.up_of(entry.files[0].path)], settings.scale
-        diagonal_m = None if category == TABLE else settings.diagonal_m
+        axes, scale = UP_AXES[settings.up_of(path)], settings.scale
     rotated = transform_shape(loaded.shape, pose(axes, np.zeros(3)))
     lower, upper = rotated.bounds
     diagonal = float(np.linalg.norm(upper - lower))
     if diagonal == 0.0:
-        raise MeshError("no_size", f"{entry.files[0].path} has no extent")
+        raise MeshError("no_size", f"{path} has no extent")
     if not np.isfinite(diagonal):
-        raise MeshError("not_finite", f"{entry.files[0].path} is too large for floating-point numbers")
-    scale = scale if diagonal_m is None else diagonal_m / diagonal
-    _check_size(entry.files[0].path, scale * diagonal, assets.limits)
+        raise MeshError("not_finite", f"{path} is too large for floating-point numbers")
+    if isinstance(settings, FolderSource) and settings.diagonal_m is not None and category != TABLE:
+        scale = settings.diagonal_m / diagonal
+    _check_size(path, scale * diagonal, assets.limits)
     centre = 0.5 * (lower + upper) * scale
     shape = transform_shape(rotated, pose(scale * np.eye(3), -centre))
     mass = mass_properties(shape, assets.density_kg_m3, assets.shell_kg_m2)
@@ -107,7 +99,7 @@ def place_asset(
         category=category,
         source=settings.source,
         licence=entry.licence,
-        path=entry.files[0].path,
+        path=path,
         sha256=entry.files[0].sha256,
         shape=shape,
         mass=mass,
@@ -135,13 +127,12 @@ def find_doubt(asset: Asset, settings: ShapeNetSource | FolderSource, hull_verti
 
 def _check_size(name: str, diagonal_m: float, limits: MeshLimits) -> None:
     """MeshError `size` where a body is so small or large that nothing about it could be simulated or seen."""
-    for over, word, key, cap in (
-        (diagonal_m < limits.min_size_m, "under", "min_size_m", limits.min_size_m),
-        (diagonal_m > limits.max_size_m, "over", "max_size_m", limits.max_size_m),
-    ):
-        if over:
-            remedy = "set `scale` (0.001 for millimetres) or `diagonal_m` of its source"
-            raise MeshError("size", f"{name} is {diagonal_m:.3g} m across, {word} {key} = {cap:g}: {remedy}")
+    if limits.min_size_m <= diagonal_m <= limits.max_size_m:
+        return
+    small = diagonal_m < limits.min_size_m
+    cap = f"under min_size_m = {limits.min_size_m:g}" if small else f"over max_size_m = {limits.max_size_m:g}"
+    remedy = "set `scale` (0.001 for millimetres) or `diagonal_m` of its source"
+    raise MeshError("size", f"{name} is {diagonal_m:.3g} m across, {cap}: {remedy}")
 
 
 FLAT_SHARE, ROUGH_SHARE = 0.004, 0.016
@@ -267,24 +258,20 @@ class Measured:
 
 def measure_asset(asset: Asset, hull: Hull | None) -> str:
     """The measures of an asset whose source has z up, as JSON."""
-    extents = asset.extents_m
+    x, y, z = (float(extent) for extent in asset.extents_m)
     textures = [part.material.texture for part in asset.shape.parts if part.material.texture is not None]
-    pictures = {id(texture) for texture in textures if max(texture.shape[:2]) > PLACEHOLDER_PX}
     found = None if hull is None else find_upright(hull.vertices, asset.mass.com)
-    return json.dumps(
-        asdict(
-            Measured(
-                extents=(float(extents[0]), float(extents[1]), float(extents[2])),
-                vertices=int(np.sum([len(part.vertices) for part in asset.shape.parts])),
-                faces=int(np.sum([len(part.faces) for part in asset.shape.parts])),
-                watertight=asset.watertight,
-                textures=len(pictures),
-                notes=asset.notes,
-                up=None if found is None else found.axis,
-                confidence=None if found is None else found.confidence,
-            )
-        )
+    measured = Measured(
+        extents=(x, y, z),
+        vertices=sum(len(part.vertices) for part in asset.shape.parts),
+        faces=sum(len(part.faces) for part in asset.shape.parts),
+        watertight=asset.watertight,
+        textures=len({id(texture) for texture in textures if max(texture.shape[:2]) > PLACEHOLDER_PX}),
+        notes=asset.notes,
+        up=None if found is None else found.axis,
+        confidence=None if found is None else found.confidence,
     )
+    return json.dumps(asdict(measured))
 
 
 def read_measured(data: bytes) -> Measured:

@@ -40,7 +40,7 @@ from schemas.scene.shape import Asset, Hull, MassProperties, Material, Part, Sha
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, hash_files
 from workers.assets.external.placement import find_doubt, list_files, load_entry, measure_asset
-from workers.assets.external.urdf import all_mesh_names, find_mesh, parse_urdf
+from workers.assets.external.urdf import find_mesh, mesh_names, parse_urdf
 from workers.geometry.hull import convex_hull
 
 Kind = Literal["list", "check", "load", "measure", "names"]
@@ -98,9 +98,7 @@ def ask(request: Request) -> Iterator[bytes | MeshError]:
         answers, code = _exchange(replace(request, tasks=left))
         if code in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP):
             raise MachineError("a process that reads meshes was killed from outside, perhaps for want of memory")
-        if (
-            not answers
-        ):  # it ended in the first task, before which it had read nothing else: the verdict is the file's own
+        if not answers:  # it ended in the first task and had read nothing before: the verdict is the file's own
             answers = [_describe_end(code, left[0].path, request.assets.limits)]
         yield from answers
         left = left[len(answers) :]
@@ -114,18 +112,18 @@ def ask_all(request: Request, watch: Watch) -> Iterator[tuple[Task, bytes | Mesh
     size, done = BATCH[tasks[0].kind], 0
     batches = iter([replace(request, tasks=tasks[at : at + size]) for at in range(0, len(tasks), size)])
     count = min(len(os.sched_getaffinity(0)), MOST_PROCESSES)
+
+    def ask_batch(batch: Request) -> list[tuple[Task, bytes | MeshError]]:
+        return list(zip(batch.tasks, ask(batch), strict=True))
+
     with ThreadPoolExecutor(count) as pool:
-        waiting = [pool.submit(_ask_batch, batch) for batch in islice(batches, 2 * count)]
+        waiting = [pool.submit(ask_batch, batch) for batch in islice(batches, 2 * count)]
         while waiting:
             answers = waiting.pop(0).result()
-            waiting += [pool.submit(_ask_batch, batch) for batch in islice(batches, 1)]
+            waiting += [pool.submit(ask_batch, batch) for batch in islice(batches, 1)]
             yield from answers
             done += len(answers)
             watch(done, len(tasks))
-
-
-def _ask_batch(batch: Request) -> list[tuple[Task, bytes | MeshError]]:
-    return list(zip(batch.tasks, ask(batch), strict=True))
 
 
 _processes = multiprocessing.get_context("forkserver")
@@ -244,9 +242,11 @@ def _answer(request: Request, task: Task) -> bytes:
         files = hash_files(paths, request.folder)
         return json.dumps([[file.path, file.size, file.sha256] for file in files]).encode()
     if task.kind == "names":
-        return json.dumps(
-            [file.relative_to(request.folder).as_posix() for file in _named_files(task.path, request)]
-        ).encode()
+        found = []
+        for name in mesh_names(parse_urdf(task.path, request.assets.limits), "*"):
+            with suppress(MeshError):
+                found.append(find_mesh(name, task.path, request.folder).relative_to(request.folder).as_posix())
+        return json.dumps(found).encode()
     assert task.entry is not None
     asset = load_entry(request.settings, request.folder, task.entry, task.category, request.assets)
     if task.kind == "load":
@@ -256,15 +256,6 @@ def _answer(request: Request, task: Task) -> bytes:
         return measure_asset(asset, hull).encode()
     doubt = None if hull is None else find_doubt(asset, request.settings, hull.vertices)
     return (doubt or "").encode()
-
-
-def _named_files(urdf: Path, request: Request) -> list[Path]:
-    """The meshes below the folder that a URDF names, for what is seen and for what collides. MeshError as parse_urdf."""
-    found = []
-    for name in all_mesh_names(parse_urdf(urdf, request.assets.limits)):
-        with suppress(MeshError):
-            found.append(find_mesh(name, urdf, request.folder))
-    return found
 
 
 def _check_fit(asset: Asset, path: Path) -> Hull | None:

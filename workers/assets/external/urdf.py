@@ -2,7 +2,9 @@
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -50,19 +52,14 @@ def parse_urdf(path: Path, limits: MeshLimits) -> ElementTree.Element:
     return robot
 
 
-def mesh_names(robot: ElementTree.Element) -> list[str]:
-    """The file names of the meshes of all visuals, each once, in their order."""
-    return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind("link/visual/geometry/mesh")))
+def mesh_names(robot: ElementTree.Element, kind: str = "visual") -> list[str]:
+    """The file names of the meshes of all visuals, or `*`: also of those that only collide; each once, in their order."""
+    return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind(f"link/{kind}/geometry/mesh")))
 
 
 def seen_meshes(urdf: Path, root: Path, limits: MeshLimits) -> list[Path]:
     """The files of the meshes of all visuals, each once; MeshError where one is not inside `root`."""
     return list(dict.fromkeys(find_mesh(name, urdf, root) for name in mesh_names(parse_urdf(urdf, limits))))
-
-
-def all_mesh_names(robot: ElementTree.Element) -> list[str]:
-    """The file names of all meshes, also of those that only collide."""
-    return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind("link/*/geometry/mesh")))
 
 
 def find_mesh(name: str, urdf: Path, root: Path) -> Path:
@@ -77,46 +74,30 @@ def find_mesh(name: str, urdf: Path, root: Path) -> Path:
 
 def load_urdf(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     """All visuals of all links, joints at zero, in the frame of the first root link, metres; MeshError as load_shape."""
-    robot = parse_urdf(path, limits)
-    meshes = _Meshes(path, root, limits)
+    robot, budget = parse_urdf(path, limits), Budget(limits)
     colors = {m.get("name", ""): _color(path, m) for m in robot.iterfind("material")}
-    parts: list[Part] = []
-    notes: list[str] = []
-    vertices = faces = 0
+    parts, notes, vertices, faces = list[Part](), list[str](), 0, 0
+
+    @cache
+    def load(name: str) -> LoadedMesh:
+        return load_shape(find_mesh(name, path, root), limits, root, budget)
+
     for link, T_root_link in _link_poses(path, robot):
         for visual in link.iterfind("visual"):
-            loaded = _load_visual(path, visual, meshes)
+            loaded = _load_visual(path, visual, load)
             notes += loaded.notes
             material = visual.find("material")
             color = None if material is None else _color(path, material) or colors.get(material.get("name", ""))
             shape = transform_shape(loaded.shape, T_root_link @ _origin(path, visual))
-            parts += [_colored(part, color) for part in shape.parts]
             for part in shape.parts:
                 check_coordinates(path, part.vertices)
-            vertices += sum(len(part.vertices) for part in shape.parts)
-            faces += sum(len(part.faces) for part in shape.parts)
+                parts.append(replace(_colored(part, color), name=f"part{len(parts)}"))
+                vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
             check_nodes(path, len(parts), "parts", limits)
             check_counts(path, vertices, faces, limits)
     if not parts:
         raise MeshError("no_faces", f"{path} has no visual geometry")
-    named = tuple(replace(part, name=f"part{number}") for number, part in enumerate(parts))
-    return LoadedMesh(Shape(named), tuple(dict.fromkeys(notes)))
-
-
-class _Meshes:
-    """The meshes of a URDF, each read once however often it is named."""
-
-    def __init__(self, urdf: Path, root: Path, limits: MeshLimits) -> None:
-        self._urdf, self._root, self._limits = urdf, root, limits
-        self._budget = Budget(limits)
-        self._loaded: dict[str, LoadedMesh] = {}
-
-    def load(self, name: str) -> LoadedMesh:
-        """The mesh of this name in its own frame; MeshError."""
-        if name not in self._loaded:
-            mesh = find_mesh(name, self._urdf, self._root)
-            self._loaded[name] = load_shape(mesh, self._limits, self._root, self._budget)
-        return self._loaded[name]
+    return LoadedMesh(Shape(tuple(parts)), tuple(dict.fromkeys(notes)))
 
 
 def _colored(part: Part, color: tuple[float, ...] | None) -> Part:
@@ -153,11 +134,11 @@ def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTre
     return placed
 
 
-def _load_visual(path: Path, visual: ElementTree.Element, meshes: _Meshes) -> LoadedMesh:
-    """One visual's geometry in its own frame."""
+def _load_visual(path: Path, visual: ElementTree.Element, load: Callable[[str], LoadedMesh]) -> LoadedMesh:
+    """One visual's geometry in its own frame; `load` reads a mesh by its name."""
     for kind in visual.iterfind("geometry/*"):
         if kind.tag == "mesh":
-            loaded = meshes.load(kind.get("filename", ""))
+            loaded = load(kind.get("filename", ""))
             scale = _numbers(path, kind.get("scale", "1 1 1"), 3)
             if 0.0 in scale:
                 raise MeshError("no_size", f"{path} scales a mesh by {scale}")
@@ -167,17 +148,17 @@ def _load_visual(path: Path, visual: ElementTree.Element, meshes: _Meshes) -> Lo
 
 
 def _primitive(path: Path, kind: ElementTree.Element) -> Part:
+    def number(name: str) -> float:
+        return float(_numbers(path, kind.get(name), 1, positive=True)[0])
+
     if kind.tag == "box":
         mesh = trimesh.creation.box(_numbers(path, kind.get("size"), 3, positive=True))
     elif kind.tag == "sphere":
-        mesh = trimesh.creation.uv_sphere(
-            _numbers(path, kind.get("radius"), 1, positive=True)[0], count=[SEGMENTS, SEGMENTS]
-        )
-    elif kind.tag in ("cylinder", "capsule"):
-        radius = _numbers(path, kind.get("radius"), 1, positive=True)[0]
-        length = _numbers(path, kind.get("length"), 1, positive=True)[0]
-        make = trimesh.creation.cylinder if kind.tag == "cylinder" else trimesh.creation.capsule
-        mesh = make(radius=radius, height=length, **({"sections": SEGMENTS} if kind.tag == "cylinder" else {}))
+        mesh = trimesh.creation.uv_sphere(number("radius"), count=[SEGMENTS, SEGMENTS])
+    elif kind.tag == "cylinder":
+        mesh = trimesh.creation.cylinder(number("radius"), number("length"), sections=SEGMENTS)
+    elif kind.tag == "capsule":
+        mesh = trimesh.creation.capsule(radius=number("radius"), height=number("length"))
     else:
         raise MeshError("unreadable", f"{path}: geometry <{kind.tag:.40}> is not known")
     return Part(kind.tag, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
