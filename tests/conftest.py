@@ -119,7 +119,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 LONGEST_FIRST = (
     "services/study/test_command.py",
     "services/run/test_run_job.py",
-    "services/run/test_several_objects.py",
+    "services/run/test_whole_scenes.py",
     "effects/test_random_scenes.py",
     "effects/test_physics_effects.py",
     "services/bench/test_rounds.py",

@@ -33,13 +33,11 @@ def merge_folder(store: Store) -> Iterator[Path]:
     try:
         with explain_full_disk(), store.scratch(SCRATCH) as folder:
             yield folder
-    except (MachineError, FileNotFoundError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise RunError(
-                f"{error.filename or SCRATCH} was removed while {store.name} was merged: another coordinator merges here; "
-                "start again when it has ended"
-            ) from error
-        raise
+    except FileNotFoundError as error:
+        raise RunError(
+            f"{error.filename or SCRATCH} was removed while {store.name} was merged: another coordinator merges here; "
+            "start again when it has ended"
+        ) from error
 
 
 def open_scratch(path: Path, tables: str) -> sqlite3.Connection:

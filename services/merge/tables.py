@@ -3,6 +3,7 @@
 Tables are written in files of about 100,000 rows, the text files in blocks of lines (dataset.md section 1).
 """
 
+import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -164,35 +165,24 @@ class _Parts:
             self._sink.drain(file)
 
 
-class _Sink:
+class _Sink(io.BytesIO):
     """Where a Parquet writer writes to: memory, so that it never fails and hundreds of files need not be open at once."""
 
-    def __init__(self) -> None:
-        self.closed = False
-        self._position = 0
-        self._pending: list[bytes] = []
-
-    def write(self, data: bytes | pa.Buffer) -> int:
-        """Takes the next bytes."""
-        self._pending.append(bytes(memoryview(data)))
-        self._position += len(self._pending[-1])
-        return len(self._pending[-1])
+    _drained = 0
 
     def tell(self) -> int:
-        """Bytes so far."""
-        return self._position
-
-    def flush(self) -> None:
-        """Does nothing."""
+        """Bytes so far, drained ones too."""
+        return self._drained + super().tell()
 
     def close(self) -> None:
-        """Takes no more bytes."""
-        self.closed = True
+        """Does nothing: what the writer wrote last is still to be drained."""
 
     def drain(self, file: IO[bytes]) -> None:
         """Moves the bytes since the last call to a file."""
-        pending, self._pending = self._pending, []
-        file.writelines(pending)
+        file.write(self.getvalue())
+        self._drained = self.tell()
+        self.seek(0)
+        self.truncate()
 
 
 _ELEMENTS = [f"T{row}{column}" for row in range(4) for column in range(4)]
@@ -210,19 +200,17 @@ class PoseFiles:
 
     def __init__(self, folder: Path) -> None:
         self.paths = {name: folder / name for name in (CAM_POSES, CAMERAS, OBJECTS)}
-        self._append(CAM_POSES, (",".join(["id", "parent_id", *_ELEMENTS]) + "\n").encode())
-        self._append(CAMERAS, (",".join([*_CAMERA_COLUMNS, *_ELEMENTS]) + "\n").encode())
-        self._append(OBJECTS, b"")
+        headers = (["id", "parent_id", *_ELEMENTS], [*_CAMERA_COLUMNS, *_ELEMENTS])
+        self._append(*((",".join(words) + "\n").encode() for words in headers), b"")
 
     def add(self, views: pa.Table, objects: pa.Table) -> None:
         """Takes the next ranges' rows of both tables."""
-        self._append(CAM_POSES, cam_pose_lines(views))
-        self._append(CAMERAS, camera_lines(views))
-        self._append(OBJECTS, object_lines(objects))
+        self._append(cam_pose_lines(views), camera_lines(views), object_lines(objects))
 
-    def _append(self, name: str, lines: bytes) -> None:
-        with open(self.paths[name], "ab") as file:
-            file.write(lines)
+    def _append(self, *lines: bytes) -> None:
+        for path, more in zip(self.paths.values(), lines, strict=True):
+            with open(path, "ab") as file:
+                file.write(more)
 
 
 def cam_pose_lines(views: pa.Table) -> bytes:
@@ -246,7 +234,11 @@ def object_lines(objects: pa.Table) -> bytes:
     """
     columns = ["pose_id", "category", "instance_id", "region_id", "u", "v", "T_cam_obj"]
     rows = objects.select(columns).filter(_is_pose(objects)).combine_chunks()
-    names = [_escaped_all(rows.column(name)) for name in ("category", "instance_id")]
+    names = []
+    for name in ("category", "instance_id"):
+        coded = rows.column(name).dictionary_encode().combine_chunks()
+        words = pa.array([escaped(text) for text in coded.dictionary.to_pylist()], pa.string())
+        names.append(words.take(coded.indices))
     numbers = [rows.column(name) for name in ("region_id", "u", "v")]
     return _lines([rows.column("pose_id"), *names, *numbers, _joined(rows.column("T_cam_obj"), " ")], " ")
 
@@ -287,13 +279,6 @@ def _text(column: pa.ChunkedArray | pa.Array) -> pa.Array:
     if pa.types.is_floating(whole.type):
         return shortest(whole)
     return whole if pa.types.is_string(whole.type) else whole.cast(pa.string())
-
-
-def _escaped_all(names: pa.ChunkedArray) -> pa.ChunkedArray:
-    """The names as words."""
-    coded = names.dictionary_encode().combine_chunks()
-    words = pa.array([escaped(name) for name in coded.dictionary.to_pylist()], pa.string())
-    return words.take(coded.indices)
 
 
 def _is_pose(rows: pa.Table) -> pa.ChunkedArray:

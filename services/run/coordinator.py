@@ -27,7 +27,7 @@ from services.run.machine import Process, send
 from services.run.metrics import Tally
 from services.run.progress import log_event, say
 from services.run.ray_cluster import Slots
-from services.run.watchdog import AttemptName, Stall, Watchdog, end_worker_here, find_own_workers, scenes_in_progress
+from services.run.watchdog import AttemptName, Sight, end_worker_here, find_own_workers, scenes_in_progress, watch
 from workers.store.attempt import TIMED_OUT, attempts_at, blamed_scene, host_part, retry_of_attempt, sweep_attempt
 from workers.store.commit import read_record
 from workers.store.ledger import read_summary
@@ -44,18 +44,6 @@ EXPLANATIONS: dict[Reason, str] = {
 """The stored detail of an environmental failure."""
 
 
-@dataclass(frozen=True)
-class Death:
-    """A worker that died with the range from `start`: in which scene, if it had begun one, and of what."""
-
-    start: int
-    scene: int | None
-    reason: Reason
-    message: str
-    with_node: bool = False
-    """Whether its whole node was lost."""
-
-
 class Deaths:
     """The deaths of a run's workers, by the scene that they died in, or by the range where they had begun none."""
 
@@ -64,20 +52,22 @@ class Deaths:
         self._counts: Counter[tuple[bool, str, int]] = Counter()
         self._blamed: dict[int, Blame] = {}
 
-    def count(self, death: Death) -> None:
-        """Counts a death, and blames its scene after too many. Raises RunError where workers die before they begin one."""
-        place = ("range", death.start) if death.scene is None else ("scene", death.scene)
-        self._counts[death.with_node, *place] += 1
-        deaths = self._counts[death.with_node, *place]
-        if deaths < self._attempts * (NODE_PATIENCE if death.with_node else 1):
+    def count(self, start: int, scene: int | None, reason: Reason, message: str, with_node: bool = False) -> None:
+        """Counts a death with the range from `start`, in `scene` if it had begun one; `with_node`: its whole node was lost.
+
+        Blames the scene after too many. Raises RunError where workers die before they begin one.
+        """
+        place = (with_node, "range", start) if scene is None else (with_node, "scene", scene)
+        self._counts[place] += 1
+        deaths = self._counts[place]
+        if deaths < self._attempts * (NODE_PATIENCE if with_node else 1):
             return
-        if death.scene is None:
+        if scene is None:
             raise RunError(
-                f"the worker for the scenes from {death.start} died {deaths} times before it began one or while it committed "
-                f"({death.reason}: {death.message}): see `verso doctor`"
+                f"the worker for the scenes from {start} died {deaths} times before it began one or while it committed "
+                f"({reason}: {message}): see `verso doctor`"
             )
-        detail = EXPLANATIONS[death.reason]
-        self._blamed[death.scene] = Blame(scene_id=death.scene, reason=death.reason, detail=detail, attempts=deaths)
+        self._blamed[scene] = Blame(scene_id=scene, reason=reason, detail=EXPLANATIONS[reason], attempts=deaths)
 
     def blamed_in(self, spans: Iterable[Span]) -> tuple[Blame, ...]:
         """Scenes of these ranges that are not to be tried again."""
@@ -90,17 +80,16 @@ def count_under_way(shards: Iterable[tuple[Span, ...]], in_progress: Mapping[int
     in_progress: the scene that a worker makes now by the start of its range; None between scenes, which counts as none of it. A
     range whose commit is under way is there too, while the next one is made.
     """
-    return sum(_made_of(spans, in_progress) for spans in shards)
-
-
-def _made_of(spans: tuple[Span, ...], in_progress: Mapping[int, int | None]) -> int:
-    made = before = 0
-    for span in spans:
-        if span.start in in_progress:
-            scene_id, ids = in_progress[span.start], span.scene_ids
-            made = before + (ids.index(scene_id) if scene_id is not None and scene_id in ids else 0)
-        before += span.count
-    return made
+    total = 0
+    for spans in shards:
+        made = before = 0
+        for span in spans:
+            if span.start in in_progress:
+                scene_id, ids = in_progress[span.start], span.scene_ids
+                made = before + (ids.index(scene_id) if scene_id is not None and scene_id in ids else 0)
+            before += span.count
+        total += made
+    return total
 
 
 LOOK_EVERY_S = 2.0
@@ -178,7 +167,7 @@ class Coordinator:
         self._stalled: set[ray.ObjectRef] = set()
         """Shards whose workers the watchdog ended."""
         self._deaths = Deaths(limits.attempts)
-        self._lost_nodes = LostNodes(_alive_hosts)
+        self._lost_nodes = LostNodes(lambda: {host for _, host in _alive_nodes()})
 
     def run(self, shards: Iterator[tuple[Span, ...]], progress: Callable[[Tally], None] = lambda tally: None) -> None:
         """Makes every range of every shard.
@@ -187,13 +176,13 @@ class Coordinator:
         many scenes fail. On KeyboardInterrupt, committed ranges stay and running shards are ended.
         """
         try:
-            with Watchdog(self._store, self._order.label, self._order.job.run.scene_timeout_s) as watchdog:
+            with watch(self._store, self._order.label, self._order.job.run.scene_timeout_s) as take_stalls:
                 while self._fill_slots(shards):
                     ready, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
                     for ref in ready:
                         self._collect(ref, self._running.pop(ref))
-                    for stall in watchdog.take_stalls():
-                        self._end_stalled(stall)
+                    for attempt, sight in take_stalls():
+                        self._end_stalled(attempt, sight)
                     self._tally.in_flight = sum(len(spans) for spans in self._running.values())
                     self._tally.under_way = self._count_under_way()
                     if self._env_vars and (lost := self._lost_nodes.take()):
@@ -279,29 +268,29 @@ class Coordinator:
             else:
                 self._again.append(spans)
 
-    def _end_stalled(self, stall: Stall) -> None:
+    def _end_stalled(self, attempt: AttemptName | None, sight: Sight) -> None:
         """Says that a worker shows no progress, and ends it: what follows is the same as after any other death."""
         own = {process.pid: process for process in find_own_workers()}
-        if stall.attempt is None:
-            return self._end_stopped(stall.idle_s, list(own.values()))
-        start, retry = stall.attempt.start, retry_of_attempt(stall.attempt.name)
-        ref = next((ref for ref, spans in self._running.items() if (start, retry) in _keys(spans)), None)
-        if ref is None:
+        if attempt is None:
+            return self._end_stopped(sight.idle_s, list(own.values()))
+        key = attempt.start, retry_of_attempt(attempt.name)
+        refs = (ref for ref, spans in self._running.items() if key in [(span.start, span.retry) for span in spans])
+        if (ref := next(refs, None)) is None:
             return
         self._stalled.add(ref)
-        pid, host = stall.attempt.pid, stall.attempt.host
-        log_event("worker stalled", logging.WARNING, range=start, scene=stall.scene_id, pid=pid, host=host)
-        doing = "committing" if stall.scene_id is None else f"scene {stall.scene_id}"
+        start, pid, host = attempt.start, attempt.pid, attempt.host
+        log_event("worker stalled", logging.WARNING, range=start, scene=sight.scene_id, pid=pid, host=host)
+        doing = "committing" if sight.scene_id is None else f"scene {sight.scene_id}"
         stopped = ", which was stopped by a signal" if pid in own and own[pid].stopped else ""
         say(
-            f"range from {start}, {doing}: no progress for {stall.idle_s:.0f} s by process {pid} on {host}{stopped}: "
+            f"range from {start}, {doing}: no progress for {sight.idle_s:.0f} s by process {pid} on {host}{stopped}: "
             "it is ended, and the range is made again"
         )
         if pid in own:
-            send(own[pid], signal.SIGKILL)
-            return
-        for node in _nodes_called(host):
-            _end_worker.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(pid)
+            return send(own[pid], signal.SIGKILL)
+        for node, its_host in _alive_nodes():
+            if its_host == host:
+                _end_worker.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(pid)
 
     def _end_stopped(self, idle_s: float, own: list[Process]) -> None:
         """Says that no worker has begun a range for a long time, and ends those that were stopped by a signal."""
@@ -342,7 +331,7 @@ class Coordinator:
         message = " ".join(str(error).split())[:300]
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
         self._tally.lost[reason] += 1
-        self._deaths.count(Death(span.start, scene, reason, message, isinstance(error, NodeDiedError)))
+        self._deaths.count(span.start, scene, reason, message, isinstance(error, NodeDiedError))
 
     def _find_evidence(self, left: Sequence[Span]) -> tuple[Span, int | None, bool]:
         """The range and the scene in progress when a worker of this run was lost, and whether its time was up.
@@ -365,16 +354,6 @@ class Coordinator:
         return found
 
 
-def _keys(spans: tuple[Span, ...]) -> list[tuple[int, int]]:
-    return [(span.start, span.retry) for span in spans]
-
-
-def _alive_hosts() -> set[str]:
-    """The hosts of the cluster's nodes, as attempts are named."""
-    return {host_part(node["NodeManagerHostname"]) for node in ray.nodes() if node["Alive"]}
-
-
-def _nodes_called(host: str) -> list[str]:
-    """Ids of the cluster's nodes whose host has this name, as attempts are named."""
-    nodes = [node for node in ray.nodes() if node["Alive"]]
-    return [node["NodeID"] for node in nodes if host_part(node["NodeManagerHostname"]) == host]
+def _alive_nodes() -> list[tuple[str, str]]:
+    """(id, host, as attempts are named) of the cluster's nodes."""
+    return [(node["NodeID"], host_part(node["NodeManagerHostname"])) for node in ray.nodes() if node["Alive"]]

@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,10 +74,10 @@ def descendants(pid: int) -> list[Process]:
 
 def send(process: Process, number: int) -> None:
     """Sends a signal to exactly this process; nothing where it is gone, even if its id was given out again."""
-    with contextlib.suppress(OSError), _descriptor(process.pid) as descriptor:
+    with contextlib.suppress(OSError), open(os.pidfd_open(process.pid), "rb", buffering=0) as descriptor:
         now = read_process(process.pid)
         if now is not None and now.born == process.born:
-            signal.pidfd_send_signal(descriptor, number)
+            signal.pidfd_send_signal(descriptor.fileno(), number)
 
 
 def marked(mark: str) -> list[Process]:
@@ -141,15 +141,6 @@ def die_with(parent: int, number: int) -> None:
 def _prctl(option: int, value: int) -> None:
     if ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), f"prctl {option}")
-
-
-@contextlib.contextmanager
-def _descriptor(pid: int) -> Iterator[int]:
-    descriptor = os.pidfd_open(pid)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
 
 
 def usable_cores(proc: Path = Path("/proc/self/cgroup"), cgroups: Path = Path("/sys/fs/cgroup")) -> int:

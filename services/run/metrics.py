@@ -5,6 +5,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -38,6 +39,24 @@ class Counts:
     phase: str = "planning"
 
 
+GAUGES = {
+    "verso_scenes_asked": ("asked", "Scenes that this run was to make."),
+    "verso_ranges_in_flight": ("in_flight", "Ranges given to Ray and not reported."),
+    "verso_slots": ("slots", "Shards that may run at once."),
+    "verso_making_since_timestamp_seconds": ("since", "When the making began."),
+}
+COUNTERS = {
+    "verso_scenes_made": ("made", "Scenes made and committed in this run."),
+    "verso_commits": ("commits", "Ranges committed in this run."),
+}
+COUNTERS_BY = {
+    "verso_scenes_failed": ("failed", "reason", "Scenes that could not be made."),
+    "verso_workers_lost": ("lost", "reason", "Workers that died, by cause."),
+    "verso_stage_seconds": ("seconds", "stage", "Time of the workers in each stage."),
+}
+"""By name: the field of `Counts`, the label if there is one, and what it is."""
+
+
 class Meter(Collector):
     """The latest counts of one job, as metrics with the label `job`."""
 
@@ -56,37 +75,20 @@ class Meter(Collector):
     def collect(self) -> Iterable[Metric]:
         """The metrics of one scrape."""
         now = self._counts
-        gauges = {
-            "verso_scenes_asked": ("Scenes that this run was to make.", now.asked),
-            "verso_ranges_in_flight": ("Ranges given to Ray and not reported.", now.in_flight),
-            "verso_slots": ("Shards that may run at once.", now.slots),
-            "verso_making_since_timestamp_seconds": ("When the making began.", now.since),
-        }
-        counters = {
-            "verso_scenes_made": ("Scenes made and committed in this run.", now.made),
-            "verso_commits": ("Ranges committed in this run.", now.commits),
-        }
-        for name, (what, value) in gauges.items():
-            yield _family(GaugeMetricFamily(name, what, labels=["job"]), {(self._job,): value})
-        for name, (what, value) in counters.items():
-            yield _family(CounterMetricFamily(name, what, labels=["job"]), {(self._job,): value})
-        yield self._by("verso_scenes_failed", "Scenes that could not be made.", "reason", now.failed)
-        yield self._by("verso_workers_lost", "Workers that died, by cause.", "reason", now.lost)
-        yield self._by("verso_stage_seconds", "Time of the workers in each stage.", "stage", now.seconds)
-        phases: dict[tuple[str, ...], float] = {(self._job, phase): float(phase == now.phase) for phase in PHASES}
-        yield _family(GaugeMetricFamily("verso_phase", "1 for what the run does now.", labels=["job", "phase"]), phases)
+        for name, (field_name, what) in GAUGES.items():
+            yield self._family(GaugeMetricFamily, name, what, {None: getattr(now, field_name)})
+        for name, (field_name, what) in COUNTERS.items():
+            yield self._family(CounterMetricFamily, name, what, {None: getattr(now, field_name)})
+        for name, (field_name, label, what) in COUNTERS_BY.items():
+            yield self._family(CounterMetricFamily, name, what, dict(sorted(getattr(now, field_name).items())), label)
+        phases = {phase: float(phase == now.phase) for phase in PHASES}
+        yield self._family(GaugeMetricFamily, "verso_phase", "1 for what the run does now.", phases, "phase")
 
-    def _by(self, name: str, what: str, label: str, values: Mapping[str, float]) -> Metric:
-        family = CounterMetricFamily(name, what, labels=["job", label])
-        return _family(family, {(self._job, key): value for key, value in sorted(values.items())})
-
-
-def _family(
-    family: CounterMetricFamily | GaugeMetricFamily, values: Mapping[tuple[str, ...], float]
-) -> CounterMetricFamily | GaugeMetricFamily:
-    for labels, value in values.items():
-        family.add_metric(list(labels), value)
-    return family
+    def _family(self, kind: Any, name: str, what: str, values: Mapping[Any, float], label: str | None = None) -> Metric:
+        family = kind(name, what, labels=["job", *([label] if label else [])])
+        for key, value in values.items():
+            family.add_metric([self._job, *([key] if label else [])], value)
+        return family
 
 
 @contextlib.contextmanager

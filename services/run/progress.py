@@ -25,9 +25,6 @@ LINE_EVERY_S = 60.0
 USUAL_COLUMNS, USUAL_ROWS = 80, 24
 """Size of a terminal that tells none: tqdm draws nothing in one without rows."""
 
-CODE = Path(__file__).resolve().parents[2]
-"""The folder that holds `services` and `workers`."""
-
 LOG_BYTES = 4 * 2**20
 LOG_FILES = 5
 
@@ -112,12 +109,6 @@ def _tell(done: int, asked: int, unit: str, failed: int | None, passed_s: float)
         rate = done / passed_s
         parts += [f"{rate:.1f} {unit}s/s", f"{describe_seconds(max(0, asked - done) / rate)} left"]
     return ", ".join(parts)
-
-
-def note_of_first_start(code: Path = CODE) -> str:
-    """What is added to the start of workers where no compiled loop lies beside the code, in a folder that holds `workers`."""
-    kept = any((code / "workers" / "geometry" / "__pycache__").glob("*.nbi"))
-    return "" if kept else " (a first start compiles for up to a minute)"
 
 
 def say(line: str) -> None:

@@ -42,7 +42,7 @@ class SpanPlan:
 
 def plan_spans(job: Job, ledger: Ledger, retry_failed: bool) -> SpanPlan:
     """The missing ranges, and with `retry_failed` the scenes to try again. Raises as `plan_ranges`."""
-    ranges = plan_ranges(job.first_scene, job.stop_scene, job.range_size, committed_ranges(ledger))
+    ranges = plan_ranges(job.first_scene, job.stop_scene, job.range_size, ledger.ranges)
     retries = plan_retries(ledger) if retry_failed else []
     return SpanPlan(job.scenes - ledger.committed + sum(span.count for span in retries), ranges, retries)
 
@@ -138,11 +138,6 @@ def _take(spans: Iterator[Span], least: int) -> tuple[Span, ...]:
         if sum(one.count for one in shard) >= least:
             break
     return tuple(shard)
-
-
-def committed_ranges(ledger: Ledger) -> NDArray[np.int64]:
-    """[R, 2] start and stop of every committed range, in order."""
-    return ledger.ranges
 
 
 def _check_grid(first_scene: int, stop_scene: int, range_size: int, ranges: NDArray[np.int64]) -> None:

@@ -15,7 +15,7 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +38,15 @@ LOOK_EVERY_S = 2.0
 
 @dataclass(frozen=True)
 class Slots:
-    """The number of shards that run at once, and that may be given to Ray at once."""
+    """The number of shards that run at once, and that may be given to Ray at once; `look` tells them where they change."""
 
     running: int
     in_flight: int
+    look: "Callable[[], Slots] | None" = None
 
     def now(self) -> "Slots":
         """The slots at this moment."""
-        return self
+        return self.look() if self.look else self
 
 
 def slots_of(cores: int, workers: int | None) -> Slots:
@@ -57,52 +58,30 @@ def slots_of(cores: int, workers: int | None) -> Slots:
     return Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
 
 
-@dataclass(frozen=True)
-class ClusterSlots(Slots):
-    """The slots of a cluster as they are at first; `look` tells those of the moment."""
+def cluster_slots(
+    count_cores: Callable[[], int], workers: int | None, clock: Callable[[], float] = time.monotonic
+) -> Slots:
+    """The slots of a cluster, at least one also while it has no node; `count_cores` is asked every few seconds."""
+    known, at_s = slots_of(count_cores(), workers), clock()
 
-    look: Callable[[], Slots]
+    def look() -> Slots:
+        nonlocal known, at_s
+        if clock() - at_s >= LOOK_EVERY_S:
+            known, at_s = slots_of(count_cores(), workers), clock()
+        return known
 
-    @classmethod
-    def of(
-        cls, count_cores: Callable[[], int], workers: int | None, clock: Callable[[], float] = time.monotonic
-    ) -> "ClusterSlots":
-        """The slots of a cluster whose cores `count_cores` counts; it is asked every few seconds."""
-        known = slots_of(count_cores(), workers)
-        at_s = clock()
-
-        def look() -> Slots:
-            nonlocal known, at_s
-            if clock() - at_s >= LOOK_EVERY_S:
-                known, at_s = slots_of(count_cores(), workers), clock()
-            return known
-
-        return cls(known.running, known.in_flight, look)
-
-    def now(self) -> Slots:
-        """The slots that the cluster has now: at least one, also while it has no node."""
-        return self.look()
+    return replace(known, look=look)
 
 
-@dataclass(frozen=True)
-class SharedSlots(Slots):
-    """Slots that several jobs share evenly, as many as `jobs` tells at the moment."""
+def share_slots(whole: Slots, jobs: Callable[[], int]) -> Slots:
+    """With other jobs an even share of all, rounded up, of which none waits in Ray: it would take another job's turn."""
 
-    whole: Slots
-    jobs: Callable[[], int]
+    def look() -> Slots:
+        now, sharing = whole.now(), jobs()
+        share = math.ceil(now.running / max(1, sharing))
+        return now if sharing <= 1 else Slots(share, share)
 
-    @classmethod
-    def of(cls, whole: Slots, jobs: Callable[[], int]) -> "SharedSlots":
-        """A share of all slots of a cluster."""
-        return cls(whole.running, whole.in_flight, whole, jobs)
-
-    def now(self) -> Slots:
-        """With other jobs an even share, rounded up, of which none waits in Ray: it would take another job's turn."""
-        whole, jobs = self.whole.now(), self.jobs()
-        if jobs <= 1:
-            return whole
-        share = math.ceil(whole.running / jobs)
-        return Slots(share, share)
+    return replace(whole, look=look)
 
 
 def private_environment() -> dict[str, str]:
@@ -170,7 +149,11 @@ def remove_dead(place: Path) -> None:
     for folder in place.glob(f"{PREFIX}*"):
         # Locked by a process that lives, or not one of these folders, or removed by another process meanwhile.
         with contextlib.suppress(OSError):
-            _remove_if_dead(folder)
+            status = folder.lstat()
+            if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid():
+                with open(os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)) as owner:
+                    fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    _remove(folder)
 
 
 def _places() -> list[Path]:
@@ -190,7 +173,13 @@ def _make(places: Sequence[Path]) -> tuple[Path, int]:
         try:
             folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
             (folder / INNER).mkdir()
-            return folder, _lock(folder)
+            unnamed = (
+                folder / f"{OWNER}.new"
+            )  # it gets its name when it is locked, so nobody ever finds it unlocked before
+            owner = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            unnamed.rename(folder / OWNER)
+            return folder, owner
         except OSError as error:
             errors.append(f"{place} ({error.strerror or error})")
     wanted = tempfile.gettempdir()
@@ -199,28 +188,6 @@ def _make(places: Sequence[Path]) -> tuple[Path, int]:
         f"no place for Ray's sockets: the name of {wanted} has {len(os.fsencode(wanted))} bytes, at most {MAX_BASE_BYTES} "
         f"fit{tried}: set TMPDIR to a writable folder with a short name"
     )
-
-
-def _lock(folder: Path) -> int:
-    """Locks the owner's file. It gets its name when it is locked, so that nobody ever finds it unlocked before."""
-    unnamed = folder / f"{OWNER}.new"
-    file = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    unnamed.rename(folder / OWNER)
-    return file
-
-
-def _remove_if_dead(folder: Path) -> None:
-    """Raises OSError where the owner lives, or where the folder is none of this user's."""
-    status = folder.lstat()
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
-        return
-    file = os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        _remove(folder)
-    finally:
-        os.close(file)
 
 
 def _remove(folder: Path) -> None:
@@ -356,7 +323,7 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
             ) from error
         if _count_cores() < 1:
             raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-        yield ClusterSlots.of(_count_cores, workers)
+        yield cluster_slots(_count_cores, workers)
 
 
 def _count_cores() -> int:

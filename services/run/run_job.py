@@ -1,6 +1,7 @@
 """`verso run`: makes a job's dataset, or the part of it that is missing."""
 
 import contextlib
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -19,11 +20,12 @@ from services.run.coordinator import Coordinator, Limits
 from services.run.joining import Pattern, join_cluster, terms_of_driver, with_own_stack
 from services.run.lock import Lock, explain_lost_folder, hold_lock
 from services.run.metrics import Meter, Tally, serve
-from services.run.progress import ProgressLine, event_log, log_event, note_of_first_start, show_counts
+from services.run.progress import ProgressLine, event_log, log_event, show_counts
 from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_shards, plan_spans
-from services.run.ray_cluster import SharedSlots, Slots, open_ray
+from services.run.ray_cluster import Slots, open_ray, share_slots
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
+from workers.geometry.loops import are_kept
 from workers.render.tiers import require_tier
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
@@ -135,7 +137,8 @@ def make_missing(run: Run, cluster: contextlib.AbstractContextManager[Slots] | N
     if request.address is not None:
         pattern = replace(pattern, order=with_own_stack(run.store, pattern.order))
     there = f", {run.ledger.committed} are there" if run.ledger.committed else ""
-    note = "" if request.address else note_of_first_start()
+    own = os.environ.get("NUMBA_CACHE_DIR")  # noqa: TID251 - numba itself reads it nowhere else
+    note = "" if request.address or are_kept(own) else " (a first start compiles for up to a minute)"
     print(
         f"{job.name}: {run.plan.scenes} scenes to make{there}; starting the workers{note}", file=sys.stderr, flush=True
     )
@@ -143,7 +146,7 @@ def make_missing(run: Run, cluster: contextlib.AbstractContextManager[Slots] | N
         if request.address is not None:
             pattern = join_cluster(run.store, run.lock, pattern)
         if request.sharing is not None:
-            slots = SharedSlots.of(slots, request.sharing)
+            slots = share_slots(slots, request.sharing)
         return _coordinate(run, pattern, slots)
 
 

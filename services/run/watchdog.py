@@ -6,14 +6,13 @@ have stalled is decided by pure functions above it: no change for longer than a 
 
 import contextlib
 import os
-import queue
 import signal
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from services.run.machine import Process, descendants, read_process, send
 from workers.store.attempt import blamed_scene, staged_attempts
@@ -52,15 +51,6 @@ class Sight:
     idle_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class Stall:
-    """An attempt that shows no change for `idle_s` seconds; None: in that time there was no attempt at all."""
-
-    attempt: AttemptName | None
-    scene_id: int | None
-    idle_s: float
-
-
 def look(
     before: Mapping[AttemptName, Sight], now: Mapping[AttemptName, int | None], passed_s: float
 ) -> dict[AttemptName, Sight]:
@@ -78,21 +68,13 @@ def find_stalls(seen: Mapping[AttemptName, Sight], scene_timeout_s: float) -> di
 
     Of several attempts at one range, the one that changed last is the one that counts: workers of others were lost.
     """
+    latest = {one.start: one for one in sorted(seen, key=lambda one: (seen[one].idle_s, one), reverse=True)}
     factors = {True: COMMIT_FACTOR, False: SCENE_FACTOR}
     return {
         attempt: seen[attempt]
-        for attempt in _latest(seen)
+        for attempt in latest.values()
         if seen[attempt].idle_s > factors[seen[attempt].scene_id is None] * scene_timeout_s
     }
-
-
-def _latest(seen: Mapping[AttemptName, Sight]) -> Iterable[AttemptName]:
-    latest: dict[int, AttemptName] = {}
-    for attempt in sorted(seen):
-        other = latest.get(attempt.start)
-        if other is None or seen[attempt].idle_s < seen[other].idle_s:
-            latest[attempt.start] = attempt
-    return latest.values()
 
 
 LOOKS = 12
@@ -105,51 +87,43 @@ MOST_LOOKS_AT_ONCE = 3
 _WORKER_TITLE = b"ray::"
 
 
-class Watchdog:
-    """Looks at the attempts of one coordinator, known by their `label`, in a thread of its own while a block lasts."""
+Stall = tuple[AttemptName | None, Sight]
+"""An attempt that shows no change, and what is the same for so long; None: in that time there was no attempt at all."""
 
-    def __init__(self, store: Store, label: str, scene_timeout_s: float) -> None:
-        self._store = store
-        self._label = label
-        self._scene_timeout_s = scene_timeout_s
-        self._stalls: queue.SimpleQueue[Stall] = queue.SimpleQueue()
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
 
-    def __enter__(self) -> "Watchdog":
-        self._thread.start()
-        return self
+@contextlib.contextmanager
+def watch(store: Store, label: str, scene_timeout_s: float) -> Iterator[Callable[[], list[Stall]]]:
+    """Looks at a coordinator's attempts, known by their `label`, in a thread while the block lasts.
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._over.set()
+    What comes back takes the stalls that were found since its last call.
+    """
+    stalls: deque[Stall] = deque()
+    over = threading.Event()
+    settings = (store, label, scene_timeout_s, stalls, over)
+    threading.Thread(target=_watch, args=settings, name="watchdog", daemon=True).start()
+    try:
+        yield lambda: [stalls.popleft() for _ in range(len(stalls))]
+    finally:
+        over.set()
 
-    def take_stalls(self) -> list[Stall]:
-        """The stalls found since the last call."""
-        found = []
-        with contextlib.suppress(queue.Empty):
-            while True:
-                found.append(self._stalls.get_nowait())
-        return found
 
-    def _watch(self) -> None:
-        period_s = SCENE_FACTOR * self._scene_timeout_s / LOOKS
-        seen: dict[AttemptName, Sight] = {}
-        last, empty_s = time.monotonic(), 0.0
-        while not self._over.wait(period_s):
-            with contextlib.suppress(Exception):  # a store that does not answer now may do so at the next look
-                scenes = scenes_in_progress(self._store, self._label)
-                now = time.monotonic()
-                passed_s, last = min(now - last, MOST_LOOKS_AT_ONCE * period_s), now
-                seen = look(seen, scenes, passed_s)
-                for attempt, sight in find_stalls(seen, self._scene_timeout_s).items():
-                    self._stalls.put(Stall(attempt, sight.scene_id, sight.idle_s))
-                    seen[attempt] = Sight(sight.scene_id)
-                empty_s = 0.0 if seen else empty_s + passed_s
-                if empty_s > COMMIT_FACTOR * self._scene_timeout_s:
-                    self._stalls.put(Stall(None, None, empty_s))
-                    empty_s = 0.0
+def _watch(store: Store, label: str, scene_timeout_s: float, stalls: deque[Stall], over: threading.Event) -> None:
+    period_s = SCENE_FACTOR * scene_timeout_s / LOOKS
+    seen: dict[AttemptName, Sight] = {}
+    last, empty_s = time.monotonic(), 0.0
+    while not over.wait(period_s):
+        with contextlib.suppress(Exception):  # a store that does not answer now may do so at the next look
+            scenes = scenes_in_progress(store, label)
+            now = time.monotonic()
+            passed_s, last = min(now - last, MOST_LOOKS_AT_ONCE * period_s), now
+            seen = look(seen, scenes, passed_s)
+            for attempt, sight in find_stalls(seen, scene_timeout_s).items():
+                stalls.append((attempt, sight))
+                seen[attempt] = Sight(sight.scene_id)
+            empty_s = 0.0 if seen else empty_s + passed_s
+            if empty_s > COMMIT_FACTOR * scene_timeout_s:
+                stalls.append((None, Sight(None, empty_s)))
+                empty_s = 0.0
 
 
 def scenes_in_progress(store: Store, label: str) -> dict[AttemptName, int | None]:

@@ -93,18 +93,15 @@ def _why_not_writable(folder: str) -> str:
     return ""
 
 
-def _read_code() -> tuple[str, str]:
-    """(the digest of the project's code, "") or ("", why it cannot be imported)."""
-    try:
-        from workers.shard.code import code_digest
-    except ImportError as error:
-        return "", str(error)
-    return code_digest(), ""
-
-
 def see(names: Iterable[str], proof: str, token: str) -> Sight:
     """This process's node; `proof` is empty where the output is no folder."""
-    code, no_code = _read_code()
+    code = no_code = ""
+    try:
+        from workers.shard.code import code_digest
+
+        code = code_digest()
+    except ImportError as error:
+        no_code = str(error)
     folder = look_at_folder(proof, token) if proof else ""
     return Sight(socket.gethostname(), processor_flags(), start_environment(names), code, no_code, folder)
 
@@ -133,60 +130,40 @@ def worker_environment(environ: Mapping[str, str]) -> dict[str, str]:
     return own | {name: environ[name] for name in VARIABLES if name in environ}
 
 
-def refusal_of(terms: WorkerTerms, node: Sight) -> VersoError | None:
-    """The error that refuses a node; None where it may work."""
-    return _processor(terms, node) or _code(terms, node) or _folder(terms, node)
-
-
-def refusal_of_worker(terms: WorkerTerms, node: Sight) -> VersoError | None:
-    """The same for a worker, whose environment counts too."""
-    return _processor(terms, node) or _environment(terms, node) or _code(terms, node) or _folder(terms, node)
-
-
-def _processor(terms: WorkerTerms, node: Sight) -> VersoError | None:
+def refusal_of(terms: WorkerTerms, node: Sight, is_worker: bool = False) -> VersoError | None:
+    """The error that refuses a node, or a worker, whose environment counts too; None where it may work."""
+    driver = f"{terms.driver}, where the run was started,"
     missing = sorted(X86_64_V3 - node.flags)
-    if not missing or not ON_X86_64_V3.items() <= set(terms.environment):
-        return None
-    return MachineError(
-        f"the processor of {node.host} is below x86-64-v3 (no {', '.join(missing)}), and that of {terms.driver}, where the run "
-        f"was started, is not: they do not make the same bytes. Take {node.host} out of the cluster, or use machines of one kind"
-    )
-
-
-def _environment(terms: WorkerTerms, node: Sight) -> VersoError | None:
-    wrong = [(name, node.environment.get(name), value) for name, value in terms.environment]
-    told = [f"{name} is {_quoted(found)} there and {value!r} here" for name, found, value in wrong if found != value]
-    if not told:
-        return None
-    return FingerprintError(
-        f"a worker on {node.host} has not the environment of the run on {terms.driver}, on which bytes depend: "
-        f"{'; '.join(told)}. Set it for `ray start` on {node.host} (deploy/Dockerfile has the list), and see that nothing "
-        "there changes it"
-    )
-
-
-def _quoted(value: str | None) -> str:
-    return "not set" if value is None else repr(value)
-
-
-def _code(terms: WorkerTerms, node: Sight) -> VersoError | None:
-    if node.code == terms.code:
-        return None
-    have = f"has code {node.code[:12]}" if node.code else f"has no code of this project ({node.no_code})"
-    return FingerprintError(
-        f"{node.host} {have}, and {terms.driver}, where the run was started, has {terms.code[:12]}: install the same wheel "
-        "or image on every node, then start Ray there again"
-    )
-
-
-def _folder(terms: WorkerTerms, node: Sight) -> VersoError | None:
-    if not node.folder:
-        return None
-    return OutputError(
-        f"{node.host} does not share the output folder {terms.out} with {terms.driver}, where the run was started: "
-        f"{node.folder}. Give --out a folder that every node mounts at the same path (NFS), or an object store "
-        "(--out s3://BUCKET/NAME --set output.layout=tar); nothing was made"
-    )
+    if missing and ON_X86_64_V3.items() <= set(terms.environment):
+        return MachineError(
+            f"the processor of {node.host} is below x86-64-v3 (no {', '.join(missing)}), and that of {driver} is not: they do "
+            f"not make the same bytes. Take {node.host} out of the cluster, or use machines of one kind"
+        )
+    found = {name: node.environment.get(name) for name, _ in terms.environment}
+    told = [
+        f"{name} is {'not set' if found[name] is None else repr(found[name])} there and {value!r} here"
+        for name, value in terms.environment
+        if found[name] != value
+    ]
+    if told and is_worker:
+        return FingerprintError(
+            f"a worker on {node.host} has not the environment of the run on {terms.driver}, on which bytes depend: "
+            f"{'; '.join(told)}. Set it for `ray start` on {node.host} (deploy/Dockerfile has the list), and see that nothing "
+            "there changes it"
+        )
+    if node.code != terms.code:
+        have = f"has code {node.code[:12]}" if node.code else f"has no code of this project ({node.no_code})"
+        return FingerprintError(
+            f"{node.host} {have}, and {driver} has {terms.code[:12]}: install the same wheel or image on every node, then start "
+            "Ray there again"
+        )
+    if node.folder:
+        return OutputError(
+            f"{node.host} does not share the output folder {terms.out} with {driver.rstrip(',')}: {node.folder}. Give --out a "
+            "folder that every node mounts at the same path (NFS), or an object store (--out s3://BUCKET/NAME --set "
+            "output.layout=tar); nothing was made"
+        )
+    return None
 
 
 DRAIN = "VERSO_DRAIN"
@@ -210,7 +187,7 @@ def enter_shard(terms: WorkerTerms, order: bytes, catalogue: bytes) -> "ShardRep
 def check_worker(terms: WorkerTerms) -> None:
     """Raises the refusal of this process; asked once in a process and run."""
     names = [name for name, _ in terms.environment]
-    refusal = refusal_of_worker(terms, see(names, terms.proof, terms.token))
+    refusal = refusal_of(terms, see(names, terms.proof, terms.token), is_worker=True)
     if refusal is not None:
         raise refusal
 

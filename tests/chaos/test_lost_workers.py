@@ -19,7 +19,7 @@ from services.run import coordinator as module
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import Pattern
 from services.run.metrics import Tally
-from services.run.range_planner import committed_ranges, plan_ranges
+from services.run.range_planner import plan_ranges
 from services.run.ray_cluster import Slots
 from services.run.worker_entry import WorkerTerms
 from tests.kit.faults import REQUESTS, check_published, requests, unflushed
@@ -115,7 +115,7 @@ def test_a_worker_that_lives_and_commits_while_it_is_given_up_keeps_its_files(
     print(f"{trials} trials, {committed} committed, {lost} without their files")
     assert lost == 0
     assert 0 < committed < trials, "both outcomes are needed"
-    for start, end in plan_ranges(0, 2 * trials, 2, committed_ranges(list_commits(store))):
+    for start, end in plan_ranges(0, 2 * trials, 2, list_commits(store).ranges):
         attempt_at(store, start, end, terms(range_size=2), small_scene).commit()
     assert merge(store, 0, 2 * trials).rows["scenes"] > 0
 
@@ -206,6 +206,6 @@ def fresh_bucket() -> ObjectStore:
 def finish(store: ObjectStore) -> str:
     """What the next run does; the dataset's digest."""
     sweep(store, fenced=None)
-    for start, end in plan_ranges(0, 4, 2, committed_ranges(list_commits(store))):
+    for start, end in plan_ranges(0, 4, 2, list_commits(store).ranges):
         attempt_at(store, start, end, TAR, small_scene).commit()
     return merge(store, 0, 4).digest

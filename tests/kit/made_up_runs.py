@@ -10,7 +10,7 @@ from schemas.dataset.layout import STAGING
 from schemas.scene.scene import SceneOutput
 from services.merge.merge import MergeResult, merge
 from services.run.lock import Lock
-from services.run.range_planner import committed_ranges, plan_ranges, plan_retries
+from services.run.range_planner import plan_ranges, plan_retries
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene, terms
 from workers.store.attempt import sweep
 from workers.store.ledger import list_commits
@@ -34,7 +34,7 @@ def make_dataset(
     """Clears up, makes what is missing, tries failures again where asked to, and merges."""
     store.prepare()
     sweep(store, fenced=None)
-    for start, end in plan_ranges(FIRST, stop, RANGE, committed_ranges(list_commits(store))):
+    for start, end in plan_ranges(FIRST, stop, RANGE, list_commits(store).ranges):
         attempt_at(store, start, end, settings_of(layout), make).commit()
     for span in plan_retries(list_commits(store)) if retry else ():
         again = {"retry": span.retry, "scenes": span.scenes}

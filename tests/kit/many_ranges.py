@@ -60,8 +60,13 @@ def record_of(scene_id: int, tables: dict[str, bytes]) -> CommitRecord:
         terms=TERMS,
         files=tuple(FileEntry(path=path, bytes=size, sha256=sha) for path, (size, sha) in sorted(files.items())),
         tables={table: rows[table].num_rows for table in TABLES},
-        scenes=(SceneMark(scene_id=scene_id, outcome="made" if made else "intrinsic", digest="0" * 16),),
+        scenes=(_mark(scene_id, made),),
     )
+
+
+def _mark(scene_id: int, made: bool) -> SceneMark:
+    told = {"outcome": "made"} if made else {"outcome": "intrinsic", "reason": "left_table"}
+    return SceneMark(scene_id=scene_id, digest="0" * 16, **told)
 
 
 def write_ranges(root: Path, scenes: int) -> LocalStore:

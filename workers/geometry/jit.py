@@ -13,7 +13,6 @@ loops are compiled by one process at a time, under the file's lock: of two at on
 import fcntl
 import gc
 import hashlib
-import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,13 +23,9 @@ import numba
 from numba.core import config, event
 
 from schemas.environment import cache_folder
+from workers.geometry.loops import MADE_WITH_THE_CODE, folder_name
 
 Loop = TypeVar("Loop", bound=Callable[..., object])
-
-ROOT = Path(__file__).resolve().parents[2]
-
-MADE_WITH_THE_CODE = ROOT / ".loops"
-"""Where an image has loops that were compiled when it was built. It may be read-only: they are copied from there."""
 
 _config: Any = config
 _njit: Any = numba.njit
@@ -38,26 +33,12 @@ _modules: set[str] = set()
 _planned: dict[str, list[tuple[Any, str]]] = {}
 
 
-def _digest() -> str:
-    """Of the place and the text of each file of the project that has a loop, and of all that these import."""
-    found = {path for path in (ROOT / "workers").rglob("*.py") if "\n@compiled" in path.read_text()}
-    ahead = list(found)
-    while ahead:
-        for module in re.findall(r"^from ((?:schemas|workers)[\w.]*) import", ahead.pop().read_text(), re.MULTILINE):
-            path = ROOT / f"{module.replace('.', '/')}.py"
-            if path.exists() and path not in found:
-                found.add(path)
-                ahead.append(path)
-    texts = sorted(f"{path}\0{path.read_text()}" for path in found)
-    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
-
-
 def _open_folder() -> Path | None:
     """The folder of loops of this code, in `NUMBA_CACHE_DIR` or the user's cache; None where it cannot be written to."""
     above = Path(_config.CACHE_DIR) if _config.CACHE_DIR else cache_folder("loops")
     if above is None:
         return None
-    folder = above / f"loops-{_digest()}"
+    folder = above / folder_name()
     made = MADE_WITH_THE_CODE / folder.name
     try:
         if made.is_dir() and not folder.exists():

@@ -14,23 +14,25 @@ from schemas.dataset.tables import TABLES
 from schemas.errors import CommitConflict, CorruptError, RunError
 from services.merge import merge as merge_module
 from services.merge.merge import merge, read_success
+from services.run.range_planner import plan_ranges
 from tests.kit.faults import disk
 from tests.kit.made_up_runs import half_merged
 from tests.kit.s3_server import Bucket, s3_server
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, small_scene, terms, with_shapes
+from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
+SINGLE = ("camPoses.csv", "cameras.csv", "objects.dat")
 
 
-def test_success_names_the_digest_of_every_merged_file(merged):
+def test_success_names_the_digest_of_every_merged_file_and_the_dataset_digest_is_as_defined(merged):
     store, result = merged
     success = json.loads((store.root / "_SUCCESS").read_text())
-    assert success["digest"] == result.digest
-    assert success["schema_version"] == 1
-    assert {"camPoses.csv", "cameras.csv", "objects.dat"} < success["files"].keys()
+    assert (success["digest"], success["schema_version"]) == (result.digest, 1)
+    assert set(SINGLE) < success["files"].keys()
     on_disk = {str(path.relative_to(store.root)) for path in (store.root / "manifest").glob("[a-z]*/*/*.parquet")}
     assert {name for name in success["files"] if name.startswith("manifest/")} == on_disk
     for name, file in success["files"].items():
@@ -38,61 +40,48 @@ def test_success_names_the_digest_of_every_merged_file(merged):
         assert (file["bytes"], file["sha256"]) == (len(data), hashlib.sha256(data).hexdigest())
     assert success["scenes"] == {"made": 24, "intrinsic": 3, "environmental": 0}
     assert success["images"] == 24 * 22
+    files = {file.path: file.data for i in range(FIRST, STOP) for file in scene(i).files}
+    files |= {name: (store.root / name).read_bytes() for name in SINGLE}
+    text = "verso dataset 1\n" + "".join(f"{table} {success['tables'][table]}\n" for table in list(TABLES)[:5])
+    for name in sorted(files, key=str.encode):
+        text += f"{name}\n{hashlib.sha256(files[name]).hexdigest()}\n"
+    assert result.digest == hashlib.sha256(text.encode()).hexdigest()
 
 
-def test_merging_again_changes_nothing(tmp_path):
-    store = dataset_at(tmp_path)
-    first = merge(store, FIRST, STOP)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
-    assert merge(store, FIRST, STOP) == first
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
-
-
-@pytest.mark.parametrize("lost", ["camPoses.csv", "manifest/views/category=mug/part-00000.parquet", "_SUCCESS"])
-def test_what_was_lost_of_a_merge_is_made_again(tmp_path, lost):
-    store = dataset_at(tmp_path)
-    first = merge(store, FIRST, STOP)
-    (tmp_path / lost).unlink()
-    assert merge(store, FIRST, STOP) == first
-    assert (tmp_path / lost).exists()
-
-
-def test_stale_merged_files_are_taken_away(tmp_path):
+def test_merging_again_changes_nothing_and_makes_again_what_was_lost_or_torn(tmp_path):
     store = dataset_at(tmp_path)
     stale = tmp_path / "manifest/views/category=old/part-00007.parquet"
     stale.parent.mkdir(parents=True)
     stale.write_bytes(b"torn")
-    merge(store, FIRST, STOP)
-    assert not stale.parent.exists()
-    assert not list(store.files(STAGING))
-
-
-def test_a_torn_success_does_not_count(tmp_path):
-    store = dataset_at(tmp_path)
     first = merge(store, FIRST, STOP)
+    assert not stale.parent.exists() and not list(store.files(STAGING))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    assert merge(store, FIRST, STOP) == first
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
+    for lost in ("camPoses.csv", "manifest/views/category=mug/part-00000.parquet", "_SUCCESS"):
+        (tmp_path / lost).unlink()
+        assert merge(store, FIRST, STOP) == first
+        assert (tmp_path / lost).exists()
     (tmp_path / "_SUCCESS").write_bytes((tmp_path / "_SUCCESS").read_bytes()[:100])
     assert read_success(store) is None
     assert merge(store, FIRST, STOP) == first
 
 
-def test_a_gap_is_refused_and_nothing_is_merged(tmp_path):
-    store = dataset_at(tmp_path, 0, 8)
-    with pytest.raises(RunError, match="scenes 8 to 11 are not committed"):
-        merge(store, 0, 12)
-    assert not (tmp_path / "camPoses.csv").exists()
-    assert not (tmp_path / "manifest/views").exists()
-    assert not list(store.files(STAGING))
-
-
-def test_an_image_that_is_missing_or_cut_is_told_by_name(tmp_path):
+def test_a_gap_or_an_image_that_is_missing_or_cut_is_told_and_nothing_is_merged(tmp_path):
     store = dataset_at(tmp_path, 0, 8)
     image = made_scene(1).files[0].path
+
+    def refused(error: type, stop: int, words: str) -> None:
+        with pytest.raises(error, match=words):
+            merge(store, 0, stop)
+        assert not (tmp_path / "camPoses.csv").exists() and not (tmp_path / "manifest/views").exists()
+        assert not list(store.files(STAGING))
+
+    refused(RunError, 12, "scenes 8 to 11 are not committed")
     store.put(image, b"cut")
-    with pytest.raises(CorruptError, match=f"{image} has 3 bytes"):
-        merge(store, 0, 8)
+    refused(CorruptError, 8, f"{image} has 3 bytes")
     store.remove(image)
-    with pytest.raises(CorruptError, match=f"{image} is named by a commit"):
-        merge(store, 0, 8)
+    refused(CorruptError, 8, f"{image} is named by a commit")
 
 
 def own_description(scene_id):
@@ -106,21 +95,19 @@ def own_shape(scene_id):
 
 
 @pytest.mark.parametrize("make", [own_description, own_shape])
-def test_two_ranges_of_one_stack_that_make_one_asset_differently_are_a_conflict(tmp_path, make):
-    store = dataset_at(tmp_path, 0, 8, make=make)
+def test_an_asset_that_ranges_made_differently_is_a_conflict_of_one_stack_and_merged_where_a_mix_is_allowed(
+    tmp_path, make
+):
+    store = dataset_at(tmp_path / "one", 0, 8, make=make)
     with pytest.raises(CommitConflict, match=r"differently|two digests"):
         merge(store, 0, 8)
     assert read_success(store) is None
-
-
-@pytest.mark.parametrize("make", [own_description, own_shape])
-def test_two_stacks_that_make_one_asset_differently_are_merged_where_a_mix_is_allowed(tmp_path, make):
-    store = LocalStore(tmp_path)
-    store.prepare()
+    mixed = LocalStore(tmp_path / "mixed")
+    mixed.prepare()
     for start, name in ((0, "stack-a"), (4, "stack-b")):
-        attempt_at(store, start, start + 4, terms(fingerprint=name, fingerprint_mode="record"), make).commit()
-    assert merge(store, 0, 8).complete
-    assert json.loads((tmp_path / "_SUCCESS").read_text())["fingerprints"] == ["stack-a", "stack-b"]
+        attempt_at(mixed, start, start + 4, terms(fingerprint=name, fingerprint_mode="record"), make).commit()
+    assert merge(mixed, 0, 8).complete
+    assert json.loads(mixed.read("_SUCCESS"))["fingerprints"] == ["stack-a", "stack-b"]
 
 
 @pytest.mark.parametrize("question", [1, 2, 3])
@@ -177,41 +164,18 @@ def test_an_object_store_is_asked_for_each_file_of_a_range_once_and_many_at_a_ti
     assert held.most_at_once > 8
 
 
-def test_the_digest_is_what_its_definition_says(merged):
-    store, result = merged
-    success = json.loads((store.root / "_SUCCESS").read_text())
-    files = {file.path: file.data for i in range(FIRST, STOP) for file in scene(i).files}
-    files |= {name: (store.root / name).read_bytes() for name in ("camPoses.csv", "cameras.csv", "objects.dat")}
-    text = "verso dataset 1\n" + "".join(f"{table} {success['tables'][table]}\n" for table in list(TABLES)[:5])
-    for name in sorted(files, key=str.encode):
-        text += f"{name}\n{hashlib.sha256(files[name]).hexdigest()}\n"
-    assert result.digest == hashlib.sha256(text.encode()).hexdigest()
-
-
-@pytest.mark.parametrize(
-    "how",
-    [
-        {"size": 1},
-        {"size": 7},
-        {"size": 100},
-        {"order": -1},
-        {"layout": "tar"},
-        {"layout": "tar", "size": 5, "order": -1},
-    ],
-    ids=str,
-)
-def test_the_digest_does_not_depend_on_ranges_order_layout_or_attempts(merged, tmp_path, how):
-    assert merge(dataset_at(tmp_path, **how), FIRST, STOP) == merged[1]
+def test_the_digest_does_not_depend_on_ranges_order_layout_or_attempts(merged, tmp_path):
+    for number, how in enumerate(
+        [{"size": 1}, {"size": 7}, {"size": 100}, {"order": -1}, {"layout": "tar", "size": 5, "order": -1}]
+    ):
+        assert merge(dataset_at(tmp_path / str(number), **how), FIRST, STOP) == merged[1], how
 
 
 def test_a_dataset_extended_twice_has_the_digest_of_one_made_at_once(merged, tmp_path):
     store = LocalStore(tmp_path)
     store.prepare()
-    from services.run.range_planner import committed_ranges, plan_ranges
-    from workers.store.ledger import list_commits
-
     for stop in (9, 10, STOP):
-        for start, end in plan_ranges(FIRST, stop, 4, committed_ranges(list_commits(store))):
+        for start, end in plan_ranges(FIRST, stop, 4, list_commits(store).ranges):
             attempt_at(store, start, end).commit()
         result = merge(store, FIRST, stop)
         assert result.complete
@@ -233,32 +197,16 @@ def test_a_dataset_whose_killed_scenes_were_retried_has_the_digest_of_one_withou
     assert merge(store, FIRST, STOP) == merged[1]
 
 
-def changed_image(scene_id):
-    output = scene(scene_id)
-    if scene_id != 12:
-        return output
-    return made_scene(12, salt="!")
+def test_the_digest_tells_of_a_changed_image_row_shape_or_failure(merged, tmp_path):
+    def with_row(output, table: str, **changes):
+        return dataclasses.replace(output, rows={**output.rows, table: [{**output.rows[table][0], **changes}]})
 
-
-def changed_row(scene_id):
-    output = scene(scene_id)
-    if scene_id != 12:
-        return output
-    rows = [{**row, "support_margin_mm": np.nextafter(row["support_margin_mm"], 99)} for row in output.rows["scenes"]]
-    return dataclasses.replace(output, rows={**output.rows, "scenes": rows})
-
-
-def changed_shape(scene_id):
-    return with_shapes(scene(scene_id), lambda data: data[::-1])
-
-
-def changed_failure(scene_id):
-    if scene_id != 16:
-        return scene(scene_id)
-    output = failed_scene(scene_id)
-    return dataclasses.replace(output, rows={"failures": [{**output.rows["failures"][0], "detail": "it slid"}]})
-
-
-@pytest.mark.parametrize("make", [changed_image, changed_row, changed_shape, changed_failure])
-def test_the_digest_tells(merged, tmp_path, make):
-    assert merge(dataset_at(tmp_path, make=make), FIRST, STOP).digest != merged[1].digest
+    margin = np.nextafter(scene(12).rows["scenes"][0]["support_margin_mm"], 99)
+    changes = [
+        lambda i: made_scene(12, salt="!") if i == 12 else scene(i),
+        lambda i: with_row(scene(i), "scenes", support_margin_mm=margin) if i == 12 else scene(i),
+        lambda i: with_row(failed_scene(i), "failures", detail="it slid") if i == 16 else scene(i),
+        lambda i: with_shapes(scene(i), lambda data: data[::-1]),
+    ]
+    made = [dataset_at(tmp_path / str(number), make=make) for number, make in enumerate(changes)]
+    assert len({merged[1].digest, *(merge(store, FIRST, STOP).digest for store in made)}) == 5

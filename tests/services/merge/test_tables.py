@@ -1,8 +1,11 @@
+"""The merged files: tables that pyarrow reads, the article's text files, and the card beside them."""
+
 import csv
 import dataclasses
 import math
 import urllib.parse
 import weakref
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.dataset as ds
@@ -12,53 +15,46 @@ from hypothesis import strategies as st
 
 from schemas.dataset.tables import SCHEMAS, SORT_KEYS, TABLES
 from schemas.errors import CorruptError
+from schemas.job.assets import Assets
 from services.merge import reading
 from services.merge import tables as merge_tables
+from services.merge.dataset_card import describe_sources
 from services.merge.merge import merge
 from services.merge.tables import escaped, object_lines, shortest
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
 from tests.made_up_scenes import failed_scene, fails, made_scene, scene
+from workers.assets.catalogue import Catalogue
+from workers.assets.external.listing import Listing
 from workers.store.manifest import table_of_rows
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 
-@pytest.mark.parametrize("table", [table for table in TABLES if table != "timings"])
-def test_pyarrow_reads_every_row_once_with_the_schema_and_the_category(merged, table):
-    store, _ = merged
-    data = ds.dataset(store.root / "manifest" / table, partitioning="hive")
-    schema = SCHEMAS[table]
-    assert {field.name: field.type for field in data.schema} == {field.name: field.type for field in schema}
-    rows = data.to_table().select(schema.names).to_pylist()
-    rows.sort(key=lambda row: tuple(row[key] for key in SORT_KEYS[table]))
-    assert rows == plain_rows(table)
+def types_of(schema: pa.Schema) -> dict[str, pa.DataType]:
+    return {field.name: field.type for field in schema}
 
 
-def test_rows_within_a_category_are_in_order(merged):
-    store, _ = merged
-    for table in TABLES:
-        for folder in (store.root / "manifest" / table).iterdir():
-            rows = pa.concat_tables(
-                [pa.parquet.read_table(path, partitioning=None) for path in sorted(folder.iterdir())]
-            )
-            keys = list(zip(*(rows.column(key).to_pylist() for key in SORT_KEYS[table]), strict=True))
-            assert keys == sorted(set(keys))
+def test_pyarrow_reads_every_row_once_with_the_schema_and_the_category(merged):
+    for table, schema in SCHEMAS.items():
+        data = ds.dataset(merged[0].root / "manifest" / table, partitioning="hive")
+        assert types_of(data.schema) == types_of(schema)
+        rows = data.to_table().select(schema.names).to_pylist()
+        rows.sort(key=lambda row, table=table: tuple(row[key] for key in SORT_KEYS[table]))
+        assert table == "timings" or rows == plain_rows(table)
+        for folder in (merged[0].root / "manifest" / table).iterdir():
+            parts = [pa.parquet.read_table(path, partitioning=None) for path in sorted(folder.iterdir())]
+            keys = [pa.concat_tables(parts).column(key).to_pylist() for key in SORT_KEYS[table]]
+            assert list(zip(*keys, strict=True)) == sorted(set(zip(*keys, strict=True)))
 
 
-def test_a_table_without_rows_still_opens_with_its_schema(tmp_path):
-    merge(dataset_at(tmp_path, 0, 4), 0, 4)  # no scene of these fails
-    data = ds.dataset(tmp_path / "manifest/failures", partitioning="hive")
-    assert data.count_rows() == 0
-    assert {field.name: field.type for field in data.schema} == {f.name: f.type for f in SCHEMAS["failures"]}
-
-
-def test_a_dataset_in_which_everything_failed_still_opens(tmp_path):
-    merge(dataset_at(tmp_path, 0, 4, make=failed_scene), 0, 4)
-    for table in TABLES:
-        data = ds.dataset(tmp_path / "manifest" / table, partitioning="hive")
-        assert data.schema.field("category").type == pa.string()
-        assert data.count_rows() == (4 if table in ("failures", "timings") else 0)
-    assert (tmp_path / "objects.dat").read_text() == ""
+def test_tables_without_rows_still_open_with_their_schema(tmp_path):
+    merge(dataset_at(tmp_path / "none", 0, 4), 0, 4)  # no scene of these fails
+    merge(dataset_at(tmp_path / "all", 0, 4, make=failed_scene), 0, 4)
+    for name, table in [("none", "failures"), *(("all", table) for table in TABLES)]:
+        data = ds.dataset(tmp_path / name / "manifest" / table, partitioning="hive")
+        assert types_of(data.schema) == types_of(SCHEMAS[table])
+        assert data.count_rows() == (4 if name == "all" and table in ("failures", "timings") else 0)
+    assert (tmp_path / "all" / "objects.dat").read_text() == ""
 
 
 def test_the_digest_does_not_depend_on_the_size_of_merged_files(merged, tmp_path, monkeypatch):
@@ -72,18 +68,20 @@ def test_the_digest_does_not_depend_on_the_size_of_merged_files(merged, tmp_path
     assert again.num_rows == merged[1].rows["views"]
 
 
-@pytest.mark.parametrize("order", [[3, 4, 4], [4, 3], [3, 7, 6]], ids=["twice", "backwards", "across blocks"])
-@pytest.mark.parametrize("block", [1, 2, 3])
-def test_rows_that_come_twice_or_out_of_order_are_refused(tmp_path, block, order):
-    table = merge_tables.MergedTable("scenes", tmp_path)
-    rows = table_of_rows("scenes", [made_scene(scene_id).rows["scenes"][0] for scene_id in order])
-
-    def add_all():
-        for start in range(0, len(order), block):
-            table.add(rows.slice(start, block))
-
-    with pytest.raises(CorruptError, match=r"scenes: the key \(scene_id\) = .* comes after .* the ranges do not join"):
-        add_all()
+def test_rows_that_come_twice_or_out_of_order_are_refused_and_empty_ones_not_kept(tmp_path):
+    told = r"scenes: the key \(scene_id\) = .* comes after .* the ranges do not join"
+    for order in ([3, 4, 4], [4, 3], [3, 7, 6]):
+        rows = table_of_rows("scenes", [made_scene(scene_id).rows["scenes"][0] for scene_id in order])
+        for block in (1, 2, 3):
+            table = merge_tables.MergedTable("scenes", tmp_path)
+            pieces = (table.add(rows.slice(start, block)) for start in range(0, len(order), block))
+            with pytest.raises(CorruptError, match=told):
+                list(pieces)
+    empty = SCHEMAS["failures"].empty_table()
+    kept = weakref.ref(empty)
+    merge_tables.MergedTable("failures", tmp_path).add(empty)
+    del empty
+    assert kept() is None
 
 
 def test_scenes_whose_pose_ids_collide_are_refused(tmp_path):
@@ -96,21 +94,8 @@ def test_scenes_whose_pose_ids_collide_are_refused(tmp_path):
         merge(dataset_at(tmp_path, 0, 8, make=colliding), 0, 8)
 
 
-def test_rows_that_there_are_not_are_not_kept(tmp_path):
-    table = merge_tables.MergedTable("failures", tmp_path)
-    rows = SCHEMAS["failures"].empty_table()
-    kept = weakref.ref(rows)
-    table.add(rows)
-    del rows
-    assert kept() is None
-
-
-ROLE_ORDER = ["input", "aligned", "mirror", "projected"]
-
-
 def test_cam_poses_has_two_rows_a_pair_that_read_back_to_the_same_doubles(merged):
-    store, _ = merged
-    with open(store.root / "camPoses.csv", newline="") as file:
+    with open(merged[0].root / "camPoses.csv", newline="") as file:
         header, *rows = csv.reader(file)
     assert header == ["id", "parent_id", *(f"T{i}{j}" for i in range(4) for j in range(4))]
     views = [row for row in plain_rows("views") if row["role"] in ("input", "mirror")]
@@ -123,52 +108,36 @@ def test_cam_poses_has_two_rows_a_pair_that_read_back_to_the_same_doubles(merged
 
 
 def test_cameras_has_every_camera_in_order_with_both_conventions(merged):
-    store, _ = merged
-    with open(store.root / "cameras.csv", newline="") as file:
+    with open(merged[0].root / "cameras.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    views = sorted(plain_rows("views"), key=lambda view: (view["pose_id"], ROLE_ORDER.index(view["role"])))
-    assert len(rows) == len(views)
+    roles = ["input", "aligned", "mirror", "projected"]
+    views = sorted(plain_rows("views"), key=lambda view: (view["pose_id"], roles.index(view["role"])))
+    names = ["pose_id", "parent_id", "width", "height", "fx", "cx", "cy", "cx_opencv", "cy_opencv", "depth_units_per_m"]
     for row, view in zip(rows, views, strict=True):
         assert row["role"] == view["role"]
-        for name in (
-            "pose_id",
-            "parent_id",
-            "width",
-            "height",
-            "fx",
-            "cx",
-            "cy",
-            "cx_opencv",
-            "cy_opencv",
-            "depth_units_per_m",
-        ):
-            assert float(row[name]) == view[name]
+        assert [float(row[name]) for name in names] == [view[name] for name in names]
         assert [float(row[f"T{i}{j}"]) for i in range(4) for j in range(4)] == view["T_world_cam"]
 
 
 def test_objects_has_a_line_for_everything_in_a_pose_table_included(merged):
-    store, _ = merged
-    lines = (store.root / "objects.dat").read_text().splitlines()
+    lines = (merged[0].root / "objects.dat").read_text().splitlines()
     objects = [row for row in plain_rows("objects") if row["role"] in ("input", "mirror")]
-    assert len(lines) == len(objects)
+    keys = ("pose_id", "category", "instance_id", "region_id", "u", "v")
     for line, row in zip(lines, objects, strict=True):
-        pose, category, instance, region, u, v, *matrix = line.split(" ")
-        assert (int(pose), category, instance, int(region)) == tuple(
-            row[key] for key in ("pose_id", "category", "instance_id", "region_id")
-        )
-        assert (int(u), int(v)) == (row["u"], row["v"])
-        assert list(map(float, matrix)) == row["T_cam_obj"]
+        words = line.split(" ")
+        assert words[:6] == [str(row[key]) for key in keys]
+        assert list(map(float, words[6:])) == row["T_cam_obj"]
     assert {line.split(" ")[1] for line in lines} >= {"table"}
 
 
-@pytest.mark.parametrize("name", ["blue mug", "50%", "a\tb", "non\u00a0breaking", "line\nend", "plain-name_1.2"])
-def test_a_name_with_spaces_is_one_word_and_can_be_had_back(name):
-    row = {**made_scene(3).rows["objects"][0], "instance_id": name}
-    (line,) = object_lines(pa.Table.from_pylist([row], schema=SCHEMAS["objects"])).decode().splitlines(keepends=True)
-    words = line.removesuffix("\n").split()
-    assert len(words) == 22
-    assert urllib.parse.unquote(words[2]) == name
-    assert (escaped(name) == name) == (name == "plain-name_1.2")
+def test_a_name_with_spaces_is_one_word_and_can_be_had_back():
+    for name in ("blue mug", "50%", "a\tb", "non\u00a0breaking", "line\nend", "plain-name_1.2"):
+        row = {**made_scene(3).rows["objects"][0], "instance_id": name}
+        (line,) = object_lines(pa.Table.from_pylist([row], schema=SCHEMAS["objects"])).decode().splitlines(True)
+        words = line.removesuffix("\n").split()
+        assert len(words) == 22
+        assert urllib.parse.unquote(words[2]) == name
+        assert (escaped(name) == name) == (name == "plain-name_1.2")
 
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False)))
@@ -176,3 +145,29 @@ def test_every_double_is_written_as_python_writes_it(numbers):
     edges = [0.0, -0.0, 1.0, 1e-4, 9.999e-5, 1e10, 9999999999.999998, 1e15, 1e16, 5e-324, 1.7976931348623157e308]
     for values in (numbers, numbers + edges):
         assert shortest(pa.array(values, pa.float64())).to_pylist() == list(map(repr, values))
+
+
+def test_the_card_names_every_source_with_its_licence_and_what_was_left_out_of_it_or_is_doubtful():
+    objects = [
+        {"source": "procedural", "weight": 2.0, "seed": 7},
+        {"source": "urdf", "folder": "meshes", "licence": "CC-BY-4.0"},
+    ]
+    assets = Assets.model_validate({"objects": objects})
+    catalogue = Catalogue(assets, (None, None), (None,), "d" * 64, {"meshes": {"too large": 2, "torn": 1}})
+    lines = describe_sources(catalogue)
+    assert lines[:2] == [
+        "objects, weight 2: made from seed 7, licence CC0-1.0",
+        "objects, weight 1: urdf folder meshes, licence CC-BY-4.0",
+    ]
+    assert lines[2].startswith("tables, weight 1: made from seed")
+    assert lines[3:] == ["left out of meshes: 2 too large, 1 torn"]
+    doubts = {f"{name}.glb": "y" for name in "dcba"}
+    examples = ("a.obj (no_faces: has no triangles)", "b.obj (...)")
+    listing = Listing(Path("/meshes"), {}, {"no_faces": 4}, examples=examples, doubts=doubts)
+    catalogue = Catalogue(Assets(), (listing, None), (None,), "d" * 64, {"/meshes": {"no_faces": 4}})
+    said = "left out of /meshes: 4 no_faces; a.obj (no_faces: has no triangles); b.obj (...)"
+    assert describe_sources(catalogue)[-1] == said
+    (line,) = catalogue.describe_doubts()
+    told = "/meshes: files stand on another axis than `up` says: a.glb on y, b.glb on y, c.glb on y and 1 more"
+    assert line.startswith(told) and 'such as {"a.glb": y}' in line
+    assert Catalogue(Assets(), (None,), (None,), "d" * 64).describe_doubts() == []

@@ -1,8 +1,6 @@
-"""Queues in folders and buckets: what is refused, and what several writers at once may not do."""
+"""Queues in folders and buckets: a job's state after its events, what is refused, and what several writers may not do."""
 
-import itertools
 import threading
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -31,53 +29,51 @@ def queue(request, tmp_path):
         yield made
 
 
-def test_a_job_is_read_as_it_was_stored(queue):
-    assert queue.ids() == [A]
-    assert queue.read(A).request == request_of(A)
-    assert not queue.put_request(request_of(A, name="another"))
+def in_threads(work) -> None:
+    """Runs `work` in eight threads that start at once; raises what one raises."""
+    start, faults = threading.Barrier(8), []
 
-
-def test_events_are_kept_in_their_order_and_folded(queue):
-    for kind, attempt in (("started", 1), ("began", 1), ("died", 1), ("started", 2)):
-        assert queue.append(A, kind, attempt) is not None
-    fresh = Queue(queue.store).read(A)
-    assert (fresh.state, fresh.attempt, fresh.deaths, fresh.events) == ("running", 2, 1, 4)
-
-
-def test_of_many_writers_at_once_one_decides(queue):
-    won: list[int] = []
-    start = threading.Barrier(8)
-
-    def contend(number: int) -> None:
-        own = Queue(queue.store)
+    def contend() -> None:
         start.wait()
-        if own.append(A, "started", 1) is not None:
-            won.append(number)
+        try:
+            work()
+        except Exception as error:
+            faults.append(error)
 
-    threads = [threading.Thread(target=contend, args=(number,)) for number in range(8)]
+    threads = [threading.Thread(target=contend) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(won) == 1
+    assert faults == []
+
+
+def test_a_job_and_its_events_are_read_as_they_were_stored_and_none_that_does_not_apply(queue):
+    assert queue.ids() == [A]
+    assert not queue.put_request(request_of(A, name="another"))
+    for kind, attempt in (("started", 1), ("began", 1), ("died", 1), ("started", 2)):
+        assert queue.append(A, kind, attempt) is not None
+    assert queue.append(A, "started", 2) is None
+    fresh = Queue(queue.store).read(A)
+    assert fresh.request == request_of(A)
+    assert (fresh.state, fresh.attempt, fresh.deaths, fresh.events) == ("running", 2, 1, 4)
+    with pytest.raises(InputError, match=f"^[^\n]* has no job {B}: `verso jobs` lists[^\n]*$"):
+        queue.read(B)
+
+
+def test_of_many_writers_at_once_one_decides(queue):
+    won = []
+    in_threads(lambda: won.append(Queue(queue.store).append(A, "started", 1)))
+    assert len([view for view in won if view is not None]) == 1
     assert queue.read(A).events == 1
 
 
-def test_an_event_that_does_not_apply_is_not_stored(queue):
-    queue.append(A, "cancel")
-    assert queue.append(A, "started", 1) is None
-    assert queue.read(A).events == 1
-
-
-def test_the_share_is_what_was_said_last(queue):
+def test_the_share_is_what_was_said_last_and_logs_are_kept_once_from_their_end(queue):
     assert queue.share() == 1
     queue.put_share(3)
     assert queue.share() == 3
     queue.store.put("share.json", b"{torn")
     assert queue.share() == 1
-
-
-def test_logs_are_kept_once_and_from_their_end(queue):
     queue.put_log(A, 1, "x" * (2 << 20) + "end")
     queue.put_log(A, 1, "again")
     kept = queue.read_log(A, 1)
@@ -85,41 +81,30 @@ def test_logs_are_kept_once_and_from_their_end(queue):
     assert queue.read_log(A, 2) is None
 
 
-def test_an_unknown_id_is_told_in_one_line(queue):
-    with pytest.raises(InputError, match=f"^[^\n]* has no job {B}: `verso jobs` lists[^\n]*$"):
-        queue.read(B)
+def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path):
+    event = events_folder(A)
+    for number, (key, data, words) in enumerate(
+        [
+            (request_path(A), b"{", "is damaged"),
+            (request_path(A), b'{"queue": 2}', "is newer than this program"),
+            (request_path(A), b'{"queue": 1, "id": "j1"}', "was not written by this program"),
+            (request_path(A), None, "is the request of another job"),
+            (event_path(event, 0), b"[]", "was not written by this program"),
+            (event_path(event, 3), b"{}", "lacks an event"),
+            (event_path(event, 0), b"x" * (2 << 20), "should have less"),
+        ]
+    ):
+        queue = queue_of(tmp_path / str(number), request_of(A), request_of(B))
+        queue.store.put(key, queue.store.read(request_path(B)) if data is None else data)
+        views, faults = queue.read_all(queue.ids())
+        assert [view.request.id for view in views] == [B]
+        assert words in faults[A] and key.rpartition("/")[0] in faults[A] and "\n" not in faults[A]
+        with pytest.raises(CorruptError):
+            queue.append(A, "cancel")
 
 
-@pytest.mark.parametrize(
-    ("key", "data", "words"),
-    [
-        (request_path(A), b"{", "is damaged"),
-        (request_path(A), b'{"queue": 2}', "is newer than this program"),
-        (request_path(A), b'{"queue": 1, "id": "j1"}', "was not written by this program"),
-        (event_path(events_folder(A), 0), b"[]", "was not written by this program"),
-        (event_path(events_folder(A), 3), b"{}", "lacks an event"),
-        (event_path(events_folder(A), 0), b"x" * (2 << 20), "should have less"),
-    ],
-)
-def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path, key, data, words):
-    queue = queue_of(tmp_path / "q", request_of(A), request_of(B))
-    queue.store.put(key, data)
-    views, faults = queue.read_all(queue.ids())
-    assert [view.request.id for view in views] == [B]
-    assert words in faults[A] and key.rpartition("/")[0] in faults[A] and "\n" not in faults[A]
-    with pytest.raises(CorruptError):
-        queue.append(A, "cancel")
-
-
-def test_a_request_in_the_place_of_another_is_refused(tmp_path):
-    queue = queue_of(tmp_path / "q", request_of(A), request_of(B))
-    queue.store.put(request_path(A), queue.store.read(request_path(B)))
-    with pytest.raises(CorruptError, match="is the request of another job"):
-        queue.read(A)
-
-
-def test_a_new_or_an_empty_folder_becomes_a_queue_and_stays_one(tmp_path):
-    make_queue(str(tmp_path / "new"))
+def test_a_new_or_an_empty_folder_becomes_a_queue_and_stays_one_also_where_many_make_it(tmp_path):
+    in_threads(lambda: make_queue(str(tmp_path / "new")))
     assert open_queue(str(tmp_path / "new")).ids() == []
     assert {path.name for path in (tmp_path / "new").iterdir()} == {MARK_FILE, "_staging"}
     mark = (tmp_path / "new" / MARK_FILE).read_bytes()
@@ -127,41 +112,23 @@ def test_a_new_or_an_empty_folder_becomes_a_queue_and_stays_one(tmp_path):
     assert (tmp_path / "new" / MARK_FILE).read_bytes() == mark
 
 
-def test_many_who_make_one_queue_at_once_all_get_it(tmp_path):
-    faults: list[Exception] = []
-
-    def make() -> None:
-        try:
-            make_queue(str(tmp_path / "q"))
-        except Exception as error:
-            faults.append(error)
-
-    threads = [threading.Thread(target=make) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert faults == []
-    assert open_queue(str(tmp_path / "q")).ids() == []
-
-
 def test_a_queue_that_another_makes_between_two_looks_is_taken(tmp_path, monkeypatch):
     make_queue(str(tmp_path / "q"))
-    asked = []
+    asked, real = [], LocalStore.size
 
     def absent_at_first(store, key):
         asked.append(key)
         return None if len(asked) == 1 else real(store, key)
 
-    real = LocalStore.size
     monkeypatch.setattr(LocalStore, "size", absent_at_first)
     assert make_queue(str(tmp_path / "q")).ids() == []
     assert asked[0] == MARK_FILE
 
 
 def test_what_is_no_queue_is_refused_with_one_line(tmp_path):
-    (tmp_path / "letters").mkdir()
-    (tmp_path / "letters" / "to_mother.txt").write_text("dear")
+    letter = tmp_path / "letters" / "to_mother.txt"
+    letter.parent.mkdir()
+    letter.write_text("dear")
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("x")
     for opener, name, words in [
@@ -175,107 +142,80 @@ def test_what_is_no_queue_is_refused_with_one_line(tmp_path):
     ]:
         with pytest.raises(InputError, match=words) as caught:
             opener(str(tmp_path / name))
-        assert "\n" not in str(caught.value)
-        assert "--queue" in str(caught.value)
-    assert list((tmp_path / "letters").iterdir()) == [Path(tmp_path / "letters" / "to_mother.txt")]
+        assert "\n" not in str(caught.value) and "--queue" in str(caught.value)
+    assert list(letter.parent.iterdir()) == [letter]
 
 
-REQUEST = request_of("j00000001")
+# ------------------------------------------------------------------------------------------- a job after its events
 
 
-def event(kind: str, attempt: int = 0, **fields: object) -> JobEvent:
-    code = {"code": 0} if kind == "ended" and "code" not in fields else {}
-    return JobEvent(kind=kind, attempt=attempt, at=0.0, nonce="0" * 32, **code, **fields)
+def event(kind: str, attempt: int = 0, code: int = 0) -> JobEvent:
+    told = {"code": code} if kind == "ended" else {}
+    return JobEvent(kind=kind, attempt=attempt, at=0.0, nonce="0" * 32, **told)
 
 
-def after(*words: str) -> JobView:
+def after(events: str) -> JobView:
     """The job after events written `kind` or `kind:attempt` or `ended:attempt:code`."""
-    events = []
-    for word in words:
-        kind, *numbers = word.split(":")
-        fields = {"code": int(numbers[1])} if len(numbers) > 1 else {}
-        events.append(event(kind, int(numbers[0]) if numbers else 0, **fields))
-    return fold(REQUEST, events)
+    words = (word.split(":") for word in events.split())
+    return fold(request_of(A), [event(kind, *map(int, numbers)) for kind, *numbers in words])
 
 
-@pytest.mark.parametrize(
-    ("events", "state"),
-    [
-        ("", "queued"),
-        ("cancel", "cancelled"),
-        ("started:1", "running"),
-        ("started:1 began:1", "running"),
-        ("started:1 began:1 ended:1:0", "done"),
-        ("started:1 began:1 ended:1:1", "failed"),
-        ("started:1 began:1 ended:1:2", "failed"),
-        ("started:1 began:1 died:1", "queued"),
-        ("started:1 died:1 started:2 began:2 ended:2:0", "done"),
-        ("started:1 began:1 busy:1", "waiting"),
-        ("started:1 began:1 busy:1 started:2 began:2", "running"),
-        ("started:1 cancel", "cancelling"),
-        ("started:1 began:1 cancel stopped:1", "cancelled"),
-        ("started:1 began:1 cancel died:1", "cancelled"),
-        ("started:1 began:1 cancel busy:1", "cancelled"),
-        ("started:1 began:1 cancel ended:1:1", "cancelled"),
-        ("started:1 began:1 cancel ended:1:0", "done"),
-        ("started:1 died:1 cancel", "cancelled"),
-    ],
-)
-def test_the_state_after_these_events(events, state):
-    assert after(*events.split()).state == state
+STATES = {
+    "": "queued",
+    "cancel": "cancelled",
+    "started:1": "running",
+    "started:1 began:1": "running",
+    "started:1 began:1 ended:1:0": "done",
+    "started:1 began:1 ended:1:1": "failed",
+    "started:1 began:1 ended:1:2": "failed",
+    "started:1 began:1 died:1": "queued",
+    "started:1 died:1 started:2 began:2 ended:2:0": "done",
+    "started:1 began:1 busy:1": "waiting",
+    "started:1 began:1 busy:1 started:2 began:2": "running",
+    "started:1 cancel": "cancelling",
+    "started:1 began:1 cancel stopped:1": "cancelled",
+    "started:1 began:1 cancel died:1": "cancelled",
+    "started:1 began:1 cancel busy:1": "cancelled",
+    "started:1 began:1 cancel ended:1:1": "cancelled",
+    "started:1 began:1 cancel ended:1:0": "done",
+    "started:1 died:1 cancel": "cancelled",
+}
+LATE = [
+    ("cancel", "started:1"),
+    ("started:1", "started:1 ended:1:0"),
+    ("started:1 began:1", "started:2 began:1 stopped:1"),
+    ("started:1 cancel", "began:1"),
+    ("started:1 died:1 started:2", "began:1"),
+    ("started:1 began:1 died:1 started:2", "ended:1:0"),
+    ("started:1 began:1 died:1", "died:1"),
+    ("started:1 began:1 ended:1:0", "died:1 cancel"),
+    ("started:1 began:1 cancel", "cancel"),
+]
+"""Events, and others that come too late after them."""
 
 
-@pytest.mark.parametrize(
-    ("events", "late"),
-    [
-        ("cancel", "started:1"),
-        ("started:1", "started:1"),
-        ("started:1 began:1", "started:2"),
-        ("started:1 began:1", "began:1"),
-        ("started:1 cancel", "began:1"),
-        ("started:1", "ended:1:0"),
-        ("started:1 died:1 started:2", "began:1"),
-        ("started:1 began:1 died:1 started:2", "ended:1:0"),
-        ("started:1 began:1 died:1", "died:1"),
-        ("started:1 began:1 ended:1:0", "died:1"),
-        ("started:1 began:1 ended:1:0", "cancel"),
-        ("started:1 began:1", "stopped:1"),
-        ("started:1 began:1 cancel", "cancel"),
-    ],
-)
-def test_an_event_that_comes_too_late_changes_nothing_but_the_count(events, late):
-    before = after(*events.split())
-    now = after(*events.split(), late)
-    assert now.events == before.events + 1
-    assert (now.state, now.attempt, now.began, now.deaths) == (
-        before.state,
-        before.attempt,
-        before.began,
-        before.deaths,
-    )
+def test_the_state_after_events_and_that_those_that_come_too_late_change_nothing_but_the_count():
+    assert {events: after(events).state for events in STATES} == STATES
+    for events, late in LATE:
+        before = after(events)
+        for one in late.split():
+            now = after(f"{events} {one}")
+            assert now.events == before.events + 1
+            for name in ("state", "attempt", "began", "deaths"):
+                assert getattr(now, name) == getattr(before, name), (events, one)
 
 
-def test_a_job_is_taken_up_again_three_times_and_then_lost():
-    words: list[str] = []
-    states = []
-    for attempt in range(1, RESTARTS + 2):
-        words += [f"started:{attempt}", f"died:{attempt}"]
-        states.append(after(*words).state)
-    assert states == ["queued", "queued", "queued", "lost"]
-    assert after(*words, "started:5").state == "lost"
-
-
-def test_waiting_for_a_folder_is_no_death():
-    words = list(itertools.chain.from_iterable((f"started:{n}", f"began:{n}", f"busy:{n}") for n in range(1, 9)))
-    assert (after(*words).state, after(*words).deaths, after(*words).attempt) == ("waiting", 0, 8)
+def test_a_job_is_taken_up_again_three_times_and_then_lost_but_waiting_for_a_folder_is_no_death():
+    deaths = [" ".join(f"started:{n} died:{n}" for n in range(1, last + 1)) for last in range(1, RESTARTS + 2)]
+    assert [after(words).state for words in deaths] == ["queued", "queued", "queued", "lost"]
+    assert after(f"{deaths[-1]} started:5").state == "lost"
+    waited = after(" ".join(f"started:{n} began:{n} busy:{n}" for n in range(1, 9)))
+    assert (waited.state, waited.deaths, waited.attempt) == ("waiting", 0, 8)
 
 
 def test_a_job_claims_its_folder_from_its_first_attempt_to_its_end():
-    assert [
-        after(*events.split()).claims_folder
-        for events in ("", "started:1", "started:1 died:1", "started:1 began:1 busy:1")
-    ] == [False, True, True, True]
-    assert not after("started:1", "began:1", "ended:1:1").claims_folder
+    claims = {"": False, "started:1": True, "started:1 died:1": True, "started:1 began:1 ended:1:1": False}
+    assert {events: after(events).claims_folder for events in claims} == claims
 
 
 KINDS = st.sampled_from(["started", "began", "busy", "ended", "died", "stopped", "cancel"])
@@ -283,18 +223,10 @@ KINDS = st.sampled_from(["started", "began", "busy", "ended", "died", "stopped",
 
 @given(st.lists(st.tuples(KINDS, st.integers(1, 3), st.sampled_from([0, 1, 2])), max_size=14))
 def test_whatever_comes_an_ended_job_stays_as_it_is_and_attempts_only_count_up(events):
-    view = JobView(REQUEST)
+    view = JobView(request_of(A))
     for kind, attempt, code in events:
-        one = event(kind, 0 if kind == "cancel" else attempt, **({"code": code} if kind == "ended" else {}))
-        following = apply(view, one)
+        following = apply(view, event(kind, 0 if kind == "cancel" else attempt, code))
         assert following == view or not view.ended
         assert view.attempt <= following.attempt <= view.attempt + 1
         assert following.deaths <= following.attempt
         view = following
-
-
-def test_names_of_events_sort_as_their_numbers():
-    folder = events_folder("j00000001")
-    assert sorted(event_path(folder, number) for number in (10, 9, 100)) == [
-        event_path(folder, number) for number in (9, 10, 100)
-    ]

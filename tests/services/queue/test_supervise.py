@@ -3,27 +3,90 @@
 import itertools
 import shlex
 import subprocess
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from schemas.errors import RunError
 from schemas.queue import submission_id
-from services.queue.queue import Queue, make_queue
-from services.queue.supervise import Driver, build_entrypoint, hold_queue
-from tests.kit.faults import unflushed
-from tests.kit.queue_world import AT_ONCE, DIES, Killed, World, ids
+from services.queue.queue import JobState, JobView, Queue, make_queue
+from services.queue.supervise import (
+    PAUSES_S,
+    Action,
+    Driver,
+    build_entrypoint,
+    choose_starts,
+    hold_queue,
+    pause_of,
+    tend_drivers,
+    waiting_for_folder,
+)
+from tests.kit.queue_world import AT_ONCE, DIES, Killed, World, ids, request_of
 from tests.kit.s3_server import Bucket, s3_server
 from workers.store.objects import ObjectStore
 
-__all__ = ["unflushed"]
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 PLAIN, DYING, CANCELLED, SECOND, LAST = ids(5)
+A, B, C = ids(3)
 MOST_TICKS = 60
+
+
+def view(
+    job: str, state: JobState = "queued", attempt: int = 0, began: bool = False, deaths: int = 0, **request: object
+) -> JobView:
+    return replace(JobView(request_of(job, **request)), state=state, attempt=attempt, began=began, deaths=deaths)
+
+
+def started(*views: JobView, at_once: int = 2, **kwargs: Any) -> list[str]:
+    return [action.job for action in choose_starts(views, at_once, **kwargs)]
+
+
+def test_the_next_turn_is_by_priority_and_age_while_there_is_room_and_never_two_in_a_folder():
+    jobs = [view(A, submitted=3.0), view(B, submitted=2.0), view(C, submitted=9.0, priority=1)]
+    assert started(*jobs, at_once=3) == [C, B, A]
+    assert started(*jobs) == [C, B]
+    assert started(view(A, "running", 1), view(B, "cancelling", 1), view(C)) == []
+    assert started(view(A, "running", 1), view(B, "queued", 1, deaths=1), view(C)) == [B]
+    assert started(view(A, "queued", 1, deaths=1), view(B), at_once=1, is_due=lambda one: one.deaths == 0) == [B]
+    assert choose_starts([view(A, "queued", 2, deaths=2)], 1) == [Action("start", A, 3)]
+    assert started(view(A, out="/o"), view(B, out="/o"), view(C)) == [A, C]
+    for state in ("running", "cancelling", "queued", "waiting"):
+        first, second = view(A, state, 1, out="/o"), view(B, out="/o", priority=9)
+        assert started(first, second, is_due=lambda one: one.attempt == 0) == []
+    assert started(view(A, "failed", 1, out="/o"), view(B, out="/o")) == [B]
+    assert waiting_for_folder([view(A, "running", 1, out="/o"), view(B, out="/o"), view(C)]) == {B}
+    assert [pause_of(view(A, "queued", n, deaths=n)) for n in range(4)] == [0.0, *PAUSES_S] == sorted([0.0, *PAUSES_S])
+
+
+def test_what_is_done_about_a_driver():
+    for state, began, driver, deed in [
+        ("running", False, None, "hand over"),
+        ("running", False, "running", None),
+        ("running", False, "over", "note death"),
+        ("running", True, "running", None),
+        ("running", True, "over", "note death"),
+        ("running", True, None, "note death"),
+        ("cancelling", True, "running", "stop"),
+        ("cancelling", False, "running", "stop"),
+        ("cancelling", True, "over", "note stop"),
+        ("cancelling", True, None, "note stop"),
+        ("queued", False, None, None),
+        ("done", True, "running", None),
+        ("waiting", True, None, None),
+    ]:
+        drivers = {submission_id(A, 2): Driver(driver)} if driver else {}
+        done = tend_drivers([view(A, state, 2, began)], {submission_id(A, 1): Driver("over"), **drivers})
+        assert [(one.deed, one.job, one.attempt) for one in done] == ([(deed, A, 2)] if deed else [])
+
+
+# ------------------------------------------------------------------------------------------- a world of five jobs
 
 
 def world_of(folder, queue: Queue | None = None) -> World:
     """Five jobs: one plain, one whose first driver dies, one to be cancelled while it runs, two of one folder."""
+    folder.mkdir(exist_ok=True)
     world = World(queue or make_queue(str(folder / "q")))
     world.submit(PLAIN, priority=2)
     world.submit(DYING, priority=2, name=f"{DIES}-once", submitted=2.0)
@@ -47,55 +110,43 @@ def play(world: World, look) -> None:
 
 
 def check_ends(world: World) -> None:
-    assert world.states_of_jobs() == {
-        PLAIN: "done",
-        DYING: "done",
-        CANCELLED: "cancelled",
-        SECOND: "done",
-        LAST: "done",
-    }
+    ends = {PLAIN: "done", DYING: "done", CANCELLED: "cancelled", SECOND: "done", LAST: "done"}
+    assert world.states_of_jobs() == ends
     assert set(world.began.values()) == {1}  # no attempt began twice
     assert world.began[submission_id(DYING, 1)] == 1
     assert world.queue.read(DYING).deaths == 1
     assert world.most_at_once <= AT_ONCE
-    for job in (PLAIN, DYING, CANCELLED, SECOND, LAST):
+    for job in ends:
         assert all(world.queue.has_log(job, attempt) for attempt in range(1, world.queue.read(job).attempt + 1))
 
 
 def test_five_jobs_come_to_their_ends(tmp_path):
     world, said = world_of(tmp_path), []
-    play(world, world.supervisor(said.append).look)
+    supervisor = world.supervisor(said.append)
+    supervisor.look()
+    assert world.queue.share() == 2
+    play(world, supervisor.look)
     check_ends(world)
-    assert world.handed_over == [
-        submission_id(*one) for one in [(PLAIN, 1), (DYING, 1), (CANCELLED, 1), (DYING, 2), (SECOND, 1), (LAST, 1)]
-    ] or world.handed_over.index(submission_id(SECOND, 1)) < world.handed_over.index(submission_id(LAST, 1))
+    assert world.handed_over.index(submission_id(SECOND, 1)) < world.handed_over.index(submission_id(LAST, 1))
     assert f"job {DYING}, attempt 1: its driver ended without telling how; it is taken up again in 10 s" in said
     assert f"job {CANCELLED}: cancelled; what it committed is kept" in said
     assert world.queue.share() == 1
 
 
-def count_effects(folder) -> int:
-    world, effects = world_of(folder), []
-    world.effect = lambda: effects.append(world.ticks)
-    play(world, world.supervisor().look)
-    return len(effects)
-
-
-def test_a_supervisor_killed_at_any_step_loses_nothing_and_starts_nothing_twice(tmp_path):
-    (tmp_path / "whole").mkdir()
-    steps = count_effects(tmp_path / "whole")
-    assert steps > 20
-    for step in range(steps):
-        (tmp_path / str(step)).mkdir()
+def at_each_step(tmp_path, happens) -> None:
+    """Plays the world once for each of its effects; `happens(world, supervisors)` at this effect; the last one looks."""
+    whole, effects = world_of(tmp_path / "whole"), []
+    whole.effect = lambda: effects.append(whole.ticks)
+    play(whole, whole.supervisor().look)
+    assert len(effects) > 20
+    for step in range(len(effects)):
         world = world_of(tmp_path / str(step))
+        supervisors = [world.supervisor()]
         left = itertools.chain(itertools.repeat(False, step), [True], itertools.repeat(False))
 
-        def die_once(left=left) -> None:
+        def effect(world=world, supervisors=supervisors, left=left) -> None:
             if next(left):
-                raise Killed
-
-        world.effect = die_once
-        supervisors = [world.supervisor()]
+                happens(world, supervisors)
 
         def look(world=world, supervisors=supervisors) -> None:
             try:
@@ -103,52 +154,42 @@ def test_a_supervisor_killed_at_any_step_loses_nothing_and_starts_nothing_twice(
             except Killed:
                 supervisors.append(world.supervisor())
 
+        world.effect = effect
         play(world, look)
-        assert len(supervisors) == 2, step
+        assert not next(left), step
         check_ends(world)
 
 
-def test_a_second_supervisor_that_acts_in_the_middle_of_any_step_of_the_first_doubles_nothing(tmp_path):
-    (tmp_path / "whole").mkdir()
-    for step in range(count_effects(tmp_path / "whole")):
-        (tmp_path / str(step)).mkdir()
-        world = world_of(tmp_path / str(step))
-        first, second = world.supervisor(), world.supervisor()
-        left = itertools.chain(itertools.repeat(False, step), [True], itertools.repeat(False))
+def test_a_supervisor_killed_at_any_step_loses_nothing_and_starts_nothing_twice(tmp_path):
+    def die(world, supervisors) -> None:
+        raise Killed
 
-        def interfere(left=left, second=second) -> None:
-            if next(left):
-                second.look()
-
-        world.effect = interfere
-        play(world, first.look)
-        assert not next(left)
-        check_ends(world)
+    at_each_step(tmp_path, die)
 
 
-def test_two_supervisors_that_look_in_turn_double_nothing(tmp_path):
-    world = world_of(tmp_path)
+def test_a_second_supervisor_that_acts_in_the_middle_of_any_step_or_in_turn_doubles_nothing(tmp_path):
+    at_each_step(tmp_path, lambda world, supervisors: world.supervisor().look())
+    world = world_of(tmp_path / "in turn")
     turns = itertools.cycle([world.supervisor().look, world.supervisor().look])
     play(world, lambda: next(turns)())
     check_ends(world)
 
 
-@pytest.mark.parametrize("tick", range(1, 12))
-def test_a_head_that_comes_back_and_knows_nothing_costs_an_attempt_and_no_job(tmp_path, tick):
-    world = world_of(tmp_path)
-    supervisor = world.supervisor()
-    ticks = itertools.count()
+def test_a_head_that_comes_back_and_knows_nothing_costs_an_attempt_and_no_job(tmp_path):
+    for tick in range(1, 12):
+        world = world_of(tmp_path / str(tick))
+        supervisor, ticks = world.supervisor(), itertools.count()
 
-    def look() -> None:
-        if next(ticks) == tick:
-            world.restart()
-        supervisor.look()
+        def look(world=world, supervisor=supervisor, ticks=ticks, tick=tick) -> None:
+            if next(ticks) == tick:
+                world.restart()
+            supervisor.look()
 
-    play(world, look)
-    ends = world.states_of_jobs()
-    assert ends.pop(CANCELLED) == "cancelled"
-    assert set(ends.values()) == {"done"}
-    assert set(world.began.values()) == {1}
+        play(world, look)
+        ends = world.states_of_jobs()
+        assert ends.pop(CANCELLED) == "cancelled"
+        assert set(ends.values()) == {"done"}
+        assert set(world.began.values()) == {1}
 
 
 def test_while_ray_does_not_answer_nothing_is_decided_and_that_is_told_once(tmp_path):
@@ -156,9 +197,8 @@ def test_while_ray_does_not_answer_nothing_is_decided_and_that_is_told_once(tmp_
     supervisor = world.supervisor(said.append)
     supervisor.look()
     world.tick()
-    told = list(said)
+    told, before = list(said), world.states_of_jobs()
     world.answers = False
-    before = world.states_of_jobs()
     for _ in range(5):
         supervisor.look()
     assert world.states_of_jobs() == before
@@ -169,71 +209,42 @@ def test_while_ray_does_not_answer_nothing_is_decided_and_that_is_told_once(tmp_
     play(world, supervisor.look)
 
 
-def test_a_job_whose_drivers_always_die_is_lost_after_three_more_tries(tmp_path):
-    world = World(make_queue(str(tmp_path / "q")))
+def test_a_dead_driver_is_followed_by_another_after_a_pause_and_by_none_after_three_more(tmp_path):
+    world, clock = World(make_queue(str(tmp_path / "q"))), [0.0]
     world.submit(PLAIN)
-    supervisor = world.supervisor()
-    for _ in range(40):
-        supervisor.look()
-        world.ticks += 1
-        for submission in world.known:
-            world.known[submission] = Driver("over")
-    assert world.queue.read(PLAIN).state == "lost"
-    assert len(world.handed_over) == 4
-
-
-def test_a_pause_is_kept(tmp_path):
-    world = World(make_queue(str(tmp_path / "q")))
-    world.submit(PLAIN)
-    clock = [0.0]
     supervisor = world.supervisor()
     supervisor._clock = lambda: clock[0]
     supervisor.look()
     world.end(PLAIN, 1)
     supervisor.look()
-    for seconds, attempts in ((9.0, 1), (10.0, 2)):
-        clock[0] = seconds
+    for clock[0], attempts in ((9.0, 1), (10.0, 2)):
         supervisor.look()
         assert world.queue.read(PLAIN).attempt == attempts
+    for _ in range(40):
+        clock[0] += 1000.0
+        supervisor.look()
+        world.known = dict.fromkeys(world.known, Driver("over"))
+    assert world.queue.read(PLAIN).state == "lost"
+    assert len(world.handed_over) == 4
 
 
-def test_a_cancelled_job_that_waits_never_starts(tmp_path):
-    world = world_of(tmp_path)
-    world.queue.append(PLAIN, "cancel")
-    play(world, world.supervisor().look)
-    assert world.queue.read(PLAIN).state == "cancelled"
-    assert not any(PLAIN in one for one in world.handed_over)
-
-
-def test_a_damaged_job_is_told_once_and_stops_no_other(tmp_path):
+def test_a_cancelled_job_that_waits_never_starts_and_a_damaged_one_is_told_once_and_stops_no_other(tmp_path):
     world, said = world_of(tmp_path), []
+    world.queue.append(DYING, "cancel")
     world.queue.store.put(f"jobs/{LAST}/request.json", b"{")
     supervisor = world.supervisor(said.append)
     for _ in range(30):
         supervisor.look()
         world.tick()
-    assert world.queue.read(PLAIN).state == "done"
+    assert [world.queue.read(job).state for job in (PLAIN, DYING)] == ["done", "cancelled"]
+    assert not any(DYING in one for one in world.handed_over)
     assert sum(f"job {LAST} is left alone" in line for line in said) == 1
-
-
-def test_the_share_follows_the_number_of_jobs_that_run(tmp_path):
-    world = world_of(tmp_path)
-    supervisor = world.supervisor()
-    supervisor.look()
-    assert world.queue.share() == 2
-    play(world, supervisor.look)
-    assert world.queue.share() == 1
 
 
 @pytest.mark.parametrize("place", ["/q", "/it's $(touch x) `touch x`; touch x", "/a\nb&&touch x", 's3://b/ü "x"'])
 def test_the_entrypoint_gives_the_shell_nothing_to_do(place, tmp_path):
-    told = subprocess.run(
-        build_entrypoint(["/opt/my verso", "-P"], place, PLAIN, 3).replace("'/opt/my verso'", "printf '%s\\0'"),
-        shell=True,
-        cwd=tmp_path,
-        capture_output=True,
-        check=True,
-    )
+    line = build_entrypoint(["/opt/my verso", "-P"], place, PLAIN, 3).replace("'/opt/my verso'", "printf '%s\\0'")
+    told = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, check=True)
     assert told.stdout.decode().split("\0")[:-1] == ["-P", "drive", PLAIN, "3", "--queue", place]
     assert list(tmp_path.iterdir()) == []
     assert shlex.split(build_entrypoint(["verso"], place, PLAIN, 3))[0] == "verso"
@@ -250,8 +261,7 @@ def test_five_jobs_come_to_their_ends_in_a_bucket_that_fails_one_request_in_ten(
     bucket = Bucket()
     bucket.share, bucket.faults = 0.1, ("500", "503", "503 when done", "reset", "reset when done")
     with s3_server(bucket) as client:
-        store = ObjectStore(client, "s3://mine")
-        world = world_of(tmp_path, Queue(store))
+        world = world_of(tmp_path, Queue(ObjectStore(client, "s3://mine")))
         play(world, world.supervisor().look)
         check_ends(world)
     assert bucket.requests["fault"] > 20

@@ -1,9 +1,14 @@
-"""Counting of reports and handing out of shards; deaths, retries and interruptions on a real Ray are in test_step.py."""
+"""The coordinator without Ray: reports and deaths counted, shards handed out, and stalls judged by what changes."""
 
+import os
 import pickle
+import signal
+import subprocess
+import time
 from collections import Counter
 from typing import cast
 
+import obstore.store
 import pytest
 
 from schemas.dataset.commit import Span
@@ -15,7 +20,6 @@ from services.run.coordinator import (
     LOOK_EVERY_S,
     NODE_PATIENCE,
     Coordinator,
-    Death,
     Deaths,
     Limits,
     LostNodes,
@@ -24,46 +28,61 @@ from services.run.coordinator import (
 )
 from services.run.joining import Pattern
 from services.run.metrics import Tally
-from services.run.ray_cluster import ClusterSlots, Slots
+from services.run.ray_cluster import Slots
+from services.run.watchdog import (
+    COMMIT_FACTOR,
+    SCENE_FACTOR,
+    AttemptName,
+    Sight,
+    end_worker_here,
+    find_own_workers,
+    find_stalls,
+    look,
+    scenes_in_progress,
+    watch,
+)
 from services.run.worker_entry import WorkerTerms
 from tests.made_up_scenes import small_scene, terms
 from workers.assets.catalogue import Catalogue
 from workers.store import attempt as module_store
 from workers.store.attempt import Attempt, begin_attempt
 from workers.store.local import LocalStore
+from workers.store.objects import ObjectStore
+from workers.store.store import Store
 
 STACK = Fingerprint(canary="c", code="d", libraries={}, simd="", renderer="")
 
 
-def report(*spans: SpanReport) -> ShardReport:
-    return ShardReport(spans=spans, seconds={}, wall_s=2.0, cpu_s=1.5, fingerprint=STACK, host="h", pid=1)
+def report(*spans: SpanReport, **seconds: float) -> ShardReport:
+    return ShardReport(spans=spans, seconds=seconds, wall_s=2.0, cpu_s=1.5, fingerprint=STACK, host="h", pid=1)
 
 
 def span(start: int, made: int, failed: dict[str, int], conflict: str | None = None) -> SpanReport:
-    return SpanReport(
-        start=start, stop=start + 4, retry=0, won=conflict is None, conflict=conflict, made=made, failed=failed
-    )
+    won = conflict is None
+    return SpanReport(start=start, stop=start + 4, retry=0, won=won, conflict=conflict, made=made, failed=failed)
 
 
-def test_reports_add_up_by_the_kind_of_failure():
+def spans(*starts: int) -> tuple[Span, ...]:
+    return tuple(Span(start=start, stop=start + 2) for start in starts)
+
+
+def test_reports_add_up_by_the_kind_of_failure_and_what_is_served_stays_as_it_was():
     tally = Tally(asked=12)
-    tally.add(report(span(0, 3, {"intrinsic: left_table": 1}), span(4, 4, {})))
-    tally.add(report(span(8, 1, {"intrinsic: left_table": 2, "environmental: killed": 1})))
-    assert (tally.made, tally.done) == (8, 12)
-    assert tally.failed == Counter({"intrinsic: left_table": 3, "environmental: killed": 1})
-    assert (tally.shard_wall_s, tally.shard_cpu_s) == (4.0, 3.0)
-    assert tally.conflicts == []
-
-
-def test_a_conflict_is_kept_word_for_word():
-    tally = Tally(asked=4)
-    tally.add(report(span(0, 4, {}, conflict="two attempts made other bytes")))
+    tally.add(report(span(0, 3, {"intrinsic: left_table": 1}), span(4, 4, {}), settle=1.5))
+    before = tally.counts(2)
+    tally.add(report(span(8, 1, {"intrinsic: left_table": 2, "environmental: killed": 1}), settle=2.5))
+    after = tally.counts(2)
+    failed = {"intrinsic: left_table": 3, "environmental: killed": 1}
+    assert (before.made, before.failed, before.seconds) == (7, {"intrinsic: left_table": 1}, {"settle": 1.5})
+    assert (after.made, after.failed, after.seconds, after.asked, after.slots) == (8, failed, {"settle": 4.0}, 12, 2)
+    assert (tally.done, tally.shard_wall_s, tally.shard_cpu_s, tally.conflicts) == (12, 4.0, 3.0, [])
+    tally.add(report(span(12, 4, {}, conflict="two attempts made other bytes")))
     assert tally.conflicts == ["two attempts made other bytes"]
 
 
 @pytest.fixture
 def handed_out(monkeypatch, tmp_path):
-    """A coordinator without Ray, and the shards that it has handed out, by the names of their references."""
+    """A coordinator without Ray, the shards that it has handed out, by the names of their references, and its slots."""
     shards: dict[str, tuple[Span, ...]] = {}
 
     class Task:
@@ -78,12 +97,8 @@ def handed_out(monkeypatch, tmp_path):
     order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
     pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
     slots = [1]
-    looking = ClusterSlots(1, 1, lambda: Slots(slots[0], slots[0]))
+    looking = Slots(1, 1, lambda: Slots(slots[0], slots[0]))
     return Coordinator(LocalStore(tmp_path), pattern, Limits(looking, 1, 0), Tally(asked=8)), shards, slots
-
-
-def spans(*starts: int) -> tuple[Span, ...]:
-    return tuple(Span(start=start, stop=start + 2) for start in starts)
 
 
 def test_what_a_node_that_is_to_end_gives_back_is_handed_out_again_without_counting_a_death(handed_out, monkeypatch):
@@ -121,71 +136,9 @@ def test_what_a_lost_host_had_is_handed_out_again_and_what_others_work_on_is_not
     coordinator._give_up_on({"h2"})
     assert cancelled == ["shard 0", "shard 2"]
     assert set(coordinator._running) == {"shard 1", "shard 3"}
-    assert coordinator._fill_slots(iter([]))
-    assert sorted(map(str, list(shards.values())[4:])) == sorted(map(str, [spans(0), spans(2)]))
     slots[0] = 9
     coordinator._fill_slots(iter([]))
-    assert list(shards.values())[6:] == [spans(6, 8)]
-
-
-SPAN = Span(start=4, stop=8)
-
-
-def test_a_scene_is_blamed_after_as_many_deaths_as_attempts():
-    deaths = Deaths(3)
-    for _ in range(2):
-        deaths.count(Death(4, 5, "time", ""))
-    deaths.count(Death(4, 6, "killed", ""))
-    assert deaths.blamed_in([SPAN]) == ()
-    deaths.count(Death(4, 5, "memory", ""))
-    (blame,) = deaths.blamed_in([SPAN])
-    assert (blame.scene_id, blame.reason, blame.attempts) == (5, "memory", 3)
-    assert deaths.blamed_in([Span(start=8, stop=12)]) == ()
-
-
-def test_workers_that_die_before_they_begin_end_the_run():
-    deaths = Deaths(2)
-    deaths.count(Death(4, None, "killed", "why"))
-    with pytest.raises(RunError, match=r"died 2 times before it began one.*why"):
-        deaths.count(Death(4, None, "killed", "why"))
-
-
-def test_a_lost_node_is_not_the_scenes_fault_until_it_happens_again_and_again():
-    deaths = Deaths(1)
-    for _ in range(NODE_PATIENCE - 1):
-        deaths.count(Death(4, 5, "killed", "", with_node=True))
-        deaths.count(Death(4, None, "killed", "", with_node=True))
-    assert deaths.blamed_in([SPAN]) == ()
-    deaths.count(Death(4, 5, "killed", "", with_node=True))
-    assert deaths.blamed_in([SPAN])[0].attempts == NODE_PATIENCE
-    with pytest.raises(RunError):
-        deaths.count(Death(4, None, "killed", "", with_node=True))
-
-
-SHARD = (Span(start=0, stop=4), Span(start=4, stop=8))
-
-
-@pytest.mark.parametrize(
-    ("in_progress", "made"),
-    [
-        ({}, 0),
-        ({0: 0}, 0),
-        ({0: 3}, 3),
-        ({4: 4}, 4),
-        ({4: 6}, 6),
-        ({4: None}, 4),
-        ({0: None, 4: 6}, 6),
-        ({0: 99}, 0),
-        ({8: 9}, 0),
-    ],
-)
-def test_ranges_before_the_one_in_progress_and_scenes_before_the_one_in_progress_are_made(in_progress, made):
-    assert count_under_way([SHARD], in_progress) == made
-
-
-def test_shards_add_up_and_a_retry_counts_its_own_scenes():
-    retry = (Span(start=16, stop=32, retry=1, scenes=(17, 20, 31)),)
-    assert count_under_way([SHARD, retry], {4: 5, 16: 31}) == 5 + 2
+    assert sorted(map(str, list(shards.values())[4:])) == sorted(map(str, [spans(0), spans(2), spans(6, 8)]))
 
 
 def test_a_host_is_told_once_when_it_has_no_node_any_more():
@@ -214,18 +167,154 @@ def test_a_shards_hosts_are_those_that_began_or_committed_its_ranges(tmp_path, m
     begin(0, "h-1").commit()
     begin(2, "h2")
     begin(4, "h3").abandon()
-    spans = [Span(start=start, stop=start + 2) for start in (0, 2, 4, 6)]
-    assert [hosts_of(store, "ours", [span]) for span in spans] == [{"h_1"}, {"h2"}, set(), set()]
-    assert hosts_of(store, "ours", spans) == {"h_1", "h2"}
-    assert hosts_of(store, "others", spans) == set()
+    assert [hosts_of(store, "ours", [one]) for one in spans(0, 2, 4, 6)] == [{"h_1"}, {"h2"}, set(), set()]
+    assert hosts_of(store, "ours", spans(0, 2, 4, 6)) == {"h_1", "h2"}
+    assert hosts_of(store, "others", spans(0, 2)) == set()
 
 
-def test_what_is_served_is_what_was_counted_and_stays_when_the_run_goes_on():
-    tally = Tally(asked=12)
-    tally.add(report(span(0, 3, {"intrinsic: left_table": 1})).model_copy(update={"seconds": {"settle": 1.5}}))
-    before = tally.counts(2)
-    tally.add(report(span(4, 3, {"intrinsic: left_table": 1})).model_copy(update={"seconds": {"settle": 2.5}}))
-    after = tally.counts(2)
-    assert (before.made, before.failed, before.seconds) == (3, {"intrinsic: left_table": 1}, {"settle": 1.5})
-    assert (after.made, after.failed, after.seconds) == (6, {"intrinsic: left_table": 2}, {"settle": 4.0})
-    assert (after.asked, after.slots) == (12, 2)
+def test_a_scene_is_blamed_after_as_many_deaths_as_attempts_and_later_where_its_node_was_lost():
+    mine, other = Span(start=4, stop=8), Span(start=8, stop=12)
+    deaths = Deaths(3)
+    for scene, reason in ((5, "time"), (5, "time"), (6, "killed")):
+        deaths.count(4, scene, reason, "")
+    assert deaths.blamed_in([mine]) == ()
+    deaths.count(4, 5, "memory", "")
+    (blame,) = deaths.blamed_in([mine])
+    assert (blame.scene_id, blame.reason, blame.attempts) == (5, "memory", 3)
+    assert deaths.blamed_in([other]) == ()
+    lost = Deaths(1)
+    for _ in range(NODE_PATIENCE - 1):
+        lost.count(4, 5, "killed", "", with_node=True)
+        lost.count(4, None, "killed", "", with_node=True)
+    assert lost.blamed_in([mine]) == ()
+    lost.count(4, 5, "killed", "", with_node=True)
+    assert lost.blamed_in([mine])[0].attempts == NODE_PATIENCE
+    with pytest.raises(RunError, match=rf"died {NODE_PATIENCE} times before it began one.*why"):
+        lost.count(4, None, "killed", "why", with_node=True)
+
+
+def test_ranges_before_the_one_in_progress_and_scenes_before_the_one_in_progress_are_made():
+    shard = (Span(start=0, stop=4), Span(start=4, stop=8))
+    for in_progress, made in (
+        ({}, 0),
+        ({0: 0}, 0),
+        ({0: 3}, 3),
+        ({4: 4}, 4),
+        ({4: 6}, 6),
+        ({4: None}, 4),
+        ({0: None, 4: 6}, 6),
+        ({0: 99}, 0),
+        ({8: 9}, 0),
+    ):
+        assert count_under_way([shard], in_progress) == made
+    retry = (Span(start=16, stop=32, retry=1, scenes=(17, 20, 31)),)
+    assert count_under_way([shard, retry], {4: 5, 16: 31}) == 5 + 2
+
+
+# ------------------------------------------------------------------------------------------------ the watchdog
+
+MUG = AttemptName(16, "r0-1a2b3c4d-node_7.lab-4711-0123456789ab")
+CAN = AttemptName(32, "r0-1a2b3c4d-node_8-4712-0123456789ab")
+AGAIN = AttemptName(16, "r0-1a2b3c4d-node_8-9-ba9876543210")
+
+
+def test_stalls_are_judged_by_what_changes_between_two_looks():
+    def looks(*seen: dict[AttemptName, int | None]) -> dict[AttemptName, Sight]:
+        known: dict[AttemptName, Sight] = {}
+        for now in seen:
+            known = look(known, now, 10.0)
+        return known
+
+    assert (MUG.host, MUG.pid) == ("node_7.lab", 4711)
+    for last, idle_s in ((17, 20), (18, 0), (None, 0)):
+        assert looks({MUG: 17}, {MUG: 17}, {MUG: last})[MUG].idle_s == idle_s
+    assert looks({MUG: 17, CAN: 33}, {CAN: 33}) == {CAN: Sight(33, 10.0)}, "what has ended is forgotten"
+    for scene, limit_s in ((17, 15), (None, 50)):
+        late = Sight(scene, limit_s + 1)
+        assert find_stalls({MUG: Sight(scene, limit_s)}, 10.0) == {}
+        assert find_stalls({MUG: late, CAN: Sight(33, 1.0)}, 10.0) == {MUG: late}
+    left_behind = Sight(17, 100.0)
+    assert find_stalls({MUG: left_behind, AGAIN: Sight(17, 1.0)}, 10.0) == {}
+    assert find_stalls({MUG: left_behind, AGAIN: Sight(17, 20.0)}, 10.0) == {AGAIN: Sight(17, 20.0)}
+
+
+LIMIT_S = 0.2
+TERMS = terms(layout="tar", fingerprint_mode="record")
+
+
+@pytest.fixture(params=["folder", "object store"])
+def store(request, tmp_path) -> Store:
+    far = request.param == "object store"
+    made: Store = ObjectStore(obstore.store.MemoryStore(), "memory://") if far else LocalStore(tmp_path)
+    made.prepare()
+    return made
+
+
+def first_stall(take_stalls, within_s: float) -> tuple[AttemptName | None, Sight, float]:
+    begun = time.monotonic()
+    while time.monotonic() - begun < within_s:
+        if found := take_stalls():
+            return *found[0], time.monotonic() - begun
+        time.sleep(0.01)
+    raise TimeoutError
+
+
+def test_a_worker_that_stays_in_a_scene_is_found_and_one_that_goes_on_is_not(store):
+    stuck = begin_attempt(store, Span(start=4, stop=8), TERMS, "label")
+    lively = begin_attempt(store, Span(start=8, stop=12), TERMS, "label")
+    begin_attempt(store, Span(start=12, stop=16), TERMS, "others").begin_scene(12)
+    stuck.begin_scene(5)
+    with watch(store, "label", 2 * LIMIT_S) as take_stalls:
+        found = []
+        for number in range(40):
+            lively.begin_scene(8 + number % 4)
+            time.sleep(0.03)
+            found += take_stalls()
+    assert {(attempt.start, sight.scene_id) for attempt, sight in found} == {(4, 5)}
+    attempt, sight = found[0]
+    assert (attempt.name, attempt.pid) == (stuck.name, os.getpid())
+    assert sight.idle_s > SCENE_FACTOR * 2 * LIMIT_S
+
+
+def test_a_run_in_which_nothing_begins_is_found_and_a_worker_between_scenes_has_longer(store):
+    with watch(store, "label", LIMIT_S) as take_stalls:
+        attempt, _, _ = first_stall(take_stalls, 20)
+    assert attempt is None
+    assert scenes_in_progress(store, "label") == {}
+    begin_attempt(store, Span(start=4, stop=8), TERMS, "label")
+    with watch(store, "label", LIMIT_S) as take_stalls:
+        attempt, sight, after_s = first_stall(take_stalls, 20)
+    assert (attempt.start, sight.scene_id) == (4, None)
+    assert after_s > COMMIT_FACTOR * LIMIT_S
+
+
+def test_a_store_that_does_not_answer_for_a_while_is_no_stall(store, monkeypatch):
+    """The looks that fail count as time, but never as a look."""
+    begin_attempt(store, Span(start=4, stop=8), TERMS, "label").begin_scene(5)
+    real = type(store).children
+    monkeypatch.setattr(type(store), "children", lambda *_: 1 / 0)
+    with watch(store, "label", LIMIT_S) as take_stalls:
+        time.sleep(4 * LIMIT_S)
+        assert take_stalls() == []
+        monkeypatch.setattr(type(store), "children", real)
+        assert first_stall(take_stalls, 20)[1].scene_id == 5
+
+
+def test_only_rays_workers_are_ended_whatever_the_process_id():
+    shell = ["/bin/bash", "-c"]
+    worker, other = (
+        subprocess.Popen([*shell, f"exec -a {title} sleep 600"]) for title in ("ray::run_shard", "somebody")
+    )
+    try:
+        deadline = time.monotonic() + 10
+        while worker.pid not in {process.pid for process in find_own_workers()}:
+            assert time.monotonic() < deadline
+        assert other.pid not in {process.pid for process in find_own_workers()}
+        assert not end_worker_here(other.pid) and not end_worker_here(2**22 + 1)
+        assert end_worker_here(worker.pid)
+        assert worker.wait(10) == -signal.SIGKILL
+        assert other.poll() is None
+    finally:
+        for process in (worker, other):
+            process.kill()
+            process.wait()

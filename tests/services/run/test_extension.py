@@ -15,7 +15,7 @@ from services.job.job_file import validate_job
 from services.job.record import record_job, require_job
 from services.run.run_job import RunRequest, order_pattern, run_job
 from tests.datasets import SMALL, make_dataset
-from workers.assets.catalogue import open_catalogue
+from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.shard import run_shard as module
 from workers.shard.run_shard import run_shard
 from workers.store.ledger import list_commits
@@ -40,37 +40,33 @@ def kept(store: LocalStore) -> dict[str, bytes]:
     return {key: store.read(key) for key in KEPT if store.size(key) is not None}
 
 
-def larger(store: LocalStore, **run) -> RunRequest:
-    return RunRequest(validate_job({**SMALL, "scenes": 3, "run": run}, "test"), Path(), str(store.root))
+def larger(store: LocalStore, scenes: int = 3, **run) -> RunRequest:
+    return RunRequest(validate_job({**SMALL, "scenes": scenes, "run": run}, "test"), Path(), str(store.root))
 
 
-def order_of(store: LocalStore, **run) -> tuple[ShardOrder, object]:
+def order_of(store: LocalStore, scenes: int = 3, **run) -> tuple[ShardOrder, Catalogue]:
     """The order of the third scene as the coordinator gives it, and the catalogue."""
-    request = larger(store, **run)
+    request = larger(store, scenes, **run)
     catalogue = open_catalogue(request.job.assets, Path(), tuple(request.job.categories))
     record = record_job(request.job, catalogue.digest, Path())
     pattern = order_pattern(store, record, list_commits(store))
     return pattern.model_copy(update={"spans": (Span(start=2, stop=3),)}), catalogue
 
 
-def test_where_ray_does_not_start_a_finished_dataset_stays_finished(finished):
+def test_where_ray_does_not_start_or_the_first_scene_cannot_be_written_it_stays_finished(finished, monkeypatch):
     @contextlib.contextmanager
     def no_ray():
         raise MachineError("Ray did not start")
         yield
+
+    def full(*args):
+        raise MachineError("the disk is full")
 
     before = kept(finished)
     with pytest.raises(MachineError, match="Ray did not start"):
         run_job(larger(finished), no_ray())
     assert kept(finished) == before
     assert require_job(finished).job.scenes == 2
-
-
-def test_a_worker_that_fails_in_its_first_scene_leaves_it_finished(finished, monkeypatch):
-    def full(*args):
-        raise MachineError("the disk is full")
-
-    before = kept(finished)
     monkeypatch.setattr(LocalStage, "flush", full)
     with pytest.raises(MachineError, match="the disk is full"):
         run_shard(*order_of(finished))
@@ -91,49 +87,31 @@ def test_the_first_new_commit_reopens_it_and_writes_the_larger_job(finished, mon
 
 
 def test_an_older_order_does_not_make_a_later_job_smaller(finished):
-    order, catalogue = order_of(finished)
-    tree = {**SMALL, "scenes": 5}
-    larger_still = RunRequest(validate_job(tree, "test"), Path(), str(finished.root))
-    record = record_job(larger_still.job, catalogue.digest, Path())
-    change = order_pattern(finished, record, list_commits(finished)).job_change
-    finished.put(JOB_FILE, change.after.encode())
-    run_shard(order, catalogue)
+    older = order_of(finished)
+    finished.put(JOB_FILE, order_of(finished, scenes=5)[0].job_change.after.encode())
+    run_shard(*older)
     assert require_job(finished).job.scenes == 5
 
 
-def another_stack(monkeypatch):
+def test_another_stack_is_refused_by_what_the_commits_say_and_a_mix_of_them_ends_a_strict_job(finished, monkeypatch):
     mine = module._fingerprint("raster")
-    monkeypatch.setattr(module, "_fingerprint", lambda tier: mine.model_copy(update={"simd": "other"}))
-    return mine
-
-
-@pytest.mark.parametrize("gone", [True, False], ids=["without the file", "with the file of the other stack"])
-def test_another_stack_is_refused_by_what_the_commits_say(finished, monkeypatch, gone):
-    mine = another_stack(monkeypatch)
-    finished.remove(FINGERPRINT_FILE)
-    if not gone:
-        finished.put(FINGERPRINT_FILE, module._fingerprint("raster").model_dump_json().encode())
-    before = kept(finished)
-    with pytest.raises(FingerprintError, match=f"the dataset's is {mine.digest[:12]}"):
-        run_shard(*order_of(finished))
-    assert kept(finished) == before
-    run_shard(*order_of(finished, fingerprint="record"))
-
-
-def test_a_lost_or_damaged_fingerprint_file_is_written_again_by_the_same_stack(finished):
     whole = json.loads(finished.read(FINGERPRINT_FILE))
-    for damaged in (None, b"{", b"[]"):
-        if damaged is None:
-            finished.remove(FINGERPRINT_FILE)
-        else:
+    for damaged in (None, b"{", b"[]"):  # of the file: the same stack writes it again
+        finished.remove(FINGERPRINT_FILE)
+        if damaged is not None:
             finished.put(FINGERPRINT_FILE, damaged)
-        order, _ = order_of(finished)
-        module._join_stack(finished, module._fingerprint("raster"), order)
+        module._join_stack(finished, mine, order_of(finished)[0])
         assert json.loads(finished.read(FINGERPRINT_FILE)) == whole
-
-
-def test_a_strict_job_does_not_go_on_where_the_commits_have_two_stacks(finished, monkeypatch):
-    another_stack(monkeypatch)
+    other = mine.model_copy(update={"simd": "other"})
+    monkeypatch.setattr(module, "_fingerprint", lambda tier: other)
+    for file in (None, other.model_dump_json().encode()):
+        finished.remove(FINGERPRINT_FILE)
+        if file is not None:
+            finished.put(FINGERPRINT_FILE, file)
+        before = kept(finished)
+        with pytest.raises(FingerprintError, match=f"the dataset's is {mine.digest[:12]}"):
+            run_shard(*order_of(finished))
+        assert kept(finished) == before
     run_shard(*order_of(finished, fingerprint="record"))
     with pytest.raises(FingerprintError, match=r"made by 2 stacks .* set it to record to go on"):
         order_of(finished)

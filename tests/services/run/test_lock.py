@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -24,7 +23,6 @@ FAST = Beat(period_s=0.05, patience=4)
 HOLD = """
 import sys, time
 from services.run.lock import Beat, hold_lock
-from tests.kit.faults import STILL, taken_over
 from workers.store.local import LocalStore
 with hold_lock(LocalStore(sys.argv[1]), beat=Beat(0.05, 4)):
     print("held", flush=True)
@@ -39,15 +37,6 @@ def store(tmp_path):
     return store
 
 
-@pytest.fixture
-def holding_process(store):
-    process = subprocess.Popen([sys.executable, "-c", HOLD, str(store.root)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "held\n"
-    yield process
-    process.kill()
-    process.communicate()
-
-
 THEIRS = Holder(token="theirs", host="far", pid=7, machine="another", born="1")
 
 
@@ -59,36 +48,50 @@ def beat_of(store) -> int:
     return json.loads(store.read(LOCK_FILE))["beat"]
 
 
-def test_a_lock_is_there_while_it_is_held_and_gone_afterwards(store):
-    with hold_lock(store, beat=FAST):
+def in_threads(*works) -> None:
+    """Runs each work in a thread of its own until all have ended; raises what one raised."""
+    faults = []
+
+    def run(work) -> None:
+        try:
+            work()
+        except Exception as error:
+            faults.append(error)
+
+    threads = [threading.Thread(target=run, args=(work,)) for work in works]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert faults == []
+
+
+def test_a_lock_is_there_while_it_is_held_and_gone_afterwards_also_after_an_error(store):
+    with hold_lock(store, beat=FAST) as lock:
         holder, before = read_holder(store), beat_of(store)
         assert holder.pid == os.getpid()
         time.sleep(0.3)
+        lock.require_held()
         assert read_holder(store) == holder
         assert beat_of(store) > before
-        assert json.loads(store.read(LOCK_FILE))["token"] == holder.token
+        assert json.loads(store.read(LOCK_FILE))["token"] == holder.token == lock.token
+    with pytest.raises(ZeroDivisionError), hold_lock(store, beat=FAST):
+        raise ZeroDivisionError
     assert read_holder(store) is None
     assert not list(store.files("_staging")) and not (store.root / LOCK_FILE).exists()
 
 
-def test_a_lock_is_given_back_after_an_error(store):
-    with pytest.raises(ZeroDivisionError), hold_lock(store, beat=FAST):
-        raise ZeroDivisionError
-    assert read_holder(store) is None
-
-
-def test_a_second_process_is_refused_at_once_naming_the_first(store, holding_process):
-    begun = time.monotonic()
-    message = f"in use by process {holding_process.pid} on .*wait until it ends or stop it"
-    with pytest.raises(RunError, match=message), hold_lock(store, beat=Beat(period_s=30.0)):
-        pass
-    assert time.monotonic() - begun < 5
-
-
-def test_the_lock_of_a_killed_process_of_this_machine_is_taken_over_at_once(store, holding_process):
-    holding_process.send_signal(signal.SIGKILL)
-    holding_process.wait()
-    begun = time.monotonic()
+def test_a_second_process_is_refused_at_once_naming_the_first_and_takes_over_at_once_where_it_was_killed(store):
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(store.root)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout.readline() == "held\n"
+        begun = time.monotonic()
+        told = f"in use by process {process.pid} on .*wait until it ends or stop it"
+        with pytest.raises(RunError, match=told), hold_lock(store, beat=Beat(period_s=30.0)):
+            pass
+    finally:
+        process.kill()
+        process.communicate()
     with hold_lock(store, beat=Beat(period_s=30.0)):
         assert read_holder(store).pid == os.getpid()
     assert time.monotonic() - begun < 5
@@ -102,7 +105,7 @@ def test_a_process_id_that_was_given_out_again_is_not_taken_for_the_holder(store
         assert read_holder(store).token != "old"
 
 
-def test_a_holder_elsewhere_that_beats_is_refused_and_one_that_is_silent_replaced(store):
+def test_a_holder_elsewhere_that_beats_is_refused_and_one_that_is_silent_replaced_whatever_the_clocks_say(store):
     write(store, THEIRS)
     ended = threading.Event()
 
@@ -112,97 +115,40 @@ def test_a_holder_elsewhere_that_beats_is_refused_and_one_that_is_silent_replace
             count += 1
             store.put(LOCK_FILE, str(count).encode())
 
-    thread = threading.Thread(target=beat)
-    thread.start()
-    try:
-        with pytest.raises(RunError, match="in use by process 7 on far"), hold_lock(store, beat=FAST):
-            pass
-    finally:
-        ended.set()
-        thread.join()
+    def ask():
+        try:
+            with pytest.raises(RunError, match="in use by process 7 on far"), hold_lock(store, beat=FAST):
+                pass
+        finally:
+            ended.set()
+
+    in_threads(beat, ask)
+    os.utime(store.path(LOCK_FILE), (1e9, 1e9))  # old by any clock
     begun = time.monotonic()
     with hold_lock(store, beat=FAST):
         assert read_holder(store).host != "far"
     assert time.monotonic() - begun >= FAST.period_s * FAST.patience
 
 
-def test_clocks_have_no_say(store):
+def test_of_many_that_take_over_a_dead_holder_one_at_a_time_gets_it(store):
     write(store, THEIRS)
-    store.put(LOCK_FILE, b"1")
-    os.utime(store.path(LOCK_FILE), (1e9, 1e9))  # old by any clock
-    taken = []
-
-    def contend():
-        with hold_lock(store, beat=Beat(period_s=0.2, patience=5)):
-            taken.append(time.monotonic())
-
-    begun = time.monotonic()
-    contend()
-    assert taken[0] - begun >= 1.0
-
-
-@contextlib.contextmanager
-def hold_when_free(store):
-    """Tries again until the lock is free, as a user does."""
-    with contextlib.ExitStack() as stack:
-        while True:
-            with contextlib.suppress(RunError):
-                stack.enter_context(hold_lock(store, beat=FAST))
-                break
-            time.sleep(0.01)
-        yield
-
-
-def test_a_lock_that_was_given_back_goes_to_whoever_asks_next(store):
-    order = []
-    inside = threading.Event()
-
-    def first():
-        with hold_lock(store, beat=FAST):
-            inside.set()
-            time.sleep(0.4)
-            order.append("first")
-
-    thread = threading.Thread(target=first)
-    thread.start()
-    inside.wait()
-    with hold_when_free(store):
-        order.append("second")
-    thread.join()
-    assert order == ["first", "second"]
-
-
-def test_a_holder_that_was_taken_over_notices_and_leaves_the_new_lock_alone(store):
-    with hold_lock(store, beat=FAST):
-        write(store, THEIRS)
-        time.sleep(0.3)
-        assert read_holder(store) == THEIRS
-        assert "lock heartbeat" not in [thread.name for thread in threading.enumerate()]
-    assert read_holder(store) == THEIRS
-
-
-def test_of_many_that_take_over_a_dead_holder_one_gets_it(store):
-    write(store, THEIRS)
-    inside, most, failures = [], [], []
+    inside, most = [], []
     gate = threading.Barrier(6)
 
     def contend():
         gate.wait()
-        try:
-            with hold_when_free(store):
-                inside.append(1)
-                most.append(len(inside))
-                time.sleep(0.1)
-                inside.pop()
-        except Exception as error:
-            failures.append(error)
+        with contextlib.ExitStack() as stack:
+            while True:  # as a user does
+                with contextlib.suppress(RunError):
+                    stack.enter_context(hold_lock(store, beat=FAST))
+                    break
+                time.sleep(0.01)
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.1)
+            inside.pop()
 
-    threads = [threading.Thread(target=contend) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not failures
+    in_threads(*[contend] * 6)
     assert most == [1] * 6
 
 
@@ -224,18 +170,22 @@ def test_events_that_cannot_be_read_are_taken_over_after_a_while(store):
             assert read_holder(store).pid == os.getpid()
 
 
-def test_a_heartbeat_survives_a_disk_that_is_full_for_a_while(store, monkeypatch):
-    with hold_lock(store, beat=FAST):
+def test_a_heartbeat_survives_a_full_disk_and_a_clock_that_is_set_back(store, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    with hold_lock(store, FAST) as lock:
         with monkeypatch.context() as patch:
-
-            def full(*_, **__):
-                raise OSError(28, "No space left on device")
-
             patch.setattr(store, "put", full)
             time.sleep(0.2)
         before = beat_of(store)
-        time.sleep(0.2)
+        monkeypatch.setattr(time, "time", lambda: -1e9)
+        os.utime(store.path(LOCK_FILE), (0, 0))
+        time.sleep(5 * FAST.period_s)
+        lock.require_held()
         assert beat_of(store) > before
+        with pytest.raises(RunError, match="is in use"), hold_lock(store, FAST):
+            pass
 
 
 # ------------------------------------------------------------------------------------------------ losing it
@@ -264,21 +214,7 @@ def paused(store, at: int, then):
         yield steps
 
 
-def silent_lock(store):
-    """A lock without a heartbeat of its own that has shown no life for as long as FAST is patient."""
-    mine = Holder("mine", "here", os.getpid(), "this", "1")
-    write(store, mine)
-    return module.Lock(store, mine, FAST)
-
-
-def test_a_lock_that_is_held_may_be_asked_at_any_time(store):
-    with hold_lock(store, FAST) as lock:
-        for _ in range(20):
-            lock.require_held()
-        assert lock.held
-
-
-def test_a_holder_that_was_paused_is_told_who_took_over(store):
+def test_a_holder_that_was_paused_is_told_who_took_over_and_leaves_the_new_lock_alone(store):
     with hold_lock(store, STILL) as lock:
         lock.require_held()
         with taken_over(store) as theirs:
@@ -290,7 +226,11 @@ def test_a_holder_that_was_paused_is_told_who_took_over(store):
         assert read_holder(store) is None
         with pytest.raises(RunError, match="taken over"):
             lock.require_held()  # it stays lost when the other has ended
-    assert read_holder(store) is None
+    with hold_lock(store, beat=FAST):
+        write(store, THEIRS)
+        time.sleep(0.3)
+        assert "lock heartbeat" not in [thread.name for thread in threading.enumerate()]
+    assert read_holder(store) == THEIRS
 
 
 @pytest.mark.parametrize("ended", [False, True], ids=["still there", "ended again"])
@@ -299,7 +239,9 @@ def test_paused_at_any_step_of_a_beat_and_taken_over_a_holder_knows_that_it_lost
     while True:
         mine = LocalStore(tmp_path / str(at))
         mine.prepare()
-        lock = silent_lock(mine)
+        me = Holder("mine", "here", os.getpid(), "this", "1")
+        write(mine, me)
+        lock = module.Lock(mine, me, FAST)  # without a heartbeat of its own
         others = contextlib.ExitStack()
         theirs = []
 
@@ -323,14 +265,6 @@ def test_paused_at_any_step_of_a_beat_and_taken_over_a_holder_knows_that_it_lost
     assert lost >= (1 if ended else at)
 
 
-def test_a_lock_taken_over_and_given_back_before_a_beat_is_lost(store):
-    lock = silent_lock(store)
-    with taken_over(LocalStore(store.root)):
-        pass
-    assert not lock.held
-    assert read_holder(store) is None
-
-
 def test_what_was_removed_or_damaged_by_hand_is_written_again(store):
     with hold_lock(store, FAST) as lock:
         for damage in (b"", b"{", b"[]", b"\xff" * 50):
@@ -345,78 +279,55 @@ def test_what_was_removed_or_damaged_by_hand_is_written_again(store):
         with pytest.raises(RunError, match="is in use by process"), hold_lock(store, FAST):
             pass
         assert lock.held
-
-
-def test_of_two_coordinators_after_the_lock_was_removed_by_hand_one_is_left(store):
     with hold_lock(store, STILL) as first:
         store.remove_tree(LOCK_CLAIMS)
         with hold_lock(LocalStore(store.root), STILL) as second:
-            assert [first.held, second.held] == [False, True]
+            assert [first.held, second.held] == [False, True], "of two coordinators one is left"
 
 
-def test_a_heartbeat_that_cannot_begin_leaves_no_lock(store, monkeypatch):
+def test_a_heartbeat_that_cannot_begin_leaves_no_lock_and_one_that_ended_costs_it(store, monkeypatch):
     def no_threads(self):
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(threading.Thread, "start", no_threads)
-    with pytest.raises(RuntimeError), hold_lock(store, FAST):
-        pass
-    assert read_holder(store) is None
-
-
-def test_a_heartbeat_that_ended_costs_the_lock_and_says_so(store, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_show_life", lambda *_: None)
-        with hold_lock(store, FAST) as lock, taken_over(store), pytest.raises(RunError, match="on far"):
-            lock.require_held()
-
-
-def test_a_clock_that_is_set_back_changes_nothing(store, monkeypatch):
-    with hold_lock(store, FAST) as lock:
-        before = beat_of(store)
-        monkeypatch.setattr(time, "time", lambda: -1e9)
-        os.utime(store.path(LOCK_FILE), (0, 0))
-        time.sleep(5 * FAST.period_s)
-        lock.require_held()
-        assert beat_of(store) > before
-        with pytest.raises(RunError, match="is in use"), hold_lock(store, FAST):
+        patch.setattr(threading.Thread, "start", no_threads)
+        with pytest.raises(RuntimeError), hold_lock(store, FAST):
             pass
+    assert read_holder(store) is None
+    monkeypatch.setattr(module, "_show_life", lambda *_: None)
+    with hold_lock(store, FAST) as lock, taken_over(store), pytest.raises(RunError, match="on far"):
+        lock.require_held()
 
 
-@pytest.mark.parametrize("error", [RunError("swept: another coordinator works on this folder"), FileNotFoundError("x")])
-@pytest.mark.parametrize("made_anew", [False, True])
-def test_a_removed_folder_is_told_even_where_parts_of_it_were_made_anew(tmp_path, error, made_anew):
-    out = tmp_path / "out"
-    out.mkdir()
+def test_a_removed_or_a_moved_folder_is_told_even_where_parts_of_it_were_made_anew(tmp_path):
+    swept = RunError("swept: another coordinator works on this folder")
 
-    def work() -> None:
-        out.rmdir()
-        if made_anew:
+    def lose(out, how: str, error: Exception) -> None:
+        if how == "moved":
+            out.rename(tmp_path / "elsewhere")
+        else:
+            out.rmdir()
+        if how == "made anew":
             (out / "manifest").mkdir(parents=True)
         raise error
 
-    with (
-        pytest.raises(MachineError, match="was removed while the run worked in it") as caught,
-        explain_lost_folder(out),
+    for number, (how, error, told) in enumerate(
+        [
+            ("removed", swept, "was removed while the run worked in it"),
+            ("removed", FileNotFoundError("x"), "was removed while the run worked in it"),
+            ("made anew", swept, "was removed while the run worked in it"),
+            ("moved", FileNotFoundError("x"), r"was moved .* move it back"),
+        ]
     ):
-        work()
-    assert str(out) in str(caught.value)
-    assert "another coordinator" not in str(caught.value)
+        out = tmp_path / str(number)
+        out.mkdir()
+        with pytest.raises(MachineError, match=told) as caught, explain_lost_folder(out):
+            lose(out, how, error)
+        assert str(out) in str(caught.value) and "another coordinator" not in str(caught.value)
 
 
-def test_a_folder_that_was_moved_is_told_with_what_to_do(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-
-    def work() -> None:
-        out.rename(tmp_path / "elsewhere")
-        raise FileNotFoundError("x")
-
-    with pytest.raises(MachineError, match=r"was moved .* move it back"), explain_lost_folder(out):
-        work()
-
-
-def test_other_errors_stay_what_they_are(tmp_path):
+def test_other_errors_stay_what_they_are(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "REMOVAL_S", 0.2)
     with pytest.raises(RunError, match="as it was"), explain_lost_folder(tmp_path):
         raise RunError("as it was")
     with pytest.raises(RunError, match="in a bucket"), explain_lost_folder(None):

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.geometry import jit
+from workers.geometry import jit, loops
+from workers.geometry.loops import are_kept, folder_name
 
 ROOT = Path(__file__).resolve().parents[3]
 HEAD = """
@@ -84,16 +85,32 @@ def test_the_folder_is_another_one_where_anything_changes_that_a_loop_may_be_mad
         "schemas/far.py": "A = 1\n",
         "workers/other.py": "B = 1\n",
     }
-    monkeypatch.setattr(jit, "ROOT", tmp_path)
     for name, text in texts.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    before = jit._digest()
+    before = folder_name(tmp_path)
     for name, text in texts.items():
         (tmp_path / name).write_text(f"{text}C = 3\n")
-        assert (jit._digest() == before) == (name == "workers/other.py")
+        assert (folder_name(tmp_path) == before) == (name == "workers/other.py")
         (tmp_path / name).write_text(text)
-    assert jit._digest() == before
+    assert folder_name(tmp_path) == before
+
+
+def test_whether_loops_are_kept_is_known_without_numba_by_what_is_there_of_every_planned_file(tmp_path, monkeypatch):
+    texts = {"a": "\n@compiled_for('i8')\n", "b": "\n@compiled_for('f8')\n", "c": "\n@compiled\n"}
+    (tmp_path / "workers").mkdir()
+    for name, text in texts.items():
+        (tmp_path / "workers" / f"{name}.py").write_text(text)
+    monkeypatch.setattr(loops, "ROOT", tmp_path)
+    monkeypatch.setattr(loops, "folder_name", lambda: "loops-0")
+    kept = tmp_path / "cache" / "loops-0"
+    kept.mkdir(parents=True)
+    for module, told in (("workers.a", False), ("workers.b", True)):
+        assert not are_kept(str(tmp_path / "cache"))
+        (kept / f"{module}-1a2b3c4d.kept").touch()
+        assert are_kept(str(tmp_path / "cache")) is told
+    ask = "import sys; from workers.geometry.loops import are_kept; are_kept(None); print('numba' in sys.modules)"
+    assert said(start(tmp_path, ask)) == ["False"]
 
 
 def test_processes_that_start_at_once_share_the_planned_loops_and_later_ones_read_them(tmp_path):

@@ -12,7 +12,7 @@ from services.merge.merge import merge, read_success
 from services.read.query import query
 from services.read.status import read_status
 from services.run.lock import Beat, hold_lock, read_holder
-from services.run.range_planner import committed_ranges, plan_ranges
+from services.run.range_planner import plan_ranges
 from tests.kit.faults import check_published
 from tests.kit.s3_server import Bucket, s3_server
 from tests.made_up_scenes import attempt_at, made_scene, scene, terms
@@ -46,7 +46,7 @@ def store(request, tmp_path):
 def make_all(store, settings=TAR, make=scene, stop=STOP) -> str:
     """What a coordinator with one worker does."""
     sweep(store, fenced=None)
-    for start, end in plan_ranges(0, stop, 4, committed_ranges(list_commits(store))):
+    for start, end in plan_ranges(0, stop, 4, list_commits(store).ranges):
         attempt_at(store, start, end, settings, make).commit()
     return merge(store, 0, stop).digest
 

@@ -1,10 +1,11 @@
-"""Disks that are full at any point of a merge: one line says so, and the same command finishes later."""
+"""Limits of a machine that a merge must live with: a disk that is full at any point, and memory however many ranges."""
 
-import contextlib
 import errno
+import json
 import os
 import resource
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -19,17 +20,6 @@ from tests.made_up_datasets import FIRST, STOP, dataset_at
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 
-@contextlib.contextmanager
-def largest_file(limit: int):
-    """Writes beyond so many bytes of a file fail, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 def failed(store) -> str:
     """What a merge said; empty where it had room."""
     told = ""
@@ -42,13 +32,17 @@ def failed(store) -> str:
     return told
 
 
-def test_a_merge_without_room_at_any_point_says_so_and_can_be_done_again(merged, tmp_path):
+def test_a_merge_without_room_at_any_size_of_a_file_says_so_and_can_be_done_again(merged, tmp_path):
+    """Writes beyond so many bytes of a file fail, as on a full disk."""
     store = dataset_at(tmp_path)
-    told = []
-    limit = 64
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    told, limit = [], 64
     while True:
-        with largest_file(limit):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+        try:
             told.append(failed(store))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
         if not told[-1]:
             break
         assert not list(store.files(STAGING)), limit
@@ -108,3 +102,49 @@ def test_a_disk_that_is_full_says_so_and_the_merge_can_be_done_when_it_has_room(
     assert all(told[:4])
     assert not told[-1]
     assert merge(store, FIRST, STOP) == merged[1]
+
+
+MANY = """
+import json, sys, time
+from pathlib import Path
+from services.merge import reading, shared, tables
+from services.merge.merge import merge
+from tests.kit.many_ranges import ManyRanges
+
+folder, ranges, limits = Path(sys.argv[1]), int(sys.argv[2]), json.loads(sys.argv[3])
+tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, shared.CACHE_KIB = limits
+
+class Watched(ManyRanges):
+    rss_mib = {}
+
+    def _tables(self, scene_id):
+        if scene_id * 20 % self.scenes == 0:
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            self.rss_mib[scene_id] = pages * 4096 / 2**20
+        return super()._tables(scene_id)
+
+store = Watched(folder, ranges)
+store.prepare()
+begun = time.perf_counter()
+result = merge(store, 0, store.scenes)
+took = time.perf_counter() - begun
+print(json.dumps({"rows": result.rows, "rss_mib": list(store.rss_mib.values()), "seconds": took}))
+"""
+
+
+@pytest.mark.parametrize(
+    ("ranges", "limits", "most_mib"),
+    [
+        (2_000, [512, 512, 2 << 10], 16.0),
+        pytest.param(20_000, [8_192, 4_096, 16 << 10], 48.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_merge_takes_as_much_memory_at_its_end_as_at_its_beginning(ranges, limits, most_mib, tmp_path, record_figure):
+    """Limits of a tenth show with a tenth of the rows what those of the program hold."""
+    command = [sys.executable, "-c", MANY, str(tmp_path), str(ranges), json.dumps(limits)]
+    figures = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert figures["rows"]["views"] == 10 * (ranges - ranges // 1000)
+    grown = figures["rss_mib"][-1] - figures["rss_mib"][2]
+    record_figure(f"merge_grown_mib_in_{ranges}_ranges", "passed", grown, most_mib)
+    record_figure("merge_rows_per_s", "passed", sum(figures["rows"].values()) / figures["seconds"])
+    assert grown < most_mib

@@ -1,0 +1,388 @@
+"""Datasets from the job file to the merged files and back: of several objects, of few instances, and with less in them."""
+
+import csv
+import io
+import re
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import trimesh
+
+import services.read.verify_range
+import workers.assets.catalogue
+from schemas.dataset.codec import Row
+from schemas.dataset.shard import Fingerprint
+from schemas.errors import InputError, JobError
+from schemas.job.job import Job
+from services.bench.command import refuse_unmatched
+from services.dataset.dataset import open_dataset
+from services.job.job_file import validate_job
+from services.job.record import require_job
+from services.merge.dataset_card import describe_dataset
+from services.merge.merge import MergeResult, read_success
+from services.read.query import query
+from services.read.replay import open_context, replay_scene
+from services.read.scene_geometry import scene_glb
+from tests.datasets import SMALL, faults_of, images_of, make_dataset, overlaid, run_here
+from workers.assets.catalogue import Catalogue, InstanceRef, open_cache
+from workers.store.images import decode_png
+from workers.store.local import LocalStore
+from workers.store.tars import read_tar
+
+THREE: dict[str, Any] = {
+    "objects_per_scene": 3,
+    "scenes": 3,
+    "check": {"raycast_share": 1.0},
+    "categories": ["box", "camera", "bottle"],  # of few convex parts: Bullet's time goes with their number
+}
+
+
+def rows(store: LocalStore, sql: str) -> list[Row]:
+    return query(store, sql).to_pylist()
+
+
+def check_whole(store: LocalStore, scene_id: int) -> None:
+    """It verifies, and a scene replays to the byte."""
+    assert faults_of(store) == []
+    replayed = replay_scene(store, scene_id)
+    assert (replayed.same_stack, replayed.differences) == (True, ())
+
+
+# ------------------------------------------------------------------------------------------------ several objects
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory) -> LocalStore:
+    """Three scenes of three objects, each checked against cast rays and released again."""
+    return make_dataset(tmp_path_factory.mktemp("three"), **THREE)[0]
+
+
+def masks(store: LocalStore) -> list[tuple[Row, np.ndarray]]:
+    """Every rendered view with its mask."""
+    found = []
+    for view in rows(store, "select * from views where role != 'projected' order by pose_id, role"):
+        path = next(file["path"] for file in view["files"] if file["path"].split("/")[1].startswith("segment"))
+        found.append((view, decode_png(store.read(path))))
+    return found
+
+
+@pytest.mark.minute
+def test_every_region_of_a_mask_is_an_object_with_its_own_patch_and_its_row_counts_its_pixels(three):
+    check_whole(three, 2)
+    objects = {(o["pose_id"], o["role"], o["region_id"]): o for o in rows(three, "select * from objects")}
+    assert len(objects) == 3 * 3 * 4  # scenes, rendered views, the table and three objects
+    patches, half = 0, np.array([16, 12])
+    for view, mask in masks(three):
+        assert mask.dtype == np.uint8 and set(np.unique(mask)) <= {0, 1, 2, 3, 4, 5}
+        own = [objects[view["pose_id"], view["role"], region] for region in (3, 4, 5)]
+        assert [row["pixels"] for row in own] == [int((mask == region).sum()) for region in (3, 4, 5)]
+        assert view["object_pixels"] == int((mask >= 3).sum()) > 0
+        assert view["visible_fraction"] == own[0]["visible_fraction"]
+        assert view["patch_object_fraction"] == own[0]["patch_object_fraction"]
+        listed = {file["path"] for file in view["files"]}
+        number = view["parent_id"] + (view["role"] == "mirror")
+        content = "segmentAligned" if view["role"] == "aligned" else "segment"
+        for row in own:
+            path = f"{view['category']}/patches/{content}{number:05d}obj{row['region_id'] - 3}.png"
+            middle = np.array([row["u"], row["v"]])
+            fits = (middle >= half).all() and (middle + half <= [160, 120]).all()
+            assert (path in listed) == bool(fits and row["pixels"] > 0) == (row["patch_object_fraction"] is not None)
+            if path in listed:
+                left, top = middle - half
+                crop = mask[top : top + 24, left : left + 32]
+                assert np.array_equal(decode_png(three.read(path)), crop)
+                assert row["patch_object_fraction"] == (crop == row["region_id"]).mean()
+                patches += 1
+    assert patches > 15
+
+
+@pytest.mark.minute
+def test_a_scenes_own_columns_are_the_first_objects_and_the_worst_of_all_and_poses_agree(three):
+    scenes = {row["scene_id"]: row for row in rows(three, "select * from scenes")}
+    for row in scenes.values():
+        bodies = row["bodies"]
+        assert [body["region_id"] for body in bodies] == [3, 4, 5]
+        assert [row[name] for name in ("category", "instance_id", "T_world_obj")] == [
+            bodies[0][name] for name in ("category", "instance_id", "T_world_obj")
+        ]
+        for name in ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s", "recheck_move_mm"):
+            assert row[name] == max(body[name] for body in bodies)
+        assert row["support_margin_mm"] == min(body["support_margin_mm"] for body in bodies)
+        assert len({body["T_world_obj"][3] for body in bodies}) == 3
+    views = {(v["pose_id"], v["role"]): v for v in rows(three, "select * from views")}
+    for row in rows(three, "select * from objects where region_id > 2"):
+        body = scenes[row["scene_id"]]["bodies"][row["region_id"] - 3]
+        assert (row["category"], row["instance_id"]) == (body["category"], body["instance_id"])
+        T_world_cam = np.reshape(views[row["pose_id"], row["role"]]["T_world_cam"], (4, 4))
+        T_world_obj = T_world_cam @ np.reshape(row["T_cam_obj"], (4, 4))
+        np.testing.assert_allclose(T_world_obj, np.reshape(body["T_world_obj"], (4, 4)), atol=1e-12)
+    told = {body["instance_id"] for row in scenes.values() for body in row["bodies"]}
+    listed = [row["instance_id"] for row in rows(three, "select instance_id from assets where category != 'table'")]
+    assert sorted(listed) == sorted(told)
+    assert {path.stem for path in (three.root / "assets").rglob("*.glb") if path.parent.name != "table"} == told
+    lines = [line.split() for line in (three.root / "objects.dat").read_text().splitlines()]
+    assert [(int(words[0]), int(words[3])) for words in lines] == [(p, r) for p in range(6) for r in (2, 3, 4, 5)]
+
+
+@pytest.mark.minute
+def test_d_z_is_the_distance_to_the_front_of_the_whole_group(three):
+    """As many of its depth pixels lie nearer as the percentile of 2 says: of all objects together, and not of the first."""
+    apart = 0
+    for view, mask in masks(three):
+        if view["role"] != "input":
+            continue
+        path = f"{view['category']}/depth{view['pose_id']:05d}.png"
+        depth = decode_png(three.read(path)) / view["depth_units_per_m"]
+        group, first = depth[(mask >= 3) & (depth > 0)], depth[(mask == 3) & (depth > 0)]
+        rank = 0.02 * (len(group) - 1)
+        assert (group < view["d_z_m"] - 1e-9).sum() - 1 <= rank <= (group < view["d_z_m"] + 1e-9).sum() + 1
+        apart += abs(np.percentile(first, 2.0) - view["d_z_m"]) > 1e-3
+    assert apart > 0
+
+
+@pytest.mark.minute
+def test_tars_hold_the_same_images(three, tmp_path):
+    store, _ = make_dataset(tmp_path, **THREE, output={"layout": "tar"})
+    packed = {}
+    for path in tmp_path.glob("*/*.tar"):
+        packed.update(read_tar(path.parent.name, path.read_bytes(), path.name))
+    assert packed == images_of(three)
+    check_whole(store, 1)
+
+
+@pytest.mark.minute
+def test_a_scene_that_has_one_object_by_chance_is_the_scene_of_a_job_with_one(tmp_path):
+    """Of a range of counts: the same images, under names without `obj`."""
+    ranged, _ = make_dataset(tmp_path / "ranged", scenes=6, objects_per_scene=[1, 3])
+    counts = [len(row["bodies"]) for row in rows(ranged, "select bodies from scenes order by scene_id")]
+    assert set(counts) == {1, 2, 3}
+    assert faults_of(ranged) == []
+    before, after = images_of(make_dataset(tmp_path / "single", scenes=6)[0]), images_of(ranged)
+
+    def of_scene(images: dict[str, bytes], scene_id: int) -> dict[str, bytes]:
+        ids = {f"{2 * scene_id:05d}", f"{2 * scene_id + 1:05d}"}
+        return {path: data for path, data in images.items() if re.findall(r"\d{5}", path)[0] in ids}
+
+    for scene_id, count in enumerate(counts):
+        own = of_scene(after, scene_id)
+        assert any("obj" in path for path in own) == (count > 1)
+        assert count > 1 or own == of_scene(before, scene_id)
+
+
+BODY_CHANGES = {
+    "T_cam_obj does not follow": lambda bodies: bodies[1]["T_world_obj"].__setitem__(
+        3, bodies[1]["T_world_obj"][3] + 1e-6
+    ),
+    "penetration_mm is": lambda bodies: bodies[1].update(penetration_mm=bodies[1]["penetration_mm"] + 1.0),
+    "instance_id is": lambda bodies: bodies[0].update(instance_id="another"),
+    "bodies have the regions": lambda bodies: bodies[2].update(region_id=9),
+}
+"""By what is told: a change of one value of a scene's bodies."""
+
+
+@pytest.mark.minute
+def test_rows_and_masks_that_disagree_are_found(three, monkeypatch):
+    """They are changed on their way from the file, so that checksums still hold."""
+    range_rows, read_image = services.read.verify_range.range_rows, services.read.verify_range.read_image
+
+    def check_found(name: str, damaged, *words: str) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(services.read.verify_range, name, damaged)
+            faults = "\n".join(faults_of(three))
+        assert all(word in faults for word in words), (words, faults)
+
+    def with_rows(wanted: str, change) -> Any:
+        def damaged(store, records, table):
+            found = range_rows(store, records, table)
+            if table != wanted:
+                return found
+            changed = found.to_pylist()
+            change(changed)
+            return pa.Table.from_pylist(changed, found.schema)
+
+        return damaged
+
+    for told, change in BODY_CHANGES.items():
+        check_found("range_rows", with_rows("scenes", lambda found, change=change: change(found[0]["bodies"])), told)
+
+    def larger_share(found: list[Row]) -> None:
+        row = next(row for row in found if row["patch_object_fraction"])
+        row["patch_object_fraction"] += 0.01
+
+    check_found("range_rows", with_rows("objects", larger_share), "of its patch")
+
+    def swapped(read, path):
+        mask = read_image(read, path)
+        if not path.endswith("/segment00000.png") or "patches" in path:
+            return mask
+        return np.where(mask == 3, 4, np.where(mask == 4, 3, mask)).astype(np.uint8)
+
+    check_found("read_image", swapped, "region 3: the mask has", "region 4: the mask has")
+
+
+# ------------------------------------------------------------------------------------------------ few instances
+
+FEW: dict[str, Any] = {
+    "scenes": 8,
+    "categories": ["box", "can"],
+    "assets": {
+        "objects": [{"source": "procedural", "instances": 3}],
+        "tables": [{"source": "procedural", "instances": 1}],
+        "split": {"train": 0.5, "val": 0.1, "test": 0.4},
+    },
+    "run": {"range_size": 4},
+}
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory) -> tuple[LocalStore, str]:
+    """Eight scenes of at most three boxes and three cans on one table."""
+    return make_dataset(tmp_path_factory.mktemp("few"), **FEW)
+
+
+@pytest.fixture
+def nothing_cached(monkeypatch):
+    monkeypatch.setattr(workers.assets.catalogue, "_cache", open_cache(2**28))
+
+
+@pytest.mark.minute
+def test_each_instance_is_stored_once_and_those_held_out_share_no_scene_with_the_others(few):
+    store, _ = few
+    listed = {row["instance_id"] for row in rows(store, "select instance_id from assets")}
+    used = {row["instance_id"] for row in rows(store, "select instance_id from scenes")}
+    assert listed == {"table-0-000000", *used}
+    assert 2 < len(used) < 8
+    assert used < {f"{name}-0-00000{index}" for name in ("box", "can") for index in range(3)}
+    assert {path.stem for path in (store.root / "assets").rglob("*.glb")} == listed
+    assert faults_of(store) == []
+    sql = "select instance_id from scenes where instance_id {} (select instance_id from assets where split = 'train')"
+    train, held_out = ([row["instance_id"] for row in rows(store, sql.format(word))] for word in ("in", "not in"))
+    assert len(train) + len(held_out) == 8 and train and held_out and not set(train) & set(held_out)
+    assert {pair.instance_id for pair in open_dataset(store.root).pairs()} == {*train, *held_out}
+
+
+@pytest.mark.minute
+@pytest.mark.usefixtures("nothing_cached")
+def test_shapes_are_made_once_and_are_the_same_in_ranges_of_any_size_in_an_extension_and_in_a_replay(
+    few, tmp_path, monkeypatch
+):
+    assert replay_scene(few[0], 7).differences == (), "without the scenes before it"
+    monkeypatch.setattr(workers.assets.catalogue, "_cache", open_cache(2**28))
+    loaded: list[tuple[str, InstanceRef]] = []
+    load = Catalogue.load
+    with monkeypatch.context() as patch:
+        patch.setattr(Catalogue, "load", lambda self, ref: loaded.append((self.digest, ref)) or load(self, ref))
+        assert make_dataset(tmp_path / "8", **{**FEW, "run": {"range_size": 8}})[1] == few[1]
+    assert 0 < len(loaded) == len(set(loaded))
+    assert make_dataset(tmp_path / "3", **{**FEW, "run": {"range_size": 3}})[1] == few[1]
+    make_dataset(tmp_path / "grown", **{**FEW, "scenes": 3})
+    assert run_here(validate_job(overlaid(SMALL, FEW), "test"), tmp_path / "grown")[1] == few[1]
+    one = {"objects": [{"source": "procedural", "instances": 1}]}
+    store, _ = make_dataset(tmp_path / "one", scenes=1, objects_per_scene=3, categories=["mug"], assets=one)
+    assert faults_of(store) == []
+    (row,) = rows(store, "select bodies from scenes")
+    assert len({body["instance_id"] for body in row["bodies"]}) == 1
+    assert rows(store, "select count(*) as n from assets where category = 'mug'") == [{"n": 1}]
+    names = trimesh.load_scene(io.BytesIO(scene_glb(store, 0)), file_type="glb").graph.nodes_geometry
+    assert len({name.partition("/")[0] for name in names if name.startswith("mug ")}) == 3
+
+
+# ------------------------------------------------------------------------------------------------ switches
+
+ROLES = {"input", "aligned", "mirror", "projected"}
+NO_PROJECTION = {"images": {"projection": {"enabled": False}}}
+SWITCHES: dict[str, Any] = {
+    "depth_camera": (
+        {"cameras": {"depth": {"enabled": False}}},
+        {"aligned"},
+        ("aligned", "Aligned"),
+        "| input, mirror, projected |",
+    ),
+    "projection": (NO_PROJECTION, {"projected"}, ("projected", "Projected"), "| input, aligned, mirror |"),
+    "mirror": (
+        {"cameras": {"mirror": {"enabled": False}}, **NO_PROJECTION},
+        {"mirror", "projected"},
+        ("projected", "Projected"),
+        "| input, aligned |",
+    ),
+    "rgb": ({"render": {"rgb": False}}, set(), ("RGB",), "; without RGB |"),
+}
+"""By the effect: what is switched off, the roles that go, words that no file's name may have then, and what the card says."""
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory) -> LocalStore:
+    return make_dataset(tmp_path_factory.mktemp("full"))[0]
+
+
+def lines_by_pose(store: LocalStore, name: str) -> dict[tuple[str, ...], str]:
+    """Lines of a merged file by (pose id,), in cameras.csv by (pose id, role)."""
+    lines = (store.root / name).read_text().splitlines()
+    key = {"camPoses.csv": (0,), "cameras.csv": (0, 2), "objects.dat": (0, 3)}[name]
+    split = [re.split("[ ,]", line) for line in lines]
+    return {tuple(words[k] for k in key): line for words, line in zip(split, lines, strict=True)}
+
+
+def check_merged_files(full: LocalStore, store: LocalStore, gone: set[str]) -> None:
+    """They have the lines of the cameras that are there, and only these."""
+    before, after = (lines_by_pose(one, "cameras.csv") for one in (full, store))
+    assert after == {key: line for key, line in before.items() if key[1] not in gone}
+    for name in ("camPoses.csv", "objects.dat"):
+        before, after = (lines_by_pose(one, name) for one in (full, store))
+        odd_too = "mirror" not in gone
+        assert after == {key: line for key, line in before.items() if odd_too or key[0][-1] not in "13579"}
+    with open(store.root / "camPoses.csv") as file:
+        assert [int(row["id"]) for row in csv.DictReader(file)] == ([0, 1, 2, 3] if "mirror" not in gone else [0, 2])
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+def test_what_a_job_switches_off_is_not_there_and_nothing_else_changes(full, name, tmp_path):
+    changes, gone, words, told = SWITCHES[name]
+    store, digest = make_dataset(tmp_path, **changes)
+    assert faults_of(store) == []
+    before, after = images_of(full), images_of(store)
+    assert after and not [path for path in after if any(word in path for word in words)]
+    assert after == {path: before[path] for path in after}
+    files = rows(full, "select role, unnest(files).path as path from views")
+    lost = {row["path"] for row in files if row["role"] in gone or (name == "rgb" and "RGB" in row["path"])}
+    assert before.keys() - after.keys() == lost
+    for sql in (
+        "select * exclude (files) from views order by pose_id, role",
+        "select * from objects order by pose_id, role, region_id",
+    ):
+        expected = [row for row in rows(full, sql) if row["role"] not in gone]
+        assert rows(store, sql) == expected
+        assert sql.startswith("select * from") or {row["role"] for row in expected} == ROLES - gone
+    check_merged_files(full, store, gone)
+    for row in rows(store, "select effects, skipped from scenes"):
+        assert name not in row["effects"]
+        assert any(skip["effect"] == name and skip["why"].endswith("is false") for skip in row["skipped"])
+    assert all(name in row["effects"] for row in rows(full, "select effects from scenes"))
+    record, success = require_job(store), read_success(store)
+    fingerprint = Fingerprint.model_validate_json(store.read("manifest/_fingerprint.json"))
+    merged = MergeResult(digest, True, dict(success["scenes"]), dict(success["rows"]))
+    card = describe_dataset(record, open_context(record).catalogue, merged, fingerprint)
+    assert told in next(line for line in card.splitlines() if line.startswith("| views of each pair"))
+    with pytest.raises(InputError, match="is off"):
+        refuse_unmatched(validate_job({"name": "t", **changes}, "t"))
+    assert replay_scene(store, 1).differences == ()
+    (store.root / "job.yaml").write_text((full.root / "job.yaml").read_text())
+    assert faults_of(store), "its job says one thing and its rows say another"
+
+
+def test_switches_and_numbers_that_cannot_be_are_refused_with_the_remedy():
+    few = {"assets": {"objects": [{"source": "procedural", "instances": None}]}}
+    for changes, told in (
+        ({"cameras": {"mirror": {"enabled": False}}}, r"set images\.projection\.enabled: false too"),
+        ({"render": {"rgb": False}, "sensor": {"rgb_noise": {}}}, r"sensor\.rgb_noise"),
+        *(
+            ({"assets": {"objects": [{"source": "procedural", "instances": value}]}}, r"^[^\n]*instances[^\n]*$")
+            for value in (0, -3, 10**13, 1.5, "few")
+        ),
+    ):
+        with pytest.raises(JobError, match=told):
+            validate_job({"name": "t", **changes}, "t")
+    refuse_unmatched(Job(name="t"))
+    assert validate_job({"name": "t", **few}, "t")
