@@ -95,17 +95,18 @@ def simulate(options: argparse.Namespace) -> int:
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise OutputError(f"{path} is there already: name a new or an empty folder")
     from workers.assets.catalogue import open_catalogue
-    from workers.capture.simulate.simulate import ASKED, load_object, plan_effects, simulate_capture
+    from workers.capture.simulate.simulate import load_object, simulate_capture
     from workers.render.tiers import require_tier
+    from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
     from workers.scene.plan import SceneChance
 
     settings, chance = job.captures.simulate, SceneChance(job.seed, job.first_scene)
     require_tier(Render(tier=settings.tier))
     catalogue = open_catalogue(job.assets, Path.cwd(), job.categories)
     asset = load_object(job, catalogue, chance)
-    plan = plan_effects(settings)
+    plan = plan_capture(settings)
     truth = simulate_capture(settings, job.captures.board, asset, chance, path)
-    seconds, ran = time.perf_counter() - begun, [name for name in ASKED if plan.runs(name)]
+    seconds, ran = time.perf_counter() - begun, [name for name in CAPTURE_EFFECTS if plan.runs(name)]
     views = len(truth.T_board_cam)
     print(f"{path}: {views} views of {asset.instance_id} in {seconds:.1f} s; effects: {', '.join(ran) or 'none'}")
     print(f"{path / 'truth'}: poses and the true mesh, which only `verso capture evaluate` reads")

@@ -7,7 +7,7 @@ from operator import attrgetter
 
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import MODALITIES, ROLES, PixelKind, Role
+from schemas.scene.view import MODALITIES, ROLES, VIEW_ROLES, PixelKind, Role
 
 JOB_FILE = "job.yaml"
 README_FILE = "DATASET.md"
@@ -56,10 +56,10 @@ class Image:
 
 
 IMAGES = tuple(
-    Image(modality.words[role], role, modality.name)
-    for role in ROLES
+    Image(word, role.name, modality.name)
+    for role in VIEW_ROLES.values()
     for modality in MODALITIES.values()
-    if role in modality.words
+    if (word := modality.word_of(role)) is not None
 )
 """(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
 
@@ -76,9 +76,7 @@ _MERGED = re.compile(rf"{MANIFEST}/[a-z]+/category=[^/]+/part-[0-9]{{5,}}\.parqu
 
 
 SWITCHES: dict[Role | PixelKind, str] = {
-    "aligned": "cameras.depth.enabled",
-    "mirror": "cameras.mirror.enabled",
-    "projected": "images.projection.enabled",
+    **{role.name: role.switch for role in VIEW_ROLES.values() if role.switch is not None},
     **{modality.name: modality.switch for modality in MODALITIES.values() if modality.switch is not None},
 }
 """The key of the job that switches a view, or the colour of every view, on and off. What is not here is always stored."""

@@ -169,9 +169,8 @@ class ProceduralSource(Frozen):
     seed: Seed = 0
     """Seed of the shapes; instance n of a category is the same in every dataset with this seed."""
     instances: Annotated[int, Field(ge=1, le=10**12)] = 1_000_000
-    """Number of distinct instances of each category. With the default hardly a shape comes twice. With few, such as 64, scenes
-    share shapes, as with a folder of meshes: an instance is in about scenes / (categories x `instances`) scenes. Up to 10,000 are
-    kept once made. docs/measured.md has what that saves."""
+    """Number of distinct instances of each category. With few, such as 64, scenes share shapes. Up to 10,000 are kept once
+    made."""
     size: Literal["article", "metric"] = "article"
     """`article`: bounding-box diagonal `diagonal_m`; `metric`: the true size of such an object. Tables are metric."""
     diagonal_m: Positive = 0.25
@@ -205,11 +204,11 @@ class FolderSource(Frozen):
     folder: Folder
     """A folder relative to the job file, or `pybullet_data` for the meshes inside that package."""
     category_map: dict[Folder, MappedName] = Field(default_factory=dict)
-    """Category, of any name, or `table`, by file pattern (glob relative to `folder`); the first match wins. Empty: the map that
-    is built in for `pybullet_data`."""
+    """Category, or `table`, by file pattern (glob relative to `folder`); the first match wins. Empty: the map for
+    `pybullet_data`."""
     up: UpAxis | dict[Folder, UpAxis] = "z"
-    """Which axis of the files points up: one for all, or a map from file patterns, such as `{"*.glb": y, "**/*.obj": z}`; the
-    first match wins, and what none matches has z up."""
+    """Which axis of the files points up: one for all, or a map from file patterns, such as `{"*.glb": y}`; the first match
+    wins, else z."""
     scale: Positive = 1.0
     """Multiplies the source's coordinates: 0.001 for millimetres."""
     diagonal_m: Positive | None = None
@@ -273,7 +272,7 @@ class MeshLimits(Frozen):
     max_asset_mb: Positive = 512.0
     """Most bytes, MB, of a mesh or URDF and all files that it refers to."""
     max_nodes: PositiveInt = 4096
-    """Most parts of a mesh, files that it reads, nodes of a GLB's tree, and links, joints or visuals of a URDF."""
+    """Most parts, files, nodes, links, joints or visuals of an asset."""
     min_size_m: Positive = 0.001
     """Smallest bounding-box diagonal of an object or table, metres, after scaling."""
     max_size_m: Positive = 20.0

@@ -125,7 +125,7 @@ class Simulate(Frozen):
     roll_deg: NonNegative = 12.0
     """Standard deviation of the roll of the hand-held camera."""
     image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Size of all images over the Azure Kinect's (1920 x 1080 and 640 x 576); below 1 for quick trials."""
+    """Size of all images over the Azure Kinect's (1920 x 1080 and 640 x 576)."""
     tier: Literal["raster", "pathtraced"] = "raster"
     """How RGB is made."""
     depth_noise: KinectDepthNoise | None = None
@@ -175,7 +175,7 @@ class Fusion(Frozen):
     max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 75.0
     """Pixels that see their surface at a larger angle of incidence are left out."""
     board_clearance_m: NonNegative = 0.003
-    """What is nearer to the board's plane than this, once all views are merged, is the board's; more where depth is uneven."""
+    """What is nearer to the board's plane than this is the board's; more where depth is uneven."""
     min_views: PositiveInt = 2
     """A point of the cloud must be confirmed by as many views."""
 

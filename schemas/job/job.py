@@ -26,8 +26,7 @@ class Check(Frozen):
     """What is checked before a scene is committed."""
 
     raycast_share: Share = 0.01
-    """Share of scenes, chosen by scene id, whose depth and masks are compared with a ray caster, and whose objects are
-    released again to see that they stay where they are."""
+    """Share of scenes whose depth and masks are compared with a ray caster, and whose objects are released again."""
     mirror_agreement_mm: Positive = 1.0
     """Largest median difference between input depth carried into the mirror view and the mirror depth."""
 
@@ -49,9 +48,9 @@ class Run(Frozen):
     range_size: RangeSize | None = None
     """Scenes in a commit; recorded at the first run. None: at most 16, and fewer where scenes are few or slow."""
     max_failure_share: Share = 0.01
-    """Above this share of failed scenes the run exits 1, and stops early once that is certain."""
+    """Above this share of failed scenes the run exits 1."""
     max_attempts: PositiveInt = 3
-    """Tries of a range whose worker dies, before the scene it died in is recorded as an environmental failure."""
+    """Tries of a range whose worker dies, before its scene is an environmental failure."""
     scene_timeout_s: Positive = 120.0
     """A worker that takes longer over one scene is killed."""
     device: Literal["any", "gpu"] = "any"
@@ -128,7 +127,7 @@ class Job(Frozen):
     name: Annotated[str, Field(max_length=1000), AfterValidator(_usable)]
     """Names the dataset; the default output folder is data/<name>."""
     preset: PresetName = "balanced"
-    """Defaults of keys that are not given: `fast` and `exact` trade errors for time as measured in docs/tradeoff."""
+    """Defaults of keys that are not given; docs/measured.md has what they cost."""
     seed: Seed = 0
     """Seed of all that is random in a scene."""
     scenes: PositiveInt = 64
@@ -138,10 +137,9 @@ class Job(Frozen):
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
     """Input and mirror poses of each scene."""
     objects_per_scene: ObjectCount = ONE_OBJECT
-    """Number of objects on the table; from a range each number is equally likely. The scene's category is the first object's."""
+    """Number of objects on the table; a range is drawn from evenly. The first gives the scene's category."""
     categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
-    """Weights of the categories, under any names that the sources offer; a list of names means equal weights. Default: all
-    that the sources offer."""
+    """Weights of the categories that the sources offer; a list of names means equal weights."""
     assets: Assets = Assets()
     """Where shapes come from."""
     start: Start = Start()

@@ -38,13 +38,13 @@ class Start(Frozen):
     offset_m: Interval = Range(-0.25, 0.25)
     """Offset from the centre of the table top, along x and along y."""
     arrange: Literal["spread", "pile"] = "spread"
-    """Arrangement of several objects. spread: each has its own place on the table; pile: they fall onto one another."""
+    """Arrangement of several objects: each in its own place, or falling onto one another."""
     pile_offset_m: Interval = Range(-0.03, 0.03)
     """Offset of each further object of a pile from the first, along x and along y."""
     clearance_m: Interval = Range(0.005, 0.05)
     """Height of the lowest point above the table, or above what is below it in a pile, at the start of a drop."""
     max_redraws: NonNegativeInt = 20
-    """Largest number of redraws of a position with no table under the centre of mass or no room beside other objects."""
+    """Most redraws of a position that is not over the table or has no room."""
 
 
 Collision = Literal["planned", "box", "hull", "parts"]
@@ -58,18 +58,17 @@ class Rest(Frozen):
     spin_rad_s: Positive = 0.01
     """Bound on the rate at which it turns."""
     window_s: Positive = 0.25
-    """Time for which both must hold; a fifth of it for a single object on a flat top without the energy to tip or to slide."""
+    """Time for which both must hold; a fifth of it for a single object on a flat top."""
 
 
 class Physics(Frozen):
     """PyBullet's settings."""
 
     step_hz: Annotated[int, Field(ge=30, le=20_000)] = 960
-    """Steps a second while all objects move slowly; up to 16 times as many otherwise. A single object falls first with half as
-    many, and with up to four times as many where its energy rises."""
+    """Steps a second while all objects move slowly; up to 16 times as many otherwise (docs/rest.md)."""
     max_step_travel_mm: Positive = 0.05
-    """Largest travel of the fastest point in a step; more in falls from above 25 mm, less for objects thinner than 1 mm; six
-    times as much for a single object's first fall, forty times among several."""
+    """Largest travel of the fastest point in a step; six times as much for a single object's first fall, forty times among
+    several."""
     solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Iterations of the contact solver in each step."""
     max_settle_s: Positive = 20.0
@@ -85,10 +84,9 @@ class Physics(Frozen):
     restitution: Share = 0.0
     """Restitution of each body; contact restitution is the product of the two."""
     collision: Collision = "planned"
-    """Shape of an object in the simulator. planned: its hull while it moves over the table's flat top alone, else its
-    convex parts; hull, parts: always these; box: its bounding box along its own axes."""
+    """Shape of an object in the simulator. planned: its hull while it moves over the table's flat top alone, else its convex
+    parts; box: its bounding box."""
     concavity: Annotated[float, Field(ge=0.01, le=1)] = 0.05
-    """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2; parts of built-in shapes are exact."""
+    """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2."""
     exact_rest: bool = True
-    """Whether what the simulation leaves calm is brought to exact rest between the true meshes, and refused where it overlaps
-    or hovers by more than 0.01 mm, or has more than 0.1 % of its weight out of balance."""
+    """Whether objects are brought to exact rest between the true meshes, and refused beyond the gate of docs/rest.md."""

@@ -118,8 +118,8 @@ class Images(Frozen):
     projection: Projection = Projection()
     """How the input cloud is carried into the mirror view."""
     png_level: Annotated[int, Field(ge=0, le=9)] = 1
-    """Compression level of the PNG files; pixels do not change. 1 is the fastest. At 2 a scene's images are a quarter smaller and
-    take 12 ms more, at 6 more than a third smaller and 70 ms more."""
+    """Compression level of the PNG files. At 2 a scene's images are a quarter smaller and take 12 ms more, at 6 a third and 70
+    ms."""
 
     @model_validator(mode="after")
     def _fits_16_bits(self) -> "Images":
@@ -141,15 +141,12 @@ class Render(Frozen):
     rgb: bool = True
     """Whether there are RGB images; without them no colour is computed."""
     tier: Tier = "raster"
-    """raster: textured floors, a key light with soft shadows, contact shadows, transparent texels cut out, smooth edges;
-    flat: albedo and light from two directions, in less than half the time; pathtraced: global illumination, glass and
-    metal by Mitsuba, in seconds an image (`./verso extra pathtraced` installs it). Depth and masks are the same in all."""
+    """raster: textures, a key light with soft shadows, contact shadows, smooth edges; flat: albedo and two lights, in less
+    than half the time; pathtraced: global illumination, glass and metal by Mitsuba, in seconds an image."""
     samples: Literal[1, 4] = 1
-    """Colour samples in a pixel at an edge, for tier raster: 1 smooths edges by their neighbours, 4 draws them at three
-    more points, in twice the time. Labels are always those of the pixel centre."""
+    """Colour samples in a pixel at an edge, for tier raster: 1 smooths edges by their neighbours, 4 takes twice the time."""
     path_samples: Annotated[int, Field(ge=1, le=65_536)] = 16
-    """Paths through each pixel, for tier pathtraced: time grows with them. They fill a grid of nearly equal
-    sides, and are rounded up where they do not: 16 is 4 x 4, 13 becomes 15."""
+    """Paths through each pixel, for tier pathtraced; rounded up to a grid of nearly equal sides."""
     path_bounces: Annotated[int, Field(ge=1, le=64)] = 8
     """Largest number of scatterings and glass crossings of a path, for tier pathtraced."""
 
@@ -172,7 +169,7 @@ class DepthNoise(Frozen):
     axial_m: NonNegative = 0.0
     """Standard deviation along the optical axis that does not depend on the distance, metres [assumed]."""
     axial_per_m: NonNegative = 17e-3 / 3.86**2
-    """The standard deviation at z grows by this times z squared: 17 mm at 3.86 m, and 1.1 mm at 1 m."""
+    """The standard deviation grows by this times z squared."""
     incidence_power: NonNegative = 1.0
     """The standard deviation is divided by the cosine of the angle of incidence to this power [assumed]."""
     grazing_deg: Annotated[float, Field(gt=0, le=90)] = 80.0

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +9,43 @@ from numpy.typing import NDArray
 from schemas.base import Array, Frozen, Pose
 from schemas.job.views import Patch, Sensor
 
-Role = Literal["input", "aligned", "mirror", "projected"]
-ROLES: tuple[Role, ...] = ("input", "aligned", "mirror", "projected")
+Role = str
+"""The name of a view's place in its pair."""
+
+
+@dataclass(frozen=True)
+class ViewRole:
+    """What a view of a pair is; its switch, its effect and the names of its files follow."""
+
+    name: Role
+    branch: str | None = None
+    """The branch of the job whose `enabled` switches it on and off; None where it is always stored."""
+    effect: str | None = None
+    """The effect that it is made by, where it can be left out."""
+    beside: bool = False
+    """Drawn by a camera that stands beside the input camera, at its branch's `offset_m`; it shares the input's pose id."""
+    projected: bool = False
+    """Carried over from the input view into the mirror camera, not drawn: it has no regions and no labels."""
+
+    @property
+    def switch(self) -> str | None:
+        """The key of the job that switches it on and off."""
+        return None if self.branch is None else f"{self.branch}.enabled"
+
+
+VIEW_ROLES: dict[Role, ViewRole] = {
+    role.name: role
+    for role in (
+        ViewRole("input"),
+        ViewRole("aligned", "cameras.depth", "depth_camera", beside=True),
+        ViewRole("mirror", "cameras.mirror", "mirror"),
+        ViewRole("projected", "images.projection", "projection", projected=True),
+    )
+}
+"""Every view that a pair may have, in the order that tables and files have them in."""
+
+ROLES: tuple[Role, ...] = tuple(VIEW_ROLES)
+DRAWN_ROLES: tuple[Role, ...] = tuple(role.name for role in VIEW_ROLES.values() if not role.projected)
 
 PixelKind = str
 """The name of a modality."""
@@ -22,12 +56,21 @@ class Modality:
     """A kind of image that views have, stored as PNG without loss."""
 
     name: PixelKind
-    words: Mapping[Role, str]
-    """The word in the file's name, by each role that has such an image."""
+    word: str
+    """The word in the names of its files."""
     dtype: str
     channels: int = 1
     switch: str | None = None
     """The key of the job that switches it on and off in every view; None where it is always stored."""
+    projected: bool = False
+    """Whether a view that is projected and not drawn has such an image too."""
+
+    def word_of(self, role: ViewRole) -> str | None:
+        """The word in the file's name (`RGB`, `RGBaligned`, `depthAligned`); None where such a view has no such image."""
+        if role.projected and not self.projected:
+            return None
+        suffix = role.name if role.beside or role.projected else ""
+        return self.word + (suffix if self.word.isupper() else suffix.capitalize())
 
     def shape(self, height: int, width: int) -> tuple[int, ...]:
         """Of the array of an image of this size."""
@@ -37,19 +80,9 @@ class Modality:
 MODALITIES: dict[PixelKind, Modality] = {
     modality.name: modality
     for modality in (
-        Modality(
-            "rgb",
-            {"input": "RGB", "aligned": "RGBaligned", "mirror": "RGB", "projected": "RGBprojected"},
-            "uint8",
-            3,
-            "render.rgb",
-        ),
-        Modality(
-            "depth",
-            {"input": "depth", "aligned": "depthAligned", "mirror": "depth", "projected": "depthProjected"},
-            "uint16",
-        ),
-        Modality("region", {"input": "segment", "aligned": "segmentAligned", "mirror": "segment"}, "uint8"),
+        Modality("rgb", "RGB", "uint8", 3, "render.rgb", projected=True),
+        Modality("depth", "depth", "uint16", projected=True),
+        Modality("region", "segment", "uint8"),
     )
 }
 """Every modality there is. Files, `verify`, the Python door and the exports take from here which images there are."""
@@ -181,7 +214,8 @@ class Pair:
 
     d_z_m: float
     input: View
-    aligned: View | None
+    beside: tuple[View, ...] = ()
+    """Those of cameras beside the input camera."""
     mirror: View | None = None
     projected: View | None = None
     agreement: Agreement | None = None
@@ -192,7 +226,10 @@ class Pair:
     @property
     def views(self) -> tuple[View, ...]:
         """The views that exist, in the order of `ROLES`."""
-        return tuple(view for view in (self.input, self.aligned, self.mirror, self.projected) if view is not None)
+        there = {
+            view.role: view for view in (self.input, *self.beside, self.mirror, self.projected) if view is not None
+        }
+        return tuple(there[role] for role in ROLES if role in there)
 
 
 def crop_box(label: ObjectLabel, camera: Camera, patch: Patch) -> tuple[slice, slice] | None:

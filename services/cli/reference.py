@@ -46,8 +46,8 @@ EXIT_CODES = (
 
 HEAD = """# Commands
 
-Every command has `--help` with an example, and `--json`, which makes the last line of standard output one JSON object.
-Messages go to standard error. In a checkout type `./verso`; where Verso was installed as a package, `verso`.
+`verso COMMAND --help` explains every option. `--json` makes the last line of standard output one JSON object.
+Messages go to standard error.
 
 | exit code | meaning |
 |---|---|"""
@@ -68,21 +68,18 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
             yield from _describe(command.commands, f"{words} ")
             continue
         yield from (f"\n##{'#' * bool(above)} {words}\n", what, "", f"    verso {words} {command.example}".rstrip())
-        options = [*command.options, *command.one_of]
-        if rows := [_row(option) for option in options]:
-            yield from ("", *rows)
+        if options := [f"`{written}`" for one in (*command.options, *command.one_of) if (written := _written(one))]:
+            yield from ("", f"Options: {', '.join(options)}.")
 
 
-def _row(option: Option) -> str:
+def _written(option: Option) -> str:
+    """How an option is written, with the name of its value; empty for an argument, which the example shows."""
     names, settings = option
     choices = settings.get("choices")
     value = settings.get("metavar") or ("|".join(map(str, choices)) if choices else "")
-    flag = settings.get("action") == "store_true"
-    shown = (
-        value or names[0] if not names[0].startswith("-") else f"{names[0]}{'' if flag or not value else f' {value}'}"
-    )
-    told = settings.get("help", "")
-    return f"- `{shown}`{f': {told}' if told else ''}"
+    if not names[0].startswith("-"):
+        return ""
+    return f"{names[0]} {value}" if value and settings.get("action") != "store_true" else names[0]
 
 
 if __name__ == "__main__":

@@ -144,11 +144,29 @@ class Pair:
     instance_id: str
     scene: Mapping[str, Any] = field(repr=False)
     asset: Mapping[str, Any] = field(repr=False)
-    input: View = field(repr=False)
-    aligned: View | None = field(repr=False)
-    mirror: View | None = field(repr=False)
-    projected: View | None = field(repr=False)
+    views: Mapping[Role, View] = field(repr=False)
+    """Every view there is, by role; those of the article have names of their own below."""
     _files: Files = field(repr=False)
+
+    @property
+    def input(self) -> View:
+        """What the camera sees."""
+        return self.views["input"]
+
+    @property
+    def aligned(self) -> View | None:
+        """What the depth camera beside it sees."""
+        return self.views.get("aligned")
+
+    @property
+    def mirror(self) -> View | None:
+        """What is on the other side."""
+        return self.views.get("mirror")
+
+    @property
+    def projected(self) -> View | None:
+        """The input view's points, as the mirror camera sees them."""
+        return self.views.get("projected")
 
     @cached_property
     def T_world(self) -> Mapping[int, Pose]:
@@ -171,9 +189,6 @@ class Pair:
 def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> Pair:
     """The pair of a row of `pair_table`; `labels`: rows of `objects` by (pose id, role)."""
     scene = {name: value for name, value in row.items() if name not in (*_NESTED, "parent_id")}
-    views = {role: _read_view(row[role], labels, files) for role in ROLES}
-    first = views["input"]
-    assert first is not None  # no pair without an input view
     return Pair(
         pose_id=row["parent_id"],
         scene_id=row["scene_id"],
@@ -181,10 +196,7 @@ def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: File
         instance_id=row["instance_id"],
         scene=MappingProxyType(scene),
         asset=MappingProxyType(row["asset"] or {}),
-        input=first,
-        aligned=views["aligned"],
-        mirror=views["mirror"],
-        projected=views["projected"],
+        views=MappingProxyType({role: _read_view(row[role], labels, files) for role in ROLES if row[role] is not None}),
         _files=files,
     )
 
@@ -192,9 +204,7 @@ def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: File
 _NESTED = (*ROLES, "asset")
 
 
-def _read_view(row: Row | None, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> View | None:
-    if row is None:
-        return None
+def _read_view(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> View:
     labelled: Role = "mirror" if row["role"] == "projected" else row["role"]
     pose_id = file_pose_id(labelled, row["parent_id"])
     return View(

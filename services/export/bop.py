@@ -22,7 +22,7 @@ from scipy.spatial.distance import cdist
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part
-from schemas.scene.view import Role
+from schemas.scene.view import DRAWN_ROLES, Role
 from services.export.folder import ExportFolder
 from services.export.formats import Added, ExportRequest, Writer
 from services.export.shapes import ColoredShape, Shapes, Silhouette, box_of, whole_silhouette
@@ -30,9 +30,6 @@ from services.export.source import ExportPair, ExportScene
 from workers.geometry.frames import invert
 from workers.geometry.hull import convex_hull
 from workers.store.images import decode_png, encode_mask
-
-ROLES: Final[tuple[Role, ...]] = ("input", "aligned", "mirror")
-"""Pair k has the images 3 k, 3 k + 1 and 3 k + 2 of its scene."""
 
 NO_SHAPE: Final = "an object is hidden in part, and its shape is neither stored nor here"
 _MM = 1000.0
@@ -67,7 +64,7 @@ class Bop(Writer):
         written: list[_Shot] = []
         left_out = []
         for pair in scene.pairs:
-            shots = [self._shot(scene, pair, role, numbers) for role in ROLES if role in pair.views]
+            shots = [self._shot(scene, pair, role, numbers) for role in DRAWN_ROLES if role in pair.views]
             if reason := next((shot for shot in shots if isinstance(shot, str)), None):
                 left_out.append((pair.pose_id, reason))
                 continue
@@ -95,7 +92,10 @@ class Bop(Writer):
         rgb, region, depth = pair.image(role, "rgb"), pair.pixels(role, "region"), pair.image(role, "depth")
         if rgb is None or region is None or depth is None:
             return f"no {'rgb' if rgb is None else 'labels'} of the {role} view"
-        number, view, pixels = len(ROLES) * pair.number + ROLES.index(role), pair.views[role], decode_png(depth)
+        number = len(DRAWN_ROLES) * pair.number + DRAWN_ROLES.index(
+            role
+        )  # pair k has the images 3 k, 3 k + 1 and 3 k + 2
+        view, pixels = pair.views[role], decode_png(depth)
         shot = _Shot(number, view, {f"rgb/{number:06d}.png": rgb, f"depth/{number:06d}.png": depth})
         for label in pair.labels(role):
             if label["region_id"] < REGION_FIRST_OBJECT:

@@ -128,7 +128,7 @@ def scenes_of(store: Store, stored: StoredRange, chosen: Sequence[int]) -> Itera
     rows = {row["scene_id"]: row for row in stored.rows["scenes"]}
     for scene_id in chosen:
         pairs = tuple(
-            ExportPair(number, views, tuple(objects), read)  # type: ignore[arg-type]
+            ExportPair(number, views, tuple(objects), read)
             for number, (views, objects) in enumerate(stored.pairs(scene_id))
         )
         yield ExportScene(rows[scene_id], pairs, assets, read_plain, stored)

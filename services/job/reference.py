@@ -19,7 +19,7 @@ HEADER = """\
 
 Written from `schemas/job/` by `python -m services.job.reference`; a test holds the two together. Every key but `name` has a
 default. A key that is not in this list is refused, and so is a value that is not allowed. Any key can be changed on the
-command line: `--set physics.step_hz=480`. After each key: what is allowed; the default.
+command line: `--set physics.step_hz=480`. After each key: what is allowed; the default. `null` stands for nothing.
 
 """
 
@@ -53,43 +53,43 @@ def allowed_keys(path: Sequence[str]) -> list[str]:
 
 
 def describe_allowed(field: FieldInfo) -> str:
-    """The type and bounds of a field in a few words."""
-    words = [_name(field.annotation)]
+    """The type and bounds of a field in a few words: `number >0`, `integer >=0,<=1000`."""
+    bounds = []
     for bound in field.metadata:
         signs = ((Ge, ">="), (Gt, ">"), (Le, "<="), (Lt, "<"))
-        words += [
-            f"{sign} {getattr(bound, kind.__name__.lower()):g}" for kind, sign in signs if isinstance(bound, kind)
+        bounds += [
+            f"{sign}{getattr(bound, kind.__name__.lower()):g}" for kind, sign in signs if isinstance(bound, kind)
         ]
         if isinstance(bound, MinLen):
-            words.append(f"at least {bound.min_length}")
-    return ", ".join(words)
+            bounds.append(f"at least {bound.min_length}")
+    return " ".join([_name(field.annotation), ",".join(bounds)]).strip()
 
 
 def _name(annotation: Any) -> str:
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Literal:
-        return ", ".join(f"`{value}`" for value in arguments)
+        return "/".join(f"`{value}`" for value in arguments)
     if origin is typing.Annotated:
         return describe_allowed(FieldInfo.from_annotation(annotation))
     if origin in (typing.Union, types.UnionType):
-        names = ["nothing" if argument is type(None) else _name(argument) for argument in arguments]
+        names = ["`null`" if argument is type(None) else _name(argument) for argument in arguments]
         return " or ".join(dict.fromkeys(names))
     if origin is list:
         return f"list of {_name(typing.get_args(annotation)[0])}"
     if origin is tuple:
-        return "list" if Ellipsis in arguments else f"list of {len(arguments)} numbers"
+        return "list" if Ellipsis in arguments else f"{len(arguments)} numbers"
     if origin is dict or (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
         return "map"
     if annotation is Range:
         return "[low, high]"
     if annotation is Counts:
-        return f"whole number or [low, high], from 1 to {MOST_OBJECTS}"
-    return {int: "whole number", float: "number", bool: "`true` or `false`", str: "text"}[annotation]
+        return f"integer or [low, high], from 1 to {MOST_OBJECTS}"
+    return {int: "integer", float: "number", bool: "`true`/`false`", str: "text"}[annotation]
 
 
 def _default(field: FieldInfo) -> str:
     if field.is_required():
-        return "none: must be given"
+        return "required"
     value = field.get_default(call_default_factory=True)
     if isinstance(value, BaseModel):
         return "below"
@@ -100,15 +100,17 @@ def _default(field: FieldInfo) -> str:
     if isinstance(value, tuple):
         return "one `procedural` source" if isinstance(value[0], BaseModel) else f"`{list(value)}`"
     if isinstance(value, dict):
-        return "all, equal weights" if value else "nothing"
+        return "all, equal weights" if value else "`null`"
     if value is None:
-        return "nothing"
+        return "`null`"
     return f"`{str(value).lower() if isinstance(value, bool) else value}`"
 
 
 def write_doc() -> str:
     """The whole page."""
-    lines = []
+    lines: list[str] = []
+    told: dict[Any, str] = {}
+    again: list[str] = []
     for path, field in list_keys():
         if path.endswith(".source") and len(typing.get_args(field.annotation)) == 1:
             continue
@@ -117,6 +119,13 @@ def write_doc() -> str:
         meaning = " ".join((field.description or "").split())
         if path == "assets.tables":
             meaning += " Each has the keys of a source of objects."
+        if path.startswith(tuple(again)):
+            continue  # told where the same branch stands first
+        if field.annotation is not None and (branch := [kind for _, kind in _branches(field.annotation)]):
+            first = told.setdefault(tuple(branch), path)
+            if first != path and path != "assets.tables":
+                again.append(f"{path}.")
+                meaning += f" Its keys are those of `{first}`."
         default = "" if (shown := _default(field)) == "below" else f"; {shown}"
         lines.append(f"- `{path}` ({describe_allowed(field)}{default}): {meaning}\n")
     return HEADER + "".join(lines)

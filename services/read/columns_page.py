@@ -17,8 +17,8 @@ prints the same.
 
 A column name ends in its unit where it has one: `_m` metres, `_mm` millimetres, `_rad` radians, `_deg` degrees, `_s` seconds.
 Below, `1` is a pure number, `id` and `count` are whole numbers. `T_a_b` takes coordinates in frame b to coordinates in frame a:
-16 doubles, row by row. `name[]` stands for the items of a list. "or null" says that a value may be missing; columns marked
-"captures" are null in datasets of scenes, columns marked "scenes" in datasets of captures, which have no simulated rest.
+16 doubles, row by row; its frames stand after the unit. `name[]` stands for the items of a list.
+Columns marked "captures" are null in datasets of scenes, those marked "scenes" in datasets of captures.
 
 Frames:
 
@@ -64,13 +64,14 @@ def describe_columns(table: str | None) -> list[str]:
 def _facts(column: Column) -> str:
     """Type, unit and frame in a few words."""
     words = [f"{column.type}{' or null' if column.null else ''}", column.unit]
-    words += [f"frame: {' from '.join(column.frame.split(', '))}" if column.frame else ""]
+    words += [f"{' from '.join(column.frame.split(', '))}" if column.frame else ""]
     return ", ".join(word for word in [*words, "" if column.of == "both" else column.of] if word)
 
 
 def write_page() -> str:
     """The text of docs/columns.md."""
     lines = [HEADER + "\n".join(f"- **{name}**: {text}" for name, text in FRAMES.items())]
+    first: dict[str, str] = {}
     for table in TABLES:
         lines += [
             "",
@@ -79,7 +80,11 @@ def write_page() -> str:
             f"{TABLES[table]} Key: {', '.join(f'`{one}`' for one in SORT_KEYS[table])}.",
             "",
         ]
-        lines += [f"- `{column.path}` ({_facts(column)}): {column.meaning}" for column in COLUMNS[table]]
+        rows = {f"- `{column.path}` ({_facts(column)}): {column.meaning}": column.path for column in COLUMNS[table]}
+        again = {row: path for row, path in rows.items() if first.setdefault(row, table) != table}
+        lines += [row for row in rows if row not in again]
+        for other in dict.fromkeys(first[row] for row in again):
+            lines.append(f"- as in {other}: {', '.join(f'`{again[row]}`' for row in again if first[row] == other)}")
     return "\n".join(lines) + "\n"
 
 

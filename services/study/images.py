@@ -125,7 +125,7 @@ def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[s
       lies more than 5 mm behind what the mirror camera's ray meets.
     """
     images = context.job.images
-    views = [view for pair in scene.pairs for view in (pair.input, pair.aligned, pair.mirror) if view is not None]
+    views = [view for pair in scene.pairs for view in pair.views if view.region is not None]
     patches = [truth.patch(pair.input.camera, number) for number, pair in enumerate(scene.pairs)]
     projected = [pair for pair in scene.pairs if pair.projected is not None]
     return (

@@ -19,7 +19,7 @@ from tests.effects.scenes import Setting, facts_of, make, with_holes, without_te
 from workers.geometry.raycast import cast_view
 from workers.physics.settle import settle_scene
 from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects
-from workers.scene.pairs import place_aligned_camera, place_mirror_camera
+from workers.scene.pairs import place_beside, place_mirror_camera
 
 pytestmark = pytest.mark.minute
 
@@ -55,10 +55,10 @@ def random_setting(number: int) -> Setting:
 
 
 def cameras_of(facts: Facts) -> Iterator[Camera]:
-    """The input camera, the one beside it, and mirror cameras from objects at seven distances."""
+    """The input camera, those beside it, and mirror cameras from objects at seven distances."""
     first, job = facts.plan.input_cameras[0], facts.job
     yield first
-    yield place_aligned_camera(first, job.cameras.depth)
+    yield from place_beside(first, job).values()
     for d_z_m in np.linspace(*job.images.depth_range_m, 7):
         yield place_mirror_camera(first, float(d_z_m), job.cameras.mirror)
 

@@ -126,7 +126,7 @@ def make_capture_pair(
 
     first = view("input", images.camera, images)
     assert first.region is not None
-    pair = Pair(object_distance(first.depth, first.region, job.images, job.cameras.mirror), first, None)
+    pair = Pair(object_distance(first.depth, first.region, job.images, job.cameras.mirror), first)
     if not thing.effects.runs("mirror"):
         return CapturedPair(images.number, pair, None)
     camera = place_mirror_camera(images.camera, pair.d_z_m, job.cameras.mirror)

@@ -16,7 +16,7 @@ from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
 from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
-from workers.scene.pairs import object_distance, place_aligned_camera, place_mirror_camera
+from workers.scene.pairs import object_distance, place_beside, place_mirror_camera
 from workers.scene.rows import image_boxes
 
 ROUNDING = 1e-12
@@ -174,15 +174,12 @@ def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: R
 
 
 def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
-    """Compare d_z with the input's stored depth, and the aligned and mirror poses with the input pose and d_z."""
+    """Compare d_z with the input's stored depth, and the other poses with the input pose and d_z."""
     first, faults = stored["input"], []
     assert first.region is not None
     d_z = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
-    poses = {
-        "aligned": place_aligned_camera(first.camera, job.cameras.depth),
-        "mirror": place_mirror_camera(first.camera, d_z, job.cameras.mirror),
-    }
-    poses["projected"] = poses["mirror"]
+    mirror = place_mirror_camera(first.camera, d_z, job.cameras.mirror)
+    poses = {**place_beside(first.camera, job), "mirror": mirror, "projected": mirror}
     for role, camera in poses.items():
         if role in stored and _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
             where = f"pose {stored[role].pose_id} ({role})"

@@ -1,7 +1,7 @@
-"""What a scene calls for: one table of effects, one entry an effect, and the plan that follows from it. Pure.
+"""What a scene or a simulated capture calls for: one table of effects, one row an effect, and the plan. Pure.
 
 The plan is made from the scene as it is drawn, before anything moves; the kinds are explained in schemas/scene/scene.py.
-To add an effect: add an entry with its kind, predicate and stage, let the step that it belongs to ask the plan, and
+To add an effect: add a row with its kind, predicate and stage, let the step that it belongs to ask the plan, and
 give it its two scenes (tests/effects/cases.py) and its proof (tests/effects/proofs.py).
 """
 
@@ -13,15 +13,16 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.dataset.layout import SWITCHES, PixelKind, is_stored
+from schemas.job.captures import Simulate
 from schemas.job.job import Check, Job
 from schemas.job.views import SensorEffects, Tier
 from schemas.scene.scene import EffectKind, EffectPlan, ScenePlan
 from schemas.scene.shape import Part
-from schemas.scene.view import Camera, Role
+from schemas.scene.view import VIEW_ROLES, Camera, Role
 from workers.geometry.camera import is_outside_views
 from workers.geometry.colour import has_holes
 from workers.physics.effects import PREDICATES
-from workers.scene.pairs import place_aligned_camera, place_mirror_camera
+from workers.scene.pairs import place_beside, place_mirror_camera
 from workers.scene.plan import SceneChance, Stream
 
 
@@ -37,15 +38,21 @@ class Facts:
 Reason = Callable[[Facts], str | None]
 """Why a scene does not call for an effect; None where it does."""
 
+CaptureReason = Callable[[Simulate], str | None]
+"""Why a simulated capture does not call for an effect; None where it does."""
+
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """An entry of the table of effects: its predicate, and the stage that its time is counted in."""
+    """A row of the table of effects: its predicates, and the stage that its time is counted in."""
 
     name: str
     kind: EffectKind
-    skipped_because: Reason
+    skipped_because: Reason | None
+    """Of scenes; None where they do not have the effect."""
     stage: str
+    in_captures: CaptureReason | None = None
+    """Of simulated captures; None where they do not have it."""
 
 
 def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPlan:
@@ -54,9 +61,16 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
         raise ValueError(f"no effects of these names: {', '.join(sorted(unknown))}")
     if asked := forced & names_of_kind("asked"):
         raise ValueError(f"switches of the job, which cannot be forced: {', '.join(sorted(asked))}")
-    reasons = {effect.name: effect.skipped_because(facts) for effect in EFFECTS}
+    reasons = {effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}
     skipped = {name: why for name, why in reasons.items() if why is not None and name not in forced}
     return EffectPlan(tuple(name for name in reasons if name not in skipped), skipped, forced)
+
+
+def plan_capture(simulate: Simulate) -> EffectPlan:
+    """Which effects a simulated capture runs, and why each of the others does not."""
+    reasons = {effect.name: why(simulate) for effect in TABLE if (why := effect.in_captures) is not None}
+    skipped = {name: why for name, why in reasons.items() if why is not None}
+    return EffectPlan(tuple(name for name in reasons if name not in skipped), skipped)
 
 
 def is_raycast_scene(check: Check, chance: SceneChance) -> bool:
@@ -162,13 +176,30 @@ def _views(facts: Facts) -> Iterator[tuple[Camera, ...]]:
     job = facts.job
     for camera in facts.plan.input_cameras:
         yield (camera,)
-        yield (place_aligned_camera(camera, job.cameras.depth),)
+        yield from ((near,) for near in place_beside(camera, job).values())
         yield tuple(place_mirror_camera(camera, d_z, job.cameras.mirror) for d_z in job.images.depth_range_m)
 
 
 _NOISY_DEPTH = _where(
     lambda facts: facts.job.sensor.depth_noise is not None, "stored depth is exact: sensor.depth_noise is off"
 )
+
+
+# ------------------------------------------------------------------------------------------- captures
+
+
+def _always(simulate: Simulate) -> None:
+    """An effect of every picture."""
+
+
+def _of_tier(tier: Tier) -> CaptureReason:
+    """An effect of the pictures of one tier."""
+    return lambda simulate: None if simulate.tier == tier else f"tier is {simulate.tier}"
+
+
+def _simulated(name: str) -> CaptureReason:
+    """An effect that runs where `captures.simulate` has a branch of this name."""
+    return lambda simulate: f"captures.simulate.{name} is off" if getattr(simulate, name) is None else None
 
 
 # ------------------------------------------------------------------------------------------- the table
@@ -183,29 +214,36 @@ def _of_physics(name: str) -> Effect:
 
 PHYSICS_EFFECTS: tuple[Effect, ...] = tuple(_of_physics(name) for name in PREDICATES)
 
-EFFECTS: tuple[Effect, ...] = (
+CAPTURE_EFFECTS: tuple[str, ...] = tuple(name for name, key in Simulate.model_fields.items() if key.default is None)
+"""The branches of `captures.simulate` that are off unless asked for: each switches an effect of its name on."""
+
+TABLE: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,
-    Effect("depth_camera", "asked", _stored("aligned"), "render"),
+    *(Effect(str(role.effect), "asked", _stored(role.name), "render") for role in VIEW_ROLES.values() if role.beside),
     Effect("mirror", "asked", _stored("mirror"), "render"),
     Effect("projection", "asked", _PROJECTION, "projection"),
     Effect("splat", "asked", _first_of(_PROJECTION, _SPLAT), "projection"),
     Effect("hidden_point_removal", "asked", _first_of(_PROJECTION, _HIDDEN_POINTS), "projection"),
-    Effect("rgb", "asked", _stored("rgb"), "render"),
-    Effect("shadows", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render"),
-    Effect("ambient_occlusion", "asked", _tier("raster"), "render"),
+    Effect("rgb", "asked", _stored("rgb"), "render", _always),
+    Effect("shadows", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render", _of_tier("raster")),
+    Effect("ambient_occlusion", "asked", _tier("raster"), "render", _of_tier("raster")),
     Effect("antialiasing", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render"),
     Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "render"),
-    Effect("global_illumination", "asked", _tier("pathtraced"), "render"),
-    Effect("glass", "asked", _tier("pathtraced"), "render"),
+    Effect("global_illumination", "asked", _tier("pathtraced"), "render", _of_tier("pathtraced")),
+    Effect("glass", "asked", _tier("pathtraced"), "render", _of_tier("pathtraced")),
     *(Effect(f"sensor_{name}", "asked", _sensor(name), "sensor") for name in SensorEffects.model_fields),
     Effect("raycast_check", "asked", _RAYCAST, "raycast"),
     Effect("release_again", "asked", _RAYCAST, "recheck"),
-    Effect("floor", "no_op", _floor, "render"),
-    Effect("table", "no_op", _table, "render"),
-    Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "render"),
+    Effect("floor", "no_op", _floor, "render", _always),
+    Effect("table", "no_op", _table, "render", _always),
+    Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "render", _always),
     # Tier flat has no such pass that could be forced, and the path tracer has it in its materials.
-    Effect("transparency", "no_op", _first_of(_tier("raster", "pathtraced"), _HOLES), "render"),
-    Effect("light_maps", "no_op", _tier("raster"), "render"),
+    Effect("transparency", "no_op", _first_of(_tier("raster", "pathtraced"), _HOLES), "render", _always),
+    Effect("light_maps", "no_op", _tier("raster"), "render", _of_tier("raster")),
     Effect("exact_agreement", "no_op", _first_of(_stored("mirror"), _NOISY_DEPTH), "check"),
+    *(Effect(name, "asked", None, "simulate", _simulated(name)) for name in CAPTURE_EFFECTS),
 )
 """Every effect there is. A receipt names them in this order."""
+
+EFFECTS: tuple[Effect, ...] = tuple(effect for effect in TABLE if effect.skipped_because is not None)
+"""Those of scenes."""

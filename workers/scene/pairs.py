@@ -6,6 +6,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose, frozen_array
 from schemas.dataset.layout import file_pose_id, input_pose_id
 from schemas.errors import ViewError
-from schemas.job.views import DepthCamera, Images, Mirror
+from schemas.job.job import Job
+from schemas.job.views import Images, Mirror
 from schemas.scene.scene import EffectPlan, PosedScene, ScenePlan
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import ROLES, Camera, Pair, Role, View
+from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
 from workers.geometry.frames import UP, half_turn, pose, translation
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.render.tiers import draw_view
@@ -27,9 +29,21 @@ from workers.scene.ray_check import check_against_rays
 from workers.scene.sensor import SensorChance, sense_view
 
 
-def place_aligned_camera(camera: Camera, depth_camera: DepthCamera) -> Camera:
-    """The depth camera: T_world_depth = T_world_rgb Trans(t), t along the RGB camera's optical axes, same rotation [D]."""
-    return Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*depth_camera.offset_m)))
+def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
+    """The cameras that the job has beside the input camera, of which the article has one, the depth camera.
+
+    T_world_beside = T_world_input Trans(t), t along the input camera's optical axes, same rotation [D].
+    """
+    branches = {
+        role.name: attrgetter(role.branch)(job)
+        for role in VIEW_ROLES.values()
+        if role.beside and role.branch is not None
+    }
+    return {
+        name: Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*branch.offset_m)))
+        for name, branch in branches.items()
+        if branch.enabled
+    }
 
 
 def place_mirror_camera(camera: Camera, d_z_m: float, mirror: Mirror) -> Camera:
@@ -87,13 +101,14 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     images, bound_mm = job.images, job.check.mirror_agreement_mm
     exact_input = render_view(scene, "input", number, camera)
     first = sense(scene, exact_input, number)
-    aligned = None
-    if effects.runs("depth_camera"):
-        with stopwatch.effect("depth_camera"):
-            aligned_camera = place_aligned_camera(camera, job.cameras.depth)
-            aligned = sense(scene, render_view(scene, "aligned", number, aligned_camera), number)
+    beside = []
+    for role, near in place_beside(camera, job).items():
+        if not effects.runs(effect := str(VIEW_ROLES[role].effect)):
+            continue
+        with stopwatch.effect(effect):
+            beside.append(sense(scene, render_view(scene, role, number, near), number))
     assert first.region is not None
-    pair = Pair(object_distance(first.depth, first.region, images, job.cameras.mirror), first, aligned)
+    pair = Pair(object_distance(first.depth, first.region, images, job.cameras.mirror), first, tuple(beside))
     if not effects.runs("mirror"):
         return pair
     with stopwatch.effect("mirror"):

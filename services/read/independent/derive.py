@@ -39,13 +39,19 @@ MOST_BROKEN_TIES = 0.25
 
 FLOOR, TABLE, FIRST_OBJECT = 1, 2, 3
 
-IMAGES = {
-    "input": {"rgb": "RGB", "depth": "depth", "region": "segment"},
-    "aligned": {"rgb": "RGBaligned", "depth": "depthAligned", "region": "segmentAligned"},
-    "mirror": {"rgb": "RGB", "depth": "depth", "region": "segment"},
-    "projected": {"rgb": "RGBprojected", "depth": "depthProjected"},
-}
-"""Content word of each image, by role and kind of pixel."""
+
+def beside(job: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The branches of the cameras beside the input camera, by the role of their views."""
+    cameras = job["cameras"].items()
+    return {"aligned" if name == "depth" else name: branch for name, branch in cameras if "offset_m" in branch}
+
+
+def words(role: str) -> dict[str, str]:
+    """Content word of each image of a view, by kind of pixel."""
+    if role in ("input", "mirror"):
+        return {"rgb": "RGB", "depth": "depth", "region": "segment"}
+    said = {"rgb": f"RGB{role}", "depth": f"depth{role.capitalize()}"}
+    return said if role == "projected" else {**said, "region": f"segment{role.capitalize()}"}
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ class StoredPair:
 
     def kinds(self, role: str) -> list[str]:
         """Kinds of pixel that the job stores of a view."""
-        return [kind for kind in IMAGES[role] if kind != "rgb" or self.job["render"]["rgb"]]
+        return [kind for kind in words(role) if kind != "rgb" or self.job["render"]["rgb"]]
 
 
 def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
@@ -225,7 +231,7 @@ def check_projection(pair: StoredPair) -> Iterator[str]:
 def _path(view: Row, kind: str, folder: str = "", suffix: str = "") -> str:
     """`mug/depth00000.png`: the mirror camera's own images have the mirror's odd id, all others the input's."""
     number = view["parent_id"] + (view["role"] == "mirror")
-    return f"{view['category']}/{folder}{IMAGES[view['role']][kind]}{number:05d}{suffix}.png"
+    return f"{view['category']}/{folder}{words(view['role'])[kind]}{number:05d}{suffix}.png"
 
 
 def _decode(data: bytes) -> NDArray:

@@ -65,9 +65,11 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
     for role, view in pair.views.items():
         if not abs(view["d_z_m"] - d_z) <= ROUNDING:
             yield f"d_z_m of {role} is {view['d_z_m']}, the object's input depth gives {d_z}"
-    expected = {"aligned": T_in @ _transform(np.eye(3), cameras["depth"]["offset_m"])}
-    derive = _derive_rolled_mirror if pair.is_captured else _derive_mirror
-    expected["mirror"] = expected["projected"] = derive(T_in, d_z, cameras["mirror"]["T_z_m"])
+    expected = {
+        role: T_in @ _transform(np.eye(3), beside["offset_m"]) for role, beside in derive.beside(pair.job).items()
+    }
+    other_side = _derive_rolled_mirror if pair.is_captured else _derive_mirror
+    expected["mirror"] = expected["projected"] = other_side(T_in, d_z, cameras["mirror"]["T_z_m"])
     for role, T in expected.items():
         if role in pair.views and not (off := distance(matrix(pair.views[role], "T_world_cam"), T)) <= ROUNDING:
             yield f"T_world_cam of {role} is off by {off:.3g} from its definition"
@@ -137,7 +139,7 @@ def _has_plain_points(job: Mapping[str, Any]) -> bool:
 def check_pair(pair: StoredPair) -> list[str]:
     """Stored values of one pair that differ from their definitions, a sentence each."""
     cameras, projection = pair.job["cameras"], pair.job["images"]["projection"]
-    switches = {"aligned": cameras["depth"], "mirror": cameras["mirror"], "projected": projection}
+    switches = {**derive.beside(pair.job), "mirror": cameras["mirror"], "projected": projection}
     expected = {"input", *(role for role, branch in switches.items() if branch["enabled"])}
     if set(pair.views) != expected:
         return [f"scene {pair.scene['scene_id']}: has views {sorted(pair.views)}, and must have {sorted(expected)}"]
@@ -173,20 +175,25 @@ def check_merged(read: Callable[[str], bytes], views: Sequence[Row], objects: Se
             yield f"{path}: cannot be read: {error}"
 
 
+def _rank(role: str) -> int:
+    """Where lines of this role come among those of one pose: cameras that the article does not have come last."""
+    order = ("input", "aligned", "mirror", "projected")
+    return order.index(role) if role in order else len(order)
+
+
 def _check_lines(
     lines: Sequence[Sequence[str]], columns: Sequence[str], key: Sequence[str], rows: Sequence[Row]
 ) -> Iterator[str]:
     """Lines in the order of their keys, each with the values of its row and its matrix; names are written as in a URL."""
-    roles = {role: number for number, role in enumerate(derive.IMAGES)}
     table = {}
     for line in lines:
         named = dict(zip([*columns, *_ELEMENTS], map(urllib.parse.unquote, line), strict=True))
-        table[tuple(roles[named[name]] if name == "role" else int(named[name]) for name in key)] = named
+        table[tuple(_rank(named[name]) if name == "role" else int(named[name]) for name in key)] = named
     if len(table) != len(lines) or list(table) != sorted(table):
         yield f"lines are not sorted by {' and '.join(key)}, or a key stands twice"
     for row in rows:
         values = [*(row[name] for name in columns), *row["T_cam_obj" if "T_cam_obj" in row else "T_world_cam"]]
-        named = table.get(tuple(roles[row[name]] if name == "role" else row[name] for name in key), {})
+        named = table.get(tuple(_rank(row[name]) if name == "role" else row[name] for name in key), {})
         pairs = zip([*columns, *_ELEMENTS], values, strict=True)
         if wrong := [name for name, value in pairs if name not in named or type(value)(named[name]) != value]:
             at = ", ".join(f"{name} {row[name]}" for name in key)

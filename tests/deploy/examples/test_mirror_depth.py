@@ -52,7 +52,8 @@ def test_features_and_baseline_hold_nothing_of_the_mirror_view(pairs, examples, 
 
         monkeypatch.setattr(View, name, blind)
     for pair, seen in zip(pairs, examples, strict=True):
-        unlabelled = dataclasses.replace(pair, mirror=dataclasses.replace(pair.mirror, objects=()), projected=None)
+        bare = dataclasses.replace(pair.mirror, objects=())
+        unlabelled = dataclasses.replace(pair, views={"input": pair.input, "mirror": bare})
         again = make_example(unlabelled)
         for name in ("features", "baseline", "background", "turned", "middle_m"):
             assert np.array_equal(getattr(again, name), getattr(seen, name))

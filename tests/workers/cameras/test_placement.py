@@ -10,7 +10,7 @@ from schemas.job.job import Job
 from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import inclination, look_at, orbit_pose
 from workers.geometry.frames import half_turn, pose, rotation_about, translation
-from workers.scene.pairs import front_distance, mirror_pose, object_distance, place_aligned_camera, place_mirror_camera
+from workers.scene.pairs import front_distance, mirror_pose, object_distance, place_beside, place_mirror_camera
 
 JOB = Job(name="t")
 CAMERA = Camera(Intrinsics.of(JOB.cameras.sensor), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5))
@@ -86,7 +86,7 @@ def test_with_roll_the_articles_product_is_another_pose():
 
 
 def test_the_depth_camera_stands_off_in_the_rgb_cameras_own_axes():
-    aligned = place_aligned_camera(CAMERA, JOB.cameras.depth)
+    aligned = place_beside(CAMERA, JOB)["aligned"]
     R = CAMERA.T_world_cam[:3, :3]
     assert R.T @ (aligned.position - CAMERA.position) == pytest.approx([-0.051, 0.001, -0.001])
     assert np.array_equal(aligned.T_world_cam[:3, :3], R)

@@ -1,11 +1,9 @@
 """A virtual capture from its settings to its folder: effects, camera path, photographs, held-out views.
 
-- Which effects a simulated capture runs: one table of effects, and the plan that follows from its settings. Pure.
 - The path of a hand-held camera around an object, as poses at the moments of its photographs.
 - Views of a simulated capture that were not photographed: what synthesised views are compared with.
 
-The plan is of the same kind as that of scenes (schemas/scene/scene.py). Effects of the rendering are no-ops where a
-capture does not call for them; every other one is asked for by name in `captures.simulate`.
+The plan is of the same kind as that of scenes (workers/scene/effects.py). What it does not run is off.
 """
 
 import math
@@ -48,38 +46,13 @@ from workers.capture.simulate.photograph import (
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_codes
 from workers.geometry.frames import pose, rotation_about
+from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
 from workers.scene.plan import SceneChance, Stream, choose_assets
-
-ASKED = (
-    "hidden_markers",
-    "print_scale",
-    "motion_blur",
-    "distortion",
-    "exposure",
-    "rgb_noise",
-    "depth_noise",
-    "registration_error",
-)
-"""Effects that run where `captures.simulate` has a branch of this name. A receipt names them in this order."""
-
-RASTER = ("shadows", "ambient_occlusion", "light_maps")
-TRACED = ("global_illumination", "glass")
-DRAWN = ("rgb", "floor", "table", "textures", "transparency")
-"""What the renderers draw of every capture; antialiasing is not theirs, because photographs are averaged (camera.py)."""
-
-
-def plan_effects(simulate: Simulate) -> EffectPlan:
-    """The effects that a capture runs, and why each of the others does not."""
-    of_tier = RASTER if simulate.tier == "raster" else TRACED
-    ran = [*DRAWN, *of_tier, *(name for name in ASKED if getattr(simulate, name) is not None)]
-    skipped = {name: f"tier is {simulate.tier}" for name in (*RASTER, *TRACED) if name not in of_tier}
-    skipped |= {name: f"captures.simulate.{name} is off" for name in ASKED if name not in ran}
-    return EffectPlan(tuple(ran), skipped)
 
 
 def planned_settings(simulate: Simulate, plan: EffectPlan) -> Simulate:
     """The settings of those effects that the plan runs: every other one is off."""
-    return simulate.model_copy(update=dict.fromkeys(name for name in ASKED if not plan.runs(name)))
+    return simulate.model_copy(update=dict.fromkeys(name for name in CAPTURE_EFFECTS if not plan.runs(name)))
 
 
 VIEWS_PER_TURN = 14
@@ -178,7 +151,7 @@ def write_held_out(studio: Studio, board: Board, target: Array, path: Path) -> N
 
 def without_sensors(studio: Studio) -> Studio:
     """The studio with the same things, seen by ideal cameras."""
-    simulate = studio.simulate.model_copy(update=dict.fromkeys(ASKED))
+    simulate = studio.simulate.model_copy(update=dict.fromkeys(CAPTURE_EFFECTS))
     return replace(studio, simulate=simulate, drawn_color=studio.rig.color, lookup=None)
 
 
@@ -214,7 +187,7 @@ def simulate_capture(
     path.mkdir(parents=True, exist_ok=True)
     if any(path.iterdir()):
         raise CaptureError("exists", f"{path} holds files already: name a new or an empty folder")
-    plan = plan_effects(simulate) if effects is None else effects
+    plan = plan_capture(simulate) if effects is None else effects
     simulate = planned_settings(simulate, plan)
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
     studio = build_studio(simulate, board, thing, plan, chance)

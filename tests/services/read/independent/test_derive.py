@@ -50,10 +50,12 @@ def nearest_for_percentile(plant: Plant, _: Any) -> None:
 
 
 def offset_with_the_other_sign(plant: Plant, _: Any) -> None:
-    original = workers.scene.pairs.place_aligned_camera
+    original = workers.scene.pairs.place_beside
 
-    def planted(camera, depth_camera):
-        return original(camera, depth_camera.model_copy(update={"offset_m": tuple(-x for x in depth_camera.offset_m)}))
+    def planted(camera, job):
+        turned = {"offset_m": tuple(-x for x in job.cameras.depth.offset_m)}
+        cameras = job.cameras.model_copy(update={"depth": job.cameras.depth.model_copy(update=turned)})
+        return original(camera, job.model_copy(update={"cameras": cameras}))
 
     plant(original, planted)
 

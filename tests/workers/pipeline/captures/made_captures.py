@@ -14,7 +14,8 @@ from workers.assets.builtin.make import make_asset
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.simulate.camera import opencv_lens
 from workers.capture.simulate.photograph import build_studio, photograph, place_object
-from workers.capture.simulate.simulate import plan_effects, plan_path, simulate_capture
+from workers.capture.simulate.simulate import plan_path, simulate_capture
+from workers.scene.effects import plan_capture
 from workers.scene.plan import SceneChance, Stream
 
 KEPT = tempfile.TemporaryDirectory(prefix="verso-captures-")
@@ -41,7 +42,7 @@ def made(seed=11, without=(), **settings):
 def _made(settings, seed, without):
     simulate = Simulate.model_validate_json(settings)
     path = Path(tempfile.mkdtemp(dir=KEPT.name))
-    plan = plan_effects(simulate).without(*without)
+    plan = plan_capture(simulate).without(*without)
     truth = simulate_capture(simulate, Board(), asset_of(), SceneChance(seed, 0), path, plan)
     return Made(open_folder(path), truth)
 
@@ -55,7 +56,7 @@ def take_one(seed=11, **settings):
 def _taken(settings, seed):
     simulate, chance, asset = Simulate.model_validate_json(settings), SceneChance(seed, 0), asset_of()
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
-    studio = build_studio(simulate, Board(), thing, plan_effects(simulate), chance)
+    studio = build_studio(simulate, Board(), thing, plan_capture(simulate), chance)
     (T_board_cam, *_) = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
     view, _ = photograph(studio, 0, T_board_cam)
     return view, CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion)), T_board_cam

@@ -22,8 +22,9 @@ from workers.capture.estimate import ProcessorClock
 from workers.capture.folder import open_folder, read_truth
 from workers.capture.make_capture import process_capture
 from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth, place_object
-from workers.capture.simulate.simulate import plan_effects, simulate_capture
+from workers.capture.simulate.simulate import simulate_capture
 from workers.capture.surface.evaluate import compare_poses
+from workers.scene.effects import plan_capture
 from workers.scene.plan import SceneChance, Stream
 from workers.store.images import encode_png
 
@@ -56,7 +57,7 @@ def with_other_depth(path: Path, simulate: Simulate, asset: Asset, number: int) 
     shutil.copytree(path, other, copy_function=os.link)
     chance = chance_of(number)
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
-    studio = build_studio(simulate, Board(), thing, plan_effects(simulate), chance)
+    studio = build_studio(simulate, Board(), thing, plan_capture(simulate), chance)
     truth = read_truth(path)
     assert truth is not None
     for view, T_board_cam in enumerate(truth.T_board_cam):

@@ -13,7 +13,8 @@ from schemas.job.job import Job
 from tests.workers.pipeline.captures.made_captures import asset_of, made
 from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import read_truth, read_view
-from workers.capture.simulate.simulate import ASKED, load_object, simulate_capture
+from workers.capture.simulate.simulate import load_object, simulate_capture
+from workers.scene.effects import CAPTURE_EFFECTS
 from workers.scene.plan import SceneChance
 
 SMALL = {"views": 2, "image_scale": 0.25}
@@ -96,7 +97,7 @@ def test_a_folder_with_files_is_refused():
         simulate_capture(Simulate(), Board(), asset_of(), SceneChance(11, 0), made(**SMALL).folder.path)
 
 
-@pytest.mark.parametrize("name", ASKED)
+@pytest.mark.parametrize("name", CAPTURE_EFFECTS)
 def test_an_effect_that_is_withdrawn_leaves_every_byte_as_it_is_without_it(name):
     withdrawn = made(without=(name,), **SMALL, **{name: ON[name]})
     assert changed(withdrawn, made(**SMALL)) == set()
@@ -105,7 +106,7 @@ def test_an_effect_that_is_withdrawn_leaves_every_byte_as_it_is_without_it(name)
     assert {"effect": name, "why": "withdrawn"} in receipt["skipped"]
 
 
-@pytest.mark.parametrize("name", ASKED)
+@pytest.mark.parametrize("name", CAPTURE_EFFECTS)
 def test_an_effect_changes_its_own_files_and_no_pose(name):
     plain, asked = made(**SMALL), made(**SMALL, **{name: ON[name]})
     assert changed(asked, plain) == CHANGES[name]
