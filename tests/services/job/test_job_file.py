@@ -201,11 +201,11 @@ def test_every_key_is_documented_and_the_page_is_current():
     assert [path for path, field in keys.items() if not field.description] == []
     assert (ROOT / "docs" / "job.md").read_text() == write_doc()
     for key, words in (
-        ("images.projection.splat", "whole number, >= 1, <= 15"),
+        ("images.projection.splat", "integer >=1,<=15"),
         ("start.offset_m", "[low, high]"),
-        ("cameras.depth.offset_m", "list of 3 numbers"),
-        ("run.workers", "whole number, >= 1, <= 100000 or nothing"),
-        ("assets.objects[urdf].up", "`x`, `y`, `z` or map"),
+        ("cameras.depth.offset_m", "3 numbers"),
+        ("run.workers", "integer >=1,<=100000 or `null`"),
+        ("assets.objects[urdf].up", "`x`/`y`/`z` or map"),
     ):
         assert describe_allowed(keys[key]) == words
     assert allowed_keys(["assets", "split", "trian"]) == ["test", "train", "val"]

@@ -76,7 +76,7 @@ def measure(things, *pairs, units=UNITS):
 
 
 def pair_of(first, mirror=None, d_z_m=TOP_Z, aligned=None, projected=None, agreement=None) -> Pair:
-    return Pair(d_z_m, first, aligned, mirror, projected, agreement, agreement)
+    return Pair(d_z_m, first, () if aligned is None else (aligned,), mirror, projected, agreement, agreement)
 
 
 def made(**changes):
