@@ -90,7 +90,6 @@ _SHARED = {
     "balance": "Share of its weight that the contact forces cannot balance.",
     "centre": "Principal point, where the centre of the first pixel is at 0.5.",
     "centre_opencv": "Principal point, where the centre of the first pixel is at 0, as in OpenCV.",
-    "to_world": "takes object coordinates to world coordinates; 4 x 4, row by row.",
     "by_row": "; 4 x 4, row by row.",
     "share_seen": "unoccluded and also outside the frame",
 }
@@ -104,8 +103,8 @@ instance_id | string | - | - | {instance}
 source | string | - | - | {source}
 table_id | string | - | - | The table's shape: the key of `assets`.
 object_scale | double | 1 | - | {scale}
-T_world_obj | double[16] | m | world, object | Pose of the first object at rest: {to_world}
-T_world_table | double[16] | m | world, object | Pose of the table: takes table coordinates to world coordinates{by_row}
+T_world_obj | double[16] | m | world, object | Pose of the first object at rest{by_row}
+T_world_table | double[16] | m | world, object | Pose of the table{by_row}
 pose | string, scenes | - | - | How the objects started: upright, tumbled or placed.
 redraws | int64 | count | - | How often the start position was drawn again before one was valid.
 effects | list of string | - | - | Names of the effects that ran.
@@ -128,7 +127,7 @@ bodies[].category | string | - | - | {category}
 bodies[].instance_id | string | - | - | {instance}
 bodies[].source | string | - | - | {source}
 bodies[].object_scale | double | 1 | - | {scale}
-bodies[].T_world_obj | double[16] | m | world, object | Pose at rest: {to_world}
+bodies[].T_world_obj | double[16] | m | world, object | Pose at rest{by_row}
 bodies[].redraws | int64 | count | - | How often its start position was drawn again.
 bodies[].penetration_mm | double | mm | - | {overlap}
 bodies[].hover_gap_mm | double | mm | - | {gap}
@@ -181,7 +180,7 @@ parent_id | int64 | id | - | The pair: the pose id of its input view.
 role | string | - | - | {role}
 scene_id | int64 | id | - | {scene_id}
 category | string | - | - | {category}
-T_world_cam | double[16] | m | world, camera | Pose of the camera: takes camera coordinates to world coordinates{by_row}
+T_world_cam | double[16] | m | world, camera | Pose of the camera{by_row}
 inclination_rad | double | rad | world | Angle of the optical axis below the horizontal.
 yaw_rad | double | rad | world | Direction from the scene to the camera about the vertical axis, from the x axis.
 width | int64 | px | - | Columns of the image.
@@ -227,7 +226,7 @@ category | string | - | - | {category}
 instance_id | string | - | - | {instance}
 u | int64 | px | image | Column of the object's origin; -1 outside the image or behind the camera.
 v | int64 | px | image | Row of the object's origin; -1 outside the image or behind the camera.
-T_cam_obj | double[16] | m | camera, object | Pose: takes object coordinates to camera coordinates{by_row}
+T_cam_obj | double[16] | m | camera, object | Pose{by_row}
 bbox_xywh | int64[4] | px | image | Bounding box of its pixels: left, top, width, height.
 pixels | int64 | count | - | Pixels of it that are seen.
 visible_fraction | double | 1 | - | Share that is seen of its own pixels, {share_seen}.
