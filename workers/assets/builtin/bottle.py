@@ -6,24 +6,8 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.builtin.materials import (
-    Color,
-    band_height,
-    bands,
-    chance,
-    clear_glass,
-    glass_color,
-    jitter,
-    label,
-    mix,
-    pale,
-    pick,
-    plastic,
-    solid_color,
-    steel,
-    textured,
-    vivid,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import Color, chance, pick
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import lathe
 from workers.assets.builtin.sweeps import bezier, fillet, rounded_sections, squircle
@@ -157,14 +141,16 @@ def _sections(profile: Array, body: float, shoulder: float, squareness: int, dep
 def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Array) -> tuple[Surface, ...]:
     body = _body_material(rng, kind)
     color: Color = body.base_color[:3]
-    paper = pick(rng, (pale(rng), (0.93, 0.92, 0.88), vivid(rng)))
+    paper = pick(rng, (paint.pale(rng), (0.93, 0.92, 0.88), paint.vivid(rng)))
     on_label = np.flatnonzero(surface == LABEL)
     low, high = float(corners[on_label[0], 1]), float(corners[on_label[-1] + 1, 1])
     printed = body
     if chance(rng, 0.8):
-        rows = band_height(low, high, float(corners[on_label[0], 0]))
-        picture = label(rng, paper, rows) if chance(rng, 0.8) else bands(rng, [paper, vivid(rng), color])
-        printed = textured(picture, rng.uniform(0.4, 0.7))
+        rows = paint.band_height(low, high, float(corners[on_label[0], 0]))
+        picture = (
+            paint.label(rng, paper, rows) if chance(rng, 0.8) else paint.bands(rng, [paper, paint.vivid(rng), color])
+        )
+        printed = paint.textured(picture, rng.uniform(0.4, 0.7))
     return (
         Surface("body", body),
         Surface("label", printed, "cylinder", low=low, high=high),
@@ -174,22 +160,26 @@ def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Arr
 
 def _body_material(rng: np.random.Generator, kind: Kind) -> Material:
     if kind.material == "glass":
-        return clear_glass(glass_color(rng), rng.uniform(0.08, 0.18))
+        return paint.clear_glass(paint.glass_color(rng), rng.uniform(0.08, 0.18))
     if kind.material == "clear":
         tint = pick(
             rng, ((0.72, 0.82, 0.85), (0.6, 0.74, 0.82), (0.66, 0.8, 0.66), (0.28, 0.12, 0.06), (0.78, 0.5, 0.16))
         )
-        return clear_glass(jitter(rng, tint, 0.04), rng.uniform(0.1, 0.25))
+        return paint.clear_glass(paint.jitter(rng, tint, 0.04), rng.uniform(0.1, 0.25))
     if kind.material == "metal":
-        return steel(rng) if chance(rng, 0.3) else solid_color(jitter(rng, vivid(rng)), rng.uniform(0.35, 0.65))
-    return plastic(rng)
+        return (
+            paint.steel(rng)
+            if chance(rng, 0.3)
+            else paint.solid_color(paint.jitter(rng, paint.vivid(rng)), rng.uniform(0.35, 0.65))
+        )
+    return paint.plastic(rng)
 
 
 def _cap_material(rng: np.random.Generator, kind: Kind) -> Material:
     if kind.cap == "cork":
-        return solid_color(jitter(rng, (0.72, 0.56, 0.38)), 0.85)
+        return paint.solid_color(paint.jitter(rng, (0.72, 0.56, 0.38)), 0.85)
     if kind.cap == "crown":
-        return steel(rng) if chance(rng, 0.5) else solid_color(vivid(rng), 0.35, metallic=0.4)
+        return paint.steel(rng) if chance(rng, 0.5) else paint.solid_color(paint.vivid(rng), 0.35, metallic=0.4)
     if kind.cap == "foil":
-        return solid_color(mix(vivid(rng), (0.1, 0.05, 0.05), 0.5), 0.4, metallic=0.3)
-    return steel(rng) if chance(rng, 0.15) else plastic(rng)
+        return paint.solid_color(paint.mix(paint.vivid(rng), (0.1, 0.05, 0.05), 0.5), 0.4, metallic=0.3)
+    return paint.steel(rng) if chance(rng, 0.15) else paint.plastic(rng)

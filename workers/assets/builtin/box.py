@@ -6,30 +6,8 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.builtin.materials import (
-    BLACK,
-    WHITE,
-    band_height,
-    bands,
-    blank,
-    chance,
-    dots,
-    ink_on,
-    jitter,
-    kraft,
-    label,
-    metal,
-    mix,
-    pale,
-    pick,
-    rgb,
-    solid_color,
-    textured,
-    upright_stripes,
-    vivid,
-    wood,
-    wood_colors,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import chance, pick
 from workers.assets.builtin.parts import Model, Surface, over_top
 from workers.assets.builtin.solid import Solid, circle, combine, difference, lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism, split_sides, straight_prism
@@ -73,28 +51,28 @@ def _carton(rng: np.random.Generator) -> Model:
     """A cardboard carton: four flaps above, a slot between them, tape along it."""
     size = draw_size(rng, (0.16, 0.4), (0.55, 0.95), (0.4, 0.95))
     w, d, h = size
-    board = jitter(rng, (0.72, 0.56, 0.38), 0.05)
+    board = paint.jitter(rng, (0.72, 0.56, 0.38), 0.05)
     crease = rng.uniform(0.0015, 0.003)
     slot = straight_prism((w + 0.02, 0.003), h - 0.0015, h + 0.01, 0.0008, OTHER)
-    paper = textured(kraft(rng, board), 0.85)
-    printed = kraft(rng, board)
+    paper = paint.textured(paint.kraft(rng, board), 0.85)
+    printed = paint.kraft(rng, board)
     if chance(rng, 0.7):
-        mark = label(rng, board, height=64, width=128, faces=1)
-        inked = np.abs(mark.astype(np.int16) - rgb(board)).sum(axis=2) > 40
+        mark = paint.label(rng, board, height=64, width=128, faces=1)
+        inked = np.abs(mark.astype(np.int16) - paint.rgb(board)).sum(axis=2) > 40
         printed[40:104] = np.where(inked[..., None], mark, printed[40:104])
-    top = kraft(rng, board)
+    top = paint.kraft(rng, board)
     if chance(rng, 0.75):
-        tape = pick(rng, ((0.8, 0.68, 0.45), (0.85, 0.83, 0.78), vivid(rng)))
+        tape = pick(rng, ((0.8, 0.68, 0.45), (0.85, 0.83, 0.78), paint.vivid(rng)))
         half = max(2, round(0.5 * 128 * rng.uniform(0.05, 0.07) / d))
-        top[64 - half : 64 + half] = rgb(mix(board, tape, 0.8))
-    front, back = _front_and_back(textured(printed, 0.85), size)
+        top[64 - half : 64 + half] = paint.rgb(paint.mix(board, tape, 0.8))
+    front, back = _front_and_back(paint.textured(printed, 0.85), size)
     surfaces = (
         front,
         Surface("sides", paper, "box", size=max(size)),
-        over_top("top", textured(top, 0.7), w, d),
-        Surface("bottom", solid_color(board, 0.85)),
+        over_top("top", paint.textured(top, 0.7), w, d),
+        Surface("bottom", paint.solid_color(board, 0.85)),
         back,
-        Surface("slot", solid_color(mix(board, BLACK, 0.5), 0.9)),
+        Surface("slot", paint.solid_color(paint.mix(board, paint.BLACK, 0.5), 0.9)),
     )
     return Model(_slotted(size, crease, 0.004, 6, slot), surfaces)
 
@@ -109,27 +87,27 @@ def make_lidded(rng: np.random.Generator) -> Model:
     profile = np.column_stack([[step + b, step, step, step, 0.0, 0.0, b], levels])
     numbers = [BOTTOM, SIDE, SIDE, SIDE, BOTTOM, LID, LID, TOP]
     body = prism(profile, (w, d), rng.uniform(0.0035, 0.006), numbers, 3, (6, 6))
-    color = pick(rng, (vivid(rng), pale(rng), WHITE, BLACK))
-    cover = color if chance(rng, 0.4) else jitter(rng, vivid(rng))
+    color = pick(rng, (paint.vivid(rng), paint.pale(rng), paint.WHITE, paint.BLACK))
+    cover = color if chance(rng, 0.4) else paint.jitter(rng, paint.vivid(rng))
     roughness = rng.uniform(0.4, 0.8)
-    side = Surface("side", solid_color(color, roughness))
-    top = Surface("top", solid_color(cover, roughness))
-    ribbon = Surface("ribbon", solid_color(vivid(rng), 0.35))
+    side = Surface("side", paint.solid_color(color, roughness))
+    top = Surface("top", paint.solid_color(cover, roughness))
+    ribbon = Surface("ribbon", paint.solid_color(paint.vivid(rng), 0.35))
     if chance(rng, 0.5):
         body = union([body, *_ribbon(rng, size)])
     elif chance(rng, 0.7):
-        top = over_top("top", textured(label(rng, cover, height=128, width=128, faces=1), roughness), w, d)
+        top = over_top("top", paint.textured(paint.label(rng, cover, height=128, width=128, faces=1), roughness), w, d)
     if chance(rng, 0.4):
         patterns = (
-            dots(rng, color, mix(color, ink_on(rng, color), 0.7), 256),
-            upright_stripes(rng, [color, mix(color, WHITE, 0.5)]),
+            paint.dots(rng, color, paint.mix(color, paint.ink_on(rng, color), 0.7), 256),
+            paint.upright_stripes(rng, [color, paint.mix(color, paint.WHITE, 0.5)]),
         )
-        side = Surface("side", textured(pick(rng, patterns), roughness), "box", size=max(size))
+        side = Surface("side", paint.textured(pick(rng, patterns), roughness), "box", size=max(size))
     surfaces = (
         side,
-        Surface("lid", solid_color(cover, roughness)),
+        Surface("lid", paint.solid_color(cover, roughness)),
         top,
-        Surface("bottom", solid_color(mix(color, BLACK, 0.2), 0.8)),
+        Surface("bottom", paint.solid_color(paint.mix(color, paint.BLACK, 0.2), 0.8)),
         ribbon,
     )
     return Model(body, surfaces)
@@ -175,19 +153,25 @@ def _packet(rng: np.random.Generator) -> Model:
     w, d, h = size
     seam = straight_prism((w + 0.02, 0.0016), h - 0.001, h + 0.01, 0.0004, OTHER)
     body = _slotted(size, 0.0015, 0.0025, 5, seam.moved(y=d * rng.uniform(-0.2, 0.2)))
-    paper = vivid(rng) if chance(rng, 0.75) else pale(rng)
-    picture = label(rng, paper, height=160, width=128, faces=1)
+    paper = paint.vivid(rng) if chance(rng, 0.75) else paint.pale(rng)
+    picture = paint.label(rng, paper, height=160, width=128, faces=1)
     gloss = rng.uniform(0.35, 0.7)
-    front, back = _front_and_back(textured(picture, gloss), size)
-    second = bands(rng, [paper, mix(paper, WHITE, 0.6)]) if chance(rng, 0.4) else blank(8, 8, jitter(rng, paper))
-    side = Surface("sides", textured(second, gloss), "plane", origin=(0, -d / 2, 0), across=(0, d, 0), up=(0, 0, h))
+    front, back = _front_and_back(paint.textured(picture, gloss), size)
+    second = (
+        paint.bands(rng, [paper, paint.mix(paper, paint.WHITE, 0.6)])
+        if chance(rng, 0.4)
+        else paint.blank(8, 8, paint.jitter(rng, paper))
+    )
+    side = Surface(
+        "sides", paint.textured(second, gloss), "plane", origin=(0, -d / 2, 0), across=(0, d, 0), up=(0, 0, h)
+    )
     surfaces = (
         front,
         side,
-        Surface("top", solid_color(jitter(rng, paper, 0.02), gloss)),
-        Surface("bottom", solid_color(paper, 0.7)),
+        Surface("top", paint.solid_color(paint.jitter(rng, paper, 0.02), gloss)),
+        Surface("bottom", paint.solid_color(paper, 0.7)),
         back,
-        Surface("seam", solid_color(mix(paper, BLACK, 0.5), 0.8)),
+        Surface("seam", paint.solid_color(paint.mix(paper, paint.BLACK, 0.5), 0.8)),
     )
     return Model(body, surfaces)
 
@@ -205,15 +189,15 @@ def _tin(rng: np.random.Generator) -> Model:
         ]
     )
     body = prism(profile, (w, d), radius, [BOTTOM, BOTTOM, *[SIDE] * 3, *[LID] * 5, TOP], 6, (2, 2))
-    paper = vivid(rng) if chance(rng, 0.7) else pale(rng)
+    paper = paint.vivid(rng) if chance(rng, 0.7) else paint.pale(rng)
     shine, gloss = (0.5 if chance(rng, 0.4) else 0.0), rng.uniform(0.3, 0.5)
-    lid = metal(rng) if chance(rng, 0.3) else solid_color(jitter(rng, paper), gloss, shine)
-    picture = label(rng, paper, band_height(0.0, h, 0.5 * (w + d) / 3.14), faces=2)
+    lid = paint.metal(rng) if chance(rng, 0.3) else paint.solid_color(paint.jitter(rng, paper), gloss, shine)
+    picture = paint.label(rng, paper, paint.band_height(0.0, h, 0.5 * (w + d) / 3.14), faces=2)
     surfaces = (
-        Surface("side", textured(picture, gloss, shine), "cylinder", low=0.0, high=h - deep),
+        Surface("side", paint.textured(picture, gloss, shine), "cylinder", low=0.0, high=h - deep),
         Surface("lid", lid),
         Surface("top", lid),
-        Surface("bottom", metal(rng)),
+        Surface("bottom", paint.metal(rng)),
     )
     return Model(body, surfaces)
 
@@ -234,7 +218,7 @@ def _chest(rng: np.random.Generator) -> Model:
     if chance(rng, 0.6):
         slab = prism(bevelled_profile(0.5 * lid, 0.001), (0.1 * w, 0.008), 0.0015, [EXTRA] * 5, 2)
         body = union([body, slab.moved(y=-d / 2, z=h - 1.25 * lid)])
-    light, dark = wood_colors(rng)
-    timber = textured(wood(rng, light, dark, size=128), rng.uniform(0.5, 0.8))
+    light, dark = paint.wood_colors(rng)
+    timber = paint.textured(paint.wood(rng, light, dark, size=128), rng.uniform(0.5, 0.8))
     grain = [Surface(name, timber, "box", size=max(size)) for name in ("side", "lid", "top", "bottom")]
-    return Model(body, (*grain, Surface("clasp", metal(rng))))
+    return Model(body, (*grain, Surface("clasp", paint.metal(rng))))

@@ -3,21 +3,8 @@
 import numpy as np
 
 from schemas.scene.shape import Material
-from workers.assets.builtin.materials import (
-    BLACK,
-    Color,
-    Texture,
-    blend,
-    chance,
-    jitter,
-    mix,
-    noise,
-    pick,
-    solid_color,
-    steel,
-    textured,
-    vivid,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import Color, Texture, chance, pick
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, combine, lathe, level_ring, loft, union_at
 from workers.assets.builtin.sweeps import fillet, prism, straight_prism
@@ -158,34 +145,39 @@ def _grip(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
 
 
 def _surfaces(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> tuple[Surface, ...]:
-    dark: Color = jitter(rng, (0.1, 0.1, 0.105), 0.03)
+    dark: Color = paint.jitter(rng, (0.1, 0.1, 0.105), 0.03)
     if kind == 0:
-        shell, skin = solid_color(dark, rng.uniform(0.5, 0.7)), dark
+        shell, skin = paint.solid_color(dark, rng.uniform(0.5, 0.7)), dark
     else:
-        plate = steel(rng) if chance(rng, 0.6) else solid_color(dark, 0.4)
-        colors = (dark, dark, (0.3, 0.17, 0.1), vivid(rng), mix(vivid(rng), BLACK, 0.4))
+        plate = paint.steel(rng) if chance(rng, 0.6) else paint.solid_color(dark, 0.4)
+        colors = (dark, dark, (0.3, 0.17, 0.1), paint.vivid(rng), paint.mix(paint.vivid(rng), paint.BLACK, 0.4))
         shell, skin = plate, pick(rng, colors)
         if kind == 2 and chance(rng, 0.6):
-            paint = solid_color(vivid(rng) if chance(rng, 0.5) else jitter(rng, (0.75, 0.75, 0.76)), 0.4)
-            return _order(textured(_leather(rng, paint.base_color[:3], 0.06), 0.4), paint, rng)
-    return _order(textured(_leather(rng, skin, 0.5), 0.75), shell, rng, max(size))
+            coat = paint.solid_color(
+                paint.vivid(rng) if chance(rng, 0.5) else paint.jitter(rng, (0.75, 0.75, 0.76)), 0.4
+            )
+            return _order(paint.textured(_leather(rng, coat.base_color[:3], 0.06), 0.4), coat, rng)
+    return _order(paint.textured(_leather(rng, skin, 0.5), 0.75), shell, rng, max(size))
 
 
 def _order(skin: Material, shell: Material, rng: np.random.Generator, size: float = 0.1) -> tuple[Surface, ...]:
-    lens = solid_color(jitter(rng, (0.09, 0.09, 0.095), 0.03), 0.45) if chance(rng, 0.75) else steel(rng)
-    ring = pick(rng, (steel(rng), solid_color(jitter(rng, (0.75, 0.1, 0.1)), 0.4), steel(rng)))
+    lens = (
+        paint.solid_color(paint.jitter(rng, (0.09, 0.09, 0.095), 0.03), 0.45) if chance(rng, 0.75) else paint.steel(rng)
+    )
+    ring = pick(rng, (paint.steel(rng), paint.solid_color(paint.jitter(rng, (0.75, 0.1, 0.1)), 0.4), paint.steel(rng)))
     return (
         Surface("skin", skin, "box", size=0.5 * size),
         Surface("shell", shell),
         Surface("lens", lens),
         Surface("ring", ring),
-        Surface("glass", solid_color((0.08, 0.09, 0.16), 0.08)),
-        Surface("dial", steel(rng) if chance(rng, 0.5) else solid_color(BLACK, 0.5)),
-        Surface("display", solid_color((0.04, 0.045, 0.06), 0.15)),
-        Surface("shoe", solid_color((0.3, 0.3, 0.31), 0.45)),
+        Surface("glass", paint.solid_color((0.08, 0.09, 0.16), 0.08)),
+        Surface("dial", paint.steel(rng) if chance(rng, 0.5) else paint.solid_color(paint.BLACK, 0.5)),
+        Surface("display", paint.solid_color((0.04, 0.045, 0.06), 0.15)),
+        Surface("shoe", paint.solid_color((0.3, 0.3, 0.31), 0.45)),
     )
 
 
 def _leather(rng: np.random.Generator, color: Color, depth: float) -> Texture:
     """A texture of grained leather."""
-    return blend(mix(color, BLACK, depth), mix(color, (0.9, 0.9, 0.9), 0.15 * depth), noise(rng, 64, 64, 32, 32))
+    dark, light = paint.mix(color, paint.BLACK, depth), paint.mix(color, (0.9, 0.9, 0.9), 0.15 * depth)
+    return paint.blend(dark, light, paint.noise(rng, 64, 64, 32, 32))

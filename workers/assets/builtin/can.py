@@ -4,25 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from workers.assets.builtin.materials import (
-    Color,
-    Texture,
-    band_height,
-    bands,
-    blank,
-    chance,
-    ink_on,
-    label,
-    mix,
-    pale,
-    pick,
-    plastic,
-    rgb,
-    solid_color,
-    steel,
-    textured,
-    vivid,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import Color, Texture, chance, pick
 from workers.assets.builtin.parts import Model, Surface, over_top
 from workers.assets.builtin.solid import lathe
 from workers.assets.builtin.sweeps import fillet
@@ -47,7 +30,7 @@ def make_can(rng: np.random.Generator) -> Model:
     on_side = np.flatnonzero(surface == SIDE)
     low, high = float(levels[on_side[0]]), float(levels[on_side[-1] + 1])
     lid_radius = float(radii[np.flatnonzero(surface == LID)[0]])
-    rows = band_height(low, high, float(radii[on_side[0]]))
+    rows = paint.band_height(low, high, float(radii[on_side[0]]))
     return Model(solid, _surfaces(rng, build is _drink, low, high, rows, lid_radius))
 
 
@@ -118,34 +101,34 @@ def _paint(rng: np.random.Generator) -> Outline:
 def _surfaces(
     rng: np.random.Generator, drink: bool, low: float, high: float, rows: int, lid_radius: float
 ) -> tuple[Surface, ...]:
-    bare = steel(rng)
-    paper: Color = vivid(rng) if chance(rng, 0.6) else pale(rng)
+    bare = paint.steel(rng)
+    paper: Color = paint.vivid(rng) if chance(rng, 0.6) else paint.pale(rng)
     if chance(rng, 0.08):
         side = bare
     else:
         if chance(rng, 0.8):
-            picture = label(rng, paper, rows, faces=int(rng.integers(2, 4)))
+            picture = paint.label(rng, paper, rows, faces=int(rng.integers(2, 4)))
         else:
-            picture = bands(rng, [paper, ink_on(rng, paper), vivid(rng)])
+            picture = paint.bands(rng, [paper, paint.ink_on(rng, paper), paint.vivid(rng)])
         shiny = drink or chance(rng, 0.4)
         roughness = rng.uniform(0.3, 0.5) if shiny else rng.uniform(0.6, 0.8)
-        side = textured(picture, roughness, 0.35 if drink else 0.0)
+        side = paint.textured(picture, roughness, 0.35 if drink else 0.0)
     lid = Surface("lid", bare)
     if drink:
-        opener = textured(_opener(bare.base_color[:3]), bare.roughness, 1.0)
+        opener = paint.textured(_opener(bare.base_color[:3]), bare.roughness, 1.0)
         lid = over_top("lid", opener, 2 * lid_radius, 2 * lid_radius)
-    top = plastic(rng) if chance(rng, 0.8) else solid_color(mix(paper, (0.95, 0.95, 0.95), 0.5), 0.5)
+    top = paint.plastic(rng) if chance(rng, 0.8) else paint.solid_color(paint.mix(paper, (0.95, 0.95, 0.95), 0.5), 0.5)
     return Surface("side", side, "cylinder", low=low, high=high), Surface("metal", bare), lid, Surface("cap", top)
 
 
 def _opener(color: Color) -> Texture:
     """A drinks lid seen from above: the score line of the mouth, and the ring pull."""
-    picture = blank(64, 64, color)
+    picture = paint.blank(64, 64, color)
     y, x = (np.arange(64)[:, None] - 31.5) / 32, (np.arange(64)[None] - 31.5) / 32
     mouth = (x / 0.3) ** 2 + ((y - 0.42) / 0.4) ** 2
-    picture[np.abs(mouth - 1.0) < 0.14] = rgb(mix(color, (0.2, 0.2, 0.2), 0.6))
+    picture[np.abs(mouth - 1.0) < 0.14] = paint.rgb(paint.mix(color, (0.2, 0.2, 0.2), 0.6))
     tab = (x / 0.2) ** 2 + ((y + 0.16) / 0.4) ** 2
     hole = (x / 0.11) ** 2 + ((y + 0.3) / 0.14) ** 2
-    picture[(tab < 1.0) & (hole > 1.0)] = rgb(mix(color, (1.0, 1.0, 1.0), 0.4))
-    picture[(np.abs(tab - 1.0) < 0.16) | (np.abs(hole - 1.0) < 0.3)] = rgb(mix(color, (0.1, 0.1, 0.1), 0.6))
+    picture[(tab < 1.0) & (hole > 1.0)] = paint.rgb(paint.mix(color, (1.0, 1.0, 1.0), 0.4))
+    picture[(np.abs(tab - 1.0) < 0.16) | (np.abs(hole - 1.0) < 0.3)] = paint.rgb(paint.mix(color, (0.1, 0.1, 0.1), 0.6))
     return picture

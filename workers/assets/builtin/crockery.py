@@ -5,29 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.materials import (
-    WHITE,
-    band_height,
-    bands,
-    chance,
-    dots,
-    flecked,
-    glaze_color,
-    ink_on,
-    jitter,
-    label,
-    metal,
-    mix,
-    pale,
-    pick,
-    solid_color,
-    steel,
-    textured,
-    upright_stripes,
-    vivid,
-    wood,
-    wood_colors,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import chance, pick
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, lathe
 from workers.assets.builtin.sweeps import (
@@ -68,11 +47,11 @@ def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     high = float(wall.profile[:, 1].max())
     kind = rng.random()
     if kind < 0.12:
-        metal = steel(rng)
-        return Surface("outside", metal), Surface("inside", metal), Surface("base", metal)
+        bare = paint.steel(rng)
+        return Surface("outside", bare), Surface("inside", bare), Surface("base", bare)
     if kind < 0.32:
-        light, dark = wood_colors(rng)
-        timber = textured(wood(rng, light, dark, size=128), rng.uniform(0.45, 0.7))
+        light, dark = paint.wood_colors(rng)
+        timber = paint.textured(paint.wood(rng, light, dark, size=128), rng.uniform(0.45, 0.7))
         # The grain runs along x through the whole block that the bowl was turned from: no seam anywhere.
         reach = float(wall.profile[:, 0].max())
         across, up = (2 * reach, 0.0, 0.0), (0.0, 1.6 * reach, 1.2 * reach)
@@ -83,21 +62,21 @@ def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
 
 def _pottery(rng: np.random.Generator, high: float, radius: float) -> tuple[Surface, Surface, Surface]:
     roughness = rng.uniform(0.15, 0.4) if chance(rng, 0.75) else rng.uniform(0.6, 0.85)
-    ground = glaze_color(rng)
-    inside = ground if chance(rng, 0.45) else jitter(rng, WHITE, 0.03)
-    outside = solid_color(ground, roughness)
+    ground = paint.glaze_color(rng)
+    inside = ground if chance(rng, 0.45) else paint.jitter(rng, paint.WHITE, 0.03)
+    outside = paint.solid_color(ground, roughness)
     if chance(rng, 0.55):
-        ink, rows = ink_on(rng, ground), band_height(0.0, 1.4 * high, 0.75 * radius)
+        ink, rows = paint.ink_on(rng, ground), paint.band_height(0.0, 1.4 * high, 0.75 * radius)
         painters = (
-            lambda: bands(rng, [ground, mix(ground, ink, 0.7), pale(rng)]),
-            lambda: upright_stripes(rng, [ground, ground, mix(ground, ink, 0.6)]),
-            lambda: dots(rng, ground, mix(ground, ink, 0.8), rows),
-            lambda: flecked(rng, ground, rows),
+            lambda: paint.bands(rng, [ground, paint.mix(ground, ink, 0.7), paint.pale(rng)]),
+            lambda: paint.upright_stripes(rng, [ground, ground, paint.mix(ground, ink, 0.6)]),
+            lambda: paint.dots(rng, ground, paint.mix(ground, ink, 0.8), rows),
+            lambda: paint.flecked(rng, ground, rows),
         )
-        outside = textured(pick(rng, painters)(), roughness)
+        outside = paint.textured(pick(rng, painters)(), roughness)
     first = Surface("outside", outside, "cylinder", low=0.0, high=high)
-    base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
-    return first, Surface("inside", solid_color(inside, roughness)), Surface("base", base)
+    base = paint.solid_color(paint.mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
+    return first, Surface("inside", paint.solid_color(inside, roughness)), Surface("base", base)
 
 
 HANDLE = 3
@@ -169,25 +148,25 @@ def _path(rng: np.random.Generator, start: Array, out: Array, stop: Array, back:
 def _surfaces_mug(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     low, high = float(wall.outer[0, 1]), float(wall.profile[:, 1].max())
     roughness = rng.uniform(0.15, 0.35) if chance(rng, 0.75) else rng.uniform(0.6, 0.85)
-    ground = jitter(rng, WHITE, 0.03) if chance(rng, 0.35) else glaze_color(rng)
-    inside = ground if chance(rng, 0.5) else jitter(rng, WHITE, 0.03)
-    body = solid_color(ground, roughness)
+    ground = paint.jitter(rng, paint.WHITE, 0.03) if chance(rng, 0.35) else paint.glaze_color(rng)
+    inside = ground if chance(rng, 0.5) else paint.jitter(rng, paint.WHITE, 0.03)
+    body = paint.solid_color(ground, roughness)
     if chance(rng, 0.55):
-        height = band_height(low, high, wall.radius_at(0.5 * high))
+        height = paint.band_height(low, high, wall.radius_at(0.5 * high))
         painters = (
-            lambda: bands(rng, [ground, ink_on(rng, ground), pale(rng)]),
-            lambda: label(rng, ground, height),
-            lambda: dots(rng, ground, ink_on(rng, ground), height),
-            lambda: upright_stripes(rng, [ground, ground, mix(ground, ink_on(rng, ground), 0.7)]),
-            lambda: flecked(rng, ground, height),
+            lambda: paint.bands(rng, [ground, paint.ink_on(rng, ground), paint.pale(rng)]),
+            lambda: paint.label(rng, ground, height),
+            lambda: paint.dots(rng, ground, paint.ink_on(rng, ground), height),
+            lambda: paint.upright_stripes(rng, [ground, ground, paint.mix(ground, paint.ink_on(rng, ground), 0.7)]),
+            lambda: paint.flecked(rng, ground, height),
         )
-        body = textured(pick(rng, painters)(), roughness)
-    grip = ground if chance(rng, 0.75) else vivid(rng)
-    handle = metal(rng) if chance(rng, 0.06) else solid_color(grip, roughness)
-    base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
+        body = paint.textured(pick(rng, painters)(), roughness)
+    grip = ground if chance(rng, 0.75) else paint.vivid(rng)
+    handle = paint.metal(rng) if chance(rng, 0.06) else paint.solid_color(grip, roughness)
+    base = paint.solid_color(paint.mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
     return (
         Surface("body", body, "cylinder", low=low, high=high),
-        Surface("inside", solid_color(inside, roughness)),
+        Surface("inside", paint.solid_color(inside, roughness)),
         Surface("base", base),
         Surface("handle", handle),
     )

@@ -5,27 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.scene.shape import Material
-from workers.assets.builtin.materials import (
-    WHITE,
-    Color,
-    band_height,
-    bands,
-    blank,
-    chance,
-    clear_glass,
-    dots,
-    flecked,
-    glaze_color,
-    ink_on,
-    jitter,
-    label,
-    mix,
-    pale,
-    pick,
-    solid_color,
-    textured,
-    upright_stripes,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import Color, chance, pick
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, circle, lathe
 from workers.assets.builtin.sweeps import (
@@ -131,10 +112,10 @@ def _ears(rng: np.random.Generator, wall: Wall) -> list[Solid]:
 
 def _surfaces(rng: np.random.Generator, wall: Wall, glass: bool) -> tuple[Surface, ...]:
     high = float(wall.profile[:, 1].max())
-    rows = band_height(0.0, high, float(wall.outer[:, 0].max()))
+    rows = paint.band_height(0.0, high, float(wall.outer[:, 0].max()))
     if glass:
-        tint = jitter(rng, pick(rng, ((0.74, 0.83, 0.83), (0.66, 0.76, 0.74), (0.32, 0.2, 0.1))), 0.04)
-        outside = base = clear_glass(tint, rng.uniform(0.08, 0.2))
+        tint = paint.jitter(rng, pick(rng, ((0.74, 0.83, 0.83), (0.66, 0.76, 0.74), (0.32, 0.2, 0.1))), 0.04)
+        outside = base = paint.clear_glass(tint, rng.uniform(0.08, 0.2))
         inside = replace(base, ior=1.0)
         if chance(rng, 0.6):
             outside = _on_glass(rng, tint, rows)
@@ -144,36 +125,36 @@ def _surfaces(rng: np.random.Generator, wall: Wall, glass: bool) -> tuple[Surfac
         Surface("outside", outside, "cylinder", low=0.0, high=high),
         Surface("inside", inside),
         Surface("base", base),
-        Surface("ears", solid_color(inside.base_color[:3], inside.roughness)),
+        Surface("ears", paint.solid_color(inside.base_color[:3], inside.roughness)),
     )
 
 
 def _on_glass(rng: np.random.Generator, tint: Color, rows: int) -> Material:
     """A glass with a paper label around its middle."""
-    paper = pale(rng) if chance(rng, 0.6) else (0.92, 0.9, 0.84)
-    printed = label(rng, paper, height=rows // 2)
-    picture = blank(rows, 256, tint)
+    paper = paint.pale(rng) if chance(rng, 0.6) else (0.92, 0.9, 0.84)
+    printed = paint.label(rng, paper, height=rows // 2)
+    picture = paint.blank(rows, 256, tint)
     top = int(0.36 * rows)
     picture[top : top + len(printed)] = printed
     clear = np.full(picture.shape[:2], 255, np.uint8)
     clear[top : top + len(printed)] = 0
     clear.setflags(write=False)
-    return replace(textured(picture, 0.35), transmission=1.0, transmission_map=clear)
+    return replace(paint.textured(picture, 0.35), transmission=1.0, transmission_map=clear)
 
 
 def _pottery(rng: np.random.Generator, rows: int) -> tuple[Material, Material, Material]:
     roughness = rng.uniform(0.15, 0.4) if chance(rng, 0.6) else rng.uniform(0.65, 0.9)
-    ground = jitter(rng, (0.68, 0.4, 0.27), 0.06) if chance(rng, 0.2) else glaze_color(rng)
-    plain = solid_color(ground, roughness)
-    base = solid_color(mix(ground, (0.7, 0.6, 0.5), 0.6), 0.85)
+    ground = paint.jitter(rng, (0.68, 0.4, 0.27), 0.06) if chance(rng, 0.2) else paint.glaze_color(rng)
+    plain = paint.solid_color(ground, roughness)
+    base = paint.solid_color(paint.mix(ground, (0.7, 0.6, 0.5), 0.6), 0.85)
     if chance(rng, 0.4):
         return plain, plain, base
-    ink = ink_on(rng, ground)
+    ink = paint.ink_on(rng, ground)
     painters = (
-        lambda: bands(rng, [ground, mix(ground, ink, 0.7), pale(rng)]),
-        lambda: upright_stripes(rng, [ground, ground, mix(ground, ink, 0.5)]),
-        lambda: dots(rng, ground, mix(ground, ink, 0.7), rows),
-        lambda: flecked(rng, ground, rows),
-        lambda: bands(rng, [ground, WHITE, ink]),
+        lambda: paint.bands(rng, [ground, paint.mix(ground, ink, 0.7), paint.pale(rng)]),
+        lambda: paint.upright_stripes(rng, [ground, ground, paint.mix(ground, ink, 0.5)]),
+        lambda: paint.dots(rng, ground, paint.mix(ground, ink, 0.7), rows),
+        lambda: paint.flecked(rng, ground, rows),
+        lambda: paint.bands(rng, [ground, paint.WHITE, ink]),
     )
-    return textured(pick(rng, painters)(), roughness), plain, base
+    return paint.textured(pick(rng, painters)(), roughness), plain, base

@@ -6,26 +6,8 @@ import math
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.materials import (
-    BLACK,
-    WHITE,
-    Color,
-    Texture,
-    blank,
-    blend,
-    chance,
-    draw_small_print,
-    hsv,
-    jitter,
-    lightness,
-    mix,
-    noise,
-    pick,
-    rgb,
-    solid_color,
-    textured,
-    vivid,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import Color, Texture, chance, pick
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import TRIG_DIGITS, Solid, combine, difference, lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism, straight_prism
@@ -92,21 +74,23 @@ def _surfaces(
     width, depth = size
     greys = ((0.76, 0.77, 0.78), (0.62, 0.63, 0.65), (0.34, 0.35, 0.37), (0.12, 0.12, 0.13))
     if chance(rng, 0.88):
-        color = jitter(rng, pick(rng, (*greys, (0.84, 0.78, 0.72))), 0.03)
+        color = paint.jitter(rng, pick(rng, (*greys, (0.84, 0.78, 0.72))), 0.03)
     else:
-        color = mix(vivid(rng), (0.5, 0.5, 0.5), 0.4)
+        color = paint.mix(paint.vivid(rng), (0.5, 0.5, 0.5), 0.4)
     metallic = 0.8 if chance(rng, 0.6) else 0.0
-    case = solid_color(color, rng.uniform(0.35, 0.55), metallic)
-    key = BLACK if chance(rng, 0.7) else mix(color, WHITE, 0.5)
-    board = _keyboard(rng, jitter(rng, key, 0.02), mix(color, BLACK, 0.4 if key == BLACK else 0.2))
+    case = paint.solid_color(color, rng.uniform(0.35, 0.55), metallic)
+    key = paint.BLACK if chance(rng, 0.7) else paint.mix(color, paint.WHITE, 0.5)
+    board = _keyboard(
+        rng, paint.jitter(rng, key, 0.02), paint.mix(color, paint.BLACK, 0.4 if key == paint.BLACK else 0.2)
+    )
     low, across = (DECK_MIDDLE - 0.5 * DECK_DEPTH) * depth, (DECK_WIDTH * width, 0.0, 0.0)
     origin, up = (-0.5 * across[0], low, 0.0), (0.0, DECK_DEPTH * depth, 0.0)
-    keys = Surface("keys", textured(board, 0.6), "plane", origin=origin, across=across, up=up)
-    bezel = case if chance(rng, 0.2) else solid_color(jitter(rng, BLACK, 0.02), 0.4)
+    keys = Surface("keys", paint.textured(board, 0.6), "plane", origin=origin, across=across, up=up)
+    bezel = case if chance(rng, 0.2) else paint.solid_color(paint.jitter(rng, paint.BLACK, 0.02), 0.4)
     # The closed screen's picture: u along x, v from the hinge to the free edge, carried along by the turn.
     corner, across = hinge - 0.5 * width * axes[0], (width, 0.0, 0.0)
     screen = Surface(
-        "screen", textured(_desktop(rng), 0.25), "plane", origin=corner, across=across, up=-depth * axes[1]
+        "screen", paint.textured(_desktop(rng), 0.25), "plane", origin=corner, across=across, up=-depth * axes[1]
     )
     return (
         Surface("case", case),
@@ -114,7 +98,7 @@ def _surfaces(
         screen,
         Surface("bezel", bezel),
         keys,
-        Surface("pad", solid_color(mix(color, BLACK, 0.12), 0.3, 0.5 * metallic)),
+        Surface("pad", paint.solid_color(paint.mix(color, paint.BLACK, 0.12), 0.3, 0.5 * metallic)),
     )
 
 
@@ -122,9 +106,9 @@ def _keyboard(rng: np.random.Generator, key: Color, deck: Color) -> Texture:
     """Rows of keys with a light edge above; the lowest row has the space bar."""
     height, width, rows = 80, 224, 5
     columns = int(rng.integers(12, 15))
-    picture = blank(height, width, deck)
-    letter = rgb(mix(key, WHITE if lightness(key) < 0.45 else BLACK, 0.6))
-    cap, edge = rgb(key), rgb(mix(key, WHITE, 0.25))
+    picture = paint.blank(height, width, deck)
+    letter = paint.rgb(paint.mix(key, paint.WHITE if paint.lightness(key) < 0.45 else paint.BLACK, 0.6))
+    cap, edge = paint.rgb(key), paint.rgb(paint.mix(key, paint.WHITE, 0.25))
     pitch = height // rows
     for row in range(rows):
         top = (rows - 1 - row) * pitch
@@ -144,13 +128,13 @@ def _desktop(rng: np.random.Generator) -> Texture:
     height, width = 128, 192
     kind = rng.random()
     if kind < 0.25:
-        return blank(8, 8, (0.03, 0.03, 0.035))
+        return paint.blank(8, 8, (0.03, 0.03, 0.035))
     hue = rng.random()
-    a = hsv(hue, rng.uniform(0.3, 0.8), rng.uniform(0.2, 0.5))
-    b = hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.2, 0.7), rng.uniform(0.6, 0.95))
+    a = paint.hsv(hue, rng.uniform(0.3, 0.8), rng.uniform(0.2, 0.5))
+    b = paint.hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.2, 0.7), rng.uniform(0.6, 0.95))
     slope = np.broadcast_to(np.linspace(1.0, 0.0, height, dtype=np.float32)[:, None], (height, width))
-    picture = blend(a, b, 0.5 * slope + 0.5 * noise(rng, height, width, 3, 4))
-    picture[-9:] = rgb(mix(a, BLACK, 0.6))
+    picture = paint.blend(a, b, 0.5 * slope + 0.5 * paint.noise(rng, height, width, 3, 4))
+    picture[-9:] = paint.rgb(paint.mix(a, paint.BLACK, 0.6))
     if kind > 0.6:
         for _ in range(int(rng.integers(1, 4))):
             _window(rng, picture)
@@ -161,7 +145,9 @@ def _window(rng: np.random.Generator, picture: Texture) -> None:
     height, width = picture.shape[:2]
     top, left = int(rng.integers(4, height // 2)), int(rng.integers(4, width // 2))
     bottom, right = min(top + int(rng.integers(35, 80)), height - 12), min(left + int(rng.integers(50, 110)), width - 4)
-    paper = WHITE if chance(rng, 0.6) else (0.13, 0.14, 0.17)
-    picture[top:bottom, left:right] = rgb(paper)
-    picture[top : top + 6, left:right] = rgb(mix(paper, (0.5, 0.5, 0.55), 0.5))
-    draw_small_print(rng, picture, (top + 10, left + 5, bottom - 4, right - 5), mix(paper, (0.5, 0.5, 0.5), 0.9))
+    paper = paint.WHITE if chance(rng, 0.6) else (0.13, 0.14, 0.17)
+    picture[top:bottom, left:right] = paint.rgb(paper)
+    picture[top : top + 6, left:right] = paint.rgb(paint.mix(paper, (0.5, 0.5, 0.55), 0.5))
+    paint.draw_small_print(
+        rng, picture, (top + 10, left + 5, bottom - 4, right - 5), paint.mix(paper, (0.5, 0.5, 0.5), 0.9)
+    )

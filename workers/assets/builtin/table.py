@@ -6,23 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.materials import (
-    BLACK,
-    WHITE,
-    chance,
-    jitter,
-    metal,
-    mix,
-    pale,
-    pick,
-    solid_color,
-    speckled,
-    stone,
-    textured,
-    vivid,
-    wood,
-    wood_colors,
-)
+from workers.assets.builtin import materials as paint
+from workers.assets.builtin.materials import chance, pick
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Indices, Solid, circle, combine, lathe, level_ring, loft, union
 from workers.assets.builtin.sweeps import bezier, prism, rounded_rectangle, squircle
@@ -72,24 +57,24 @@ def _top(rng: np.random.Generator, plan: TableSize) -> Solid:
 
 
 def _surfaces(rng: np.random.Generator, plan: TableSize) -> tuple[Surface, ...]:
-    light, dark = wood_colors(rng)
+    light, dark = paint.wood_colors(rng)
     long = max(plan.width, plan.depth)
-    timber = textured(wood(rng, light, dark, planks=int(rng.integers(0, 8))), rng.uniform(0.35, 0.7))
+    timber = paint.textured(paint.wood(rng, light, dark, planks=int(rng.integers(0, 8))), rng.uniform(0.35, 0.7))
     kind = rng.random()
     if kind < 0.55:
         top = timber
     elif kind < 0.72:
         greys, brown = ((0.2, 0.2, 0.21), (0.5, 0.5, 0.5)), ((0.75, 0.68, 0.6), (0.5, 0.42, 0.35))
-        pair = pick(rng, ((WHITE, (0.6, 0.6, 0.62)), greys, brown))
-        top = textured(stone(rng, *pair), rng.uniform(0.15, 0.4))
+        pair = pick(rng, ((paint.WHITE, (0.6, 0.6, 0.62)), greys, brown))
+        top = paint.textured(paint.stone(rng, *pair), rng.uniform(0.15, 0.4))
     elif kind < 0.8:
-        ground = pale(rng)
-        top = textured(speckled(rng, ground, mix(ground, BLACK, 0.5), 0.04, 192, 192), 0.4)
+        ground = paint.pale(rng)
+        top = paint.textured(paint.speckled(rng, ground, paint.mix(ground, paint.BLACK, 0.5), 0.04, 192, 192), 0.4)
     else:
-        paint = pick(rng, (WHITE, (0.85, 0.85, 0.84), BLACK, (0.3, 0.32, 0.34), vivid(rng)))
-        top = solid_color(jitter(rng, paint), rng.uniform(0.3, 0.6))
+        coat = pick(rng, (paint.WHITE, (0.85, 0.85, 0.84), paint.BLACK, (0.3, 0.32, 0.34), paint.vivid(rng)))
+        top = paint.solid_color(paint.jitter(rng, coat), rng.uniform(0.3, 0.6))
     matching = top is timber and chance(rng, 0.7)
-    legs = timber if matching or not chance(rng, 0.5) else metal(rng)
+    legs = timber if matching or not chance(rng, 0.5) else paint.metal(rng)
     parts = (("top", top, 0), ("legs", legs, 2), ("frame", legs, 0))
     return tuple(Surface(name, material, "box", size=long, grain=grain) for name, material, grain in parts)
 
