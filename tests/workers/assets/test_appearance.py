@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from schemas.job.job import Job
-from schemas.job.views import Render
 from tests.kit.shapes import asset_of, box, table
 from workers.assets.appearance import (
     FLOOR_KINDS,
@@ -16,7 +15,6 @@ from workers.assets.appearance import (
     draw_floor_material,
     make_pattern,
 )
-from workers.scene.effects import Facts, plan_effects, write_receipt
 from workers.scene.plan import SceneChance, Stream, draw_scene
 
 BOX, TABLE = asset_of(box(0.1, 0.08, 0.2)), table()
@@ -62,27 +60,6 @@ def test_scenes_are_neither_dark_nor_burnt_out():
         assert light.lights[0].direction[2] > math.sin(0.7) - 1e-9, "shadows stay within the floor's map"
         assert min(light.ambient + light.below + light.background) >= 0.0
     assert {len(look(scene)[1].lights) for scene in range(50)} == {1, 2, 3}
-
-
-@pytest.mark.parametrize(
-    ("tier", "expected"),
-    [
-        ("flat", set()),
-        ("raster", {"shadows", "ambient_occlusion", "antialiasing"}),
-        ("pathtraced", {"global_illumination", "glass"}),
-    ],
-)
-def test_the_receipt_says_which_effects_of_light_ran(tier, expected):
-    job = JOBS["raster"].model_copy(update={"render": Render(tier=tier)})
-    ran, skipped = write_receipt(
-        plan_effects(Facts(job, draw_scene(JOBS["raster"], SceneChance(5, 0), TABLE, BOX), False))
-    )
-    names = {"shadows", "ambient_occlusion", "antialiasing", "global_illumination", "glass"}
-    assert names & set(ran) == expected
-    reasons = dict.fromkeys(names - expected, f"render.tier is {tier}")
-    if tier == "pathtraced":  # paths are shadowed, and spread over a pixel, in any case
-        reasons |= dict.fromkeys(("shadows", "antialiasing"), "part of global_illumination")
-    assert {one["effect"]: one["why"] for one in skipped if one["effect"] in names} == reasons
 
 
 def test_a_floor_goes_on_where_it_ends():

@@ -19,14 +19,8 @@ from workers.assets.builtin.sweeps import (
     OUTSIDE,
     bend_radius,
     bevelled_profile,
-    bezier,
-    fillet,
     prism,
     rod,
-    rounded_rectangle,
-    spline,
-    split_sides,
-    squircle,
     wall_around,
 )
 
@@ -42,42 +36,6 @@ def prism_area(count):
 
 def cylinder(radius=1.0, height=2.0, count=64, surface=(0, 0, 0)):
     return lathe(np.array([[0, 0], [radius, 0], [radius, height], [0, height]]), surface, count)
-
-
-# ------------------------------------------------------------------------------------------------ curves
-
-
-def test_circle_points_have_radius_one_and_exact_quarters():
-    for count in (12, 20, 48):
-        points = circle(count)
-        assert np.hypot(*points.T) == pytest.approx(np.ones(count), abs=2e-14)
-        assert points[:: count // 4].tolist() == [[1, 0], [0, 1], [-1, 0], [0, -1]]
-        angles = np.unwrap(np.arctan2(points[:, 1], points[:, 0]))
-        assert np.diff(angles) == pytest.approx(np.full(count - 1, 2 * math.pi / count), abs=1e-12)
-
-
-def test_curves_go_through_their_points_along_their_handles():
-    a, b, c, d = (np.array(p, float) for p in ([0, 0], [0, 3], [4, 3], [4, 0]))
-    curve = bezier(a, b, c, d, 101)
-    assert curve[[0, -1]].tolist() == [[0, 0], [4, 0]] and curve[1][0] / curve[1][1] < 0.05
-    assert curve[50] == pytest.approx((a + 3 * b + 3 * c + d) / 8)
-    points = np.array([[0.0, 0], [1, 2], [3, 3], [2, 5]])
-    assert spline(points, 7)[::7] == pytest.approx(points)
-    line = spline(np.array([[0.0, 0], [1, 1], [2, 2]]), 5)
-    assert line[:, 0] == pytest.approx(line[:, 1])
-    for squareness in (0, 1, 2):
-        power = (np.abs(squircle(48, squareness)) ** 2 ** (squareness + 1)).sum(axis=1)
-        assert power == pytest.approx(np.ones(48), rel=1e-12)
-    outline = Polygon(rounded_rectangle(4.0, 2.0, 0.5, 32))
-    assert outline.exterior.is_ccw and outline.bounds == pytest.approx((-2, -1, 2, 1))
-    assert outline.area == pytest.approx(8 - (4 - math.pi) * 0.25, rel=1e-3)
-
-
-def test_a_rounded_corner_leaves_and_meets_its_sides_and_knows_them():
-    points, owner = fillet(np.array([[0.0, 0], [1, 0], [1, 1]]), [0, 0.2, 0], 4)
-    assert points[1] == pytest.approx([0.8, 0]) and points[-2] == pytest.approx([1, 0.2])
-    assert owner.tolist() == [0, 0, 0, 1, 1, 1]
-    assert Polygon([*points, [0, 1]]).area == pytest.approx(1 - 0.2 * 0.2 / 3, rel=0.02)  # a parabola cuts off a third
 
 
 # ------------------------------------------------------------------------------------------------ solids
@@ -175,14 +133,6 @@ def test_a_union_at_some_faces_puts_only_those_in(monkeypatch):
     both = union_at(BODY, TOUCHED, APEX, [arm(0.1)], [aside])
     assert len(sizes) == 1 and max(sizes[0]) < len(BODY.faces) / 2
     assert set(both.surface) == {1, 2, 3} and mesh_of(both).body_count == 1
-
-
-def test_the_sides_of_a_box_are_told_apart():
-    solid = split_sides(prism(np.array([[0.0, 0.0], [0.0, 1.0]]), (2.0, 1.0), 0.01, [9, 0, 9]), 0, (1, 2, 3, 4))
-    centres = solid.vertices[solid.faces].mean(axis=1)
-    for number, (axis, sign) in {1: (1, -1), 2: (0, 1), 3: (1, 1), 4: (0, -1)}.items():
-        assert (sign * centres[solid.surface == number][:, axis] > 0.4).all()
-    assert (solid.surface == 9).sum() == 2 * 16
 
 
 def test_a_wall_is_as_thick_as_it_says_around_its_hollow_and_stands_on_its_foot_ring():

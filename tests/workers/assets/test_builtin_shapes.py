@@ -233,24 +233,15 @@ FORMS: Mapping[str, Callable[[Solid], None]] = {
 }
 
 
+@pytest.mark.parametrize("instances", [FEW, pytest.param(MANY, marks=pytest.mark.slow)], ids=["few", "many"])
 @pytest.mark.parametrize("category", EVERYTHING)
-def test_every_instance_is_a_faultless_body_of_the_size_and_form_of_its_kind(category):
-    for index in FEW:
+def test_every_instance_is_a_faultless_body_of_the_size_and_form_of_its_kind(category, instances):
+    for index in instances:
         check_body(category, index)
         check_asset(category, index)
         check_lofts(category, index)
         FORMS[category](make_model(category, 0, index).solid)
-    assert len({asset(category, index).sha256 for index in FEW}) == len(FEW), "instances differ"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("category", EVERYTHING)
-def test_many_more_instances_are_too(category):
-    for index in MANY:
-        check_body(category, index)
-        check_asset(category, index)
-        check_lofts(category, index)
-        FORMS[category](make_model(category, 0, index).solid)
+    assert len({asset(category, index).sha256 for index in instances}) == len(instances), "instances differ"
 
 
 @pytest.mark.minute

@@ -17,12 +17,8 @@ from workers.assets.external.formats import load_shape
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.mesh import (
     LoadedMesh,
-    find_bodies,
-    find_collapsed,
     find_flips,
-    find_repeated,
     is_solid,
-    merge_points,
     transform_shape,
 )
 from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand, place_asset
@@ -49,18 +45,6 @@ def solid(shape) -> bool:
     return is_solid(shape.vertices, shape.faces)
 
 
-# ------------------------------------------------------------------------------------------------ points, faces, bodies
-
-
-def test_points_collapsed_faces_and_doubled_faces_are_found():
-    assert len(np.unique(merge_points(soup(trimesh.creation.icosphere(2))[0]))) == 162
-    assert len(np.unique(merge_points(np.array([[0.0, 0, 0], [1e-10, 0, 0], [1e-4, 0, 0], [1, 1, 1]])))) == 3
-    faces = np.array([[0, 1, 2], [1, 2, 0], [2, 1, 0], [3, 3, 1], [0, 1, 3]])
-    assert find_collapsed(faces).tolist() == [False, False, False, True, False]
-    assert find_repeated(faces, oriented=True).tolist() == [False, True, False, False, False]
-    assert find_repeated(faces, oriented=False).tolist() == [False, True, True, False, False]
-
-
 def test_turning_the_faces_that_disagree_takes_the_fewest_flips_and_leaves_a_moebius_strip_alone():
     mesh = trimesh.creation.icosphere(3)
     for share in (0.1, 0.4):
@@ -71,17 +55,6 @@ def test_turning_the_faces_that_disagree_takes_the_fewest_flips_and_leaves_a_moe
     next_lower, next_upper = np.append(lower[1:], upper[0]), np.append(upper[1:], lower[0])
     strip = np.concatenate([np.stack([lower, next_lower, next_upper], 1), np.stack([lower, next_upper, upper], 1)])
     assert not find_flips(strip).any()
-
-
-def test_bodies_are_told_apart_with_the_volume_of_each():
-    one, two = trimesh.creation.box((1, 2, 3)), trimesh.creation.icosphere(3, 0.5)
-    two.apply_translation((5, 0, 0))
-    sheet = trimesh.Trimesh([[9, 0, 0], [9, 1, 0], [9, 0, 1]], [[0, 1, 2]], process=False)
-    whole = trimesh.util.concatenate([one, two, sheet])
-    bodies = find_bodies(whole.vertices, whole.faces, whole.faces)
-    assert bodies.closed.tolist() == [True, True, False]
-    assert bodies.volume[:2] == pytest.approx([one.volume, two.volume], rel=1e-12)
-    assert np.bincount(bodies.body).tolist() == [12, len(two.faces), 1]
 
 
 def test_only_a_closed_and_consistent_mesh_with_volume_is_solid():

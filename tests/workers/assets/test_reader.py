@@ -30,8 +30,6 @@ from workers.assets.external import verdicts as verdict_file
 from workers.assets.external.listing import Entry, SourceFile, hash_files
 from workers.assets.external.placement import load_entry, read_measured
 from workers.assets.external.reader import (
-    ANSWER,
-    REFUSAL,
     Request,
     Task,
     answer_task,
@@ -214,19 +212,6 @@ def test_many_files_are_answered_in_their_order_by_several_processes(tmp_path, m
 def answer(folder, text, kind="check", name="a.obj", category="mug"):
     asked = request(folder, write(folder / name, text), kind=kind, category=category)
     return answer_task(asked, asked.tasks[0])
-
-
-def test_a_mesh_is_listed_passes_or_is_refused_with_its_reason(tmp_path):
-    ((name, size, sha256),) = json.loads(answer(tmp_path, CUBE, "list")[1:])
-    assert (name, size, len(sha256)) == ("a.obj", len(CUBE), 64)
-    assert answer(tmp_path, CUBE) == ANSWER
-    refused = answer(tmp_path, "v 0 0 0\n")
-    assert refused[:1] == REFUSAL
-    assert json.loads(refused[1:]) == ["no_faces", f"{tmp_path}/a.obj has no triangles", "intrinsic"]
-    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"  # no body, but it may be a table
-    reason, detail, _ = json.loads(answer(tmp_path, triangle)[1:])
-    assert reason == "no_hull" and "four points apart" in detail
-    assert answer(tmp_path, triangle, category="table") == ANSWER
 
 
 def test_whatever_is_raised_is_a_refusal_in_one_line_that_names_the_file_and_memory_is_told_apart(
