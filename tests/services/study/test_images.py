@@ -118,9 +118,6 @@ def test_depth_is_off_by_what_was_added_and_the_table_s_apart_from_the_object_s(
         errors = dict.fromkeys(("depth_mm", "table_depth_mm", "between_mm"), 0.0) | dict([expected])
         errors["between_mm"] = errors["depth_mm"]
         assert {name: found[name] for name in errors} == pytest.approx(errors, abs=1e-3)
-    # 1.8 m in units of 1/7 m is 12.6 and is stored as 13; the table's 14 is exact.
-    found = measure(table_and(block()), pair_of(view(*seen, units=7.0)), units=7.0)
-    assert (found["depth_mm"], found["table_depth_mm"]) == pytest.approx(((13 / 7 - 1.8) * 1e3, 0.0), abs=1e-6)
 
 
 def test_depth_that_one_pixel_in_fifty_has_wrong_counts_and_one_in_two_hundred_or_without_depth_does_not(seen):
@@ -207,7 +204,10 @@ def test_the_mirror_camera_is_off_by_what_d_z_is_off_the_nearest_visible_point()
     ball = trimesh.creation.uv_sphere(radius=0.1, count=(64, 64))
     ball.apply_translation((0.0, 0.0, 0.1))
     assert mirror_mm(1.8 + 0.012, ball) == pytest.approx(12.0, abs=1e-3)
-    assert mirror_mm(1.8 - 0.003, ball) == pytest.approx(3.0, abs=1e-3)
+    first, worst = view(*seen_of_block(camera_above())), ((0.001, 0.3), (-0.004, 0.2), (0.002, None))
+    pairs = [pair_of(first, first, TOP_Z + off, agreement=Agreement(median, 1.0, 900, 0.0)) for off, median in worst]
+    found = measure(table_and(block()), *pairs)  # of several pairs the worst is told
+    assert found["mirror_mm"] == pytest.approx(4.0, abs=1e-3) and found["agreement_mm"] == 0.3
     needle = trimesh.creation.cone(radius=0.05, height=0.3, sections=7)  # its point is between all rays
     assert mirror_mm(1.7, needle) == pytest.approx(0.0, abs=1e-6)
     beyond = trimesh.util.concatenate([block(), box(0.2, 0.2, 0.6, (0.7, 0.0, 0.3))])  # a taller one beside the picture
@@ -217,13 +217,6 @@ def test_the_mirror_camera_is_off_by_what_d_z_is_off_the_nearest_visible_point()
     T = look_at(np.array([1.2, -0.7, 1.9]), np.zeros(3))
     right, off = mirror_pose(T, 2.0), mirror_pose(T, 2.0125)
     assert off[:3, 3] - right[:3, 3] == pytest.approx(0.0125 * T[:3, 2]) and np.array_equal(off[:3, :3], right[:3, :3])
-
-
-def test_of_several_pairs_the_worst_is_told(seen):
-    first, worst = view(*seen), ((0.001, 0.3), (-0.004, 0.2), (0.002, None))
-    pairs = [pair_of(first, first, TOP_Z + off, agreement=Agreement(median, 1.0, 900, 0.0)) for off, median in worst]
-    found = measure(table_and(block()), *pairs)
-    assert found["mirror_mm"] == pytest.approx(4.0, abs=1e-3) and found["agreement_mm"] == 0.3
 
 
 def projected_errors(things, first, depth_m, camera=None):
@@ -288,16 +281,8 @@ def test_truth_is_kept_while_the_poses_are_the_same_and_no_longer(seen):
     assert truth_of(scene_of(things, scene_id=6), truth) is not truth and truth_of(scene_of(things)) is not truth
 
 
-def test_a_scene_s_truth_forgets_the_views_asked_for_longest_ago_and_knows_one_camera_at_all_sizes():
+def test_a_camera_scaled_to_another_size_asks_for_the_same_rays():
     truth = Truth(scene_of(table_and(block())))
-    cameras = [camera_above(f=F + i) for i in range(20)]
-    first = truth.pixels(cameras[0])
-    for camera in cameras[1:]:
-        truth.pixels(camera)
-        assert truth.pixels(cameras[0]) is first
-    for camera in cameras[1:]:
-        truth.pixels(camera)
-    assert truth.pixels(cameras[0]) is not first
     f, scales = 525.3, (0.5, 0.7, 1.1, 1.3, 2.0)
     assert len({f * scale / round(WIDTH * scale) for scale in scales}) > 1, "rounding must not tell them apart"
     for scale in scales:
