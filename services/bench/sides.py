@@ -7,7 +7,6 @@ encoder, and a durable write.
 """
 
 import contextlib
-import importlib
 import json
 import os
 import struct
@@ -54,18 +53,12 @@ class Look:
     """Whether its images are comparable with those of the raster tier only."""
 
 
+_PLAIN = "same files; RGB with a floor of one colour, one light, no shadows"
+_SAME = "same files; RGB with the floor's texture, the scene's lights and pyrender's shadows"
+
 LOOKS = {
-    "plain": Look(
-        "script_plain",
-        "the script, plain look",
-        "same files; RGB with a floor of one colour, one light, no shadows",
-    ),
-    "same": Look(
-        "script_same_look",
-        "the script, same look",
-        "same files; RGB with the floor's texture, the scene's lights and pyrender's shadows",
-        only_raster=True,
-    ),
+    "plain": Look("script_plain", "the script, plain look", _PLAIN),
+    "same": Look("script_same_look", "the script, same look", _SAME, only_raster=True),
 }
 """By the word that the script is asked with."""
 
@@ -93,12 +86,10 @@ def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
         com = " ".join(f"{x:.9g}" for x in asset.mass.com)
         urdf = URDF.format(name=name, com=com, mass=asset.mass.mass_kg, i=np.diag(asset.mass.inertia).tolist())
         (folder / f"{name}.urdf").write_text(urdf)
-    sensor, mass, lights = job.cameras.sensor, start.asset.mass, scene.posed.appearance.lights
+    sensor, lights = job.cameras.sensor, scene.posed.appearance.lights
     described = {
         "T_world_table": table.T_world_table.tolist(),
         "T_world_obj": start.T_world_obj.tolist(),
-        # In the object's frame; the inertia is the principal moments.
-        "object": {"mass_kg": mass.mass_kg, "com": mass.com.tolist(), "inertia": np.diag(mass.inertia).tolist()},
         "floor": _floor(scene.posed.things[0], folder),
         "lights": [{"towards": light.direction.tolist(), "color": list(light.color)} for light in lights],
         "intrinsics": {key: getattr(sensor, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
@@ -227,11 +218,7 @@ def encoders() -> dict[str, Encoder]:
         for strategy, strategy_number in STRATEGIES.items():
             options = {cv2.IMWRITE_PNG_STRATEGY: strategy_number, cv2.IMWRITE_PNG_FILTER: number}
             found[f"cv2 {strategy} {row_filter}"] = partial(_encode_opencv, options=options)
-    try:
-        codecs = importlib.import_module("imagecodecs")
-    except ImportError:
-        return found
-    return found | {"imagecodecs png 1": lambda pixels: bytes(codecs.png_encode(pixels, level=1))}
+    return found
 
 
 def encode_fpng(pixels: Pixels) -> bytes:

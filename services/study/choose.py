@@ -126,9 +126,8 @@ def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
 
 def meets(row: Row, targets: Targets, rows: Sequence[Row]) -> bool:
     """Whether all errors are at most their targets; an error that was never measured meets none."""
-    return all(
-        (found := error_of(row, name, rows)) is not None and found.value <= target for name, target in targets.items()
-    )
+    found = {name: error_of(row, name, rows) for name in targets}
+    return all(figure is not None and figure.value <= targets[name] for name, figure in found.items())
 
 
 def check_targets(rows: Sequence[Row], targets: Targets) -> None:

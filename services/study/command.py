@@ -4,7 +4,6 @@ A job of simulated captures has a study of its own: what views, estimates, itera
 """
 
 import argparse
-import itertools
 import json
 import shlex
 import sys
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from schemas.capture import CaptureScore, ProcessedCapture
+from schemas.capture import CaptureScore
 from schemas.errors import CaptureError, InputError
 from schemas.job.job import Job
 from services.bench.command import require_extra
@@ -122,9 +121,7 @@ def write_job(source: Path, changes: list[str], row: Row, path: Path, target: st
 
 # ---------------------------------------------------------------------------------------------- captures
 
-BYTES_OF_POINT = 3 * 4 + 3 * 4 + 3
-BYTES_OF_VERTEX = 3 * 4 + 3
-BYTES_OF_FACE = 3 * 4
+POINT_BYTES, VERTEX_BYTES, FACE_BYTES = 3 * 4 + 3 * 4 + 3, 3 * 4 + 3, 3 * 4
 """As a cloud and a mesh are written: float32 coordinates and normals, 8-bit colours, 32-bit indices."""
 
 ERRORS_OF_SCORE = {
@@ -160,7 +157,8 @@ def measure_capture(
             done = process_capture(folder, captures, watch)
             answer["whole"][setting.name] = sum(s for stage, s in watch.seconds.items() if stage != "score")
             answer["errors"][setting.name] = errors_of(done.score or CaptureScore())
-            answer["bytes"][setting.name] = _bytes(done)
+            points, vertices, faces = map(len, (done.surface.points, done.surface.vertices, done.surface.faces))
+            answer["bytes"][setting.name] = points * POINT_BYTES + vertices * VERTEX_BYTES + faces * FACE_BYTES
         except CaptureError as error:
             answer["failed"][setting.name] = str(error)
     answer["cold"] = answer["whole"].get(settings[0].name, 0.0)
@@ -177,12 +175,6 @@ def errors_of(score: CaptureScore) -> dict[str, float]:
     found = {name: getattr(score, figure) for name, figure in ERRORS_OF_SCORE.items()}
     found["missing_share"] = None if score.completeness is None else 1.0 - score.completeness
     return {name: float(value) for name, value in found.items() if value is not None}
-
-
-def _bytes(done: ProcessedCapture) -> int:
-    surface = done.surface
-    points, vertices, faces = len(surface.points), len(surface.vertices), len(surface.faces)
-    return points * BYTES_OF_POINT + vertices * BYTES_OF_VERTEX + faces * BYTES_OF_FACE
 
 
 def check_captures(plan: Plan) -> None:
@@ -202,29 +194,24 @@ def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, prog
     A capture is simulated once, and processed with every setting in an order of its own, lap by lap, on one core.
     """
     first, sizes = plan.job.first_scene, plan.sizes
-    units = {
-        f"captures/{scene}/{lap}": (scene, lap)
-        for scene, lap in itertools.product(range(first, first + sizes.scenes), range(sizes.laps))
-    }
-    missing: dict[int, list[str]] = {}
-    for name, (scene, _) in units.items():
-        if name not in journal:
-            missing.setdefault(scene, []).append(name)
-    progress.expect(len(units))
+    scenes, laps, warm = range(first, first + sizes.scenes), range(sizes.laps), False
+    names = {(scene, lap): f"captures/{scene}/{lap}" for scene in scenes for lap in laps}
+    progress.expect(len(names))
     with pinned():
-        for number, (scene, names) in enumerate(missing.items()):
+        for scene in scenes:
+            missing = [lap for lap in laps if names[scene, lap] not in journal]
+            if not missing:
+                continue
             with temporary_folder("study") as scratch:
                 path = scratch / "capture"
                 simulate_one(context, scene, path)
-                if number == 0:
+                if not warm:
                     warm_up(context, plan.settings[0], path)
-                for name in names:
-                    journal.add(name, measure_capture(context, plan.settings, path, units[name]))
-                    progress.show(sum(unit in journal for unit in units))
-    laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(sizes.laps)]
-    for name, (scene, lap) in units.items():
-        laps[lap][scene] = journal[name]
-    return rows_of(plan, laps)
+                    warm = True
+                for lap in missing:
+                    journal.add(names[scene, lap], measure_capture(context, plan.settings, path, (scene, lap)))
+                    progress.show(sum(name in journal for name in names.values()))
+    return rows_of(plan, [{scene: journal[names[scene, lap]] for scene in scenes} for lap in laps])
 
 
 def rows_of(plan: Plan, laps: Sequence[Mapping[int, dict[str, Any]]]) -> tuple[Row, ...]:
@@ -233,12 +220,7 @@ def rows_of(plan: Plan, laps: Sequence[Mapping[int, dict[str, Any]]]) -> tuple[R
     for row, _ in timed_rows(plan.settings, laps):
         name = row.setting.name
         failed = [str(one["failed"][name]) for one in answers if name in one["failed"]]
-        rows.append(
-            replace(
-                row,
-                errors=image_figures([one["errors"][name] for one in answers if name in one["errors"]]),
-                failed_share=len(failed) / len(answers),
-                notes=tuple(dict.fromkeys(failed)),
-            )
-        )
+        errors = image_figures([one["errors"][name] for one in answers if name in one["errors"]])
+        notes = tuple(dict.fromkeys(failed))
+        rows.append(replace(row, errors=errors, failed_share=len(failed) / len(answers), notes=notes))
     return tuple(rows)

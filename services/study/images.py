@@ -5,6 +5,7 @@ the size of pixels, through places that do not depend on it. Views of all pairs 
 """
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import SceneError
 from schemas.job.views import Images
-from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Camera, Pair, View
 from services.study.colour import (
@@ -45,14 +45,9 @@ class Truth:
     """Casts of rays in one scene, with a cache of the last ones, which is kept from setting to setting while poses stay."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene_id = scene.plan.scene_id
+        self.scene_id, self.geometry = scene.plan.scene_id, _geometry(scene)
         self.things = scene.posed.things
         self._kept: LRUCache[Key, Any] = LRUCache(KEPT)
-
-    def fits(self, scene: Scene) -> bool:
-        """Whether the scene has the same shapes at the same poses."""
-        alike = self.scene_id == scene.plan.scene_id and len(self.things) == len(scene.posed.things)
-        return alike and all(map(_same, self.things, scene.posed.things))
 
     @cachedmethod(lambda self: self._kept, key=lambda self, camera: ("pixels", *_key(camera)))
     def pixels(self, camera: Camera) -> Pixels:
@@ -72,7 +67,7 @@ class Truth:
 
 def truth_of(scene: Scene, kept: Truth | None = None) -> Truth:
     """The truth of a scene: `kept`, of an earlier setting, where the geometry is the same, or a new one."""
-    return kept if kept is not None and kept.fits(scene) else Truth(scene)
+    return kept if kept is not None and kept.geometry == _geometry(scene) else Truth(scene)
 
 
 def _key(camera: Camera) -> Key:
@@ -86,13 +81,11 @@ def _frame(camera: Camera) -> Key:
     return *(round(share, 12) for share in shares), camera.T_world_cam.tobytes()
 
 
-def _same(mine: Placed, other: Placed) -> bool:
-    if mine.region_id != other.region_id or not np.array_equal(mine.T_world_shape, other.T_world_shape):
-        return False
-    return mine.shape is other.shape or (
-        np.array_equal(mine.shape.vertices, other.shape.vertices)
-        and np.array_equal(mine.shape.faces, other.shape.faces)
-    )
+def _geometry(scene: Scene) -> Key:
+    """What the casts depend on: the scene's shapes and their poses."""
+    things = scene.posed.things
+    arrays = [(thing.T_world_shape, thing.shape.vertices, thing.shape.faces) for thing in things]
+    return scene.plan.scene_id, *(thing.region_id for thing in things), *(a.tobytes() for some in arrays for a in some)
 
 
 PERCENTILE = 99.0
@@ -207,10 +200,9 @@ def _percentile(name: str, errors: Iterable[Array], percent: float) -> dict[str,
     return {name: float(np.percentile(values, percent))} if len(values) else {}
 
 
-def _mean(name: str, flags: Iterable[NDArray[np.bool_]]) -> dict[str, float]:
+def _mean(name: str, flags: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
     """The share of true flags by its name, or none for no flags."""
-    values = np.concatenate([np.empty(0, bool), *flags])
-    return {name: float(values.mean())} if len(values) else {}
+    return {name: float(np.concatenate(flags).mean())} if any(map(len, flags)) else {}
 
 
 CONVERGED_PATHS = 256
@@ -228,10 +220,11 @@ def measure_scene_images(
     """Errors of depth, masks, mirror pose and projection by the settings' names, where the scene can be made."""
     truth, answers = None, {}
     for setting in settings:
-        found = _make(context_for(context, setting), scene_id)
-        if found is not None:
-            truth = truth_of(found[1], truth)
-            answers[setting.name] = measure_images(*found, truth)
+        with suppress(SceneError):
+            worker = context_for(context, setting)
+            scene = make_scene(worker, scene_id, Stopwatch())
+            truth = truth_of(scene, truth)
+            answers[setting.name] = measure_images(worker, scene, truth)
     return answers
 
 
@@ -241,41 +234,34 @@ def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id
     `flip` is against a path-traced image, where that tier is installed. `edge_flip`, of tier raster, is against the same
     tier's own light at 64 samples a pixel, because FLIP against other light tells little of edges.
     """
-    made = {setting.name: _make(_input_alone(context, setting), scene_id) for setting in settings}
-    found = {name: one for name, one in made.items() if one is not None}
-    if not found:
-        return {}
-    first = next(iter(found.values()))
-    crop = crop_of(first[1])
-    if crop is None:
+    found: dict[str, tuple[WorkerContext, Scene]] = {}
+    for setting in settings:
+        with suppress(SceneError):
+            found[setting.name] = _input_alone(context, setting, scene_id)
+    first = next(iter(found.values()), None)
+    crop = None if first is None else crop_of(first[1])
+    if first is None or crop is None:
         return {}
     traced = None if colour_truth_missing() else converged_colour(*first, CONVERGED_PATHS)
     smooth = _smooth(context, scene_id, crop)
     answers = {}
     for name, (worker, scene) in found.items():
-        rgb = scene.pairs[0].input.rgb
         truths = {"flip": traced, "edge_flip": smooth if worker.job.render.tier == "raster" else None}
-        if rgb is not None:
+        if (rgb := scene.pairs[0].input.rgb) is not None:
             answers[name] = {error: flip_error(truth, rgb) for error, truth in truths.items() if truth is not None}
     return answers
 
 
-def _input_alone(context: WorkerContext, setting: Setting) -> WorkerContext:
-    """The setting's job without the views whose colour is not compared."""
-    return context_for(context, Setting(setting.parts, {**setting.changes, **INPUT_ALONE}))
+def _input_alone(context: WorkerContext, setting: Setting, scene_id: int) -> tuple[WorkerContext, Scene]:
+    """The setting's job without the views whose colour is not compared, and its scene. Raises SceneError."""
+    worker = context_for(context, Setting(setting.parts, {**setting.changes, **INPUT_ALONE}))
+    return worker, make_scene(worker, scene_id, Stopwatch())
 
 
 def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | None:
     """The raster tier's image with 64 samples a pixel: drawn 4 times as wide with 4 samples each, averaged by area."""
-    fine = size_value(context.job, FINE_WIDTH).changes
-    setting = Setting((("truth", "edges"),), {**fine, "render.tier": "raster", "render.samples": 4})
-    made = _make(_input_alone(context, setting), scene_id)
-    rgb = None if made is None else made[1].pairs[0].input.rgb
-    return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))
-
-
-def _make(context: WorkerContext, scene_id: int) -> tuple[WorkerContext, Scene] | None:
-    try:
-        return context, make_scene(context, scene_id, Stopwatch())
-    except SceneError:
-        return None
+    finest = {**size_value(context.job, FINE_WIDTH).changes, "render.tier": "raster", "render.samples": 4}
+    with suppress(SceneError):
+        rgb = _input_alone(context, Setting((("truth", "edges"),), finest), scene_id)[1].pairs[0].input.rgb
+        return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))
+    return None

@@ -153,7 +153,7 @@ def _cells(kind: str, words: Iterable[str]) -> str:
 def _errors(study: Study) -> str:
     measured = {name for row in study.rows for name in row.errors}
     rows = [
-        (kind.name, short(kind.name), kind.title, kind.unit or "0 to 1", kind.truth,
+        (kind.name, kind.short, kind.title, kind.unit or "0 to 1", kind.truth,
          "all scenes together" if kind.pooled else "95th percentile", "yes" if kind.name in measured else "no")
         for kind in ERRORS.values()
     ]  # fmt: skip
