@@ -18,28 +18,17 @@ from matplotlib.transforms import Bbox
 from services.study.choose import front, own_row
 from services.study.model import Row, Study, as_often, cost, milliseconds, number, short, shown, unit
 
+_PHYSICS = "pose_mm moved_mm outcome_mm penetration_mm gap_mm unbalanced_share turned_deg outcome_deg"
+
 PARTS = (
-    (
-        "at rest",
-        "How objects rest",
-        (
-            "pose_mm",
-            "moved_mm",
-            "outcome_mm",
-            "penetration_mm",
-            "gap_mm",
-            "unbalanced_share",
-            "turned_deg",
-            "outcome_deg",
-        ),
-    ),
-    ("in depth", "Depth and masks", ("between_mm", "depth_mm", "outline_share", "mask_share", "table_depth_mm")),
-    ("in the mirror", "The other side", ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")),
-    ("in colour", "Colour", ("flip", "edge_flip")),
-    ("in the poses", "Camera poses", ("camera_mm", "camera_deg")),
-    ("in the cloud", "Merged cloud", ("cloud_mm", "cloud_p95_mm")),
-    ("in completeness", "What is missing", ("missing_share",)),
-    ("in new views", "Synthesised views", ("view_depth_mm",)),
+    ("at rest", "How objects rest", _PHYSICS),
+    ("in depth", "Depth and masks", "between_mm depth_mm outline_share mask_share table_depth_mm"),
+    ("in the mirror", "The other side", "mirror_mm agreement_mm unfilled_share hidden_share"),
+    ("in colour", "Colour", "flip edge_flip"),
+    ("in the poses", "Camera poses", "camera_mm camera_deg"),
+    ("in the cloud", "Merged cloud", "cloud_mm cloud_p95_mm"),
+    ("in completeness", "What is missing", "missing_share"),
+    ("in new views", "Synthesised views", "view_depth_mm"),
 )
 """Each part of a scene: its name in the title, its heading, and its errors. The panel shows the first that settings move."""
 
@@ -73,8 +62,8 @@ PRESET: Mark = {"color": "black", "marker": "s", "ms": 10.0, "mfc": "none", "mew
 SEVERAL: Mark = {"color": PALE, "marker": "d", "ms": 6.5, "mfc": "white", "zorder": 3}
 SINGLE: Mark = {"ms": 6.5, "mec": "white", "mew": 0.6, "zorder": 4}
 
-OWN_NAME = "the job as it is"
-
+KINDS = {"own": ("the job as it is", OWN), "preset": ("preset", PRESET), "several": ("several knobs at once", SEVERAL)}
+"""The names and marks of settings that are not one knob's."""
 
 PLAIN = {"font.family": "DejaVu Sans", "font.size": 9.5, "axes.edgecolor": "#888888"}
 """The font and the size of texts, whatever the user's matplotlibrc says."""
@@ -113,14 +102,13 @@ def write_plots(study: Study, folder: Path) -> list[Path]:
 
 def panels_of(rows: Sequence[Row]) -> list[Panel]:
     """One for each part of a scene in which a setting moved an error; where there is none, those of the job alone."""
-    moved_panels: list[Panel] = []
-    own_panels: list[Panel] = []
+    panels: dict[bool, list[Panel]] = {True: [], False: []}
     for name, heading, errors in PARTS:
-        measured = [error for error in errors if any(error in row.errors for row in rows)]
+        measured = [error for error in errors.split() if any(error in row.errors for row in rows)]
         moved = [error for error in measured if len(moving_rows(rows, error)) > 1]
         for error in (moved or measured)[:1]:
-            (moved_panels if moved else own_panels).append(Panel(name, heading, error, half_row(rows, error)))
-    return moved_panels or own_panels
+            panels[bool(moved)].append(Panel(name, heading, error, half_row(rows, error)))
+    return panels[True] or panels[False]
 
 
 def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
@@ -172,11 +160,7 @@ def _draw_panel(study: Study, panel: Panel, axes: Axes) -> list[Label]:
     _set_axes(axes, [row.ms for row in rows], rows, error)
     corners = pts_to_poststep(*zip(*(_place_of(row, error) for row in best), strict=True))
     axes.plot(*corners, color=INK, lw=1.3, zorder=2, label="front: none is cheaper and better")
-    for kind, title, mark in (
-        ("own", OWN_NAME, OWN),
-        ("preset", "preset", PRESET),
-        ("several", "several knobs at once", SEVERAL),
-    ):
+    for kind, (title, mark) in KINDS.items():
         _draw_rows(axes, [row for row in rows if row.setting.kind == kind], error, title, mark)
     for knob in single_knobs(rows):
         look = knobs.index(knob)
@@ -243,7 +227,7 @@ def _draw_along(study: Study, knob: str, error: str, axes: Axes) -> list[Label]:
     _set_axes(axes, [end for span in spans for end in span], rows, error)
     axes.hlines([_place_of(row, error)[1] for row in rows], *zip(*spans, strict=True), color=PALE, lw=0.8)
     _draw_rows(axes, turned, error, cut(knob), {**SINGLE, "color": COLORS[0], "marker": "o", "ls": "-", "lw": 1.0})
-    _draw_rows(axes, rows[: len(rows) - len(turned)], error, OWN_NAME, OWN)
+    _draw_rows(axes, rows[: len(rows) - len(turned)], error, *KINDS["own"])
     return [_label(row, error) for row in rows]
 
 
@@ -295,10 +279,8 @@ def _draw_rows(axes: Axes, rows: Sequence[Row], error: str, title: str, mark: Ma
     """Markers of settings with the intervals of their errors, and an entry of the legend."""
     if rows:
         x, y = zip(*(_place_of(row, error) for row in rows), strict=True)
-        figures = [row.errors[error] for row in rows]
-        low, high = (
-            [shown(error, end) for end in ends] for ends in zip(*((f.low, f.high) for f in figures), strict=True)
-        )
+        ends = [(shown(error, row.errors[error].low), shown(error, row.errors[error].high)) for row in rows]
+        low, high = zip(*ends, strict=True)
         axes.vlines(x, low, high, color=mark["color"], lw=0.8, alpha=0.55, label="95 % interval over scenes")
         axes.plot(x, y, label=title, clip_on=False, **{"ls": "", **mark})
 

@@ -90,14 +90,8 @@ class Journal(dict[str, Any], AbstractContextManager):
         self._file.close()
 
 
-SAVES = 0.98
-"""A value is cheaper where it takes at most this share of the job's own time."""
-
-WORSE = 1.5
-"""An error is kept where it grows by at most this factor."""
-
-BETTER = 0.67
-"""An error is better below this share of the job's own."""
+SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
+"""A value saves time at this share of the job's own, keeps an error that grows to this share, and shrinks one below this."""
 
 NEGLIGIBLE: Mapping[str, float] = {"mm": 0.02, "deg": 0.02, "": 0.001}
 """By unit: errors below this are as good as none, however they compare."""
@@ -127,12 +121,9 @@ def promising(rows: Sequence[Row], targets: Mapping[str, float]) -> tuple[Settin
         row for row in cheap if all(row.errors[name].value <= targets[name] for name in set(targets) & set(row.errors))
     )
     pairs = [pair for kind in (saving, exact) for pair in itertools.combinations(kind[:MOST_OF_A_KIND], 2)]
+    together = [some for some in (*pairs, saving, exact, meeting) if len(some) > 1]
     # In the order of the table, whatever the ranks, so that names do not depend on noise.
-    found = [
-        joined([row.setting for row in singles if row in some])
-        for some in (*pairs, saving, exact, meeting)
-        if len(some) > 1
-    ]
+    found = [joined([row.setting for row in singles if row in some]) for some in together]
     return tuple({setting.name: setting for setting in found}.values())
 
 
@@ -215,9 +206,11 @@ class Round:
         laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(self.plan.sizes.laps)]
         for unit in self.timings():
             laps[unit.lap][unit.scene_id] = journal[unit.name]
-        answers: dict[str, list[dict[str, Any]]] = {"settling": [], "images": [], "colour": []}
-        for unit in self.errors():
-            answers[unit.kind].append(journal[unit.name])
+        units = self.errors()
+        answers = {
+            kind: [journal[unit.name] for unit in units if unit.kind == kind]
+            for kind in ("settling", "images", "colour")
+        }
         rows = []
         for row, scenes in timed_rows(self.settings, laps):
             errors = self._errors(answers, row.setting.name)
