@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,16 +59,14 @@ class Seen:
         return image[self.rows, self.columns]
 
 
-@dataclass(frozen=True, eq=False)
-class Pixels:
+class Pixels(NamedTuple):
     """A view by rays at its own pixels: all in the box that objects can be seen in, and some evenly over the image."""
 
     box: Seen
     spread: Seen
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
+class Patch(NamedTuple):
     """The objects in a view by rays that do not depend on the image's size.
 
     front_m: least z of their visible points, inf where none is visible. box: (left, top, right, bottom) of the visible part
@@ -82,15 +81,60 @@ class Patch:
     region: NDArray[np.uint8]
 
 
+NOTHING = Patch(math.inf, None, np.empty((0, 2)), np.empty(0), np.empty(0, np.uint8))
+
+
+class Eye:
+    """A camera and the things of a scene in its frame, where Embree's float32 is finest."""
+
+    def __init__(self, things: Sequence[Placed], camera: Camera) -> None:
+        self.camera, self.k = camera, camera.intrinsics
+        T_cam_world = invert(camera.T_world_cam)
+        self.things = [Placed(thing.region_id, thing.shape, T_cam_world @ thing.T_world_shape) for thing in things]
+
+    def cast(self, u: Array, v: Array) -> tuple[Array, NDArray[np.uint8]]:
+        """(z [N] float64 metres, region [N] uint8) of the rays through image coordinates; 0 without a hit.
+
+        Like `cast_view`, from the near plane on.
+        """
+        rays = np.stack([(u - self.k.cx) / self.k.fx, (v - self.k.cy) / self.k.fy, np.ones(len(u))], axis=1)
+        hits = first_hit(self.things, NEAR_M * rays, rays)
+        return np.where(np.isinf(hits.distance), 0.0, hits.distance + NEAR_M), hits.region
+
+    def sees(self, points: Array) -> NDArray[np.bool_]:
+        """[N] bool: whether surface points [N, 3] in the camera's frame, before it, are visible: the rays to them hit them."""
+        u, v = project(points, self.k)
+        z, region = self.cast(u, v)
+        inside = (u >= 0.0) & (u < self.k.width) & (v >= 0.0) & (v < self.k.height)
+        return inside & (region > 0) & (np.abs(z - points[:, 2]) <= SAME_M)
+
+    def vertices(self) -> Array:
+        """[V, 3] float64: the vertices of the objects, which are all things but floor and table."""
+        objects = [thing for thing in self.things if thing.region_id >= REGION_FIRST_OBJECT]
+        return np.concatenate(
+            [np.empty((0, 3)), *(transform(one.T_world_shape, one.shape.vertices) for one in objects)]
+        )
+
+    def box(self) -> Box | None:
+        """The box about the objects' projected vertices, pixels, cut to the image; None where it is outside.
+
+        The whole image where a vertex is not in front of the near plane.
+        """
+        points = self.vertices()
+        if not len(points):
+            return None
+        bounds = project_bounds(points, self.k, NEAR_M)
+        left, top, right, bottom = np.clip(bounds, 0, [self.k.width, self.k.height] * 2).tolist()
+        return (left, top, right, bottom) if left < right and top < bottom else None
+
+
 def cast_pixels(things: Sequence[Placed], camera: Camera) -> Pixels:
     """A view at its own pixels' centres."""
-    box = project_box(things, camera) or (0.0, 0.0, 0.0, 0.0)
-    left, top, right, bottom = math.floor(box[0]), math.floor(box[1]), math.ceil(box[2]), math.ceil(box[3])
-    rows, columns = np.mgrid[top:bottom, left:right]
-    places = (rows.ravel(), columns.ravel()), _spread(camera.intrinsics.width, camera.intrinsics.height)
-    return Pixels(
-        *(Seen(v, u, *cast_at(things, camera, u.astype(float) + 0.5, v.astype(float) + 0.5)) for v, u in places)
-    )
+    eye = Eye(things, camera)
+    left, top, right, bottom = eye.box() or (0.0, 0.0, 0.0, 0.0)
+    rows, columns = np.mgrid[math.floor(top) : math.ceil(bottom), math.floor(left) : math.ceil(right)]
+    places = (rows.ravel(), columns.ravel()), _spread(eye.k.width, eye.k.height)
+    return Pixels(*(Seen(v, u, *eye.cast(u.astype(float) + 0.5, v.astype(float) + 0.5)) for v, u in places))
 
 
 @cache
@@ -109,36 +153,28 @@ def _spread(width: int, height: int) -> tuple[Index, Index]:
 
 def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
     """The objects in a view; `names` seed the random rays: the scene and the pair."""
-    k = camera.intrinsics
-    nothing = Patch(math.inf, None, np.empty((0, 2)), np.empty(0), np.empty(0, np.uint8))
-    reach = project_box(things, camera)
+    eye = Eye(things, camera)
+    reach = eye.box()
     if reach is None:
-        return nothing
+        return NOTHING
     left, top, right, bottom = reach
     cell = ((right - left) / DENSE, (bottom - top) / DENSE)
     rows, columns = (index.ravel() for index in np.mgrid[0:DENSE, 0:DENSE])
-    depth_m, region = cast_at(things, camera, left + cell[0] * (columns + 0.5), top + cell[1] * (rows + 0.5))
+    depth_m, region = eye.cast(left + cell[0] * (columns + 0.5), top + cell[1] * (rows + 0.5))
     mine = region >= REGION_FIRST_OBJECT
     if not mine.any():
-        return nothing
-    rows, columns, depth_m = rows[mine], columns[mine], depth_m[mine]
-    front_m = _nearest_seen(things, camera, float(depth_m.min()))
-    across = (left + cell[0] * np.array([columns.min(), columns.max() + 1])) / k.width
-    down = (top + cell[1] * np.array([rows.min(), rows.max() + 1])) / k.height
+        return NOTHING
+    rows, columns, dense_m = rows[mine], columns[mine], float(depth_m[mine].min())
+    # A flat face is nearest at a vertex, so the visible vertices before the dense rays' hits are tried as well.
+    points = eye.vertices()
+    points = points[(points[:, 2] > NEAR_M) & (points[:, 2] < dense_m)]
+    front_m = float(points[eye.sees(points), 2].min(initial=dense_m))
+    across = (left + cell[0] * np.array([columns.min(), columns.max() + 1])) / eye.k.width
+    down = (top + cell[1] * np.array([rows.min(), rows.max() + 1])) / eye.k.height
     rng = np.random.default_rng([BETWEEN_SEED, *names])
     at = rng.uniform((across[0], down[0]), (across[1], down[1]), (BETWEEN, 2))
-    z, hit = cast_at(things, camera, at[:, 0] * k.width, at[:, 1] * k.height)
-    return Patch(front_m, (float(across[0]), float(down[0]), float(across[1]), float(down[1])), at, z, hit)
-
-
-def _nearest_seen(things: Sequence[Placed], camera: Camera, dense_m: float) -> float:
-    """Least z of the objects' visible points, given the least z of the dense rays.
-
-    A flat face is nearest at a vertex, so the visible vertices before `dense_m` are tried as well.
-    """
-    points = _vertices(things, camera)
-    points = points[(points[:, 2] > NEAR_M) & (points[:, 2] < dense_m)]
-    return float(points[sees(camera, things, points), 2].min(initial=dense_m))
+    box = (float(across[0]), float(down[0]), float(across[1]), float(down[1]))
+    return Patch(front_m, box, at, *eye.cast(at[:, 0] * eye.k.width, at[:, 1] * eye.k.height))
 
 
 def seen_by_other(things: Sequence[Placed], camera: Camera, seen: Seen, other: Camera) -> NDArray[np.bool_]:
@@ -147,50 +183,6 @@ def seen_by_other(things: Sequence[Placed], camera: Camera, seen: Seen, other: C
     points = unproject(seen.rows[mine], seen.columns[mine], seen.depth_m[mine], camera.intrinsics)
     there = transform(invert(other.T_world_cam) @ camera.T_world_cam, points)
     before = there[:, 2] > NEAR_M
-    mine, there = mine[before], there[before]
     both = np.zeros(len(seen.region), bool)
-    both[mine] = sees(other, things, there)
+    both[mine[before]] = Eye(things, other).sees(there[before])
     return both
-
-
-def project_box(things: Sequence[Placed], camera: Camera) -> Box | None:
-    """The box about the objects' projected vertices, pixels, cut to the image; None where it is outside.
-
-    The whole image where a vertex is not in front of the near plane.
-    """
-    k = camera.intrinsics
-    points = _vertices(things, camera)
-    if not len(points):
-        return None
-    bounds = project_bounds(points, k, NEAR_M)
-    left, top, right, bottom = np.clip(bounds, 0, [k.width, k.height] * 2).tolist()
-    return (left, top, right, bottom) if left < right and top < bottom else None
-
-
-def _vertices(things: Sequence[Placed], camera: Camera) -> Array:
-    """[V, 3] float64: the vertices of the objects, which are all things but floor and table, in the camera's frame."""
-    T_cam_world = invert(camera.T_world_cam)
-    objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
-    parts = [transform(T_cam_world @ thing.T_world_shape, thing.shape.vertices) for thing in objects]
-    return np.concatenate([np.empty((0, 3)), *parts])
-
-
-def cast_at(things: Sequence[Placed], camera: Camera, u: Array, v: Array) -> tuple[Array, NDArray[np.uint8]]:
-    """(z [N] float64 metres, region [N] uint8) of the rays through image coordinates; 0 without a hit.
-
-    Like `cast_view`: in the camera's frame, where Embree's float32 is finest, and from the near plane on.
-    """
-    k, T_cam_world = camera.intrinsics, invert(camera.T_world_cam)
-    there = [Placed(thing.region_id, thing.shape, T_cam_world @ thing.T_world_shape) for thing in things]
-    rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(len(u))], axis=1)
-    hits = first_hit(there, NEAR_M * rays, rays)
-    return np.where(np.isinf(hits.distance), 0.0, hits.distance + NEAR_M), hits.region
-
-
-def sees(camera: Camera, things: Sequence[Placed], points: Array) -> NDArray[np.bool_]:
-    """[N] bool: whether surface points [N, 3] in the camera's frame, before it, are visible: the rays to them hit them."""
-    k = camera.intrinsics
-    u, v = project(points, k)
-    z, region = cast_at(things, camera, u, v)
-    inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
-    return inside & (region > 0) & (np.abs(z - points[:, 2]) <= SAME_M)
