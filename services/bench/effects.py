@@ -13,7 +13,6 @@ import numpy as np
 from schemas.base import Array
 from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
-from schemas.scene.scene import EffectPlan
 from services.bench.figures import Spread, describe_head, describe_machine, format_spread, pinned
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
@@ -56,7 +55,7 @@ def time_settling(scenes: Sequence[Facts], rounds: int) -> tuple[dict[str, Array
     """Settle each scene in each variant in turn. Raises RunError where no scene settles both by plan and with all forced.
 
     Returns by variant the seconds of processor, [rounds, scenes], nan where the plan has the effect or settling failed; and
-    how often settling failed.
+    how often settling failed. What goes by the plan includes the choice of effects.
     """
     seconds = {name: np.full((rounds + 1, len(scenes)), np.nan) for name in FORCED}
     failed = dict.fromkeys(FORCED, 0)
@@ -65,26 +64,19 @@ def time_settling(scenes: Sequence[Facts], rounds: int) -> tuple[dict[str, Array
             continue
         if name in EFFECTS and name not in plan_effects(facts).skipped:
             continue
-        took = _settle_s(facts, plan_effects(facts, FORCED[name]), by_plan=name not in (WHOLE, EVERYTHING))
-        failed[name] += took is None
-        seconds[name][lap, number] = np.nan if took is None else took
+        plan, scene, physics = plan_effects(facts, FORCED[name]), facts.plan, facts.job.physics
+        began = time.process_time()
+        if name not in (WHOLE, EVERYTHING):
+            called_for(scene.objects, scene.table, physics)
+        try:
+            settle_scene(scene, physics, plan)
+            seconds[name][lap, number] = time.process_time() - began
+        except SceneError:
+            failed[name] += 1
     timed = {name: found[1:] for name, found in seconds.items()}
     if not _compared(timed).any():
         raise RunError(f"none of {len(scenes)} scenes comes to rest both by its plan and with every effect forced")
     return timed, failed
-
-
-def _settle_s(facts: Facts, plan: EffectPlan, by_plan: bool) -> float | None:
-    """Seconds of processor, with `by_plan` including the choice of effects; None where the scene does not come to rest."""
-    scene, physics = facts.plan, facts.job.physics
-    began = time.process_time()
-    if by_plan:
-        called_for(scene.objects, scene.table, physics)
-    try:
-        settle_scene(scene, physics, plan)
-    except SceneError:
-        return None
-    return time.process_time() - began
 
 
 def _compared(seconds: Mapping[str, Array]) -> Array:
@@ -136,17 +128,14 @@ def describe(figures: dict[str, Any]) -> list[str]:
     for name, side in figures["forced"].items():
         lines.append(f"{name + ' forced':34} {_ms(side)}   the plan saves {format_spread(side['saved'], '.1%')}")
     for name, cost in figures["effects"].items():
-        lines.append(f"  {'plan and ' + name:32} {_more(cost)}")
+        told = "every scene calls for it"
+        if (more := cost["more_ms"]) is not None:
+            spread = f"[{more['least']:+.1f} to {more['most']:+.1f}]"
+            told = f"{more['median']:+8.1f} {spread} a scene, in {cost['scenes']} scenes"
+        lines.append(f"  {'plan and ' + name:32} {told}")
     failed = [f"{name} {count}" for name, count in figures["failed"].items() if count]
     return [*lines, f"did not come to rest: {', '.join(failed) or 'none'}"]
 
 
 def _ms(side: Mapping[str, float]) -> str:
     return f"{side['median_ms']:8.1f} ({side['mean_ms']:.1f})"
-
-
-def _more(cost: Mapping[str, Any]) -> str:
-    if cost["more_ms"] is None:
-        return "every scene calls for it"
-    more = cost["more_ms"]
-    return f"{more['median']:+8.1f} [{more['least']:+.1f} to {more['most']:+.1f}] a scene, in {cost['scenes']} scenes"

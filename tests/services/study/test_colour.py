@@ -1,10 +1,6 @@
 """Errors of colour: FLIP by its formula, the part of a picture that is compared, and truth that no setting decides."""
 
 import itertools
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,30 +57,6 @@ def test_images_of_two_sizes_or_of_another_kind_are_refused_and_end_no_process()
     for one, other in (*((image, other) for other in others), (image.astype(np.float32), image)):
         with pytest.raises(ValueError, match="uint8 of one size"):
             flip_between(one, other)
-
-
-@pytest.mark.minute
-def test_flip_prints_nothing_writes_nothing_and_is_the_same_on_any_number_of_threads(tmp_path):
-    code = (
-        "import numpy as np; from services.study.colour import flip_between;"
-        "rng = np.random.default_rng(0); a = rng.integers(0, 256, (150, 170, 3), dtype=np.uint8);"
-        "b = np.clip(a + rng.normal(0, 20, a.shape), 0, 255).astype(np.uint8);"
-        "print(*{flip_between(a, b).hex() for _ in range(3)})"
-    )
-    plain_environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "PYTHONDONTWRITEBYTECODE": "1"}
-    said = [
-        subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=tmp_path,
-            env={**plain_environment, "OMP_NUM_THREADS": threads},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        for threads in ("1", "3")
-    ]
-    assert said[0].stdout == said[1].stdout and len(said[0].stdout.split()) == 1
-    assert said[0].stderr == said[1].stderr == "" and list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------------------------------------- what is compared
