@@ -32,7 +32,7 @@ def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     (OpenCV's encoder at its level 1 11 ms and 212 KiB, at 9 420 ms and 158 KiB); projected RGB 1.6 ms and 157 KiB, 2.5 and
     119, 4.6 and 100; depth 0.4 ms and 16 KiB, region ids 0.1 ms and 6 KiB at level 1. ISA-L is as fast as fpng, but once in
     some thousand images its level 1 makes other bytes from the same pixels, depending on leftovers in its memory;
-    tests/encoded_digests.py compares the bytes of these two over 100,000 images.
+    tests/kit/encoded_digests.py compares the bytes of these two over 100,000 images.
     """
     colored = pixels.dtype == np.uint8 and pixels.ndim == 3 and pixels.shape[2] == 3
     if not colored and (pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16)):

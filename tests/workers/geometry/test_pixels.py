@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from schemas.scene.view import Camera, Intrinsics
-from tests.workers.labels.planes import HERE, plane_view
-from tests.workers.labels.planes import K as PLANE_K
+from tests.kit.planes import HERE, plane_view
+from tests.kit.planes import K as PLANE_K
 from workers.geometry.camera import unproject
 from workers.geometry.colour import SRGB_STEPS, decode_codes, encode_codes, encode_srgb
 from workers.geometry.pixels import (

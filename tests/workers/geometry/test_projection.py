@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from schemas.scene.view import Camera, Intrinsics
-from tests.workers.labels.planes import HERE as PLANE_HERE
-from tests.workers.labels.planes import IMAGES, plane_view
-from tests.workers.labels.planes import THERE as PLANE_THERE
+from tests.kit.planes import HERE as PLANE_HERE
+from tests.kit.planes import IMAGES, plane_view
+from tests.kit.planes import THERE as PLANE_THERE
 from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.frames import invert, pose, uniform_rotation
 from workers.geometry.projection import (

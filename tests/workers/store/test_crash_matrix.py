@@ -1,7 +1,7 @@
 """One matrix of crashes: operation x point. Each ends in a dataset without loss or double, or in a refusal.
 
 An operation is killed, loses its power, or meets another process at a point: just before one of the steps that it takes on the
-disk, or of the requests that it makes to a bucket. By default each row tries two points; `--all` tries all of them.
+disk, or of the requests that it makes to a bucket. With `--ci` each row tries two points, with `--all` all of them.
 """
 
 import hashlib
@@ -48,9 +48,9 @@ from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
 NEVER = 10**9
-every_point = pytest.mark.parametrize(
-    "every", [False, pytest.param(True, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])], ids=["two", "every"]
-)
+TWO = pytest.param(False, marks=pytest.mark.minute, id="two")
+EVERY = pytest.param(True, marks=[pytest.mark.slow, pytest.mark.timeout(1800)], id="every")
+every_point = pytest.mark.parametrize("every", [TWO, EVERY])
 
 
 def points(steps: int, every: bool) -> tuple[int, ...]:
@@ -256,16 +256,11 @@ def promised(store) -> str | None:
     return success["digest"]
 
 
-class Newer(NamedTuple):
-    """A coordinator that took the lock while the merge was paused, and the end of the scenes that it merges."""
-
-    stop: int
-
-    def __call__(self, store) -> None:
-        layout = store.layouts[0]
-        if self.stop == 6:
-            attempt_at(store, 4, 6, terms(layout=layout, range_size=2), small_scene).commit()
-        merge(store, 0, self.stop)
+def merge_newer(store, stop: int) -> None:
+    """A coordinator that took the lock while the merge was paused merges the scenes up to `stop`, having made what lacks."""
+    if stop == 6:
+        attempt_at(store, 4, 6, terms(layout=store.layouts[0], range_size=2), small_scene).commit()
+    merge(store, 0, stop)
 
 
 @pytest.fixture(scope="module")
@@ -282,7 +277,7 @@ def expected(tmp_path_factory):
     return digests
 
 
-def pause_on_disk(tmp_path: Path, newer: Newer):
+def pause_on_disk(tmp_path: Path, stop: int):
     """A function that pauses a merge at a step, and what is left then: (steps, store, what the merge said)."""
     with disk():
         half_merged(LocalStore(tmp_path / "seed"))
@@ -290,14 +285,14 @@ def pause_on_disk(tmp_path: Path, newer: Newer):
     def pause(step: int):
         root = tmp_path / str(step)
         shutil.copytree(tmp_path / "seed", root)
-        with disk(at=step, then=lambda: newer(LocalStore(root))) as watched:
+        with disk(at=step, then=lambda: merge_newer(LocalStore(root), stop)) as watched:
             told = refusal(LocalStore(root))
         return watched.steps, LocalStore(root), told
 
     return pause
 
 
-def pause_in_bucket(_: Path, newer: Newer):
+def pause_in_bucket(_: Path, stop: int):
     """The same at the requests to an object store."""
     seed = MemoryStore()
     half_merged(ObjectStore(seed, "memory://"), "tar")
@@ -310,7 +305,7 @@ def pause_in_bucket(_: Path, newer: Newer):
         with pytest.MonkeyPatch.context() as patch:
             for module in (store_module, merge_module, reading, ledger):  # requests in the same order each time
                 patch.setattr(module, "map_ahead", lambda store, function, items, at_once=None: map(function, items))
-            with requests(at=step, then=lambda: newer(store), names=REQUESTS) as watched:
+            with requests(at=step, then=lambda: merge_newer(store, stop), names=REQUESTS) as watched:
                 told = refusal(store)
         return watched.count, store, told
 
@@ -329,7 +324,7 @@ def refusal(store) -> str:
 @pytest.mark.parametrize("stop", [6, 4], ids=["extends", "merges again"])
 @pytest.mark.parametrize("where", [pause_on_disk, pause_in_bucket], ids=["disk", "bucket"])
 def test_paused_at_a_point_while_a_newer_merge_completes_one_of_them_stands(where, stop, every, expected, tmp_path):
-    pause = where(tmp_path, Newer(stop))
+    pause = where(tmp_path, stop)
     steps = pause(NEVER)[0]
     finished, refused = [], []
     for step in points(steps, every):

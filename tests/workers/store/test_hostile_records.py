@@ -13,7 +13,6 @@ import pytest
 from schemas.dataset.layout import STAGING, SUCCESS_FILE, commit_path
 from schemas.errors import CommitConflict, CorruptError, OutputError, RunError
 from services.merge.merge import merge, read_success
-from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, small_scene
 from tests.mutations import mutated_bytes, mutated_tree
 from workers.store.attempt import sweep
@@ -23,61 +22,35 @@ from workers.store.local import LocalStore
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 KEY = commit_path(0)
-OUTSIDE = [
-    "../../victim",
-    "../victim",
-    "/victim",
-    "mug/../../victim",
-    "mug//RGB00000.png",
-    "./mug/RGB00000.png",
-    "",
-    ".",
-]
-OUTSIDE += ["mug/./RGB00000.png", "mug/RGB00000.png/", "..", "mug/RGB00000.png\0", "mug\\RGB00000.png"]
-UNPRINTABLE = ["mug/RGB00000.png\n", "mug/\x1b[2JRGB00000.png", "mug/RGB00000.png\u2028"]
-OF_THE_DATASET = ["job.yaml", "_SUCCESS", "_lock.json", "DATASET.md", "camPoses.csv", "_logs/RGB00000.png"]
-OF_THE_DATASET += ["_staging/0000000004/r0-x/mug/RGB00000.png", "manifest/_commits/0000000004.json"]
-OF_THE_DATASET += [
-    "manifest/_fingerprint.json",
-    "manifest/RGB00000.png",
-    "manifest/views/category=mug/part-00000.parquet",
-]
-OF_ANOTHER_RANGE = ["manifest/_ranges/0000000004/views.parquet", "manifest/_ranges/0000000000.retry-1/views.parquet"]
-OF_ANOTHER_RANGE += ["manifest/_ranges/0000000000/../0000000004/views.parquet", "mug/0000000004.tar"]
-OF_ANOTHER_RANGE += ["mug/0000000000.retry-1.tar", "mug/RGB99999.png", "mug/RGB00008.png"]
-OF_NO_KIND = ["manifest/_ranges/0000000000/views.parquet.exe", "mug/photo00000.png", "mug/RGB0.png", "mug/RGB00000.svg"]
-OF_NO_KIND += [
-    "mug/other/RGB00000.png",
-    "assets/RGB00000.png",
-    "assets/mug/a.sh",
-    "assets/mug/b/a.glb",
-    "assets/../mug/a.glb",
-]
+FIELDS = ("start", "stop", "retry", "scenes")
+OUTSIDE = (
+    *("../../victim", "../victim", "/victim", "mug/../../victim", "mug//RGB00000.png", "./mug/RGB00000.png", "", "."),
+    *("mug/./RGB00000.png", "mug/RGB00000.png/", "..", "mug/RGB00000.png\0", "mug\\RGB00000.png"),
+)
+UNPRINTABLE = ("mug/RGB00000.png\n", "mug/\x1b[2JRGB00000.png", "mug/RGB00000.png\u2028")
+OF_THE_DATASET = (
+    *("job.yaml", "_SUCCESS", "_lock.json", "DATASET.md", "camPoses.csv", "_logs/RGB00000.png"),
+    *("_staging/0000000004/r0-x/mug/RGB00000.png", "manifest/_commits/0000000004.json", "manifest/_fingerprint.json"),
+    *("manifest/RGB00000.png", "manifest/views/category=mug/part-00000.parquet"),
+)
+OF_ANOTHER_RANGE = (
+    *("manifest/_ranges/0000000004/views.parquet", "manifest/_ranges/0000000000.retry-1/views.parquet"),
+    *("manifest/_ranges/0000000000/../0000000004/views.parquet", "mug/0000000004.tar"),
+    *("mug/0000000000.retry-1.tar", "mug/RGB99999.png", "mug/RGB00008.png"),
+)
+OF_NO_KIND = (
+    *("manifest/_ranges/0000000000/views.parquet.exe", "mug/photo00000.png", "mug/RGB0.png", "mug/RGB00000.svg"),
+    *("mug/other/RGB00000.png", "assets/RGB00000.png", "assets/mug/a.sh", "assets/mug/b/a.glb", "assets/../mug/a.glb"),
+)
 PATHS = OUTSIDE + UNPRINTABLE + OF_THE_DATASET + OF_ANOTHER_RANGE + OF_NO_KIND
-
-ATTEMPTS = [
-    "../x",
-    "r0-a/../../x",
-    "r0-",
-    "x",
-    "",
-    "r1-a",
-    "r0-a.fenced",
-    "r0-a\n",
-    "r0-\x1b",
+ATTEMPTS = (
+    *("../x", "r0-a/../../x", "r0-", "x", "", "r1-a", "r0-a.fenced", "r0-a\n", "r0-\x1b", "/r0-a"),
     "r0-" + "a" * 300,
-    "/r0-a",
-]
-SPANS = [
-    {"start": -1, "stop": 4, "retry": 0, "scenes": []},
-    {"start": 0, "stop": 10**30, "retry": 0, "scenes": []},
-    {"start": 0, "stop": 10**14, "retry": 0, "scenes": []},
-    {"start": 0, "stop": 0, "retry": 0, "scenes": []},
-    {"start": 0, "stop": 4, "retry": 0, "scenes": [1]},
-    {"start": 0, "stop": 4, "retry": 1, "scenes": []},
-    {"start": 0, "stop": 4, "retry": 1, "scenes": [9]},
-    {"start": "../0", "stop": 4, "retry": 0, "scenes": []},
-]
+)
+SPANS = (
+    *((-1, 4, 0, []), (0, 10**30, 0, []), (0, 10**14, 0, []), (0, 0, 0, [])),
+    *((0, 4, 0, [1]), (0, 4, 1, []), (0, 4, 1, [9]), ("../0", 4, 0, [])),
+)
 
 
 @pytest.fixture
@@ -128,7 +101,7 @@ def test_a_name_or_a_span_that_is_none_is_refused_at_once(store, undecided):
         told = refused(store, undecided, attempt=attempt)
         assert "is not the name of an attempt" in told or len(attempt) > 200  # the message is cut there
     for span in SPANS:
-        refused(store, undecided, span=span)
+        refused(store, undecided, span=dict(zip(FIELDS, span, strict=True)))
 
 
 def link_into(store: LocalStore, key: str, outside: Path) -> dict[str, bytes | str]:
@@ -144,22 +117,22 @@ def link_into(store: LocalStore, key: str, outside: Path) -> dict[str, bytes | s
     return everything(outside)
 
 
-@pytest.mark.parametrize("key", ["bottle", "camera", "mug", "mug/patches", "assets", "assets/mug", "manifest/_ranges"])
-def test_nothing_is_published_through_a_link_that_leads_out(store, undecided, key, tmp_path):
-    before = link_into(store, key, tmp_path / "home")
-
-    def make_three_ranges():
+@pytest.mark.parametrize("key", ["mug", "mug/patches", "assets/mug", "manifest/_ranges", "manifest/views"])
+def test_nothing_is_published_or_merged_through_a_link_that_leads_out(store, undecided, key, tmp_path):
+    def publish_and_merge():
         for start in (0, 4, 8):
             attempt_at(store, start, start + 4).commit()
             sweep(store, fenced=None)
+        merge(store, 0, 12)
 
+    before = link_into(store, key, tmp_path / "home")
     with pytest.raises(OutputError, match=f"{key} is a symbolic link that leads out of .*: nothing is written") as told:
-        make_three_ranges()
+        publish_and_merge()
     assert len(str(told.value).splitlines()) == 1
     assert everything(tmp_path / "home") == before
 
 
-@pytest.mark.parametrize("key", ["_staging", "_staging/_tmp", "manifest", "manifest/_commits"])
+@pytest.mark.parametrize("key", ["_staging/_tmp", "manifest", "manifest/_commits"])
 def test_a_run_does_not_begin_where_a_link_leads_out(tmp_path, key):
     store = LocalStore(tmp_path / "out")
     before = link_into(store, key, tmp_path / "home")
@@ -183,14 +156,6 @@ def test_a_run_does_not_begin_where_a_link_leads_out(tmp_path, key):
     assert everything(tmp_path / "home") == before
 
 
-def test_a_merge_removes_and_writes_nothing_behind_a_link(tmp_path):
-    store = dataset_at(tmp_path / "out")
-    before = link_into(store, "manifest/views", tmp_path / "home")
-    with pytest.raises(OutputError, match="manifest/views is a symbolic link that leads out of "):
-        merge(store, FIRST, STOP)
-    assert everything(tmp_path / "home") == before
-
-
 def test_a_link_that_stays_inside_is_followed(store, undecided):
     (store.root / "big").mkdir()
     for name in ("mug", "camera", "bottle"):
@@ -199,9 +164,9 @@ def test_a_link_that_stays_inside_is_followed(store, undecided):
     assert list((store.root / "big").glob("*.png"))
 
 
-def test_a_success_file_that_names_other_files_is_not_whole(tmp_path):
-    store = dataset_at(tmp_path / "out", stop=FIRST + 4)
-    merge(store, FIRST, FIRST + 4)
+def test_a_success_file_that_names_other_files_is_not_whole(store):
+    attempt_at(store, 0, 4).commit()
+    merge(store, 0, 4)
     success = json.loads(store.read(SUCCESS_FILE))
     assert read_success(store) == success
     for path in ("../victim", "job.yaml", "mug/RGB00000.png", "manifest/views/category=a/../x.parquet", ""):

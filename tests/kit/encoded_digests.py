@@ -1,13 +1,13 @@
 """Digests of many encoded images, to compare between processes, processors and contents of leftover memory.
 
-    python -m tests.encoded_digests render SOURCES.npy
-    python -m tests.encoded_digests digest SOURCES.npy DIGESTS.npy --images 100000
-    python -m tests.encoded_digests digest SOURCES.npy OTHER.npy --images 100000 --backward
-    python -m tests.encoded_digests compare DIGESTS.npy OTHER.npy
+    python -m tests.kit.encoded_digests render SOURCES.npy
+    python -m tests.kit.encoded_digests digest SOURCES.npy DIGESTS.npy --images 100000
+    python -m tests.kit.encoded_digests digest SOURCES.npy OTHER.npy --images 100000 --backward
+    python -m tests.kit.encoded_digests compare DIGESTS.npy OTHER.npy
 
 `digest` loads the encoder and nothing else of the project, so it also runs on an emulated processor:
 
-    qemu-x86_64 -cpu Nehalem,-pclmulqdq python -m tests.encoded_digests digest SOURCES.npy OTHER.npy --images 4000
+    qemu-x86_64 -cpu Nehalem,-pclmulqdq python -m tests.kit.encoded_digests digest SOURCES.npy OTHER.npy --images 4000
 
 With glibc, `MALLOC_PERTURB_=165` fills whatever is allocated or freed, which shows what leftovers in memory change.
 """

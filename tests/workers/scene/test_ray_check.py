@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,6 +29,10 @@ CAMERA = Camera(
 )
 
 
+def buffer(depth, region) -> GBuffer:
+    return GBuffer(np.zeros((120, 160, 3), np.uint8), depth.astype(np.float32), region)
+
+
 @pytest.fixture(scope="module")
 def scene() -> PosedScene:
     job = Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}})
@@ -38,8 +43,7 @@ def scene() -> PosedScene:
 @pytest.fixture(scope="module")
 def truth(scene) -> GBuffer:
     """What a perfect renderer would have made."""
-    depth, region, _ = cast_view(scene.things, CAMERA)
-    return GBuffer(np.zeros((120, 160, 3), np.uint8), depth.astype(np.float32), region)
+    return buffer(*cast_view(scene.things, CAMERA)[:2])
 
 
 def test_right_labels_pass(scene, truth):
@@ -47,47 +51,40 @@ def test_right_labels_pass(scene, truth):
     check_against_rays(scene, CAMERA, truth, STORED)
 
 
-@pytest.mark.parametrize(("region_id", "error_m"), [(1, 2e-5), (2, 2e-5), (3, 2e-5)])
-def test_depth_that_is_off_by_twenty_micrometres_is_found_in_every_region(scene, truth, region_id, error_m):
-    wrong = truth.depth_m + np.where(truth.region == region_id, np.float32(error_m), np.float32(0))
-    with pytest.raises(LabelError, match=f"region {region_id}"):
-        check_against_rays(scene, CAMERA, dataclasses.replace(truth, depth_m=wrong), STORED)
-
-
-@pytest.mark.parametrize(("region_id", "share", "error_mm"), [(1, 0.001, 0.02), (3, 0.01, 0.1), (3, 0.5, 0.02)])
-def test_depth_is_held_to_its_percentiles_to_the_pixel(scene, region_id, share, error_mm):
+def test_depth_is_held_to_its_percentiles_to_the_pixel(scene):
     """Around the number of wrong pixels from which numpy's percentile exceeds the bound."""
     depth, region, cosine = cast_view(scene.things, CAMERA)
-    compared = (region == region_id) & (depth < STORED.high) & (cosine > STEEPEST_COS)
-    pixels, verdicts = np.argwhere(compared), set()
-    pixels = pixels[np.argsort(-edge_distance_px(scene.things, CAMERA, pixels))]
-    for count in range(math.floor(share * len(pixels)) - 3, math.floor(share * len(pixels)) + 4):
-        wrong = depth.copy()
-        wrong[tuple(pixels[:count].T)] += error_mm / 1e3
-        buffer = GBuffer(np.zeros((120, 160, 3), np.uint8), wrong.astype(np.float32), region)
-        off = np.abs(buffer.depth_m.astype(np.float64) - depth)[compared] * 1e3
-        bounds = [(99.9, 0.01)] if region_id < 3 else [(50.0, 0.01), (99.0, 0.05)]
-        fails = any(np.percentile(off, percentile) > bound for percentile, bound in bounds)
-        with pytest.raises(LabelError, match=f"region {region_id}: ") if fails else contextlib.nullcontext():
-            check_against_rays(scene, CAMERA, buffer, STORED)
-        verdicts.add(fails)
-    assert verdicts == {True, False}
+    for region_id, share, error_mm in ((1, 0.001, 0.02), (3, 0.01, 0.1), (3, 0.5, 0.02)):
+        compared = (region == region_id) & (depth < STORED.high) & (cosine > STEEPEST_COS)
+        pixels, verdicts = np.argwhere(compared), set()
+        pixels = pixels[np.argsort(-edge_distance_px(scene.things, CAMERA, pixels))]
+        for count in range(math.floor(share * len(pixels)) - 3, math.floor(share * len(pixels)) + 4):
+            wrong = depth.copy()
+            wrong[tuple(pixels[:count].T)] += error_mm / 1e3
+            seen = buffer(wrong, region)
+            off = np.abs(seen.depth_m.astype(np.float64) - depth)[compared] * 1e3
+            bounds = [(99.9, 0.01)] if region_id < 3 else [(50.0, 0.01), (99.0, 0.05)]
+            fails = any(np.percentile(off, percentile) > bound for percentile, bound in bounds)
+            with pytest.raises(LabelError, match=f"region {region_id}: ") if fails else contextlib.nullcontext():
+                check_against_rays(scene, CAMERA, seen, STORED)
+            verdicts.add(fails)
+        assert verdicts == {True, False}
 
 
-def test_half_a_pixel_of_shift_is_found(scene, truth):
+def test_twenty_micrometres_half_a_pixel_and_one_wrong_pixel_are_found(scene, truth):
+    for region_id in (1, 2, 3):
+        wrong = truth.depth_m + np.where(truth.region == region_id, np.float32(2e-5), np.float32(0))
+        with pytest.raises(LabelError, match=f"region {region_id}"):
+            check_against_rays(scene, CAMERA, dataclasses.replace(truth, depth_m=wrong), STORED)
     shifted = Camera(CAMERA.intrinsics.model_copy(update={"cx": 79.5}), CAMERA.T_world_cam)
-    depth, region, _ = cast_view(scene.things, shifted)
     with pytest.raises(LabelError):
-        check_against_rays(scene, CAMERA, GBuffer(truth.rgb, depth.astype(np.float32), region), STORED)
-
-
-def test_one_wrong_pixel_away_from_every_edge_is_found(scene, truth):
+        check_against_rays(scene, CAMERA, buffer(*cast_view(scene.things, shifted)[:2]), STORED)
     region, depth = truth.region.copy(), truth.depth_m.copy()
     row, column = (int(np.median(index)) for index in np.nonzero(region == 3))
     region[row, column] = 2
     depth[row, column] += 0.01
     with pytest.raises(LabelError, match=rf"pixel \({column}, {row}\) is region 2 in the mask and 3 by ray"):
-        check_against_rays(scene, CAMERA, GBuffer(truth.rgb, depth, region), STORED)
+        check_against_rays(scene, CAMERA, buffer(depth, region), STORED)
 
 
 def test_a_pixel_at_an_edge_of_a_small_thing_may_show_either_side_and_one_amid_it_may_not(scene):
@@ -109,52 +106,46 @@ def test_a_pixel_at_an_edge_of_a_small_thing_may_show_either_side_and_one_amid_i
             break
     k, at, depth, moved, region = found[0]
     assert (region == 3).sum() < 100
-    camera, rgb = Camera(k, CAMERA.T_world_cam), np.zeros((120, 160, 3), np.uint8)
+    camera = Camera(k, CAMERA.T_world_cam)
     other = depth.copy()
     other[at] = moved[at]
-    check_against_rays(scene, camera, GBuffer(rgb, other.astype(np.float32), region), STORED)
+    check_against_rays(scene, camera, buffer(other, region), STORED)
     amid = depth.copy()
     inside = np.argwhere((region == 3) & (np.abs(np.indices(region.shape)[1] - at[1]) > 1))
     away = edge_distance_px(scene.things, camera, inside)
     amid[tuple(inside[int(np.argmax(away))])] += 0.01
     with pytest.raises(LabelError, match="region 3: 99 %"):
-        check_against_rays(scene, camera, GBuffer(rgb, amid.astype(np.float32), region), STORED)
+        check_against_rays(scene, camera, buffer(amid, region), STORED)
 
 
-@pytest.mark.parametrize(("apart_mm", "passes"), [(0.04, True), (0.5, False)])
-def test_where_two_things_cut_through_one_another_either_may_be_shown_within_a_tenth_of_a_millimetre(
-    scene, apart_mm, passes
-):
+def test_where_two_things_cut_through_one_another_either_may_be_shown_within_a_tenth_of_a_millimetre(scene):
     """Two slabs that cross at a third of a degree, one of them drawn as if it stood so much higher, with its true depth."""
     slab = shape_of(box(0.3, 0.3, 0.02))
     level = translation(0.0, 0.0, 0.8)
     tilted = level @ pose(rotation_about(np.array([0.0, 1.0, 0.0]), math.radians(0.3)), np.zeros(3))
     things = (*scene.things[:2], Placed(3, slab, level), Placed(4, slab, tilted))
-    raised = (*things[:3], Placed(4, slab, translation(0.0, 0.0, apart_mm / 1e3) @ tilted))
     alone = {t.region_id: cast_view([t], CAMERA)[0] for t in things}
-    _, region, _ = cast_view(raised, CAMERA)
     _, right, _ = cast_view(things, CAMERA)
-    assert ((region != right) & (region == 4)).sum() > 5
-    region = np.where((region == 4) & (alone[4] > 0), region, right).astype(np.uint8)
-    depth = np.select([region == k for k in alone], list(alone.values())).astype(np.float32)
-    buffer = GBuffer(np.zeros((120, 160, 3), np.uint8), depth, region)
-    with contextlib.nullcontext() if passes else pytest.raises(LabelError, match="4 in the mask and 3 by ray"):
-        check_against_rays(dataclasses.replace(scene, things=things), CAMERA, buffer, STORED)
+    for apart_mm, passes in ((0.04, True), (0.5, False)):
+        raised = (*things[:3], Placed(4, slab, translation(0.0, 0.0, apart_mm / 1e3) @ tilted))
+        _, region, _ = cast_view(raised, CAMERA)
+        assert ((region != right) & (region == 4)).sum() > 5
+        region = np.where((region == 4) & (alone[4] > 0), region, right).astype(np.uint8)
+        seen = buffer(np.select([region == k for k in alone], list(alone.values())), region)
+        with contextlib.nullcontext() if passes else pytest.raises(LabelError, match="4 in the mask and 3 by ray"):
+            check_against_rays(dataclasses.replace(scene, things=things), CAMERA, seen, STORED)
 
 
-class PairLike:
-    """check_pair looks at nothing but the agreement."""
-
-    def __init__(self, object_mm: float | None, scene_mm: float | None) -> None:
-        self.exact_agreement = Agreement(object_mm, 1.0, 100, scene_mm)
-
-
-@pytest.mark.parametrize(("object_mm", "scene_mm", "what"), [(1.5, 0.1, "the object"), (0.1, 1.5, "the scene")])
-def test_views_that_disagree_are_a_failure_that_says_by_how_much(object_mm, scene_mm, what):
-    with pytest.raises(LabelError, match=f"of {what} carried into the mirror view is off by 1.500 mm"):
-        check_pair(PairLike(object_mm, scene_mm), Job(name="t").check)
-
-
-def test_views_that_agree_or_have_nothing_to_compare_pass():
-    check_pair(PairLike(0.1, 0.1), Job(name="t").check)
-    check_pair(PairLike(None, None), Job(name="t").check)
+def test_views_that_disagree_are_a_failure_that_says_by_how_much():
+    """`check_pair` looks at nothing but the agreement."""
+    check = Job(name="t").check
+    for object_mm, scene_mm, what in (
+        (1.5, 0.1, "the object"),
+        (0.1, 1.5, "the scene"),
+        (0.1, 0.1, ""),
+        (None, None, ""),
+    ):
+        pair = SimpleNamespace(exact_agreement=Agreement(object_mm, 1.0, 100, scene_mm))
+        told = f"of {what} carried into the mirror view is off by 1.500 mm"
+        with pytest.raises(LabelError, match=told) if what else contextlib.nullcontext():
+            check_pair(pair, check)

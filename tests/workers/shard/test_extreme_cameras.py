@@ -8,24 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import FINGERPRINT_FILE, IMAGES, commit_path
-from schemas.dataset.shard import ShardOrder
 from schemas.errors import JobError, MachineError
 from schemas.job.identity import settings_digest
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.job.job_file import validate_job
+from tests.workers.shard import shards
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import invert, transform
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import make_scene
-from workers.shard.run_shard import run_shard
 from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png
 from workers.store.local import LocalStore
-
-pytestmark = pytest.mark.minute
 
 IN_THE_MIDDLE = {"offset_m": [0.0, 0.0], "pose": "placed"}
 EVERY_EFFECT = {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}
@@ -40,24 +36,9 @@ def job_of(width: int, height: int, focal: float, **changes):
     return validate_job(tree, "test")
 
 
-def order_of(job, out: Path, scenes: int) -> ShardOrder:
-    terms = CommitTerms(
-        job_digest="test",
-        fingerprint="",
-        fingerprint_mode="record",
-        layout="files",
-        first_scene=0,
-        range_size=scenes,
-        pairs_per_scene=job.pairs_per_scene,
-    )
-    return ShardOrder(out=str(out), job=job, terms=terms, spans=(Span(start=0, stop=scenes),))
-
-
 def run(job, out: Path, scenes: int = 2):
     """(scenes made, failures by reason, the store) of a shard of one range."""
-    LocalStore(out).prepare()
-    report = run_shard(order_of(job, out, scenes), open_catalogue(job.assets, Path(), tuple(job.categories)))
-    (span,) = report.spans
+    (span,) = shards.run(job, out, (0, scenes)).spans
     assert span.made + sum(span.failed.values()) == scenes
     return span.made, span.failed, LocalStore(out)
 
@@ -70,31 +51,29 @@ def images_of(store: LocalStore) -> dict[str, np.ndarray]:
     return {path: decode_png(store.read(path), path) for path in paths}
 
 
-@pytest.mark.parametrize("changes", [{}, {"sensor": EVERY_EFFECT}, {"images": HARD_TO_DERIVE}])
-@pytest.mark.parametrize("samples", [1, 4])
-def test_an_image_of_one_pixel_is_made_whole(tmp_path, changes, samples):
-    job = job_of(1, 1, 525.0, start=IN_THE_MIDDLE, render={"samples": samples}, **changes)
-    made, failed, store = run(job, tmp_path, scenes=6)
-    assert made > 0 and set(failed) <= {"intrinsic: object_not_seen"}
-    images = images_of(store)
-    assert len(images) == made * len(IMAGES), "and no patch, which would be larger than the image"
-    assert {image.shape[:2] for image in images.values()} == {(1, 1)}
+@pytest.mark.minute
+def test_images_of_one_pixel_or_without_an_inside_are_made_whole(tmp_path):
+    hard = {"sensor": EVERY_EFFECT, "images": HARD_TO_DERIVE}
+    sizes = ((2, 2), (3, 1), (1, 3), (2, 640), (4096, 1))
+    cases = [(1, 1, 525.0, {"render": {"samples": 4}, **changes}) for changes in ({}, hard)]
+    cases += [(width, height, 60.0, hard) for width, height in sizes]
+    for number, (width, height, focal, changes) in enumerate(cases):
+        job = job_of(width, height, focal, start=IN_THE_MIDDLE, **changes)
+        made, failed, store = run(job, tmp_path / str(number), scenes=4)
+        assert made > 0 and set(failed) <= {"intrinsic: object_not_seen"}, (width, height)
+        images = images_of(store)
+        assert {image.shape[:2] for image in images.values()} == {(height, width)}
+        assert len(images) == made * len(IMAGES), "and no patch, which would be larger than the image"
 
 
-@pytest.mark.parametrize(("width", "height"), [(2, 2), (3, 1), (1, 3), (2, 640), (4096, 1)])
-@pytest.mark.parametrize("changes", [{}, {"sensor": EVERY_EFFECT, "images": HARD_TO_DERIVE}])
-def test_images_too_narrow_to_have_an_inside_are_made(tmp_path, width, height, changes):
-    made, failed, store = run(job_of(width, height, 60.0, start=IN_THE_MIDDLE, **changes), tmp_path, scenes=4)
-    assert made > 0 and set(failed) <= {"intrinsic: object_not_seen"}
-    assert {image.shape[:2] for image in images_of(store).values()} == {(height, width)}
-
-
+@pytest.mark.minute
 def test_a_sensor_that_sees_half_the_world_in_a_pixel_says_that_it_sees_no_object(tmp_path):
     for n, focal in enumerate((0.001, 0.5)):
         made, failed, _ = run(job_of(64, 48, focal), tmp_path / str(n))
         assert (made, failed) == (0, {"intrinsic: object_not_seen": 2})
 
 
+@pytest.mark.minute
 def test_a_sensor_that_sees_micrometres_makes_scenes_or_says_what_disagrees(tmp_path):
     made, failed, store = run(job_of(64, 48, 1e6, start=IN_THE_MIDDLE), tmp_path, scenes=4)
     assert set(failed) <= {f"intrinsic: {reason}" for reason in ("views_disagree", "object_not_seen")}
@@ -103,26 +82,18 @@ def test_a_sensor_that_sees_micrometres_makes_scenes_or_says_what_disagrees(tmp_
     assert paths and all(decode_png(store.read(path), path).min() >= REGION_FIRST_OBJECT for path in paths[:1])
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("sensor.fx", 1e300),
-        ("sensor.fy", 1e-300),
-        ("sensor.cx", 1e300),
-        ("sensor.cy", -1e300),
-        ("sensor.width", 4097),
-        ("sensor.height", 0),
-        ("orbit.radius_m", 1e300),
-        ("mirror.T_z_m", 1e300),
+def test_numbers_that_no_camera_has_are_refused_by_name():
+    for key, value in (
+        *(("sensor.fx", 1e300), ("sensor.fy", 1e-300), ("sensor.cx", 1e300), ("sensor.cy", -1e300)),
+        *(("sensor.width", 4097), ("sensor.height", 0), ("orbit.radius_m", 1e300), ("mirror.T_z_m", 1e300)),
         ("depth.offset_m", [0.0, 1e300, 0.0]),
-    ],
-)
-def test_numbers_that_no_camera_has_are_refused_by_name(key, value):
-    branch, name = key.split(".")
-    with pytest.raises(JobError, match=rf"cameras\.{branch}\.{name}"):
-        validate_job({"name": "extreme", "cameras": {branch: {name: value}}}, "test")
+    ):
+        branch, name = key.split(".")
+        with pytest.raises(JobError, match=rf"cameras\.{branch}\.{name}"):
+            validate_job({"name": "extreme", "cameras": {branch: {name: value}}}, "test")
 
 
+@pytest.mark.minute
 def test_a_camera_inside_an_object_sees_its_inside(tmp_path):
     """The mirror camera 8 cm behind the front surface; labels agree with the ray caster's in every view."""
     cameras = {"mirror": {"T_z_m": 0.08}, "orbit": {"inclination_rad": [0.1, 0.1]}}
@@ -150,16 +121,8 @@ def test_the_largest_image_is_made_whole(tmp_path, changes):
     job = job_of(4096, 4096, 3360.0, check={"raycast_share": 0.0}, run={"scene_timeout_s": 1000.0}, **changes)
     made, failed, store = run(job, tmp_path, scenes=1)
     assert (made, failed) == (1, {})
-    record = read_record(store, 0)
-    assert record is not None
-    whole = [
-        entry.path
-        for entry in committed_files(store, record)
-        if entry.path.endswith(".png") and "/patches/" not in entry.path
-    ]
-    assert len(whole) == len(IMAGES)
-    for path in whole:
-        assert decode_png(store.read(path), path).shape[:2] == (4096, 4096)
+    whole = [image for path, image in images_of(store).items() if "/patches/" not in path]
+    assert len(whole) == len(IMAGES) and {image.shape[:2] for image in whole} == {(4096, 4096)}
 
 
 def test_a_gpu_that_is_asked_for_and_not_there_stops_the_shard_before_any_scene(tmp_path, monkeypatch):

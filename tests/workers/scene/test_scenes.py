@@ -1,0 +1,227 @@
+"""One scene from its steps to its files and rows, and what a worker process holds; effects are proven in tests/effects."""
+
+import dataclasses
+import hashlib
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from schemas.dataset.tables import SCHEMAS
+from schemas.errors import SettleError
+from schemas.job.identity import settings_digest
+from schemas.job.job import Job
+from schemas.job.views import Images, Patch
+from schemas.scene.view import ROLES, Camera, Intrinsics, ObjectLabel, Pair, View
+from tests.effects.scenes import Made, Setting, make
+from tests.workers.render.random_scenes import built_in_assets
+from workers.geometry.frames import invert
+from workers.scene.context import Stopwatch, open_worker
+from workers.scene.rows import encode_view, failed_scene, image_boxes, object_labels, timing_row
+from workers.store.images import decode_png
+from workers.store.manifest import table_of_rows
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(scope="module")
+def made() -> Made:
+    """Two pairs, whose mirror camera has a distance and a pivot of its own."""
+    mirror = {"T_z_m": 1.1, "pivot_depth": "nearest"}
+    return make(Setting({"pairs_per_scene": 2, "cameras": {"mirror": mirror}}, scene_id=3))
+
+
+@pytest.fixture(scope="module")
+def three() -> Made:
+    """One pair of three objects."""
+    return make(Setting({"objects_per_scene": 3}))
+
+
+# ---------------------------------------------------------------------------------------------- steps
+
+
+def test_pose_ids_are_arithmetic_and_every_view_names_its_input(made):
+    ids = [[(view.role, view.pose_id, view.parent_id) for view in pair.views] for pair in made.scene.pairs]
+    assert ids == [[("input", n, n), ("aligned", n, n), ("mirror", n + 1, n), ("projected", n, n)] for n in (12, 14)], (
+        "pair k of scene 3 has the even id 2 (2 * 3 + k)"
+    )
+
+
+def test_things_are_drawn_where_they_rest_and_labels_say_where_the_camera_sees_them(made):
+    things, plan = made.scene.posed.things, made.scene.plan
+    assert [thing.region_id for thing in things] == [1, 2, 3]
+    assert np.array_equal(things[1].T_world_shape, plan.table.T_world_table)
+    assert np.array_equal(things[2].T_world_shape, made.scene.settled[0].T_world_obj)
+    for view in (view for pair in made.scene.pairs for view in (pair.input, pair.mirror)):
+        label = next(label for label in view.labels if label.region_id == 3)
+        T_cam_obj = invert(view.camera.T_world_cam) @ made.scene.settled[0].T_world_obj
+        assert label.T_cam_obj == pytest.approx(T_cam_obj, abs=1e-12)
+        assert label.pixels == (view.region == 3).sum() > 0
+
+
+def test_the_mirror_camera_looks_at_the_pivot_in_the_stored_depth_and_the_projected_view_is_its_own(made):
+    for pair in made.scene.pairs:
+        T_in, T_mirror = pair.input.camera.T_world_cam, pair.mirror.camera.T_world_cam
+        own = pair.input.depth[(pair.input.region >= 3) & (pair.input.depth > 0)]
+        assert pair.d_z_m == own.min() / 5000.0
+        pivot = T_in[:3, 3] + pair.d_z_m * T_in[:3, 2]
+        assert T_mirror[:3, 3] + 1.1 * T_mirror[:3, 2] == pytest.approx(pivot, abs=1e-12)
+        assert T_mirror[2, 2] == pytest.approx(T_in[2, 2]), "half a turn about z keeps the inclination"
+        assert pair.projected.camera is pair.mirror.camera
+        assert pair.filled_share == (pair.projected.depth > 0).mean() and 0.0 <= pair.hidden_share <= 1.0
+
+
+def test_a_view_that_the_plan_does_not_run_is_not_there_and_the_input_stays():
+    (whole,) = make(Setting({}, scene_id=3)).scene.pairs
+    for withdrawn, gone in (("depth_camera", {1}), ("mirror", {2, 3}), ("projection", {3})):
+        (pair,) = make(Setting({}, scene_id=3), withdrawn=(withdrawn,)).scene.pairs
+        assert [view.role for view in pair.views] == [role for n, role in enumerate(ROLES) if n not in gone]
+        assert np.array_equal(pair.input.depth, whole.input.depth) and np.array_equal(pair.input.rgb, whole.input.rgb)
+
+
+# ---------------------------------------------------------------------------------------------- rows
+
+
+def test_rows_have_the_tables_columns_and_name_the_files_that_are_written(three):
+    counts = {table: len(three.rows[table]) for table in ("scenes", "views", "objects", "assets")}
+    assert counts == {"scenes": 1, "views": 4, "objects": 3 * 4, "assets": 4}
+    for table in ("views", "objects", "assets"):
+        assert table_of_rows(table, three.rows[table]).schema == SCHEMAS[table]
+    listed = {file["path"]: file["sha256"] for row in three.rows["views"] for file in row["files"]}
+    assert listed == {path: digest for path, digest in three.files.items() if path.endswith(".png")}
+
+
+def test_a_scenes_figures_are_the_worst_of_its_objects_and_a_projected_view_has_no_object_columns(three):
+    (row,), settled = three.rows["scenes"], three.scene.settled
+    assert row["hover_gap_mm"] == max(rest.hover_gap_mm for rest in settled)
+    assert row["support_margin_mm"] == min(rest.support_margin_mm for rest in settled)
+    assert [body["region_id"] for body in row["bodies"]] == [3, 4, 5]
+    projected = next(row for row in three.rows["views"] if row["role"] == "projected")
+    assert projected["object_pixels"] is projected["visible_fraction"] is projected["patch_object_fraction"] is None
+    assert 0 < projected["projected_filled_share"] < 1
+    assert all(row["patch_object_fraction"] is None for row in three.rows["objects"] if row["region_id"] == 2)
+
+
+def test_a_failed_scene_is_one_row():
+    output = failed_scene(7, "mug", SettleError("left_table", "it rolled off"), attempts=2)
+    assert output.files == ()
+    (row,) = table_of_rows("failures", output.rows["failures"]).to_pylist()
+    assert (row["scene_id"], row["stage"], row["kind"], row["reason"]) == (7, "settle", "intrinsic", "left_table")
+    assert (row["detail"], row["attempts"]) == ("it rolled off", 2)
+
+
+def test_stages_and_effects_add_up_also_of_a_block_that_raises_and_a_row_has_their_seconds(monkeypatch):
+    ticks = iter([0.0, 0.0, 1.0, 10.0, 12.0, 13.0, 20.0, 23.0])
+    monkeypatch.setattr("workers.scene.context.time.perf_counter", lambda: next(ticks))
+    watch = Stopwatch()
+    with watch.effect("mirror"):
+        for _ in range(2):
+            with watch.stage("render", "projection"):
+                pass
+    with pytest.raises(ValueError, match="broken"), watch.stage("check"):
+        raise ValueError("broken")
+    assert watch.seconds == {"render": 3.0, "check": 3.0}
+    assert watch.effects == {"projection": 3.0, "mirror": 13.0}
+    (row,) = table_of_rows("timings", [timing_row(3, "mug", watch)]).to_pylist()
+    assert row["total_s"] == 6.0 and {one["name"]: one["seconds"] for one in row["effects"]} == watch.effects
+    total = Stopwatch({"render": 1.0})
+    total.add(watch)
+    assert total.seconds == {"render": 4.0, "check": 3.0}
+
+
+# ---------------------------------------------------------------------------------------------- image files
+
+IMAGES = Images(patch=Patch(width=16, height=8))
+CAMERA = Camera(Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0), np.eye(4))
+
+
+def label(region_id: int, category: str, u: int = 32) -> ObjectLabel:
+    return ObjectLabel(region_id, category, "instance", np.eye(4), u, 24, (0, 0, 1, 1), 1, 1.0)
+
+
+def view_of(*labels: ObjectLabel) -> View:
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    depth = rng.integers(0, 9000, (48, 64)).astype(np.uint16)
+    return View("input", 6, 6, CAMERA, rgb, depth, np.full((48, 64), 3, np.uint8), labels)
+
+
+def boxes_of(view: View, pair: Pair | None = None) -> dict:
+    objects = object_labels(view, pair or Pair(1.0, view, None))
+    return {path: box for path, _, box in image_boxes(view, objects, objects[0].category, IMAGES.patch)}
+
+
+def test_every_image_and_patch_reads_back_as_what_the_view_holds_with_its_digest():
+    view = view_of(label(2, "table"), label(3, "mug"))
+    files = {file.path: file for file in encode_view(view, Pair(1.0, view, None), IMAGES)}
+    names = ("RGB", "depth", "segment")
+    assert files.keys() == {f"mug/{folder}{name}00006.png" for name in names for folder in ("", "patches/")}
+    for name, pixels in zip(names, (view.rgb, view.depth, view.region), strict=True):
+        assert np.array_equal(decode_png(files[f"mug/{name}00006.png"].data), pixels)
+        assert np.array_equal(decode_png(files[f"mug/patches/{name}00006.png"].data), pixels[20:28, 24:40])
+    assert all(file.sha256 == hashlib.sha256(file.data).hexdigest() for file in files.values())
+    assert list(boxes_of(dataclasses.replace(view, rgb=None))) == [path for path in boxes_of(view) if "RGB" not in path]
+
+
+def test_patches_are_of_each_object_that_they_do_not_leave_and_a_projected_views_are_the_mirrors():
+    several = view_of(label(3, "mug"), label(4, "can", u=2), label(5, "jar", u=40))
+    patches = [path for path in boxes_of(several) if "patches/depth" in path]
+    assert patches == ["mug/patches/depth00006obj0.png", "mug/patches/depth00006obj2.png"]
+    view = view_of(label(2, "table"), label(3, "mug"))
+    mirror = dataclasses.replace(view, role="mirror", pose_id=7, labels=(label(3, "mug", u=20),))
+    projected = dataclasses.replace(view, role="projected", region=None, labels=())
+    box = (slice(20, 28), slice(12, 28))
+    assert boxes_of(projected, Pair(1.0, view, None, mirror, projected)) == {
+        f"mug/{folder}{name}00006.png": box if folder else None
+        for name in ("RGBprojected", "depthProjected")
+        for folder in ("", "patches/")
+    }
+
+
+# ---------------------------------------------------------------------------------------------- a worker process
+
+FAULTS = """
+import resource, sys
+import numpy as np
+from workers.scene.context import keep_freed_memory
+if sys.argv[1] == "keep":
+    keep_freed_memory()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(50):
+    arrays = [np.ones(size) for size in 8 * [900_000]]
+    del arrays
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_images_made_again_and_again_do_not_fault_in_new_pages():
+    def faults(how: str) -> int:
+        run = [sys.executable, "-c", FAULTS, how]
+        return int(subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True).stdout)
+
+    assert faults("keep") < 0.2 * faults("leave")
+
+
+def test_opencv_of_a_worker_has_one_thread():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        open_worker(Job(name="t"), built_in_assets())
+        assert cv2.getNumThreads() == 1
+    finally:
+        cv2.setNumThreads(before)
+
+
+def test_what_changes_a_scene_is_in_the_digest_of_its_settings_and_nothing_else():
+    def digest(catalogue: str = "assets", **changes) -> str:
+        return settings_digest(Job.model_validate({"name": "t", **changes}), catalogue)
+
+    for same in ({"name": "o"}, {"scenes": 7}, {"first_scene": 3}, {"run": {"scene_timeout_s": 5.0}}, {"sensor": {}}):
+        assert digest(**same) == digest()
+    others = ({"seed": 1}, {"sensor": {"rgb_noise": {}}}, {"physics": {"restitution": 0.5}}, {"catalogue": "others"})
+    assert len({digest(), *(digest(**changes) for changes in others)}) == 5

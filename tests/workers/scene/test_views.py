@@ -1,0 +1,242 @@
+"""Labels of a view, cameras that follow from another, the projected view, and the agreement of two, in closed form."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from schemas.errors import ViewError
+from schemas.job.job import Job
+from schemas.job.views import Distortion, Patch, Projection
+from schemas.scene.scene import EffectPlan, Placed, PosedScene
+from schemas.scene.view import Camera, Intrinsics, ObjectLabel, crop_box
+from tests.kit.planes import HERE, IMAGES, THERE, K, plane_view
+from tests.kit.shapes import asset_of, box, table
+from workers.geometry.camera import inclination, look_at, orbit_pose
+from workers.geometry.distortion import distort
+from workers.geometry.frames import half_turn, pose, rotation_about, translation
+from workers.geometry.pixels import Extent
+from workers.scene.labels import (
+    carry_depth,
+    compare_views,
+    count_unoccluded,
+    derive_projected,
+    label_region,
+    label_regions,
+    label_things,
+    patch_object_fraction,
+    pixels_behind,
+    projection_shares,
+)
+from workers.scene.pairs import front_distance, mirror_pose, object_distance, place_beside, place_mirror_camera
+from workers.scene.plan import SceneChance, draw_scene
+
+JOB = Job(name="t")
+CAMERA = Camera(Intrinsics.of(JOB.cameras.sensor), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5))
+X_AXIS, Y_AXIS, Z_AXIS = np.eye(3)
+CUBE = asset_of(box(0.1, 0.1, 0.1), category="box")
+NO_EFFECTS = EffectPlan((), {})
+SOURCE = plane_view("input", HERE)
+
+
+# ---------------------------------------------------------------------------------------------- cameras
+
+
+def article_product(T_world_cam: np.ndarray, d_z_m: float, T_z_m: float = 1.3) -> np.ndarray:
+    """The article's product of transforms, [4, 4] float64, for a zero-roll camera.
+
+    T_in Trans_z(d_z) Rot_x(phi) Rot_y(pi) Rot_x(-phi) Trans_z(-T_z), with phi the angle of the axis below the
+    horizontal.
+    """
+    phi = inclination(T_world_cam)
+    turn = rotation_about(X_AXIS, phi) @ half_turn(Y_AXIS) @ rotation_about(X_AXIS, -phi)
+    return T_world_cam @ translation(0, 0, d_z_m) @ pose(turn, np.zeros(3)) @ translation(0, 0, -T_z_m)
+
+
+def random_camera(seed: int, roll: bool) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T = look_at(rng.uniform((-3, -3, 1), (3, 3, 7)), rng.uniform(-0.5, 0.5, 3))
+    return T @ pose(rotation_about(Z_AXIS, rng.uniform(-3, 3)), np.zeros(3)) if roll else T
+
+
+def test_mirror_camera_looks_at_the_pivot_from_exactly_T_z_with_the_same_inclination_and_the_opposite_heading():
+    for seed in range(20):
+        for roll in (False, True):
+            T, d_z = random_camera(seed, roll), 0.7 + 0.1 * seed
+            mirror = mirror_pose(T, d_z, 1.3)
+            pivot = T[:3, 3] + d_z * T[:3, 2]
+            assert mirror[:3, 3] + 1.3 * mirror[:3, 2] == pytest.approx(pivot, abs=1e-9)
+            assert np.linalg.norm(mirror[:3, 3] - pivot) == pytest.approx(1.3, abs=1e-9)
+            assert mirror[:3, :3].T @ mirror[:3, :3] == pytest.approx(np.eye(3), abs=1e-9)
+            assert np.linalg.det(mirror[:3, :3]) == pytest.approx(1.0, abs=1e-9)
+            assert inclination(mirror) == pytest.approx(inclination(T), abs=1e-9)
+            assert mirror[:2, 2] == pytest.approx(-T[:2, 2], abs=1e-9)
+            assert T[2, 3] - mirror[2, 3] == pytest.approx((d_z - 1.3) * math.sin(inclination(T)), abs=1e-9)
+            assert mirror_pose(mirror_pose(T, 1.3, 1.3), 1.3, 1.3) == pytest.approx(T, abs=1e-9)
+
+
+def test_the_mirror_pose_is_the_articles_product_at_zero_roll_and_another_with_roll():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        T = orbit_pose(np.array([0, 0, 0.7]), rng.uniform(0.7, 0.9), rng.uniform(-math.pi, math.pi), 2.5)
+        d_z = rng.uniform(2.0, 2.6)
+        assert mirror_pose(T, d_z, 1.3) == pytest.approx(article_product(T, d_z, 1.3), abs=1e-9)
+    T = random_camera(3, roll=True)
+    assert np.abs(mirror_pose(T, 2.0) - article_product(T, 2.0)).max() > 0.1
+
+
+def test_the_depth_camera_stands_off_in_the_rgb_cameras_axes_and_the_mirror_camera_keeps_its_intrinsics():
+    aligned, R = place_beside(CAMERA, JOB)["aligned"], CAMERA.T_world_cam[:3, :3]
+    assert R.T @ (aligned.position - CAMERA.position) == pytest.approx([-0.051, 0.001, -0.001])
+    assert np.array_equal(aligned.T_world_cam[:3, :3], R)
+    mirror = place_mirror_camera(CAMERA, 2.2, JOB.cameras.mirror)
+    assert mirror.intrinsics == CAMERA.intrinsics
+    assert np.linalg.norm(mirror.position - CAMERA.position - 2.2 * R[:, 2]) == pytest.approx(1.3)
+
+
+def test_the_front_distance_is_read_from_the_depth_of_whichever_object_is_seen():
+    mirror = JOB.cameras.mirror
+    depth = np.concatenate([np.linspace(1.0, 2.0, 101), np.full(500, 0.3), [0.0]])[None, :]
+    mask = np.zeros(depth.shape, bool)
+    mask[0, :101] = mask[0, -1] = True  # the last pixel has no depth and must not count as nearest
+    for estimator, expected in (("percentile", 1.02), ("median", 1.5), ("nearest", 1.0)):
+        found = front_distance(depth, mask, mirror.model_copy(update={"pivot_depth": estimator}))
+        assert found == pytest.approx(expected)
+    for own in ([2.0], [2.0, 2.1]):
+        assert 2.0 <= front_distance(np.array([own]), np.ones((1, len(own)), bool), mirror) <= 2.1
+    region = np.full((10, 10), 1, np.uint8)  # the first object is hidden, the second stands at 2 m, the third at 3 m
+    region[2:4], region[6:8] = 4, 5
+    depth = np.where(region == 4, 10_000, np.where(region == 5, 15_000, 5_000)).astype(np.uint16)
+    assert object_distance(depth, region, JOB.images, mirror) == pytest.approx(2.0)
+    region[region == 4] = 2
+    assert object_distance(depth, region, JOB.images, mirror) == pytest.approx(3.0)
+    with pytest.raises(ViewError, match="no depth pixel") as caught:
+        object_distance(depth, np.minimum(region, 2), JOB.images, mirror)
+    assert caught.value.reason == "object_not_seen"
+
+
+# ---------------------------------------------------------------------------------------------- regions and patches
+
+
+def nothing_left(things, camera):
+    pytest.fail("nothing is left to count")
+
+
+def test_a_label_counts_boxes_and_shares_its_own_pixels():
+    thing = Placed(3, CUBE.shape, HERE.T_world_cam @ translation(0.001, 0.001, 2.0))
+    made = label_region(thing, ("mug", "m"), HERE, Extent(50, (30, 10, 5, 10)), 100)
+    assert (made.region_id, made.category, made.instance_id, made.u, made.v) == (3, "mug", "m", 80, 60)
+    assert (made.bbox_xywh, made.pixels, made.visible_fraction) == ((30, 10, 5, 10), 50, 0.5)
+    unseen = label_region(thing, ("mug", "m"), HERE, Extent(0, (0, 0, 0, 0)), 0)
+    assert (unseen.pixels, unseen.visible_fraction, unseen.bbox_xywh) == (0, 0.0, (0, 0, 0, 0))
+
+
+def test_table_and_objects_are_labelled_in_order_the_floor_is_not_and_only_what_is_seen_is_counted():
+    plan = draw_scene(JOB, SceneChance(0, 0), table(), CUBE)
+    start = plan.objects[0]
+    placed = ((1, plan.floor, np.eye(4)), (2, plan.table.asset.shape, plan.table.T_world_table))
+    things = tuple(Placed(*one) for one in (*placed, (3, CUBE.shape, start.T_world_obj)))
+    region = np.ones((K.height, K.width), np.uint8)
+    region[40:80, 40:120], region[50:60, 60:70] = 2, 3
+    posed = PosedScene(things, plan.appearance)
+    labels = label_regions(plan, posed, HERE, region, lambda seen, camera: [200 for _ in seen])
+    assert [(label.region_id, label.category, label.pixels) for label in labels] == [
+        (2, "table", 3100),
+        (3, "box", 100),
+    ]
+    assert (labels[1].bbox_xywh, labels[1].visible_fraction) == ((60, 50, 10, 10), 0.5)
+    assert np.allclose(HERE.T_world_cam @ labels[1].T_cam_obj, start.T_world_obj)
+    things = [Placed(region_id, CUBE.shape, np.eye(4)) for region_id in (2, 3, 4)]
+    region = np.zeros((K.height, K.width), np.uint8)
+    region[0, :5], region[1, :8] = 2, 4
+    names, counts = dict.fromkeys((2, 3, 4), ("box", "b")), {2: 10, 4: 32}
+    labels = label_things(things, names, HERE, region, lambda seen, camera: [counts[one.region_id] for one in seen])
+    assert [label.visible_fraction for label in labels] == [0.5, 0.0, 0.25]
+    nothing = label_things(things, names, HERE, np.zeros_like(region), nothing_left)
+    assert [label.pixels for label in nothing] == [0, 0, 0]
+
+
+def test_what_the_processor_cannot_count_is_counted_by_the_renderer():
+    near, far = (Placed(n, CUBE.shape, HERE.T_world_cam @ translation(0, 0, n)) for n in (0, 2))
+    asked = []
+    counts = count_unoccluded(
+        [far, near, far], HERE, lambda things, camera: [asked.append(one) or 77 for one in things]
+    )
+    assert counts == [36, 77, 36] and asked == [near]  # its side is 6.7 pixels
+    assert count_unoccluded([far], HERE, nothing_left) == [36]
+
+
+def label(u: int, v: int) -> ObjectLabel:
+    return ObjectLabel(3, "mug", "m", np.eye(4), u, v, (0, 0, 0, 0), 1, 1.0)
+
+
+def test_a_patch_is_centred_on_the_object_left_out_where_it_would_leave_the_image_and_filled_by_its_share():
+    patch = Patch(width=128, height=96)
+    assert crop_box(label(80, 60), HERE, patch) == (slice(12, 108), slice(16, 144))
+    assert crop_box(label(64, 48), HERE, patch) == (slice(0, 96), slice(0, 128))
+    hidden = dataclasses.replace(label(80, 60), pixels=0)
+    for one in (label(63, 60), label(97, 60), label(80, 73), label(-1, -1), hidden):
+        assert crop_box(one, HERE, patch) is None
+    region = np.full_like(SOURCE.region, 2)
+    region[:60] = 3
+    view, patch = dataclasses.replace(SOURCE, region=region), Patch(width=32, height=24)
+    for one, share in ((label(80, 60), 0.5), (label(80, 40), 1.0), (label(5, 60), None)):
+        assert patch_object_fraction(view, one, patch) == share
+    assert patch_object_fraction(dataclasses.replace(view, region=None), label(80, 60), patch) is None
+
+
+# ---------------------------------------------------------------------------------------------- two views
+
+
+def test_two_views_of_one_plane_agree_to_the_quantisation_and_of_two_disagree_by_their_distance():
+    same = compare_views(SOURCE, plane_view("mirror", THERE), IMAGES, 1.0)
+    # Each stored depth is off by up to 0.1 mm, evenly: the median of the difference of the two stays below that.
+    assert same.points > 3000 and same.median_mm < 0.1 and same.share == 1.0
+    apart = compare_views(SOURCE, plane_view("mirror", THERE, -0.003), IMAGES, 1.0)
+    assert apart.median_mm > 2.0 and apart.share == 0.0
+    few = compare_views(plane_view("input", HERE, region=2), plane_view("mirror", THERE, region=2), IMAGES, 1.0)
+    assert few.median_mm is None and few.points == 0 and few.scene_median_mm < 0.1
+
+
+def test_projected_colours_come_from_the_pixels_that_the_depth_came_from():
+    rgb, depth = derive_projected(SOURCE, THERE, IMAGES, None, NO_EFFECTS)
+    projected = carry_depth(SOURCE, THERE, IMAGES, NO_EFFECTS)
+    filled = projected.source >= 0
+    assert filled.sum() > 2000
+    assert np.array_equal(rgb[filled], SOURCE.rgb.reshape(-1, 3)[projected.source[filled]])
+    assert (rgb[~filled] == 0).all() and (depth[~filled] == 0).all()
+    exact = plane_view("mirror", THERE).depth.astype(int)
+    # The source pixel's centre lands anywhere in its target pixel, so depths differ by the plane's slope over a pixel.
+    assert np.abs(depth.astype(int) - exact)[filled].max() < 5000 * 0.05
+    near = np.array([[0, 5000, 5100, 5040]], np.uint16)
+    assert projection_shares(near, np.full_like(near, 5000), IMAGES) == (0.75, pytest.approx(1 / 3))
+
+
+def test_hidden_points_splats_and_the_lens_are_as_the_plan_has_them():
+    def carried(target, images=IMAGES, *effects):
+        return carry_depth(SOURCE, target, images, EffectPlan(effects, {})).source >= 0
+
+    below = Camera(K, orbit_pose(np.zeros(3), -0.8, 0.7, 2.5))
+    assert carried(below).any() and not carried(below, IMAGES, "hidden_point_removal").any()
+    assert carried(THERE, IMAGES, "hidden_point_removal").sum() > 2000
+    wide, plain = IMAGES.model_copy(update={"projection": Projection(splat=3)}), carried(THERE)
+    splatted = carried(THERE, wide, "splat")
+    assert np.array_equal(carried(THERE, wide), plain)
+    assert (plain <= splatted).all() and splatted.sum() > 1.2 * plain.sum()
+    lens = Distortion(k1=-0.2)
+    plain, left_out, drawn = (
+        derive_projected(SOURCE, THERE, IMAGES, used, EffectPlan(effects, {}))[0]
+        for used, effects in ((None, ()), (lens, ()), (lens, ("sensor_distortion",)))
+    )
+    assert np.array_equal(left_out, plain) and not np.array_equal(drawn, plain)
+
+
+def test_behind_a_lens_a_depth_pixel_has_the_colour_of_the_pixel_that_its_centre_is_drawn_in():
+    """A radial lens leaves the centre of the image where it is, moves the corner, and may move it out of the image."""
+    centre = K.height // 2 * K.width + K.width // 2
+    found = pixels_behind(Distortion(k1=-0.2), np.array([centre, 0, -1]), K)
+    u, v = distort(np.array([0.5]), np.array([0.5]), Distortion(k1=-0.2), K)
+    assert found.tolist() == [centre, int(v[0]) * K.width + int(u[0]), -1]
+    assert found[1] > K.width
+    assert pixels_behind(Distortion(k1=0.2), np.array([0]), K).tolist() == [-1]

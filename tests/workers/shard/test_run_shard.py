@@ -1,0 +1,295 @@
+"""A shard of small scenes through the real path onto disk: ranges, commits under way, errors, and the stack's fingerprint."""
+
+import itertools
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.dataset.layout import FINGERPRINT_FILE, commit_path
+from schemas.dataset.shard import Blame, Fingerprint, ShardReport
+from schemas.errors import FingerprintError, MachineError
+from services.job.job_file import validate_job
+from services.run.worker_entry import processor_flags
+from tests.effects.scenes import SMALL
+from tests.workers.shard import shards
+from workers.render.raster.gbuffer import shared_renderer
+from workers.shard import run_shard as module
+from workers.shard.code import SOURCE_PACKAGES, code_digest
+from workers.shard.fingerprint import TIER_LIBRARIES, maths_digest, numpy_simd, take_fingerprint
+from workers.shard.run_shard import Committer, describe, explain, keep_traceback
+from workers.store.attempt import Attempt, blamed_scene, staged_attempts
+from workers.store.commit import read_record
+from workers.store.ledger import range_rows
+from workers.store.local import LocalStage, LocalStore
+
+ROOT = Path(__file__).resolve().parents[3]
+OTHER = Fingerprint(canary="0" * 64, code="0" * 64, libraries={}, simd="none", renderer="none")
+
+
+def run(out: Path, *starts: int, mode: str = "record", **changes) -> ShardReport:
+    """A shard of ranges of two scenes."""
+    job = validate_job({**SMALL, "run": {"fingerprint": mode}}, "a test")
+    return shards.run(job, out, *((start, start + 2) for start in starts or (0,)), **changes)
+
+
+def failures_of(out: Path) -> list[dict]:
+    record = read_record(LocalStore(out), 0)
+    assert record is not None
+    return range_rows(LocalStore(out), [record], "failures").to_pylist()
+
+
+def raises(error: Exception) -> Callable[..., None]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
+
+
+# ---------------------------------------------------------------------------------------------- ranges
+
+
+def test_every_range_is_committed_and_reported_in_order_and_a_worker_that_is_to_end_begins_no_other(tmp_path):
+    asked = itertools.count()
+    report = run(tmp_path, 0, 2, 4, is_over=lambda: next(asked) == 2)
+    assert [(span.start, span.stop, span.won, span.made) for span in report.spans] == [(0, 2, True, 2), (2, 4, True, 2)]
+    assert {"assets", "plan", "physics", "render", "encode", "write", "commit"} <= report.seconds.keys()
+    assert [path.name for path in (tmp_path / "_staging").glob("*/*")] == []
+    (again,) = run(tmp_path, 0).spans
+    assert (again.won, again.conflict) == (False, None), "a second attempt loses, and made the same bytes"
+    assert run(tmp_path, 6, is_over=lambda: True).spans == ()
+
+
+def test_the_next_range_is_made_while_one_at_a_time_is_committed_and_has_no_scene_in_progress(tmp_path, monkeypatch):
+    begun, ended, noted, events = threading.Event(), threading.Event(), [], []
+    begin_scene, end_scenes, flush, commit = Attempt.begin_scene, Attempt.end_scenes, LocalStage.flush, Attempt.commit
+
+    def note_begin(attempt, scene_id):
+        begin_scene(attempt, scene_id)
+        if scene_id == 2:
+            begun.set()
+
+    def note_end(attempt):
+        end_scenes(attempt)
+        if attempt.span.start == 2:
+            ended.set()
+
+    def wait(stage):
+        assert begun.wait(60.0), "scene 2 is not begun while the range before it is committed"
+        assert ended.wait(60.0)
+        store = LocalStore(tmp_path)
+        noted.extend(blamed_scene(store, start, name) for start, name in staged_attempts(store))
+        flush(stage)
+
+    def watched(attempt, job_change):
+        events.append(attempt.span.start)
+        result = commit(attempt, job_change)
+        events.append(attempt.span.start)
+        return result
+
+    for owner, name, new in (
+        (Attempt, "begin_scene", note_begin),
+        (Attempt, "end_scenes", note_end),
+        (Attempt, "commit", watched),
+        (LocalStage, "flush", wait),
+    ):
+        monkeypatch.setattr(owner, name, new)
+    assert [span.won for span in run(tmp_path, 0, 2).spans] == [True, True]
+    assert noted[:2] == [None, None] and events == [0, 0, 2, 2]
+
+
+def test_a_range_that_cannot_be_committed_is_told_and_made_again_by_the_next_run(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalStage, "flush", raises(MachineError("the disk is full")))
+        with pytest.raises(MachineError, match="the disk is full"):
+            run(tmp_path, 0, 2, 4)
+    store = LocalStore(tmp_path)
+    assert [store.size(commit_path(start)) for start in (0, 2, 4)] == [None] * 3
+    assert [span.won for span in run(tmp_path, 0, 2).spans] == [True] * 2
+
+
+def test_an_error_in_a_range_lets_the_commit_before_it_end(tmp_path, monkeypatch):
+    flush, failed = LocalStage.flush, threading.Event()
+
+    def fail(attempt, scene_id):
+        if scene_id == 2:
+            failed.set()
+            raise MachineError("the GPU is gone")
+
+    def wait(stage):
+        failed.wait(60.0)
+        flush(stage)
+
+    monkeypatch.setattr(Attempt, "begin_scene", fail)
+    monkeypatch.setattr(LocalStage, "flush", wait)
+    with pytest.raises(MachineError, match="the GPU is gone"):
+        run(tmp_path, 0, 2)
+    store = LocalStore(tmp_path)
+    assert store.size(commit_path(0)) is not None and store.size(commit_path(2)) is None
+
+
+class Made:
+    """A range whose commit waits until it is let go, and returns its number, or raises."""
+
+    def __init__(self, number: int, events: list[str], error: Exception | None = None) -> None:
+        self.number, self.events, self.error = number, events, error
+        self.let_go = threading.Event()
+
+    def commit(self, job_change) -> int:
+        assert job_change == "change"
+        self.events.append(f"begin {self.number}")
+        assert self.let_go.wait(60.0)
+        self.events.append(f"end {self.number}")
+        if self.error is not None:
+            raise self.error
+        return self.number
+
+
+def test_a_commit_is_under_way_until_the_next_begins_and_its_error_is_raised_there():
+    events: list[str] = []
+    first, second, third, fourth = (Made(n, events, MachineError("full") if n == 3 else None) for n in (1, 2, 3, 4))
+    with Committer("change") as committer:
+        committer.wait()  # there is nothing to wait for
+        committer.begin(first)
+        events.append("make 2")
+        assert committer.reports == []
+        for made in (first, second, third):
+            made.let_go.set()
+        committer.begin(second)
+        assert committer.reports == [1]
+        committer.begin(third)
+        with pytest.raises(MachineError, match="full"):
+            committer.begin(fourth)
+    assert committer.reports == [1, 2] and "begin 4" not in events
+    assert events.index("make 2") < events.index("end 1") < events.index("begin 2"), "the making thread did not wait"
+    last = Made(5, events)
+
+    def fail() -> None:
+        with Committer("change") as committer:
+            committer.begin(last)
+            threading.Timer(0.3, last.let_go.set).start()
+            raise MachineError("the GPU is gone")
+
+    with pytest.raises(MachineError, match="the GPU is gone"):
+        fail()
+    assert events[-2:] == ["begin 5", "end 5"], "no commit is under way after a block that raised"
+
+
+# ---------------------------------------------------------------------------------------------- errors nobody expected
+
+
+def break_scene(monkeypatch: pytest.MonkeyPatch, scene_id: int, error: Exception) -> None:
+    real = module.make_scene
+
+    def make(context, scene, stopwatch):
+        if scene == scene_id:
+            raise error
+        return real(context, scene, stopwatch)
+
+    monkeypatch.setattr(module, "make_scene", make)
+
+
+def test_a_bug_in_one_scene_is_a_row_names_what_was_in_it_and_the_others_are_made(tmp_path, monkeypatch):
+    break_scene(monkeypatch, 1, ZeroDivisionError("no such thing\nand more"))
+    (span,) = run(tmp_path).spans
+    assert (span.made, span.failed) == (1, {"environmental: bug": 1})
+    (row,) = failures_of(tmp_path)
+    assert (row["scene_id"], row["stage"], row["kind"], row["reason"]) == (1, "worker", "environmental", "bug")
+    assert row["detail"].startswith("ZeroDivisionError: no such thing at test_run_shard.py:")
+    (told,) = span.bugs
+    assert told.startswith(f"scene 1 ({row['category']} ") and ", on table " in told and "\n" not in told
+    kept = (tmp_path / "_logs" / "scene-1.txt").read_text()
+    assert "ZeroDivisionError: no such thing" in kept and "Traceback" in kept
+    assert describe(KeyError()) == "KeyError" and explain(RuntimeError("x" * 5000)).detail.count("x") < 250
+    (tmp_path / "file").write_text("somebody's")
+    assert keep_traceback(LocalStore(tmp_path / "file"), 3, ValueError("x")) == "", "a log must not end the range"
+
+
+def test_an_output_that_breaks_the_schema_is_a_row_too(tmp_path, monkeypatch):
+    real = module.run_scene
+
+    def lacking(context, scene_id, total):
+        output = real(context, scene_id, total)
+        if scene_id == 0:
+            output.rows["views"][0]["width"] = "wide"
+        return output
+
+    monkeypatch.setattr(module, "run_scene", lacking)
+    (span,) = run(tmp_path).spans
+    assert (span.made, span.failed) == (1, {"environmental: bug": 1})
+    assert "scene 0 (" in span.bugs[0] and failures_of(tmp_path)[0]["scene_id"] == 0
+    images = [path.name for path in tmp_path.glob("*/*.png")]
+    assert images and not any("00000." in name or "00001." in name for name in images)
+
+
+def test_memory_that_runs_out_is_told_as_that_and_an_error_of_the_machine_ends_the_shard(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        break_scene(patch, 0, np._core._exceptions._ArrayMemoryError((10**6, 10**6), np.dtype(float)))
+        (span,) = run(tmp_path / "a").spans
+    assert span.failed == {"environmental: memory": 1}
+    assert "use fewer workers" in failures_of(tmp_path / "a")[0]["detail"]
+    break_scene(monkeypatch, 1, MachineError("the disk is full"))
+    with pytest.raises(MachineError, match="the disk is full"):
+        run(tmp_path / "b")
+    assert read_record(LocalStore(tmp_path / "b"), 0) is None
+
+
+def test_a_scene_that_killed_its_workers_is_a_row_and_is_not_tried_again(tmp_path):
+    blame = Blame(scene_id=1, reason="killed", detail="three workers died in it", attempts=3)
+    (span,) = run(tmp_path, blamed=(blame,)).spans
+    assert (span.made, span.failed) == (1, {"environmental: killed": 1})
+    (row,) = failures_of(tmp_path)
+    assert (row["scene_id"], row["stage"], row["detail"], row["attempts"]) == (1, "worker", blame.detail, 3)
+
+
+# ---------------------------------------------------------------------------------------------- the stack
+
+
+def test_a_worker_of_another_stack_is_refused_unless_the_job_records_stacks(tmp_path):
+    (tmp_path / FINGERPRINT_FILE).parent.mkdir(parents=True)
+    (tmp_path / FINGERPRINT_FILE).write_text(OTHER.model_dump_json())
+    with pytest.raises(FingerprintError, match=f"the dataset's is {OTHER.digest[:12]}"):
+        run(tmp_path, mode="strict")
+    assert run(tmp_path, mode="record").spans[0].won
+
+
+def test_the_same_stack_has_the_same_fingerprint_and_names_what_the_bytes_depend_on():
+    first, second = (take_fingerprint(shared_renderer(), "raster") for _ in range(2))
+    assert first == second and first.digest == second.digest
+    assert first.libraries["numpy"] == np.__version__
+    assert first.code == code_digest() and len(first.canary) == 64
+    assert first.simd == numpy_simd() and first.renderer == shared_renderer().name
+    assert TIER_LIBRARIES["pathtraced"][0] not in first.libraries
+
+
+def asked(code: str, cwd: Path = ROOT, **environ: str) -> list[str]:
+    """The words that a process prints, which sees nothing but the packages in `cwd`."""
+    whole = f"import sys; sys.path.insert(0, '.'); {code}"
+    command = [sys.executable, "-P", "-c", whole]
+    done = subprocess.run(command, cwd=cwd, env={**os.environ, **environ}, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_a_c_library_that_multiplies_and_adds_in_two_steps_is_another_stack_and_one_without_avx512_is_not():
+    ask = "from workers.shard.fingerprint import maths_digest; print(maths_digest())"
+    less = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX512DQ,-AVX512CD"
+    assert asked(ask, GLIBC_TUNABLES=less) == [maths_digest()]
+    if "fma" not in processor_flags():
+        pytest.skip("this processor has no fused multiplication")
+    assert asked(ask, GLIBC_TUNABLES="glibc.cpu.hwcaps=-FMA,-AVX2") != [maths_digest()]
+
+
+def test_a_copy_of_the_code_has_the_same_digest_and_a_changed_line_another(tmp_path):
+    for package in SOURCE_PACKAGES:
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    ask = "from workers.shard.code import code_digest; print(code_digest(), 'numpy' in sys.modules)"
+    assert asked(ask, tmp_path) == [code_digest(), "False"]
+    with (tmp_path / "workers" / "scene" / "plan.py").open("a") as file:
+        file.write("# changed\n")
+    assert asked(ask, tmp_path)[0] != code_digest()

@@ -1,0 +1,281 @@
+"""Rows of a range: checked, sorted, stored as Parquet, and digested as their plain encoding is, however they are stored."""
+
+import hashlib
+import io
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.errors import CorruptError
+from tests.made_up_scenes import failed_scene, made_scene
+from workers.store.canonical import TableDigest, dataset_digest, rows_digest
+from workers.store.manifest import (
+    decode_table,
+    encode_table,
+    scene_digest,
+    sorted_rows,
+    table_of_rows,
+)
+
+
+def rows_of(table: str) -> list[dict]:
+    return (failed_scene(5) if table == "failures" else made_scene(3)).rows[table]
+
+
+def fields_of(kind: pa.DataType) -> list[pa.Field]:
+    return [kind.field(n) for n in range(kind.num_fields)]
+
+
+def is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+# ---------------------------------------------------------------------------------------------- absent and infinite values
+
+
+def whole(kind: pa.DataType) -> Any:
+    """A value of this type in which nothing is absent; lists have two items."""
+    if pa.types.is_struct(kind):
+        return {field.name: whole(field.type) for field in fields_of(kind)}
+    if is_list(kind):
+        return [whole(kind.value_type)] * (kind.list_size if pa.types.is_fixed_size_list(kind) else 2)
+    return {pa.float64(): 1.5, pa.int64(): 7, pa.string(): "x", pa.bool_(): True}[kind]
+
+
+def damaged(kind: pa.DataType, nullable: bool) -> Iterator[tuple[Any, bool]]:
+    """(a value in which one place holds what it may not or need not, whether it may) for every place within the type."""
+    yield None, nullable
+    if pa.types.is_struct(kind):
+        for field in fields_of(kind):
+            for value, allowed in damaged(field.type, field.nullable):
+                yield {**whole(kind), field.name: value}, allowed
+    elif is_list(kind):
+        for value, allowed in damaged(kind.value_type, kind.value_field.nullable):
+            yield [*whole(kind)[:-1], value], allowed
+    elif pa.types.is_floating(kind):
+        yield float("nan"), False
+        yield float("-inf"), False
+
+
+def raises(table: str, rows: list[dict]) -> bool:
+    try:
+        table_of_rows(table, rows)
+    except ValueError:
+        return True
+    return False
+
+
+def test_an_absent_or_infinite_value_is_found_at_every_place_of_a_row_of_any_table():
+    for table, schema in SCHEMAS.items():
+        kind = pa.struct(list(schema))
+        good, places = whole(kind), 0
+        assert not raises(table, [good, good])
+        for row, allowed in damaged(kind, nullable=True):
+            if row is not None:
+                assert raises(table, [good, row, good]) != allowed, (table, row)
+                places += 1
+        assert places >= len(kind)
+
+
+def test_a_row_that_breaks_the_schema_is_refused_by_column_and_numpys_values_are_taken_as_plain_ones():
+    absent = {"files": [{"path": None, "bytes": 1, "sha256": ""}]}
+    for table, change, message in (
+        ("scenes", {"colour": "red"}, "other columns than the schema: colour"),
+        ("scenes", {"settle_s": None}, "scenes.settle_s is missing in scene"),
+        ("scenes", {"settle_s": float("nan")}, "scenes.settle_s is not finite: nan"),
+        ("scenes", {"T_world_obj": [float("inf")] * 16}, "scenes.T_world_obj is not finite: inf"),
+        ("scenes", {"T_world_obj": [0.0] * 15}, "scenes.T_world_obj: .*16"),
+        ("scenes", {"scene_id": "three"}, "scenes.scene_id: .*three"),
+        ("scenes", {"scene_id": 2**63}, "scenes.scene_id: "),
+        ("views", absent, "views.files.path is missing"),
+        ("views", {"mirror_agreement": {"median_mm": float("nan"), "share": 1.0}}, "agreement.median_mm is not fin"),
+        ("assets", {"volume_m3": float("-inf")}, "assets.volume_m3 is not finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            table_of_rows(table, [{**rows_of(table)[0], **change}])
+    row = rows_of("scenes")[0]
+    with pytest.raises(ValueError, match="recheck_move_mm"):  # a missing column is not taken as null
+        table_of_rows("scenes", [{key: value for key, value in row.items() if key != "recheck_move_mm"}])
+    other = {**row, "scene_id": np.int64(3), "settle_s": np.float64(0.7), "T_world_obj": np.array(row["T_world_obj"])}
+    other["raycast_checked"] = np.bool_(row["raycast_checked"])
+    assert table_of_rows("scenes", [other]).equals(table_of_rows("scenes", [row]))
+
+
+# ---------------------------------------------------------------------------------------------- Parquet
+
+
+def test_rows_come_back_from_parquet_as_they_went_in_with_the_version_of_their_schema():
+    for table in TABLES:
+        rows = table_of_rows(table, rows_of(table))
+        again = decode_table(table, encode_table(rows), "x")
+        assert again.equals(rows) and again.to_pylist() == rows_of(table)
+        assert again.schema.equals(SCHEMAS[table], check_metadata=True)
+        metadata = pq.ParquetFile(pa.BufferReader(encode_table(rows))).schema_arrow.metadata
+        assert (metadata[b"schema_version"], metadata[b"verso_table"]) == (b"1", table.encode())
+    older = table_of_rows("scenes", rows_of("scenes")).drop_columns("recheck_move_mm")
+    again = decode_table("scenes", encode_table(older), "x")
+    assert again.schema.equals(SCHEMAS["scenes"]) and again.column("recheck_move_mm").to_pylist() == [None]
+
+
+def test_rows_are_sorted_by_their_key_and_two_of_one_key_are_refused():
+    rows = rows_of("objects")
+    table = sorted_rows("objects", table_of_rows("objects", rows[::-1]))
+    keys = list(zip(*(table.column(name).to_pylist() for name in ("pose_id", "role", "region_id")), strict=True))
+    assert keys == sorted(keys)
+    with pytest.raises(ValueError, match="objects: two rows have the key pose_id, role, region_id"):
+        sorted_rows("objects", table_of_rows("objects", [*rows, rows[3]]))
+
+
+def test_a_flipped_bit_anywhere_is_found_or_harmless_and_a_torn_file_or_another_table_is_told_by_name():
+    """But for a few in the headers of pages, which Parquet's checksums do not cover: a range's record has the file's digest."""
+    for table in ("scenes", "failures"):
+        rows = table_of_rows(table, rows_of(table))
+        data = encode_table(rows)
+        found = other = 0
+        for position in range(0, len(data), 7):
+            flipped = bytearray(data)
+            flipped[position] ^= 1 << (position % 8)
+            try:
+                again = decode_table(table, bytes(flipped), "manifest/_ranges/0/x.parquet")
+            except CorruptError as error:
+                found += "manifest/_ranges/0/x.parquet" in str(error)
+            else:
+                other += not again.equals(rows)
+        assert found > len(data) / 7 / 10
+        assert other <= len(data) / 7 / 200
+    data = encode_table(table_of_rows("scenes", rows_of("scenes")))
+    for torn in (data[: len(data) // 2], b"", b"PAR1" + bytes(20) + b"PAR1"):
+        with pytest.raises(CorruptError, match=r"here.parquet cannot be read"):
+            decode_table("scenes", torn, "here.parquet")
+    with pytest.raises(CorruptError, match="lacks the column pose_id of the table views"):
+        decode_table("views", data, "here.parquet")
+
+
+# ---------------------------------------------------------------------------------------------- digests
+
+
+def test_the_digest_of_a_scene_knows_no_order_or_type_and_tells_the_last_bit_of_any_number():
+    base = made_scene(3).rows
+    digest = scene_digest(base)
+    turned = {
+        table: [dict(reversed(row.items())) for row in reversed(found)] for table, found in reversed(base.items())
+    }
+    turned["scenes"][0]["penetration_mm"] = np.float64(turned["scenes"][0]["penetration_mm"])
+    turned["scenes"][0]["redraws"] = np.int64(turned["scenes"][0]["redraws"])
+    assert scene_digest(turned) == digest
+    for table in ("timings", "assets"):
+        assert scene_digest({**base, table: []}) == digest
+    for table, column in (("scenes", "settle_s"), ("views", "d_z_m"), ("objects", "u")):
+        other = made_scene(3).rows
+        value = other[table][0][column]
+        other[table][0][column] = value + 1 if isinstance(value, int) else float(np.nextafter(value, np.inf))
+        assert scene_digest(other) != digest
+
+
+SIMPLE = {
+    pa.float64(): st.floats(allow_nan=False, allow_infinity=False),
+    pa.int64(): st.integers(-(2**63), 2**63 - 1),
+    pa.string(): st.text(st.characters(codec="utf-8"), max_size=5),
+    pa.bool_(): st.booleans(),
+}
+
+
+def values_of(kind, nullable):
+    """Values that Arrow can hold in a column of this type."""
+    if pa.types.is_struct(kind):
+        values = st.fixed_dictionaries({field.name: values_of(field.type, field.nullable) for field in fields_of(kind)})
+    elif is_list(kind):
+        least, most = (kind.list_size, kind.list_size) if pa.types.is_fixed_size_list(kind) else (0, 3)
+        values = st.lists(values_of(kind.value_type, kind.value_field.nullable), min_size=least, max_size=most)
+    else:
+        values = SIMPLE[kind]
+    return st.none() | values if nullable else values
+
+
+def plain_column(kind: pa.DataType, values: list) -> bytes:
+    """A second, plain implementation of what canonical.py's first paragraph promises, from Python values."""
+    present, lengths, data, children = b"".join(bytes([value is not None]) for value in values), b"", b"", []
+    if pa.types.is_struct(kind):
+        for field in fields_of(kind):
+            children.append(plain_column(field.type, [None if v is None else v[field.name] for v in values]))
+    elif is_list(kind):
+        lengths = b"".join(struct.pack("<q", len(value or [])) for value in values)
+        children = [plain_column(kind.value_type, [item for value in values if value is not None for item in value])]
+    elif pa.types.is_string(kind):
+        texts = [(value or "").encode() for value in values]
+        lengths, data = b"".join(struct.pack("<q", len(text)) for text in texts), b"".join(texts)
+    else:
+        code = {pa.float64(): "<d", pa.int64(): "<q", pa.bool_(): "?"}[kind]
+        data = b"".join(struct.pack(code, 0 if value is None else value) for value in values)
+    streams = [hashlib.sha256(stream).digest() for stream in (present, lengths, data)]
+    return hashlib.sha256(b"".join([*streams, *children])).digest()
+
+
+def plain_tag(kind: pa.DataType) -> str:
+    if pa.types.is_struct(kind):
+        return "{" + ",".join(f"{field.name}:{plain_tag(field.type)}" for field in fields_of(kind)) + "}"
+    if is_list(kind):
+        return f"[{plain_tag(kind.value_type)}]"
+    return {pa.float64(): "<f8", pa.int64(): "<i8", pa.string(): "text", pa.bool_(): "|u1"}[kind]
+
+
+@pytest.mark.parametrize("table", TABLES)
+@given(st.data())
+def test_a_digest_is_that_of_the_plain_encoding_however_rows_are_cut(table, data):
+    fields = {field.name: values_of(field.type, field.nullable) for field in SCHEMAS[table]}
+    rows = data.draw(st.lists(st.fixed_dictionaries(fields), max_size=4))
+    plain = hashlib.sha256(f"verso rows 1\n{table}\n{len(rows)}\n".encode())
+    for field in SCHEMAS[table]:
+        plain.update(f"{field.name}\n{plain_tag(field.type)}\n".encode())
+        plain.update(plain_column(field.type, [row[field.name] for row in rows]))
+    arrow = pa.Table.from_pylist(rows, schema=SCHEMAS[table])
+    cut = data.draw(st.integers(0, len(rows)))
+    digest = TableDigest(table)
+    for part in (arrow.slice(0, cut), arrow.slice(cut)):
+        digest.update(part)
+    assert (digest.rows, digest.hexdigest()) == (len(rows), plain.hexdigest())
+
+
+def test_a_digest_does_not_change_with_how_parquet_stores_the_rows_and_tells_any_other_value():
+    for table in TABLES:
+        rows = table_of_rows(table, rows_of(table))
+        expected = rows_digest(table, rows)
+        for options in ({"compression": "none", "use_dictionary": False}, {"compression": "zstd", "row_group_size": 1}):
+            file = io.BytesIO()
+            pq.write_table(rows, file, **options)
+            assert rows_digest(table, pq.read_table(pa.BufferReader(file.getvalue()))) == expected
+        assert rows_digest(table, pa.concat_tables([rows, rows])) != expected
+    first, *others = rows_of("views")
+    (one, *more) = first["files"]
+    changes = (
+        {"files": [{**one, "path": "mug/other.png"}, *more]},
+        {"files": [{**one, "path": one["path"][:-1], "sha256": "g" + one["sha256"]}, *more]},
+        {"files": more},
+        {"files": [*more, one]},
+        {"yaw_rad": first["yaw_rad"] + 2**-54},
+        {"T_world_cam": [-0.0 if x == 0 else x for x in first["T_world_cam"]]},
+        {"projected_filled_share": 0.0},
+        {"mirror_agreement": {"median_mm": 0.0, "share": 0.0}},
+        {"object_pixels": 531},
+    )
+    variants = [[first, *others], others, [*others, first], *([{**first, **change}, *others] for change in changes)]
+    assert len({rows_digest("views", table_of_rows("views", rows)) for rows in variants}) == len(variants)
+
+
+def test_the_digest_of_a_dataset_is_that_of_the_tables_but_timings_and_the_sorted_files():
+    digests = {"scenes": "1", "views": "2", "objects": "3", "assets": "4", "failures": "5", "timings": "6"}
+    text = "verso dataset 1\nscenes 1\nviews 2\nobjects 3\nassets 4\nfailures 5\na/b\nx\na/ü\ny\n"
+    expected = hashlib.sha256(text.encode()).hexdigest()
+    for timings in ("6", "other"):
+        assert dataset_digest({**digests, "timings": timings}, [("a/b", "x"), ("a/ü", "y")]) == expected
+    for paths in (["b", "a"], ["a", "a"], ["ü", "z"]):
+        with pytest.raises(ValueError, match="sorted and unique"):
+            dataset_digest(digests, [(path, "x") for path in paths])
