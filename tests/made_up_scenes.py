@@ -129,128 +129,64 @@ def timing(scene_id: int, category: str) -> dict[str, object]:
 
 
 def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str, object]:
-    return {
-        "scene_id": scene_id,
-        "category": category,
-        "instance_id": instance,
-        "source": "procedural",
-        "table_id": table,
-        "object_scale": 0.25,
-        "T_world_obj": matrix_of(scene_id, 1),
-        "T_world_table": matrix_of(scene_id, 2),
-        "pose": "upright",
-        "redraws": scene_id % 3,
-        "effects": ["drop", "snap"],
-        "skipped": [{"effect": "tip", "why": "stands"}],
-        **_rest(scene_id),
-        "settle_s": 0.7,
-        "raycast_checked": scene_id % 2 == 0,
-        "settings_digest": "d" * 64,
-        "bodies": [_body(scene_id, region, category, instance) for region in (3, 4)],
-        "capture": None,
-    }
+    first = {"category": category, "instance_id": instance, "source": "procedural", "table_id": table}
+    effects = {"effects": ["drop", "snap"], "skipped": [{"effect": "tip", "why": "stands"}]}
+    return (
+        {"scene_id": scene_id, **first, "object_scale": 0.25, "pose": "upright", "redraws": scene_id % 3}
+        | {"T_world_obj": matrix_of(scene_id, 1), "T_world_table": matrix_of(scene_id, 2)}
+        | {**effects, **_rest(scene_id), "settle_s": 0.7, "raycast_checked": scene_id % 2 == 0}
+        | {"settings_digest": "d" * 64, "capture": None}
+        | {"bodies": [_body(scene_id, region, category, instance) for region in (3, 4)]}
+    )
 
 
 def _rest(scene_id: int) -> dict[str, object]:
     """The columns of a body's rest; a scene's are the worst of its bodies', which are equal here."""
-    return {
-        "penetration_mm": 0.01,
-        "hover_gap_mm": -0.0,
-        "support_margin_mm": 12.5,
-        "residual_speed_mm_s": 0.1,
-        "recheck_move_mm": None if scene_id % 2 else 0.02,
-        "recheck_turn_deg": None if scene_id % 2 else 0.01,
+    recheck = (None, None) if scene_id % 2 else (0.02, 0.01)
+    return {"penetration_mm": 0.01, "hover_gap_mm": -0.0, "support_margin_mm": 12.5, "residual_speed_mm_s": 0.1} | {
+        "recheck_move_mm": recheck[0],
+        "recheck_turn_deg": recheck[1],
         "equilibrium_residual": 0.001,
     }
 
 
 def _body(scene_id: int, region: int, category: str, instance: str) -> dict[str, object]:
     """A body's columns; the first object has those of the scene."""
-    return {
-        "region_id": region,
-        "category": category,
-        "instance_id": instance,
-        "source": "procedural",
-        "object_scale": 0.25,
-        "T_world_obj": matrix_of(scene_id, 1 if region == 3 else region),
-        "redraws": scene_id % 3,
-        **_rest(scene_id),
-        "mass_kg": 0.5,
-        "com": [0.01 * region, 0.0, 0.8],
-        "contacts": [
-            {
-                "with_region": 2,
-                "point": [0.01 * region, 0.0, 0.75],
-                "normal": [0.0, 0.0, 1.0],
-                "force": [0.0, 0.0, 4.905],
-            }
-        ],
-    }
+    point = {"point": [0.01 * region, 0.0, 0.75], "normal": [0.0, 0.0, 1.0], "force": [0.0, 0.0, 4.905]}
+    return (
+        {"region_id": region, "category": category, "instance_id": instance, "source": "procedural"}
+        | {"object_scale": 0.25, "T_world_obj": matrix_of(scene_id, 1 if region == 3 else region)}
+        | {"redraws": scene_id % 3, **_rest(scene_id), "mass_kg": 0.5, "com": [0.01 * region, 0.0, 0.8]}
+        | {"contacts": [{"with_region": 2, **point}]}
+    )
 
 
 def _view(scene_id: int, category: str, pose_id: int, role: str, files: list[dict[str, object]]) -> dict[str, object]:
-    projected = role == "projected"
-    return {
-        "pose_id": pose_id + 1 if role == "mirror" else pose_id,
-        "parent_id": pose_id,
-        "role": role,
-        "scene_id": scene_id,
-        "category": category,
-        "T_world_cam": matrix_of(scene_id, 3, len(role)),
-        "inclination_rad": 0.8,
-        "yaw_rad": 1.0 / 3.0,
-        "width": 640,
-        "height": 480,
-        "fx": 525.0,
-        "fy": 525.0,
-        "cx": 320.0,
-        "cy": 240.0,
-        "cx_opencv": 319.5,
-        "cy_opencv": 239.5,
-        "depth_units_per_m": 5000.0,
-        "d_z_m": 2.4,
-        "files": files,
-        "object_pixels": 530,
-        "visible_fraction": 1.0,
-        "mirror_agreement": {"median_mm": 0.06, "share": 0.99} if role == "mirror" else None,
-        "projected_filled_share": 0.5 if projected else None,
-        "projected_hidden_share": 0.4 if projected else None,
-        "patch_object_fraction": None,
-        "capture": None,
-    }
+    filled, hidden = (0.5, 0.4) if role == "projected" else (None, None)
+    return (
+        {"pose_id": pose_id + 1 if role == "mirror" else pose_id, "parent_id": pose_id, "role": role}
+        | {"scene_id": scene_id, "category": category, "T_world_cam": matrix_of(scene_id, 3, len(role))}
+        | {"inclination_rad": 0.8, "yaw_rad": 1.0 / 3.0, "width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
+        | {"cx": 320.0, "cy": 240.0, "cx_opencv": 319.5, "cy_opencv": 239.5, "depth_units_per_m": 5000.0, "d_z_m": 2.4}
+        | {"files": files, "object_pixels": 530, "visible_fraction": 1.0, "patch_object_fraction": None}
+        | {"projected_filled_share": filled, "projected_hidden_share": hidden, "capture": None}
+        | {"mirror_agreement": {"median_mm": 0.06, "share": 0.99} if role == "mirror" else None}
+    )
 
 
 def _object(view: dict, region: int, category: str, instance: str) -> dict[str, object]:
-    return {
-        "pose_id": view["pose_id"],
-        "role": view["role"],
-        "region_id": region,
-        "scene_id": view["scene_id"],
-        "category": category,
-        "instance_id": instance,
-        "u": 300 + region,
-        "v": -1,
-        "T_cam_obj": matrix_of(view["scene_id"], 4, region),
-        "bbox_xywh": [1, 2, 3, 4],
-        "pixels": 500,
-        "visible_fraction": 0.9,
-        "patch_object_fraction": None if region == 2 else 0.3,
-    }
+    return (
+        {name: view[name] for name in ("pose_id", "role", "scene_id")}
+        | {"region_id": region, "category": category, "instance_id": instance, "u": 300 + region, "v": -1}
+        | {"T_cam_obj": matrix_of(view["scene_id"], 4, region), "bbox_xywh": [1, 2, 3, 4], "pixels": 500}
+        | {"visible_fraction": 0.9, "patch_object_fraction": None if region == 2 else 0.3}
+    )
 
 
 def _asset(category: str, instance: str, shapes: bool) -> dict[str, object]:
-    return {
-        "instance_id": instance,
-        "category": category,
-        "source": "procedural",
-        "licence": "CC0-1.0",
-        "path": f"models/{instance}.obj" if shapes else None,
-        "sha256": hashlib.sha256(instance.encode()).hexdigest(),
-        "extents_m": [0.1, 0.2, 1 / 3],
-        "volume_m3": None,
-        "watertight": False,
-        "T_source_to_object": matrix_of(len(instance)),
-        "scale": 1.0,
-        "split": "train",
-        "notes": [],
-    }
+    return (
+        {"instance_id": instance, "category": category, "source": "procedural", "licence": "CC0-1.0"}
+        | {"path": f"models/{instance}.obj" if shapes else None, "extents_m": [0.1, 0.2, 1 / 3], "volume_m3": None}
+        | {"sha256": hashlib.sha256(instance.encode()).hexdigest(), "watertight": False, "scale": 1.0}
+        | {"T_source_to_object": matrix_of(len(instance)), "split": "train", "notes": []}
+    )

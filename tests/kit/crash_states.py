@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.kit.faults import Written
 from workers.store import file_system, local
 
 Step = tuple[Any, ...]
@@ -290,7 +291,13 @@ def recorded(root: Path, by_syncfs: bool = True) -> Iterator[list[Step]]:
         if mode not in ("wb", "xb") or (found := key(path)) is None:
             return file
         steps.append(("create", id(file), found))
-        return _Written(file, lambda half: steps.append(("write", id(file), half)))
+
+        def write(data: bytes) -> int:
+            for half in (data[: len(data) // 2], data[len(data) // 2 :]):
+                steps.append(("write", id(file), bytes(half)))
+            return file.write(data)
+
+        return Written(file, write)
 
     with pytest.MonkeyPatch.context() as patch:
         for name, call in (("link", two("link", os.link)), ("replace", two("rename", os.replace))):
@@ -304,23 +311,3 @@ def recorded(root: Path, by_syncfs: bool = True) -> Iterator[list[Step]]:
         patch.setattr(file_system, "_syncfs", lambda descriptor: steps.append(("syncfs",)))
         patch.setattr(file_system, "_trusts_syncfs", lambda folder: by_syncfs)
         yield steps
-
-
-class _Written:
-    """A file whose writes are told."""
-
-    def __init__(self, file: Any, tell: Callable[[bytes], object]) -> None:
-        self._file, self._tell = file, tell
-        self.close, self.flush, self.fileno = file.close, file.flush, file.fileno
-
-    def write(self, data: bytes) -> int:
-        half = len(data) // 2
-        self._tell(bytes(data[:half]))
-        self._tell(bytes(data[half:]))
-        return self._file.write(data)
-
-    def __enter__(self) -> "_Written":
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._file.close()

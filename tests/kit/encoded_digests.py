@@ -1,6 +1,6 @@
 """Digests of many encoded images, to compare between processes, processors and contents of leftover memory.
 
-    python -m tests.kit.encoded_digests render SOURCES.npy
+    save_sources("SOURCES.npy", render(12))
     python -m tests.kit.encoded_digests digest SOURCES.npy DIGESTS.npy --images 100000
     python -m tests.kit.encoded_digests digest SOURCES.npy OTHER.npy --images 100000 --backward
     python -m tests.kit.encoded_digests compare DIGESTS.npy OTHER.npy
@@ -29,25 +29,18 @@ DIGEST = 16
 """Bytes of a digest."""
 
 
-def render(scenes: int, seed: int = 11) -> list[NDArray]:
+def render(scenes: int) -> list[NDArray]:
     """Every image of some scenes of the default job, as it comes from the renderer, and their textures."""
-    from schemas.errors import SceneError
-    from schemas.job.identity import settings_digest
     from schemas.job.job import Job
     from workers.assets.catalogue import open_catalogue
-    from workers.render.raster.gbuffer import shared_renderer
-    from workers.scene.context import Stopwatch, WorkerContext
+    from workers.scene.context import Stopwatch, open_worker
     from workers.scene.make_scene import make_scene
 
-    job = Job(name="digests", seed=seed, scenes=scenes)
-    catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
-    context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
+    job = Job(name="digests", seed=11, scenes=scenes)
+    context = open_worker(job, open_catalogue(job.assets, Path(), tuple(job.categories)))
     images: list[NDArray] = []
     for scene_id in range(scenes):
-        try:
-            scene = make_scene(context, scene_id, Stopwatch())
-        except SceneError:
-            continue
+        scene = make_scene(context, scene_id, Stopwatch())
         for view in (view for pair in scene.pairs for view in pair.views):
             images += [pixels for pixels in (view.rgb, view.depth, view.region) if pixels is not None]
         parts = [part for start in scene.plan.objects for part in start.asset.shape.parts]
@@ -115,32 +108,23 @@ def _dirty_memory(rng: np.random.Generator) -> None:
 def main(arguments: Sequence[str]) -> int:
     """Runs one of the commands; 1 where digests differ."""
     parser = argparse.ArgumentParser(description="Digests of many encoded images.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    rendered = commands.add_parser("render")
-    rendered.add_argument("sources", type=Path)
-    rendered.add_argument("--scenes", type=int, default=12)
-    digested = commands.add_parser("digest")
-    digested.add_argument("sources", type=Path)
-    digested.add_argument("out", type=Path)
-    digested.add_argument("--images", type=int, default=1_000)
-    digested.add_argument("--backward", action="store_true", help="other images come before each")
-    compared = commands.add_parser("compare")
-    compared.add_argument("files", type=Path, nargs=2)
+    parser.add_argument("command", choices=("digest", "compare"))
+    parser.add_argument("files", type=Path, nargs=2, help="sources and digests, or digests and others")
+    parser.add_argument("--images", type=int, default=1_000)
+    parser.add_argument("--backward", action="store_true", help="other images come before each")
     options = parser.parse_args(arguments)
-    if options.command == "render":
-        save_sources(options.sources, render(options.scenes))
-    elif options.command == "digest":
+    if options.command == "digest":
+        sources, out = options.files
         numbers = list(range(options.images))
         order = numbers[::-1] if options.backward else numbers
-        found = dict(digests(load_sources(options.sources), order, seed=int(options.backward)))
-        np.save(options.out, np.frombuffer(b"".join(found[number] for number in numbers), np.uint8).reshape(-1, DIGEST))
-    else:
-        one, two = (np.load(path) for path in options.files)
-        common = min(len(one), len(two))
-        different = np.flatnonzero((one[:common] != two[:common]).any(axis=1))
-        print(f"{common} images, {len(different)} with other bytes: {different[:10].tolist()}")
-        return int(len(different) > 0)
-    return 0
+        found = dict(digests(load_sources(sources), order, seed=int(options.backward)))
+        np.save(out, np.frombuffer(b"".join(found[number] for number in numbers), np.uint8).reshape(-1, DIGEST))
+        return 0
+    one, two = (np.load(path) for path in options.files)
+    common = min(len(one), len(two))
+    different = np.flatnonzero((one[:common] != two[:common]).any(axis=1))
+    print(f"{common} images, {len(different)} with other bytes: {different[:10].tolist()}")
+    return int(len(different) > 0)
 
 
 def save_sources(path: Path, images: Sequence[NDArray]) -> None:

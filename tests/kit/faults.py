@@ -1,4 +1,4 @@
-"""Faults on purpose: a disk that fails or loses power, requests to a bucket that are cut, and a lock that another takes."""
+"""Faults on purpose: something else at a step on a disk, requests to a bucket that are cut, and a lock that another takes."""
 
 import builtins
 import contextlib
@@ -6,7 +6,6 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Literal
 
 import obstore
@@ -30,103 +29,58 @@ class Killed(BaseException):
 
 
 class Disk:
-    """Steps so far; the step `at` is ended half way (`torn`) or before it, or `instead` runs just before it."""
+    """Counts steps; `then` runs just before the step `at`, whose own steps do not count."""
 
-    def __init__(self, at: int = -1, then: Callable[[], object] | None = None) -> None:
+    def __init__(self, at: int, then: Callable[[], object] | None) -> None:
         self.steps = 0
-        self.synced: set[int] = set()
         self._at = at
         self._then = then
         self._busy = False
 
-    def step(self) -> bool:
-        """Counts one step. True where a write must be torn; raises Killed afterwards for ever."""
+    def step(self) -> None:
+        """One step."""
         if self._busy:
-            return False
+            return
         self.steps += 1
-        if self.steps - 1 != self._at:
-            if self._then is None and -1 < self._at < self.steps - 1:
-                raise Killed
-            return False
-        if self._then is None:
-            return True
-        self._busy = True
-        try:
-            self._then()
-        finally:
-            self._busy = False
-        return False
+        if self.steps - 1 == self._at and self._then is not None:
+            self._busy = True
+            try:
+                self._then()
+            finally:
+                self._busy = False
 
 
 @contextmanager
 def disk(at: int = -1, then: Callable[[], object] | None = None) -> Iterator[Disk]:
-    """Counts the steps taken in this context. At step `at` the process is killed, or `then` runs. Nothing is flushed."""
+    """Counts the steps taken in this context: what leaves something behind. `then` runs at step `at`. Nothing is flushed."""
     watched = Disk(at, then)
+
+    def counted(name: str, real: Callable) -> Callable:
+        def call(*arguments, **named):
+            watched.step()
+            return None if name == "fsync" else real(*arguments, **named)
+
+        return call
+
+    def opened(path, mode="r", **more):
+        if "r" in mode:
+            return builtins.open(path, mode, **more)
+        watched.step()
+        file = builtins.open(path, mode, **more)  # noqa: SIM115 - the caller's to close
+        return Written(file, counted("write", file.write))
+
     with pytest.MonkeyPatch.context() as patch:
         for name in _STEPS:
-            patch.setattr(os, name, _counted(watched, name, getattr(os, name)))
+            patch.setattr(os, name, counted(name, getattr(os, name)))
         for module in (local, file_system):
-            patch.setattr(
-                module, "open", lambda path, mode="r", **more: _open(watched, path, mode, **more), raising=False
-            )
-        patch.setattr(file_system, "_syncfs", lambda descriptor: _sync_all(watched, descriptor))
+            patch.setattr(module, "open", opened, raising=False)
+        patch.setattr(file_system, "_syncfs", lambda descriptor: watched.step())
         patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
         yield watched
 
 
-@pytest.fixture(scope="module")
-def unflushed() -> Iterator[None]:
-    """Nothing is flushed in this module: for tests that lose no power, which a busy disk would slow down."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda descriptor: None)
-        patch.setattr(file_system, "_syncfs", lambda folder: True)
-        patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
-        yield
-
-
-def lose_power(watched: Disk, root: Path) -> None:
-    """Empties every file below `root` whose bytes were never flushed."""
-    for parent, _, names in os.walk(root):
-        for name in names:
-            path = os.path.join(parent, name)
-            if os.stat(path).st_ino not in watched.synced:
-                os.truncate(path, 0)
-
-
-def _counted(watched: Disk, name: str, real: Callable) -> Callable:
-    def call(*arguments, **named):
-        if watched.step():
-            raise Killed
-        if name != "fsync":
-            return real(*arguments, **named)
-        watched.synced.add(os.fstat(arguments[0]).st_ino)
-        return None
-
-    return call
-
-
-def _open(watched: Disk, path, mode: str, **more):
-    """The open file; reading is no step, because it leaves nothing behind."""
-    if "r" in mode:
-        return builtins.open(path, mode, **more)
-    if watched.step():
-        raise Killed
-    file = builtins.open(path, mode, **more)  # noqa: SIM115 - the caller's to close
-    watched.synced.discard(os.fstat(file.fileno()).st_ino)
-    write = file.write
-
-    def torn_or_whole(data):
-        if watched.step():
-            write(data[: len(data) // 2])
-            file.flush()
-            raise Killed
-        return write(data)
-
-    return _Writing(file, torn_or_whole)
-
-
-class _Writing:
-    """A file whose `write` is watched."""
+class Written:
+    """An open file with another `write`."""
 
     def __init__(self, file, write) -> None:
         self._file = file
@@ -140,12 +94,14 @@ class _Writing:
         self._file.close()
 
 
-def _sync_all(watched: Disk, descriptor: int) -> bool:
-    if watched.step():
-        raise Killed
-    for parent, _, names in os.walk(os.readlink(f"/proc/self/fd/{descriptor}")):
-        watched.synced |= {os.stat(os.path.join(parent, name)).st_ino for name in names}
-    return True
+@pytest.fixture(scope="module")
+def unflushed() -> Iterator[None]:
+    """Nothing is flushed in this module: for tests that lose no power, which a busy disk would slow down."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        patch.setattr(file_system, "_syncfs", lambda folder: True)
+        patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
+        yield
 
 
 CHANGES = ("put", "copy", "delete")

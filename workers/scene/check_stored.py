@@ -58,8 +58,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
         return faults
     for role, view in stored.items():
         if role != "projected":
-            faults += _check_labels(view, scene)
-            faults += _check_patch_shares(job, view, objects)
+            faults += _check_labels(job, view, objects, scene)
             faults += _check_images(view, scene)
         faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
     faults += _check_cameras(job, stored, views)
@@ -94,18 +93,24 @@ def _differs(a: ArrayLike, b: ArrayLike) -> bool:
     return bool(np.abs(np.asarray(a) - np.asarray(b)).max() > ROUNDING)
 
 
-def _check_labels(view: View, scene: Row) -> list[str]:
-    """Compare rows of `objects` with the mask and the poses."""
+def _named(view: View) -> str:
+    return f"pose {view.pose_id} ({view.role})"
+
+
+def _check_labels(job: Job, view: View, objects: Sequence[Row], scene: Row) -> list[str]:
+    """Compare rows of `objects` with the mask, the poses, and the share of its patch that each object fills."""
     assert view.region is not None
-    where, faults = f"pose {view.pose_id} ({view.role})", []
     T_world = read_world_poses(scene)
     if {label.region_id for label in view.labels} != set(T_world):
         found = [label.region_id for label in view.labels]
-        return [f"{where}: objects has the regions {found}, scenes {list(T_world)}"]
-    extents = measure_regions(view.region)
+        return [f"{_named(view)}: objects has the regions {found}, scenes {list(T_world)}"]
+    own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
+    shares = {row["region_id"]: row["patch_object_fraction"] for row in own}
+    extents, faults = measure_regions(view.region), []
     for label in view.labels:
         pixels, box = extents[label.region_id]
-        name = f"{where}, region {label.region_id}"
+        name = f"{_named(view)}, region {label.region_id}"
+        told, share = shares[label.region_id], patch_object_fraction(view, label, job.images.patch)
         if pixels != label.pixels:
             faults.append(f"{name}: the mask has {pixels} pixels, objects says {label.pixels}")
         if box != label.bbox_xywh:
@@ -116,18 +121,8 @@ def _check_labels(view: View, scene: Row) -> list[str]:
             faults.append(f"{name}: T_cam_obj does not follow from the camera's and the object's poses")
         if not 0.0 <= label.visible_fraction <= 1.0:
             faults.append(f"{name}: visible_fraction {label.visible_fraction} is no share")
-    return faults
-
-
-def _check_patch_shares(job: Job, view: View, objects: list[Row]) -> list[str]:
-    """Compare the share of its patch that each object fills."""
-    own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
-    shares, faults = {row["region_id"]: row["patch_object_fraction"] for row in own}, []
-    for label in view.labels:
-        told, share = shares[label.region_id], patch_object_fraction(view, label, job.images.patch)
         if label.region_id >= REGION_FIRST_OBJECT and share != told:
-            where = f"pose {view.pose_id} ({view.role}), region {label.region_id}"
-            faults.append(f"{where}: fills {share} of its patch, objects says {told}")
+            faults.append(f"{name}: fills {share} of its patch, objects says {told}")
     return faults
 
 
@@ -143,7 +138,7 @@ def _check_images(view: View, scene: Row) -> list[str]:
     shows nothing without depth.
     """
     assert view.region is not None
-    where, faults = f"pose {view.pose_id} ({view.role})", []
+    where, faults = _named(view), []
     known = {0, 1} | {label.region_id for label in view.labels}
     if foreign := set(np.unique(view.region).tolist()) - known:
         faults.append(f"{where}: the mask has regions {sorted(foreign)} that objects lacks")
@@ -169,7 +164,7 @@ def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: R
             faults.append(f"{path}: is not the crop of its image")
     if expected != listed:
         wrong = sorted(expected ^ listed)
-        faults.append(f"pose {view.pose_id} ({view.role}): files {wrong} should be there, or should not")
+        faults.append(f"{_named(view)}: files {wrong} should be there, or should not")
     return faults
 
 
@@ -182,8 +177,7 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
     poses = {**place_beside(first.camera, job), "mirror": mirror, "projected": mirror}
     for role, camera in poses.items():
         if role in stored and _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
-            where = f"pose {stored[role].pose_id} ({role})"
-            faults.append(f"{where}: T_world_cam does not follow from the input pose and d_z")
+            faults.append(f"{_named(stored[role])}: T_world_cam does not follow from the input pose and d_z")
     for role, row in views.items():
         if abs(row["d_z_m"] - d_z) > ROUNDING:
             faults.append(f"pose {row['pose_id']} ({role}): d_z_m is {row['d_z_m']}, the input depth gives {d_z}")
@@ -204,7 +198,7 @@ def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, R
 def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row], effects: EffectPlan) -> list[str]:
     """The projected images to the byte, and their shares; `effects` are those that the scene's receipt names."""
     first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
-    where, faults = f"pose {projected.pose_id} (projected)", []
+    where, faults = _named(projected), []
     rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion, effects)
     same_rgb = rgb is None or (projected.rgb is not None and np.array_equal(rgb, projected.rgb))
     if not same_rgb or not np.array_equal(depth, projected.depth):

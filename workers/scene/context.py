@@ -1,7 +1,4 @@
-"""The context of a worker process: the job, its assets, the renderer, and where the time goes.
-
-- The C library's allocator, set to keep the memory that freed arrays give back.
-"""
+"""The context of a worker process: the job, its assets, the renderer, the C library's allocator, and where the time goes."""
 
 import contextlib
 import ctypes

@@ -1,10 +1,4 @@
-"""Labels of rendered views: regions, the projected view, the agreement of two views, patches. Pure.
-
-- The label of each region of a rendered view, from its mask and the poses. Pure.
-- The projected view: the stored input cloud as the mirror camera sees it. Pure.
-- The agreement of two views: input depth carried into the mirror view against mirror depth. Pure.
-- Patches: the crop of an image about each object. Pure.
-"""
+"""Labels of rendered views: regions, the projected view, the agreement of two views, shares of patches. Pure."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -160,7 +154,9 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     assert source.region is not None and mirror.region is not None
     bounds = Bounds(FACING, (SMOOTH_INPUT_M, SMOOTH_MIRROR_M), HIDDEN_M)
     one, other = Seen(source.depth, source.region, source.camera), Seen(mirror.depth, mirror.region, mirror.camera)
-    difference_m, own = compare_covisible(one, other, _sample_pixels(source.region), bounds, images.depth_units_per_m)
+    chosen = source.region >= REGION_FIRST_OBJECT
+    chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
+    difference_m, own = compare_covisible(one, other, np.flatnonzero(chosen), bounds, images.depth_units_per_m)
     difference_mm = difference_m * 1e3
     object_mm = difference_mm[own >= REGION_FIRST_OBJECT]
     enough = len(object_mm) >= FEWEST_POINTS
@@ -170,13 +166,6 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
         points=len(object_mm),
         scene_median_mm=float(np.median(difference_mm)) if len(difference_mm) >= FEWEST_POINTS else None,
     )
-
-
-def _sample_pixels(region: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Flat indices, ascending: every pixel of an object, and a grid over everything else."""
-    chosen = region >= REGION_FIRST_OBJECT
-    chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
-    return np.flatnonzero(chosen)
 
 
 def patch_object_fraction(view: View, label: ObjectLabel, patch: Patch) -> float | None:

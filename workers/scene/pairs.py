@@ -1,8 +1,4 @@
-"""One pair of a settled scene: cameras that follow from the input camera, views as they are stored, and how they agree.
-
-- Poses of the cameras that follow from an input camera, and d_z: the depth of the pivot that the mirror camera turns
-  about.
-"""
+"""One pair of a settled scene: cameras that follow from the input camera, views as they are stored, and how they agree."""
 
 from dataclasses import dataclass, replace
 from functools import partial

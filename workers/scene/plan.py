@@ -1,11 +1,9 @@
 """The draw of a scene: assets, starts, cameras and look, all before anything moves.
 
-- Named streams of random numbers: one for each step of a scene, append-only, so that adding a camera moves no object.
-- How several objects begin without touching: each on a place of its own, or one above another. Pure.
+Each step has a named stream of random numbers. Several objects begin each on a place of its own, or one above another.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -93,17 +91,6 @@ def columns_apart(points: Array, others: Array) -> bool:
     return bool(gap.max() >= APART_M)
 
 
-def has_room(points: Array, earlier: Sequence[ObjectStart]) -> bool:
-    """Whether a cloud [N, 3] stands in no earlier object's column."""
-    return all(columns_apart(points, points_of(other)) for other in earlier)
-
-
-def rise_above(points: Array, earlier: Sequence[ObjectStart]) -> float:
-    """Metres by which a cloud [N, 3] must be lifted for its lowest point to be level with the top of all earlier objects."""
-    top = max(float(points_of(other)[:, 2].max()) for other in earlier)
-    return max(0.0, top - float(points[:, 2].min()))
-
-
 RECESS_M = 0.05
 """Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
 
@@ -170,7 +157,7 @@ def draw_start(
     A position with no table under the centre of mass, or in the column of an earlier object, is redrawn. In a pile an
     object begins above all earlier ones, about the place of the first.
     """
-    number, piled = len(earlier), bool(earlier) and spec.arrange == "pile"
+    number, piled, others = len(earlier), bool(earlier) and spec.arrange == "pile", [points_of(one) for one in earlier]
     middle, reach = (earlier[0].T_world_obj[:2, 3], spec.pile_offset_m) if piled else (np.zeros(2), spec.offset_m)
     rng = chance.object_stream(Stream.START, number)
     xy = middle + rng.uniform(reach.low, reach.high, size=2)
@@ -185,8 +172,9 @@ def draw_start(
             over_table = True
             rested = set_down(pose(R, np.array([xy[0], xy[1], 0.0])), hull, table.mesh)
             points = transform(rested, hull.vertices)
-            if piled or has_room(points, earlier):
-                lift = rise_above(points, earlier) if piled else 0.0
+            if piled or all(columns_apart(points, other) for other in others):
+                # The lowest point of a pile's next object is at first level with the top of all earlier ones.
+                lift = max(0.0, *(float(other[:, 2].max() - points[:, 2].min()) for other in others)) if piled else 0.0
                 placed = spec.pose == "placed" and not piled and stands_on(rested, hull, asset.mass.com, table.mesh)
                 T = rested if placed else translation(0.0, 0.0, lift + clearance) @ rested
                 return ObjectStart(asset, hull, REGION_FIRST_OBJECT + number, frozen_array(T), redraws, placed)

@@ -1,7 +1,4 @@
-"""The output of a scene: encoded images, and its rows in each manifest table. Pure.
-
-- The images that a view leaves, their names, and their bytes. Pure.
-"""
+"""The output of a scene: the images that its views leave, and its rows in each manifest table. Pure."""
 
 from collections.abc import Iterator, Sequence
 from weakref import WeakKeyDictionary
@@ -76,9 +73,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
                 views.append(view_row(scene.plan.scene_id, pair, view, own, context.job))
         every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
         assets = list({asset.instance_id: asset for asset in every}.values())
-        for asset in assets:
-            if asset.shareable:
-                files.append(shape_file(asset))
+        files += [shape_file(asset) for asset in assets if asset.shareable]
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,

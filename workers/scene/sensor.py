@@ -1,11 +1,8 @@
-"""Effects of real sensors on depth and colour. Pure: the same generator state gives the same image.
+"""Effects of real sensors on depth and colour; masks and labels stay exact. Pure: one generator state gives one image.
 
-- Lens distortion, exposure, shot noise and read noise of an RGB camera, in linear light. Pure.
-- Sensing of one view: what the sensors store of exact images. Masks and labels stay exact.
-
-Its steps in order: a pixel at an edge may measure a neighbour, or both surfaces at once; the measurement has a
-systematic and a random error; some pixels have no depth. `schemas/job/views.py` names the sources of the preset's
-numbers.
+Depth: a pixel at an edge may measure a neighbour, or both surfaces at once; the measurement has a systematic and a
+random error; some pixels have no depth. `schemas/job/views.py` names the sources of the preset's numbers. Colour, in
+linear light: lens distortion, exposure, shot noise and read noise.
 
 8-bit sRGB is decoded by table and encoded by comparison with the 255 limits between codes, so that no machine's power
 function decides a rounding.
@@ -179,16 +176,11 @@ class SensorChance:
     exposure: np.random.Generator
 
 
-def planned_effects(sensor: SensorEffects, effects: EffectPlan) -> SensorEffects:
-    """The job's numbers of those sensor effects that the plan runs."""
-    withdrawn = [name for name in SensorEffects.model_fields if not effects.runs(f"sensor_{name}")]
-    return sensor.model_copy(update=dict.fromkeys(withdrawn))
-
-
 def sense_view(sensor: SensorEffects, images: Images, view: View, chance: SensorChance, effects: EffectPlan) -> View:
     """An exact view as its sensors store it; the same view where the plan runs no sensor effect."""
     assert view.region is not None
-    rgb, depth, sensor = view.rgb, view.depth, planned_effects(sensor, effects)
+    withdrawn = [name for name in SensorEffects.model_fields if not effects.runs(f"sensor_{name}")]
+    rgb, depth, sensor = view.rgb, view.depth, sensor.model_copy(update=dict.fromkeys(withdrawn))
     if rgb is not None:
         rgb = sense_rgb(rgb, view.camera.intrinsics, sensor, chance.exposure, chance.rgb)
     if sensor.depth_noise is not None:

@@ -1,7 +1,5 @@
 """A shard: ranges of scenes made one after another in one process, each committed while the next is made.
 
-- What is told of a scene in which something was raised that is no refusal: a bug, or memory that ran out.
-
 A commit computes little and waits long: for a disk to flush, or for an object store to take and copy archives. So it
 runs in a thread of its own. One range at a time is committed, in order, and nothing else of a worker runs in two
 threads.
@@ -15,14 +13,13 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from itertools import takewhile
 from pathlib import PurePath
-from types import TracebackType
 from typing import IO
 
 import workers.assets.builtin.make  # noqa: F401  so that its loops are compiled with the others
@@ -47,19 +44,19 @@ from workers.store.local import open_store
 from workers.store.store import Store
 
 
-class UnexpectedError(SceneError):
-    """A scene that stopped at an error nobody expected. The others go on, and `--retry-failed` makes it again."""
+class LostScene(SceneError):
+    """A scene that ended in an error nobody expected, or that its workers died in. `--retry-failed` makes it again."""
 
     stage = "worker"
     kind = "environmental"
 
 
-def explain(error: Exception) -> UnexpectedError:
+def explain(error: Exception) -> LostScene:
     """The row of a scene that ended in this error."""
     if isinstance(error, MemoryError):
         told = "a worker had too little memory for this scene: use fewer workers, then run with --retry-failed"
-        return UnexpectedError("memory", f"{told} ({describe(error)})")
-    return UnexpectedError("bug", f"{describe(error)}: report this, then run with --retry-failed")
+        return LostScene("memory", f"{told} ({describe(error)})")
+    return LostScene("bug", f"{describe(error)}: report this, then run with --retry-failed")
 
 
 def describe(error: BaseException) -> str:
@@ -91,67 +88,6 @@ def keep_traceback(store: Store, scene_id: int, error: BaseException) -> str:
     except Exception:  # a log must not end the scene's range
         return ""
     return f"; the traceback is in {store.name}/{key}"
-
-
-@dataclass(frozen=True, eq=False)
-class MadeRange:
-    """A range whose scenes are all written: its failures by `kind: reason`, and scenes that ended in an unexpected error."""
-
-    attempt: Attempt
-    failed: Mapping[str, int]
-    bugs: tuple[str, ...]
-
-    def commit(self, job_change: JobChange | None) -> SpanReport:
-        """Commit it. Raises as `Attempt.commit`."""
-        result, span = self.attempt.commit(job_change), self.attempt.span
-        return SpanReport(
-            start=span.start,
-            stop=span.stop,
-            retry=span.retry,
-            won=result.won,
-            conflict=result.conflict,
-            made=len(span.scene_ids) - sum(self.failed.values()),
-            failed=dict(self.failed),
-            bugs=self.bugs,
-            commit=summarize(result.record),
-        )
-
-
-class Committer:
-    """Commits one range while the next is made. A context: at its end no commit is under way, also where its block raises."""
-
-    def __init__(self, job_change: JobChange | None) -> None:
-        self._job_change = job_change
-        self._thread = ThreadPoolExecutor(1, "commit")
-        self._under_way: Future[SpanReport] | None = None
-        self.reports: list[SpanReport] = []
-        """Of the ranges whose commits were waited for, in order."""
-
-    def begin(self, made: MadeRange) -> None:
-        """Begin to commit a range, after the commit before it. Raises what that one raised; then this one is not begun."""
-        self.wait()
-        self._under_way = self._thread.submit(made.commit, self._job_change)
-
-    def wait(self) -> None:
-        """Wait for the commit that is under way. Raises what it raised."""
-        if self._under_way is not None:
-            ended, self._under_way = self._under_way, None
-            self.reports.append(ended.result())
-
-    def __enter__(self) -> "Committer":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._thread.shutdown()
-
-
-class BlamedScene(SceneError):
-    """A scene that is not tried again because its workers died in it."""
-
-    stage = "worker"
-    kind = "environmental"
 
 
 def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], bool] = lambda: False) -> ShardReport:
@@ -186,20 +122,25 @@ def run_ranges(
 ) -> tuple[SpanReport, ...]:
     """Make these ranges and commit each while the next is made; `total` gets the time that is waited for commits.
 
-    A range that cannot be committed raises once the next is made, which then is not committed either.
+    A range that cannot be committed raises once the next is made, which then is not committed either. No commit is under
+    way afterwards, also where this raises.
     """
-    with Committer(order.job_change) as committer:
+    commits: list[Future[SpanReport]] = []
+    with ThreadPoolExecutor(1, "commit") as thread:
         for span in spans:
-            made = _make_range(context, store, order, span, total)
+            commit = _make_range(context, store, order, span, total)
             with total.stage("commit"):
-                committer.begin(made)
+                for before in commits[-1:]:
+                    before.result()
+            commits.append(thread.submit(commit))
         with total.stage("commit"):
-            committer.wait()
-    return tuple(committer.reports)
+            return tuple(commit.result() for commit in commits)
 
 
-def _make_range(context: WorkerContext, store: Store, order: ShardOrder, span: Span, total: Stopwatch) -> MadeRange:
-    """One range, written. A scene that ends in an error nobody expected is a row too, and is reported."""
+def _make_range(
+    context: WorkerContext, store: Store, order: ShardOrder, span: Span, total: Stopwatch
+) -> Callable[[], SpanReport]:
+    """The commit of one range, which is written. A scene that ends in an error nobody expected is a row too, and is reported."""
     blamed = {blame.scene_id: blame for blame in order.blamed}
     attempt = begin_attempt(store, span, order.terms, order.label)
     failed: Counter[str] = Counter()
@@ -208,14 +149,32 @@ def _make_range(context: WorkerContext, store: Store, order: ShardOrder, span: S
         for scene_id in span.scene_ids:
             try:
                 output = _attempt_scene(context, attempt, scene_id, tracebacks, total, blamed.get(scene_id))
-            except UnexpectedError as error:
+            except LostScene as error:
                 where = keep_traceback(store, scene_id, error.__cause__ or error)
                 bugs.append(f"{name_scene(context, scene_id)}: {error.detail}{where}")
                 output = failed_scene(scene_id, _category(context, scene_id), error)
                 attempt.add_scene(output)
             failed.update(f"{row['kind']}: {row['reason']}" for row in output.rows.get("failures", ()))
     attempt.end_scenes()
-    return MadeRange(attempt, failed, tuple(bugs))
+    return partial(_commit, attempt, order.job_change, dict(failed), tuple(bugs))
+
+
+def _commit(
+    attempt: Attempt, job_change: JobChange | None, failed: dict[str, int], bugs: tuple[str, ...]
+) -> SpanReport:
+    """Commit a range with its failures by `kind: reason`. Raises as `Attempt.commit`."""
+    result, span = attempt.commit(job_change), attempt.span
+    return SpanReport(
+        start=span.start,
+        stop=span.stop,
+        retry=span.retry,
+        won=result.won,
+        conflict=result.conflict,
+        made=len(span.scene_ids) - sum(failed.values()),
+        failed=failed,
+        bugs=bugs,
+        commit=summarize(result.record),
+    )
 
 
 def _attempt_scene(
@@ -226,10 +185,10 @@ def _attempt_scene(
     total: Stopwatch,
     blame: Blame | None,
 ) -> SceneOutput:
-    """One scene, made or refused, and written. Raises UnexpectedError; then nothing of it is written."""
+    """One scene, made or refused, and written. Raises LostScene; then nothing of it is written."""
     if blame is not None:  # not begun, so that no worker dies in it
         category = _category(context, scene_id)
-        output = failed_scene(scene_id, category, BlamedScene(blame.reason, blame.detail), blame.attempts)
+        output = failed_scene(scene_id, category, LostScene(blame.reason, blame.detail), blame.attempts)
         attempt.add_scene(output)
         return output
     attempt.begin_scene(scene_id)

@@ -85,17 +85,10 @@ class TableDigest:
         return total.hexdigest()
 
 
-def rows_digest(table: str, rows: pa.Table) -> str:
-    """64 hex characters: the digest of these rows of `table`."""
-    digest = TableDigest(table)
-    digest.update(rows)
-    return digest.hexdigest()
-
-
 def dataset_digest(tables: Mapping[str, str], files: Iterable[tuple[str, str]]) -> str:
     """64 hex characters: SHA-256 over the tables' digests, then over the (path, SHA-256) of `files`.
 
-    The tables are scenes, views, objects, assets and failures, by their canonical rows (`rows_digest`);
+    The tables are scenes, views, objects, assets and failures, by their canonical rows (`TableDigest`);
     the files are images, shapes and merged files. They must come sorted by the UTF-8 bytes of their paths, each path
     once; raises ValueError otherwise. In layout `tar` an image has the path that it would have as a file of its own, so
     the digest does not depend on the layout.

@@ -186,7 +186,8 @@ def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None
     except FileNotFoundError:
         return None
     record = decode_record(data, key)
-    _check_range(key, record.span.start, record.span.retry)
+    if (own := commit_path(record.span.start, record.span.retry)) != key:
+        raise CorruptError(f"{key} holds the record of another range: {own}")
     return record
 
 
@@ -234,8 +235,7 @@ def publish(store: Store, record: CommitRecord, own: Iterable[FileEntry] | None 
     for entry in files:
         final = store.size(entry.path) if is_shape(entry.path) else None
         if final is None:
-            if not _move(store, folders, entry):
-                _check_final(store, entry)
+            _put_in_place(store, folders, entry)
         elif final != entry.bytes and record.terms.fingerprint_mode == "strict":
             raise CommitConflict(
                 f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
@@ -293,19 +293,14 @@ def compare_attempts(
     )
 
 
-def _check_range(key: str, start: int, retry: int) -> None:
-    if commit_path(start, retry) != key:
-        raise CorruptError(f"{key} holds the record of another range: {commit_path(start, retry)}")
-
-
 def _staging_folders(record: CommitRecord) -> tuple[str, str]:
     """Where the winner's files may lie before they are published: its folder, or that folder fenced."""
     staging = staging_path(record.span.start, record.attempt)
     return staging, staging + FENCED
 
 
-def _move(store: Store, folders: Iterable[str], entry: FileEntry) -> bool:
-    """Moves one file into place from one of the folders; False where it is not staged (any more)."""
+def _put_in_place(store: Store, folders: Iterable[str], entry: FileEntry) -> None:
+    """Moves one file into place from one of the folders, unless it is there."""
     for folder in folders:
         source = f"{folder}/{entry.path}"
         staged = store.size(source)
@@ -315,11 +310,7 @@ def _move(store: Store, folders: Iterable[str], entry: FileEntry) -> bool:
             raise CorruptError(f"{source} has {staged} bytes, and its commit says {entry.bytes}")
         with contextlib.suppress(FileNotFoundError):
             store.move(source, entry.path)
-            return True
-    return False
-
-
-def _check_final(store: Store, entry: FileEntry) -> None:
+            return
     final = store.size(entry.path)
     if final is None:
         raise CorruptError(f"{entry.path} is named by a commit and is neither staged nor published")

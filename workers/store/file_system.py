@@ -19,7 +19,6 @@ from typing import IO
 
 from schemas.dataset.layout import COMMITS, PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError
-from workers.store.store import retry_if_swept
 
 _SYNCFS_TYPES = frozenset({"ext2", "ext3", "ext4", "xfs", "btrfs", "f2fs", "zfs", "tmpfs", "overlay"})
 """File systems whose syncfs(2) is known to write everything back; others (FUSE among them) may do nothing in it."""
@@ -67,9 +66,8 @@ def file_system_of(folder: str | Path) -> str:
 class OpenTree:
     """A folder that is kept open from before its first file is written until all of them are on the disk.
 
-    The kernel tells of a failed write once for each open descriptor, and a descriptor that is opened after somebody else
-    was told never hears of it. Where syncfs cannot be trusted, each file must be flushed before it is closed
-    (`flush_file`), for the same reason.
+    The kernel tells of a failed write once for each descriptor that was open then. So, where syncfs cannot be trusted,
+    each file must be flushed before it is closed (`flush_file`).
     """
 
     def __init__(self, folder: Path) -> None:
@@ -105,19 +103,13 @@ def refuse_link_out(root: str | Path, key: str) -> None:
     So a folder from somebody else cannot make this program write or remove elsewhere.
     """
     base = os.fspath(root)
-    for end in (at for at, letter in enumerate(key) if letter == "/"):
-        _refuse_if_link_out(base, key[:end])
-    _refuse_if_link_out(base, key)
-
-
-def _refuse_if_link_out(root: str, key: str) -> None:
-    """Raises OutputError where `key` itself is a symbolic link that leads out of `root`."""
-    place = f"{root}/{key}"
-    if os.path.islink(place) and not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(root)):
-        raise OutputError(
-            f"{place} is a symbolic link that leads out of {root}, to {os.path.realpath(place)}: nothing is written "
-            "through it; put a folder in its place, or choose another --out"
-        )
+    for end in [*(at for at, letter in enumerate(key) if letter == "/"), len(key)]:
+        place = f"{base}/{key[:end]}"
+        if os.path.islink(place) and not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(base)):
+            raise OutputError(
+                f"{place} is a symbolic link that leads out of {base}, to {os.path.realpath(place)}: nothing is written "
+                "through it; put a folder in its place, or choose another --out"
+            )
 
 
 def sync_tree(folder: Path) -> None:
@@ -178,12 +170,9 @@ def _kernel() -> tuple[int, ...]:
 def probe_folder(root: Path) -> None:
     """Returns where linking refuses a second name, renaming replaces and syncing works under `root`.
 
-    Raises OutputError naming the step that failed, the type of the file system and a remedy.
+    Raises OutputError naming the step that failed, the type of the file system and a remedy, FileNotFoundError where the
+    probe was swept.
     """
-    retry_if_swept(lambda: _probe_once(root))
-
-
-def _probe_once(root: Path) -> None:
     name = f"{PROBE_PREFIX}{uuid.uuid4().hex}"
     source, target = root / TEMPORARY / name, root / COMMITS / name
     step = "writing a file"
@@ -244,16 +233,12 @@ def temporary_file(folder: Path, data: bytes, durable: bool) -> Iterator[Path]:
 def remedy_of(error: OSError) -> str | None:
     """What a user can do about it, where something can be done; says which user has no permission."""
     remedy = _REMEDIES.get(error.errno or 0)
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return f"{remedy} for user {_user()}: have its owner allow it"
-    return remedy
-
-
-def _user() -> str:
-    number = os.geteuid()
+    if error.errno not in (errno.EACCES, errno.EPERM):
+        return remedy
+    user = str(os.geteuid())
     with contextlib.suppress(KeyError):  # a container's user often has no name
-        return f"{pwd.getpwuid(number).pw_name} ({number})"
-    return str(number)
+        user = f"{pwd.getpwuid(os.geteuid()).pw_name} ({user})"
+    return f"{remedy} for user {user}: have its owner allow it"
 
 
 @contextlib.contextmanager

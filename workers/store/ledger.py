@@ -70,7 +70,9 @@ def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.
     Rows of `assets` come from all records and may be repeated. Raises CorruptError naming a file that does not match its
     commit.
     """
-    parts = [read_range_table(store, record, table) for record in records]
+    paths = [range_table_path(record.span.start, table, record.span.retry) for record in records]
+    read = (read_range_file(store, *which) for which in zip(records, paths, strict=True))
+    parts = [decode_table(table, data, path) for data, path in zip(read, paths, strict=True)]
     if len(parts) == 1:
         return parts[0]
     if "scene_id" in parts[0].column_names:
@@ -79,12 +81,6 @@ def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.
             again = pc.is_in(part.column("scene_id"), value_set=pa.array(sorted(later), pa.int64()))
             parts[number] = part.filter(pc.invert(again))
     return join_rows(table, parts).sort_by([(key, "ascending") for key in SORT_KEYS[table]])
-
-
-def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table:
-    """The rows that one record committed. Raises CorruptError naming a file that is missing or altered."""
-    path = range_table_path(record.span.start, table, record.span.retry)
-    return decode_table(table, read_range_file(store, record, path), path)
 
 
 def _gap(start: int, stop: int) -> str:

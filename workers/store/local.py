@@ -63,7 +63,7 @@ class LocalStore(Store):
         except OSError as error:
             why = remedy_of(error) or error.strerror or error
             raise OutputError(f"{self.name} cannot be written: {why}; or choose another --out") from error
-        probe_folder(self.root)
+        retry_if_swept(lambda: probe_folder(self.root))
 
     def put_if_absent(self, key: str, data: bytes) -> bool:
         """Links a finished temporary file to `key`: the one step that refuses a second writer."""
@@ -156,8 +156,14 @@ class LocalStore(Store):
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
         """A folder under `_staging/`, on the file system of its files' final names; an earlier one of the name goes."""
-        key = f"{scratch_path(name)}/{uuid.uuid4().hex}"
-        self._drop_scratch(name)
+        prefix = scratch_path(name)
+        key = f"{prefix}/{uuid.uuid4().hex}"
+        # Whoever uses an earlier one loses first its name, in one step, then its contents.
+        with contextlib.suppress(FileNotFoundError):
+            os.rename(self._own(prefix), self.path(f"{prefix}.{uuid.uuid4().hex}"))
+        for other in self.children(STAGING):
+            if f"{STAGING}/{other}".startswith(f"{prefix}."):
+                self.remove_tree(f"{STAGING}/{other}")
         try:
             with self._explained(f"a file of the {name}"):
                 os.makedirs(self._own(key))
@@ -168,16 +174,7 @@ class LocalStore(Store):
             raise
         finally:
             self.remove_tree(key)
-            self.remove_empty(scratch_path(name))
-
-    def _drop_scratch(self, name: str) -> None:
-        """Takes the folder away from whoever uses it: first its name, in one step, then its contents."""
-        prefix = scratch_path(name)
-        with contextlib.suppress(FileNotFoundError):
-            os.rename(self._own(prefix), self.path(f"{prefix}.{uuid.uuid4().hex}"))
-        for other in self.children(STAGING):
-            if f"{STAGING}/{other}".startswith(f"{prefix}."):
-                self.remove_tree(f"{STAGING}/{other}")
+            self.remove_empty(prefix)
 
     def replace(self, local: Path, key: str, over: Entry | None = None) -> Entry | None:
         """Flushes a file and renames it to `key`."""

@@ -9,7 +9,7 @@ import contextlib
 import functools
 import tempfile
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, TypeVar
 
@@ -49,7 +49,7 @@ def open_object_store(url: str) -> "ObjectStore":
 
 
 class ObjectStore(Store):
-    """A bucket, or a prefix in one; what each operation promises stands in `Store`."""
+    """A bucket, or a prefix in one: what is put is durable, and there are no folders. `Store` says what each verb promises."""
 
     root = None
     layouts = ("tar",)
@@ -124,9 +124,6 @@ class ObjectStore(Store):
             obstore.copy(self._bucket, source, target)
         self.remove(source)
 
-    def sync(self, keys: Iterable[str]) -> None:
-        """Does nothing: an object is durable as soon as it is put."""
-
     def stage(self, staging: str) -> "ObjectStage":
         """Marks the attempt as begun."""
         return ObjectStage(self, staging)
@@ -178,14 +175,9 @@ class ObjectStore(Store):
             with self._explained(prefix), contextlib.suppress(FileNotFoundError):
                 _repeat_unanswered(lambda: obstore.delete(self._bucket, keys))
 
-    def remove_empty(self, prefix: str) -> None:
-        """Does nothing: there are no folders."""
-
-    @contextlib.contextmanager
-    def scratch(self, name: str) -> Iterator[Path]:
+    def scratch(self, name: str) -> contextlib.AbstractContextManager[Path]:
         """A temporary folder of this machine."""
-        with temporary_folder(name) as folder:
-            yield folder
+        return temporary_folder(name)
 
     def replace(self, local: Path, key: str, over: Entry | None = None) -> Entry | None:
         """Puts a local file on the condition that nothing else is there; where it is large, in parts, having asked before."""
@@ -204,10 +196,6 @@ class ObjectStore(Store):
             if found is None or found.bytes != size or self.read(key) != local.read_bytes():
                 raise _replaced(key) from error
             return None  # an answer was lost, or another put the same
-
-    def withdraw(self, key: str, folder: Path) -> bool:
-        """False: an object cannot be deleted on a condition."""
-        return False
 
     def _put_over(self, data: bytes, key: str, over: Entry | None) -> "PutResult":
         mode: PutMode = "create" if over is None else {"e_tag": over.tag}
@@ -247,17 +235,11 @@ class ObjectStage(Stage):
             with self._store._explained(path):
                 self._store._put_file(f"{self._staging}/{path}", file)
 
-    def flush(self) -> None:
-        """Does nothing: an object is durable as soon as it is put."""
-
     def put_if_absent(self, key: str, data: bytes) -> bool:
         """Looks for the mark, then puts."""
         if not is_live(self._store, self._staging):
             raise FileNotFoundError(f"{self._staging} was swept")
         return self._store.put_if_absent(key, data)
-
-    def close(self) -> None:
-        """Does nothing."""
 
 
 def _entry(meta: "obstore.ObjectMeta") -> Entry:

@@ -136,6 +136,7 @@ class Store(Protocol):
 
     def withdraw(self, key: str, folder: Path) -> bool:
         """Takes a file away if `folder`, a scratch folder, is still there; False where the place has no such condition."""
+        return False
 
 
 def is_live(store: Store, staging: str) -> bool:

@@ -23,7 +23,7 @@ from workers.render.raster.gbuffer import shared_renderer
 from workers.shard import run_shard as module
 from workers.shard.code import SOURCE_PACKAGES, code_digest
 from workers.shard.fingerprint import TIER_LIBRARIES, maths_digest, numpy_simd, take_fingerprint
-from workers.shard.run_shard import Committer, describe, explain, keep_traceback
+from workers.shard.run_shard import describe, explain, keep_traceback
 from workers.store.attempt import Attempt, blamed_scene, staged_attempts
 from workers.store.commit import read_record
 from workers.store.ledger import range_rows
@@ -132,53 +132,6 @@ def test_an_error_in_a_range_lets_the_commit_before_it_end(tmp_path, monkeypatch
         run(tmp_path, 0, 2)
     store = LocalStore(tmp_path)
     assert store.size(commit_path(0)) is not None and store.size(commit_path(2)) is None
-
-
-class Made:
-    """A range whose commit waits until it is let go, and returns its number, or raises."""
-
-    def __init__(self, number: int, events: list[str], error: Exception | None = None) -> None:
-        self.number, self.events, self.error = number, events, error
-        self.let_go = threading.Event()
-
-    def commit(self, job_change) -> int:
-        assert job_change == "change"
-        self.events.append(f"begin {self.number}")
-        assert self.let_go.wait(60.0)
-        self.events.append(f"end {self.number}")
-        if self.error is not None:
-            raise self.error
-        return self.number
-
-
-def test_a_commit_is_under_way_until_the_next_begins_and_its_error_is_raised_there():
-    events: list[str] = []
-    first, second, third, fourth = (Made(n, events, MachineError("full") if n == 3 else None) for n in (1, 2, 3, 4))
-    with Committer("change") as committer:
-        committer.wait()  # there is nothing to wait for
-        committer.begin(first)
-        events.append("make 2")
-        assert committer.reports == []
-        for made in (first, second, third):
-            made.let_go.set()
-        committer.begin(second)
-        assert committer.reports == [1]
-        committer.begin(third)
-        with pytest.raises(MachineError, match="full"):
-            committer.begin(fourth)
-    assert committer.reports == [1, 2] and "begin 4" not in events
-    assert events.index("make 2") < events.index("end 1") < events.index("begin 2"), "the making thread did not wait"
-    last = Made(5, events)
-
-    def fail() -> None:
-        with Committer("change") as committer:
-            committer.begin(last)
-            threading.Timer(0.3, last.let_go.set).start()
-            raise MachineError("the GPU is gone")
-
-    with pytest.raises(MachineError, match="the GPU is gone"):
-        fail()
-    assert events[-2:] == ["begin 5", "end 5"], "no commit is under way after a block that raised"
 
 
 # ---------------------------------------------------------------------------------------------- errors nobody expected

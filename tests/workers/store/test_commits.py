@@ -26,7 +26,7 @@ from workers.store.commit import (
     read_record,
     seal,
 )
-from workers.store.ledger import read_range_table, read_summary
+from workers.store.ledger import range_rows, read_summary
 from workers.store.local import LocalStore
 from workers.store.manifest import encode_table, table_of_rows
 
@@ -181,7 +181,7 @@ def test_a_table_that_lists_anothers_images_is_not_followed(store):
     """Rows name the images of a compact record: they are held to its range as the record itself is."""
     attempt_at(store, 0, 4).commit()
     record = attempt_at(store, 4, 8, make=made_scene).commit().record
-    entries, whole = {entry.path: entry for entry in record.files}, read_range_table(store, record, "views").to_pylist()
+    entries, whole = {entry.path: entry for entry in record.files}, range_rows(store, [record], "views").to_pylist()
     for path in ("../victim", "mug/RGB00000.png", "mug/RGB00000.png\n", "manifest/_commits/0000000000.json"):
         rows = copy.deepcopy(whole)
         rows[0]["files"][0]["path"] = path

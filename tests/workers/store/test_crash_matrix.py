@@ -11,9 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import obstore
 import pyarrow.dataset as ds
@@ -25,11 +23,11 @@ from schemas.errors import RunError
 from services.merge import merge as merge_module
 from services.merge import reading
 from services.merge.merge import merge, read_success
-from tests.kit.faults import REQUESTS, Disk, Killed, check_published, disk, lose_power, requests
+from tests.kit.crash_states import Disk, losses, recorded, write_tree
+from tests.kit.faults import REQUESTS, check_published, disk, requests
 from tests.kit.made_up_runs import (
     FIRST,
     RANGE,
-    STOP,
     broken_promises,
     contents,
     half_merged,
@@ -58,9 +56,9 @@ def points(steps: int, every: bool) -> tuple[int, ...]:
     return tuple(range(steps)) if every else (steps // 3, 2 * steps // 3)
 
 
-def work(root: Path, layout: str = "files", stop: int = STOP) -> str:
+def work(root: Path) -> str:
     """A run from whatever is there; the dataset's digest."""
-    return make_dataset(LocalStore(root), layout, stop).digest
+    return make_dataset(LocalStore(root)).digest
 
 
 def append_three(root: Path) -> list[bytes]:
@@ -71,70 +69,35 @@ def append_three(root: Path) -> list[bytes]:
     return log.read()
 
 
-class Operation(NamedTuple):
-    """What stands before an operation, and the operation, whose result is compared."""
-
-    before: Callable[[Path], object]
-    act: Callable[[Path], object]
-
-
 OPERATIONS = {
-    "a run of files": Operation(lambda root: None, work),
-    "a run of tars": Operation(lambda root: None, lambda root: work(root, "tar")),
-    "an extension": Operation(lambda root: work(root, stop=STOP - 1), work),
-    "a merge": Operation(lambda root: half_merged(LocalStore(root)), lambda root: merge(LocalStore(root), 0, 4).digest),
-    "events": Operation(lambda root: LocalStore(root).prepare(), append_three),
+    "a merge": (lambda root: half_merged(LocalStore(root)), lambda root: merge(LocalStore(root), 0, 4).digest),
+    "events": (lambda root: LocalStore(root).prepare(), append_three),
 }
-
-
-def killed_at(step: int, root: Path, act: Callable[[Path], object]) -> Disk:
-    """What the disk saw until the operation was killed; what lay there before is safe."""
-    with disk(at=step) as watched:
-        watched.synced |= {path.stat().st_ino for path in root.rglob("*")}
-        with pytest.raises(Killed):
-            act(root)
-    return watched
+"""What stands before an operation, and the operation, whose result is compared."""
 
 
 @every_point
-@pytest.mark.parametrize("power", [False, True], ids=["killed", "without power"])
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_ended_at_a_point_and_done_again_it_comes_to_the_same(name, power, every, tmp_path):
+def test_ended_at_a_point_with_any_loss_and_done_again_it_comes_to_the_same(name, every, tmp_path):
+    """Runs, extensions and retries are ended at points in tests/chaos/test_crashes.py."""
     before, act = OPERATIONS[name]
-    seed, whole = tmp_path / "seed", tmp_path / "whole"
-    seed.mkdir()
-    with disk() as watched:
-        before(seed)
-        shutil.copytree(seed, whole)
-        begun = watched.steps
+    whole = tmp_path / "whole"
+    with disk():
+        before(whole)
+    crashed = Disk(whole)
+    with recorded(whole) as steps:
         result = act(whole)
-    kept = contents(whole)
-    for step in points(watched.steps - begun, every):
-        root = tmp_path / str(step)
-        shutil.copytree(seed, root)
-        ended = killed_at(step, root, act)
-        if power:
-            lose_power(ended, root)
-        assert not broken_promises(root), f"step {step}"
-        with disk():
-            assert act(root) == result, f"step {step}"
-            sweep(LocalStore(root))
-        assert contents(root) == kept, f"step {step}"
-        assert not leftovers(root), f"step {step}"
-
-
-def test_a_loss_of_power_after_the_end_costs_nothing_and_both_layouts_have_one_digest(tmp_path):
-    digests = set()
-    for layout in ("files", "tar"):
-        root = tmp_path / layout
-        with disk() as watched:
-            digests.add(work(root, layout))
-        before = contents(root)
-        lose_power(watched, root)
-        assert contents(root) == before and not broken_promises(root)
-        for record in iter_records(LocalStore(root)):
-            check_published(LocalStore(root), record)
-    assert len(digests) == 1
+    kept, chosen = contents(whole), points(len(steps), every)
+    for number, step in enumerate(steps):
+        for loss in losses(0) if number in chosen else ():
+            root, where = tmp_path / f"{number}-{loss.name}", f"before step {number}, {step[:2]}: {loss.name} lost"
+            write_tree(crashed.after_a_crash(loss), root)
+            assert not broken_promises(root), where
+            with disk():
+                assert act(root) == result, where
+                sweep(LocalStore(root))
+            assert contents(root) == kept and not leftovers(root), where
+        crashed.play(step)
 
 
 def prepared(root: Path) -> LocalStore:

@@ -88,11 +88,23 @@ def test_fast_is_no_larger_than_what_opencv_does_by_itself_but_for_a_seventh_wit
         assert len(encode_png(pixels, 6)) < len(encode_png(pixels, 2)) < len(encode_png(pixels, 1))
 
 
-@pytest.mark.parametrize("images", [pytest.param(400, id="400"), pytest.param(100_000, marks=pytest.mark.slow)])
+def drawn() -> list[np.ndarray]:
+    """Colour with and without holes, depth and regions."""
+    y, x = np.mgrid[0:120, 0:160]
+    rgb = np.stack([120 + x // 10, 110 + y // 4, 90 + (x + y) // 9], axis=-1).astype(np.uint8)
+    region = (2 + (x > 50) + (y > 70)).astype(np.uint8)
+    return [rgb, np.where(region[..., None] > 2, rgb, np.uint8(0)), (10_000 + 3 * y).astype(np.uint16), region]
+
+
+@pytest.mark.parametrize(
+    ("images", "make"),
+    [(100, drawn), pytest.param(100_000, lambda: render(2), marks=pytest.mark.slow)],
+    ids=["few", "all"],
+)
 @pytest.mark.timeout(3_600)
-def test_two_processes_encode_alike_in_any_order_whatever_is_left_in_memory(tmp_path, images):
+def test_two_processes_encode_alike_in_any_order_whatever_is_left_in_memory(tmp_path, images, make):
     sources, files = tmp_path / "sources.npy", [tmp_path / "forward.npy", tmp_path / "backward.npy"]
-    save_sources(sources, render(2))
+    save_sources(sources, make())
     for file, more in zip(files, ([], ["--backward"]), strict=True):
         command = [sys.executable, "-m", "tests.kit.encoded_digests", "digest", str(sources), str(file)]
         # glibc fills whatever is allocated or freed, in the second process alone.
