@@ -44,12 +44,14 @@ class Stage(Protocol):
 
     def flush(self) -> None:
         """Returns when everything in the folder survives a loss of power. Not to be called again after an error."""
+        return  # what an object store has put does
 
     def put_if_absent(self, key: str, data: bytes) -> bool:
         """`Store.put_if_absent`, unless the folder was revoked. An object store may miss a revocation at the same moment."""
 
     def close(self) -> None:
         """Frees what the stage holds of this process; its files stay."""
+        return
 
 
 class Store(Protocol):
@@ -101,6 +103,7 @@ class Store(Protocol):
 
     def sync(self, keys: Iterable[str]) -> None:
         """Returns when the names `keys` survive a loss of power."""
+        return
 
     def remove(self, key: str) -> None:
         """Removes a file, if there is one."""
@@ -110,6 +113,7 @@ class Store(Protocol):
 
     def remove_empty(self, prefix: str) -> None:
         """Removes a folder if it is there and empty."""
+        return
 
     def stage(self, staging: str) -> Stage:
         """Begins an attempt in the folder `staging`."""

@@ -38,7 +38,7 @@ def rows_of(*scene_ids: int) -> dict[str, list[dict]]:
     return {t: table_of_rows(t, [row for rows in made for row in rows[t]]).to_pylist() for t in LABEL_TABLES}
 
 
-def members_of(path) -> list[tuple[tarfile.TarInfo, bytes]]:
+def members_of(path):
     """With nothing but the standard library."""
     with tarfile.open(path) as archive:
         return [(header, archive.extractfile(header).read()) for header in archive]
