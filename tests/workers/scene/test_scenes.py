@@ -151,13 +151,13 @@ def view_of(*labels: ObjectLabel) -> View:
 
 
 def boxes_of(view: View, pair: Pair | None = None) -> dict:
-    objects = object_labels(view, pair or Pair(1.0, view, None))
+    objects = object_labels(view, pair or Pair(1.0, view))
     return {path: box for path, _, box in image_boxes(view, objects, objects[0].category, IMAGES.patch)}
 
 
 def test_every_image_and_patch_reads_back_as_what_the_view_holds_with_its_digest():
     view = view_of(label(2, "table"), label(3, "mug"))
-    files = {file.path: file for file in encode_view(view, Pair(1.0, view, None), IMAGES)}
+    files = {file.path: file for file in encode_view(view, Pair(1.0, view), IMAGES)}
     names = ("RGB", "depth", "segment")
     assert files.keys() == {f"mug/{folder}{name}00006.png" for name in names for folder in ("", "patches/")}
     for name, pixels in zip(names, (view.rgb, view.depth, view.region), strict=True):
@@ -175,7 +175,7 @@ def test_patches_are_of_each_object_that_they_do_not_leave_and_a_projected_views
     mirror = dataclasses.replace(view, role="mirror", pose_id=7, labels=(label(3, "mug", u=20),))
     projected = dataclasses.replace(view, role="projected", region=None, labels=())
     box = (slice(20, 28), slice(12, 28))
-    assert boxes_of(projected, Pair(1.0, view, None, mirror, projected)) == {
+    assert boxes_of(projected, Pair(1.0, view, mirror=mirror, projected=projected)) == {
         f"mug/{folder}{name}00006.png": box if folder else None
         for name in ("RGBprojected", "depthProjected")
         for folder in ("", "patches/")
