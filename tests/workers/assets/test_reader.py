@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 from schemas.base import frozen_array
@@ -229,25 +228,6 @@ def test_whatever_is_raised_is_a_refusal_in_one_line_that_names_the_file_and_mem
         errors = [one]
         with pytest.raises(MemoryError):
             answer(tmp_path, CUBE)
-
-
-def test_a_urdf_names_what_is_seen_and_what_collides_below_the_folder(tmp_path):
-    for name in ("seen.obj", "hit.obj"):
-        write(tmp_path / "parts" / name, CUBE)
-    mesh = '<geometry><mesh filename="{}"/></geometry>'.format
-    text = f"<visual>{mesh('parts/seen.obj')}</visual><visual>{mesh('none.obj')}</visual>"
-    text += f"<collision>{mesh('package://parts/hit.obj')}</collision>"
-    urdf = f'<robot name="r"><link name="l">{text}</link></robot>'
-    assert json.loads(answer(tmp_path, urdf, "names", "a.urdf")[1:]) == ["parts/seen.obj", "parts/hit.obj"]
-
-
-def test_a_lying_can_tells_its_size_and_the_axis_that_it_stands_on(tmp_path):
-    can = trimesh.creation.cylinder(0.04, 0.1, sections=48)
-    can.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
-    found = read_measured(answer(tmp_path, can.export(file_type="stl"), "measure", "can.stl")[1:])
-    assert found.extents == pytest.approx((0.08, 0.1, 0.08), abs=1e-6)
-    assert (found.faces, found.watertight, found.up, found.confidence) == (len(can.faces), True, "y", "sure")
-    assert found.vertices >= len(can.vertices) and found.textures == 0 and found.notes == ()
 
 
 def test_pictures_are_counted_and_missing_ones_are_named(tmp_path):

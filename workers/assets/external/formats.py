@@ -63,7 +63,7 @@ def load_shape(path: Path, limits: MeshLimits, root: Path | None = None, budget:
     check_counts(path, sum(len(m.vertices) for m in meshes), sum(len(m.faces) for m in meshes), limits)
     if not meshes:
         raise MeshError("no_faces", f"{path} has no triangles")
-    shape, mended = clean_shape(path, [place_mesh(path, f"part{k}", mesh) for k, mesh in enumerate(meshes)])
+    shape, mended = clean_shape(path, [place_mesh(path, mesh) for mesh in meshes])
     return LoadedMesh(shape, tuple(dict.fromkeys([*resolver.notes, *mended])))
 
 

@@ -161,10 +161,18 @@ def find_files(
     Raises AssetSourceError where map or folder cannot be used.
     """
     folder = locate_folder(settings.folder, job_folder)
-    category_map = _read_map(settings, folder)
-    found: dict[str, list[Path]] = {category: [] for category in sorted(set(category_map.values()) & set(categories))}
+    if not folder.is_dir():
+        remedy = f"Set `folder` of the urdf source to one, or to `{PYBULLET_DATA}`."
+        raise AssetSourceError(f"{folder} is not a folder. {remedy}")
+    category_map = settings.category_map or (PYBULLET_MAP if settings.folder == PYBULLET_DATA else {})
+    if not category_map:
+        raise AssetSourceError(
+            f'{folder} needs a `category_map`, such as {{"mugs/*.obj": mug}}: nothing says what its files are. '
+            f"It has {describe_folder(folder)}."
+        )
     matched = _match_files(category_map, folder)
     _check_up(settings, folder, matched)
+    found: dict[str, list[Path]] = {name: [] for name in sorted(set(category_map.values()) & set(categories))}
     for path, category in sorted(matched.items()):
         if category in found:
             found[category].append(path)
@@ -173,44 +181,23 @@ def find_files(
 
 def _match_files(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
     """The category of every file inside the folder that a pattern finds; the first pattern wins."""
-    matches: dict[Path, str] = {}
+    found: dict[Path, str] = {}
     for pattern, category in category_map.items():
         try:
-            found = [path for path in folder.glob(pattern) if path.is_file()]
+            paths = [path.resolve() for path in folder.glob(pattern) if path.is_file()]
         except (ValueError, NotImplementedError) as error:
             raise AssetSourceError(f"category_map: {pattern!r} is not a pattern below the folder: {error}") from error
-        for path in found:
-            if path.resolve().is_relative_to(folder):
-                matches.setdefault(path.resolve(), category)
-    return matches
+        found |= {path: found.get(path, category) for path in paths if path.is_relative_to(folder)}
+    return found
 
 
 def _check_up(settings: FolderSource, folder: Path, files: Iterable[Path]) -> None:
     """AssetSourceError for a pattern of `up` that finds none of the files: it is most likely misspelt."""
-    if isinstance(settings.up, str):
-        return
     names = [path.relative_to(folder).as_posix() for path in files]
-    for pattern in settings.up:
+    for pattern in () if isinstance(settings.up, str) else settings.up:
         if not any(matches(name, pattern) for name in names):
-            first = ", ".join(names[:3])
-            raise AssetSourceError(
-                f"up: {pattern!r} finds none of the {len(names)} files of {folder} (such as {first})"
-            )
-
-
-def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
-    """The category by file pattern; AssetSourceError where there is none."""
-    if not folder.is_dir():
-        raise AssetSourceError(
-            f"{folder} is not a folder. Set `folder` of the urdf source to one, or to `{PYBULLET_DATA}`."
-        )
-    category_map = settings.category_map or (PYBULLET_MAP if settings.folder == PYBULLET_DATA else {})
-    if not category_map:
-        raise AssetSourceError(
-            f'{folder} needs a `category_map`, such as {{"mugs/*.obj": mug}}: nothing says what its files are. '
-            f"It has {describe_folder(folder)}."
-        )
-    return category_map
+            such = ", ".join(names[:3])
+            raise AssetSourceError(f"up: {pattern!r} finds none of the {len(names)} files of {folder} (such as {such})")
 
 
 _MESHES = ("models/model_normalized.obj", "model.obj")

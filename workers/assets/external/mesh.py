@@ -177,24 +177,16 @@ class MeshVisual:
 
 @dataclass(frozen=True, eq=False)
 class RawMesh:
-    """Triangles as a file has them: vertices [V, 3], faces [F, 3] int64, normals [V, 3] or None, and the node's pose [4, 4]."""
+    """Triangles as a file has them: vertices [V, 3], faces [F, 3] int64, normals [V, 3] or None.
+
+    matrix: the pose [4, 4] of the node that shows them; once placed (`place_mesh`), the identity.
+    """
 
     vertices: NDArray
     faces: Indices
     normals: NDArray | None
     visual: MeshVisual
     matrix: Pose
-
-
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """A mesh in the frame of the scene: vertices [V, 3], faces [F, 3] int64, unit normals [V, 3] or None."""
-
-    name: str
-    vertices: Array
-    faces: Indices
-    normals: Array | None
-    visual: MeshVisual
 
 
 def make_material(
@@ -225,8 +217,8 @@ def transform_shape(shape: Shape, matrix: Pose) -> Shape:
     return Shape(tuple(parts), shape.closed)
 
 
-def place_mesh(path: Path, name: str, mesh: RawMesh) -> Piece:
-    """A mesh in the frame of its scene, with corners of their own where faces have colours.
+def place_mesh(path: Path, mesh: RawMesh) -> RawMesh:
+    """A mesh in the frame of its scene: float64, unit normals, and corners of their own where faces have colours.
 
     Raises MeshError `index_out_of_range` or `not_finite`.
     """
@@ -247,7 +239,7 @@ def place_mesh(path: Path, name: str, mesh: RawMesh) -> Piece:
         vertices, normals = vertices[faces.ravel()], None if normals is None else normals[faces.ravel()]
         visual = replace(visual, colors=np.repeat(visual.face_colors, 3, axis=0), face_colors=None)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
-    return Piece(name, vertices, faces, normals, visual)
+    return RawMesh(vertices, faces, normals, visual, np.eye(4))
 
 
 def check_coordinates(path: Path, vertices: Array) -> None:
@@ -272,8 +264,8 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.where(length == 0, 1.0, length)
 
 
-def clean_shape(path: Path, pieces: list[Piece]) -> tuple[Shape, list[str]]:
-    """The pieces as one clean shape, and what was mended.
+def clean_shape(path: Path, pieces: list[RawMesh]) -> tuple[Shape, list[str]]:
+    """Placed meshes as one clean shape, a part each, and what was mended.
 
     Drops collapsed and doubled faces, but keeps two faces back to back where two solids touch. Winds neighbours alike
     and closed bodies outwards, but keeps a closed body that faces inwards inside another: it is a void. Drops slivers
@@ -297,7 +289,8 @@ def clean_shape(path: Path, pieces: list[Piece]) -> tuple[Shape, list[str]]:
         if not len(faces):
             raise MeshError("no_faces", f"{path} has only faces without area")
     notes = [f"{len(kept) - len(faces)} doubled or empty faces dropped"] if len(faces) < len(kept) else []
-    parts = [_part(piece, faces[owner == k] - starts[k]) for k, piece in enumerate(pieces) if (owner == k).any()]
+    mine = ((k, piece, faces[owner == k] - starts[k]) for k, piece in enumerate(pieces))
+    parts = [_part(f"part{k}", piece, left) for k, piece, left in mine if len(left)]
     closed = watertight and bool((bodies.volume > 0.0).all())
     return Shape(tuple(parts), closed), notes
 
@@ -342,13 +335,13 @@ def _slivers(vertices: Array, faces: Indices) -> Mask:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-12 * longest
 
 
-def _part(piece: Piece, faces: Indices) -> Part:
+def _part(name: str, piece: RawMesh, faces: Indices) -> Part:
     """A part with the remaining faces and the vertices that they name."""
     used, index = np.unique(faces, return_inverse=True)
     vertices, corners = piece.vertices[used], index.reshape(-1, 3)
     normals = None if piece.normals is None else _facing(vertices, corners, piece.normals[used])
     return Part(
-        name=piece.name,
+        name=name,
         vertices=frozen_array(vertices),
         faces=frozen_array(corners, np.int32),
         material=piece.visual.material,
