@@ -198,6 +198,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
+@pytest.mark.minute
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
 def test_images_made_again_and_again_do_not_fault_in_new_pages():
     def faults(how: str) -> int:

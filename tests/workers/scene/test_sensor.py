@@ -240,7 +240,7 @@ def test_an_effect_runs_because_the_plan_has_it_and_changes_what_its_number_says
 
 
 def test_a_dataset_with_every_effect_on_verifies_and_says_what_ran(tmp_path):
-    store, _ = make_dataset(tmp_path, sensor=EVERY)
+    store, _ = make_dataset(tmp_path, scenes=1, sensor=EVERY)
     assert faults_of(store) == []
     for row in query(store, "select * from scenes").to_pylist():
         assert set(NAMES) <= set(row["effects"])

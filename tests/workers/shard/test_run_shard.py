@@ -229,6 +229,7 @@ def asked(code: str, cwd: Path = ROOT, **environ: str) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.minute
 def test_a_c_library_that_multiplies_and_adds_in_two_steps_is_another_stack_and_one_without_avx512_is_not():
     ask = "from workers.shard.fingerprint import maths_digest; print(maths_digest())"
     less = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX512DQ,-AVX512CD"
