@@ -271,17 +271,10 @@ def temporary_folder(name: str) -> Iterator[Path]:
 def remove_abandoned(name: str) -> None:
     """Removes the folders of this name whose process is gone."""
     for folder in Path(tempfile.gettempdir()).glob(f"verso-{name}-*"):
-        with contextlib.suppress(OSError):
-            if _is_abandoned(folder):
-                shutil.rmtree(folder)
-
-
-def _is_abandoned(folder: Path) -> bool:
-    try:
-        with open(folder / _LOCK, "rb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-    except BlockingIOError:
-        return False
-    except FileNotFoundError:
-        return time.time() - folder.stat().st_mtime > _YOUNG_S
+        with contextlib.suppress(OSError):  # among them that of a lock that is held
+            if (folder / _LOCK).exists():
+                with open(folder / _LOCK, "rb") as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            elif time.time() - folder.stat().st_mtime < _YOUNG_S:
+                continue
+            shutil.rmtree(folder)

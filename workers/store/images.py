@@ -29,10 +29,8 @@ def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     and for all else; other levels are zlib-ng.
 
     640 x 480, one core, rendered images: RGB at level 1 1.8 ms and 256 KiB, at 2 4.0 ms and 192 KiB, at 6 18 ms and 153 KiB
-    (OpenCV's encoder at its level 1 11 ms and 212 KiB, at 9 420 ms and 158 KiB); projected RGB 1.6 ms and 157 KiB, 2.5 and
-    119, 4.6 and 100; depth 0.4 ms and 16 KiB, region ids 0.1 ms and 6 KiB at level 1. ISA-L is as fast as fpng, but once in
-    some thousand images its level 1 makes other bytes from the same pixels, depending on leftovers in its memory;
-    tests/kit/encoded_digests.py compares the bytes of these two over 100,000 images.
+    (OpenCV's encoder at its level 1 11 ms and 212 KiB, at 9 420 ms and 158 KiB). ISA-L is as fast as fpng, but once in some
+    thousand images makes other bytes of the same pixels; tests/kit/encoded_digests.py compares 100,000 images.
     """
     colored = pixels.dtype == np.uint8 and pixels.ndim == 3 and pixels.shape[2] == 3
     if not colored and (pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16)):
@@ -42,7 +40,10 @@ def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     whole: NDArray = np.ascontiguousarray(pixels)
     shaded = pixels.ndim == 3 and not _has_holes(pixels)
     if level == 1 and shaded and max(pixels.shape) <= _FPNG_SIDE:
-        return _whole(fpng.from_ndarray(whole))
+        data = fpng.from_ndarray(whole)
+        if not data.endswith(_END):  # it has stopped early, which it says in no other way
+            raise ValueError(f"fpng made a PNG of {len(data)} bytes that does not end")
+        return data
     return _deflated(whole, shaded and level > 1, level)
 
 
@@ -58,13 +59,6 @@ def _deflated(pixels: NDArray, sub: bool, level: int) -> bytes:
     rows = _differences(pixels) if sub else _unfiltered_rows(pixels)
     body = zlib_ng.compress(rows.reshape(-1), level)
     return b"".join((_SIGNATURE, *_chunk(b"IHDR", head), *_chunk(b"IDAT", body), *_chunk(b"IEND", b"")))
-
-
-def _whole(data: bytes) -> bytes:
-    """The bytes as they are. Raises ValueError where fpng stopped early, which it says in no other way."""
-    if not data.endswith(_END):
-        raise ValueError(f"fpng made a PNG of {len(data)} bytes that does not end")
-    return data
 
 
 def _unfiltered_rows(pixels: NDArray) -> NDArray[np.uint8]:

@@ -25,7 +25,6 @@ from workers.store.manifest import (
     table_of_rows,
 )
 
-
 STRIDE = 19
 """Of bytes in which a bit is flipped, one in so many."""
 
