@@ -9,7 +9,7 @@ import threading
 import time
 import urllib.parse
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Literal
@@ -84,13 +84,14 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, format, *arguments) -> None:
         pass
 
-    def _serve(self, act: Callable[[bytes], None]) -> None:
+    def _serve(self) -> None:
         """Does what was asked, unless a fault comes before or after."""
+        act = {"PUT": self._put, "GET": self._get, "HEAD": self._get, "DELETE": self._delete, "POST": self._post}
         data = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         with self.bucket.counted(self.command, self._key()) as fault:
             self._dropped = fault is not None and fault.endswith("when done")
             if fault is None or self._dropped:
-                act(data)
+                act[self.command](data)
         if fault in ("500", "503", "503 when done"):
             self._dropped = False
             self._error(int(fault[:3]), "SlowDown")
@@ -100,19 +101,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             self.close_connection = True
 
-    def do_PUT(self) -> None:
-        self._serve(self._put)
-
-    def do_GET(self) -> None:
-        self._serve(self._get)
-
-    do_HEAD = do_GET
-
-    def do_DELETE(self) -> None:
-        self._serve(self._delete)
-
-    def do_POST(self) -> None:
-        self._serve(self._post)
+    do_PUT = do_GET = do_HEAD = do_DELETE = do_POST = _serve
 
     def _key(self) -> str:
         return urllib.parse.unquote(urllib.parse.urlsplit(self.path).path).split("/", 2)[-1]
@@ -220,9 +209,7 @@ class _Handler(BaseHTTPRequestHandler):
             f"<ETag>{_tag(data)}</ETag></Contents>"
             for key, data in keys
         )
-        common = "".join(
-            f"<CommonPrefixes><Prefix>{escape(folder)}</Prefix></CommonPrefixes>" for folder in sorted(folders)
-        )
+        common = "".join(f"<CommonPrefixes><Prefix>{escape(one)}</Prefix></CommonPrefixes>" for one in sorted(folders))
         return f"<ListBucketResult><IsTruncated>false</IsTruncated>{contents}{common}</ListBucketResult>".encode()
 
 

@@ -40,7 +40,7 @@ def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     whole: NDArray = np.ascontiguousarray(pixels)
     shaded = pixels.ndim == 3 and not _has_holes(pixels)
     if level == 1 and shaded and max(pixels.shape) <= _FPNG_SIDE:
-        data = fpng.from_ndarray(whole)
+        data: bytes = fpng.from_ndarray(whole)
         if not data.endswith(_END):  # it has stopped early, which it says in no other way
             raise ValueError(f"fpng made a PNG of {len(data)} bytes that does not end")
         return data

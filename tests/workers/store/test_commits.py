@@ -11,8 +11,8 @@ from schemas.dataset.commit import FileEntry
 from schemas.dataset.layout import RANGES, STAGING, commit_path, range_table_path
 from schemas.errors import CommitConflict, CorruptError, OutputError
 from tests.kit.faults import check_published
+from tests.kit.stored_images import iter_records
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
-from tests.stored_images import iter_records
 from workers.store.attempt import sweep
 from workers.store.commit import (
     commit_names,

@@ -35,8 +35,8 @@ from tests.kit.made_up_runs import (
     make_dataset,
     settings_of,
 )
+from tests.kit.stored_images import iter_records
 from tests.made_up_scenes import TERMS, attempt_at, small_scene, terms
-from tests.stored_images import iter_records
 from workers.store import ledger
 from workers.store import store as store_module
 from workers.store.attempt import sweep

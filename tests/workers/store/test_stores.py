@@ -22,8 +22,8 @@ from services.run.lock import Beat, hold_lock, read_holder
 from services.run.range_planner import plan_ranges
 from tests.kit.faults import check_published
 from tests.kit.s3_server import Bucket, s3_server
+from tests.kit.stored_images import iter_records, read_images
 from tests.made_up_scenes import attempt_at, made_scene, scene, terms
-from tests.stored_images import iter_records, read_images
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, sweep
 from workers.store.commit import publish, read_record
 from workers.store.events import Events

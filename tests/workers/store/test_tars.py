@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from schemas.dataset.layout import IMAGES, file_pose_id, image_path, patch_path, tar_path
 from schemas.errors import CorruptError
+from tests.kit.stored_images import read_images
 from tests.made_up_scenes import attempt_at, made_scene, scene, terms
-from tests.stored_images import read_images
 from workers.store.local import LocalStore
 from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
 from workers.store.tars import (
