@@ -1,11 +1,8 @@
 """`verso verify --independent N` and `--audit N`: labels derived a second time, and what was skipped proven not to matter.
 
-- Motion of a settled scene that is released again with every effect of physics on, and the mask pixels that it
-  changes.
-
 Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored. Approximations: the
-scene at rest is released again with every effect of physics on. Where MuJoCo is installed, it holds
-every scene as a referee (referee.py): its figures are told, and have no bound.
+scene at rest is released again with every effect of physics on. Where MuJoCo is installed, it holds every scene as a
+referee (referee.py): its figures are told, and have no bound.
 """
 
 import dataclasses

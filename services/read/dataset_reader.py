@@ -2,13 +2,12 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
-from schemas.dataset.commit import CommitRecord, Ledger
+from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
 from workers.store.commit import code_of, list_codes, split_code
@@ -58,45 +57,23 @@ def read_stored(store: Store, records: Sequence[CommitRecord]) -> StoredRange:
 
 def choose_scenes(store: Store, count: int, seed: int) -> list[int]:
     """`count` of the scenes that were made, or all of them, evenly over their ids; the seed sets the first."""
-    return choose_evenly(MadeScenes(list_commits(store)), count, seed)
+    ledger = list_commits(store)
+    ranges, failed = ledger.ranges, ledger.failures.column("scene_id").to_numpy()
+    before = np.append(0, np.cumsum(ranges[:, 1] - ranges[:, 0]))
+    at = np.searchsorted(ranges[:, 0], failed, side="right") - 1
+    made_before = before[at] + failed - ranges[at, 0] - np.arange(len(failed))  # [F] of each scene that failed
+    chosen = choose_evenly(int(before[-1]) - len(failed), count, seed)
+    place = chosen + np.searchsorted(made_before, chosen, side="right")
+    at = np.searchsorted(before, place, side="right") - 1
+    return [int(scene) for scene in ranges[at, 0] + place - before[at]]
 
 
-class MadeScenes(Sequence[int]):
-    """The ids of all scenes that were made, in order, without a list of them."""
-
-    def __init__(self, ledger: Ledger) -> None:
-        self._ranges = ledger.ranges
-        self._before = np.append(0, np.cumsum(self._ranges[:, 1] - self._ranges[:, 0]))
-        failed = ledger.failures.column("scene_id").to_numpy()
-        at = np.searchsorted(self._ranges[:, 0], failed, side="right") - 1
-        gone = self._before[at] + failed - self._ranges[at, 0]
-        self._shift = gone - np.arange(len(gone))
-        """[F] how many scenes were made before each that failed."""
-
-    def __len__(self) -> int:
-        return int(self._before[-1]) - len(self._shift)
-
-    @overload
-    def __getitem__(self, index: int) -> int: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[int]: ...
-
-    def __getitem__(self, index: int | slice) -> int | list[int]:
-        if isinstance(index, slice):
-            return [self[at] for at in range(*index.indices(len(self)))]
-        if not 0 <= index < len(self):
-            raise IndexError(index)
-        place = index + int(np.searchsorted(self._shift, index, side="right"))
-        at = int(np.searchsorted(self._before, place, side="right")) - 1
-        return int(self._ranges[at, 0]) + place - int(self._before[at])
-
-
-def choose_evenly(scenes: Sequence[int], count: int, seed: int) -> list[int]:
-    """`count` of the scenes, which are in order, or all of them, evenly over their ids; the seed sets the first."""
-    if count >= len(scenes):
-        return list(scenes)
+def choose_evenly(total: int, count: int, seed: int) -> NDArray[np.int64]:
+    """`count` of the numbers below `total`, or all of them, in even steps; the seed sets the first."""
+    if count >= total:
+        return np.arange(total)
     first = float(np.random.default_rng(seed).random())
-    return [scenes[int((i + first) * len(scenes) / count)] for i in range(count)]
+    return np.array([int((i + first) * total / count) for i in range(count)], np.int64)
 
 
 def find_scene(store: Store, scene_id: int) -> StoredRange:

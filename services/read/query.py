@@ -1,7 +1,4 @@
-"""`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing.
-
-- Query results as a table for people, or as CSV, JSON or Parquet for programs, written as they come.
-"""
+"""`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing."""
 
 import csv
 import io
@@ -144,13 +141,6 @@ def write_rows(rows: pa.RecordBatchReader, style: Format, sink: IO[bytes], wide:
         return
     for text in (_json if style == "json" else _csv)(rows.schema, _records(rows)):
         sink.write(text.encode())
-
-
-def format_rows(rows: pa.Table, style: Format) -> bytes:
-    """The rows of a whole table, as `write_rows`."""
-    sink = io.BytesIO()
-    write_rows(rows.to_reader(), style, sink)
-    return sink.getvalue()
 
 
 def _row_groups(rows: pa.RecordBatchReader) -> Iterator[pa.Table]:

@@ -17,7 +17,7 @@ from services.read.replay import Maker
 from services.read.verdict import COPY, Verdict
 from services.read.verify import StoredJob, Terms, check_fingerprint, encode_fingerprint, read_stored_job, verify
 from services.read.verify_files import read_stored_success
-from services.read.verify_range import commit_groups, read_records
+from services.read.verify_range import commit_groups, is_table, read_records
 from services.run.lock import hold_lock
 from workers.capture.results import open_sources
 from workers.render.raster.gbuffer import shared_renderer
@@ -47,15 +47,12 @@ def repair(store: Store, scenes: Collection[int], progress: Callable[[Verdict], 
     with hold_lock(store):
         _Repairing(store, found).run(scenes)
         found.verdict = verify(store, progress)
-        if _needs_merge(found.verdict):
+        wrong = found.verdict.parts.keys()
+        # Files that belong nowhere are not in the way of a merge.
+        if {"merge", "card"} & wrong and not {"commit", "file", "job"} & wrong:
             _merge_again(store, found)
             found.verdict = verify(store, progress)
     return found
-
-
-def _needs_merge(verdict: Verdict) -> bool:
-    """Whether all that is wrong is what a merge writes; files that belong nowhere are not in its way."""
-    return bool({"merge", "card"} & verdict.parts.keys()) and not {"commit", "file", "job"} & verdict.parts.keys()
 
 
 def _merge_again(store: Store, found: Repair) -> None:
@@ -83,8 +80,6 @@ class _Repairing:
         self._store = store
         self._found = found
         self._terms = Terms()
-        self._lost_times: list[str] = []
-        """Tables of measured times that cannot be put back."""
 
     def run(self, scenes: Collection[int]) -> None:
         """Everything but merging."""
@@ -136,20 +131,14 @@ class _Repairing:
     def _mend_range(self, maker: Maker, start: int, retries: Sequence[int]) -> None:
         """Puts back the lost files of a range and its retries: tables first, because they name the others."""
         for record in read_records(self._store, start, retries, Verdict()):
-            lost = self._lost(record, [entry for entry in record.files if _is_table(entry)])
-            self._restore(maker, record, lost)
+            lost_times = self._restore(maker, record, [entry for entry in record.files if is_table(entry)])
             try:
                 entries = committed_files(self._store, record)
             except CorruptError:
                 entries = record.files
-            self._restore(maker, record, self._lost(record, [one for one in entries if not _is_table(one)]))
-            if any(path.endswith("/timings.parquet") for path in self._lost_times):
-                self._lost_times.clear()
+            self._restore(maker, record, [one for one in entries if not is_table(one)])
+            if lost_times:
                 return self._drop(start, "its measured times are lost, and nothing else tells them")
-
-    def _lost(self, record: CommitRecord, entries: Sequence[FileEntry]) -> list[FileEntry]:
-        """Those that are missing or damaged."""
-        return [entry for entry in entries if not self._is_whole(record, entry)]
 
     def _is_whole(self, record: CommitRecord, entry: FileEntry) -> bool:
         try:
@@ -158,9 +147,11 @@ class _Repairing:
             return False
         return hashlib.sha256(data).hexdigest() == entry.sha256
 
-    def _restore(self, maker: Maker, record: CommitRecord, lost: Sequence[FileEntry]) -> None:
+    def _restore(self, maker: Maker, record: CommitRecord, entries: Sequence[FileEntry]) -> bool:
+        """Puts back those that are missing or damaged. Whether measured times are lost."""
+        lost = [entry for entry in entries if not self._is_whole(record, entry)]
         if not lost:
-            return
+            return False
         missing = {entry.path for entry in lost}
         try:
             for path, data in maker.make_files(record, lost):
@@ -169,8 +160,9 @@ class _Repairing:
             why = "does not come out as it was: another stack, other assets or another version made it"
         except VersoError as error:
             why = f"cannot be made again: {error}"
-        self._lost_times += [path for path in sorted(missing) if path.endswith("/timings.parquet")]
-        self._found.left += [f"{path}: {why}; {COPY}" for path in sorted(missing - set(self._lost_times))]
+        times = {path for path in missing if path.endswith("/timings.parquet")}
+        self._found.left += [f"{path}: {why}; {COPY}" for path in sorted(missing - times)]
+        return bool(times)
 
     def _put(self, path: str, data: bytes) -> None:
         """Writes a file whole and durably in place of what is there."""
@@ -202,7 +194,3 @@ class _Repairing:
             self._store.remove_tree(f"{RANGES}/{range_name(start, retry)}")
         self._store.sync([key])
         self._found.left.append(f"{key}: dropped, because {why}: run the job again to make its scenes")
-
-
-def _is_table(entry: FileEntry) -> bool:
-    return entry.path.startswith(f"{RANGES}/")

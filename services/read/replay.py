@@ -1,7 +1,4 @@
-"""`verso replay`: makes scenes again from their job, and compares or puts back what is stored.
-
-- Files of a committed range made again from the job, and kept only where their SHA-256 is what the commit says.
-"""
+"""`verso replay`: makes scenes again from their job, and compares or gives back what is stored."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence

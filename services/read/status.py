@@ -63,6 +63,11 @@ def read_status(store: Store, first_scene: int, stop_scene: int) -> Status:
     told = pc.binary_join_element_wise(failures.column("kind"), failures.column("reason"), ": ")
     failed = Counter(told.to_pylist())
     asked = stop_scene - first_scene
+    running = tuple(
+        Running(start, attempt, blamed_scene(store, start, attempt))
+        for start, attempt in staged_attempts(store)
+        if store.size(commit_path(start, retry_of_attempt(attempt) or 0)) is None
+    )
     return Status(
         asked=asked,
         made=ledger.committed - failed.total(),
@@ -70,7 +75,7 @@ def read_status(store: Store, first_scene: int, stop_scene: int) -> Status:
         missing=asked - ledger.committed,
         scenes_per_s=_rate(store, ledger),
         digest=(read_success(store) or {}).get("digest"),
-        running=tuple(_running(store)),
+        running=running,
         holder=read_holder(store),
         lost=tuple(find_lost(store, ledger)),
     )
@@ -93,11 +98,3 @@ def _rate(store: Store, ledger: Ledger) -> float | None:
     if len(latest) < 2 or latest[-1][0] <= latest[0][0]:
         return None
     return sum(scenes[one] for one in latest[1:]) / (latest[-1][0] - latest[0][0])
-
-
-def _running(store: Store) -> list[Running]:
-    return [
-        Running(start, attempt, blamed_scene(store, start, attempt))
-        for start, attempt in staged_attempts(store)
-        if store.size(commit_path(start, retry_of_attempt(attempt) or 0)) is None
-    ]

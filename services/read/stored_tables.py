@@ -1,11 +1,7 @@
-"""The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket.
-
-- The paths of a view's images that are stored, by its row of `views`. Pure.
-- The files of a dataset as a file system of pyarrow's, so that a bucket is scanned as a folder is, a file at a time.
-"""
+"""The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket."""
 
 import urllib.parse
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from itertools import groupby
 from types import MappingProxyType
@@ -40,20 +36,17 @@ from workers.store.store import Store
 
 def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:
     """The paths of a view's images that are stored, by kind."""
-    named = {i.pixels: image_path(row["category"], i.content, row["pose_id"]) for i in IMAGES if i.role == row["role"]}
-    return _stored(row, named)
+    return _stored(row, lambda content: image_path(row["category"], content, row["pose_id"]))
 
 
 def patch_paths(row: Mapping[str, Any], index: int | None) -> Mapping[PixelKind, str]:
     """The paths of the patches of a view's object that are stored, by kind."""
-    named = {
-        i.pixels: patch_path(row["category"], i.content, row["pose_id"], index) for i in IMAGES if i.role == row["role"]
-    }
-    return _stored(row, named)
+    return _stored(row, lambda content: patch_path(row["category"], content, row["pose_id"], index))
 
 
-def _stored(row: Mapping[str, Any], named: Mapping[PixelKind, str]) -> Mapping[PixelKind, str]:
+def _stored(row: Mapping[str, Any], path_of: Callable[[str], str]) -> Mapping[PixelKind, str]:
     listed = {file["path"] for file in row["files"]}
+    named = {image.pixels: path_of(image.content) for image in IMAGES if image.role == row["role"]}
     return MappingProxyType({kind: path for kind, path in named.items() if path in listed})
 
 
@@ -117,7 +110,30 @@ class StoredTables:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._done = read_success(store)
-        self._committed = _Committed(store) if self._done is None else None
+        self._plain: list[int] = []
+        """Of an unfinished dataset, the ranges whose tables are in place, as they were made first."""
+        self._other: list[list[CommitRecord]] = []
+        """The ranges that are not published or have retries: their rows go through memory."""
+        if self._done is None:
+            self._find_ranges()
+
+    def _find_ranges(self) -> None:
+        names = commit_names(self._store)
+        if not names:
+            raise OutputError(
+                f"{self._store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet"
+            )
+        # Listed after the commits: a committed range without staging is published.
+        staged = set(self._store.children(STAGING))
+        for start, group in groupby(names, key=lambda name: name[0]):
+            retries = [retry for _, retry, _ in group]
+            if retries == [0] and range_name(start) not in staged:
+                self._plain.append(start)
+            else:
+                records = [
+                    record for retry in retries if (record := read_record(self._store, start, retry)) is not None
+                ]
+                self._other.append(records)
 
     @cached_property
     def _merged_files(self) -> list[str]:
@@ -132,25 +148,25 @@ class StoredTables:
 
     def parts(self, table: str) -> list[Rows]:
         """The rows of one table in one or two pieces. In `assets` of an unfinished dataset an instance may be repeated."""
-        schema = SCHEMAS[table]
-        if self._committed is not None:
-            return self._committed.parts(table, schema)
-        return [_merged(self._store, self._merged_files, table, schema)]
+        schema, files = SCHEMAS[table], file_system_of(self._store)
+        if self._done is not None:
+            folder = f"{MANIFEST}/{table}"
+            keys = [key for key in self._merged_files if key.startswith(f"{folder}/")]
+            hive: Any = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
+            options = {"filesystem": files, "partition_base_dir": folder, "partitioning": hive}
+            return [ds.dataset(keys, schema, _FORMAT, **options)]
+        rows = [range_rows(self._store, records, table) for records in self._other]
+        parts: list[Rows] = [join_rows(table, [schema.empty_table(), *rows])]
+        if self._plain:
+            paths = [range_table_path(start, table) for start in self._plain]
+            parts.append(ds.dataset(paths, schema, _FORMAT, filesystem=files))
+        return parts
 
     def dataset(self, table: str) -> ds.Dataset:
         """The rows of one table as one pyarrow dataset, as `parts`."""
         parts = self.parts(table)
         found = [part if isinstance(part, ds.Dataset) else ds.dataset(part) for part in parts]
         return found[0] if len(found) == 1 else ds.dataset(found)
-
-
-def _merged(store: Store, keys: Iterable[str], table: str, schema: pa.Schema) -> ds.Dataset:
-    """The merged table."""
-    folder = f"{MANIFEST}/{table}"
-    keys = [key for key in keys if key.startswith(f"{folder}/")]
-    partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
-    files: dict[str, Any] = {"filesystem": file_system_of(store), "partition_base_dir": folder}
-    return ds.dataset(keys, schema, _FORMAT, partitioning=partitioning, **files)
 
 
 def category_of(key: str) -> str:
@@ -164,33 +180,3 @@ def read_merged(table: str, key: str, data: bytes) -> pa.Table:
     column = pa.repeat(pa.scalar(category_of(key)), rows.num_rows)
     schema = SCHEMAS[table]
     return rows.append_column("category", column).select(schema.names).cast(schema)
-
-
-class _Committed:
-    """Committed rows: files in place, and rows in memory for ranges that are not published or have retries."""
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        self._plain: list[int] = []
-        self._other: list[list[CommitRecord]] = []
-        names = commit_names(store)
-        if not names:
-            raise OutputError(f"{store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet")
-        # Listed after the commits: a committed range without staging is published.
-        staged = set(store.children(STAGING))
-        for start, group in groupby(names, key=lambda name: name[0]):
-            retries = [retry for _, retry, _ in group]
-            if retries == [0] and range_name(start) not in staged:
-                self._plain.append(start)
-            else:
-                records = [record for retry in retries if (record := read_record(store, start, retry)) is not None]
-                self._other.append(records)
-
-    def parts(self, table: str, schema: pa.Schema) -> list[Rows]:
-        """The rows of one table: those in memory, and those in files."""
-        rows = [range_rows(self._store, records, table) for records in self._other]
-        parts: list[Rows] = [join_rows(table, [schema.empty_table(), *rows])]
-        if self._plain:
-            paths = [range_table_path(start, table) for start in self._plain]
-            parts.append(ds.dataset(paths, schema, _FORMAT, filesystem=file_system_of(self._store)))
-        return parts

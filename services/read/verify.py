@@ -1,13 +1,12 @@
 """`verso verify`: proves that a folder is exactly its dataset: every scene asked, every file and label, no more.
 
-- The merge of ranges that `verify` has read, made again in a temporary folder: what `_SUCCESS` and its files must be.
-- What a dataset says of itself, against its commits: job.yaml and the fingerprint of its stack.
-
-Ranges are read one by one, and what they share is kept in a temporary folder: memory does not grow with the dataset.
+What ranges say is merged again in a temporary folder, and `_SUCCESS` and its files must be the result. Ranges are read one
+by one: memory does not grow with the dataset.
 """
 
 import contextlib
 import errno
+import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,7 +41,6 @@ from services.read.verify_files import (
     check_card,
     check_merged,
     check_success,
-    check_told,
     read_stored_success,
     tell_strays,
 )
@@ -101,9 +99,7 @@ class StoredJob:
     """A job.yaml as it was found: its record, None where it cannot be read, and whether its bytes are as they were written."""
 
     record: JobRecord | None = None
-    sealed: bool = False
     whole: bool = False
-    """As an earlier version wrote it, or sealed."""
 
     @property
     def digest(self) -> str | None:
@@ -123,7 +119,7 @@ def read_stored_job(store: Store, verdict: Verdict) -> StoredJob:
         told = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
         verdict.tell(f"{JOB_FILE}: {told}", COPY, "job")
         return StoredJob()
-    found = StoredJob(record, is_job_sealed(data), is_job_sealed(data))
+    found = StoredJob(record, is_job_sealed(data))
     if not found.whole:
         verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "job")
     elif record.digest != found.digest:
@@ -143,12 +139,13 @@ class Terms:
     def take(self, record: CommitRecord) -> None:
         """Remembers what a commit says."""
         key, terms = commit_path(record.span.start, record.span.retry), record.terms
-        if len(self.jobs) < MOST_TOLD:
-            self.jobs.setdefault(terms.job_digest, key)
-        if len(self.range_sizes) < MOST_TOLD:
-            self.range_sizes.setdefault(terms.range_size, key)
-        if len(self.stacks) < MOST_TOLD:
-            self.stacks.setdefault((terms.fingerprint, terms.fingerprint_mode), key)
+        stack = (terms.fingerprint, terms.fingerprint_mode)
+        known: tuple[tuple[dict[Any, str], object], ...] = (
+            *((self.jobs, terms.job_digest), (self.range_sizes, terms.range_size), (self.stacks, stack)),
+        )
+        for commits, term in known:
+            if len(commits) < MOST_TOLD:
+                commits.setdefault(term, key)
 
 
 def check_terms(job: StoredJob, terms: Terms, verdict: Verdict) -> None:
@@ -229,13 +226,14 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     verdict = Verdict(store.name)
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
-        with contextlib.closing(Remerge(_made(folder / "merged"))) as merging:
+        (folder / "merged").mkdir()
+        with contextlib.closing(Remerge(folder / "merged")) as merging:
             check = RangeCheck(store, job.record, job.digest, index, verdict)
             found = _read_ranges(store, _spans(job, success, verdict), check, merging, progress)
             check_terms(job, found.terms, verdict)
             check_fingerprint(store, found.terms, verdict)
             remade = _merge_again(merging, found, verdict)
-        _check_finished(store, job, success, found, remade, index, verdict)
+        _check_finished(store, success, found, remade, index, verdict)
         _check_ledger(store, verdict)
         index.add_all(TOP_FILES)
         lost = sorted([*found.spans.gaps, *found.spans.unreadable])
@@ -294,7 +292,6 @@ def _merge_again(merging: Remerge, found: Ranges, verdict: Verdict) -> tuple[dic
 
 def _check_finished(
     store: Store,
-    job: StoredJob,
     success: Success,
     found: Ranges,
     remade: tuple[dict[str, Any], dict[str, Path]] | None,
@@ -312,7 +309,7 @@ def _check_finished(
         verdict.tell(f"{found.staged} committed files are in _staging, and not in their places", verdict.run_again)
     digest = success.told.get("digest")
     if remade is None:
-        check_told(store, success, verdict)
+        check_merged(store, success, {}, verdict)
     else:
         expected, files = remade
         first, stop = found.spans.asked or (0, 0)
@@ -324,7 +321,7 @@ def _check_finished(
         check_success(success, {**expected, "files": entries, **asked}, verdict)
         digest = expected["digest"]
     if isinstance(digest, str):
-        check_card(store, digest, job.sealed, verdict)
+        check_card(store, digest, verdict)
 
 
 def _check_ledger(store: Store, verdict: Verdict) -> None:
@@ -360,11 +357,6 @@ def _tell_unfinished(found: Ranges, remade: dict[str, Any] | None, verdict: Verd
         verdict.tell(f"{missing} {told}", f"{verdict.run_again}, or {verdict.repair}", "merge")
 
 
-def _made(folder: Path) -> Path:
-    folder.mkdir()
-    return folder
-
-
 @contextlib.contextmanager
 def _temporary_folder() -> Iterator[Path]:
     """A folder for what the ranges share. Raises MachineError where it is full."""
@@ -376,4 +368,9 @@ def _temporary_folder() -> Iterator[Path]:
                 raise
             raise MachineError(
                 f"{folder} is full: verify keeps the merged tables there; set TMPDIR to a folder with more room"
+            ) from error
+        except sqlite3.Error as error:
+            raise MachineError(
+                f"the list of a dataset's files could not be kept in the temporary folder: {error}; free some space there, "
+                "or set TMPDIR to a folder with more"
             ) from error

@@ -31,7 +31,7 @@ from schemas.dataset.layout import (
     pose_of_image,
 )
 from services.merge.dataset_card import is_card_sealed
-from services.merge.merge import encode_success
+from services.merge.merge import encode_success, file_entry
 from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable
 from workers.store.store import Store
 
@@ -44,7 +44,7 @@ FRAME = frozenset({MANIFEST, COMMITS, RANGES})
 _RANGE = re.compile(rf"{RANGES}/(\d{{10,19}})(?:\.retry-(\d{{1,9}}))?/")
 _TAR = re.compile(r"[^/]+/(\d{10,19})(?:\.retry-\d{1,9})?\.tar")
 
-Kind = Literal["file", "folder", "link", "special", "unreadable"]
+Kind = Literal["file", "empty folder", "link", "special", "unreadable"]
 
 
 @dataclass(frozen=True)
@@ -72,31 +72,24 @@ class Known:
         return at >= 0 and scene < self.lost[at][1]
 
 
+ODD: dict[Kind, tuple[str, str]] = {
+    "link": ("is a symbolic link", "put a copy of what it leads to in its place, or move it away"),
+    "unreadable": ("cannot be listed", "check its permissions and the disk"),
+    "special": ("is neither a file nor a folder", MOVE),
+    "empty folder": ("is an empty folder", "remove it"),
+}
+"""What is never part of a dataset, and what to do about it."""
+
+
 def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
     """Tells of everything that no commit names."""
-    if store.root is None:
-        for entry in store.files(""):
-            key = entry.key
-            if not FREE & {key, key.partition("/")[0]} and not _belongs(key, known):
+    for kind, key in _walk(store):
+        if kind == "file":
+            if not _belongs(key, known):
                 _tell_file(store, key, verdict)
-        return
-    for kind, key in _walk(store.root, ""):
-        _tell_entry(store, store.root, kind, key, known, verdict)
-
-
-def _tell_entry(store: Store, root: Path, kind: Kind, key: str, known: Known, verdict: Verdict) -> None:
-    if kind == "link":
-        verdict.tell(
-            f"{key}: is a symbolic link", "put a copy of what it leads to in its place, or move it away", "stray"
-        )
-    elif kind == "unreadable":
-        verdict.tell(f"{key}: cannot be listed", "check its permissions and the disk", "stray")
-    elif kind == "special":
-        verdict.tell(f"{key}: is neither a file nor a folder", MOVE, "stray")
-    elif kind == "file" and not _belongs(key, known):
-        _tell_file(store, key, verdict)
-    elif kind == "folder" and not (known.merging or key in FRAME or key in known.index) and _is_empty(root / key):
-        verdict.tell(f"{key}: is an empty folder", "remove it", "stray")
+        elif kind != "empty folder" or not (known.merging or key in FRAME or key in known.index):
+            what, remedy = ODD[kind]
+            verdict.tell(f"{key}: {what}", remedy, "stray")
 
 
 def _tell_file(store: Store, key: str, verdict: Verdict) -> None:
@@ -109,14 +102,6 @@ def _tell_file(store: Store, key: str, verdict: Verdict) -> None:
         verdict.tell(f"{key}: is in no commit", MOVE, "stray")
 
 
-def _is_empty(folder: Path) -> bool:
-    try:
-        with os.scandir(folder) as entries:
-            return next(entries, None) is None
-    except OSError:
-        return False
-
-
 def _belongs(key: str, known: Known) -> bool:
     """Whether a file is the dataset's, or may be."""
     name = key.rpartition("/")[2]
@@ -127,18 +112,24 @@ def _belongs(key: str, known: Known) -> bool:
     return known.has_lost(key)
 
 
-def _walk(root: Path, folder: str) -> Iterator[tuple[Kind, str]]:
-    """(kind, key) of everything below the output folder, in no order, without a list of it."""
-    waiting = [folder]
+def _walk(store: Store) -> Iterator[tuple[Kind, str]]:
+    """(kind, key) of everything that writers do not keep for themselves, in no order, without a list of it."""
+    if store.root is None:
+        keys = (entry.key for entry in store.files(""))
+        yield from (("file", key) for key in keys if not FREE & {key, key.partition("/")[0]})
+        return
+    waiting = [""]
     while waiting:
         above = waiting.pop()
         try:
-            entries = os.scandir(root / above)
+            entries = os.scandir(store.root / above)
         except OSError:
             yield "unreadable", above
             continue
+        empty = True
         with entries:
             for entry in entries:
+                empty = False
                 key = f"{above}/{entry.name}" if above else entry.name
                 if key in FREE:
                     continue
@@ -146,9 +137,10 @@ def _walk(root: Path, folder: str) -> Iterator[tuple[Kind, str]]:
                     yield "link", key
                 elif entry.is_dir():
                     waiting.append(key)
-                    yield "folder", key
                 else:
                     yield "file" if entry.is_file() else "special", key
+        if empty:
+            yield "empty folder", above
 
 
 _ROWS = 4_096
@@ -213,43 +205,31 @@ def check_merged(
     """Compares every merged file with the one that the commits give; {bytes, sha256} that `_SUCCESS` must hold for each.
 
     Parquet bytes change with pyarrow's version: where `_SUCCESS` vouches for other bytes, their rows must be the same.
+    Where the commits cannot be merged again, nothing is `remade`, and files are compared with `_SUCCESS` alone.
     """
-    entries: dict[str, dict[str, object]] = {}
-    for path, local in sorted(remade.items()):
-        with open(local, "rb") as file:
-            entry = {"bytes": local.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
-        entries[path] = entry
+    entries = {path: file_entry(local) for path, local in sorted(remade.items())} or dict(success.files)
+    for path, entry in entries.items():
         found = _hash_file(store, path, verdict)
+        vouched = found == success.files.get(path)
         if isinstance(found, str):
             verdict.tell(f"{path}: {found}", verdict.repair, "merge")
+        elif found != entry and not vouched:
+            verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.repair, "merge")
+        elif found != entry and path.endswith(".parquet") and _same_rows(store, path, remade[path]):
+            entries[path] = found
         elif found != entry:
-            if found == success.files.get(path) and path.endswith(".parquet") and _same_rows(store, path, local):
-                entries[path] = found
-            elif found == success.files.get(path):
-                verdict.tell(f"{path}: does not hold the rows of the commits", verdict.repair, "merge")
-            else:
-                verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.repair, "merge")
+            verdict.tell(f"{path}: does not hold the rows of the commits", verdict.repair, "merge")
     return entries
 
 
-def check_told(store: Store, success: Success, verdict: Verdict) -> None:
-    """Compares merged files with `_SUCCESS` alone, where the commits cannot be merged again."""
-    for path, entry in success.files.items():
-        found = _hash_file(store, path, verdict)
-        if isinstance(found, str):
-            verdict.tell(f"{path}: {found}", verdict.repair, "merge")
-        elif found != entry:
-            verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.repair, "merge")
-
-
-def check_card(store: Store, digest: str, sealed: bool, verdict: Verdict) -> None:
-    """DATASET.md: as it was written, and of this dataset. `sealed` says that job.yaml has a seal, so this has one too."""
+def check_card(store: Store, digest: str, verdict: Verdict) -> None:
+    """DATASET.md: as it was written, and of this dataset."""
     try:
         data = store.read(README_FILE)
     except OSError as error:
         verdict.tell(f"{README_FILE}: {describe_os_error(error)}", verdict.repair, "card")
         return
-    if sealed and not is_card_sealed(data):
+    if not is_card_sealed(data):
         verdict.tell(
             f"{README_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "card"
         )

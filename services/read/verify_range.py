@@ -1,9 +1,4 @@
-"""Committed ranges read back: which there must be, and of each its record, tables, files and labels.
-
-- The scenes that a dataset must hold, against those that are committed: gaps, overlaps, and commits that cannot be
-  read.
-- One committed range read back: its records, its tables, every file against its SHA-256, and every label.
-"""
+"""Committed ranges read back: which there must be, and of each its record, tables, files and labels."""
 
 import contextlib
 import hashlib
@@ -176,7 +171,7 @@ class RangeCheck:
         entries = [self._entries(record, unknown) for record in records]
         found.files = tuple(chain.from_iterable(entries))
         for files in entries:
-            self._check_files([one for one in files if _is_table(one)], {}, damaged, found)
+            self._check_files([one for one in files if is_table(one)], {}, damaged, found)
         if unknown and not damaged:
             self.verdict.tell(unknown[0], COPY)
         damaged |= set(unknown)
@@ -185,7 +180,7 @@ class RangeCheck:
         digests: dict[str, str] = {}
         told = self._check_scenes(found, found.rows, digests) if found.rows is not None else []
         for files in entries:
-            self._check_files([one for one in files if not _is_table(one)], digests, damaged, found)
+            self._check_files([one for one in files if not is_table(one)], digests, damaged, found)
         self._tell_labels(found, told, damaged)
         return found
 
@@ -303,7 +298,8 @@ class RangeCheck:
                 self.verdict.tell(fault, remedy)
 
 
-def _is_table(entry: FileEntry) -> bool:
+def is_table(entry: FileEntry) -> bool:
+    """Whether a file of a commit is one of its tables."""
     return entry.path.startswith(f"{RANGES}/")
 
 

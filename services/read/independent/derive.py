@@ -1,7 +1,5 @@
 """Cameras, labels, projection and forces of stored scenes by the definitions of Staszak and Belter 2024.
 
-- Static equilibrium of a stored scene, from its contact forces alone: weights, levers, friction and reaction.
-
 Matrices are [4, 4] float64, `T_a_b` takes frame b to frame a, metres; camera frames are optical (x right, y down, z
 forward). A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
 """

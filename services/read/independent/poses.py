@@ -1,11 +1,7 @@
 """`verso verify --independent N`: labels derived a second time, from the definitions of Staszak and Belter 2024.
 
-- Where the cameras of one stored pair stand, by the definitions of Staszak and Belter 2024.
-
-Matrices and conventions are those of derive.py.
-
 `verso verify` derives them by the producer's own functions, which finds damage and never a wrong formula. This package
-imports nothing else of the project: rows come as dictionaries, files as bytes.
+imports nothing else of the project: rows come as dictionaries, files as bytes. Conventions are those of derive.py.
 """
 
 import math

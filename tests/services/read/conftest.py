@@ -1,12 +1,15 @@
-"""Datasets that every test of reading may share, because none changes them, and a copy for those that do."""
+"""Datasets that every test of reading may share, because none changes them, and what tests do to copies of them."""
 
 import shutil
 from pathlib import Path
 
+import obstore
 import pytest
+from obstore.store import MemoryStore
 
 from tests.datasets import make_dataset
 from workers.store.local import LocalStore
+from workers.store.objects import ObjectStore
 
 TINY = {
     "scenes": 3,
@@ -41,3 +44,18 @@ def copy(tiny, tmp_path) -> Path:
     """A copy of `tiny` that a test may damage."""
     shutil.copytree(tiny.root, tmp_path / "copy")
     return tmp_path / "copy"
+
+
+def spoil(path: Path) -> None:
+    """Turns a bit in the middle."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+def in_a_bucket(root: Path, kind: type[ObjectStore] = ObjectStore) -> ObjectStore:
+    """The same files in a bucket in memory."""
+    bucket = MemoryStore()
+    for path in (path for path in root.rglob("*") if path.is_file() and "_staging" not in path.parts):
+        obstore.put(bucket, path.relative_to(root).as_posix(), path)
+    return kind(bucket, "memory://bucket")

@@ -1,106 +1,93 @@
 """`verify --audit`: what was left out is put back, and a difference is found and named."""
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 
-import services.read.audit
 import workers.scene.effects
 import workers.scene.pairs
 from schemas.dataset.layout import FINGERPRINT_FILE
+from schemas.scene.scene import Placed, PosedScene, Settled
+from schemas.scene.view import Camera, Intrinsics, View
 from services.cli.main import main
 from services.job.job_file import validate_job
-from services.read import audit as audit_motion
-from services.read.audit import Audit, Motion, audit, describe_audit
-from services.read.referee import Held
+from services.read import audit as module
+from services.read.audit import Audit, Motion, audit, compare_masks, describe_audit, move_between, shift_px
+from services.read.referee import Held, describe_held, hold_scene
 from tests.datasets import run_here
 from tests.effects.scenes import SMALL, merged
-from workers.geometry.frames import translation
+from tests.hard_cases.bodies import built_in, cube
+from tests.hard_cases.drops import level
+from tests.hard_cases.groups import Group, put, stack, together, tray
+from tests.kit.shapes import box, shape_of
+from tests.physics.settling import PHYSICS, scene_of
+from tests.workers.render.random_scenes import APPEARANCE, floor
+from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.effects import EFFECTS, Effect
 from workers.shard.fingerprint import take_fingerprint
 from workers.store.local import LocalStore
 
 JOB = validate_job(merged(SMALL, {"scenes": 4, "categories": ["can", "box"]}), "a test")
-
-
-def dataset(out: Path) -> LocalStore:
-    """Four scenes, made in this process."""
-    return run_here(JOB, out)[0]
+TWO = JOB.model_copy(update={"scenes": 2})
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> LocalStore:
-    return dataset(tmp_path_factory.mktemp("audit") / "small")
+    """Four scenes, made in this process."""
+    return run_here(JOB, tmp_path_factory.mktemp("audit") / "small")[0]
 
 
 @pytest.fixture(autouse=True)
 def no_referee(monkeypatch) -> None:
     """Holding a scene in MuJoCo takes seconds."""
-    monkeypatch.setattr(services.read.audit, "is_installed", lambda: False)
+    monkeypatch.setattr(module, "is_installed", lambda: False)
 
 
-@pytest.fixture
-def calm() -> Iterator[None]:
-    """Objects that stay where they are when they are released."""
-    with released(0.0):
-        yield
-
-
-def released(by_m: float):
+@contextlib.contextmanager
+def released(by_m: float) -> Iterator[None]:
     """Every object moves along x by so much when it is released."""
 
     def release_again(plan, settled, physics, effects, seconds):
-        assert effects.runs("dynamics") and effects.runs("table_mesh")
-        assert seconds == 1.0
+        assert effects.runs("dynamics") and effects.runs("table_mesh") and seconds == 1.0
         return tuple(translation(by_m, 0.0, 0.0) @ rest.T_world_obj for rest in settled)
 
-    return mock.patch.object(audit_motion, "release_again", release_again)
+    with mock.patch.object(module, "release_again", release_again):
+        yield
 
 
-def run_audit(store: LocalStore, count: int = 4) -> Audit:
-    return audit(store, count, lambda _: None)
+def run_audit(store: LocalStore, count: int = 2, moved_m: float = 0.0) -> Audit:
+    with released(moved_m):
+        return audit(store, count, lambda _: None)
 
 
-@pytest.mark.usefixtures("calm")
 def test_a_healthy_dataset_passes_and_each_effect_that_was_left_out_is_proven(made):
-    found = run_audit(made)
-    assert found.faults == []
-    assert found.same_stack
-    assert found.scenes == found.released == 4
+    found = run_audit(made, 4)
+    assert found.faults == [] and found.same_stack and found.scenes == found.released == 4
     left_out = {name: tally.skipped for name, tally in found.effects.items() if tally.skipped}
     names = {"table_mesh", "object_contacts", "decomposition", "transparency", "exact_agreement"}
     assert left_out == dict.fromkeys(names, 4)
     assert all(tally.proven == tally.skipped for tally in found.effects.values())
-    assert found.forced == 8
-    assert found.bytes > 4 * 10_000 and found.files >= 4 * 20
+    assert found.forced == 8 and found.bytes > 4 * 10_000 and found.files >= 4 * 20
     assert found.motion == Motion(0.0, 0.0, 0, 0)
+    assert "MuJoCo is not installed" in "\n".join(describe_audit(found))
 
 
-def test_what_moves_within_the_bound_changes_masks_at_silhouettes_alone(made):
-    with released(4e-5):
-        found = run_audit(made)
-    assert found.faults == []
-    assert found.motion.moved_mm == pytest.approx(0.04, rel=1e-6)
-    assert found.motion.turned_deg == 0.0
-    assert found.motion.pixels_outside == 0
+def test_what_moves_too_far_is_named_and_within_the_bound_changes_masks_at_silhouettes_alone(made):
+    found = run_audit(made, 4, moved_m=4e-5)
+    assert found.faults == [] and found.motion.moved_mm == pytest.approx(0.04, rel=1e-6)
+    assert (found.motion.turned_deg, found.motion.pixels_outside) == (0.0, 0)
+    found = run_audit(made, 1, moved_m=6e-5)
+    (fault,) = found.faults
+    assert "table_mesh: released with every effect, it moved 0.0600 mm, the bound is 0.05 mm" in fault
+    assert (found.effects["table_mesh"].proven, found.effects["transparency"].proven) == (0, 1)
 
 
-def test_what_moves_too_far_is_named_with_its_scene_effect_and_figure(made):
-    with released(6e-5):
-        found = run_audit(made, 1)
-    assert len(found.faults) == 1
-    assert "table_mesh: released with every effect, it moved 0.0600 mm, the bound is 0.05 mm" in found.faults[0]
-    assert found.effects["table_mesh"].proven == 0
-    assert found.effects["transparency"].proven == 1
-
-
-@pytest.mark.usefixtures("calm")
 def test_an_effect_that_was_left_out_wrongly_is_found_and_named(tmp_path):
     """The floor is left out of scenes that see it: putting it back changes their images."""
 
@@ -109,24 +96,10 @@ def test_an_effect_that_was_left_out_wrongly_is_found_and_named(tmp_path):
         return blinded if effect.name == "floor" else effect
 
     with mock.patch.object(workers.scene.effects, "EFFECTS", tuple(map(blind, EFFECTS))):
-        store = dataset(tmp_path / "blind")
-        found = run_audit(store, 2)
-    assert len(found.faults) == 2
-    assert all(", floor: forced, it changes" in fault for fault in found.faults)
-    assert found.effects["floor"].skipped == 2 and found.effects["floor"].proven == 0
+        found = run_audit(run_here(TWO, tmp_path)[0])
+    assert len(found.faults) == 2 and all(", floor: forced, it changes" in fault for fault in found.faults)
+    assert (found.effects["floor"].skipped, found.effects["floor"].proven) == (2, 0)
     assert found.effects["transparency"].proven == 2
-
-
-@pytest.mark.usefixtures("calm")
-def test_a_scene_that_is_not_made_the_same_again_blames_no_effect(tmp_path):
-    store = dataset(tmp_path / "other")
-    with mock.patch.object(
-        workers.scene.pairs, "quantise_depth", lambda depth, images: (depth * 4999).astype(np.uint16)
-    ):
-        write_fingerprint(store, {})
-        found = run_audit(store, 1)
-    assert ["made again with nothing forced, it differs" in fault for fault in found.faults] == [True]
-    assert not any(tally.proven for name, tally in found.effects.items() if tally.kind == "no_op")
 
 
 def write_fingerprint(store: LocalStore, changes: dict[str, str]) -> None:
@@ -135,33 +108,19 @@ def write_fingerprint(store: LocalStore, changes: dict[str, str]) -> None:
     store.put(FINGERPRINT_FILE, fingerprint.model_copy(update=changes).model_dump_json().encode())
 
 
-@pytest.mark.usefixtures("calm")
-def test_on_another_stack_the_forced_scene_is_held_against_a_plain_one(tmp_path):
-    store = dataset(tmp_path / "foreign")
-    for path in (tmp_path / "foreign").glob("*/RGB*.png"):
+def test_on_another_stack_a_plain_scene_is_compared_and_a_scene_made_otherwise_blames_no_effect(tmp_path):
+    store, _ = run_here(TWO, tmp_path)
+    with mock.patch.object(workers.scene.pairs, "quantise_depth", lambda depth, _: (depth * 4999).astype(np.uint16)):
+        write_fingerprint(store, {})
+        found = run_audit(store, 1)
+    assert ["made again with nothing forced, it differs" in fault for fault in found.faults] == [True]
+    assert not any(tally.proven for tally in found.effects.values() if tally.kind == "no_op")
+    for path in tmp_path.glob("*/RGB*.png"):
         path.write_bytes(b"what another stack made")
     write_fingerprint(store, {"canary": "0" * 64})
-    found = run_audit(store, 2)
-    assert not found.same_stack
-    assert found.faults == []
+    found = run_audit(store)
+    assert not found.same_stack and found.faults == []
     assert "because another stack" in "\n".join(describe_audit(found))
-
-
-@pytest.mark.usefixtures("calm")
-def test_where_mujoco_is_installed_it_holds_every_scene_and_else_a_line_says_so(made, monkeypatch):
-    assert "MuJoCo is not installed" in "\n".join(describe_audit(run_audit(made, 1)))
-    given = []
-
-    def hold_scene(plan, settled, physics):
-        given.append((len(plan.objects), len(settled), physics))
-        return Held(0.125, 0.5, 1, {"as meshes, being convex": len(settled)})
-
-    monkeypatch.setattr(services.read.audit, "is_installed", lambda: True)
-    monkeypatch.setattr(services.read.audit, "hold_scene", hold_scene)
-    found = run_audit(made, 2)
-    assert given == [(1, 1, JOB.physics)] * 2 and found.faults == []
-    assert found.held == Held(0.125, 0.5, 2, {"as meshes, being convex": 2})
-    assert "MuJoCo held 2 scenes for 1 s: moved at most 0.1250 mm" in "\n".join(describe_audit(found))
 
 
 def test_the_command_exits_1_and_lists_what_is_off(made, capsys):
@@ -169,9 +128,87 @@ def test_the_command_exits_1_and_lists_what_is_off(made, capsys):
         assert main(["verify", made.name, "--audit", "2", "--json"]) == 1
     lines = capsys.readouterr().out.splitlines()
     answer = json.loads(lines[-1])
-    assert not answer["ok"] and answer["faults"] == []
-    assert len(answer["audit"]["faults"]) >= 2
+    assert not answer["ok"] and answer["faults"] == [] and len(answer["audit"]["faults"]) >= 2
     assert answer["audit"]["effects"]["transparency"] == {"kind": "no_op", "skipped": 2, "proven": 2}
     assert any(line.startswith("audit of 2 scenes: 4 no-ops forced") for line in lines)
     with released(0.0):
         assert main(["verify", made.name, "--audit", "1"]) == 0
+
+
+# ------------------------------------------------------------------------------- motions and changed mask pixels
+
+
+def test_a_turn_and_a_shift_are_measured_exactly_however_small():
+    shape = shape_of(box(0.2, 0.2, 0.2))
+    turn = pose(rotation_about(UP, np.radians(1e-5)), np.zeros(3))
+    motion = move_between(shape, np.eye(4), turn)
+    assert motion.turned_deg == pytest.approx(1e-5, rel=1e-6)
+    assert motion.moved_mm == pytest.approx(np.radians(1e-5) * 0.1 * np.sqrt(2) * 1e3, rel=1e-6)
+    assert move_between(shape, turn, translation(0.0, 3e-5, 4e-5) @ turn).moved_mm == pytest.approx(0.05, rel=1e-6)
+
+
+# A camera 1 m above a box of 20 cm; a pixel is 1 mm on its top, 0.9 m away.
+LOOKS_DOWN = Camera(
+    Intrinsics(width=320, height=240, fx=900.0, fy=900.0, cx=160.3, cy=120.2),
+    pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.0])),
+)
+
+
+def seen_box(x_m: float = 0.0) -> PosedScene:
+    return PosedScene((floor(), Placed(3, shape_of(box(0.2, 0.2, 0.2)), translation(x_m, 0.0, 0.0))), APPEARANCE)
+
+
+def test_pixels_that_a_moved_box_uncovers_lie_within_its_motion_and_others_are_counted():
+    before, after, renderer = seen_box(), seen_box(0.0013), shared_renderer()
+    assert shift_px(before.things[1], after.things[1], LOOKS_DOWN) == pytest.approx(1.3, rel=1e-6)
+    seen = renderer.draw(before.things, before.appearance, LOOKS_DOWN)
+    view = View("input", 0, 0, LOOKS_DOWN, seen.rgb, seen.depth_m.astype(np.uint16), seen.region, ())
+    changed, outside = compare_masks(renderer, before, after, view)
+    assert changed >= 2 * 200 and outside == 0
+    region = seen.region.copy()
+    region[120, 150:157] = 1
+    assert compare_masks(renderer, before, before, dataclasses.replace(view, region=region)) == (7, 7)
+
+
+# ------------------------------------------------------------------------------- MuJoCo as a referee
+
+
+def held(group: Group, *moved_m: tuple[float, float, float]) -> Held | None:
+    """The group held from where it starts, its objects moved first."""
+    settled = []
+    for start, by in zip(group.starts, moved_m, strict=True):
+        T = np.array(start.T_world_obj)
+        T[:3, 3] += by
+        settled.append(Settled(T, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "mesh"))
+    return hold_scene(scene_of(group.starts, group.table), settled, PHYSICS)
+
+
+def test_what_rests_stays_to_some_micrometres_and_what_does_not_falls():
+    pytest.importorskip("mujoco")
+    cubes = stack(cube(0.05), cube(0.05))
+    found = held(cubes, (0.0, 0.0, -0.0005), (0.0, 0.0, -0.001))
+    assert found.moved_mm < 0.02 and found.turned_deg < 0.01
+    assert found.scenes == 1 and found.shapes == {"as meshes, being convex": 2}
+    assert held(stack(cube(0.05)), (0.0, 0.0, 0.0995)).moved_mm == pytest.approx(100.0, abs=0.1)  # in the air
+    assert held(cubes, (0.0, 0.0, -0.0005), (0.03, 0.0, -0.001)).moved_mm > 10.0  # beyond the edge
+    found = held(together(level(), [put(built_in("mug"), level(), 0.0)]), (0.0, 0.0, 0.0))
+    assert found.moved_mm < 0.02 and found.shapes == {"as parts from their making, not being convex": 1}
+    table = tray()  # not convex
+    assert held(together(table, [put(cube(0.05), table, 0.0)]), (0.0, 0.0, 0.0)) is None
+
+
+def test_where_mujoco_is_installed_it_holds_every_scene_and_the_figures_are_told(made, monkeypatch):
+    given, convex = [], "as meshes, being convex"
+
+    def hold_one(plan, settled, physics):
+        given.append((len(plan.objects), len(settled), physics))
+        return Held(0.125 * len(given), 0.5, 1, {convex: len(settled)})
+
+    monkeypatch.setattr(module, "is_installed", lambda: True)
+    monkeypatch.setattr(module, "hold_scene", hold_one)
+    found = run_audit(made)
+    assert given == [(1, 1, JOB.physics)] * 2 and found.faults == []
+    assert found.held == Held(0.25, 0.5, 2, {convex: 2})
+    told = "\n".join(describe_audit(found))
+    assert "MuJoCo held 2 scenes for 1 s: moved at most 0.2500 mm, turned at most 0.50000 degrees" in told
+    assert f"(2 objects {convex})" in told and "not convex" in describe_held(Held())

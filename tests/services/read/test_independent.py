@@ -1,0 +1,309 @@
+"""The second derivation: healthy datasets pass; a wrong formula of the producer passes plain verify, and not this one."""
+
+import copy
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import services.merge.tables as tables
+import workers.geometry.camera as camera
+import workers.geometry.pixels as pixels
+import workers.geometry.projection as projection
+import workers.render.tiers as tiers
+import workers.scene.labels as labels
+import workers.scene.pairs as pairs
+from schemas.dataset.shard import Fingerprint
+from schemas.scene.view import Camera, Intrinsics
+from services.read.audit import describe_independent, verify_independently
+from services.read.independent.derive import check_forces
+from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
+from tests.datasets import faults_of, make_dataset, run_here
+from workers.capture import make_capture
+from workers.geometry.frames import pose, rotation_about, translation
+from workers.render.raster.gbuffer import shared_renderer
+from workers.shard.fingerprint import take_fingerprint
+
+HEALTHY = {
+    "defaults": {},
+    "several": {"objects_per_scene": 3, "pairs_per_scene": 2},
+    "median, tar": {"cameras": {"mirror": {"pivot_depth": "median"}}, "output": {"layout": "tar"}},
+    "no mirror": {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}},
+    "no colour": {"cameras": {"depth": {"enabled": False}}, "render": {"rgb": False}},
+    "noise": {"sensor": {"depth_noise": {}, "distortion": {"k1": -0.1}}},
+    "splat": {"images": {"projection": {"splat": 3}}},
+}
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_a_healthy_dataset_has_no_faults(tmp_path, name):
+    store, _ = make_dataset(tmp_path, **HEALTHY[name])
+    found = verify_independently(store, 9, lambda _: None)
+    assert found.faults == []
+    assert (found.scenes, found.pairs) == (2, 2 * HEALTHY[name].get("pairs_per_scene", 1))
+    assert "nothing off" in "\n".join(describe_independent(found))
+
+
+@pytest.fixture(scope="module")
+def fingerprint() -> Fingerprint:
+    """Taken before anything is planted: its canary scene has stricter checks."""
+    return take_fingerprint(shared_renderer(), "raster")
+
+
+@pytest.fixture
+def plant(monkeypatch, fingerprint) -> Callable[[Callable, Callable], None]:
+    """Puts a function in another's place in every module that has it by name."""
+    monkeypatch.setattr("tests.datasets.take_fingerprint", lambda *_: fingerprint)
+
+    def replace(original: Callable, planted: Callable) -> None:
+        for module in list(sys.modules.values()):
+            if getattr(module, original.__name__, None) is original:
+                monkeypatch.setattr(module, original.__name__, planted)
+
+    return replace
+
+
+def turned_mirror(sign: float) -> Callable:
+    """The article's product, Rot_x(phi) Rot_y(pi) Rot_x(-phi), which holds without roll alone, or with phi's other sign."""
+
+    def planted(T_world_cam, d_z_m, T_z_m=1.3, up=None):
+        tilt = rotation_about(np.array([1.0, 0.0, 0.0]), sign * camera.inclination(T_world_cam))
+        turn = pose(tilt @ np.diag([-1.0, 1.0, -1.0]) @ tilt.T, np.zeros(3))
+        return T_world_cam @ translation(0, 0, d_z_m) @ turn @ translation(0, 0, -T_z_m)
+
+    return planted
+
+
+def farther_mirror(original: Callable) -> Callable:
+    return lambda T, d_z_m, T_z_m=1.3, *up: original(T, d_z_m, T_z_m + 1e-3, *up)
+
+
+def shifted(seen: Camera, du: float, dv: float = 0.0) -> Camera:
+    k = seen.intrinsics
+    return Camera(k.model_copy(update={"cx": k.cx + du, "cy": k.cy + dv}), seen.T_world_cam)
+
+
+def other_offset(original: Callable) -> Callable:
+    def planted(seen, job):
+        turned = {"offset_m": tuple(-x for x in job.cameras.depth.offset_m)}
+        cameras = job.cameras.model_copy(update={"depth": job.cameras.depth.model_copy(update=turned)})
+        return original(seen, job.model_copy(update={"cameras": cameras}))
+
+    return planted
+
+
+def ties_to_the_highest_index(original: Callable) -> Callable:
+    """The input image and its camera turned by half a turn: the same cloud, its pixels in the opposite order."""
+
+    def planted(depth, source, target, *rest):
+        k = source.intrinsics
+        turned = k.model_copy(update={"cx": k.width - k.cx, "cy": k.height - k.cy})
+        opposite = Camera(turned, source.T_world_cam @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+        found = original(np.ascontiguousarray(depth[::-1, ::-1]), opposite, target, *rest)
+        index = np.where(found.source >= 0, depth.size - 1 - found.source, -1).astype(np.int32)
+        return projection.Projected(found.depth_m, index)
+
+    return planted
+
+
+def thinned_cloud(original: Callable) -> Callable:
+    """Every other source row is left out."""
+    return lambda depth, *rest: original(
+        np.where(np.arange(len(depth))[:, None] % 2, depth, depth.dtype.type(0)), *rest
+    )
+
+
+def box_without_its_last_column(original: Callable) -> Callable:
+    def narrow(extent):
+        x, y, width, height = extent.bbox_xywh
+        return extent._replace(bbox_xywh=(x, y, width - 1, height)) if extent.pixels else extent
+
+    return lambda region: [narrow(extent) for extent in original(region)]
+
+
+def rounded_image_coordinates(original: Callable) -> Callable:
+    def planted(T_cam_obj, k):
+        u, v = original(T_cam_obj, k)
+        return (u, v) if u < 0 else (round(k.fx * T_cam_obj[0, 3] / T_cam_obj[2, 3] + k.cx), v)
+
+    return planted
+
+
+def patch_too_far_left(original: Callable) -> Callable:
+    def planted(*arguments):
+        box = original(*arguments)
+        return box and (box[0], slice(box[1].start - 1, box[1].stop - 1))
+
+    return planted
+
+
+def words_changed(separator: str, change: Callable[[list[str]], list]) -> Callable:
+    """Changes the words of each line of a merged file."""
+
+    def wrong(original: Callable) -> Callable:
+        def planted(rows):
+            lines = [change(line.split(separator)) for line in original(rows).decode().splitlines()]
+            return "".join(separator.join(map(str, words)) + "\n" for words in lines).encode()
+
+        return planted
+
+    return wrong
+
+
+WRONG = {
+    "mirrored phi": (pairs.mirror_pose, lambda _: turned_mirror(-1.0), "T_world_cam of mirror is off"),
+    "T_z": (pairs.mirror_pose, farther_mirror, "T_world_cam of mirror is off by 0.0"),
+    "nearest for percentile": (
+        pairs.front_distance,
+        lambda f: lambda z, own, mirror: f(z, own, mirror.model_copy(update={"pivot_depth": "nearest"})),
+        "the object's input depth gives",
+    ),
+    "offset": (pairs.place_beside, other_offset, "T_world_cam of aligned is off by 0.1"),
+    "orbit": (
+        camera.orbit_pose,
+        lambda f: lambda centre, inclination, yaw, radius: f(centre, inclination, yaw, 0.99 * radius),
+        "does not look at the table's centre from cameras.orbit.radius_m",
+    ),
+    "yaw": (camera.yaw, lambda f: lambda T: -f(T), "is not the direction from the table to the camera"),
+    "half a pixel in rendering": (
+        tiers.draw_view,
+        lambda f: lambda renderer, things, look, seen, *rest: f(renderer, things, look, shifted(seen, 0, 0.5), *rest),
+        "mm off the floor's plane",
+    ),
+    "units": (
+        pixels.round_depth,
+        lambda f: lambda depth_m, low, high, units: f(depth_m, low, high, 1.001 * units),
+        "mm off the floor's plane",
+    ),
+    "half a pixel in projection": (
+        projection.forward_project,
+        lambda f: lambda depth, source, *rest: f(depth, shifted(source, 0.5), *rest),
+        "depth pixels are not those of the input cloud",
+    ),
+    "thinned": (projection.forward_project, thinned_cloud, "depth pixels are not those of the input cloud"),
+    "ties": (projection.forward_project, ties_to_the_highest_index, "ties do not go to the lowest source index"),
+    "box": (pixels.measure_regions, box_without_its_last_column, "bbox_xywh is"),
+    "coordinates": (camera.image_coordinates, rounded_image_coordinates, "is not the pixel of the object's origin"),
+    "patch": (labels.crop_box, patch_too_far_left, "is not the crop about"),
+    "transposed poses": (
+        tables.cam_pose_lines,
+        words_changed(",", lambda words: [*words[:2], *np.array(words[2:]).reshape(4, 4).T.ravel()]),
+        "camPoses.csv: T01, T02, T03, ",
+    ),
+    "cx and cy": (
+        tables.camera_lines,
+        words_changed(",", lambda words: [*words[:7], words[8], words[7], *words[9:]]),
+        "cameras.csv: cx, cy in the line of pose_id",
+    ),
+    "u and v": (
+        tables.object_lines,
+        words_changed(" ", lambda words: [*words[:4], words[5], words[4], *words[6:]]),
+        "objects.dat: u, v in the line of pose_id",
+    ),
+}
+"""(the right formula, the wrong one made of it, what is told)."""
+
+
+@pytest.mark.parametrize("name", [*WRONG, "cx_opencv"])
+def test_a_wrong_formula_passes_plain_verify_and_not_the_second_derivation(tmp_path, monkeypatch, plant, name):
+    if name == "cx_opencv":
+        monkeypatch.setattr(Intrinsics, name, property(lambda k: k.cx + 0.5))
+        told = "cx_opencv is 80.5, the job gives 79.5"
+    else:
+        original, wrong, told = WRONG[name]
+        plant(original, wrong(original))
+    store, _ = make_dataset(tmp_path, scenes=3)
+    assert faults_of(store) == []
+    faults = verify_independently(store, 3, lambda _: None).faults
+    assert any(told in fault for fault in faults), faults
+
+
+@pytest.mark.parametrize("wrong", [lambda _: turned_mirror(1.0), farther_mirror], ids=["without roll", "T_z"])
+def test_a_wrong_mirror_camera_of_a_rolled_photograph_is_found(plant, tmp_path, monkeypatch, wrong):
+    use_exact_captures(monkeypatch)
+    plant(pairs.mirror_pose, wrong(pairs.mirror_pose))
+    store, _ = run_here(captures_job(scenes=1), tmp_path)
+    assert faults_of(store) == []
+    faults = verify_independently(store, 1, lambda _: None).faults
+    assert faults and all("T_world_cam of" in fault for fault in faults)
+
+
+def test_depth_of_photographs_along_the_ray_instead_of_the_axis_is_found(tmp_path, monkeypatch):
+    """A pixel at the edge of this wide camera is 40 % farther along its ray than along the axis."""
+    use_exact_captures(monkeypatch)
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    length = np.sqrt(1 + ((columns - CAMERA.cx) / CAMERA.fx) ** 2 + ((rows - CAMERA.cy) / CAMERA.fy) ** 2)
+
+    def process(folder, captures, watch):
+        done = exact_capture()
+
+        def images(number):
+            seen = done.images(number)
+            return type(seen)(seen.number, seen.camera, seen.rgb, seen.depth_m * length**2, seen.mask)
+
+        return type(done)(**{**vars(done), "images": images})
+
+    monkeypatch.setattr(make_capture, "process_capture", process)
+    store, _ = run_here(captures_job(scenes=1), tmp_path)
+    assert any("off the board's plane" in fault for fault in verify_independently(store, 1, lambda _: None).faults)
+
+
+JOB = {"physics": {"friction": 0.7, "exact_rest": True}, "captures": None}
+LOW, HIGH = 2.0 * 9.81, 1.0 * 9.81
+UP, DOWN = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+
+
+def contact(region: int, point: list[float], force: list[float], normal: list[float] = UP) -> dict:
+    return {"with_region": region, "point": point, "normal": normal, "force": force}
+
+
+LOW_CONTACTS = [contact(2, [x, 0.0, 0.0], [0.0, 0.0, (LOW + HIGH) / 2]) for x in (-0.1, 0.1)]
+LOW_CONTACTS += [contact(4, [x, 0.0, 0.2], [0.0, 0.0, -HIGH / 2], DOWN) for x in (-0.05, 0.05)]
+HIGH_CONTACTS = [contact(3, [x, 0.0, 0.2], [0.0, 0.0, HIGH / 2]) for x in (-0.05, 0.05)]
+BODIES = [
+    {"region_id": 3, "mass_kg": 2.0, "com": [0.0, 0.0, 0.1], "contacts": LOW_CONTACTS},
+    {"region_id": 4, "mass_kg": 1.0, "com": [0.0, 0.0, 0.3], "contacts": HIGH_CONTACTS},
+]
+"""A body of 1 kg on one of 2 kg, each held at two points."""
+
+
+def nothing_below(low, high):
+    high["contacts"], low["contacts"] = [], [contact(2, [0.0, 0.0, 0.0], [0.0, 0.0, LOW])]
+
+
+def a_pull(low, high):
+    for body, sign in ((low, 1), (high, -1)):
+        for k, share in ((-2, 1.5), (-1, -0.5)):
+            body["contacts"][k]["force"] = [0.0, 0.0, -sign * share * HIGH]
+
+
+def sideways(low, high):
+    for k, sign in ((0, 1), (1, -1)):
+        low["contacts"][k]["force"][0] = sign * 0.6 * LOW
+
+
+def no_reaction(low, high):
+    for k in (-2, -1):
+        low["contacts"][k]["force"] = [0.0, 0.0, -1.0001 * HIGH / 2]
+
+
+def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told():
+    def faults(edit: Callable, job: dict = JOB) -> str:
+        bodies = copy.deepcopy(BODIES)
+        edit(*bodies)
+        return "; ".join(check_forces(job, {"scene_id": 7, "bodies": bodies}))
+
+    assert faults(lambda low, high: None) == ""
+    for edit, told in (
+        (nothing_below, "region 4: nothing holds it"),
+        (lambda low, high: high.update(mass_kg=1.02), "region 4: its contact forces leave 2.0% of its weight over"),
+        (lambda low, high: high.update(com=[0.002, 0.0, 0.3]), "region 4: its contact forces turn it, by"),
+        (a_pull, "a contact pulls"),
+        (sideways, "a contact needs more than its friction of 0.49"),
+        (no_reaction, "scene 7: region 3 presses region 4 with another force"),
+        (lambda low, high: low["contacts"][0].update(normal=[0.0, 0.0, 1.001]), "has not the length 1"),
+    ):
+        assert told in faults(edit)
+    without_rest = {"physics": {"friction": 0.7, "exact_rest": False}, "captures": None}
+    assert faults(nothing_below, without_rest) == faults(nothing_below, {**JOB, "captures": {}}) == ""

@@ -1,0 +1,229 @@
+"""Stored ranges, scenes, pairs and geometry, what `verso status` tells of them, and the page of columns."""
+
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.errors import CorruptError, InputError, OutputError
+from schemas.job.assets import ProceduralSource
+from schemas.job.job import Job
+from services.cli.main import main
+from services.job.record import encode_job, record_job
+from services.merge.merge import merge
+from services.read.columns_page import describe_columns, list_columns, write_page
+from services.read.dataset_reader import choose_evenly, choose_scenes, file_reader, find_scene, iter_stored, read_image
+from services.read.query import query
+from services.read.scene_geometry import scene_glb
+from services.read.status import read_status
+from services.read.stored_tables import patch_paths, view_paths
+from services.run.lock import hold_lock
+from tests.datasets import make_dataset
+from tests.made_up_scenes import attempt_at, failed_scene, scene
+from workers.assets.builtin.make import make_asset
+from workers.assets.glb import mesh_of_part
+from workers.store.ledger import list_commits, save_rows
+from workers.store.local import LocalStore
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def test_scenes_are_chosen_evenly_and_by_seed():
+    chosen = choose_evenly(200, 8, 5)
+    assert len(set(chosen)) == 8 and set(np.diff(chosen)) == {25} and 0 <= chosen[0] < 25
+    assert list(chosen) != list(choose_evenly(200, 8, 6))
+    assert list(choose_evenly(200, 500, 5)) == list(range(200)) and not len(choose_evenly(0, 3, 5))
+
+
+def test_failed_scenes_are_never_chosen(tmp_path, unflushed):
+    store = LocalStore(tmp_path)
+    store.prepare()
+    for start in range(4, 20, 4):  # scenes 5 and 16 fail
+        attempt_at(store, start, start + 4).commit()
+    assert choose_scenes(store, 99, 0) == [scene for scene in range(4, 20) if scene not in (5, 16)]
+    assert len(set(choose_scenes(store, 4, 1)) - {5, 16}) == 4
+
+
+@pytest.mark.parametrize("layout", ["files", "tar"])
+def test_a_scene_is_found_with_its_pairs_and_every_image_is_read_from_either_layout(layout, tmp_path):
+    store, _ = make_dataset(tmp_path, output={"layout": layout}, pairs_per_scene=2)
+    assert choose_scenes(store, 9, 0) == [0, 1]
+    stored = find_scene(store, 1)
+    assert stored.scene(1)["scene_id"] == 1 and stored.scene(7) is None
+    pairs = list(stored.pairs(1))
+    assert [views["input"]["pose_id"] for views, _ in pairs] == [4, 6]
+    for views, objects in pairs:
+        assert set(views) == {"input", "aligned", "mirror", "projected"}
+        assert {row["pose_id"] for row in objects} == {views["input"]["pose_id"], views["mirror"]["pose_id"]}
+        assert {row["region_id"] for row in objects} == {2, 3}
+    with pytest.raises(InputError, match="scene 2 is not in"):
+        find_scene(store, 2)
+    for stored in iter_stored(store):
+        read = file_reader(store.read, stored)
+        paths = [file["path"] for row in stored.rows["views"] for file in row["files"]]
+        assert len(paths) >= 4 * 11 and all(read_image(read, path).size for path in paths)
+        with pytest.raises(CorruptError, match="mug/RGB99999"):
+            read("mug/RGB99999.png")
+    with pytest.raises(CorruptError, match=r"a\.png"):
+        read_image(lambda _: b"no png", "a.png")
+
+
+def test_only_images_that_are_stored_have_a_path():
+    def named(*paths: str) -> dict:
+        files = [{"path": f"mug/{path}.png"} for path in paths]
+        return {"category": "mug", "role": "aligned", "pose_id": 12, "files": files}
+
+    both = named("depthAligned00012", "patches/depthAligned00012", "RGB00012")
+    assert view_paths(both) == {"depth": "mug/depthAligned00012.png"}
+    assert patch_paths(both, None) == {"depth": "mug/patches/depthAligned00012.png"}
+    assert patch_paths(both, 1) == {}
+    of_second = "patches/depthAligned00012obj1"
+    assert patch_paths(named(of_second), 1) == {"depth": f"mug/{of_second}.png"}
+
+
+def materials(data: bytes) -> list[list[float]]:
+    """The base colours, which glTF has linear."""
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    return [one["pbrMetallicRoughness"].get("baseColorFactor", [1.0] * 4) for one in tree["materials"]]
+
+
+def test_a_scene_as_glb_has_every_object_where_its_row_puts_it_in_the_colours_of_its_stored_shape(three_objects):
+    data = scene_glb(three_objects, 0)
+    found = trimesh.load_scene(io.BytesIO(data), file_type="glb")
+    (row,) = query(three_objects, "select bodies from scenes").to_pylist()
+    shown, compared = np.array(materials(data)), 0
+    for body in row["bodies"]:
+        name = f"{body['category']} {body['instance_id']} {body['region_id']}"
+        nodes = [node for node in found.graph.nodes_geometry if node.startswith(name + "/")]
+        assert nodes
+        for node in nodes:
+            np.testing.assert_allclose(found.graph[node][0], np.reshape(body["T_world_obj"], (4, 4)), atol=1e-6)
+        shape = three_objects.root / "assets" / body["category"] / f"{body['instance_id']}.glb"
+        for factor in materials(shape.read_bytes()):
+            assert np.abs(shown - factor).max(axis=1).min() <= 0.5 / 255 + 1e-6
+            compared += 0.05 < factor[0] < 0.95
+    assert compared
+    assert {"floor", "table"} <= {node.split("/")[0].split(" ")[0] for node in found.graph.nodes_geometry}
+    with pytest.raises(InputError, match="scene 7 is not in"):
+        scene_glb(three_objects, 7)
+
+
+def test_a_part_keeps_its_corners_faces_and_colour_as_a_mesh():
+    for category in ("mug", "laptop", "table"):
+        for part in make_asset(category, ProceduralSource(source="procedural"), 3, 500.0).shape.parts:
+            mesh = mesh_of_part(part)
+            assert np.array_equal(mesh.vertices, part.vertices) and np.array_equal(mesh.faces, part.faces)
+            if part.material.texture is not None:
+                assert np.array_equal(np.asarray(mesh.visual.material.baseColorTexture), part.material.texture)
+            elif part.colors is None:
+                srgb = np.array(part.material.base_color[:3])
+                linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+                found = np.asarray(mesh.visual.material.baseColorFactor) / 255
+                assert found[:3] == pytest.approx(linear, abs=0.5 / 255 + 1e-9)
+
+
+# ---------------------------------------------------------------------------------------------- status
+
+
+@pytest.fixture
+def store(tmp_path, unflushed):
+    store = LocalStore(tmp_path)
+    store.prepare()
+    return store
+
+
+def test_scenes_are_counted_with_what_retries_changed(store, tmp_path):
+    with pytest.raises(OutputError, match="holds no dataset"):
+        read_status(LocalStore(tmp_path / "none"), 0, 4)
+    killed = {1, 2, 3}
+    attempt_at(store, 0, 4, make=lambda i: failed_scene(i, "environmental") if i in killed else scene(i)).commit()
+    assert read_status(store, 0, 8).scenes_per_s is None  # of one commit
+    attempt_at(store, 4, 8).commit()  # scene 5 fails
+    attempt_at(store, 0, 4, retry=1, scenes=(1, 2, 3), make=lambda i: failed_scene(i) if i == 2 else scene(i)).commit()
+    status = read_status(store, 0, 20)
+    assert (status.asked, status.made, status.missing) == (20, 6, 12)
+    assert status.failed == {"intrinsic: left_table": 2}
+    assert (status.digest, status.holder) == (None, None)
+
+
+def test_what_runs_is_told_with_the_scene_it_is_at(store):
+    attempt_at(store, 0, 4).commit()
+    busy = attempt_at(store, 4, 8)
+    busy.begin_scene(6)
+    lost = attempt_at(store, 0, 4)
+    with hold_lock(store):
+        status = read_status(store, 0, 8)
+    assert [(one.start, one.attempt, one.scene_id) for one in status.running] == [(4, busy.name, 6)]
+    assert status.holder.pid == os.getpid() and lost.name not in str(status)
+
+
+def test_the_rate_is_that_of_the_latest_commits(store, monkeypatch):
+    for number, start in enumerate(range(0, 24, 4)):
+        attempt_at(store, start, start + 4).commit()
+        written = 2e9 + number * 2 - (1e6 if number < 3 else 0)  # the first three were long ago
+        os.utime(store.path(f"manifest/_commits/{start:010d}.json"), (written, written))
+    monkeypatch.setattr("services.read.status.RATE_COMMITS", 3)
+    assert read_status(store, 0, 24).scenes_per_s == 8 / 4
+
+
+def test_the_rate_asks_few_records_for_their_time(store, monkeypatch):
+    for start in range(0, 80, 4):
+        attempt_at(store, start, start + 4, make=lambda i: failed_scene(i)).commit()
+    save_rows(store, list_commits(store).rows)
+    attempt_at(store, 84, 88).commit()
+    attempt_at(store, 80, 84).commit()
+    asked, stat = [], store.stat
+    monkeypatch.setattr(store, "stat", lambda key: asked.extend([key] * ("_commits/" in key)) or stat(key))
+    monkeypatch.setattr("services.read.status.RATE_LOOKS", 4)
+    assert read_status(store, 0, 100).scenes_per_s > 0
+    assert sorted(asked) == [f"manifest/_commits/{start:010d}.json" for start in (72, 76, 80, 84)]
+
+
+def test_what_is_lost_is_told_and_a_finished_dataset_is_not_whole_then(store, capsys):
+    for start in (0, 4):
+        attempt_at(store, start, start + 4).commit()
+    digest = merge(store, 0, 8).digest
+    status = read_status(store, 0, 8)
+    assert (status.digest, status.missing, status.running) == (digest, 0, ())
+    store.put("job.yaml", encode_job(record_job(Job.model_validate({"name": "a", "scenes": 8}), "c", Path("/"))))
+    assert main(["status", str(store.root)]) == 0
+    (store.root / "manifest/_commits/0000000004.json").unlink()
+    capsys.readouterr()
+    assert main(["status", str(store.root), "--json"]) == 1
+    out = capsys.readouterr().out
+    told = "the commits of scenes 4 to 7 of the finished dataset are lost; restore it from a copy, or run the job"
+    assert told in out
+    answer = json.loads(out.splitlines()[-1])
+    assert (answer["ok"], answer["missing"], len(answer["lost"])) == (False, 4, 1)
+
+
+# ---------------------------------------------------------------------------------------------- columns
+
+
+def test_every_column_stands_on_the_page_and_in_the_terminal(capsys):
+    told = "run `python -m services.read.columns_page > docs/columns.md`"
+    assert (ROOT / "docs/columns.md").read_text() == write_page(), told
+    for table in TABLES:
+        section = write_page().partition(f"\n## {table}\n")[2].partition("\n## ")[0]
+        for name in SCHEMAS[table].names:
+            assert f"- `{name}` (" in section or f"`{name}`" in section.partition("- as in ")[2]
+            assert any(line.startswith(f"  {name}  (") for line in describe_columns(table))
+            assert any(one["path"] == name for one in list_columns(table))
+        assert max(map(len, describe_columns(table))) <= 110
+    assert main(["columns", "failures"]) == 0
+    lines = ["failures: One row for each scene that could not be made, and why.", "  key: scene_id"]
+    assert capsys.readouterr().out.splitlines()[:2] == lines
+    assert main(["columns"]) == 0
+    out = "\n" + capsys.readouterr().out
+    assert all(f"\n{table}: " in out for table in TABLES)
+    assert main(["columns", "view"]) == 2
+    assert "there is no table 'view'; did you mean 'views'? Tables are scenes, views" in capsys.readouterr().err
+    assert main(["columns", "failures", "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)["columns"][0]
+    named = {"table": "failures", "path": "scene_id", "type": "int64", "nullable": False, "unit": "id"}
+    assert named.items() <= first.items() and not first["captures_only"]
