@@ -5,8 +5,8 @@ is the door to this file.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import InputError, did_you_mean
 from schemas.job.job import Job
 from schemas.scene.view import ROLES
-from services.dataset.pair import Pair, read_pair
+from services.dataset.pair import Files, Pair, read_pair
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
 from services.merge.merge import read_success
@@ -41,13 +41,12 @@ def pair_table(rows: Mapping[str, pa.Table]) -> pa.Table:
     such view), and the struct `asset` with the columns of `assets` of the scene's (first) object.
     """
     views = rows["views"]
-    by_role = {role: views.filter(pc.field("role") == role) for role in ROLES}
-    parents = np.unique(views.column("parent_id").to_numpy())
-    scene_of = _take(views, "parent_id", parents).column("scene_id")
-    scenes = _take(rows["scenes"], "scene_id", scene_of)
-    table = scenes.append_column("parent_id", pa.array(parents, pa.int64()))
-    for role, own in by_role.items():
-        table = table.append_column(role, _structs(own, "parent_id", parents))
+    parents = pa.chunked_array([pa.array(np.unique(views.column("parent_id").to_numpy()), pa.int64())])
+    scene_of = views.column("scene_id").take(pc.index_in(parents, views["parent_id"]))
+    scenes = rows["scenes"].take(pc.index_in(scene_of, rows["scenes"]["scene_id"]))
+    table = scenes.append_column("parent_id", parents)
+    for role in ROLES:
+        table = table.append_column(role, _structs(views.filter(pc.field("role") == role), "parent_id", parents))
     return table.append_column("asset", _structs(rows["assets"], "instance_id", table.column("instance_id")))
 
 
@@ -65,15 +64,9 @@ def choose_pairs(table: pa.Table, where: pc.Expression | None) -> pa.Table:
         ) from error
 
 
-def _take(table: pa.Table, key: str, values: pa.ChunkedArray | np.ndarray) -> pa.Table:
-    """The first row with each of the values, which is there."""
-    return table.take(pc.index_in(pa.chunked_array([values]) if isinstance(values, np.ndarray) else values, table[key]))
-
-
-def _structs(table: pa.Table, key: str, values: pa.ChunkedArray | np.ndarray) -> pa.ChunkedArray:
+def _structs(table: pa.Table, key: str, values: pa.ChunkedArray) -> pa.ChunkedArray:
     """A struct of the first row with each of the values, null where there is none."""
-    wanted = pa.chunked_array([pa.array(values)]) if isinstance(values, np.ndarray) else values
-    return table.to_struct_array().take(pc.index_in(wanted, table[key]))
+    return table.to_struct_array().take(pc.index_in(values, table[key]))
 
 
 KEPT_RANGES = 8
@@ -100,7 +93,8 @@ class Dataset:
         self.place = store.name
         self.job: Job = record.job
         """The job that made it, every default filled in."""
-        self._range_of = lru_cache(KEPT_RANGES)(self._read_range)
+        self._range_of: Callable[[int], Records] = lru_cache(KEPT_RANGES)(partial(find_records, store))
+        """The records of the range that holds a scene."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return open_dataset, (self.place,)
@@ -140,7 +134,8 @@ class Dataset:
 
     def pair(self, pose_id: int) -> Pair:
         """The pair with this id of its input view or of its mirror view. Raises InputError where it is not stored."""
-        found = [pair for pair in self.scene(self._scene_of(pose_id)) if pair.pose_id == pose_id - pose_id % 2]
+        scene_id = pose_id // (2 * self.job.pairs_per_scene)
+        found = [pair for pair in self.scene(scene_id) if pair.pose_id == pose_id - pose_id % 2]
         if not found:
             raise InputError(
                 f"{self.place} has no pair {pose_id}: `verso status {self.place}` tells which scenes are there"
@@ -151,25 +146,20 @@ class Dataset:
         """The pairs of one scene; none of a scene that failed. Raises InputError where it is not stored."""
         return tuple(self._read_pairs(self._range_of(scene_id), pc.field("scene_id") == scene_id))
 
-    def _scene_of(self, pose_id: int) -> int:
-        return pose_id // (2 * self.job.pairs_per_scene)
-
-    def _read_range(self, scene_id: int) -> Records:
-        return find_records(self._store, scene_id)
-
     def _read_pairs(self, records: Records, where: pc.Expression | None) -> Iterator[Pair]:
-        table = choose_pairs(pair_table({name: range_rows(self._store, records, name) for name in PAIR_TABLES}), where)
-        if not table.num_rows:
-            return
-        labels = _labels(range_rows(self._store, records, "objects"), table.column("scene_id"))
-        files = RangeFiles(self._files, records)
-        for number in np.argsort(table.column("parent_id").to_numpy()):
-            yield read_pair(table.slice(number, 1).to_pylist()[0], labels, files)
+        return iter_pairs(
+            lambda table: range_rows(self._store, records, table), RangeFiles(self._files, records), where
+        )
 
 
-def _labels(objects: pa.Table, scenes: pa.ChunkedArray) -> dict[tuple[int, str], list[Row]]:
-    """Rows of `objects` of some scenes by (pose id, role)."""
-    found: dict[tuple[int, str], list[Row]] = defaultdict(list)
-    for row in objects.filter(pc.is_in(objects.column("scene_id"), scenes.combine_chunks())).to_pylist():
-        found[row["pose_id"], row["role"]].append(row)
-    return found
+def iter_pairs(rows: Callable[[str], pa.Table], files: Files, where: pc.Expression | None = None) -> Iterator[Pair]:
+    """The pairs of some scenes for which `where` is true, by pose id; `rows` returns the scenes' rows of a table."""
+    table = choose_pairs(pair_table({name: rows(name) for name in PAIR_TABLES}), where)
+    if not table.num_rows:
+        return
+    objects, labels = rows("objects"), defaultdict[tuple[int, str], list[Row]](list)
+    chosen = pc.is_in(objects.column("scene_id"), table.column("scene_id").combine_chunks())
+    for row in objects.filter(chosen).to_pylist():
+        labels[row["pose_id"], row["role"]].append(row)
+    for number in np.argsort(table.column("parent_id").to_numpy()):
+        yield read_pair(table.slice(number, 1).to_pylist()[0], labels, files)

@@ -1,19 +1,15 @@
 """One scene of a job, made in this process and kept in memory: no Ray, no folder."""
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import trimesh
-
-from schemas.dataset.codec import Row
 from schemas.errors import CorruptError, SceneError
 from schemas.job.job import Job
 from schemas.job.views import Patch
 from schemas.scene.scene import SceneOutput
-from services.dataset.dataset import PAIR_TABLES, pair_table
-from services.dataset.pair import Pair, read_pair
+from services.dataset.dataset import iter_pairs
+from services.dataset.pair import Pair
 from services.dataset.shapes import Shapes
 from services.job.job_file import load_job, validate_job
 from services.job.record import JobRecord, record_job
@@ -37,7 +33,8 @@ def make_scene(
     output = run_scene(open_worker(parsed, catalogue), scene_id, Stopwatch())
     for row in output.rows.get("failures", ()):
         raise SceneError(str(row["reason"]), f"scene {scene_id} cannot be made ({row['stage']}): {row['detail']}")
-    return _pairs_of(output, record_job(parsed, catalogue.digest, folder))
+    files = _MadeFiles(output, record_job(parsed, catalogue.digest, folder))
+    return tuple(iter_pairs(lambda table: table_of_rows(table, output.rows[table]), files))
 
 
 def _parse(job: str | Path | Mapping[str, Any] | Job, changes: Sequence[str]) -> tuple[Job, Path]:
@@ -47,21 +44,12 @@ def _parse(job: str | Path | Mapping[str, Any] | Job, changes: Sequence[str]) ->
     return (job if isinstance(job, Job) else validate_job(dict(job), "the job")), Path()
 
 
-def _pairs_of(output: SceneOutput, record: JobRecord) -> tuple[Pair, ...]:
-    files = _MadeFiles(output, record)
-    table = pair_table({name: table_of_rows(name, output.rows[name]) for name in PAIR_TABLES})
-    labels: dict[tuple[int, str], list[Row]] = defaultdict(list)
-    for row in table_of_rows("objects", output.rows["objects"]).to_pylist():
-        labels[row["pose_id"], row["role"]].append(row)
-    return tuple(read_pair(row, labels, files) for row in table.to_pylist())
-
-
 class _MadeFiles:
     """The encoded files of one scene."""
 
     def __init__(self, output: SceneOutput, record: JobRecord) -> None:
         self._data = {file.path: file.data for file in output.files}
-        self._shapes = Shapes(self._shape, record)
+        self.mesh = Shapes(self._shape, record).mesh
         self.patch: Patch = record.job.images.patch
 
     def _shape(self, path: str) -> bytes:
@@ -74,7 +62,3 @@ class _MadeFiles:
         if path not in self._data:
             raise CorruptError(f"{path} was not made")
         return self._data[path]
-
-    def mesh(self, scene: Row, region_id: int) -> trimesh.Trimesh:
-        """The shape of a region in its own frame."""
-        return self._shapes.mesh(scene, region_id)

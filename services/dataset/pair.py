@@ -70,16 +70,22 @@ class Pixels:
         return self._paths
 
     def image(self, kind: PixelKind) -> NDArray:
-        """The pixels of an image of any kind in `images`, as they are stored."""
-        return self._decode(kind)
+        """The pixels of an image of any kind in `images`, as they are stored.
+
+        Raises InputError where the dataset has no such image, CorruptError where it is damaged.
+        """
+        if kind not in self._paths:
+            raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}")
+        path = self._paths[kind]
+        return decode_png(self._files.image(self._scene_id, path), path)
 
     def rgb(self) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB."""
-        return self._decode("rgb")
+        return self.image("rgb")
 
     def depth(self) -> NDArray[np.uint16]:
         """[H, W] uint16: z along the optical axis as it is stored, in units of 1 / `depth_units_per_m`; 0 where unknown."""
-        return self._decode("depth")
+        return self.image("depth")
 
     def depth_m(self) -> NDArray[np.float32]:
         """[H, W] float32: z along the optical axis, metres; 0 where unknown."""
@@ -87,14 +93,7 @@ class Pixels:
 
     def segment(self) -> NDArray[np.uint8]:
         """[H, W] uint8 region ids: 0 nothing, 1 floor, 2 table, 3 and up the objects."""
-        return self._decode("region")
-
-    def _decode(self, kind: PixelKind) -> NDArray:
-        """The pixels. Raises InputError where the dataset has no such image, CorruptError where it is damaged."""
-        if kind not in self._paths:
-            raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}")
-        path = self._paths[kind]
-        return decode_png(self._files.image(self._scene_id, path), path)
+        return self.image("region")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +187,7 @@ class Pair:
 
 def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> Pair:
     """The pair of a row of `pair_table`; `labels`: rows of `objects` by (pose id, role)."""
-    scene = {name: value for name, value in row.items() if name not in (*_NESTED, "parent_id")}
+    scene = {name: value for name, value in row.items() if name not in (*ROLES, "asset", "parent_id")}
     return Pair(
         pose_id=row["parent_id"],
         scene_id=row["scene_id"],
@@ -199,9 +198,6 @@ def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: File
         views=MappingProxyType({role: _read_view(row[role], labels, files) for role in ROLES if row[role] is not None}),
         _files=files,
     )
-
-
-_NESTED = (*ROLES, "asset")
 
 
 def _read_view(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> View:

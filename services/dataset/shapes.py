@@ -1,8 +1,4 @@
-"""Shapes and files of a dataset's pairs.
-
-- Shapes of a dataset's objects as meshes in the object frame: from the stored GLB, or from the job's sources.
-- Files of a dataset's pairs, from single files or from tars; the tars that are read are kept, bounded by their bytes.
-"""
+"""Shapes of a dataset's objects as meshes in the object frame, and the files of its pairs, from single files or from tars."""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +9,6 @@ from typing import Any
 import trimesh
 from cachetools import LRUCache
 
-from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import asset_path, tar_path
 from schemas.errors import CorruptError, InputError, MachineError
@@ -131,9 +126,8 @@ class RangeFiles:
     """The files of one committed range."""
 
     def __init__(self, files: StoredFiles, records: Sequence[CommitRecord]) -> None:
-        self._files = files
-        self._records = records
-        self.patch = files.patch
+        self._files, self._records = files, records
+        self.patch, self.mesh = files.patch, files.shapes.mesh
 
     def image(self, scene_id: int, path: str) -> bytes:
         """The bytes of an image, published or not yet. Raises CorruptError where it is missing."""
@@ -144,7 +138,3 @@ class RangeFiles:
         if path not in members:
             raise CorruptError(f"{path} is committed and in no tar: `verso verify {self._files.store.name}` tells more")
         return members[path]
-
-    def mesh(self, scene: Row, region_id: int) -> trimesh.Trimesh:
-        """The shape of a region in its own frame, as `Shapes.mesh`."""
-        return self._files.shapes.mesh(scene, region_id)

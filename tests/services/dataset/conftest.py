@@ -3,19 +3,15 @@
 import shutil
 from pathlib import Path
 
-import obstore
 import pytest
-from obstore.store import MemoryStore
 
+from schemas.dataset.tables import TABLES
 from services.dataset.dataset import Dataset, open_dataset
 from tests.datasets import make_dataset
+from tests.services.read.conftest import in_a_bucket
 from workers.store.local import LocalStore
-from workers.store.objects import ObjectStore
 
 CHANGES = {"scenes": 4, "categories": ["mug", "laptop"], "pairs_per_scene": 2, "run": {"range_size": 2}}
-SLOWER = ("tar", "running files", "running bucket")
-"""Forms whose parts the other three have too."""
-
 FORMS = ("files", "tar", "bucket", "running files", "running tar", "running bucket")
 
 
@@ -42,22 +38,24 @@ def forms(files, tars, tmp_path_factory) -> dict[str, Dataset]:
             if word:
                 unmerge(root)
             opened[word + name] = open_dataset(root)
-        bucket = MemoryStore()
-        for path in (path for path in root.rglob("*") if path.is_file()):
-            obstore.put(bucket, path.relative_to(root).as_posix(), path)
-        opened[word + "bucket"] = Dataset(ObjectStore(bucket, "memory://bucket"))
+        opened[word + "bucket"] = Dataset(in_a_bucket(root))
     return opened
 
 
-@pytest.fixture(
-    scope="package", params=[pytest.param(form, marks=pytest.mark.minute) if form in SLOWER else form for form in FORMS]
-)
+@pytest.fixture(scope="package", params=FORMS)
 def dataset(request, forms) -> Dataset:
     return forms[request.param]
+
+
+@pytest.fixture
+def copy(files, tmp_path) -> Path:
+    """A copy of `files` that a test may damage."""
+    shutil.copytree(files.root, tmp_path / "copy")
+    return tmp_path / "copy"
 
 
 def unmerge(root: Path) -> None:
     """Takes away what only a finished dataset has."""
     (root / "_SUCCESS").unlink()
-    for table in ("scenes", "views", "objects", "assets", "failures", "timings"):
+    for table in TABLES:
         shutil.rmtree(root / "manifest" / table)

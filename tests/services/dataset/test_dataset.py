@@ -1,7 +1,10 @@
 """What Python reads of a dataset, in every form, against the plain files of one."""
 
+import json
 import pickle
-import shutil
+import subprocess
+import sys
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -11,9 +14,11 @@ import pyarrow.dataset as ds
 import pytest
 
 from schemas.errors import CorruptError, InputError, OutputError
-from services.dataset.dataset import open_dataset
+from services.dataset import shapes as stored_files
+from services.dataset.dataset import Dataset, open_dataset
 from tests.captures import captures_job, use_exact_captures
-from tests.datasets import run_here
+from tests.datasets import make_dataset, run_here
+from workers.store.local import LocalStore
 
 WORDS = {
     "input": {"RGB": "RGB", "depth": "depth", "segment": "segment"},
@@ -24,128 +29,113 @@ WORDS = {
 """Content words of the article's figure 1."""
 
 
-def plain_views(root: Path) -> dict[tuple[int, str], dict]:
-    """Rows of `views` by (parent id, role), by pyarrow alone."""
-    rows = ds.dataset(root / "manifest/views", partitioning="hive").to_table().to_pylist()
-    return {(row["parent_id"], row["role"]): row for row in rows}
+def plain(root: Path, table: str) -> list[dict]:
+    """The rows of a merged table, by pyarrow alone."""
+    return ds.dataset(root / "manifest" / table, partitioning="hive").to_table().to_pylist()
+
+
+def imread(path):
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return image[..., ::-1] if image.ndim == 3 else image
 
 
 def test_every_pair_has_the_facts_and_the_pixels_of_the_files(dataset, files):
-    views = plain_views(files.root)
-    pairs = list(dataset.pairs())
+    views = {(row["parent_id"], row["role"]): row for row in plain(files.root, "views")}
+    scenes = {row["scene_id"]: row for row in plain(files.root, "scenes")}
+    assets = {row["instance_id"]: row for row in plain(files.root, "assets")}
+    pairs, patches = list(dataset.pairs()), 0
     assert [pair.pose_id for pair in pairs] == sorted({parent for parent, _ in views}) and len(pairs) == 8
     for pair in pairs:
+        assert pair.scene == scenes[pair.scene_id] and pair.asset == assets[pair.instance_id]
         for role, number in (("input", 0), ("aligned", 0), ("mirror", 1), ("projected", 0)):
             view, row = getattr(pair, role), views[pair.pose_id, role]
-            assert (view.role, view.pose_id, view.row["d_z_m"]) == (role, row["pose_id"], row["d_z_m"])
+            assert (view.role, view.pose_id, view.row) == (role, row["pose_id"], row)
             assert view.T_world_cam.ravel().tolist() == row["T_world_cam"]
             assert view.K[:2, 2].tolist() == [row["cx"], row["cy"]] == (view.K_opencv[:2, 2] + 0.5).tolist()
-            stem = lambda word, at=pair.pose_id + number, of=WORDS[role]: f"{of[word]}{at:05d}.png"  # noqa: E731
             folder = files.root / pair.category
-            rgb = cv2.imread(str(folder / stem("RGB")))[..., ::-1]
-            depth = cv2.imread(str(folder / stem("depth")), cv2.IMREAD_UNCHANGED)
-            assert np.array_equal(view.rgb(), rgb) and np.array_equal(view.depth(), depth)
-            assert view.depth_m() == pytest.approx(depth / 5000.0, abs=1e-6)
-            patch = view.patch()
-            stored = folder / "patches" / stem("RGB")
+            name = {kind: f"{word}{pair.pose_id + number:05d}.png" for kind, word in WORDS[role].items()}
+            depth = imread(folder / name["depth"])
+            assert np.array_equal(view.rgb(), imread(folder / name["RGB"])) and np.array_equal(view.depth(), depth)
+            assert np.allclose(view.depth_m(), depth / 5000.0, rtol=0, atol=1e-6)
+            patch, stored = view.patch(), folder / "patches" / name["RGB"]
             assert (patch is not None) == stored.exists()
-            if patch is not None:
-                assert np.array_equal(patch.rgb(), cv2.imread(str(stored))[..., ::-1])
+            if patch is not None:  # the crop that its intrinsics tell
+                assert np.array_equal(patch.rgb(), imread(stored))
+                column, line = np.round(view.K[:2, 2] - patch.K[:2, 2]).astype(int)
+                height, width = patch.depth().shape
+                assert np.array_equal(patch.depth(), depth[line : line + height, column : column + width])
+                assert (patch.camera.intrinsics.width, patch.camera.intrinsics.height) == (width, height)
+                patches += 1
             if role != "projected":
-                segment = cv2.imread(str(folder / stem("segment")), cv2.IMREAD_UNCHANGED)
+                segment = imread(folder / name["segment"])
                 assert np.array_equal(view.segment(), segment)
                 (label,) = [one for one in view.objects if one.region_id == 3]
                 assert label.pixels == (segment == 3).sum()
+    assert patches
 
 
-def test_a_patch_is_the_crop_that_its_intrinsics_tell(dataset):
-    seen = 0
-    for pair in dataset.pairs():
-        view = pair.mirror
-        patch = view.patch()
-        if patch is None:
-            continue
-        column, row = np.round(view.K[:2, 2] - patch.K[:2, 2]).astype(int)
-        height, width = patch.depth().shape
-        assert np.array_equal(patch.depth(), view.depth()[row : row + height, column : column + width])
-        assert (patch.camera.intrinsics.width, patch.camera.intrinsics.height) == (width, height)
-        seen += 1
-    assert seen
-
-
-@pytest.mark.parametrize(
-    ("where", "keeps"),
-    [
-        (pc.field("category") == "mug", lambda scene, first, asset: scene["category"] == "mug"),
-        (pc.field("input", "visible_fraction") > 0.999, lambda scene, first, asset: first["visible_fraction"] > 0.999),
-        (
-            pc.match_substring(pc.binary_join(pc.field("effects"), " "), "table_texture"),
-            lambda scene, first, asset: any("table_texture" in name for name in scene["effects"]),
-        ),
-        (pc.field("asset", "split") == "train", lambda scene, first, asset: asset["split"] == "train"),
-        (pc.field("scene_id").isin([0, 3]), lambda scene, first, asset: scene["scene_id"] in (0, 3)),
-        (pc.field("input", "yaw_rad") > 9.0, lambda scene, first, asset: False),
-    ],
+FILTERS = (
+    (pc.field("category") == "mug", lambda scene, first, asset: scene["category"] == "mug"),
+    (pc.field("input", "visible_fraction") > 0.999, lambda scene, first, asset: first["visible_fraction"] > 0.999),
+    (
+        pc.match_substring(pc.binary_join(pc.field("effects"), " "), "table_texture"),
+        lambda scene, first, asset: any("table_texture" in name for name in scene["effects"]),
+    ),
+    (pc.field("asset", "split") == "train", lambda scene, first, asset: asset["split"] == "train"),
+    (pc.field("scene_id").isin([0, 3]), lambda scene, first, asset: scene["scene_id"] in (0, 3)),
+    (pc.field("input", "yaw_rad") > 9.0, lambda scene, first, asset: False),
 )
-def test_a_filter_keeps_what_the_tables_say(dataset, files, where, keeps):
-    tables = {
-        name: ds.dataset(files.root / "manifest" / name, partitioning="hive").to_table().to_pylist()
-        for name in ("scenes", "assets")
-    }
-    scenes = {row["scene_id"]: row for row in tables["scenes"]}
-    assets = {row["instance_id"]: row for row in tables["assets"]}
-    expected = [
-        parent
-        for (parent, role), row in sorted(plain_views(files.root).items())
-        if role == "input" and keeps(scenes[row["scene_id"]], row, assets[scenes[row["scene_id"]]["instance_id"]])
-    ]
-    assert [pair.pose_id for pair in dataset.pairs(where)] == expected
 
 
-def test_parts_share_all_pairs_and_one_pair_is_found_by_either_id(dataset):
-    whole = [pair.pose_id for pair in dataset.pairs()]
+def test_filters_parts_and_ids_choose_pairs_and_tables_are_whole(dataset, files):
+    scenes = {row["scene_id"]: row for row in plain(files.root, "scenes")}
+    assets = {row["instance_id"]: row for row in plain(files.root, "assets")}
+    first = sorted(
+        (row for row in plain(files.root, "views") if row["role"] == "input"), key=lambda row: row["pose_id"]
+    )
+    for where, keeps in FILTERS:
+        of = [(row, scenes[row["scene_id"]]) for row in first]
+        expected = [row["pose_id"] for row, scene in of if keeps(scene, row, assets[scene["instance_id"]])]
+        assert [pair.pose_id for pair in dataset.pairs(where)] == expected
     parts = [[pair.pose_id for pair in dataset.pairs(part=(k, 2))] for k in range(2)]
-    assert sorted([*parts[0], *parts[1]]) == whole and all(parts)
+    assert sorted([*parts[0], *parts[1]]) == [row["pose_id"] for row in first] and all(parts)
     assert [dataset.pair(number).pose_id for number in (2, 3, 14, 15)] == [2, 2, 14, 14]
     assert [pair.pose_id for pair in dataset.scene(1)] == [4, 6]
     with pytest.raises(InputError, match="scene 4 is not in"):
         dataset.pair(16)
-
-
-def test_tables_are_whole_and_filter_by_expression(dataset, files):
     for name in ("scenes", "views", "objects", "failures", "timings"):
-        merged = ds.dataset(files.root / "manifest" / name, partitioning="hive")
-        assert dataset.table(name).count_rows() == merged.count_rows()
+        assert dataset.table(name).count_rows() == len(plain(files.root, name))
+    assert set(dataset.table("assets").to_table()["instance_id"].to_pylist()) == assets.keys()
     mugs = dataset.table("views").to_table(filter=pc.field("category") == "mug", columns=["pose_id", "category"])
     assert mugs.num_rows and set(mugs["category"].to_pylist()) == {"mug"}
-    assert set(dataset.table("assets").to_table()["instance_id"].to_pylist()) == set(
-        ds.dataset(files.root / "manifest/assets", partitioning="hive").to_table()["instance_id"].to_pylist()
-    )
-    with pytest.raises(InputError, match="no table 'view'; did you mean 'views'"):
-        dataset.table("view")
 
 
 def test_what_is_wrong_is_told_at_once_and_clearly(files, tmp_path):
     dataset = open_dataset(str(files.root))
-    with pytest.raises(InputError, match=r"catgory.*Columns of a pair: scene_id, category"):
-        dataset.pairs(pc.field("catgory") == "mug")
-    with pytest.raises(InputError, match="filter cannot be used"):
-        dataset.pairs(pc.field("input", "nothing") > 1)
-    with pytest.raises(InputError, match="part"):
-        dataset.pairs(part=(2, 2))
-    with pytest.raises(OutputError, match=r"holds no job\.yaml"):
-        open_dataset(tmp_path / "nowhere")
     (pair, *_) = dataset.pairs()
-    with pytest.raises(InputError, match="no image of kind 'region', only rgb, depth"):
-        pair.projected.segment()
-    with pytest.raises(InputError, match="region 9 is no object of this view; its objects are \\[3\\]"):
-        pair.input.patch(9)
-    with pytest.raises(InputError, match="has the regions \\[2, 3\\], and no 1"):
-        pair.mesh(1)
+    for error, told, call in (
+        (InputError, "no table 'view'; did you mean 'views'", lambda: dataset.table("view")),
+        (
+            InputError,
+            r"catgory.*Columns of a pair: scene_id, category",
+            lambda: dataset.pairs(pc.field("catgory") == 1),
+        ),
+        (InputError, "filter cannot be used", lambda: dataset.pairs(pc.field("input", "nothing") > 1)),
+        (InputError, "filter cannot be used", lambda: dataset.pairs(pc.field("category") == 1)),
+        (InputError, "part", lambda: dataset.pairs(part=(2, 2))),
+        (OutputError, r"holds no job\.yaml", lambda: open_dataset(tmp_path / "nowhere")),
+        (InputError, "no image of kind 'region', only rgb, depth", lambda: pair.projected.segment()),
+        (InputError, r"region 9 is no object of this view; its objects are \[3\]", lambda: pair.input.patch(9)),
+        (InputError, r"has the regions \[2, 3\], and no 1", lambda: pair.mesh(1)),
+    ):
+        with pytest.raises(error, match=told):
+            call()
 
 
-def test_nothing_of_a_pair_can_be_changed(dataset):
-    (pair, *_) = dataset.pairs()
+def test_nothing_of_a_pair_can_be_changed_and_a_dataset_travels_to_other_processes(files):
+    dataset = pickle.loads(pickle.dumps(open_dataset(files.root)))
+    (pair, *others) = dataset.pairs()
+    assert dataset.is_finished and len(others) == 7
     with pytest.raises(AttributeError):
         pair.category = "box"
     with pytest.raises(TypeError):
@@ -157,17 +147,15 @@ def test_nothing_of_a_pair_can_be_changed(dataset):
     assert np.array_equal(pair.input.rgb(), before)
 
 
-def test_a_missing_image_is_named(files, tmp_path):
-    shutil.copytree(files.root, tmp_path / "copy")
-    next((tmp_path / "copy/mug").glob("depth0*.png")).unlink()
-    mugs = list(open_dataset(tmp_path / "copy").pairs(pc.field("category") == "mug"))
+def test_a_missing_image_is_named(copy, tars):
+    for path in (copy / "mug").glob("depth0*.png"):
+        path.unlink()
+    (pair, *_) = open_dataset(copy).pairs(pc.field("category") == "mug")
     with pytest.raises(CorruptError, match=r"mug/depth\d+\.png is committed and missing"):
-        [view.depth() for pair in mugs for view in (pair.input, pair.mirror)]
-
-
-def test_it_travels_to_other_processes(files):
-    dataset = pickle.loads(pickle.dumps(open_dataset(files.root)))
-    assert dataset.is_finished and sum(1 for _ in dataset.pairs()) == 8
+        pair.input.depth()
+    (pair, *_) = Dataset(LocalStore(tars.root)).pairs()
+    with pytest.raises(CorruptError, match=r"mug/RGB99999\.png is committed and in no tar: `verso verify"):
+        pair._files.image(0, "mug/RGB99999.png")
 
 
 def test_captures_are_pairs_as_scenes_are(tmp_path, monkeypatch):
@@ -179,3 +167,70 @@ def test_captures_are_pairs_as_scenes_are(tmp_path, monkeypatch):
     assert [dataset.pair(pair.pose_id).scene["capture"] for pair in pairs] == [pair.scene["capture"] for pair in pairs]
     low, high = pairs[0].mesh().bounds
     assert (high - low).max() > 0.05
+
+
+def test_views_that_the_job_switched_off_are_none(tmp_path):
+    off = {"enabled": False}
+    changes = {"cameras": {"depth": off, "mirror": off}, "images": {"projection": off}, "render": {"rgb": False}}
+    store, _ = make_dataset(tmp_path, scenes=1, **changes)
+    (pair,) = open_dataset(store.root).pairs()
+    assert (pair.aligned, pair.mirror, pair.projected) == (None, None, None)
+    assert set(pair.input.images) == {"depth", "region"}
+    assert repr(pair) == f"Pair(pose_id=0, scene_id=0, category={pair.category!r}, instance_id={pair.instance_id!r})"
+
+
+class Counting(LocalStore):
+    """Counts what is read of each key."""
+
+    def __init__(self, root) -> None:
+        super().__init__(root)
+        self.reads: Counter[str] = Counter()
+
+    def read(self, key: str) -> bytes:
+        self.reads[key] += 1
+        return super().read(key)
+
+
+def test_a_tar_is_read_once_while_it_is_used_and_what_is_kept_is_bounded_by_its_bytes(tars, monkeypatch):
+    store = Counting(tars.root)
+    (first, *others) = Dataset(store).pairs()
+    assert not any(key.endswith((".tar", ".png")) for key in store.reads)  # before an image is asked for
+    first.input.rgb()
+    assert [key for key in store.reads if key.endswith(".tar")] == [f"{first.category}/0000000000.tar"]
+    whole = [view.depth().sum() for pair in (first, *others) for view in (pair.input, pair.mirror)]
+    read = {key: count for key, count in store.reads.items() if key.endswith(".tar")}
+    assert len(read) > 1 and set(read.values()) == {1}
+    monkeypatch.setattr(stored_files, "TAR_BYTES", 1)
+    store = Counting(tars.root)
+    assert [view.depth().sum() for pair in Dataset(store).pairs() for view in (pair.input, pair.mirror)] == whole
+    assert max(count for key, count in store.reads.items() if key.endswith(".tar")) > 1
+
+
+STREAM = """
+import json, sys
+from tests.kit.memory import peak_mib
+from pathlib import Path
+from services.dataset.dataset import Dataset
+from services.job.job_file import validate_job
+from services.job.record import encode_job, record_job
+from tests.datasets import SMALL
+from tests.kit.many_ranges import ManyRanges
+
+def stream(root, ranges):
+    store = ManyRanges(root, ranges)
+    store.prepare()
+    store.put("job.yaml", encode_job(record_job(validate_job(SMALL, "test"), "c" * 64, root)))
+    pairs = sum(1 for pair in Dataset(store).pairs() if pair.mirror.images)
+    return pairs, peak_mib()
+
+print(json.dumps([stream(Path(sys.argv[1]) / "few", 100), stream(Path(sys.argv[1]) / "many", 500)]))
+"""
+
+
+@pytest.mark.minute
+def test_five_times_the_pairs_take_no_more_memory(tmp_path, record_figure):
+    done = subprocess.run([sys.executable, "-c", STREAM, str(tmp_path)], capture_output=True, text=True, check=True)
+    (few, before), (many, after) = json.loads(done.stdout)
+    assert many > 4 * few > 300
+    record_figure("stream_pairs_growth_mib", "passed", after - before, 8.0)
+    assert after - before < 8.0

@@ -1,16 +1,25 @@
-"""Meshes of a dataset's objects lie where its images and its text files say."""
+"""Meshes of a dataset's objects lie where its images and text files say; a scene made in memory is the stored one."""
 
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pyarrow.compute as pc
 import pytest
 import trimesh
+import yaml
 
-from schemas.errors import CorruptError, InputError
+from schemas.errors import CorruptError, InputError, JobError, SceneError
 from services.dataset.dataset import open_dataset
+from services.dataset.one_scene import make_scene
+from services.job.job_file import validate_job
 from services.job.record import encode_job, read_job
-from tests.datasets import make_dataset
+from tests.datasets import SMALL, make_dataset, overlaid
+from tests.services.dataset.conftest import CHANGES
+from workers.store.local import LocalStore
+
+KEYS = overlaid(SMALL, CHANGES)
 
 
 def ray_depths(meshes, view, rows, columns) -> np.ndarray:
@@ -24,7 +33,7 @@ def ray_depths(meshes, view, rows, columns) -> np.ndarray:
     return found
 
 
-def test_a_posed_mesh_has_the_depth_of_the_image_in_every_camera(dataset):
+def test_a_posed_mesh_has_the_depth_of_the_image_in_every_camera_and_may_be_changed(dataset):
     (pair, *_) = dataset.pairs()
     for view in (pair.input, pair.aligned, pair.mirror):
         depth, region = view.depth_m(), view.segment()
@@ -34,70 +43,79 @@ def test_a_posed_mesh_has_the_depth_of_the_image_in_every_camera(dataset):
             traced = ray_depths([pair.mesh(number, view)], view, rows[some], columns[some])
             assert np.median(np.abs(traced - depth[rows, columns][some])) < 2e-4
             assert np.isfinite(traced).mean() > 0.95
-
-
-def test_a_mesh_in_the_world_is_the_glb_at_the_pose_of_objects_dat(files):
-    (pair, *_) = open_dataset(files.root).pairs()
-    line = next(
-        words
-        for words in map(str.split, (files.root / "objects.dat").read_text().splitlines())
-        if words[0] == str(pair.pose_id) and words[3] == "3"
-    )
-    T_cam_obj = np.array(line[6:], float).reshape(4, 4)
-    glb = trimesh.load_mesh(files.root / "assets" / line[1] / f"{line[2]}.glb", process=False)
-    seen = trimesh.transform_points(glb.vertices, T_cam_obj)
-    assert pair.mesh(3, pair.input).bounds == pytest.approx(np.stack([seen.min(axis=0), seen.max(axis=0)]), abs=1e-6)
-    world = trimesh.transform_points(seen, pair.input.T_world_cam)
-    assert pair.mesh().bounds == pytest.approx(np.stack([world.min(axis=0), world.max(axis=0)]), abs=1e-6)
-
-
-def test_a_mesh_may_be_changed_without_changing_the_next(dataset):
-    (pair, *_) = dataset.pairs()
     before = pair.mesh().bounds
     pair.mesh().apply_scale(9.0)
     assert np.array_equal(pair.mesh().bounds, before)
 
 
+def test_a_mesh_in_the_world_is_the_glb_at_the_pose_of_objects_dat(files):
+    (pair, *_) = open_dataset(files.root).pairs()
+    lines = map(str.split, (files.root / "objects.dat").read_text().splitlines())
+    line = next(words for words in lines if words[0] == str(pair.pose_id) and words[3] == "3")
+    T_cam_obj = np.array(line[6:], float).reshape(4, 4)
+    glb = trimesh.load_mesh(files.root / "assets" / line[1] / f"{line[2]}.glb", process=False)
+    seen = trimesh.transform_points(glb.vertices, T_cam_obj)
+    world = trimesh.transform_points(seen, pair.input.T_world_cam)
+    for mesh, points in ((pair.mesh(3, pair.input), seen), (pair.mesh(), world)):
+        assert mesh.bounds == pytest.approx(np.stack([points.min(axis=0), points.max(axis=0)]), abs=1e-6)
+
+
 def test_each_of_several_objects_has_its_own_shape(tmp_path):
-    store, _ = make_dataset(tmp_path, scenes=1, objects_per_scene=3, categories=["box", "camera", "bottle"])
-    (pair,) = open_dataset(store.root).pairs()
+    make_dataset(tmp_path, scenes=1, objects_per_scene=3, categories=["box", "camera", "bottle"])
+    (pair,) = open_dataset(tmp_path).pairs()
+    assets = open_dataset(tmp_path).table("assets")
     for number in (3, 4, 5):
         (instance,) = [body["instance_id"] for body in pair.scene["bodies"] if body["region_id"] == number]
-        (row,) = (
-            open_dataset(store.root).table("assets").to_table(filter=pc.field("instance_id") == instance).to_pylist()
-        )
+        (row,) = assets.to_table(filter=pc.field("instance_id") == instance).to_pylist()
         own = trimesh.transform_points(pair.mesh(number).vertices, np.linalg.inv(pair.T_world[number]))
         assert np.ptp(own, axis=0) == pytest.approx(row["extents_m"], abs=1e-6)
 
 
-@pytest.fixture
-def copy(files, tmp_path):
-    shutil.copytree(files.root, tmp_path / "copy")
-    return tmp_path / "copy"
-
-
-def test_a_shape_that_is_not_stored_comes_from_the_source(files, copy):
-    shutil.rmtree(copy / "assets")
-    for stored, made in zip(open_dataset(files.root).pairs(), open_dataset(copy).pairs(), strict=True):
-        for number in (2, 3):
-            assert made.mesh(number).bounds == pytest.approx(stored.mesh(number).bounds, abs=1e-6)
-
-
-def test_a_source_that_is_gone_or_another_is_told(copy, files):
-    shutil.rmtree(copy / "assets")
-    store = type(files)(copy)
-    record = read_job(store)
-    gone = {"objects": [{"source": "urdf", "folder": "/nowhere", "category_map": {"*": "mug"}}]}
-    job = type(record.job).model_validate({**record.job.model_dump(mode="json"), "assets": gone})
-    store.put("job.yaml", encode_job(type(record)(job, record.digest, record.catalogue, record.folder)))
-    (pair, *_) = open_dataset(copy).pairs()
-    with pytest.raises(InputError, match=r"assets/mug/.*\.glb is not in the dataset.*/nowhere"):
-        pair.mesh()
-
-
-def test_a_damaged_shape_is_named(copy):
+def test_a_shape_that_is_not_stored_comes_from_the_source_and_one_that_is_gone_is_told(files, copy):
     for path in (copy / "assets").rglob("*.glb"):
         path.write_bytes(b"glTF and no more")
     (pair, *_) = open_dataset(copy).pairs()
     with pytest.raises(CorruptError, match=r"\.glb cannot be read"):
         pair.mesh()
+    shutil.rmtree(copy / "assets")
+    for stored, made in zip(open_dataset(files.root).pairs(), open_dataset(copy).pairs(), strict=True):
+        for number in (2, 3):
+            assert made.mesh(number).bounds == pytest.approx(stored.mesh(number).bounds, abs=1e-6)
+    record = read_job(files)
+    gone = {"objects": [{"source": "urdf", "folder": "/nowhere", "category_map": {"*": "mug"}}]}
+    job = type(record.job).model_validate({**record.job.model_dump(mode="json"), "assets": gone})
+    LocalStore(copy).put("job.yaml", encode_job(type(record)(job, record.digest, record.catalogue, record.folder)))
+    (pair, *_) = open_dataset(copy).pairs()
+    with pytest.raises(InputError, match=r"assets/mug/.*\.glb is not in the dataset.*/nowhere"):
+        pair.mesh()
+
+
+def test_a_scene_in_memory_is_the_stored_one(files, tmp_path):
+    path = tmp_path / "job.yaml"
+    path.write_text(yaml.safe_dump(KEYS))
+    stored = open_dataset(files.root).scene(2)
+    for job in (KEYS, path, str(path), validate_job(KEYS, "test")):
+        made = make_scene(job, 2)
+        assert [pair.pose_id for pair in made] == [pair.pose_id for pair in stored] == [8, 10]
+        for mine, theirs in zip(made, stored, strict=True):
+            assert mine.scene == theirs.scene and mine.input.row == theirs.input.row
+            for role in ("input", "aligned", "mirror", "projected"):
+                a, b = getattr(mine, role), getattr(theirs, role)
+                assert np.array_equal(a.rgb(), b.rgb()) and np.array_equal(a.depth(), b.depth())
+            assert np.array_equal(mine.input.patch().segment(), theirs.input.patch().segment())
+            assert mine.mesh().bounds == pytest.approx(theirs.mesh().bounds, abs=1e-12)
+    (pair,) = make_scene(path, 0, ["pairs_per_scene=1", "start.pose=placed"])
+    assert pair.scene["pose"] == "placed"
+    with pytest.raises(JobError, match="there is no such key"):
+        make_scene(path, 0, ["start.poze=placed"])
+    with pytest.raises(SceneError, match="scene 0 cannot be made"):
+        make_scene(overlaid(KEYS, {"cameras": {"sensor": {"fx": 90_000.0, "fy": 90_000.0}}}), 0)
+
+
+def test_neither_ray_nor_a_renderer_is_loaded_to_read():
+    code = (
+        "import sys; import services.dataset.dataset; loaded = set(sys.modules) & {'ray', 'pybullet', 'OpenGL', 'duckdb'};"
+        "import services.dataset.one_scene; print(loaded, 'ray' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["set()", "False"]
