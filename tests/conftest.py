@@ -70,7 +70,7 @@ def docker_answers() -> bool:
 
 NEEDS = {
     "docker": ("deploy", "docker-compose.yml", ".dockerignore", "pyproject.toml", "requirements.lock", "tests/deploy"),
-    "browser": ("services/look", "tests/services/report"),
+    "browser": ("services/look", "tests/services/look"),
 }
 """What tests with these markers are about: --ci runs them where some of it differs from the base."""
 

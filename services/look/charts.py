@@ -1,7 +1,4 @@
-"""Histograms: counts over equal steps, added up batch by batch, and HTML figures of them with SVG bars. Pure.
-
-- Histograms as HTML figures with SVG bars, which take their colours from the page's style. Pure.
-"""
+"""Histograms: counts over equal steps, added up batch by batch, and HTML figures of them with SVG bars. Pure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,8 +1,4 @@
-"""The figures of a dataset from batches of its tables: rows of a large dataset are never all in memory.
-
-- The figures of a dataset from batches of its tables: counts, histograms, effects and their cost. Pure but for
-  reading.
-"""
+"""The figures of a dataset from batches of its tables: rows of a large dataset are never all in memory."""
 
 import math
 from collections import Counter
@@ -122,6 +118,11 @@ class Cost:
     skips: Counter[str] = field(default_factory=Counter)
     """How often it was left out, by reason."""
 
+    def add(self, seconds: float, times: int) -> None:
+        """Takes times that were measured."""
+        self.seconds += seconds
+        self.timed += times
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -152,35 +153,6 @@ class CaptureQuality:
     completeness: float | None
 
 
-@dataclass(frozen=True)
-class Figures:
-    """What the tables of a dataset say."""
-
-    scenes: int
-    """Rows of `scenes` that were read."""
-    by_category: dict[str, int]
-    instances: int
-    views: int
-    pairs: int
-    files: int
-    bytes: int
-    seconds: float
-    visibility: dict[str, Histogram]
-    """By role."""
-    inclination: dict[str, Histogram]
-    """By role, degrees below the horizontal."""
-    distance: Histogram
-    """d_z of each pair, metres."""
-    gap: Histogram
-    """Resting gap, decimal logarithm of millimetres; what is smaller than a nanometre counts as one."""
-    effects: dict[str, Cost]
-    stages: dict[str, Cost]
-    failures: tuple[Failure, ...]
-    captures: tuple[CaptureQuality, ...]
-    sampled: bool
-    """Whether some of the ranges only were read."""
-
-
 GROUNDS = ("table", "board")
 """Categories of assets that objects stand on."""
 
@@ -191,108 +163,109 @@ GAP_DECADES = (-6.0, 4.0)
 """Range of the resting gap, from a nanometre to ten metres, as a power of ten of a millimetre."""
 
 
+@dataclass
+class Figures:
+    """What the tables of a dataset say."""
+
+    sampled: bool
+    """Whether some of the ranges only were read."""
+    by_category: Counter[str] = field(default_factory=Counter)
+    """Rows of `scenes` that were read."""
+    instances: int = 0
+    """Number of different objects; what they stand on is not counted."""
+    views: int = 0
+    pairs: int = 0
+    files: int = 0
+    bytes: int = 0
+    seconds: float = 0.0
+    visibility: dict[str, Histogram] = field(default_factory=dict)
+    """By role."""
+    inclination: dict[str, Histogram] = field(default_factory=dict)
+    """By role, degrees below the horizontal."""
+    distance: Histogram = field(default_factory=lambda: Histogram(*DISTANCE_M))
+    """d_z of each pair, metres."""
+    gap: Histogram = field(default_factory=lambda: Histogram(*GAP_DECADES))
+    """Resting gap, decimal logarithm of millimetres; what is smaller than a nanometre counts as one."""
+    effects: dict[str, Cost] = field(default_factory=dict)
+    """The costliest first."""
+    stages: dict[str, Cost] = field(default_factory=dict)
+    """The costliest first."""
+    failures: tuple[Failure, ...] = ()
+    captures: list[CaptureQuality] = field(default_factory=list)
+
+    @property
+    def scenes(self) -> int:
+        """Rows of `scenes` that were read."""
+        return self.by_category.total()
+
+
 def collect(tables: Tables) -> Figures:
     """The figures of all rows, read once, by columns."""
-    scenes = _Scenes()
-    scenes.read(tables)
-    views = _Views()
-    views.read(tables)
-    stages, effects, seconds = _read_timings(tables)
-    for name, cost in scenes.effects.items():
-        timed = effects.get(name, Cost())
-        cost.seconds, cost.timed = timed.seconds, timed.timed
-    return Figures(
-        scenes=sum(scenes.by_category.values()),
-        by_category=dict(sorted(scenes.by_category.items())),
-        instances=_count_instances(tables),
-        views=views.count,
-        pairs=views.pairs,
-        files=views.files,
-        bytes=views.bytes,
-        seconds=seconds,
-        visibility=views.visibility,
-        inclination=views.inclination,
-        distance=views.distance,
-        gap=scenes.gap,
-        effects=dict(sorted(scenes.effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0]))),
-        stages=dict(sorted(stages.items(), key=lambda item: -item[1].seconds)),
-        failures=_read_failures(tables),
-        captures=tuple(scenes.captures),
-        sampled=tables.sampled,
-    )
+    figures = Figures(tables.sampled)
+    _read_scenes(tables, figures)
+    _read_views(tables, figures)
+    _read_timings(tables, figures)
+    figures.failures = _read_failures(tables)
+    figures.instances = _count_instances(tables)
+    figures.by_category = Counter(dict(sorted(figures.by_category.items())))
+    figures.effects = dict(sorted(figures.effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0])))
+    figures.stages = dict(sorted(figures.stages.items(), key=lambda item: -item[1].seconds))
+    return figures
 
 
-class _Scenes:
-    """What `scenes` says, added up."""
-
-    def __init__(self) -> None:
-        self.by_category: Counter[str] = Counter()
-        self.gap = Histogram(*GAP_DECADES)
-        self.effects: dict[str, Cost] = {}
-        self.captures: list[CaptureQuality] = []
-
-    def read(self, tables: Tables) -> None:
-        columns = ("scene_id", "category", "effects", "skipped", "hover_gap_mm", "capture")
-        for rows in tables.batches("scenes", columns):
-            self.by_category.update(_counts(rows.column("category")))
-            self.gap = self.gap.add(np.log10(np.maximum(_numbers(rows, "hover_gap_mm"), 10 ** GAP_DECADES[0])))
-            for name, runs in _counts(_flat(rows, "effects")).items():
-                self.effects.setdefault(name, Cost()).runs += runs
-            skipped = _flat(rows, "skipped")
-            both = pc.binary_join_element_wise(
-                pc.struct_field(skipped, "effect"), pc.struct_field(skipped, "why"), "\0"
-            )
-            for told, times in _counts(both).items():
-                name, _, why = told.partition("\0")
-                self.effects.setdefault(name, Cost()).skips[why] += times
-            self.captures += _captures(rows, MOST_CAPTURES - len(self.captures))
+def _read_scenes(tables: Tables, figures: Figures) -> None:
+    columns = ("scene_id", "category", "effects", "skipped", "hover_gap_mm", "capture")
+    for rows in tables.batches("scenes", columns):
+        figures.by_category.update(_counts(rows.column("category")))
+        gap_mm = np.maximum(_numbers(rows, "hover_gap_mm"), 10 ** GAP_DECADES[0])
+        figures.gap = figures.gap.add(np.log10(gap_mm))
+        for name, runs in _counts(_flat(rows, "effects")).items():
+            figures.effects.setdefault(name, Cost()).runs += runs
+        skipped = _flat(rows, "skipped")
+        both = pc.binary_join_element_wise(pc.struct_field(skipped, "effect"), pc.struct_field(skipped, "why"), "\0")
+        for told, times in _counts(both).items():
+            name, _, why = told.partition("\0")
+            figures.effects.setdefault(name, Cost()).skips[why] += times
+        figures.captures += _captures(rows, MOST_CAPTURES - len(figures.captures))
 
 
-class _Views:
-    """What `views` says, added up."""
-
-    def __init__(self) -> None:
-        self.count = self.pairs = self.files = self.bytes = 0
-        self.visibility: dict[str, Histogram] = {}
-        self.inclination: dict[str, Histogram] = {}
-        self.distance = Histogram(*DISTANCE_M)
-
-    def read(self, tables: Tables) -> None:
-        for rows in tables.batches("views", ("role", "visible_fraction", "inclination_rad", "d_z_m", "files")):
-            self.count += rows.num_rows
-            sizes = pc.struct_field(_flat(rows, "files"), "bytes")
-            self.files += len(sizes)
-            self.bytes += pc.sum(sizes).as_py() or 0
-            roles = np.asarray(rows.column("role").to_pylist())
-            for role in ("input", "mirror"):
-                of = rows.filter(pa.array(roles == role))
-                if not of.num_rows:
-                    continue
-                visibility = self.visibility.get(role, Histogram(0.0, 1.0))
-                self.visibility[role] = visibility.add(_numbers(of, "visible_fraction"))
-                inclination = self.inclination.get(role, Histogram(-96.0, 96.0))
-                self.inclination[role] = inclination.add(np.degrees(_numbers(of, "inclination_rad")))
-                if role == "input":
-                    self.pairs += of.num_rows
-                    self.distance = self.distance.add(_numbers(of, "d_z_m"))
+def _read_views(tables: Tables, figures: Figures) -> None:
+    for rows in tables.batches("views", ("role", "visible_fraction", "inclination_rad", "d_z_m", "files")):
+        figures.views += rows.num_rows
+        sizes = pc.struct_field(_flat(rows, "files"), "bytes")
+        figures.files += len(sizes)
+        figures.bytes += pc.sum(sizes).as_py() or 0
+        for role in ("input", "mirror"):
+            of = rows.filter(pc.field("role") == role)
+            if not of.num_rows:
+                continue
+            visibility = figures.visibility.get(role, Histogram(0.0, 1.0))
+            figures.visibility[role] = visibility.add(_numbers(of, "visible_fraction"))
+            inclination = figures.inclination.get(role, Histogram(-96.0, 96.0))
+            figures.inclination[role] = inclination.add(np.degrees(_numbers(of, "inclination_rad")))
+            if role == "input":
+                figures.pairs += of.num_rows
+                figures.distance = figures.distance.add(_numbers(of, "d_z_m"))
 
 
-def _read_timings(tables: Tables) -> tuple[dict[str, Cost], dict[str, Cost], float]:
-    """(stages, effects, seconds in all)."""
-    sums: dict[str, dict[str, Cost]] = {"stages": {}, "effects": {}}
-    total = 0.0
+def _read_timings(tables: Tables, figures: Figures) -> None:
     for rows in tables.batches("timings", ("stages", "effects", "total_s")):
-        total += float(_numbers(rows, "total_s").sum())
-        for column, costs in sums.items():
-            items = _flat(rows, column)
-            named = pa.table({"name": pc.struct_field(items, "name"), "seconds": pc.struct_field(items, "seconds")})
-            grouped = named.group_by("name").aggregate([("seconds", "sum"), ("seconds", "count")])
-            for one in grouped.to_pylist():
-                cost = costs.setdefault(one["name"], Cost())
-                cost.seconds += one["seconds_sum"]
-                cost.timed += one["seconds_count"]
-                cost.runs += one["seconds_count"]
-    return sums["stages"], sums["effects"], total
+        figures.seconds += float(_numbers(rows, "total_s").sum())
+        for stage, one in _sums(rows, "stages"):
+            cost = figures.stages.setdefault(stage, Cost())
+            cost.add(*one)
+            cost.runs = cost.timed
+        for effect, one in _sums(rows, "effects"):
+            if effect in figures.effects:
+                figures.effects[effect].add(*one)
+
+
+def _sums(rows: pa.Table, column: str) -> Iterator[tuple[str, tuple[float, int]]]:
+    """(name, (seconds, how many)) of the times in a list column."""
+    items = _flat(rows, column)
+    named = pa.table({"name": pc.struct_field(items, "name"), "seconds": pc.struct_field(items, "seconds")})
+    for one in named.group_by("name").aggregate([("seconds", "sum"), ("seconds", "count")]).to_pylist():
+        yield one["name"], (one["seconds_sum"], one["seconds_count"])
 
 
 def _read_failures(tables: Tables) -> tuple[Failure, ...]:

@@ -1,17 +1,13 @@
-"""The live page: how far a dataset is, what the page shows of it, and a thread that follows it.
-
-- How far a dataset is: an empty folder, one being made, one that stands still, one that is finished.
-- The live part of the page: state, progress, failures so far, and the latest pictures. Pure: progress to HTML.
-- Follows a dataset for the live page: a thread that looks every few seconds and keeps the newest answers ready.
-"""
+"""The live page: how far a dataset is, what the page shows of it, and a thread that follows it."""
 
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from typing import Literal
+
+from cachetools import LRUCache
 
 from schemas.dataset.layout import commit_path
 from schemas.errors import OutputError, VersoError, describe_seconds
@@ -185,21 +181,16 @@ SHELF_BYTES = 96_000_000
 
 
 class PictureShelf:
-    """Pictures by name; the oldest go where there are too many."""
+    """Pictures by name; those that were not asked for the longest go where there are too many."""
 
     def __init__(self, most_bytes: int = SHELF_BYTES) -> None:
-        self._most, self._bytes, self._lock = most_bytes, 0, threading.Lock()
-        self._pictures: OrderedDict[str, Picture] = OrderedDict()
+        self._lock = threading.Lock()
+        self._pictures: LRUCache[str, Picture] = LRUCache(most_bytes, lambda picture: len(picture.data))
 
     def put(self, picture: Picture) -> str:
         """Keeps a picture; returns its address on the server."""
         with self._lock:
-            if picture.name not in self._pictures:
-                self._bytes += len(picture.data)
             self._pictures[picture.name] = picture
-            self._pictures.move_to_end(picture.name)
-            while self._bytes > self._most and len(self._pictures) > 1:
-                self._bytes -= len(self._pictures.popitem(last=False)[1].data)
         return f"/picture/{picture.name}"
 
     def get(self, name: str) -> Picture | None:

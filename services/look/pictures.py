@@ -1,8 +1,4 @@
-"""Scenes chosen evenly from each category, and pictures of their stored images.
-
-- Pictures of stored images for a page: colour, depth in viridis, regions, the projection over the mirror view. Pure.
-- The full images of a stored pair, read by role and kind of pixels.
-"""
+"""Scenes chosen evenly from each category, and pictures of their stored images."""
 
 import base64
 import hashlib

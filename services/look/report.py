@@ -1,8 +1,4 @@
-"""`verso report`: a dataset as one HTML page that needs nothing beside it; and the pages of the server.
-
-- The whole page from its sections, style and scripts: one file that fetches nothing, or the page of a server.
-- What the live page shows at a moment: as a page, and as answers to a page that asks for what is new. Pure.
-"""
+"""`verso report`: a dataset as one HTML page that needs nothing beside it; and the pages of the server."""
 
 import zipfile
 from collections.abc import Sequence
@@ -67,25 +63,12 @@ class Page:
     footer: str
 
 
-@dataclass(frozen=True)
-class Around:
-    """What is not the same in a file and on a server."""
-
-    policy: str
-    style: str
-    icon: str
-    scripts: str
-    data: str = ""
-    """Attributes of the body."""
-
-
 def whole_page(page: Page) -> str:
     """The page with everything that it needs inside."""
     style = f"<style>{read_web('page.css')}</style>"
     icon = f"data:image/svg+xml,{quote(read_web('icon.svg').strip())}"
-    return fill_page(
-        page, Around(POLICY, style, icon, "".join(f"<script>{read_web(name)}</script>\n" for name in SCRIPTS))
-    )
+    scripts = "".join(f"<script>{read_web(name)}</script>\n" for name in SCRIPTS)
+    return fill_page(page, policy=POLICY, style=style, icon=icon, scripts=scripts, data="")
 
 
 def section_html(section: Section) -> str:
@@ -110,20 +93,16 @@ def read_three() -> str:
     return script
 
 
-def fill_page(page: Page, around: Around) -> str:
-    """The template with all its places filled."""
+def fill_page(page: Page, **around: str) -> str:
+    """The template with all its places filled: `around` has policy, style, icon, scripts, and attributes of the body."""
     shown = [section for section in page.sections if section.html]
     return Template(read_web("page.html")).substitute(
-        policy=around.policy,
-        data=around.data,
-        icon=around.icon,
+        around,
         title=escape(page.title),
         subtitle=f'<p class="sub">{escape(page.subtitle)}</p>' if page.subtitle else "",
-        style=around.style,
         links="".join(f'<a href="#{section.id}">{escape(section.heading)}</a>' for section in shown),
         sections="".join(map(section_html, shown)),
         footer=f"<footer>{escape(page.footer)}</footer>" if page.footer else "",
-        scripts=around.scripts,
     )
 
 
@@ -167,7 +146,8 @@ def live_page(view: View) -> str:
     page = Page(view.name, "", [Section("live", "Now", _LIVE.format(view.live)), *view.sections], "")
     scripts = "".join(f'<script src="/{name}"></script>\n' for name in (*SCRIPTS, "live.js"))
     data = f' data-version="{view.version}" data-shape="{escape(view.shape)}"'
-    return fill_page(page, Around("", '<link rel="stylesheet" href="/page.css">', "/icon.svg", scripts, data))
+    style = '<link rel="stylesheet" href="/page.css">'
+    return fill_page(page, policy="", style=style, icon="/icon.svg", scripts=scripts, data=data)
 
 
 SCENES = 24

@@ -1,9 +1,4 @@
-"""The sections of the page. Pure: figures and pictures to HTML.
-
-- Two datasets side by side, captures beside scenes above all: their figures, and a scene of each category. Pure.
-- The sections of the page that are pictures: sheets by category, the slider, the 3-D view. Pure: pictures to HTML.
-- The sections of the page that are figures: overview, histograms, effects, failures, captures. Pure: figures to HTML.
-"""
+"""The sections of the page. Pure: figures and pictures to HTML."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial

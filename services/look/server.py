@@ -1,7 +1,4 @@
-"""`verso serve`: the live page over HTTP, read-only, and who may read it. The one file that opens a port for it.
-
-- Who may read the live page: names of the server, its token, its headers. Pure.
-"""
+"""`verso serve`: the live page over HTTP, read-only, and who may read it. The one file that opens a port for it."""
 
 import contextlib
 import hashlib
@@ -11,6 +8,7 @@ import json
 import secrets
 import signal
 import socket
+import socketserver
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -106,22 +104,14 @@ def is_address(name: str) -> bool:
     return True
 
 
-def make_token() -> str:
-    """A random token of 192 bits."""
-    return secrets.token_urlsafe(24)
-
-
 def _name_of(host: str) -> str:
     """The name or address in a Host header, in lower case; empty where it is none."""
-    if host.startswith("["):
-        name, bracket, port = host[1:].partition("]")
-        return name.lower() if bracket and (not port or _is_port(port.removeprefix(":"))) else ""
-    name, colon, port = host.partition(":")
-    return name.lower().rstrip(".") if not colon or _is_port(port) else ""
-
-
-def _is_port(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) <= 5
+    try:
+        parts = urlsplit(f"//{host}")
+        name, _ = parts.hostname or "", parts.port
+    except ValueError:  # brackets or a port that are none
+        return ""
+    return name.rstrip(".") if parts.netloc == host and "@" not in host else ""
 
 
 def _cookies(header: str, name: str) -> list[str]:
@@ -178,7 +168,7 @@ def choose_place(host: str, port: int, token: str | None) -> Place:
     Raises InputError for a token that is easily guessed.
     """
     if token == "auto" or (token is None and not is_loopback(host)):
-        token = make_token()
+        token = secrets.token_urlsafe(24)
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
         told = (
             f"--token has {len(token)} characters: give at least {LEAST_TOKEN} plain ones, or `auto` for a random one"
@@ -237,7 +227,8 @@ class _Server(ThreadingHTTPServer):
 
     def server_bind(self) -> None:
         """Binds without asking for the name of the address, which may take long without a network."""
-        socket_server_bind(self)
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answers in a thread, or closes the connection where too many are open."""
@@ -255,14 +246,6 @@ class _Server(ThreadingHTTPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Says nothing of a connection that the reader closed."""
-
-
-def socket_server_bind(server: ThreadingHTTPServer) -> None:
-    """Binds the socket and notes the address."""
-    server.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    server.socket.bind(server.server_address)
-    server.server_address = server.socket.getsockname()
-    server.server_name, server.server_port = str(server.server_address[0]), server.server_address[1]
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -1,9 +1,18 @@
-"""Small datasets that the tests of the report share, because none changes them."""
+"""What the tests of the report share: a small dataset, which none changes, tables made by hand, and scenes without one."""
 
+import math
+
+import numpy as np
+import pyarrow as pa
 import pytest
 
+from schemas.dataset.tables import SCHEMAS
+from services.look.collect import collect
+from services.look.pictures import Picture, ShownScene, picture_of_colour
 from tests.datasets import make_dataset
 from workers.store.local import LocalStore
+
+HOSTILE = '"><script>alert("&")</script>'
 
 
 @pytest.fixture(scope="package")
@@ -11,3 +20,65 @@ def shown(tmp_path_factory) -> LocalStore:
     """Four finished scenes of two categories."""
     changes = {"scenes": 4, "categories": ["box", "mug"], "run": {"range_size": 2}}
     return make_dataset(tmp_path_factory.mktemp("shown"), **changes)[0]
+
+
+def scene(scene_id: int, category: str, names=("input rgb", "mirror rgb", "over")) -> ShownScene:
+    picture = picture_of_colour(np.zeros((12, 16, 3), np.uint8), "input view, colour")
+    visible = {"input": 0.98, "mirror": None}
+    return ShownScene(scene_id, category, ("a", "b"), 2 * scene_id, dict.fromkeys(names, picture), visible, 2.345678)
+
+
+def address(picture: Picture) -> str:
+    return f"/picture/{picture.name}"
+
+
+SCENES = [
+    {"scene_id": 0, "category": "mug", "effects": ["drop", "rgb"], "hover_gap_mm": 0.01,
+     "skipped": [{"effect": "glass", "why": "no glass"}]},
+    {"scene_id": 1, "category": "mug", "effects": ["drop"], "hover_gap_mm": -0.0,
+     "skipped": [{"effect": "glass", "why": "no glass"}, {"effect": "rgb", "why": "off"}]},
+    {"scene_id": 3, "category": "box", "effects": ["drop", "rgb"], "hover_gap_mm": 0.001,
+     "skipped": [{"effect": "glass", "why": "not asked"}]},
+]  # fmt: skip
+FILES = [{"bytes": 100, "path": "a", "sha256": "0"}, {"bytes": 50, "path": "b", "sha256": "0"}]
+VIEWS = [
+    {"role": "input", "visible_fraction": 0.5, "inclination_rad": math.radians(45), "d_z_m": 2.5, "files": FILES},
+    {"role": "mirror", "visible_fraction": 1.0, "inclination_rad": math.radians(40), "d_z_m": 2.5, "files": FILES[:1]},
+    {"role": "input", "visible_fraction": None, "inclination_rad": math.radians(47), "d_z_m": 2.1, "files": []},
+    {"role": "projected", "visible_fraction": None, "inclination_rad": 0.7, "d_z_m": 2.1, "files": FILES},
+]
+TIMINGS = [
+    {"stages": [{"name": "physics", "seconds": 1.5}], "effects": [{"name": "drop", "seconds": 1.0}], "total_s": 2.0},
+    {"stages": [{"name": "physics", "seconds": 0.5}, {"name": "render", "seconds": 4.0}], "total_s": 5.0,
+     "effects": [{"name": "drop", "seconds": 0.25}]},
+]  # fmt: skip
+FAILED = {"category": "mug", "kind": "intrinsic", "attempts": 1, "stage": "settle"}
+FAILURES = [
+    {"scene_id": 2, "reason": "left_table", "detail": "at 0.7 m", **FAILED},
+    {"scene_id": 5, "reason": "no_rest", "detail": "moved", **FAILED},
+    {"scene_id": 4, "reason": "left_table", "detail": "at 0.8 m", **FAILED},
+]
+ASSETS = [
+    {"instance_id": name, "category": category}
+    for name, category in map(str.split, ("a mug", "t table", "a mug", "b box"))
+]
+
+
+class Handmade:
+    """Tables of rows, in batches of one and of the rest."""
+
+    merged: tuple[str, ...] = ()
+    sampled = False
+
+    def __init__(self, **tables) -> None:
+        self.tables = tables
+
+    def batches(self, table, columns):
+        schema = pa.schema([SCHEMAS[table].field(name).with_nullable(True) for name in columns])
+        rows = [{name: row.get(name) for name in columns} for row in self.tables.get(table, [])]
+        yield from (pa.Table.from_pylist(part, schema) for part in (rows[:1], rows[1:]) if part)
+
+
+@pytest.fixture(scope="package")
+def figures():
+    return collect(Handmade(scenes=SCENES, views=VIEWS, timings=TIMINGS, failures=FAILURES, assets=ASSETS))

@@ -1,19 +1,36 @@
+"""Pictures, point clouds and meshes of stored scenes, and the parts of the page that show them."""
+
 import base64
 import io
+import json
+import re
 
+import cv2
 import numpy as np
+import pyarrow as pa
+import pytest
+import trimesh
 from PIL import Image
 
+from schemas.errors import CorruptError, MachineError
+from services.look import clouds as module
+from services.look.clouds import Body, Cloud, Space, coarsen, pack_space, read_space
 from services.look.pictures import (
     FIXED_REGIONS,
     MOST_WIDTH,
     OBJECT_REGIONS,
+    choose_scenes,
     depth_span,
     picture_of_colour,
     picture_of_depth,
     picture_of_projection,
     picture_of_regions,
+    read_pair,
+    show_scenes,
 )
+from services.look.sections import compare_html, sheets_html, space_html
+from services.read.dataset_reader import file_reader, find_scene
+from tests.services.look.conftest import HOSTILE, address, scene
 
 VIRIDIS_ENDS = ((253, 231, 37), (68, 1, 84))
 """The last and the first colour of viridis, as its authors published them."""
@@ -25,53 +42,167 @@ def decoded(picture) -> np.ndarray:
     return np.asarray(image.convert("RGB")).astype(int)
 
 
-def test_near_is_the_bright_end_of_viridis_far_the_dark_one_and_no_depth_is_black():
-    depth = np.zeros((48, 96))
-    depth[:, 32:64], depth[:, 64:] = 1.0, 3.0
+def test_depth_is_bright_to_dark_viridis_regions_have_their_colours_and_what_is_projected_is_bright():
+    depth = np.repeat([0.0, 1.0, 3.0], 32)[None].repeat(48, axis=0)
     shown = decoded(picture_of_depth(depth, (1.0, 3.0), "depth"))
     for column, color in ((8, (0, 0, 0)), (48, VIRIDIS_ENDS[0]), (88, VIRIDIS_ENDS[1])):
         assert np.abs(shown[24, column] - color).max() <= 6  # JPEG
+    regions = np.repeat(np.arange(6, dtype=np.uint8), 4)[None].repeat(4, axis=0)
+    shown = decoded(picture_of_regions(regions, "regions"))
+    assert [tuple(shown[0, 4 * i]) for i in range(6)] == [*FIXED_REGIONS, *OBJECT_REGIONS[:3]]
+    mirror = np.full((32, 64, 3), 200, np.uint8)
+    projected = np.zeros_like(mirror)
+    projected[:, 32:] = (20, 180, 60)
+    shown = decoded(picture_of_projection(mirror, projected, "over"))
+    assert np.abs(shown[16, 8] - 70).max() <= 3 and np.abs(shown[16, 56] - (20, 180, 60)).max() <= 6
 
 
-def test_the_span_of_depth_leaves_out_what_is_unknown_and_rare():
-    depth = np.concatenate([np.zeros(50), np.linspace(1.0, 2.0, 1001)])
-    low, high = depth_span(depth)
+def test_the_span_of_depth_leaves_out_what_is_unknown_and_rare_and_the_floor():
+    low, high = depth_span(np.concatenate([np.zeros(50), np.linspace(1.0, 2.0, 1001)]))
     assert (round(low, 2), round(high, 2)) == (1.01, 1.99)
     assert depth_span(np.zeros(4)) == (0.0, 0.0)
-
-
-def test_the_floor_takes_no_colours_from_what_stands_on_it():
     depth, regions = np.array([1.0, 1.5, 7.0, 7.5]), np.array([3, 2, 1, 1])
     low, high = depth_span(depth, regions)
     assert 1.0 <= low < high <= 1.5
     assert depth_span(depth, np.ones(4, int))[1] > 7.0
 
 
-def test_every_region_has_its_own_colour():
-    regions = np.repeat(np.arange(6, dtype=np.uint8), 4)[None].repeat(4, axis=0)
-    shown = decoded(picture_of_regions(regions, "regions"))
-    expected = [*FIXED_REGIONS, *OBJECT_REGIONS[:3]]
-    assert [tuple(shown[0, 4 * i]) for i in range(6)] == expected
-
-
-def test_what_was_projected_is_bright_over_the_dimmed_mirror_view():
-    mirror = np.full((32, 64, 3), 200, np.uint8)
-    projected = np.zeros_like(mirror)
-    projected[:, 32:] = (20, 180, 60)
-    shown = decoded(picture_of_projection(mirror, projected, "over"))
-    assert np.abs(shown[16, 8] - 70).max() <= 3
-    assert np.abs(shown[16, 56] - (20, 180, 60)).max() <= 6
-
-
-def test_a_large_image_is_shrunk_and_a_small_one_kept():
+def test_a_large_picture_is_shrunk_and_its_address_holds_its_bytes():
     large = picture_of_colour(np.zeros((960, 1280, 3), np.uint8), "large")
     assert (large.width, large.height) == (MOST_WIDTH, MOST_WIDTH * 3 // 4)
-    small = picture_of_colour(np.zeros((12, 16, 3), np.uint8), "small")
-    assert (small.width, small.height) == (16, 12)
-
-
-def test_the_address_holds_the_bytes_and_the_name_follows_from_them():
     picture = picture_of_colour(np.zeros((12, 16, 3), np.uint8), "small")
+    assert (picture.width, picture.height) == (16, 12)
     kind, _, data = picture.inline.partition(",")
     assert kind == "data:image/jpeg;base64" and base64.b64decode(data) == picture.data
-    assert picture.name != picture_of_colour(np.ones((12, 16, 3), np.uint8) * 9, "small").name
+    assert picture.name != picture_of_colour(np.full((12, 16, 3), 9, np.uint8), "small").name
+
+
+def test_the_images_of_a_pair_are_those_in_its_files(shown):
+    stored = find_scene(shown, 1)
+    (views, _), folder = next(stored.pairs(1)), shown.root / stored.scene(1)["category"]
+    images = read_pair(file_reader(shown.read, stored), views)
+    assert len(images) == 8 and not any(role == "aligned" for role, _ in images)
+    for key, name in ((("input", "depth"), "depth00002"), (("mirror", "depth"), "depth00003")):
+        assert np.array_equal(images[key], cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED))
+    projected = cv2.imread(str(folder / "RGBprojected00002.png"))[..., ::-1]
+    assert np.array_equal(images["projected", "rgb"], projected)
+    with pytest.raises(CorruptError, match=r"box/RGB00002\.png is not a PNG"):
+        read_pair(lambda path: b"no PNG", views)
+
+
+class Rows:
+    """Scenes in two batches."""
+
+    def __init__(self, categories: list[str]) -> None:
+        self.rows = pa.table({"scene_id": range(10, 10 + len(categories)), "category": categories})
+
+    def batches(self, table, columns):
+        half = self.rows.num_rows // 2
+        yield from (self.rows.slice(0, half), self.rows.slice(half))
+
+
+def test_each_category_has_as_many_scenes_evenly_over_its_ids_and_at_least_one():
+    chosen = choose_scenes(Rows(["mug", "box"] * 50), {"box": 50, "mug": 50}, 4)
+    assert chosen == [10 + 2 * 12 + 1, 10 + 2 * 37 + 1, 10 + 2 * 12, 10 + 2 * 37]
+    rare, names = {"box": 1, "mug": 30}, ["mug"] * 30 + ["box"]
+    assert len(chosen := choose_scenes(Rows(names), rare, 6)) == 6 and 40 in chosen
+    assert len(choose_scenes(Rows(names), rare, 1)) == 2 and choose_scenes(Rows([]), {}, 4) == []
+
+
+def test_a_scene_has_its_pictures_and_depth_is_counted_of_objects_alone(shown):
+    sample = show_scenes(shown, [0, 3])
+    assert [scene.scene_id for scene in sample.scenes] == [0, 3]
+    first = sample.scenes[0]
+    roles = {f"{role} {kind}" for role in ("input", "mirror") for kind in ("rgb", "depth", "mask")}
+    assert set(first.pictures) == roles | {"over"} and all(picture.data for picture in first.pictures.values())
+    assert 0.0 < first.visible["input"] <= 1.0 and 1.9 < first.d_z_m < 3.0
+    depth = show_scenes(shown, [0]).depth
+    assert 0 < depth["input"].count < 160 * 120 / 10 and np.isfinite(depth["mirror"].mean)
+    assert abs(depth["input"].percentile(0.02) - first.d_z_m) < 0.05
+
+
+def test_sheets_and_the_slider_show_each_scene_that_has_the_pictures_and_no_markup_of_theirs():
+    html = sheets_html([scene(3, "box"), scene(7, "mug")], address)
+    assert re.findall(r'data-show="([^"]*)"', html) == ["", "box", "mug"]
+    assert re.findall(r'data-name="([^"]*)"', html) == ["input rgb", "mirror rgb", "over"] * 2
+    assert html.count('src="/picture/') == 6 and "2 objects" in html
+    assert "98% visible in the input view, d_z 2.346 m" in html
+    assert "data-show" not in sheets_html([scene(3, "box")], address)
+    assert "no scenes to show" in sheets_html([], address)
+    html = compare_html([scene(3, "box"), scene(7, "mug", ("input rgb",))])
+    assert re.findall(r'<option value="(\d+)"', html) == ["3"] and 'type="range"' in html
+    assert compare_html([scene(7, "mug", ("input rgb",))]) == ""
+    hostile = [scene(3, HOSTILE), scene(4, "mug")]
+    assert "<script" not in sheets_html(hostile, address) + compare_html(hostile)
+
+
+# ---------------------------------------------------------------------------------------------- in space
+
+
+@pytest.fixture(scope="module")
+def space(shown):
+    return read_space(shown, 1)
+
+
+def test_the_clouds_lie_on_the_mesh_as_a_ray_caster_finds_it_on_both_sides_of_the_object(space):
+    assert [cloud.role for cloud in space.clouds] == ["input", "mirror"]
+    assert {body.kind for body in space.bodies} == {"object", "table"}
+    mesh = trimesh.util.concatenate([trimesh.Trimesh(one.vertices, one.faces, process=False) for one in space.bodies])
+    for cloud in space.clouds:
+        above = cloud.points[cloud.points[:, 2] > 0.3]  # table and object: the floor has no mesh
+        eye = cloud.T_world_cam[:3, 3]
+        rays = above - eye
+        far = np.linalg.norm(rays, axis=1)
+        places = np.tile(eye, (len(rays), 1))
+        hit, of, _ = mesh.ray.intersects_location(places, rays / far[:, None], multiple_hits=False)
+        found = np.full(len(rays), np.inf)
+        found[of] = np.linalg.norm(hit - eye, axis=1)
+        assert len(above) > 500 and np.quantile(np.abs(found - far), 0.97) < 0.002
+        assert np.linalg.norm(cloud.points - space.target, axis=1).min() < 0.15
+    eyes = [cloud.T_world_cam[:2, 3] - space.target[:2] for cloud in space.clouds]
+    assert eyes[0] @ eyes[1] < 0
+
+
+def test_of_too_many_points_those_of_objects_stay_and_a_mesh_of_too_many_faces_keeps_its_shape(
+    shown, space, monkeypatch
+):
+    (vertices,) = [body.vertices for body in space.bodies if body.kind == "object"]
+    monkeypatch.setattr(module, "MOST_POINTS", 500)
+    whole, thin = space.clouds[0].points, read_space(shown, 1).clouds[0].points
+    low, high = vertices.min(axis=0) + np.array([0, 0, 0.01]), vertices.max(axis=0) + 0.005
+    of_object = [((points > low) & (points < high)).all(axis=1).sum() for points in (whole, thin)]
+    assert len(thin) <= 500 < len(whole) and of_object[0] == of_object[1] > 10
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
+    monkeypatch.setattr(module, "MOST_FACES", 2_000)
+    monkeypatch.setattr(module, "GRID_STEPS", 30)
+    coarse = coarsen(Body("object", ball.vertices, ball.faces))
+    assert 0 < len(coarse.faces) < len(ball.faces) / 2
+    assert np.abs(np.linalg.norm(coarse.vertices, axis=1) - 0.1).max() < 0.2 / 30
+
+
+def test_what_is_packed_is_what_is_shown(space):
+    def numbers(text: str, kind: str) -> np.ndarray:
+        return np.frombuffer(base64.b64decode(text), kind).reshape(-1, 3)
+
+    packed = json.loads(pack_space(space))
+    cloud = packed["clouds"][1]
+    points = numbers(cloud["points"], "<i2") * packed["quantum"] + packed["target"]
+    assert np.abs(points - space.clouds[1].points).max() < 1.1e-4
+    assert np.array_equal(numbers(cloud["colors"], "u1"), space.clouds[1].colors)
+    assert np.array_equal(numbers(packed["bodies"][0]["faces"], "<u4"), space.bodies[0].faces)
+
+
+def test_the_view_in_space_has_a_switch_for_each_part_and_says_why_there_is_no_mesh(shown, monkeypatch):
+    def gone(*_):
+        raise MachineError("the files of the asset <folders> do not hold what they held")
+
+    monkeypatch.setattr(module, "scene_glb", gone)
+    found = read_space(shown, 1)
+    assert len(found.clouds) == 2 and found.bodies == () and "asset <folders>" in found.missing
+    cloud = Cloud("input", np.zeros((1, 3)), np.zeros((1, 3), np.uint8), 0.01, np.eye(4))
+    body = Body("object", np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    for bodies, missing, parts in (((), found.missing, []), ((body,), "", ["mesh"])):
+        html = space_html(Space(3, "box", np.zeros(3), (cloud,), bodies, missing), "{}")
+        assert re.findall(r'data-part="(\w+)"', html) == ["input", *parts, "cameras", "tint"]
+        assert ("There is no mesh: the files of the asset &lt;folders&gt;" in html) == (not bodies)
+    assert space_html(None, "") == ""

@@ -1,0 +1,212 @@
+"""Figures against tables made by hand, where each can be counted, and the sections of the page that show them."""
+
+import re
+import shutil
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pytest
+
+from schemas.dataset.layout import SUCCESS_FILE
+from schemas.job.job import Job
+from services.look import collect as module
+from services.look.charts import FINE, HEIGHT, Chart, Histogram, Window, amount, chart_html, length_of_decade, window_of
+from services.look.collect import CaptureQuality, Cost, Failure, choose_spread, collect, open_tables
+from services.look.pictures import Sample
+from services.look.sections import beside_html, captures_html, charts_html, effects_html, failures_html, overview_html
+from tests.made_up_scenes import attempt_at
+from tests.services.look.conftest import HOSTILE, Handmade, address, scene
+from workers.store.local import LocalStore
+
+
+def test_tables_made_by_hand_give_the_figures_that_can_be_counted(figures):
+    assert (figures.scenes, figures.by_category) == (3, {"box": 1, "mug": 2})
+    assert (figures.views, figures.pairs, figures.files, figures.bytes) == (4, 2, 5, 400)
+    assert (figures.instances, figures.seconds, figures.sampled) == (2, 7.0, False)
+    drop, rgb, glass = (figures.effects[name] for name in ("drop", "rgb", "glass"))
+    assert (drop.runs, drop.seconds, drop.timed, drop.skips) == (3, 1.25, 2, {})
+    assert (rgb.runs, rgb.timed, dict(rgb.skips)) == (2, 0, {"off": 1})
+    assert (glass.runs, dict(glass.skips)) == (0, {"no glass": 2, "not asked": 1})
+    assert next(iter(figures.effects)) == "drop" and list(figures.stages) == ["render", "physics"]
+    assert (figures.stages["physics"].seconds, figures.stages["physics"].timed) == (2.0, 2)
+    assert figures.visibility["input"].count == 1 and figures.visibility["input"].least == 0.5
+    assert figures.visibility["mirror"].most == 1.0
+    assert figures.inclination["input"].mean == pytest.approx(46.0)
+    assert figures.distance.count == 2 and figures.distance.mean == pytest.approx(2.3)
+    assert (figures.gap.count, figures.gap.least, figures.gap.most) == (3, -6.0, pytest.approx(-2.0))  # 0 is 1 nm
+    first, second = figures.failures
+    assert (first.reason, first.scenes, first.examples, first.detail) == ("left_table", 2, (2, 4), "at 0.7 m")
+    assert (second.reason, second.scenes) == ("no_rest", 1)
+    none = collect(Handmade())
+    assert (none.scenes, none.views, none.failures, none.captures) == (0, 0, (), [])
+
+
+def test_captures_have_their_quality():
+    capture = {
+        "name": "shots/mug", "estimate": "joint", "views": 22, "markers": 35, "reprojection_px": 0.21,
+        "left_out": [{"number": 3, "status": "blurred", "why": "x"}], "pose_mm": 0.4, "cloud_median_mm": None,
+        "completeness": 0.98, "measured_share": 0.9, "depth_offset_m": 0.0, "depth_scale": 1.0, "print_scale": 1.0,
+        "identified": [], "depth_corrected": False, "undistorted": False, "converged": True, "iterations": 3,
+        "cloud_points": 7, "notes": [],
+    }  # fmt: skip
+    scenes = [{"scene_id": 7, "category": "mug", "effects": [], "skipped": [], "capture": capture}]
+    figures = collect(Handmade(scenes=scenes))
+    (one,) = figures.captures
+    assert (one.name, one.views, one.left_out, one.pose_mm, one.cloud_median_mm) == ("shots/mug", 22, 1, 0.4, None)
+    assert figures.gap.count == 0
+    html = captures_html(figures)
+    assert all(words in html for words in ("0.21 px", "0.4 mm", "98 %", "1 left out", "<td>–</td>"))
+    assert captures_html(collect(Handmade())) == ""
+
+
+COLUMNS = {"views": ("pose_id", "role", "category", "visible_fraction"), "scenes": ("scene_id", "category", "skipped")}
+
+
+def rows_of(tables, name: str) -> list[dict]:
+    parts = list(tables.batches(name, COLUMNS[name]))
+    assert all(part.column_names == list(COLUMNS[name]) for part in parts)
+    return sorted((row for part in parts for row in part.to_pylist()), key=lambda row: tuple(map(str, row.values())))
+
+
+def test_a_finished_and_an_unfinished_dataset_give_the_rows_that_pyarrow_reads_and_no_more_columns(shown, tmp_path):
+    shutil.copytree(shown.root, tmp_path / "copy")
+    (tmp_path / "copy" / SUCCESS_FILE).unlink()
+    for name, columns in COLUMNS.items():
+        read = ds.dataset(f"{shown.root}/manifest/{name}", partitioning="hive").to_table(columns=list(columns))
+        expected = sorted(read.to_pylist(), key=lambda row: tuple(map(str, row.values())))
+        assert (
+            rows_of(open_tables(shown), name) == rows_of(open_tables(LocalStore(tmp_path / "copy")), name) == expected
+        )
+    assert list(open_tables(LocalStore(tmp_path / "none")).batches("scenes", ("scene_id",))) == []
+    rows = next(open_tables(shown).batches("views", ("files",)))
+    assert [field.name for field in rows.schema.field("files").type.value_type] == ["bytes"]
+    rows = next(open_tables(shown).batches("scenes", ("scene_id", "capture")))
+    assert rows.column("capture").null_count == rows.num_rows > 0
+    assert pa.types.is_struct(rows.schema.field("capture").type)
+
+
+def test_of_many_ranges_that_are_not_merged_some_are_read_evenly(tmp_path, monkeypatch, unflushed):
+    store = LocalStore(tmp_path)
+    store.prepare()
+    for start in range(0, 24, 2):
+        attempt_at(store, start, start + 2).commit()
+    monkeypatch.setattr(module, "MOST_RANGES", 3)
+    tables = open_tables(store)
+    assert tables.sampled and [start for start, _ in tables.ranges] == [0, 12, 22]
+    assert {row["scene_id"] // 2 * 2 for row in rows_of(tables, "scenes")} == {0, 12, 22}
+    assert [choose_spread(range(10), 4), choose_spread(range(9), 1)] == [[0, 3, 6, 9], [0]]  # with both ends
+
+
+# ---------------------------------------------------------------------------------------------- histograms
+
+
+def values_of(seed: int = 3, count: int = 5_000) -> np.ndarray:
+    return np.random.default_rng(seed).normal(2.4, 0.2, count)
+
+
+def test_counts_and_percentiles_are_those_of_numpy_whatever_the_batches():
+    values, histogram = values_of(), Histogram(0.0, 9.6)
+    for part in np.array_split(values, 7):
+        histogram = histogram.add(part)
+    expected, _ = np.histogram(values, FINE, (0.0, 9.6))
+    assert histogram.counts.tolist() == expected.tolist()
+    assert histogram.mean == pytest.approx(values.mean())
+    for share in (0.05, 0.5, 0.95):
+        assert histogram.percentile(share) == pytest.approx(np.quantile(values, share), abs=9.6 / FINE)
+    assert Histogram(0.0, 1.0).add([0.2, 1.0, 1.0, 1.0]).percentile(0.5) == 1.0  # told as it is, not as its step
+    assert Histogram(0.0, 1.0).add([0.25]).percentile(0.5) == 0.25
+    ends = Histogram(0.0, 1.0).add([np.nan, -5.0, 7.0])
+    assert ends.count == 2 and ends.counts[[0, -1]].tolist() == [1, 1]
+    assert np.isnan(Histogram(0.0, 1.0).percentile(0.5)) and np.isnan(Histogram(0.0, 1.0).mean)
+
+
+def test_the_bars_of_a_window_hold_every_value_of_all_histograms():
+    lower = values_of(4, 100) - 1.1
+    some, others = Histogram(0.0, 9.6).add(values_of()), Histogram(0.0, 9.6).add(lower)
+    window = window_of([some, others], 40)
+    assert some.bars(window).sum() == 5_000 and others.bars(window).sum() == 100
+    assert 20 <= window.number <= 40
+    assert some.edge(window, 0) <= lower.min() < values_of().max() <= some.edge(window, window.number)
+    assert Histogram(0.0, 1.0).add([1.0]).bars(Window(FINE - 3, 5, 1)).tolist() == [1]  # ends past the range
+    assert Histogram(0.0, 1.0).bars(window_of([Histogram(0.0, 1.0)], 40)).tolist() == [0] * 40
+    for value in (0.0, 0.5, 1.0):  # all equal: one bar with room beside it
+        histogram = Histogram(0.0, 1.0).add([value] * 9)
+        window = window_of([histogram], 40)
+        bars = histogram.bars(window).tolist()
+        assert sorted(bars)[-2:] == [0, 9] and len(bars) >= 24
+        assert histogram.edge(window, window.number) - histogram.edge(window, 0) == pytest.approx(0.1, abs=0.01)
+
+
+def test_bars_are_as_high_as_their_counts_and_told_in_words():
+    def chart(**series) -> str:
+        shown = {name: Histogram(0.0, 9.6).add(values) for name, values in series.items()}
+        return chart_html(Chart("Depth", shown, "Of pixels.", lambda value: amount(value, "m")))
+
+    html = chart(input=np.repeat([1.0, 2.0, 4.0], [10, 5, 20]))
+    heights = [float(height) for height in re.findall(r'height="([\d.]+)"><title>', html)]
+    assert [height / max(heights) for height in heights] == pytest.approx([0.5, 0.25, 1.0], abs=0.005)
+    assert max(heights) < HEIGHT and re.findall(r": (\d+)</title>", html) == ["10", "5", "20"]
+    html = chart(input=np.linspace(1.0, 3.0, 2001))
+    assert 'aria-label="Depth. input: median 2' in html and "n = 2,001" in html
+    html = chart(input=[1.0, 1.1], mirror=[5.0])  # the second is a line over the same axis
+    first, _, last = re.findall(r"<span>([\d.]+) m</span>", html)
+    assert html.count('<path class="line"') == 1 and float(first) <= 1.0 and float(last) >= 5.0
+    assert chart(input=[]) == ""
+    lengths = {-6.0: "1 nm", -4.5: "31.6 nm", -3.0: "1 µm", -2.0: "10 µm", 0.0: "1 mm", 3.0: "1 m"}
+    assert {decade: length_of_decade(decade) for decade in lengths} == lengths
+    assert (amount(45.678, "°"), amount(0.5, "%")) == ("45.7°", "0.5 %")
+
+
+# ---------------------------------------------------------------------------------------------- sections
+
+
+def test_sections_say_what_was_asked_made_left_out_and_failed(figures):
+    job = Job(name="small", seed=1, scenes=1200)
+    html = overview_html(figures, job, 3)
+    assert "<dd>3<small>of 1,200 asked</small>" in html and "<dd>3<small>50 % of those tried</small>" in html
+    assert "different ones in 2 categories" in html and "chosen evenly" not in html
+    assert "chosen evenly" in overview_html(replace(figures, sampled=True), job, 0)
+    html = effects_html(figures)
+    assert re.search("<code>drop</code></th><td>3<small>100%</small></td><td>1.[23] s</td><td>625 ms</td>", html)
+    assert "1 effect that ran in no scene" in html and "<dd>no glass; not asked</dd>" in html
+    assert "left out 1 ×: off" in html
+    skips = Counter({"it stands": 5, "it is flat": 2, "off": 1})
+    html = effects_html(replace(figures, effects={"floor": Cost(3), "tip": Cost(2, 1.0, 2, skips)}))
+    assert "counted with its stage: <code>floor</code>." in html and html.count("<code>floor") == 1
+    assert "left out 5 ×: it stands, 2 more reasons" in html
+    html = failures_html(figures.failures, 9)
+    assert "left table" in html and "at 0.7 m" in html and "scenes 2, 4" in html
+    assert failures_html((), 9) == '<p class="empty">No scene failed of 9.</p>'
+    html = charts_html(figures, {"input": Histogram(0.0, 9.6)})
+    titles = ["Distance to the object", "Visibility", "Inclination", "Resting gap"]  # no depth: it has no values
+    assert re.findall("<h3>(.*?)</h3>", html) == titles
+
+
+def test_what_comes_from_the_dataset_is_text_and_never_markup(figures):
+    failure = Failure(HOSTILE, "intrinsic", HOSTILE, 1, (1,), HOSTILE)
+    skips = Counter({HOSTILE: 1})
+    hostile = replace(
+        figures,
+        by_category=skips,
+        effects={HOSTILE: Cost(1, 0.0, 0, skips), f"{HOSTILE}2": Cost(0, 0.0, 0, skips)},
+        stages={HOSTILE: Cost(1, 1.0, 1)},
+        captures=(CaptureQuality(0, HOSTILE, HOSTILE, 3, 1, HOSTILE, 0.2, None, None, None, None),),
+    )
+    overview = overview_html(hostile, Job(name="small", seed=1, scenes=3), 0)
+    for part in (overview, effects_html(hostile), failures_html([failure], 1), captures_html(hostile)):
+        assert "<script" not in part and "&lt;script&gt;" in part
+
+
+def test_two_datasets_have_their_figures_in_one_table_and_a_scene_of_each_category_of_both(figures):
+    depth = {"input": Histogram(0.0, 9.6).add([2.4]), "mirror": Histogram(0.0, 9.6)}
+    ours = ("scenes", figures, Sample((scene(3, "box"),), depth))
+    theirs = ("<i>captures", collect(Handmade()), Sample((scene(4, "box"), scene(5, "mug")), {}))
+    html = beside_html(ours, theirs, address)
+    assert re.search(r"scenes</th><td>3</td><td>0</td>", html)
+    assert re.search(r"depth of the objects, input</th><td>2.4 m</td><td>–</td>", html)
+    assert re.search(r"time of a scene, mean</th><td>2,330 ms</td>", html)
+    assert html.count('class="pair"') == 1 and re.findall(r"scene (\d+)</span>", html) == ["3", "4"]
+    assert "Only in &lt;i&gt;captures: mug." in html and html.count("Only in") == 1 and "<i>" not in html
