@@ -112,6 +112,7 @@ def test_a_scene_in_memory_is_the_stored_one(files, tmp_path):
         make_scene(overlaid(KEYS, {"cameras": {"sensor": {"fx": 90_000.0, "fy": 90_000.0}}}), 0)
 
 
+@pytest.mark.minute
 def test_neither_ray_nor_a_renderer_is_loaded_to_read():
     code = (
         "import sys; import services.dataset.dataset; loaded = set(sys.modules) & {'ray', 'pybullet', 'OpenGL', 'duckdb'};"

@@ -183,6 +183,7 @@ def held(group: Group, *moved_m: tuple[float, float, float]) -> Held | None:
     return hold_scene(scene_of(group.starts, group.table), settled, PHYSICS)
 
 
+@pytest.mark.minute
 def test_what_rests_stays_to_some_micrometres_and_what_does_not_falls():
     pytest.importorskip("mujoco")
     cubes = stack(cube(0.05), cube(0.05))
