@@ -18,7 +18,7 @@ from trimesh.visual.material import PBRMaterial
 from schemas.job.assets import CATEGORIES, MeshLimits, ProceduralSource
 from schemas.scene.shape import Material, Part, Shape
 from tests.kit.shapes import asset_of
-from tests.workers.assets.mutants import exported, png_of, textured_scene
+from tests.workers.assets.mutants import exported, png_of
 from tests.workers.assets.oracles import (
     CUBE,
     gltf,
@@ -61,18 +61,6 @@ def test_every_format_gives_the_same_geometry(tmp_path):
         shape = load(tmp_path / f"ball.{suffix}", max_faces=len(mesh.faces)).shape
         assert is_solid(shape.vertices, shape.faces) and len(shape.faces) == len(mesh.faces), suffix
         assert welded(shape).volume == pytest.approx(mesh.volume, rel=1e-5)
-
-
-def test_a_glb_and_a_gltf_of_one_scene_are_the_same_shape(tmp_path):
-    for name, data in trimesh.exchange.gltf.export_gltf(textured_scene()).items():
-        write(tmp_path / name, data)
-    ours = load(tmp_path / "model.gltf").shape.parts
-    theirs = load(write(tmp_path / "m.glb", exported(textured_scene(), "glb"))).shape.parts
-    assert len(ours) == 3
-    for one, two in zip(ours, theirs, strict=True):
-        assert np.array_equal(one.vertices, two.vertices) and np.array_equal(one.faces, two.faces)
-        assert np.array_equal(one.uv, two.uv) and np.array_equal(one.material.texture, two.material.texture)
-        assert one.material.texture is ours[0].material.texture, "shared"
 
 
 def test_every_geometry_of_a_scene_stands_where_its_node_puts_it_and_mirrored_ones_face_outwards(tmp_path):
