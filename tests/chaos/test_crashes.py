@@ -1,74 +1,84 @@
-"""A crash at every step of a run on a disk, with every legal loss of what was not flushed: the next run finishes.
+"""A run that ends anywhere, and the next one, which finishes: a crash of a disk, or a request to an object store cut.
 
-Each point is a step of a recorded run and a kind of loss. Points that leave equal files are made once.
+On a disk each point is a step of a recorded run with a legal loss of what was not flushed; points that leave equal files are
+made once. In a store it is a request before which the process is killed, or whose answer never comes.
 """
 
+import gc
 import random
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import obstore
 import pytest
+from obstore.store import MemoryStore
 
+from schemas.dataset.layout import staging_path
 from schemas.errors import VersoError
 from tests.kit.crash_states import Disk, losses, recorded, write_tree
+from tests.kit.faults import Fault, Killed, requests
 from tests.kit.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module
 from workers.store.local import LocalStore
+from workers.store.objects import ObjectStore
+from workers.store.store import Store
 
 MIXTURES = 3
 POINTS = {"default": 4, "ci": 60}
-"""Points of each program in each scope; with --all, all."""
+REQUEST_POINTS = {"default": 3, "ci": 30}
+"""Points of each program (and fault) in each scope; with --all, all."""
 
 
-def nothing(root: Path) -> None:
-    """A run begins in an empty folder."""
+def nothing(store: Store, layout: str) -> None:
+    """A run begins in an empty place."""
 
 
-def smaller(root: Path) -> None:
+def smaller(store: Store, layout: str) -> None:
     """A finished dataset that is to be extended."""
-    make_dataset(LocalStore(root), stop=STOP - 1)
+    make_dataset(store, layout, stop=STOP - 1)
 
 
-def fails_once(scene_id: int):
-    return failed_scene(scene_id, "environmental") if scene_id == FIRST else small_scene(scene_id)
-
-
-def with_a_failure(root: Path) -> None:
+def with_a_failure(store: Store, layout: str) -> None:
     """A merged dataset with a scene to try again."""
-    make_dataset(LocalStore(root), make=fails_once)
+
+    def fails_once(scene_id: int):
+        return failed_scene(scene_id, "environmental") if scene_id == FIRST else small_scene(scene_id)
+
+    make_dataset(store, layout, make=fails_once)
 
 
-def littered(root: Path) -> None:
-    """Ranges committed and not published, a loser, a fenced attempt, a temporary file, and an attempt that ended half way."""
-    store = LocalStore(root)
+def littered(store: Store, layout: str) -> None:
+    """Ranges committed and not published, a loser, a fenced attempt, one that ended half way, and a temporary file."""
     store.prepare()
-    settings = settings_of("files")
+    settings = settings_of(layout)
     loser = attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene)
     fenced = attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempt_module, "publish", lambda *_: None)
         assert attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene).commit().won
-    store.revoke(f"_staging/{FIRST:010d}/{fenced.name}")
+    store.revoke(staging_path(FIRST, fenced.name))
     attempt_at(store, FIRST + RANGE, STOP, settings, small_scene)
-    store.put("_staging/_tmp/.dead", b"x")
-    assert store.size(f"_staging/{FIRST:010d}/{loser.name}/_current") is not None
+    if store.root is not None:
+        store.put("_staging/_tmp/.dead", b"x")
+        assert store.size(f"{staging_path(FIRST, loser.name)}/_current") is not None
 
 
 @dataclass(frozen=True)
 class Program:
     """A run from what `before` left, on a file system where one syncfs is trusted or each file is flushed."""
 
-    before: Callable[[Path], None]
+    before: Callable[[Store, str], None]
     layout: str = "files"
     retry: bool = False
     by_syncfs: bool = True
 
-    def __call__(self, root: Path) -> str:
-        return make_dataset(LocalStore(root), self.layout, retry=self.retry).digest
+    def __call__(self, store: Store) -> str:
+        return make_dataset(store, self.layout, retry=self.retry).digest
 
 
 PROGRAMS = {
@@ -78,6 +88,12 @@ PROGRAMS = {
     "extension": Program(smaller),
     "retry": Program(with_a_failure, retry=True),
     "sweep": Program(littered),
+}
+REQUESTED = {
+    "a run": Program(nothing, "tar"),
+    "an extension": Program(smaller, "tar"),
+    "a retry": Program(with_a_failure, "tar", retry=True),
+    "a sweep": Program(littered, "tar"),
 }
 
 
@@ -95,10 +111,10 @@ def crash_points(
     program: Program, place: Path, share: float, chance: random.Random
 ) -> Iterator[tuple[str, dict[str, bytes | None]]]:
     """A share of a program's points, each as the name of its step and loss and what the crash leaves."""
-    program.before(place)
+    program.before(LocalStore(place), program.layout)
     disk = Disk(place)
     with recorded(place, program.by_syncfs) as steps:
-        program(place)
+        program(LocalStore(place))
     for number, step in enumerate([*steps, ("nothing",)]):
         for loss in losses(MIXTURES):
             if chance.random() < share or number == len(steps):
@@ -113,7 +129,7 @@ def wrong_after(program: Program, root: Path, digest: str, files: dict[str, str]
         return f"_SUCCESS is there, and these are not whole: {broken}"
     try:
         with nothing_flushed():
-            made = program(root)
+            made = program(LocalStore(root))
     except VersoError as error:
         return f"the next run ends with: {error}"
     if made != digest:
@@ -157,3 +173,53 @@ def test_a_finished_dataset_loses_nothing_in_a_crash(name, tmp_path):
     assert len(points) == len(losses(MIXTURES))
     for where, left in points:
         assert {path: data for path, data in left.items() if path in whole} == whole, where
+
+
+# ------------------------------------------------------------------------------------------------ an object store
+
+
+@pytest.fixture
+def killed_files_are_closed():
+    """What a killed process had open is closed without a warning, as the kernel does."""
+    yield
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        gc.collect()
+
+
+def copy_of(held: MemoryStore) -> ObjectStore:
+    copied = MemoryStore()
+    for meta in obstore.list(held).collect():
+        obstore.put(copied, meta["path"], bytes(obstore.get(held, meta["path"]).bytes()))
+    return ObjectStore(copied, "memory://")
+
+
+def keys_of(store: ObjectStore) -> set[str]:
+    return {entry.key for entry in store.files("")}
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.usefixtures("unflushed", "killed_files_are_closed")
+@pytest.mark.parametrize("fault", ["killed before", "answer lost"])
+@pytest.mark.parametrize("name", REQUESTED)
+def test_ended_at_a_request_and_started_again_it_makes_the_same_dataset(name, fault: Fault, tmp_path, request):
+    program = REQUESTED[name]
+    held = MemoryStore()
+    program.before(ObjectStore(held, "memory://"), "tar")
+    whole = copy_of(held)
+    with requests() as counted:
+        assert program(whole) == (digest := make_dataset(LocalStore(tmp_path), "tar").digest)
+    wanted = REQUEST_POINTS.get(request.config.getoption("--scope"))
+    points = range(counted.count) if wanted is None else random.Random(name).sample(range(counted.count), wanted)
+    ended = 0
+    for at in points:
+        store = copy_of(held)
+        with requests(at, fault):
+            try:
+                program(store)  # a decision or a removal without an answer is made again
+            except (Killed, VersoError):
+                ended += 1
+        assert program(store) == digest, f"request {at}"
+        assert keys_of(store) == keys_of(whole), f"request {at}"
+    print(f"{name}, {fault}: {len(points)} of {counted.count} points, {ended} ended there")
+    assert ended == len(points) or fault == "answer lost"

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -46,44 +47,34 @@ def line_of(run: EndedRun) -> str:
     return lines[0].strip("\x1b[0m ")
 
 
-@pytest.mark.parametrize(
-    ("title", "words"),
-    [
-        ("ray::DashboardAgent", "the run ended without a word (exit code 1), as it does where Ray is lost"),
-        pytest.param("ray::RuntimeEnvAgent", "as it does where Ray is lost", marks=pytest.mark.slow),
-        pytest.param("raylet/raylet", "as it does where Ray is lost", marks=pytest.mark.slow),
-        pytest.param("gcs/gcs_server", "as it does where Ray is lost", marks=pytest.mark.slow),
-    ],
-)
-def test_losing_a_process_of_rays_is_one_line(tmp_path, folder, title, words):
-    run = disturbed(tmp_path, kill_processes(title, signal.SIGKILL))
-    line = line_of(run)
-    assert line.startswith("verso: ")
-    assert words in line
-    assert KEPT in line
-    assert list(folder.iterdir()) == []
+def signal_to(number: signal.Signals, link: int) -> Callable[[int, int], None]:
+    """Sends a signal to the command (0), its keeper (1) or its driver (2)."""
+    return lambda pid, terminal: os.kill(chain_of(pid)[link], number)
+
+
+LOST = "the run ended without a word (exit code 1), as it does where Ray is lost"
+WAYS = {
+    "an agent of Ray": (kill_processes("ray::DashboardAgent", signal.SIGKILL), LOST),
+    "SIGTERM": (signal_to(signal.SIGTERM, 0), "stopped by SIGTERM"),
+    "another agent": (kill_processes("ray::RuntimeEnvAgent", signal.SIGKILL), "as it does where Ray is lost"),
+    "the raylet": (kill_processes("raylet/raylet", signal.SIGKILL), "as it does where Ray is lost"),
+    "the GCS": (kill_processes("gcs/gcs_server", signal.SIGKILL), "as it does where Ray is lost"),
+    "SIGHUP": (signal_to(signal.SIGHUP, 0), "stopped by SIGHUP"),
+    "SIGQUIT": (signal_to(signal.SIGQUIT, 0), "stopped by SIGQUIT"),
+    "SIGKILL of the driver": (signal_to(signal.SIGKILL, 2), "was killed (SIGKILL)"),
+    "SIGTERM of the driver": (signal_to(signal.SIGTERM, 2), ""),
+    "SIGABRT of the driver": (signal_to(signal.SIGABRT, 2), "crashed"),
+}
+"""How a run loses a process or gets a signal, and what it says then; all but the first two are slow."""
 
 
 @pytest.mark.parametrize(
-    "number",
-    [signal.SIGTERM, *(pytest.param(other, marks=pytest.mark.slow) for other in (signal.SIGHUP, signal.SIGQUIT))],
+    "way", [*list(WAYS)[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in list(WAYS)[2:])]
 )
-def test_a_signal_to_the_command_is_one_line(tmp_path, folder, number):
-    run = disturbed(tmp_path, lambda pid, terminal: os.kill(pid, number))
-    assert line_of(run) == f"verso: stopped by {number.name}; {KEPT}"
-    assert list(folder.iterdir()) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [(signal.SIGKILL, "was killed (SIGKILL)"), (signal.SIGTERM, "verso: "), (signal.SIGABRT, "crashed")],
-)
-def test_the_death_of_the_driver_is_one_line(tmp_path, folder, number, words):
-    run = disturbed(tmp_path, lambda pid, terminal: os.kill(chain_of(pid)[2], number))
-    line = line_of(run)
-    assert words in line
-    assert KEPT in line
+def test_a_lost_process_or_a_signal_is_one_line_and_leaves_nothing(tmp_path, folder, way):
+    disturb, words = WAYS[way]
+    line = line_of(disturbed(tmp_path, disturb))
+    assert line.startswith("verso: ") and words in line and KEPT in line
     assert list(folder.iterdir()) == []
 
 

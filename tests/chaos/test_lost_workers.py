@@ -22,7 +22,7 @@ from services.run.metrics import Tally
 from services.run.range_planner import plan_ranges
 from services.run.ray_cluster import Slots
 from services.run.worker_entry import WorkerTerms
-from tests.kit.faults import REQUESTS, check_published, requests, unflushed
+from tests.kit.faults import REQUESTS, check_published, requests
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.assets.catalogue import Catalogue
 from workers.store.attempt import Attempt, attempts_at, begin_attempt, sweep
@@ -34,13 +34,10 @@ from workers.store.objects import ObjectStore
 LABEL = "ours"
 TAR = terms(layout="tar", range_size=2)
 
-__all__ = ["unflushed"]
-
 WORKER = """
 import os, sys
 from schemas.dataset.commit import Span
 from schemas.errors import VersoError
-from tests.kit.faults import unflushed
 from tests.made_up_scenes import small_scene, terms
 from workers.store.attempt import begin_attempt
 from workers.store import file_system

@@ -11,14 +11,13 @@ import pytest
 
 from schemas.dataset.layout import commit_path
 from schemas.errors import MachineError, OutputError
-from tests.kit.faults import check_published, unflushed
+from tests.kit.faults import check_published
 from tests.kit.made_up_runs import FIRST, RANGE, make_dataset, settings_of
 from tests.kit.s3_server import FAULTS, Bucket, Fault, s3_server
 from tests.made_up_scenes import attempt_at, small_scene
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
-__all__ = ["unflushed"]
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 

@@ -2,7 +2,7 @@
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,13 +31,11 @@ class Place:
     again: Callable[[Store], Store]
     watch: Callable
 
-
-def on_disk(root: Path) -> Store:
-    return LocalStore(root)
-
-
-def in_bucket(root: Path) -> Store:
-    return ObjectStore(MemoryStore(), "memory://")
+    def prepared(self, root: Path) -> Store:
+        store = self.make(root)
+        with disk():
+            store.prepare()
+        return store
 
 
 def another_client(store: Store) -> Store:
@@ -46,9 +44,9 @@ def another_client(store: Store) -> Store:
 
 
 PLACES = {
-    "files": Place("files", on_disk, lambda store: LocalStore(store.name), disk),
-    "tars": Place("tar", on_disk, lambda store: LocalStore(store.name), disk),
-    "bucket": Place("tar", in_bucket, another_client, requests),
+    "files": Place("files", LocalStore, lambda store: LocalStore(store.name), disk),
+    "tars": Place("tar", LocalStore, lambda store: LocalStore(store.name), disk),
+    "bucket": Place("tar", lambda root: ObjectStore(MemoryStore(), "memory://"), another_client, requests),
 }
 
 
@@ -71,9 +69,7 @@ def work(store: Store, layout: str) -> None:
 
 
 def steps_of(place: Place, actor: Callable[[Store, str], None], root: Path) -> int:
-    store = place.make(root)
-    with nullcontext() if place.watch is requests else disk():
-        store.prepare()
+    store = place.prepared(root)
     with watched(place) as steps:
         actor(store, place.layout)
     return steps.count if place.watch is requests else steps.steps
@@ -95,23 +91,21 @@ def test_stopped_at_a_step_until_another_has_ended_it_replaces_nothing(
         expected = make_dataset(LocalStore(tmp_path / "once"), place.layout, stop).digest
     ended = 0
     for at in points:
-        store = place.make(tmp_path / str(at))
-        with nullcontext() if place.watch is requests else disk():
-            store.prepare()
+        store = place.prepared(tmp_path / str(at))
 
-            def take_over(store=store):
-                other = place.again(store)
-                with taken_over(other):
-                    return make_dataset(other, place.layout, stop)
+        def take_over(store=store):
+            other = place.again(store)
+            with taken_over(other):
+                return make_dataset(other, place.layout, stop)
 
-            with watched(place, at, take_over):
-                try:
-                    actor(store, place.layout)
-                except VersoError:
-                    ended += 1
+        with watched(place, at, take_over):
+            try:
+                actor(store, place.layout)
+            except VersoError:
+                ended += 1
         if store.root is not None:
             assert not broken_promises(store.root), f"step {at}"
-        with nullcontext() if place.watch is requests else disk():
+        with disk():
             assert make_dataset(place.again(store), place.layout, stop).digest == expected, f"step {at}"
             assert not list(store.files("_staging")), f"step {at}"
     print(f"{name}: stopped at {len(points)} of {total} steps, {ended} refused to go on")

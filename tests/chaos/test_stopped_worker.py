@@ -18,19 +18,14 @@ from services.read.query import query
 from services.run import coordinator
 from services.run.ray_cluster import Slots, private_ray
 from services.run.run_job import RunRequest, run_job
+from tests.chaos.test_lost_processes import JOB
 from tests.kit.killed_runs import disturbed_scene
 from workers.store.local import LocalStore
 
 pytestmark = [pytest.mark.ray, pytest.mark.minute]
 
-SMALL: dict[str, Any] = {
-    "name": "small",
-    "scenes": 8,
-    "cameras": {"sensor": {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}},
-    "images": {"patch": {"width": 16, "height": 12}},
-    "check": {"mirror_agreement_mm": 20.0},
-    "run": {"range_size": 4, "max_failure_share": 0.5, "max_attempts": 1, "scene_timeout_s": 6.0},
-}
+RUN = {"range_size": 4, "max_failure_share": 0.5, "max_attempts": 1, "scene_timeout_s": 6.0}
+SMALL: dict[str, Any] = {**JOB, "scenes": 8, "run": RUN}
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +67,7 @@ def test_a_worker_on_another_node_is_ended_there(cluster, tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_a_worker_stopped_while_it_commits_is_told_and_ended_and_nothing_is_lost(cluster, tmp_path, capfd):
-    changes = {"run": {**SMALL["run"], "max_attempts": 2}}
+    changes = {"run": {**RUN, "max_attempts": 2}}
     with disturbed_scene(tmp_path, None, signal.SIGSTOP, most=1) as stopped:
         merged = make(tmp_path, **changes)
     assert len(stopped) == 1

@@ -152,15 +152,6 @@ def test_of_many_that_take_over_a_dead_holder_one_at_a_time_gets_it(store):
     assert most == [1] * 6
 
 
-def test_a_contender_that_is_late_leaves_the_new_holder_alone(store):
-    old, late = replace(THEIRS, token="old"), replace(THEIRS, token="late")
-    write(store, THEIRS)
-    assert not module._take(store, late, old) and not module._take(store, late, None)
-    assert read_holder(store) == THEIRS
-    assert module._take(store, late, THEIRS)
-    assert read_holder(store) == late
-
-
 def test_events_that_cannot_be_read_are_taken_over_after_a_while(store):
     for torn in (b"", b"{", b"[]", b'{"token": 1}'):
         store.put(f"{LOCK_CLAIMS}/00000000.json", torn)

@@ -29,17 +29,6 @@ from workers.store.ledger import list_commits, save_rows
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 
-def test_ranges_lie_on_the_grid_fill_gaps_and_an_extension_begins_at_the_last_stop():
-    for first, stop, committed, missing in (
-        (5, 14, [], [(5, 9), (9, 13), (13, 14)]),
-        (0, 12, [(0, 4), (4, 6)], [(6, 8), (8, 12)]),
-        (0, 7, [(0, 4), (4, 6)], [(6, 7)]),
-        (0, 6, [(0, 4), (4, 6)], []),
-        (0, 12, [(4, 8)], [(0, 4), (8, 12)]),
-    ):
-        assert list(plan_ranges(first, stop, 4, committed)) == missing
-
-
 def test_fewer_scenes_and_ranges_of_another_size_are_refused():
     told = "scenes 0 to 7 are committed, more than the job's 0 to 5: fewer scenes"
     other_size = "a dataset keeps the range_size of its first run"

@@ -1,5 +1,6 @@
-"""What is refused before Ray is asked, who can reach a private Ray, its folder, and the slots of a cluster."""
+"""What is refused before Ray is asked, who can reach a private Ray and what it sends, its folder, and a cluster's slots."""
 
+import json
 import os
 import shutil
 import signal
@@ -7,6 +8,9 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -33,7 +37,17 @@ from services.run.ray_cluster import (
     remove_dead,
     slots_of,
 )
-from tests.kit.network import listeners_of, unix_sockets_of
+from tests.kit.network import (
+    HOST_LAN,
+    Listener,
+    Network,
+    NoNamespacesError,
+    listeners_of,
+    open_ports,
+    private_network,
+    tree_of,
+    unix_sockets_of,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 NOBODY = 65534
@@ -61,11 +75,6 @@ def test_a_cluster_whose_token_is_missing_is_told_in_one_line(tmp_path):
     last = done.stderr.splitlines()[-1]
     assert last.startswith(f"schemas.errors.MachineError: --address {address}: ")
     assert last.endswith("needs RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN here too")
-
-
-def test_ray_is_started_in_one_place():
-    sources = [path for folder in ("schemas", "services", "workers") for path in (ROOT / folder).rglob("*.py")]
-    assert [path.name for path in sources if "ray.init(" in path.read_text()] == ["ray_cluster.py"]
 
 
 @pytest.mark.ray
@@ -217,27 +226,142 @@ def test_a_name_that_is_too_long_for_sockets_leads_to_another_folder_or_is_told(
         pass
 
 
-def connects_as_nobody(name: Path) -> bool:
-    """Whether another user reaches the socket; in a child process, which gives up being root."""
-    child = os.fork()
-    if not child:
-        os.setgid(NOBODY)
-        os.setuid(NOBODY)
-        with socket.socket(socket.AF_UNIX) as caller:
-            os._exit(caller.connect_ex(str(name)))
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+# ----------------------------------------------------------------------- a host of its own, attacked
+
+JOB = ROOT / "deploy" / "jobs" / "tabletop.yaml"
+
+
+def command(out: Path) -> list[str]:
+    options = ["--scenes", "8", "--workers", "2", "--shard-size", "4", "--set", "run.range_size=4", "--json"]
+    return [sys.executable, "-m", "services.cli.main", "run", str(JOB), "--out", str(out), *options]
+
+
+def digest(told: str) -> str:
+    return json.loads(told.splitlines()[-1])["digest"]
+
+
+@dataclass
+class Attack:
+    """What a run on a host of its own let happen."""
+
+    digest: str
+    reached: list[int]
+    """Ports that accepted the attacker's connection."""
+    answers: dict[str, dict[str, str]]
+    """By port and call: what a local process without the token was told."""
+    frames: list[str]
+    injected: bool
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory) -> Iterator[Network]:
+    try:
+        with private_network(tmp_path_factory.mktemp("network")) as network:
+            yield network
+    except NoNamespacesError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module")
+def attack(network, tmp_path_factory) -> Attack:
+    folder = tmp_path_factory.mktemp("attack")
+    victim = folder / "victim"
+    with network.watch() as frames:
+        run = subprocess.Popen(
+            network.command(command(folder / "out")),
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        attacker = [sys.executable, str(ROOT / "tests" / "kit" / "callers_without_token.py"), f"touch {victim}"]
+        caller = subprocess.Popen(
+            network.command(attacker),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={name: value for name, value in os.environ.items() if not name.startswith("RAY_")},
+        )
+        try:
+            listeners = wait_for_workers(run)
+            answers = json.loads(caller.communicate(json.dumps(sorted({one.port for one in listeners})) + "\n")[0])
+            reached = network.from_outside(lambda: scan(run))
+            told, errors = run.communicate(timeout=300)
+        finally:
+            for process in (run, caller):
+                if process.poll() is None:
+                    process.kill()
+    assert run.returncode == 0, errors
+    return Attack(digest(told), reached, answers, list(frames), victim.exists())
+
+
+def wait_for_workers(run: subprocess.Popen) -> set[Listener]:
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and run.poll() is None:
+        listeners = listeners_of(run.pid)
+        if sum(is_worker(one) for one in listeners) >= 2:
+            return listeners
+        time.sleep(0.05)
+    raise AssertionError(f"no two workers listen: {run.poll()}, {sorted(listeners_of(run.pid))}")
+
+
+def is_worker(listener: Listener) -> bool:
+    return listener.process.startswith("ray::") and "Agent" not in listener.process and "Env" not in listener.process
+
+
+def scan(run: subprocess.Popen) -> list[int]:
+    """Tries each port from outside, while the coordinator is held, so that nothing ends meanwhile."""
+    ours = [pid for pid in tree_of(run.pid) if b"services.cli.main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    coordinator = ours[-1]  # below its supervisors
+    os.kill(coordinator, signal.SIGSTOP)
+    try:
+        return open_ports(HOST_LAN, range(1, 65536))
+    finally:
+        os.kill(coordinator, signal.SIGCONT)
 
 
 @pytest.mark.root
-def test_another_user_cannot_reach_a_socket_that_is_open_to_all(short):
-    short.chmod(0o777)
-    with private_folder() as folder:
-        reached = {}
-        for place in (short, folder):
-            place.chmod(0o777)  # as Ray does with its own
-            with socket.socket(socket.AF_UNIX) as server:
-                server.bind(str(place / "raylet"))
-                server.listen()
-                (place / "raylet").chmod(0o777)
-                reached[place] = connects_as_nobody(place / "raylet")
-        assert reached == {short: True, folder: False}
+@pytest.mark.ray
+@pytest.mark.timeout(600)
+def test_nothing_answers_from_outside_and_nothing_is_sent(attack):
+    assert attack.reached == []
+    assert attack.frames == []
+
+
+@pytest.mark.root
+@pytest.mark.ray
+@pytest.mark.timeout(600)
+def test_a_local_process_without_the_token_is_refused(attack):
+    grpc_ports = http_ports = 0
+    for port, calls in attack.answers.items():
+        told = {call: answer for call, answer in calls.items() if answer not in ("UNIMPLEMENTED", "UNAVAILABLE")}
+        grpc_ports += "UNAUTHENTICATED" in told.values()
+        http_ports += any(answer.isdigit() for answer in told.values())
+        allowed = {"401", "UNAUTHENTICATED", "BadStatusLine", "RemoteDisconnected", "ConnectionResetError"}
+        assert set(told.values()) <= allowed, (port, told)
+    assert grpc_ports >= 5, attack.answers  # GCS, the raylet's two, the coordinator, two workers
+    assert http_ports >= 1, attack.answers  # the agent for environments
+    assert not attack.injected
+
+
+@pytest.mark.slow
+@pytest.mark.root
+@pytest.mark.ray
+@pytest.mark.timeout(600)
+def test_the_attack_changes_no_byte(attack, tmp_path):
+    run = subprocess.run(command(tmp_path / "out"), cwd=ROOT, capture_output=True, text=True, check=True)
+    assert digest(run.stdout) == attack.digest
+
+
+@pytest.mark.root
+@pytest.mark.ray
+@pytest.mark.timeout(600)
+def test_what_is_sent_would_be_seen(network):
+    """The watch itself: a look-up of a name, and a metadata service that is asked."""
+    ask = "import socket, contextlib\nfor host in ('metadata.google.internal', '169.254.169.254'):\n"
+    ask += "    with contextlib.suppress(OSError):\n        socket.create_connection((host, 80), timeout=1)"
+    with network.watch() as frames:
+        before = len(frames)
+        subprocess.run(network.command([sys.executable, "-c", ask]), check=True)
+    told = set(frames[before:])
+    assert {"UDP to 10.211.0.1:53", "TCP to 169.254.169.254:80"} <= told, told

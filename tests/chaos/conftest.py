@@ -1,0 +1,5 @@
+"""Fixtures that tests in this folder may ask for."""
+
+from tests.kit.faults import unflushed
+
+__all__ = ["unflushed"]
