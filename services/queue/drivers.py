@@ -7,6 +7,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 from ray.exceptions import AuthenticationError
@@ -33,14 +34,13 @@ class RayDrivers(Drivers):
 
     def __init__(self, address: str) -> None:
         self._address = address
-        self._connected: _PatientClient | None = None
 
     def states(self) -> dict[str, Driver]:
         """From one listing of all jobs."""
         with self._explained():
             return {
                 job.submission_id: Driver("over" if job.status.is_terminal() else "running", _first_line(job.message))
-                for job in self._client().list_jobs()
+                for job in self._client.list_jobs()
                 if job.submission_id
             }
 
@@ -48,7 +48,7 @@ class RayDrivers(Drivers):
         """Ray itself refuses a submission id that it knows."""
         with self._explained():
             try:
-                self._client().submit_job(entrypoint=entrypoint, submission_id=submission, metadata=dict(metadata))
+                self._client.submit_job(entrypoint=entrypoint, submission_id=submission, metadata=dict(metadata))
             except RuntimeError:
                 if submission not in self.states():
                     raise
@@ -56,18 +56,17 @@ class RayDrivers(Drivers):
     def stop(self, submission: str) -> None:
         """Ray sends SIGTERM, and SIGKILL three seconds later."""
         with self._explained():
-            self._client().stop_job(submission)
+            self._client.stop_job(submission)
 
     def log(self, submission: str) -> str | None:
         """The file that Ray keeps on the head."""
         with self._explained():
-            return self._client().get_job_logs(submission) if submission in self.states() else None
+            return self._client.get_job_logs(submission) if submission in self.states() else None
 
+    @cached_property
     def _client(self) -> "_PatientClient":
         """A client; Ray's own asks for the version first, and so notices a server that does not answer."""
-        if self._connected is None:
-            self._connected = _PatientClient(self._address)
-        return self._connected
+        return _PatientClient(self._address)
 
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:

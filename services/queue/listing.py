@@ -39,29 +39,30 @@ def list_jobs(queue: Queue, now_s: float | None = None) -> list[JobRow]:
     """The jobs in the order of their turn: those that run, those that wait, and those that have ended, the latest last."""
     views, faults = queue.read_all(queue.ids())
     waiting = waiting_for_folder(views)
-    looks = _folders_to_look_into(views)
+    begun = [view for view in views if view.attempt > 0 and view.scenes is None]
+    latest = sorted(begun, key=lambda view: (view.ended, -view.request.submitted))
+    looks = {view.request.id for view in latest[:MOST_LOOKS]}
     now_s = time.time() if now_s is None else now_s
-    rows = [_row(view, "waiting" if view.request.id in waiting else view.state, looks, now_s) for view in sort(views)]
+    rows = [
+        _row(view, view.request.id in waiting, view.request.id in looks, now_s) for view in sorted(views, key=_place)
+    ]
     return rows + [JobRow(id=job, note=fault) for job, fault in sorted(faults.items())]
 
 
-def sort(views: Sequence[JobView]) -> list[JobView]:
-    """Ended jobs last, in the order in which they were submitted; before them the others in the order of their turn."""
-    ended = sorted((view for view in views if view.ended), key=lambda view: view.request.submitted)
-    held = sorted((view for view in views if view.held), key=turn)
-    return [*held, *sorted((view for view in views if not view.ended and not view.held), key=turn), *ended]
+def _place(view: JobView) -> tuple[bool, float, bool, tuple[int, float, str]]:
+    """Sorts ended jobs last, in the order in which they were submitted, and the others in the order of their turn."""
+    return view.ended, view.request.submitted if view.ended else 0.0, not view.held, turn(view)
 
 
-def _row(view: JobView, state: str, looks: frozenset[str], now_s: float) -> JobRow:
-    request = view.request
-    done = view.scenes
+def _row(view: JobView, waits: bool, is_looked_into: bool, now_s: float) -> JobRow:
+    request, done = view.request, view.scenes
     if done is None:
-        done = _scenes_done(request.out) if request.id in looks else 0 if view.attempt == 0 else None
+        done = _scenes_done(request.out) if is_looked_into else 0 if view.attempt == 0 else None
     return JobRow(
         id=request.id,
         name=request.name,
         priority=request.priority,
-        state=state,
+        state="waiting" if waits else view.state,
         attempts=view.attempt,
         scenes_done=done,
         scenes_asked=request.scenes,
@@ -70,12 +71,6 @@ def _row(view: JobView, state: str, looks: frozenset[str], now_s: float) -> JobR
         note=view.note,
         digest=view.digest,
     )
-
-
-def _folders_to_look_into(views: Sequence[JobView]) -> frozenset[str]:
-    begun = [view for view in views if view.attempt > 0 and view.scenes is None]
-    latest = sorted(begun, key=lambda view: (view.ended, -view.request.submitted))
-    return frozenset(view.request.id for view in latest[:MOST_LOOKS])
 
 
 def _scenes_done(out: str) -> int | None:

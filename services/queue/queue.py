@@ -89,20 +89,26 @@ def apply(view: JobView, event: JobEvent) -> JobView:
     """The job after one more event; the same job where the event does not apply."""
     if not applies(view, event):
         return view
-    if event.kind == "started":
-        return replace(view, state="running", attempt=event.attempt, began=False, note="")
-    if event.kind == "began":
-        return replace(view, began=True)
-    if event.kind == "cancel":
-        return replace(view, state="cancelling" if view.held else "cancelled", note=event.note)
-    if event.kind == "stopped":
-        return replace(view, state="cancelled")
-    if event.kind == "busy":
-        state: JobState = "cancelled" if view.state == "cancelling" else "waiting"
-        return replace(view, state=state, busy=view.busy + 1, note=event.note)
-    if event.kind == "died":
-        return _after_death(view, event)
-    return _after_end(view, event)
+    cancelling = view.state == "cancelling"
+    after: dict[str, Any] = {"note": event.note}
+    match event.kind:
+        case "started":
+            after = {"state": "running", "attempt": event.attempt, "began": False, "note": ""}
+        case "began":
+            after = {"began": True}
+        case "cancel":
+            after["state"] = "cancelling" if view.held else "cancelled"
+        case "stopped":
+            after = {"state": "cancelled"}
+        case "busy":
+            after |= {"state": "cancelled" if cancelling else "waiting", "busy": view.busy + 1}
+        case "died":  # to be taken up again, unless it was cancelled or that happened too often
+            lost = view.deaths >= RESTARTS
+            after |= {"state": "cancelled" if cancelling else "lost" if lost else "queued", "deaths": view.deaths + 1}
+        case "ended":  # a cancelled job that was finished in time is done
+            after |= {"state": "done" if event.code == 0 else "cancelled" if cancelling else "failed", "busy": 0}
+            after |= {"code": event.code, "scenes": event.scenes, "digest": event.digest}
+    return replace(view, **after)
 
 
 def applies(view: JobView, event: JobEvent) -> bool:
@@ -120,21 +126,6 @@ def applies(view: JobView, event: JobEvent) -> bool:
     if event.kind == "stopped":
         return view.state == "cancelling"
     return event.kind == "died" or view.began
-
-
-def _after_death(view: JobView, event: JobEvent) -> JobView:
-    """The job whose driver is gone: it is to be taken up again, unless it was cancelled or that happened too often."""
-    deaths = view.deaths + 1
-    state: JobState = "cancelled" if view.state == "cancelling" else "lost" if deaths > RESTARTS else "queued"
-    return replace(view, state=state, deaths=deaths, note=event.note)
-
-
-def _after_end(view: JobView, event: JobEvent) -> JobView:
-    """The job whose driver told its end: a cancelled one that was finished in time is done."""
-    state: JobState = "done" if event.code == 0 else "cancelled" if view.state == "cancelling" else "failed"
-    return replace(
-        view, state=state, code=event.code, note=event.note, scenes=event.scenes, digest=event.digest, busy=0
-    )
 
 
 Model = TypeVar("Model", bound=Frozen)

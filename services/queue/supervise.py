@@ -61,22 +61,23 @@ class Action:
 
 def tend_drivers(views: Sequence[JobView], drivers: Mapping[str, Driver]) -> list[Action]:
     """What to do about jobs that have a driver, or should have one; `drivers` by submission id, as Ray knows them."""
-    return [action for view in views if view.held and (action := _tend(view, drivers)) is not None]
-
-
-def _tend(view: JobView, drivers: Mapping[str, Driver]) -> Action | None:
-    job, attempt = view.request.id, view.attempt
-    found = drivers.get(submission_id(job, attempt))
-    if view.state == "cancelling":
-        return Action("stop" if found is not None and found.state == "running" else "note stop", job, attempt)
-    if found is not None and found.state == "running":
-        return None
-    if found is not None:
-        said = f" ({found.said})" if found.said else ""
-        return Action("note death", job, attempt, f"its driver ended without telling how{said}")
-    if view.began:
-        return Action("note death", job, attempt, "Ray does not know its driver any more")
-    return Action("hand over", job, attempt)  # the supervisor was killed in between, or Ray forgot it
+    actions = []
+    for view in views:
+        job, attempt = view.request.id, view.attempt
+        found = drivers.get(submission_id(job, attempt))
+        runs = found is not None and found.state == "running"
+        if not view.held or (runs and view.state != "cancelling"):
+            continue
+        if view.state == "cancelling":
+            actions.append(Action("stop" if runs else "note stop", job, attempt))
+        elif found is not None:
+            said = f" ({found.said})" if found.said else ""
+            actions.append(Action("note death", job, attempt, f"its driver ended without telling how{said}"))
+        elif view.began:
+            actions.append(Action("note death", job, attempt, "Ray does not know its driver any more"))
+        else:  # the supervisor was killed in between, or Ray forgot it
+            actions.append(Action("hand over", job, attempt))
+    return actions
 
 
 def choose_starts(
@@ -166,18 +167,14 @@ class Supervisor:
         self._clock = clock
         self._memory = _Memory()
 
-    def look_if(self, lock: Lock) -> None:
-        """One round, while nobody else holds the queue. Raises RunError where another took over."""
-        self._bear(lock.require_held, self._look)
+    def look(self, require_held: Callable[[], None] = lambda: None) -> None:
+        """One round. Where storage or Ray does not answer, that is told, and waited for.
 
-    def look(self) -> None:
-        """One round. Where storage or Ray does not answer, that is told, and waited for."""
-        self._bear(self._look)
-
-    def _bear(self, *steps: Callable[[], None]) -> None:
+        `require_held` raises RunError where another supervisor took over.
+        """
         try:
-            for step in steps:
-                step()
+            require_held()
+            self._look()
         except (MachineError, OSError) as error:
             if self._memory.outage is None:
                 self._say(f"{error}; it is asked again and again")
@@ -236,13 +233,14 @@ class Supervisor:
 
     def _keep_logs(self, views: Sequence[JobView], known: Mapping[str, Driver]) -> None:
         """Copies the logs of drivers that are over into the queue, while Ray still has them."""
+        states = {submission: driver.state for submission, driver in known.items()}
         for view in views:
             job = view.request.id
             for attempt in range(1, view.attempt + 1):
                 submission = submission_id(job, attempt)
-                if _is(known.get(submission), "over") and submission not in self._memory.kept:
+                if states.get(submission) == "over" and submission not in self._memory.kept:
                     self._keep_log(job, attempt)
-            if view.ended and not _is(known.get(submission_id(job, view.attempt)), "running"):
+            if view.ended and states.get(submission_id(job, view.attempt)) != "running":
                 self._memory.settled.add(job)
 
     def _keep_log(self, job: str, attempt: int) -> None:
@@ -275,10 +273,6 @@ class Supervisor:
             self._say(line)
 
 
-def _is(driver: Driver | None, state: str) -> bool:
-    return driver is not None and driver.state == state
-
-
 def build_entrypoint(command: Sequence[str], queue: str, job: str, attempt: int) -> str:
     """What Ray gives to a shell: each word quoted, and none of them from a job."""
     return shlex.join([*command, "drive", job, str(attempt), "--queue", queue])
@@ -290,7 +284,7 @@ def supervise(queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str],
     with hold_queue(queue) as lock:
         supervisor = Supervisor(queue, drivers, rules, say, time.monotonic)
         while True:
-            supervisor.look_if(lock)
+            supervisor.look(lock.require_held)
             time.sleep(EVERY_S)
 
 

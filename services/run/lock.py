@@ -171,10 +171,16 @@ def shows_life(store: Store, holder: Holder, beat: Beat = DEFAULT_BEAT) -> bool:
     """Whether a holder lives: by its process on this machine, elsewhere by a heartbeat that changes within the patience."""
     if is_here(holder):
         return _born(holder.pid) == holder.born
-    before = _read_beat(store)
+
+    def read_beat() -> bytes | None:
+        with contextlib.suppress(FileNotFoundError):
+            return store.read(LOCK_FILE)
+        return None
+
+    before = read_beat()
     for _ in range(beat.patience):
         time.sleep(beat.period_s)
-        if _read_beat(store) != before or read_holder(store) != holder:
+        if read_beat() != before or read_holder(store) != holder:
             return True
     return False
 
@@ -182,13 +188,6 @@ def shows_life(store: Store, holder: Holder, beat: Beat = DEFAULT_BEAT) -> bool:
 def is_here(holder: Holder) -> bool:
     """Whether the holder's process is of this machine, so that `shows_life` answers at once."""
     return bool(holder.machine) and holder.machine == _machine()
-
-
-def _read_beat(store: Store) -> bytes | None:
-    try:
-        return store.read(LOCK_FILE)
-    except FileNotFoundError:
-        return None
 
 
 def _show_life(lock: Lock, period_s: float, ended: threading.Event) -> None:
