@@ -20,7 +20,7 @@ from workers.store.store import Store
 
 TIMED_SCENES = 3
 LONGEST_S = 10.0
-"""No further scene is timed after so long."""
+"""No further scene is timed after so long, but for the first, which compiles."""
 
 
 def describe_plan(request: RunRequest) -> list[str]:
@@ -102,7 +102,7 @@ def measure_scene(job: Job, catalogue: Catalogue) -> tuple[float, float] | None:
             continue
         took.append(time.process_time() - began)
         sizes.append(sum(len(file.data) for file in output.files))
-        if sum(took) > LONGEST_S:
+        if sum(took[1:]) > LONGEST_S:
             break
     made = [size for size in sizes if size]
     if not made:
