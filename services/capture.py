@@ -1,7 +1,4 @@
-"""The commands `verso capture ...`.
-
-- The settings of `verso capture` commands: a job of one capture, with the keys that --set changes.
-"""
+"""The commands `verso capture ...`: each reads its options, prints what it did, and returns the exit code."""
 
 import argparse
 import dataclasses
@@ -24,9 +21,8 @@ from schemas.job.views import Render
 from services.job.job_file import change_key, validate_job
 
 if TYPE_CHECKING:
-    from workers.capture.folder import CaptureFile
-    from workers.capture.stored import StoredResult
-    from workers.capture.surface.evaluate import SurfaceErrors
+    from workers.capture.score import SurfaceErrors
+    from workers.capture.views import StoredResult
 
 
 def capture_job(changes: Sequence[str] = (), keys: Mapping[str, Any] | None = None) -> Job:
@@ -52,8 +48,8 @@ def capture_settings(changes: Sequence[str] = (), keys: Mapping[str, Any] | None
 
 def board(options: argparse.Namespace) -> int:
     """Writes options.file (.pdf or .png); reads `board`, `tiles` (None or "a4"), `dpi` and `json`. Returns 0."""
-    from workers.capture.board.sheets import board_pdf, board_png, tiled_pdf
     from workers.capture.folder import read_board
+    from workers.capture.sheets import board_pdf, board_png, tiled_pdf
 
     path = Path(options.file)
     spec = read_board(options.board) if options.board else Board()
@@ -122,17 +118,21 @@ def import_recording(options: argparse.Namespace) -> int:
 
     Raises InputError and OutputError for what cannot be, CaptureError for a recording that cannot be used.
     """
-    from workers.capture.folder import read_board
-    from workers.capture.recording import import_recording as work
-    from workers.capture.recording.choose import describe_losses
+    from workers.capture import import_recording as work
+    from workers.capture.folder import CaptureFile, derive_name, read_board
 
     recording, out = Path(options.recording), Path(options.out)
-    about = _describe(options.name, options.category, out)
+    try:
+        about = CaptureFile(name=options.name or derive_name(out.resolve().name), category=options.category)
+    except ValidationError as error:
+        first = error.errors()[0]
+        words = f"--{first['loc'][0]} {first['input']!r}: letters, digits, - and _ only, at most 64"
+        raise InputError(words) from error
     board = read_board(Path(options.board)) if options.board else Board()
     if not recording.is_file():
         raise InputError(f"{recording}: no such file")
     made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
-    notes = describe_losses(made.losses)
+    notes = work.describe_losses(made.losses)
     print(
         f"{out}: {len(made.views)} views of {made.frames} frames, depth registered by the recording's own calibration"
     )
@@ -143,18 +143,6 @@ def import_recording(options: argparse.Namespace) -> int:
         told = {"ok": True, "out": str(out), "frames": made.frames, "notes": notes, "default_board": not options.board}
         print(json.dumps({**told, "losses": asdict(made.losses), "views": [asdict(view) for view in made.views]}))
     return 0
-
-
-def _describe(name: str | None, category: str, out: Path) -> "CaptureFile":
-    from workers.capture.folder import CaptureFile, derive_name
-
-    try:
-        return CaptureFile(name=name or derive_name(out.resolve().name), category=category)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(
-            f"--{first['loc'][0]} {first['input']!r}: letters, digits, - and _ only, at most 64"
-        ) from error
 
 
 def _make_empty(out: Path) -> Path:
@@ -228,7 +216,7 @@ def synthesize(options: argparse.Namespace) -> int:
     Returns 0. Raises InputError where the pose file is missing, CaptureError where nothing was processed or nothing is seen.
     """
     from workers.capture.folder import read_pose
-    from workers.capture.stored import read_result, write_mirrors, write_synthesized
+    from workers.capture.views import read_result, write_mirrors, write_synthesized
 
     out = options.out or Path(options.folder) / "views"
     result = read_result(options.folder)
@@ -255,7 +243,7 @@ def evaluate(options: argparse.Namespace) -> int:
 
     Raises CaptureError where the folder was not processed, or there is neither truth nor a mesh.
     """
-    from workers.capture.stored import read_result
+    from workers.capture.views import read_result
 
     result = read_result(options.folder)
     surface, answer = _against_truth(result) if options.mesh is None else _against_mesh(result, options)

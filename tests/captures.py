@@ -36,9 +36,9 @@ from services.job.job_file import validate_job
 from tests.datasets import overlaid
 from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset
-from workers.assets.captured import board_asset
 from workers.capture import make_capture
 from workers.capture.folder import CaptureFile, CaptureFolder, TrueObject, write_description, write_truth, write_view
+from workers.capture.make_capture import board_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer

@@ -32,9 +32,9 @@ from services.study.model import Plan, Row, Setting, Sizes
 from services.study.page import write_page, write_tables
 from services.study.study import Journal, header_of, run_study, study_of
 from workers.assets.catalogue import open_catalogue
-from workers.capture.estimate import ProcessorClock
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.make_capture import process_capture, require_captures, simulate_one
+from workers.capture.reconstruct import ProcessorClock
 from workers.geometry.camera import spread_evenly
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier

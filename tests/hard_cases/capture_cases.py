@@ -18,14 +18,19 @@ from schemas.base import Pose
 from schemas.capture import CaptureCamera, CapturedView, CaptureEstimate
 from schemas.job.captures import Board, Estimation
 from tests.hard_cases.case import refuse
-from tests.workers.capture.depths import surface_depth
-from tests.workers.capture.photographs import HALF, hand_held, photograph, printed, true_corners
-from tests.workers.capture.poses.scenes import errors
-from tests.workers.pipeline.captures.folders import draw_view
-from workers.capture.board.layout import marker_corners
-from workers.capture.estimate import estimate_poses
+from tests.workers.capture.drawn import (
+    HALF,
+    draw_view,
+    errors,
+    hand_held,
+    photograph,
+    printed,
+    surface_depth,
+    true_corners,
+)
+from workers.capture.board import marker_corners
 from workers.capture.folder import CaptureFile, open_folder, write_description, write_view
-from workers.capture.reconstruct import given_files
+from workers.capture.reconstruct import estimate_poses, given_files
 from workers.geometry.camera import look_at, orbit_pose
 
 HOLD, FLAG = "must hold", "must flag view 0"

@@ -14,10 +14,11 @@ import numpy as np
 from schemas.job.captures import Board
 from tests.hard_cases.camera_cases import HOLD
 from tests.hard_cases.case import refuse
-from tests.workers.capture.recording.made_up_recording import (
+from tests.workers.capture.recordings import (
     PERIOD_US,
     START_US,
     TAGS,
+    Track,
     calibration,
     poses,
     recording,
@@ -25,10 +26,10 @@ from tests.workers.capture.recording.made_up_recording import (
     tracks,
     true_depth,
     without,
+    write_recording,
 )
-from tests.workers.capture.recording.matroska import Track, write_recording
 from workers.capture.folder import CaptureFile, open_folder, read_view
-from workers.capture.recording.import_recording import Imported, import_recording
+from workers.capture.import_recording import Imported, import_recording
 
 COUNT = 6
 DEPTH_MM = 1.3

@@ -1,18 +1,13 @@
-"""A capture's folder: its photographs, cameras and board, and the truth of a simulated one.
-
-- The folder of a capture: the only place where its files are read and written.
-- The folder `truth/` of a simulated capture: what the simulation knows, for evaluation alone.
+"""A capture's folder: its photographs, cameras and board, and the truth of a simulated one. Read and written here alone.
 
     camera.json  board.json  capture.json (name and category; may be missing)
     rgb_00000.png  depth_00000.png  mask_00000.png  board_00000.txt  correction_00000.txt
-    truth/       what a simulation knows; read by evaluation alone
+    truth/       what a simulation knows, for evaluation alone: truth.json (poses, print scale, depth camera, lens, receipt
+                 of effects), mesh.glb (the true object in its own frame, metres, z up), mask_00000.png, held_out/
 
 Depth and masks may be missing, in some views or in all. camera.json has width, height, fx, fy, cx, cy, `pixel_centre`
 ("0" as in OpenCV and the Azure Kinect's calibration, or "0.5" from the image's edge), `distortion` (OpenCV's order, 0
 to 8 numbers) and `depth_units_per_m`. board.json is the job file's branch `captures.board`.
-
-truth.json poses, print scale, depth camera, lens, and the receipt of effects mesh.glb the true object in its own frame,
-metres, z up mask_00000.png the object's true pixels, 255
 """
 
 import json

@@ -1,7 +1,4 @@
-"""A capture's folder from photographs to poses, masks, cloud and mesh, written beside them: the list of steps.
-
-- poses.parquet: every view in every estimate, with its residuals before and after. Pure.
-"""
+"""A capture's folder from photographs to poses, masks, cloud and mesh, written beside them: the list of steps."""
 
 import io
 from collections.abc import Mapping
@@ -18,9 +15,8 @@ from schemas.dataset.codec import Row, camera_columns
 from schemas.job.captures import Captures
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.capture.estimate import ProcessorClock, estimate_surface
 from workers.capture.folder import CaptureFolder, open_folder, pose_text
-from workers.capture.reconstruct import Given, Merged, corrections_of, given_files
+from workers.capture.reconstruct import Given, Merged, ProcessorClock, corrections_of, estimate_surface, given_files
 from workers.capture.results import CLOUD_FILE, MESH_FILE, POSES_FILE, cloud_ply, mesh_ply, write_results
 from workers.capture.surface.object_mask import silhouette
 from workers.capture.surface.posed_view import distort_mask

@@ -1,9 +1,5 @@
 """What a capture's folder holds: its inputs and their digest, what processing writes, and which files are the user's.
 
-- What processing writes into a capture's folder, and how a file of ours is told from one of the user's.
-- The input files of a capture's folder, and their digest: what a dataset that is made of it depends on.
-- The sources of a job: the catalogue of its shapes, and the folders of its captures.
-
     process.json       settings, poses used, depth correction, notes, seconds, and the SHA-256 of every file below
     board_00000.txt  correction_00000.txt  mask_00000.png      where the user gave none
     cloud.ply  mesh.ply  poses.parquet
@@ -33,14 +29,17 @@ from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, TRUTH
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
-_CLOUD = np.dtype(
-    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    + [(name, "u1") for name in ("red", "green", "blue")]
-    + [("views", "<u2")]
-)
-_VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")])
-_FACE = np.dtype([("count", "u1"), ("a", "<i4"), ("b", "<i4"), ("c", "<i4")])
-_WORDS = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
+_PLACE, _NORMAL, _COLOR = ("place", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)
+_CLOUD = np.dtype([_PLACE, _NORMAL, _COLOR, ("views", "<u2")])
+_VERTEX = np.dtype([_PLACE, _COLOR])
+_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+_PROPERTIES = {
+    "place": ("float x", "float y", "float z"),
+    "normal": ("float nx", "float ny", "float nz"),
+    "color": ("uchar red", "uchar green", "uchar blue"),
+    "views": ("ushort views",),
+}
+"""Of a PLY file, for each field of a vertex."""
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
@@ -84,85 +83,56 @@ def write_results(path: Path, files: Mapping[str, bytes], record: Mapping[str, A
 def cloud_ply(points: Array, normals: Array, colors: NDArray[np.uint8], views: NDArray) -> bytes:
     """A binary PLY of points [N, 3] with normals, colours and numbers of views."""
     rows = np.zeros(len(points), _CLOUD)
-    _fill(rows, ("x", "y", "z"), points)
-    _fill(rows, ("nx", "ny", "nz"), normals)
-    _fill(rows, ("red", "green", "blue"), colors)
+    rows["place"], rows["normal"], rows["color"] = points, normals, colors
     rows["views"] = np.minimum(views, 65_535)
     return _head(rows) + rows.tobytes()
 
 
 def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
     """A binary PLY of a mesh with coloured vertices."""
-    rows = np.zeros(len(vertices), _VERTEX)
-    _fill(rows, ("x", "y", "z"), vertices)
-    _fill(rows, ("red", "green", "blue"), colors)
-    triangles = np.zeros(len(faces), _FACE)
-    triangles["count"] = 3
-    _fill(triangles, ("a", "b", "c"), faces)
+    rows, triangles = np.zeros(len(vertices), _VERTEX), np.zeros(len(faces), _FACE)
+    rows["place"], rows["color"] = vertices, colors
+    triangles["count"], triangles["corners"] = 3, faces
     return _head(rows, len(faces)) + rows.tobytes() + triangles.tobytes()
 
 
 def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
     """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
-    body = _body(path / CLOUD_FILE)
-    start, points, _ = _counts(path / CLOUD_FILE, body)
-    rows = _rows(path / CLOUD_FILE, body, _CLOUD, start, points)
-    return _take(rows, "x", "y", "z"), _take(rows, "nx", "ny", "nz"), _colors(rows), rows["views"].astype(np.int32)
+    rows, _ = _read_ply(path / CLOUD_FILE, _CLOUD)
+    places, normals = rows["place"].astype(np.float64), rows["normal"].astype(np.float64)
+    return places, normals, rows["color"].copy(), rows["views"].astype(np.int32)
 
 
 def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
     """(vertices, faces, colours) of mesh.ply. Raises CaptureError where it is not there or another's."""
-    file = path / MESH_FILE
-    body = _body(file)
-    start, vertices, faces = _counts(file, body)
-    rows = _rows(file, body, _VERTEX, start, vertices)
-    triangles = _rows(file, body, _FACE, start + vertices * _VERTEX.itemsize, faces)
-    return _take(rows, "x", "y", "z"), _take(triangles, "a", "b", "c").astype(np.int32), _colors(rows)
+    rows, triangles = _read_ply(path / MESH_FILE, _VERTEX)
+    return rows["place"].astype(np.float64), triangles["corners"].astype(np.int32), rows["color"].copy()
 
 
 def _head(rows: NDArray, faces: int | None = None) -> bytes:
-    assert rows.dtype.names is not None
     lines = ["ply", "format binary_little_endian 1.0", "comment board frame, metres", f"element vertex {len(rows)}"]
-    lines += [f"property {_WORDS[rows.dtype[name].str]} {name}" for name in rows.dtype.names]
+    lines += [f"property {one}" for name in rows.dtype.names or () for one in _PROPERTIES[name]]
     if faces is not None:
         lines += [f"element face {faces}", "property list uchar int vertex_indices"]
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
-def _fill(rows: NDArray, names: tuple[str, ...], values: NDArray) -> None:
-    for column, name in enumerate(names):
-        rows[name] = values[:, column]
-
-
-def _take(rows: NDArray, *names: str) -> Array:
-    return np.stack([rows[name] for name in names], axis=1).astype(np.float64)
-
-
-def _colors(rows: NDArray) -> NDArray[np.uint8]:
-    return _take(rows, "red", "green", "blue").astype(np.uint8)
-
-
-def _body(file: Path) -> bytes:
+def _read_ply(file: Path, vertex: np.dtype) -> tuple[NDArray, NDArray]:
+    """(vertices, triangles) of a file that `_head` begins."""
     try:
-        return file.read_bytes()
+        body = file.read_bytes()
     except FileNotFoundError:
         raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`") from None
-
-
-def _counts(file: Path, body: bytes) -> tuple[int, int, int]:
-    """(where the data begins, vertices, faces) by the header."""
-    end = body.find(b"end_header\n")
-    words = [line.split() for line in body[: max(end, 0)].decode(errors="replace").splitlines()]
+    head, end, data = body.partition(b"end_header\n")
+    words = [line.split() for line in head.decode(errors="replace").splitlines()]
     counts = {line[1]: int(line[2]) for line in words if line[:1] == ["element"] and line[2].isdigit()}
-    if end < 0 or "vertex" not in counts:
+    if not end or "vertex" not in counts:
         raise CaptureError("unreadable", f"{file} is no PLY that `verso capture process` wrote: delete it")
-    return end + len(b"end_header\n"), counts["vertex"], counts.get("face", 0)
-
-
-def _rows(file: Path, body: bytes, kind: np.dtype, start: int, count: int) -> NDArray:
-    if len(body) < start + count * kind.itemsize:
+    vertices, faces = counts["vertex"], counts.get("face", 0)
+    if len(data) < vertices * vertex.itemsize + faces * _FACE.itemsize:
         raise CaptureError("unreadable", f"{file} ends early: delete it, and process the capture again")
-    return np.frombuffer(body, kind, count, start)
+    rows = np.frombuffer(data, vertex, vertices)
+    return rows, np.frombuffer(data, _FACE, faces, vertices * vertex.itemsize)
 
 
 def _digest_of(file: Path) -> str | None:

@@ -1,8 +1,4 @@
-"""The output of a capture: pairs of views with their regions, encoded files, and rows in the tables that scenes have.
-
-- Regions of a capture's view: the object by its mask, and the board by the rays that meet it. Pure.
-- One pair of a capture: a captured view as it is stored, and its view from the other side.
-"""
+"""The output of a capture: pairs of views with their regions, encoded files, and rows in the tables that scenes have."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +15,7 @@ from schemas.job.captures import Board
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, EncodedFile, Placed, SceneOutput, encoded_file
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE, Asset
-from schemas.scene.view import Camera, ObjectLabel, Pair, Role, View
+from schemas.scene.view import Camera, Pair, Role, View
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.geometry.jit import compiled
@@ -116,12 +112,14 @@ def make_capture_pair(
     the object, CaptureError where no captured view shows anything to the mirror camera.
     """
     parent_id = input_pose_id(thing.scene_id, at, job.pairs_per_scene)
+    assets = zip(thing.things, (thing.board_asset, thing.asset), strict=True)
+    names = {placed.region_id: (asset.category, asset.instance_id) for placed, asset in assets}
 
     def view(role: Role, camera: Camera, made: PosedImages | SynthesizedView) -> View:
         region, depth = capture_regions(camera, thing.board, made.mask), quantise_depth(made.depth_m, job.images)
         if role == "mirror":
             region[depth == 0] = REGION_NOTHING
-        labels = _labels(thing, camera, region, count)
+        labels = label_things(thing.things, names, camera, region, count)
         return View(role, file_pose_id(role, parent_id), parent_id, camera, made.rgb, depth, region, labels)
 
     first = view("input", images.camera, images)
@@ -140,18 +138,6 @@ def make_capture_pair(
         projected = View("projected", first.pose_id, first.pose_id, camera, rgb, depth, None, ())
         pair = replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
     return CapturedPair(images.number, pair, made)
-
-
-def _labels(
-    thing: CapturedObject, camera: Camera, region: NDArray[np.uint8], count: CountPixels
-) -> tuple[ObjectLabel, ...]:
-    """Labels of board and object in a mask."""
-    assets = (thing.board_asset, thing.asset)
-    names = {
-        placed.region_id: (asset.category, asset.instance_id)
-        for placed, asset in zip(thing.things, assets, strict=True)
-    }
-    return label_things(thing.things, names, camera, region, count)
 
 
 SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")

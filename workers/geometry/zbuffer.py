@@ -19,7 +19,7 @@ from schemas.scene.shape import Mesh, Shape
 from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled, compiled_for
-from workers.geometry.rational_lens import pixel_rays, project_points
+from workers.geometry.lens import pixel_rays, project_points
 
 STEEPEST = math.tan(math.radians(84.0))
 """Neighbouring pixels whose depth differs as on a surface seen at a larger angle of incidence lie on two surfaces.

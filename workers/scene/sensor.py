@@ -21,7 +21,7 @@ from schemas.job.views import DepthNoise, Distortion, Exposure, Images, RgbNoise
 from schemas.scene.scene import EffectPlan
 from schemas.scene.view import Camera, Intrinsics, View
 from workers.geometry.colour import decode_codes, encode_codes
-from workers.geometry.distortion import undistort
+from workers.geometry.lens import undistort
 from workers.geometry.pixels import dequantise_depth, facing_cosine, quantise_depth
 
 

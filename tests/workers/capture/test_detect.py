@@ -1,74 +1,151 @@
+"""Markers and their corners in drawn pictures, and in the photograph of OpenCV's ArUco tutorial."""
+
 import time
 
 import cv2
 import numpy as np
 import pytest
 
-from schemas.job.captures import Board
-from tests.workers.capture.photographs import HALF, KINECT, hand_held, photograph, printed, true_corners
-from workers.capture.board.detect import detect_markers, other_dictionaries
-from workers.capture.board.layout import marker_corners, open_dictionary
+from schemas.capture import CaptureCamera
+from schemas.job.captures import Board, Estimation
+from schemas.scene.view import Intrinsics
+from tests.conftest import SHARED_DATA
+from tests.workers.capture.drawn import HALF, KINECT, QUARTER, hand_held, photograph, printed, true_corners
+from workers.capture.board import frame_in_board, marker_corners, open_dictionary
+from workers.capture.detect import detect_markers, other_dictionaries, refine_corners
+from workers.capture.poses.estimates import estimate_markers
+from workers.capture.poses.markers import Evidence, observe_view
+from workers.capture.poses.observation import Setup, pixels_of_points
+from workers.geometry.colour import encode_srgb
 
 BOARD = Board()
 DICTIONARY = open_dictionary(BOARD)
 
 
-def errors_px(found, T, k):
-    return found.corners_px.reshape(-1, 2) - true_corners(marker_corners(BOARD)[found.ids].reshape(-1, 3), T, k)
+def square(corners, blur_px, exposure):
+    """A dark square on white, 8 x 8 samples a pixel that lie within all four edges or not, pixel centres at integers."""
+    x, y = np.meshgrid(*[np.arange(120 * 8) / 8 + 1 / 16 - 0.5] * 2)
+    inside = np.ones_like(x, bool)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
+    white = 255.0 * (1 - inside.reshape(120, 8, 120, 8).mean((1, 3)))
+    light = 0.02 + cv2.GaussianBlur(white / 255, (0, 0), blur_px) * exposure
+    return np.rint(255 * encode_srgb(light)).astype(np.uint8)
 
 
-def test_corners_lie_where_a_homography_puts_them():
-    rng = np.random.default_rng(3)
-    errors = []
-    for T in hand_held(rng, 4):
-        found = detect_markers(photograph(BOARD, T, KINECT, rng), BOARD, DICTIONARY)
+def test_corners_of_a_drawn_square_are_found_to_a_few_hundredths_of_a_pixel():
+    rng, errors = np.random.default_rng(0), []
+    for _ in range(10):
+        true = np.array([[30, 28], [88, 34], [84, 90], [26, 86]]) + rng.uniform(-3, 3, (4, 2))
+        start = true + rng.uniform(-1.5, 1.5, (4, 2))
+        errors.append(refine_corners(square(true, 0.8, 0.8), start[None], 6)[0] - true)
+    assert np.abs(errors).max() < 0.06 and np.sqrt(np.square(errors).mean()) < 0.02
+    corners = np.array([[[30.0, 30], [80, 30], [80, 80], [30, 80]]])
+    assert np.array_equal(refine_corners(np.full((120, 120), 99, np.uint8), corners, 6), corners)
+    assert refine_corners(np.zeros((9, 9), np.uint8), np.zeros((0, 4, 2)), 6).shape == (0, 4, 2)
+
+
+def test_corners_lie_where_a_homography_puts_them_in_a_quarter_of_a_second_at_most():
+    rng, errors, seconds = np.random.default_rng(3), [], []
+    for T in hand_held(rng, 3):
+        picture = photograph(BOARD, T, KINECT, rng)
+        begun = time.process_time()
+        found = detect_markers(picture, BOARD, DICTIONARY)
+        seconds.append(time.process_time() - begun)
         assert len(found.ids) >= 33 and found.dropped == ()
-        errors.append(errors_px(found, T, KINECT))
+        points = marker_corners(BOARD)[found.ids].reshape(-1, 3)
+        errors.append(found.corners_px.reshape(-1, 2) - true_corners(points, T, KINECT))
     errors = np.concatenate(errors)
     assert np.sqrt((errors**2).mean()) < 0.07  # pixels an axis; OpenCV's cornerSubPix leaves 0.44 here
     assert np.abs(errors.mean(axis=0)).max() < 0.01  # half a pixel of convention would show
+    assert min(seconds) < 0.25
 
 
-def test_detection_takes_a_quarter_of_a_second_at_most():
-    rng = np.random.default_rng(4)
-    picture = photograph(BOARD, hand_held(rng, 1)[0], KINECT, rng)
-    begun = time.process_time()
-    detect_markers(picture, BOARD, DICTIONARY)
-    assert time.process_time() - begun < 0.25
-
-
-def test_a_marker_that_is_seen_twice_is_dropped():
+def test_markers_that_are_seen_twice_or_are_not_on_the_board_are_dropped():
     rng = np.random.default_rng(5)
-    print_ = printed(BOARD)
-    marker, first, second = 240, (120, 80), (120 + 320, 80)  # pixels of the print: markers 0 and 1
-    print_[second[1] : second[1] + marker, second[0] : second[0] + marker] = print_[
-        first[1] : first[1] + marker, first[0] : first[0] + marker
-    ]
-    T = hand_held(rng, 1)[0]
-    found = detect_markers(photograph(BOARD, T, KINECT, rng, picture=print_), BOARD, DICTIONARY)
-    assert 0 not in found.ids and 1 not in found.ids
-    assert found.dropped == ("marker 0 was seen 2 times",)
-
-
-def test_ids_that_are_not_on_the_board_are_dropped():
-    rng = np.random.default_rng(6)
-    T = hand_held(rng, 1)[0]
+    T, twice = hand_held(rng, 1)[0], printed(BOARD).copy()
+    twice[80:320, 440:680] = twice[80:320, 120:360]  # marker 0 where marker 1 was
+    found = detect_markers(photograph(BOARD, T, KINECT, rng, picture=twice), BOARD, DICTIONARY)
+    assert 0 not in found.ids and 1 not in found.ids and found.dropped == ("marker 0 was seen 2 times",)
     smaller = Board(columns=7, rows=5, first_id=3)
-    found = detect_markers(photograph(BOARD, T, KINECT, rng), smaller, open_dictionary(smaller))
+    found = detect_markers(photograph(BOARD, T, HALF, rng), smaller, open_dictionary(smaller))
     assert found.ids.min() == 3
     assert set(found.dropped) == {f"marker {n} is not on the board (3 to 37)" for n in (0, 1, 2)}
-
-
-def test_nothing_is_found_in_a_grey_picture():
     found = detect_markers(np.full((540, 960, 3), 120, np.uint8), BOARD, DICTIONARY)
     assert found.ids.shape == (0,) and found.corners_px.shape == (0, 4, 2)
 
 
-@pytest.mark.parametrize(("change", "words"), [("dictionary", "DICT_6X6"), ("mirror", "mirrored")])
-def test_the_markers_that_a_picture_holds_instead_are_named(change, words):
+def test_the_markers_that_a_picture_holds_instead_are_named():
     rng = np.random.default_rng(7)
-    board = Board(dictionary="DICT_6X6_100") if change == "dictionary" else BOARD
-    picture = photograph(board, hand_held(rng, 1)[0], HALF, rng)
-    if change == "mirror":
-        picture = np.ascontiguousarray(cv2.flip(picture, 1))
-    assert words in other_dictionaries(picture)
+    T = hand_held(rng, 1)[0]
+    assert "DICT_6X6" in other_dictionaries(photograph(Board(dictionary="DICT_6X6_100"), T, QUARTER, rng))
+    assert "mirrored" in other_dictionaries(np.ascontiguousarray(photograph(BOARD, T, QUARTER, rng)[:, ::-1]))
+
+
+# ------------------------------------------------- a real camera, a real print, an older dictionary and board
+
+FOLDER = SHARED_DATA / "board"
+REAL = Board(dictionary="tutorial_dict.yml", columns=5, rows=7, marker_m=0.04, gap_m=0.01, width_m=0.26, height_m=0.36)
+
+
+@pytest.fixture(scope="module")
+def estimated():
+    """(camera, detection, view) with the files as they are: OpenCV's pixel centres, five numbers of distortion."""
+    rgb = cv2.cvtColor(cv2.imread(str(FOLDER / "gboriginal.png")), cv2.COLOR_BGR2RGB)
+    file = cv2.FileStorage(str(FOLDER / "tutorial_camera_params.yml"), cv2.FILE_STORAGE_READ)
+    K, lens = file.getNode("camera_matrix").mat(), file.getNode("distortion_coefficients").mat().ravel()
+    height, width = rgb.shape[:2]
+    k = Intrinsics(width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + 0.5, cy=K[1, 2] + 0.5)
+    camera = CaptureCamera(k, np.concatenate([lens, np.zeros(3)]))
+    found = detect_markers(rgb, REAL, open_dictionary(REAL, FOLDER))
+    setup = Setup(camera, REAL, Estimation())
+    seen, pose = observe_view(found, None, setup)
+    return camera, found, estimate_markers(Evidence.of(setup, [seen], [pose])).views[0]
+
+
+def off_px(points, found):
+    """Median distance of corners from a free homography of points [N, 2] of the print."""
+    H, _ = cv2.findHomography(points, found)
+    return float(np.median(np.linalg.norm(cv2.perspectiveTransform(points[None], H)[0] - found, axis=1)))
+
+
+@pytest.mark.shared_data
+def test_all_35_markers_of_the_real_photograph_are_found_and_fit(estimated, record_figure):
+    _, found, view = estimated
+    assert list(found.ids) == list(range(35)) and found.dropped == ()
+    quads, corners = marker_corners(REAL)[:, :, :2], found.corners_px.reshape(-1, 2)
+    homography_px = off_px(quads.reshape(-1, 2), corners)
+    record_figure("real photograph: median reprojection with the given camera", "px", view.reprojection_px, 2.0)
+    record_figure("real photograph: median error of a free homography", "px", homography_px)
+    assert view.status == "used" and view.reprojection_px <= 2.0
+    # The print is not quite flat, or the lens not quite known: no pose can do better. OpenCV's own corners leave 0.85 px.
+    assert homography_px < 1.1
+    # Found after the fact, with one more parameter and on one photograph: black is 1.5 mm wider than the board's file says.
+    middles = quads.mean(axis=1, keepdims=True)
+    sides_m = np.arange(0.038, 0.0441, 0.00025)
+    errors_px = [off_px((middles + side / 0.04 * (quads - middles)).reshape(-1, 2), corners) for side in sides_m]
+    record_figure("real photograph: the same, side of the printed marker free", "px", min(errors_px))
+    assert min(errors_px) < 0.35 and 0.0405 < sides_m[int(np.argmin(errors_px))] < 0.0425
+
+
+@pytest.mark.shared_data
+def test_the_axes_stand_on_the_print_in_the_picture(estimated):
+    """Origin in the middle of the grid, x along the rows, y up the print, z towards the camera; OpenCV's solution is ours."""
+    camera, found, view = estimated
+    T = view.T_board_cam
+    origin, x, y, z = pixels_of_points(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), T, camera)
+    centres = found.corners_px.mean(axis=1)
+    assert np.linalg.norm(origin - centres[17]) < 6  # marker 17 of 35 is the middle one
+    for axis, along in ((x - origin, centres[19] - centres[15]), (y - origin, centres[2] - centres[32])):
+        assert axis @ along > 0.99 * np.linalg.norm(axis) * np.linalg.norm(along)
+    assert z[1] < origin[1] - 50 and T[2, 3] > 0  # up in the picture, towards the camera
+    grid = cv2.aruco.GridBoard((5, 7), 0.04, 0.01, open_dictionary(REAL, FOLDER))
+    corners = [quad[None].astype(np.float32) for quad in found.corners_px - 0.5]
+    points, pixels = grid.matchImagePoints(corners, found.ids.astype(np.int32)[:, None])
+    k = camera.intrinsics
+    K = np.array([[k.fx, 0, k.cx_opencv], [0, k.fy, k.cy_opencv], [0, 0, 1]])
+    _, rotation, position = cv2.solvePnP(points, pixels, K, camera.lens)
+    T_cam_theirs = np.eye(4)
+    T_cam_theirs[:3, :3], T_cam_theirs[:3, 3] = cv2.Rodrigues(rotation)[0], position.ravel()
+    ours = frame_in_board(REAL, "opencv") @ np.linalg.inv(T_cam_theirs)
+    assert np.linalg.norm(ours[:3, 3] - T[:3, 3]) < 0.004  # they have no robust loss

@@ -1,99 +1,356 @@
-"""What views say about points: offsets, visibility, exposure and colour, against a plane in closed form."""
+"""From depth images to the merged surface, held against planes, spheres and boxes in closed form."""
+
+import functools
 
 import numpy as np
 import pytest
+import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.view import Camera
-from tests.workers.capture.analytic_capture import Thing, cast, kinect
+from schemas.errors import CaptureError
+from schemas.job.captures import Fusion
+from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera, Intrinsics
+from tests.workers.capture.analytic_capture import BOARD, HIGH, RADIUS, SPHERE, Thing, capture, cast, kinect
 from workers.capture.surface.fusion import (
     UNSEEN,
     Sight,
     color_points,
     exposure_gains,
+    fuse_views,
     measure_offsets,
     observe,
     sample_light,
 )
+from workers.capture.surface.object_mask import CELL_M, down_to_board, find_object, silhouette
 from workers.capture.surface.posed_view import PosedView
-from workers.capture.surface.tsdf import fit_depth
+from workers.capture.surface.tsdf import (
+    BACK_VOXELS,
+    FRONT_VOXELS,
+    Volume,
+    cut_below,
+    empty_volume,
+    extract_surface,
+    fit_depth,
+    integrate,
+    keep_vertices,
+    large_parts,
+    vertex_normals,
+)
 from workers.geometry.camera import look_at
 from workers.geometry.colour import decode_codes
 
-K = kinect(0.25)
 NOTHING = Thing(sphere=None, boxes=[])
+
+
+def plane_depth(k, normal, distance_m):
+    """z of the plane normal . p = distance at every pixel's centre; the cosine of incidence times the ray's length; rays."""
+    rows, columns = np.mgrid[0 : k.height, 0 : k.width]
+    rays = np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(rows.shape)], axis=-1)
+    along = rays @ (np.array(normal) / np.linalg.norm(normal))
+    return (distance_m / along).astype(np.float32), along, rays
+
+
+# ---------------------------------------------------------------------------------------------- planes fitted to depth
+
+WINDOW = Intrinsics(width=120, height=90, fx=912.0, fy=905.0, cx=61.0, cy=44.0)
+"""A window of a Kinect's picture, where samples are two pixels apart."""
+INNER = np.s_[10:-10, 10:-10]
+
+
+def test_a_plane_is_fitted_exactly_with_its_angle_up_to_the_largest_one():
+    for normal in ((0, 0, 1), (0.5, 0, 1), (0.3, -0.9, 1), (-1.2, 0.4, 1)):
+        depth, along, _ = plane_depth(WINDOW, normal, 0.6)
+        fitted = fit_depth(depth, WINDOW, 80.0)
+        assert np.abs(1.0 / fitted.inverse[INNER] - depth[INNER]).max() < 2e-6
+        assert np.abs(fitted.facing[INNER] - along[INNER]).max() < 2e-3
+    part = fit_depth(depth, WINDOW, 80.0, (20, 30, 60, 80))  # a window is the same part of the whole
+    assert (part.top, part.left, part.inverse.shape) == (20, 30, (40, 50))
+    assert np.array_equal(part.inverse, fitted.inverse[20:60, 30:80])
+    depth, along, rays = plane_depth(WINDOW, (1.2, 0, 1), 0.5)
+    angle = np.degrees(np.arccos(along / np.linalg.norm(rays, axis=-1)))[45, 60]
+    assert not fit_depth(depth, WINDOW, angle - 1.5).inverse[20:-20, 55:65].any()
+    assert fit_depth(depth, WINDOW, angle + 1.5).inverse[20:-20, 55:65].all()
+
+
+def test_noise_falls_by_the_root_of_the_samples():
+    depth, _, _ = plane_depth(WINDOW, (0.2, 0.1, 1), 0.8)
+    for seed in range(3):
+        measured = depth + np.random.default_rng(seed).normal(0, 0.001, depth.shape).astype(np.float32)
+        error = (1.0 / fit_depth(measured, WINDOW, 75.0).inverse - depth)[INNER]
+        assert 0.8 / 5 < error.std() / 0.001 < 1.2 / 5 and abs(error.mean()) < 5e-5
+
+
+def test_pixels_along_an_edge_between_two_surfaces_and_lone_specks_are_left_out():
+    depth = np.full((90, 120), 0.8, np.float32)
+    depth[:, :60] = 0.6
+    depth[:, 60] = np.linspace(0.63, 0.77, 90)  # flying pixels
+    inverse = fit_depth(depth, WINDOW, 75.0).inverse
+    assert not inverse[:, 60].any()
+    assert inverse[5:-5, 5:56].all() and inverse[5:-5, 65:-5].all()
+    assert np.allclose(1.0 / inverse[5:-5, 5:58][inverse[5:-5, 5:58] > 0], 0.6, atol=1e-6)
+    speck = np.zeros_like(depth)
+    speck[40:42, 50:52] = 0.7
+    assert not fit_depth(speck, WINDOW, 75.0).inverse.any()
+
+
+# ---------------------------------------------------------------------------------------------- the distance field
+
+K = Intrinsics(width=160, height=120, fx=300.0, fy=300.0, cx=80.0, cy=60.0)
+VOXEL = 0.002
+
+
+def board_seen_from(position, height_m=0.0):
+    """A camera that looks at the origin, and exact depth of the plane z = height."""
+    T = look_at(np.array(position), np.zeros(3))
+    return Camera(K, frozen_array(T)), plane_depth(K, T[2, :3], height_m - T[2, 3])[0]
+
+
+def volume_of(*seen):
+    volume = empty_volume(np.array([-0.03, -0.03, -0.01]), np.array([0.03, 0.03, 0.03]), VOXEL)
+    for camera, depth in seen:
+        integrate(volume, fit_depth(depth, K, 80.0), camera)
+    return volume
+
+
+def test_voxels_hold_the_distance_along_the_normal_at_every_angle():
+    for position in ((0.01, 0, 0.5), (0.4, 0.1, 0.3), (0.0, -0.5, 0.2)):
+        volume = volume_of(board_seen_from(position))
+        z = volume.origin[2] + VOXEL * np.arange(volume.weight.shape[2])
+        seen = (z > -0.7 * BACK_VOXELS * VOXEL) & (z < FRONT_VOXELS * VOXEL)
+        assert (volume.weight[:, :, seen] > 0).all()
+        assert np.abs(volume.distance_m[:, :, seen] - z[seen]).max() < 2e-5
+        assert np.allclose(volume.distance_m[:, :, z > FRONT_VOXELS * VOXEL + 1e-4], FRONT_VOXELS * VOXEL)
+        assert not volume.weight[:, :, z < -BACK_VOXELS * VOXEL - 1e-4].any()
+
+
+def test_views_weigh_by_the_inverse_fourth_power_of_their_distance_and_unseen_voxels_nothing():
+    near, far = board_seen_from((0, 0.001, 0.4), 0.001), board_seen_from((0, 0.001, 0.8), -0.0005)
+    volume, level = volume_of(near, far), 5  # z = 0
+    assert volume.distance_m[15, 15, level] == pytest.approx((16 * -0.001 + 0.0005) / 17, abs=2e-5)
+    camera, depth = board_seen_from((0, 0.001, 0.5))
+    depth[:, 80:] = 0.0
+    weight = volume_of((camera, depth)).weight[:, 15, 8] > 0
+    assert sorted([weight[:10].all(), weight[-10:].all()]) == sorted([weight[:10].any(), weight[-10:].any()]) == [0, 1]
+
+
+BALL, CENTRE = 0.02, np.array([0.0003, 0.0, -0.0005])
+
+
+def field_of_a_ball(seen=lambda p: np.ones(p.shape[:3], bool)):
+    axis = np.arange(-15, 16) * 0.002
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    distance = (np.linalg.norm(grid - CENTRE, axis=-1) - BALL).astype(np.float32)
+    return Volume(
+        np.full(3, axis[0]), 0.002, distance, seen(grid).astype(np.float32), np.ones(grid.shape[:3], np.uint16)
+    )
+
+
+def test_the_surface_lies_at_distance_zero_and_is_wound_outwards_and_made_where_it_was_seen():
+    mesh = extract_surface(field_of_a_ball())
+    radius = np.linalg.norm(mesh.vertices - CENTRE, axis=1)
+    assert np.abs(radius - BALL).max() < 5e-5
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert solid.is_watertight and solid.volume == pytest.approx(4 / 3 * np.pi * BALL**3, rel=0.01)
+    assert ((vertex_normals(mesh) * (mesh.vertices - CENTRE)).sum(axis=1) / radius).min() > 0.99
+    half = extract_surface(field_of_a_ball(lambda p: p[..., 0] > -0.0001))
+    assert len(half.faces) and half.vertices[:, 0].min() > -1e-6
+    assert not len(extract_surface(field_of_a_ball(lambda p: np.linalg.norm(p, axis=-1) > 0.026)).faces)
+    assert not len(extract_surface(field_of_a_ball(lambda p: np.zeros(p.shape[:3], bool))).faces)
+
+
+def test_a_mesh_is_cut_along_a_tilted_plane_and_small_loose_parts_are_told():
+    big, crumb = extract_surface(field_of_a_ball()), trimesh.creation.icosphere(1, 0.002)
+    cut = cut_below(big, (0.1, -0.2, 0.001), 0.004).vertices
+    height = cut[:, 2] - 0.1 * cut[:, 0] + 0.2 * cut[:, 1] - 0.001
+    assert height.min() == pytest.approx(0.004, abs=1e-9) and (np.abs(height - 0.004) < 1e-9).sum() > 30
+    faces = np.concatenate([crumb.faces, big.faces + len(crumb.vertices)]).astype(np.int32)
+    both = Mesh(np.concatenate([crumb.vertices + 0.1, big.vertices]), faces)
+    keep = large_parts(both, 0.02)
+    assert (
+        not keep[: len(crumb.vertices)].any() and keep[len(crumb.vertices) :].all() and large_parts(both, 0.001).all()
+    )
+    kept, old = keep_vertices(both, keep)
+    assert np.array_equal(kept.vertices, big.vertices) and np.array_equal(kept.faces, big.faces)
+    assert np.array_equal(both.vertices[old], kept.vertices)
+
+
+# ---------------------------------------------------------------------------------------------- what views say of points
+
+SMALL = kinect(0.25)
 GRID = np.stack([*np.meshgrid(np.linspace(-0.08, 0.08, 9), np.linspace(-0.06, 0.06, 7))], axis=-1).reshape(-1, 2)
 UP = np.tile([0.0, 0.0, 1.0], (len(GRID), 1))
+WITHIN_M = 0.006
 
 
 def points(height_m=0.0):
     return np.concatenate([GRID, np.full((len(GRID), 1), height_m)], axis=1)
 
 
-def sight(position, gain=1.0, error_m=0.0):
-    camera = Camera(K, frozen_array(look_at(np.array(position), np.zeros(3))))
+def sight(position, error_m=0.0):
+    camera = Camera(SMALL, frozen_array(look_at(np.array(position), np.zeros(3))))
     depth, _, rgb = cast(NOTHING, camera)
     depth = np.where(depth > 0, depth + error_m, 0).astype(np.float32)
-    rgb = np.clip(np.rint(rgb * gain), 0, 255).astype(np.uint8)
-    return Sight(PosedView(0, camera, camera, rgb, depth), fit_depth(depth, K, 75.0), 0.26)
+    return Sight(PosedView(0, camera, camera, rgb, depth), fit_depth(depth, SMALL, 75.0), 0.26)
 
 
-@pytest.mark.parametrize("position", [(0.02, 0.0, 0.6), (0.5, 0.2, 0.4)])
-@pytest.mark.parametrize("height_m", [-0.003, 0.0, 0.004])
-def test_the_offset_is_the_way_along_the_normal_to_the_surface(position, height_m):
-    offset, weight = observe(points(height_m), UP, sight(position), 0.006)
-    assert (weight > 0).all() and np.abs(offset + height_m).max() < 5e-5
-
-
-def test_a_point_too_far_off_or_turned_away_is_not_seen():
+def test_the_offset_is_the_way_along_the_normal_to_the_surface_that_a_view_sees():
+    for position in ((0.02, 0.0, 0.6), (0.5, 0.2, 0.4)):
+        for height_m in (-0.003, 0.0, 0.004):
+            offset, weight = observe(points(height_m), UP, sight(position), WITHIN_M)
+            assert (weight > 0).all() and np.abs(offset + height_m).max() < 5e-5
     one = sight((0.3, 0.0, 0.5))
-    assert not observe(points(0.008), UP, one, 0.006)[1].any()
-    assert not observe(points(), -UP, one, 0.006)[1].any()
-    assert not observe(points(), np.tile([-1.0, 0.0, 0.0], (len(GRID), 1)), one, 0.006)[1].any()
-
-
-def test_offsets_are_the_weighted_mean_and_views_are_counted():
+    for where, normals in ((points(0.008), UP), (points(), -UP), (points(), np.tile([-1.0, 0, 0], (len(GRID), 1)))):
+        assert not observe(where, normals, one, WITHIN_M)[1].any()
     near, far = sight((0, 0.001, 0.4), error_m=-0.001), sight((0, 0.001, 0.8), error_m=0.0005)
-    found = measure_offsets(points(), UP, [near, far], 0.006)
+    found = measure_offsets(points(), UP, [near, far], WITHIN_M)
     assert (found.views == 2).all()
-    # 1.000^4 of 0.399 m against 0.8005 m; the errors lie along the vertical nearly.
-    w = (0.8005 / 0.399) ** 4
+    w = (0.8005 / 0.399) ** 4  # the errors lie along the vertical nearly
     assert np.median(found.mean_m) == pytest.approx((0.001 * w - 0.0005) / (w + 1), abs=1e-4)
 
 
-def test_light_is_read_between_pixels():
-    one = sight((0.02, 0.0, 0.6))
-    light, inside = sample_light(one.view.rgb, one.view.camera, points())
-    depth, _, _ = cast(NOTHING, one.view.camera)
-    assert inside.all() and (depth > 0).any()
-    p = points()[10]
-    wave = np.sin(40 * p + np.arange(3))
-    assert np.abs(light[10] - decode_codes(np.clip(150 + 40 * wave, 0, 255).astype(np.uint8))).max() < 0.02
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_exposures_are_made_alike(seed):
-    rng = np.random.default_rng(seed)
-    truth = rng.uniform(0.1, 0.5, (500, 3))
+def test_exposures_are_made_alike():
     gains = np.array([1.0, 0.5, 1.6, 1.0, 0.8])
-    light = (truth * gains[:, None, None] * rng.normal(1, 0.02, (5, 500, 1))).astype(np.float32)
-    score = (rng.uniform(size=(5, 500)) < 0.6).astype(np.float32)
-    found = exposure_gains(light, score)
-    assert np.allclose(found * gains / (found * gains)[0], 1.0, atol=0.02)
-    assert np.median(found) == pytest.approx(1.0)
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        truth = rng.uniform(0.1, 0.5, (500, 3))
+        light = (truth * gains[:, None, None] * rng.normal(1, 0.02, (5, 500, 1))).astype(np.float32)
+        found = exposure_gains(light, (rng.uniform(size=(5, 500)) < 0.6).astype(np.float32))
+        assert np.allclose(found * gains / (found * gains)[0], 1.0, atol=0.02) and np.median(found) == pytest.approx(
+            1.0
+        )
 
 
-def test_a_colour_is_that_of_the_views_that_see_it_best():
+def test_a_colour_is_that_of_the_views_that_see_it_best_or_of_its_neighbour():
     sights = [sight(p) for p in ((0.02, 0, 0.6), (0, 0.03, 0.6), (0.03, 0.03, 0.6), (0.6, 0, 0.25))]
+    wave = 150 + 40 * np.sin(40 * points() + np.arange(3))
+    light, inside = sample_light(sights[0].view.rgb, sights[0].view.camera, points())
+    assert inside.all() and np.abs(light[10] - decode_codes(wave[10].astype(np.uint8))).max() < 0.02
     sights[3].view.rgb[...] = 255 - sights[3].view.rgb
-    colors = color_points(points(), UP, sights, 0.006)
-    wave = np.sin(40 * points() + np.arange(3))
     # A view at 67 degrees from farther away has a fiftieth of the others' squared weight.
-    assert np.abs(colors.astype(float) - (150 + 40 * wave)).max() < 6
-
-
-def test_a_point_that_no_view_sees_has_its_neighbours_colour():
+    assert np.abs(color_points(points(), UP, sights, WITHIN_M).astype(float) - wave).max() < 6
     some = np.concatenate([points(), points(0.1)[:1]])
-    colors = color_points(some, np.tile([0.0, 0.0, 1.0], (len(some), 1)), [sight((0.02, 0, 0.6))], 0.006)
+    colors = color_points(some, np.concatenate([UP, UP[:1]]), sights[:1], WITHIN_M)
     assert np.array_equal(colors[-1], colors[0])
-    assert (color_points(points(0.1), UP, [sight((0.02, 0, 0.6))], 0.006) == UNSEEN).all()
+    assert (color_points(points(0.1), UP, sights[:1], WITHIN_M) == UNSEEN).all()
+
+
+# ---------------------------------------------------------------------------------------------- the object on the board
+
+FLAT = Thing(sphere=None, boxes=[(np.array([-0.04, -0.03, 0.0]), np.array([0.05, 0.03, 0.004]))])
+LOW_M = Fusion(board_clearance_m=0.002)
+
+
+def test_the_region_holds_the_object_and_little_more():
+    region = find_object(capture(sigma_m=0.002), BOARD, Fusion())
+    low, high = SPHERE[:2] - RADIUS, HIGH[:2]
+    assert (region.low[:2] <= [low[0], min(low[1], -0.05)]).all() and (region.high[:2] >= high).all()
+    assert (region.high[:2] - region.low[:2] < np.array([0.20, 0.12]) + 10 * CELL_M).all()
+    assert 0.13 < region.high[2] < 0.20 and region.notes == () and np.abs(region.plane).max() < 5e-4
+
+
+def test_an_object_of_4_mm_is_found_in_depth_that_is_noisier():
+    for seed in range(2):
+        region = find_object(capture(FLAT, sigma_m=0.004, seed=seed), BOARD, LOW_M)
+        low, high = np.array([-0.04, -0.03]), np.array([0.05, 0.03])
+        assert (region.low[:2] < low).all() and (region.low[:2] > low - 4 * CELL_M).all()
+        assert (region.high[:2] > high).all() and (region.high[:2] < high + 4 * CELL_M).all()
+
+
+def test_the_boards_plane_is_where_depth_has_it():
+    views = capture(FLAT, sigma_m=0.001)
+    for view in views:
+        view.depth_m[view.depth_m > 0] += np.float32(0.008)  # along the axes, some 45 degrees from the vertical
+    region = find_object(views, BOARD, LOW_M)
+    assert -0.009 < region.plane[2] < -0.004
+    assert (region.low[:2] > [-0.07, -0.06]).all() and (region.high[:2] < [0.08, 0.06]).all()
+
+
+def test_the_largest_thing_is_the_object_and_what_is_none_is_refused_with_the_height():
+    pen = (np.array([0.15, 0.10, 0.0]), np.array([0.20, 0.15, 0.05]))
+    region = find_object(capture(Thing(boxes=[*Thing().boxes, pen])), BOARD, Fusion())
+    assert region.high[0] < 0.12 and region.notes == ("1 other thing on the board left out",)
+    some = np.array([[0.17, 0.12, 0.03], [0.0, 0.0, 0.05], [0.0, 0.0, 0.001], [5.0, 0.0, 0.05]])
+    assert list(region.holds(some)) == [False, True, False, False]
+    blind = capture()
+    for view in blind:
+        view.depth_m[:] = 0.0
+    for views, spec, reason, words in (
+        (capture(NOTHING, sigma_m=0.002), Fusion(), "no_object", "stands more than"),
+        (
+            capture(FLAT),
+            Fusion(board_clearance_m=0.006),
+            "no_object",
+            r"6\.0 mm above it \(highest: [34]\.\d mm\): lower",
+        ),
+        (blind, Fusion(), "no_depth", "depth images are empty"),
+    ):
+        with pytest.raises(CaptureError, match=words) as refusal:
+            find_object(views, BOARD, spec)
+        assert refusal.value.reason == reason
+
+
+# ---------------------------------------------------------------------------------------------- the merged surface
+
+
+def fuse(views, spec=None):
+    spec = spec or Fusion()
+    return fuse_views(views, find_object(views, BOARD, spec), spec)
+
+
+@functools.cache
+def fused(sigma_m=0.002, seed=0):
+    """(views, their merged surface) of a sphere and a box."""
+    views = capture(sigma_m=sigma_m, seed=seed)
+    return views, fuse(views)
+
+
+def test_the_cloud_lies_on_the_object(record_figure):
+    for sigma_m, seed in ((0.002, 0), (0.004, 2)):
+        _, found = fused(sigma_m, seed)
+        off_mm = Thing().distance(found.points) * 1e3
+        record_figure(f"merged cloud, noise {sigma_m * 1e3:g} mm", "median, mm", float(np.median(off_mm)), 0.6)
+        # A quarter of the resolution of a Kinect: depth pixels are 6 mm apart, and its bars are 1 and 3 mm.
+        assert np.median(off_mm) < 0.6 and np.quantile(off_mm, 0.95) < 2.5
+        assert (found.views >= Fusion().min_views).all() and np.median(found.views) > 5
+    outwards = found.points - SPHERE
+    sphere = (np.linalg.norm(outwards, axis=1) < 0.062) & (found.points[:, 0] < -0.07)
+    outwards = outwards[sphere] / np.linalg.norm(outwards[sphere], axis=1)[:, None]
+    assert sphere.sum() > 1000 and np.median((found.normals[sphere] * outwards).sum(axis=1)) > 0.95
+    red, green, blue = found.colors[sphere].mean(axis=0)
+    assert red > green > blue and abs(red - 180) < 30
+
+
+def test_the_same_views_give_the_same_bytes():
+    views, one = fused()
+    two = fuse(views)
+    for name in ("points", "normals", "colors", "views", "vertices", "faces", "vertex_colors"):
+        assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+
+
+def test_what_one_view_alone_shows_is_left_out_and_one_view_refused_unless_one_is_enough():
+    views = capture(count=12)
+    ghost = views[3].depth_m
+    ghost[:] = np.where((ghost > 0) & (np.arange(ghost.shape[1]) % 40 < 20), ghost - 0.03, ghost)
+    off_mm = Thing().distance(fuse(views).points) * 1e3
+    assert np.quantile(off_mm, 0.95) < 2.0 and off_mm.max() < 12.0
+    with pytest.raises(CaptureError, match=r"fusion\.min_views is 2") as refusal:
+        fuse(views[:1])
+    assert refusal.value.reason == "too_few_views"
+    found = fuse(views[:1], Fusion(min_views=1))
+    assert len(found.points) > 1000 and np.quantile(Thing().distance(found.points), 0.95) < 0.003
+
+
+def test_the_silhouette_is_the_objects_and_its_walls_reach_the_board_and_no_farther():
+    views, found = fused()
+    region = find_object(views, BOARD, Fusion())
+    mesh = Mesh(found.vertices, found.faces)
+    closed = down_to_board(mesh, region)
+    for view in views[:4]:
+        truth, mask = cast(Thing(), view.camera)[1], silhouette(closed, view.camera)
+        # One pixel of the outline, some 250 pixels long, is 10 % of the 2,600 pixels.
+        assert (mask & truth).sum() / (mask | truth).sum() > 0.9
+    assert region.height_m(mesh.vertices).min() == pytest.approx(region.clearance_m, abs=1e-6)
+    added = closed.vertices[len(mesh.vertices) :]
+    assert len(added) > 50 and np.abs(region.height_m(added)).max() < 1e-12
+    assert np.array_equal(closed.faces[: len(mesh.faces)], mesh.faces)

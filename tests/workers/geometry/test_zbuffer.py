@@ -30,7 +30,7 @@ from tests.workers.geometry.made_up_kinect import (
 )
 from workers.geometry.camera import look_at
 from workers.geometry.frames import pose, rotation_about, translation, uniform_rotation
-from workers.geometry.rational_lens import project_points
+from workers.geometry.lens import project_points
 from workers.geometry.raycast import Placed, cast_view
 from workers.geometry.zbuffer import LARGEST_PX, NEAREST_M, count_covered, draw_depth, register_depth
 

@@ -1,10 +1,4 @@
-"""The joint estimate: all views, corners and depth in one problem.
-
-- Pairs of patches of the object, seen in two views, that lie on one piece of its surface.
-- How noisy a capture's depth is, by its own residuals: the sigma of a patch, and how much alike the patches of a view
-  err.
-- Levenberg-Marquardt over the poses of all views and the shared parameters, by dense normal equations.
-- The joint problem of a capture: corners, the board's depth and the object's, each weighed by its measured noise.
+"""The joint estimate: all views, corners and depth in one problem, each weighed by its measured noise.
 
 Errors of depth are alike over an image (the lens, the distance, the shutter). Hundreds of patches that err together
 know no more than a few; so the variance of a term is inflated by what the misfit of whole views says over that of
@@ -14,7 +8,6 @@ independent patches.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +24,6 @@ from workers.capture.poses.terms import (
     BoardTerm,
     CornerTerm,
     ObjectTerm,
-    Rows,
     Shared,
     normal_equations,
     prior_sigma,
@@ -146,11 +138,7 @@ SETTLED = 1e-7
 """A step of fewer metres and radians ends the iteration: a tenth of a micrometre."""
 
 
-class Term(Protocol):
-    """Something that is measured."""
-
-    def rows(self, poses: Array, shared: Shared) -> Rows:
-        """Its residuals and derivatives at the poses [V, 4, 4]."""
+Term = CornerTerm | BoardTerm | ObjectTerm
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,8 +291,9 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
         if measured is None:
             break
         # Poses that have followed the object's depth no longer show how far it had pulled them: the first rounds tell.
-        alike = max(alike, measured[1])
-        surface = _weighed(measured[0], alike)
+        alike, surface = max(alike, measured[1]), measured[0]
+        first, second = object_view[matches.pairs].T
+        surface = dataclasses.replace(surface, inflation=row_inflation(alike, surface.sigma_m, first, second))
         problem = Problem([*terms, surface], prior, views.fixed)
         before = solution
         solution = minimise(problem, before.poses, before.shared, spec.max_iterations - iterations)
@@ -360,14 +349,10 @@ def _measured_object(
     sigma_m = patch_sigma(residual[chosen] * growth[chosen], growth[chosen]) * growth
     rows = dataclasses.replace(term, sigma_m=sigma_m).rows(found.poses, found.shared)
     # Each pair tells of both of its views.
+    assert rows.second is not None and rows.by_second is not None
     both = np.concatenate([rows.first[chosen], rows.second[chosen]])
     by = np.concatenate([rows.by_first[chosen], rows.by_second[chosen]])
     covariance = found.covariance()[:-SHARED, :-SHARED].reshape(len(views.poses), POSE, -1, POSE)
     own = covariance[range(len(views.poses)), :, range(len(views.poses))]
     factor = inflation(np.tile(rows.residual[chosen], 2), by, both, own)
     return dataclasses.replace(term, sigma_m=sigma_m), factor
-
-
-def _weighed(term: ObjectTerm, factor: float) -> ObjectTerm:
-    a, b = term.view[term.pairs].T
-    return dataclasses.replace(term, inflation=row_inflation(factor, term.sigma_m, a, b))

@@ -1,64 +1,27 @@
-"""What one view observes: rays through pixels, corners and depth samples.
+"""What one view observes: rays through pixels, corners, and samples of depth on the board and on what stands on it.
 
-- Pixels to rays and board points to pixels, through the lens, by OpenCV's own model.
-- What the estimates know of one view: its corners as rays, where they lie on the board, and samples of its depth.
+A piece of plane has an inverse depth that is affine in the ray (x, y): 1 / z = a x + b y + c, with the plane's normal
+along (a, b, c). So one robust linear fit gives the piece's middle, its normal and its noise.
 """
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board, Estimation
-from schemas.scene.view import Intrinsics
-from workers.capture.board.layout import marker_corners
-from workers.geometry.frames import invert
-
-ROUND_TRIP_PX = 0.05
-"""A pixel whose ray does not lead back to it by less than this lies where the lens model folds: it has no ray."""
-ITERATIONS = 60
-
-
-def opencv_matrix(k: Intrinsics) -> Array:
-    """[3, 3] float64: the camera matrix as OpenCV has it, the first pixel's centre at 0."""
-    return np.array([[k.fx, 0.0, k.cx_opencv], [0.0, k.fy, k.cy_opencv], [0.0, 0.0, 1.0]])
-
-
-def rays_of_pixels(pixels: Array, camera: CaptureCamera) -> Array:
-    """[N, 2] float64: (x / z, y / z) of stored pixels [N, 2], centres at +0.5; nan where the lens model cannot be inverted."""
-    k = camera.intrinsics
-    rays = (pixels - np.array([k.cx, k.cy])) / np.array([k.fx, k.fy])
-    if not camera.has_lens or not len(rays):
-        return rays
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-10)
-    found = cv2.undistortPoints((pixels - 0.5).reshape(-1, 1, 2), opencv_matrix(k), camera.lens, criteria=stop)
-    rays = found.reshape(-1, 2).astype(np.float64)
-    back = _distorted(np.column_stack([rays, np.ones(len(rays))]), camera)
-    with np.errstate(invalid="ignore"):
-        bad = ~(np.linalg.norm(back - pixels, axis=1) <= ROUND_TRIP_PX)
-    rays[bad] = np.nan
-    return rays
+from workers.capture.board import marker_corners
+from workers.geometry.camera import spread_evenly
+from workers.geometry.frames import invert, transform
+from workers.geometry.lens import project_points, rays_of_pixels
 
 
 def pixels_of_points(points_board: Array, T_board_cam: Pose, camera: CaptureCamera) -> Array:
     """[N, 2] float64: stored pixels, centres at +0.5, of board points [N, 3]; nan behind the camera."""
     T = invert(T_board_cam)
-    points_cam = points_board @ T[:3, :3].T + T[:3, 3]
-    pixels = _distorted(points_cam, camera)
-    pixels[points_cam[:, 2] <= 0] = np.nan
-    return pixels
-
-
-def _distorted(points_cam: Array, camera: CaptureCamera) -> Array:
-    if not len(points_cam):
-        return np.zeros((0, 2))
-    zero, matrix = np.zeros(3), opencv_matrix(camera.intrinsics)
-    found, _ = cv2.projectPoints(points_cam.reshape(-1, 1, 3), zero, zero, matrix, camera.lens)
-    pixels: Array = found.reshape(-1, 2).astype(np.float64) + 0.5
-    return pixels
+    return project_points(points_board @ T[:3, :3].T + T[:3, 3], camera.intrinsics, camera.lens)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +72,6 @@ class Observation:
     corners: Corners
     board_patches: Patches = field(default_factory=no_patches)
     object_patches: Patches = field(default_factory=no_patches)
-    has_depth: bool = False
     manual_T_board_cam: Pose | None = None
     given_by: str = ""
     """Where the pose that was given is from, in words."""
@@ -132,8 +94,186 @@ class Setup:
 def corners_of(detection: Detection, board: Board, camera: CaptureCamera) -> Corners:
     """The corners of the detected markers; a marker where the lens cannot be inverted is left out. No depth yet."""
     pixels = detection.corners_px.reshape(-1, 2)
-    rays = rays_of_pixels(pixels, camera)
+    rays = rays_of_pixels(pixels, camera.intrinsics, camera.lens)
     whole = np.repeat(np.isfinite(rays).all(axis=1).reshape(-1, 4).all(axis=1), 4)
     points = marker_corners(board)[detection.ids - board.first_id].reshape(-1, 3)
     ids = np.repeat(detection.ids, 4)
     return Corners(points[whole], pixels[whole], rays[whole], ids[whole], np.zeros(int(whole.sum())))
+
+
+GRID = 12
+"""Samples along each side of a marker or gap."""
+MARGIN = 0.1
+"""Share of a marker's side at each end that is left out: depth is mixed at the edges of what hides a marker."""
+MIN_SAMPLES = 12
+MIN_SHARE = 0.25
+"""A piece needs so many samples with depth, and such a share of them."""
+OUTLIER = 3.5
+"""A sample farther from its piece's plane than this many standard deviations is left out."""
+CORNER_WINDOW_PX = 2
+"""Half the width of the window whose median is the depth of a corner."""
+
+
+def board_patches(depth: NDArray[np.uint16], detection: Detection, board: Board, camera: CaptureCamera) -> Patches:
+    """A patch for each marker found, and for each gap between two: what covers one would have kept it from being found.
+
+    The gaps are white where black ink may swallow the infrared light that depth is measured with.
+    """
+    quads = np.concatenate([detection.corners_px, _gaps(detection, board)])
+    place = np.linspace(MARGIN, 1 - MARGIN, GRID)
+    s, t = (axis.ravel() for axis in np.meshgrid(place, place))
+    weights = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], axis=1)  # of the corners, clockwise
+    pixels = np.floor(np.einsum("gk,mkc->mgc", weights, quads)).astype(np.int64)
+    return sample_patches(depth, pixels, camera)
+
+
+def _gaps(detection: Detection, board: Board) -> Array:
+    """[G, 4, 2] pixels: the areas between markers found side by side or one above the other."""
+    place = {int(marker) - board.first_id: n for n, marker in enumerate(detection.ids)}
+    corners, gaps = detection.corners_px, []
+    for marker, n in place.items():
+        right, below = place.get(marker + 1), place.get(marker + board.columns)
+        if right is not None and (marker + 1) % board.columns:
+            gaps.append([corners[n, 1], corners[right, 0], corners[right, 3], corners[n, 2]])
+        if below is not None:
+            gaps.append([corners[n, 3], corners[n, 2], corners[below, 1], corners[below, 0]])
+    return np.array(gaps, dtype=np.float64).reshape(-1, 4, 2)
+
+
+def sample_patches(depth: NDArray[np.uint16], pixels: NDArray[np.int64], camera: CaptureCamera) -> Patches:
+    """Patches fitted to the depth at pixels [P, S, 2] (column, row); those with too little depth are left out."""
+    height, width = depth.shape
+    inside = ((pixels >= 0) & (pixels < np.array([width, height]))).all(axis=2)
+    column, row = np.where(inside, pixels[..., 0], 0), np.where(inside, pixels[..., 1], 0)
+    z = np.where(inside, depth[row, column], 0) / camera.depth_units_per_m
+    centres: Array = pixels.reshape(-1, 2).astype(np.float64) + 0.5
+    rays = rays_of_pixels(centres, camera.intrinsics, camera.lens).reshape(pixels.shape)
+    return fit_patches(rays, np.where(np.isfinite(rays).all(axis=2), z, 0.0))
+
+
+def fit_patches(rays: Array, z: Array) -> Patches:
+    """Planes through samples at rays [P, S, 2] with depths z [P, S], 0 where there is none."""
+    count = (z > 0).sum(axis=1)
+    enough = (count >= MIN_SAMPLES) & (count >= MIN_SHARE * z.shape[1])
+    rays, z = np.where((z > 0)[..., None], rays, 0.0)[enough], z[enough]
+    basis = np.concatenate([rays, np.ones((*z.shape, 1))], axis=2)
+    inverse = np.where(z > 0, 1.0 / np.where(z > 0, z, 1.0), 0.0)
+    used = z > 0
+    plane, sigma = np.zeros((len(z), 3)), np.full(len(z), np.inf)
+    for _ in range(3):
+        plane = _planes(basis, inverse, used)
+        off = (inverse - np.einsum("psk,pk->ps", basis, plane)) * z**2  # metres along z, to first order
+        sigma = 1.4826 * np.nanmedian(np.where(used, np.abs(off), np.nan), axis=1) if len(z) else np.zeros(0)
+        used = (z > 0) & (np.abs(off) <= OUTLIER * np.maximum(sigma, 1e-4)[:, None])
+    total = np.maximum(used.sum(axis=1), 1)
+    ray = (basis * used[..., None]).sum(axis=1) / total[:, None]
+    ray_z = (basis * (z * used)[..., None]).sum(axis=1) / total[:, None]
+    normal = -plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
+    good = (used.sum(axis=1) >= MIN_SAMPLES) & (ray_z[:, 2] > 0)
+    return Patches(ray_z[good], ray[good], normal[good], total[good], sigma[good])
+
+
+def _planes(basis: Array, inverse: Array, used: NDArray[np.bool_]) -> Array:
+    """[P, 3]: least squares of inverse depth [P, S] on the basis [P, S, 3] over the samples used.
+
+    The basis is centred first, because the rays of a small piece are nearly one.
+    """
+    total = np.maximum(used.sum(axis=1), 1)[:, None]
+    middle = (basis[..., :2] * used[..., None]).sum(axis=1) / total
+    mean = (inverse * used).sum(axis=1, keepdims=True) / total
+    dx = (basis[..., :2] - middle[:, None]) * used[..., None]
+    matrix = np.einsum("psi,psj->pij", dx, dx)
+    matrix += 1e-9 * (np.trace(matrix, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(2)
+    slope = np.linalg.solve(matrix, np.einsum("psi,ps->pi", dx, inverse - mean)[..., None])[..., 0]
+    return np.concatenate([slope, mean - (slope * middle).sum(axis=1, keepdims=True)], axis=1)
+
+
+def depth_at(depth: NDArray[np.uint16], pixels: Array, units_per_m: float) -> Array:
+    """[N] metres: median of the depth around pixels [N, 2] (centres at +0.5); 0 where fewer than a third have depth."""
+    reach = np.arange(-CORNER_WINDOW_PX, CORNER_WINDOW_PX + 1)
+    height, width = depth.shape
+    column = np.clip(np.floor(pixels[:, 0]).astype(np.int64)[:, None] + reach, 0, width - 1)
+    row = np.clip(np.floor(pixels[:, 1]).astype(np.int64)[:, None] + reach, 0, height - 1)
+    window = depth[row[:, :, None], column[:, None, :]].reshape(len(pixels), len(reach) ** 2)
+    few = (window > 0).sum(axis=1) * 3 < window.shape[1]
+    ordered = np.sort(np.where(window > 0, window, np.iinfo(np.uint16).max), axis=1)
+    half = np.maximum((window > 0).sum(axis=1) - 1, 0) // 2
+    median = ordered[np.arange(len(pixels)), half]
+    return np.where(few, 0.0, median / units_per_m)
+
+
+SIDE_RAD = 0.012
+"""Width of a patch, seen from the camera: 10 mm at 0.8 m."""
+ACROSS = 5
+"""Samples across a patch: registered depth is coarser than colour, and need not be read at every pixel."""
+CLEARANCE_M = 0.01
+TALLEST_M = 0.5
+"""A patch lies so far above the board, as depth has the board."""
+MIN_COSINE = 0.35
+"""Patches that are seen at more than 70 degrees from their normal are left out: their depth is mixed."""
+NOISY = 3.0
+"""A patch with so many times the expected noise is no piece of plane."""
+MOST = 200
+"""Patches of one view that are kept, evenly over all that there are."""
+
+
+def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patches, setup: Setup) -> Patches:
+    """The object's patches in one view, at most MOST; heights are over the board's plane as this view's depth has it."""
+    board, camera = setup.board, setup.camera
+    side = max(ACROSS, round(SIDE_RAD * camera.intrinsics.fx))
+    blocks = _blocks_over_board(T_board_cam, board, camera, side)
+    if not len(blocks):
+        return sample_patches(depth, np.zeros((0, 1, 2), np.int64), camera)
+    normal, distance = _plane_by_depth(on_board, T_board_cam)
+    middle = blocks + side // 2
+    z = depth[middle[:, 1], middle[:, 0]] / camera.depth_units_per_m
+    centres: Array = middle.astype(np.float64) + 0.5
+    rays = rays_of_pixels(centres, camera.intrinsics, camera.lens)
+    points = np.column_stack([rays, np.ones(len(rays))]) * z[:, None]
+    with np.errstate(invalid="ignore"):
+        blocks = blocks[(z > 0) & (points @ normal - distance > CLEARANCE_M)]
+    reach = np.arange(0, side, side // ACROSS)
+    offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+    found = sample_patches(depth, blocks[:, None] + offsets, camera)
+    keep = np.flatnonzero(_is_surface(found, normal, distance, setup.spec) & _over_board(found, T_board_cam, board))
+    keep = keep[spread_evenly(len(keep), MOST)]
+    return Patches(found.ray_z[keep], found.ray[keep], found.normal[keep], found.pixels[keep], found.sigma_m[keep])
+
+
+def _blocks_over_board(T_board_cam: Pose, board: Board, camera: CaptureCamera, side: int) -> NDArray[np.int64]:
+    """[B, 2]: upper left pixels of the blocks in the rectangle around the board and the space above it."""
+    x, y = board.scale * board.width_m / 2, board.scale * board.height_m / 2
+    space = np.array([[sx * x, sy * y, z] for sx in (-1, 1) for sy in (-1, 1) for z in (0.0, 0.5 * T_board_cam[2, 3])])
+    pixels = pixels_of_points(space, T_board_cam, camera)
+    k = camera.intrinsics
+    size = np.array([k.width, k.height])
+    if np.isfinite(pixels).all():
+        low, high = np.clip(pixels.min(axis=0), 0, size), np.clip(pixels.max(axis=0), 0, size)
+    else:
+        low, high = np.zeros(2), size
+    first = np.ceil(low / side).astype(np.int64)
+    last = np.floor(high / side).astype(np.int64)
+    columns, rows = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
+    return np.stack([columns.ravel(), rows.ravel()], axis=1) * side
+
+
+def _plane_by_depth(on_board: Patches, T_board_cam: Pose) -> tuple[Array, float]:
+    """(normal [3] up, distance): the board's plane n p = d in camera axes; the pose tells the normal, depth the distance."""
+    normal = T_board_cam[2, :3]
+    if len(on_board):
+        return normal, float(np.median(on_board.ray_z @ normal))
+    return normal, float(-T_board_cam[2, 3])
+
+
+def _is_surface(found: Patches, normal: Array, distance: float, spec: Estimation) -> NDArray[np.bool_]:
+    height = found.ray_z @ normal - distance
+    z = found.ray_z[:, 2]
+    cosine = -(found.normal * found.ray).sum(axis=1) / np.linalg.norm(found.ray, axis=1)
+    smooth = found.sigma_m <= NOISY * spec.depth_sigma_m * np.maximum(z, 0.5) ** 2
+    return (height > CLEARANCE_M) & (height < TALLEST_M) & (cosine > MIN_COSINE) & smooth
+
+
+def _over_board(found: Patches, T_board_cam: Pose, board: Board) -> NDArray[np.bool_]:
+    half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
+    inside: NDArray[np.bool_] = np.abs(transform(T_board_cam, found.ray_z)[:, :2]) < half
+    return inside[:, 0] & inside[:, 1]

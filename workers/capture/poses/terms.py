@@ -1,12 +1,8 @@
-"""The terms of the joint problem: shared parameters, rows of residuals and their derivatives.
+"""The terms of the joint problem: the parameters that all views share, and rows of residuals over sigma with derivatives.
 
-- What all views of a capture share: how depth is wrong, and how large the print is; with what is known of it
-  beforehand.
-- Rows of a sparse least-squares problem over the poses of V views and the parameters that they share.
-- The terms of the joint estimate as rows of residuals over sigma: corners, the board's depth, the object's depth.
-
-Each term is fixed data; its rows depend on the poses [V, 4, 4] (T_board_cam) and on the shared parameters. The sigma of
-depth grows with its scale: otherwise a smaller scale, which makes noise smaller, would always fit better.
+Each term is fixed data: corners, the board's depth or the object's. Its rows depend on the poses [V, 4, 4] (T_board_cam) and on
+the shared parameters. The sigma of depth grows with its scale: otherwise a smaller scale, which makes noise smaller, would
+always fit better.
 """
 
 import math
@@ -43,7 +39,6 @@ SCALE = 0.001
 """The Azure Kinect's systematic error is below 11 mm + 0.1 % of the distance (Microsoft, Azure Kinect DK hardware
 specifications); taken as one sigma, because it is a bound for good conditions."""
 SCALE_BY_PRINT = 0.5
-"""Nothing is known of the print's size where depth is metric truth."""
 """Sigma of the scale of depth where the print is metric truth: the scale then takes up the error of the print as well."""
 SHIFT_M = 0.010
 TURN_RAD = math.radians(0.5)
@@ -117,20 +112,20 @@ SHARED = len(NAMES)
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """N residuals in standard deviations, each of one view or of two.
+    """N residuals in standard deviations, each of one view or, with `second`, of two.
 
-    first, second [N]: index of the view (second -1 for none); by_first, by_second [N, 6] derivatives by small motions;
-    by_shared [N, 9]; weight [N]: robust weight over the inflation of the term's variance; cost: robust, of all rows.
+    first, second [N]: index of the view; by_first, by_second [N, 6] derivatives by small motions; by_shared [N, 9]; weight [N]:
+    robust weight over the inflation of the term's variance; cost: robust, of all rows.
     """
 
     residual: Array
     first: NDArray[np.int64]
     by_first: Array
-    second: NDArray[np.int64]
-    by_second: Array
     by_shared: Array
     weight: Array
     cost: float
+    second: NDArray[np.int64] | None = None
+    by_second: Array | None = None
 
 
 def normal_equations(terms: Sequence[Rows], views: int) -> tuple[Array, Array]:
@@ -145,9 +140,9 @@ def normal_equations(terms: Sequence[Rows], views: int) -> tuple[Array, Array]:
         shared += weighted.T @ rows.by_shared
         shared_gradient += weighted.T @ rows.residual
         _add(rows, rows.first, rows.by_first, blocks, mixed, gradient)
-        if (rows.second >= 0).any():
+        if rows.second is not None and rows.by_second is not None:
             _add(rows, rows.second, rows.by_second, blocks, mixed, gradient)
-            _add_pairs(rows, blocks)
+            _add_pairs(rows, rows.second, rows.by_second, blocks)
     matrix = np.zeros((size, size))
     poses = POSE * views
     matrix[:poses, :poses] = blocks.reshape(poses, poses)
@@ -160,7 +155,6 @@ def normal_equations(terms: Sequence[Rows], views: int) -> tuple[Array, Array]:
 def _add(rows: Rows, view: NDArray[np.int64], by_view: Array, blocks: Array, mixed: Array, gradient: Array) -> None:
     """Adds what one side of the rows says of its own view."""
     order = np.argsort(view, kind="stable")
-    order = order[view[order] >= 0]
     starts = np.flatnonzero(np.diff(view[order], prepend=-1))
     for start, stop in zip(starts, [*starts[1:], len(order)], strict=True):
         index = order[start:stop]
@@ -171,16 +165,14 @@ def _add(rows: Rows, view: NDArray[np.int64], by_view: Array, blocks: Array, mix
         gradient[number] += weighted.T @ rows.residual[index]
 
 
-def _add_pairs(rows: Rows, blocks: Array) -> None:
+def _add_pairs(rows: Rows, second: NDArray[np.int64], by_second: Array, blocks: Array) -> None:
     """Adds what rows of two views say of both."""
-    index = np.flatnonzero(rows.second >= 0)
-    key = rows.first[index] * len(blocks) + rows.second[index]
-    order = index[np.argsort(key, kind="stable")]
-    outer = (rows.by_first[order] * rows.weight[order, None])[:, :, None] * rows.by_second[order][:, None]
-    starts = np.flatnonzero(np.diff(np.sort(key, kind="stable"), prepend=-1))
+    key = rows.first * len(blocks) + second
+    order = np.argsort(key, kind="stable")
+    outer = (rows.by_first[order] * rows.weight[order, None])[:, :, None] * by_second[order][:, None]
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
     sums = np.add.reduceat(outer, starts, axis=0)
-    first, second = rows.first[order[starts]], rows.second[order[starts]]
-    for a, b, block in zip(first, second, sums, strict=True):
+    for a, b, block in zip(rows.first[order[starts]], second[order[starts]], sums, strict=True):
         blocks[a, :, b] += block
         blocks[b, :, a] += block.T
 
@@ -211,7 +203,7 @@ class CornerTerm:
         by_shared = np.zeros((len(p), 2, SHARED))
         by_shared[:, :, PRINT_SCALE] = np.einsum("kij,kj->ki", by_point, np.einsum("kji,kj->ki", R, self.board))
         weight, cost = robust((residual**2).sum(axis=1))
-        return _of_one_view(
+        return Rows(
             residual.ravel(), np.repeat(self.view, 2), by_pose.reshape(-1, POSE), by_shared.reshape(-1, SHARED),
             np.repeat(weight, 2), cost,
         )  # fmt: skip
@@ -235,7 +227,7 @@ class BoardTerm:
         by_shared = np.einsum("pi,pij->pj", by_point, shared.derivative(self.patches))
         by_shared[:, DEPTH_SCALE] -= residual / shared.scale
         weight, cost = robust(residual**2, 1.0 / self.inflation)
-        return _of_one_view(residual, self.view, by_motion(by_point, p), by_shared, weight, cost)
+        return Rows(residual, self.view, by_motion(by_point, p), by_shared, weight, cost)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +255,7 @@ class ObjectTerm:
         by_shared[:, DEPTH_SCALE] -= residual / shared.scale
         weight, cost = robust(residual**2, 1.0 / self.inflation)
         by_a, by_b = by_motion(along_a, p[a]), -by_motion(along_b, p[b])
-        return Rows(residual, self.view[a], by_a, self.view[b], by_b, by_shared, weight, cost)
+        return Rows(residual, self.view[a], by_a, by_shared, weight, cost, self.view[b], by_b)
 
 
 def by_motion(along: Array, points: Array) -> Array:
@@ -274,10 +266,3 @@ def by_motion(along: Array, points: Array) -> Array:
 def robust(squares: Array, times: Array | float = 1.0) -> tuple[Array, float]:
     """(weights, cost) of Cauchy's loss for squared residuals in sigma, each `times` a constant weight."""
     return times / (1.0 + squares / ROBUST**2), float((times * ROBUST**2 * np.log1p(squares / ROBUST**2)).sum())
-
-
-def _of_one_view(
-    residual: Array, view: NDArray[np.int64], by_pose: Array, by_shared: Array, weight: Array, cost: float
-) -> Rows:
-    none = np.full(len(view), -1, np.int64)
-    return Rows(residual, view, by_pose, none, np.zeros((len(view), POSE)), by_shared, weight, cost)

@@ -1,18 +1,12 @@
-"""Effects of a real camera on a simulated photograph: exposure, motion, noise, hidden markers, lens.
+"""Effects of a real camera on a simulated photograph: samples, motion, depth noise, hidden markers, and the bend of a lens.
 
-- How a photograph is averaged: points over a pixel's area and moments of the exposure, and sums in linear light.
-- The camera's movement while the shutter is open.
-- The preset of the depth camera's noise: what a typical Azure Kinect at 0.5 to 1.5 m adds to exact depth.
-- Slips of paper that lie on the print and hide markers in part.
-- The lens of the simulated colour camera: a wider pinhole picture, and the lookup that bends it.
-
-**Published.** Microsoft bounds the random error by 17 mm and the systematic error by 11 mm + 0.1 % of the distance over
-the whole range of the mode NFOV unbinned, 0.5 to 3.86 m. Tolgyessy et al. 2021 (Sensors 21(2):413) confirm both bounds
+**Published.** Microsoft bounds the random error of depth by 17 mm and the systematic error by 11 mm + 0.1 % of the distance
+over the whole range of the mode NFOV unbinned, 0.5 to 3.86 m. Tolgyessy et al. 2021 (Sensors 21(2):413) confirm both bounds
 up to 3.5 m, find the noise lowest near the middle of the image and at short range, and describe pixels that fly between
 a surface and what is behind it. Kurillo et al. 2022 (Sensors 22(7):2469) see the random error grow with the distance.
 
-**Assumed.** The numbers below are no fit of a published table. They are a device of the usual kind at arm's length, far
-inside those bounds; what scenes have (schemas/job/views.py) is the upper bound.
+**Assumed.** The numbers of depth below are no fit of a published table. They are a device of the usual kind at arm's length,
+far inside those bounds; what scenes have (schemas/job/views.py) is the upper bound.
 """
 
 import math
@@ -27,11 +21,10 @@ from schemas.job.captures import Board, HiddenMarkers, KinectDepthNoise, MotionB
 from schemas.job.views import DepthNoise, Distortion
 from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Intrinsics
-from workers.capture.board.layout import marker_corners
-from workers.geometry.colour import SRGB_STEPS
-from workers.geometry.distortion import undistort
+from workers.capture.board import marker_corners
 from workers.geometry.frames import pose, rotation_about
 from workers.geometry.jit import compiled
+from workers.geometry.lens import undistort
 
 SAMPLES = 9
 """Images that are averaged into one photograph."""
@@ -65,16 +58,6 @@ def make_samples() -> tuple[Sample, ...]:
         Sample((n - middle) * step, (down - middle) * step, (when - middle) * step)
         for n, (down, when) in enumerate(zip(DOWN, WHEN, strict=True))
     )
-
-
-def shift_camera(k: Intrinsics, sample: Sample) -> Intrinsics:
-    """The camera whose pixel centres lie at the sample's point of each pixel."""
-    return k.model_copy(update={"cx": k.cx - sample.right_px, "cy": k.cy - sample.down_px})
-
-
-def light_table(samples: int) -> Array:
-    """[256]: what each code adds to the mean of so many samples, in linear light."""
-    return SRGB_STEPS / samples
 
 
 @compiled
@@ -182,13 +165,6 @@ WIDEST = 2.0
 """A pinhole picture that must be more than so many times as wide or high belongs to no lens of this camera."""
 
 
-def opencv_lens(lens: Distortion | None) -> Array:
-    """[8] float64: OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6; all 0 without a lens."""
-    if lens is None:
-        return frozen_array(np.zeros(8))
-    return frozen_array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, 0.0, 0.0, 0.0])
-
-
 def pinhole_lookup(lens: Distortion, k: Intrinsics) -> tuple[Intrinsics, Array, Array]:
     """(a pinhole camera that sees all that the lens does, u [H, W] and v [H, W] in its image of each stored pixel's centre).
 
@@ -205,11 +181,6 @@ def pinhole_lookup(lens: Distortion, k: Intrinsics) -> tuple[Intrinsics, Array, 
         raise CaptureError("lens", f"the lens {lens} needs a pinhole picture of {size}: make its coefficients smaller")
     update = {"width": right - left, "height": bottom - top, "cx": k.cx - left, "cy": k.cy - top}
     return k.model_copy(update=update), u - left, v - top
-
-
-def nearest_pixels(image: NDArray[np.generic], u: Array, v: Array) -> NDArray:
-    """[H, W]: the value of `image` [h, w] in the pixel that each place lies in."""
-    return image[np.floor(v).astype(np.int64), np.floor(u).astype(np.int64)]
 
 
 @compiled

@@ -1,15 +1,8 @@
-"""One photograph of a virtual capture: object and board as geometry, the Azure Kinect's two cameras, its images.
-
-- Where the object of a simulated capture stands, and the board as it was really printed.
-- The printed board as geometry: every cell of every marker is a face, so that its edges are exact at any resolution.
-- The simulated Azure Kinect: its colour camera and, beside it, its depth camera.
-- One photograph of a virtual capture: both cameras' images as the device stores them.
-"""
+"""One photograph of a virtual capture: object and board as geometry, the Azure Kinect's two cameras, its images as stored."""
 
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,28 +23,24 @@ from schemas.scene.shape import (
 )
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
-from workers.capture.board.layout import marker_corners, open_dictionary
+from workers.capture.board import marker_cells, marker_corners
 from workers.capture.simulate.camera import (
     AT_REST,
     CENTRE,
     STEP_M,
-    Motion,
     Sample,
     add_bent_light,
     add_light,
     cover_markers,
     draw_motion,
     kinect_noise,
-    light_table,
     make_samples,
-    nearest_pixels,
-    opencv_lens,
     pinhole_lookup,
     pose_at,
-    shift_camera,
 )
-from workers.geometry.colour import encode_codes
+from workers.geometry.colour import SRGB_STEPS, encode_codes
 from workers.geometry.frames import UP, pose, rotation_about, translation
+from workers.geometry.lens import opencv_lens
 from workers.geometry.zbuffer import register_depth
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.tiers import draw_view
@@ -78,8 +67,6 @@ THICKNESS_M = 0.005
 PAPER, INK = (0.91, 0.91, 0.90, 1.0), (0.20, 0.20, 0.21, 1.0)
 """sRGB of paper and of a laser printer's black: 80 % and 3 % of the light [assumed]."""
 
-ROUGHNESS = 1.0
-
 
 def board_body(board: Board) -> Shape:
     """A closed box in the board frame, metres, its print at z = 0; sizes are those of `marker_corners`.
@@ -94,25 +81,16 @@ def board_body(board: Board) -> Shape:
     all_vertices = frozen_array(np.concatenate([vertices, low]))
     return Shape(
         (
-            Part("paper", all_vertices, _triangles(paper), Material(PAPER, roughness=ROUGHNESS)),
-            Part("ink", all_vertices, _triangles(quads[black]), Material(INK, roughness=ROUGHNESS)),
+            Part("paper", all_vertices, _triangles(paper), Material(PAPER, roughness=1.0)),
+            Part("ink", all_vertices, _triangles(quads[black]), Material(INK, roughness=1.0)),
         ),
         closed=True,
     )
 
 
-def marker_bits(board: Board) -> NDArray[np.bool_]:
-    """[M, n, n] bool: the black cells of each marker with its border, row 0 at the top of the print."""
-    dictionary = open_dictionary(board)
-    side = dictionary.markerSize + 2
-    count = board.columns * board.rows
-    images = [cv2.aruco.generateImageMarker(dictionary, board.first_id + m, side) for m in range(count)]
-    return np.stack(images) < 128
-
-
 def _cells(board: Board) -> tuple[Array, Array, NDArray[np.bool_]]:
     """(x of the grid lines ascending [X], y of the grid lines ascending [Y], black cells [Y - 1, X - 1])."""
-    bits = marker_bits(board)
+    bits = marker_cells(board)
     side = bits.shape[1]
     corners = marker_corners(board)[..., :2].reshape(board.rows, board.columns, 4, 2)
     edges = np.arange(side + 1) / side
@@ -248,10 +226,11 @@ class Studio:
 def build_studio(simulate: Simulate, board: Board, thing: Placed, effects: EffectPlan, chance: SceneChance) -> Studio:
     """The floor, the board on it, and `thing`, posed in the board frame, in their light. Raises CaptureError for the lens."""
     floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), "raster")
+    parts = (part if part.uv is None else replace(part, uv=frozen_array(FINER * part.uv)) for part in floor.parts)
     T_world_board = frozen_array(translation(0.0, 0.0, THICKNESS_M))
     printed, rig = true_board(board, simulate), make_rig(simulate.image_scale)
     things = [
-        Placed(REGION_FLOOR, _finer(floor), frozen_array(np.eye(4))),
+        Placed(REGION_FLOOR, replace(floor, parts=tuple(parts)), frozen_array(np.eye(4))),
         Placed(REGION_TABLE, board_body(printed), T_world_board),
         replace(thing, T_world_shape=frozen_array(T_world_board @ thing.T_world_shape)),
     ]
@@ -265,15 +244,6 @@ def build_studio(simulate: Simulate, board: Board, thing: Placed, effects: Effec
     return Studio(simulate, effects, tuple(things), appearance, rig, T_world_board, chance, drawn, lookup)
 
 
-def _finer(floor: Shape) -> Shape:
-    """The floor with a pattern `FINER` times as fine."""
-
-    def finer(part: Part) -> Part:
-        return part if part.uv is None else replace(part, uv=frozen_array(FINER * part.uv))
-
-    return replace(floor, parts=tuple(finer(part) for part in floor.parts))
-
-
 def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[CapturedView, NDArray[np.bool_]]:
     """One view as it is stored, and the object's true pixels [H, W] bool."""
     T_world_cam = studio.T_world_board @ T_board_cam
@@ -285,13 +255,17 @@ def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[Captured
 
 def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     """[H, W, 3]: linear light of one exposure, whose middle is at the pose T_world_cam."""
-    k, motion = studio.rig.color, motion_of(studio, number)
+    k, blur, motion = studio.rig.color, studio.simulate.motion_blur, AT_REST
+    if blur is not None:
+        motion = draw_motion(blur, studio.chance.stream(Stream.MOTION, number))
     samples, render = plan_pictures(studio)
-    total, light_of = np.zeros((k.height, k.width, 3)), light_table(len(samples))
+    total, light_of = np.zeros((k.height, k.width, 3)), SRGB_STEPS / len(samples)
     rng = studio.chance.stream(Stream.PATHS, number)
     for sample in samples:
-        drawn_at = point_drawn(sample, studio)
-        camera = Camera(shift_camera(studio.drawn_color, drawn_at), pose_at(T_world_cam, motion, sample.moment))
+        drawn_at, k = point_drawn(sample, studio), studio.drawn_color
+        # The camera whose pixel centres lie at the sample's point of each pixel.
+        k = k.model_copy(update={"cx": k.cx - drawn_at.right_px, "cy": k.cy - drawn_at.down_px})
+        camera = Camera(k, pose_at(T_world_cam, motion, sample.moment))
         drawn = draw_view(
             shared_renderer(), studio.things, studio.appearance, camera, render, lambda: rng, studio.effects
         )
@@ -306,22 +280,17 @@ def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
 
 def mark_object(studio: Studio, T_world_cam: Pose) -> NDArray[np.bool_]:
     """[H, W] bool: pixels of the stored image whose centres see the object; through a lens to a sixth of a pixel."""
-    finer = 1 if studio.lookup is None else LABELS_FINER
-    _, mask = draw_labels(studio, Camera(scale_intrinsics(studio.drawn_color, finer), T_world_cam))
-    return mask if studio.lookup is None else nearest_pixels(mask, *(finer * place for place in studio.lookup))
+    if studio.lookup is None:
+        return draw_labels(studio, Camera(studio.drawn_color, T_world_cam))[1]
+    _, mask = draw_labels(studio, Camera(scale_intrinsics(studio.drawn_color, LABELS_FINER), T_world_cam))
+    columns, rows = (np.floor(LABELS_FINER * place).astype(np.int64) for place in studio.lookup)
+    return mask[rows, columns]
 
 
 def draw_labels(studio: Studio, camera: Camera) -> tuple[Array, NDArray[np.bool_]]:
     """(depth [H, W] float64, metres, 0 where nothing is; the object's pixels [H, W] bool), both of pixel centres."""
     drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS)
     return drawn.depth_m.astype(np.float64), drawn.region == REGION_FIRST_OBJECT
-
-
-def motion_of(studio: Studio, number: int) -> Motion:
-    """The camera's motion in one exposure."""
-    if studio.simulate.motion_blur is None:
-        return AT_REST
-    return draw_motion(studio.simulate.motion_blur, studio.chance.stream(Stream.MOTION, number))
 
 
 def plan_pictures(studio: Studio) -> tuple[tuple[Sample, ...], Render]:

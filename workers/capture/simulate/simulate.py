@@ -1,7 +1,4 @@
-"""A virtual capture from its settings to its folder: effects, camera path, photographs, held-out views.
-
-- The path of a hand-held camera around an object, as poses at the moments of its photographs.
-- Views of a simulated capture that were not photographed: what synthesised views are compared with.
+"""A virtual capture from its settings to its folder: the plan of effects, the camera's path, photographs, held-out views.
 
 The plan is of the same kind as that of scenes (workers/scene/effects.py). What it does not run is off.
 """
@@ -12,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.base import Array, Pose, frozen_array
+from schemas.base import Array, frozen_array
 from schemas.capture import CaptureCamera, CapturedView, CaptureTruth
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Simulate
@@ -33,7 +30,6 @@ from workers.capture.folder import (
     write_truth,
     write_view,
 )
-from workers.capture.simulate.camera import opencv_lens
 from workers.capture.simulate.photograph import (
     DEPTH_UNITS_PER_M,
     Studio,
@@ -46,6 +42,7 @@ from workers.capture.simulate.photograph import (
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_codes
 from workers.geometry.frames import pose, rotation_about
+from workers.geometry.lens import opencv_lens
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
 from workers.scene.plan import SceneChance, Stream, choose_assets
 
@@ -86,8 +83,8 @@ def plan_path(simulate: Simulate, target: Array, rng: np.random.Generator) -> Ar
     distance = _within(simulate.distance_m, 0.5 + 0.5 * _sway(time, rng))
     roll = np.radians(simulate.roll_deg) * _normal_sway(time, rng)
     aim = target + AIM_M * rng.standard_normal((views, 3))
-    poses = [_rolled(orbit_pose(aim[n], inclination[n], yaw[n], distance[n]), float(roll[n])) for n in range(views)]
-    return np.stack(poses)
+    rolls = [pose(rotation_about(OPTICAL_AXIS, float(angle)), np.zeros(3)) for angle in roll]
+    return np.stack([orbit_pose(aim[n], inclination[n], yaw[n], distance[n]) @ rolls[n] for n in range(views)])
 
 
 def _within(interval: tuple[float, float], share: Array) -> Array:
@@ -122,11 +119,6 @@ def _normal_sway(time: Array, rng: np.random.Generator) -> Array:
     return value
 
 
-def _rolled(T: Array, roll_rad: float) -> Array:
-    """The camera turned about its optical axis."""
-    return T @ pose(rotation_about(OPTICAL_AXIS, roll_rad), np.zeros(3))
-
-
 VIEWS = 3
 
 HELD_OUT_UNITS_PER_M = 10_000.0
@@ -140,28 +132,18 @@ def write_held_out(studio: Studio, board: Board, target: Array, path: Path) -> N
     of the same things without the effects of any sensor or lens: depth and mask are those of the pixel centres.
     """
     path.mkdir(parents=True)
-    exact = without_sensors(studio)
-    spec = studio.simulate.model_copy(update={"views": VIEWS})
-    for number, T_board_cam in enumerate(plan_path(spec, target, studio.chance.stream(Stream.HELD_OUT))):
-        write_view(path, take_exact(exact, number, T_board_cam))
+    ideal = studio.simulate.model_copy(update={"views": VIEWS} | dict.fromkeys(CAPTURE_EFFECTS))
+    exact = replace(studio, simulate=ideal, drawn_color=studio.rig.color, lookup=None)
+    for number, T_board_cam in enumerate(plan_path(ideal, target, studio.chance.stream(Stream.HELD_OUT))):
+        T_world_cam = studio.T_world_board @ T_board_cam
+        depth_m, mask = draw_labels(exact, Camera(studio.rig.color, T_world_cam))
+        depth = np.rint(np.clip(depth_m * HELD_OUT_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
+        depth[depth == 65_535] = 0
+        rgb = encode_codes(take_light(exact, number, T_world_cam))
+        write_view(path, CapturedView(number, rgb, depth, mask))
         write_pose(path / f"board_{number:05d}.txt", T_board_cam)
     camera = CaptureCamera(studio.rig.color, opencv_lens(None), HELD_OUT_UNITS_PER_M)
     write_description(path, CaptureFile(name="held-out"), camera, board)
-
-
-def without_sensors(studio: Studio) -> Studio:
-    """The studio with the same things, seen by ideal cameras."""
-    simulate = studio.simulate.model_copy(update=dict.fromkeys(CAPTURE_EFFECTS))
-    return replace(studio, simulate=simulate, drawn_color=studio.rig.color, lookup=None)
-
-
-def take_exact(studio: Studio, number: int, T_board_cam: Pose) -> CapturedView:
-    """One exact view, its depth in units of `HELD_OUT_UNITS_PER_M`."""
-    T_world_cam = studio.T_world_board @ T_board_cam
-    depth_m, mask = draw_labels(studio, Camera(studio.rig.color, T_world_cam))
-    depth = np.rint(np.clip(depth_m * HELD_OUT_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
-    depth[depth == 65_535] = 0
-    return CapturedView(number, encode_codes(take_light(studio, number, T_world_cam)), depth, mask)
 
 
 def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
@@ -171,12 +153,7 @@ def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
 
 
 def simulate_capture(
-    simulate: Simulate,
-    board: Board,
-    asset: Asset,
-    chance: SceneChance,
-    path: Path,
-    effects: EffectPlan | None = None,
+    simulate: Simulate, board: Board, asset: Asset, chance: SceneChance, path: Path, effects: EffectPlan | None = None
 ) -> CaptureTruth:
     """Photograph `asset` on the board and write the folder of a capture, with truth/, to `path`, a new or empty folder.
 
@@ -207,13 +184,7 @@ def simulate_capture(
     )
     write_held_out(studio, board, target, path / TRUTH / HELD_OUT)
     write_truth(path, truth, TrueObject(asset.category, asset.instance_id, asset_glb(asset)), plan.ran, plan.skipped)
-    _describe(studio, board, asset, path)
-    return truth
-
-
-def _describe(studio: Studio, board: Board, asset: Asset, path: Path) -> None:
-    """Write camera.json, board.json and capture.json."""
-    name = f"{asset.category}-{studio.chance.scene_id:05d}"
-    about = CaptureFile(name=name, category=asset.category, licence=asset.licence)
-    camera = CaptureCamera(studio.rig.color, opencv_lens(studio.simulate.distortion), DEPTH_UNITS_PER_M)
+    about = CaptureFile(name=f"{asset.category}-{chance.scene_id:05d}", category=asset.category, licence=asset.licence)
+    camera = CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion), DEPTH_UNITS_PER_M)
     write_description(path, about, camera, board)
+    return truth

@@ -1,10 +1,7 @@
-"""The surface of a capture's object: depth of all views merged, confirmed, and moved to where views face it.
-
-- What every view says about the points of a merged surface: where it really is, how many see it, and its colour.
-"""
+"""The surface of a capture's object: depth of all views merged, confirmed, moved to where views face it, and coloured."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -231,15 +228,10 @@ def sight_object(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion)
     sights = []
     for view in views:
         window = object_window(region, view.depth_camera)
-        fitted = fit_depth(without_others(view), view.depth_camera.intrinsics, spec.max_edge_deg, window)
+        fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics, spec.max_edge_deg, window)
         if fitted.inverse.any():
             sights.append(Sight(view, fitted, least_cos))
     return sights
-
-
-def without_others(view: PosedView) -> NDArray[np.float32]:
-    """[H, W] depth; where a mask was given, none where it ends, so that no surface spans its edge."""
-    return view.depth_m
 
 
 def object_window(region: ObjectRegion, camera: Camera) -> tuple[int, int, int, int]:
@@ -253,9 +245,7 @@ def object_window(region: ObjectRegion, camera: Camera) -> tuple[int, int, int, 
     return int(rows[0]), int(columns[0]), int(rows[1]), int(columns[1])
 
 
-def fuse_views(
-    views: Sequence[PosedView], region: ObjectRegion, spec: Fusion, seconds: Mapping[str, float] | None = None
-) -> Reconstruction:
+def fuse_views(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -> Reconstruction:
     """The object's surface. Raises CaptureError where too few views see it, or none of it is confirmed."""
     sights = sight_object(views, region, spec)
     if len(sights) < spec.min_views:
@@ -291,7 +281,6 @@ def fuse_views(
         vertices=mesh.vertices,
         faces=mesh.faces,
         vertex_colors=colors,
-        seconds=dict(seconds or {}),
     )
 
 

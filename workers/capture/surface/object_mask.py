@@ -1,7 +1,4 @@
-"""Where the object is: its footprint and height on the board, and its mask in each view.
-
-- Where the object stands on the board: its footprint and height, from the depth of all views together.
-- Masks of the object: the silhouette of the merged surface, down to the board.
+"""Where the object is: its footprint and height on the board, and its mask in each view, down to the board.
 
 Heights above the board are collected in the cells of a grid, and a cell's height is their median: a hundred noisy
 pixels of many views fix it to some tenths of a millimetre, so that an object of 4 mm is found where no single view

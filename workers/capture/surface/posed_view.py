@@ -1,8 +1,4 @@
-"""A view with its pose, and which points of a surface it sees.
-
-- A view with its pose and without its lens: what merging and synthesis start from.
-- Which points of a mesh the cameras can see past the mesh itself, by rays.
-"""
+"""A view with its pose and without its lens, and which points of a surface cameras see past the surface itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +13,10 @@ from schemas.errors import CaptureError
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
 from schemas.scene.view import Camera
-from workers.capture.poses.observation import opencv_matrix
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
+from workers.geometry.lens import opencv_matrix
 from workers.geometry.projection import in_frame
 from workers.geometry.raycast import first_hit
 

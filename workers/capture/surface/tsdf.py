@@ -1,14 +1,11 @@
-"""Truncated signed distances from depth images, the error of depth that they correct, and meshes from them.
+"""Truncated signed distances from depth images, and triangle meshes from them.
 
-- Planes fitted to the neighbourhood of each depth pixel: less noise, the angle of incidence, and no flying pixels.
-- A truncated signed distance field: the mean, weighted by inverse variance, of every view's distance to its surface.
-- Triangle meshes of a merged surface: extraction, cutting, loose parts, normals.
+Planes are fitted to the neighbourhood of each depth pixel: less noise, the angle of incidence, and no flying pixels. On a plane
+1/z is linear in the image, so the fit is exact there. Registered depth is coarser than the colour image that it fills, so the
+neighbourhood is sampled with a stride that grows with the focal length.
 
-On a plane 1/z is linear in the image, so the fit is exact there. Registered depth is coarser than the colour image that
-it fills, so the neighbourhood is sampled with a stride that grows with the focal length.
-
-Curless and Levoy 1996, with the distance along the surface's normal in place of the distance along the ray, because the
-latter grows with the angle of incidence.
+The field is that of Curless and Levoy 1996, with the distance along the surface's normal in place of the distance along the ray,
+because the latter grows with the angle of incidence, and weights by inverse variance.
 """
 
 import math

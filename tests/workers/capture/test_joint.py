@@ -1,0 +1,227 @@
+"""The pieces of the joint problem: derivatives by finite differences, noise by its own residuals, pairs of patches."""
+
+import numpy as np
+import pytest
+
+from schemas.job.captures import Estimation
+from tests.workers.capture.drawn import BOX, HALF, KINECT, Virtual, errors, hand_held, make, observe
+from workers.capture.poses.estimates import moved_after
+from workers.capture.poses.joint import (
+    FLOOR_M,
+    INFLATION_OF_FEW,
+    REACH_M,
+    VIEW_FLOOR_M,
+    Problem,
+    gather,
+    inflation,
+    match_patches,
+    minimise,
+    patch_sigma,
+    placed,
+    row_inflation,
+)
+from workers.capture.poses.markers import logarithm, moved
+from workers.capture.poses.observation import Patches, no_patches
+from workers.capture.poses.terms import (
+    NAMES,
+    BoardTerm,
+    CornerTerm,
+    ObjectTerm,
+    Shared,
+    identified,
+    prior_sigma,
+)
+from workers.geometry.frames import translation
+
+RNG = np.random.default_rng(0)
+STEP = np.array([0.01, -0.02, 0.01, 0.02, -0.01, 0.03, -0.02, 0.01, 0.005])
+SHARED = Shared().moved(STEP)
+POSES = np.stack(hand_held(RNG, 3))
+VIEW = RNG.integers(0, 3, 12)
+RAY = np.column_stack([RNG.uniform(-0.3, 0.3, (12, 2)), np.ones(12)])
+PATCHES = Patches(RAY * RNG.uniform(0.5, 1.2, (12, 1)), RAY, -RAY, np.full(12, 9), np.full(12, 0.001))
+PAIRS = np.array([[0, 1], [2, 5], [3, 9]])
+PAIRS = PAIRS[VIEW[PAIRS[:, 0]] != VIEW[PAIRS[:, 1]]]
+FLAT = np.column_stack([RNG.uniform(-0.2, 0.2, (12, 2)), np.zeros(12)])
+NORMAL = np.tile(np.array([[0.6, 0, 0.8]]), (len(PAIRS), 1))
+TERMS = {
+    "corners": CornerTerm(VIEW, FLAT, RAY[:, :2], np.array([900.0, 910]), 0.2),
+    "board": BoardTerm(VIEW, PATCHES, np.full(12, 0.1), np.full(12, 2.0)),
+    "object": ObjectTerm(VIEW, PATCHES, PAIRS, NORMAL, np.full(len(PAIRS), 0.1), np.ones(len(PAIRS))),
+}
+
+
+# ---------------------------------------------------------------------------------------------- terms
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_derivatives_of_each_term_equal_finite_differences(name):
+    term = TERMS[name]
+    rows = term.rows(POSES, SHARED)
+    assert len(PAIRS) >= 2
+    for axis, step in enumerate(1e-6 * np.eye(9)):
+        change = term.rows(POSES, SHARED.moved(step)).residual - term.rows(POSES, SHARED.moved(-step)).residual
+        assert rows.by_shared[:, axis] == pytest.approx(change / 2e-6, rel=1e-4, abs=1e-3)
+    for number in range(3):
+        for axis, step in enumerate(1e-6 * np.eye(6)):
+            ahead, back = POSES.copy(), POSES.copy()
+            ahead[number], back[number] = moved(POSES[number], step), moved(POSES[number], -step)
+            change = term.rows(ahead, SHARED).residual - term.rows(back, SHARED).residual
+            own = np.where(rows.first == number, rows.by_first[:, axis], 0)
+            if rows.second is not None:
+                own += np.where(rows.second == number, rows.by_second[:, axis], 0)
+            assert own == pytest.approx(change / 2e-6, rel=1e-4, abs=2e-2)
+
+
+def test_a_smaller_world_does_not_fit_better():
+    """Depth and poses scaled alike leave residuals over sigma as they are: noise shrinks with the world."""
+    small = POSES.copy()
+    small[:, :3, 3] *= 0.9
+    for name in ("board", "object"):
+        before, after = TERMS[name].rows(POSES, Shared()), TERMS[name].rows(small, Shared(scale=0.9))
+        assert after.residual == pytest.approx(before.residual)
+
+
+def test_shared_parameters_are_what_was_added_and_what_others_are_told():
+    exact = SHARED.derivative(PATCHES)
+    for axis, step in enumerate(1e-6 * np.eye(9)):
+        change = SHARED.moved(step).corrected(PATCHES) - SHARED.moved(-step).corrected(PATCHES)
+        assert exact[:, :, axis] == pytest.approx(change / 2e-6, abs=1e-7)
+    depth = SHARED.correction(("offset_m",))
+    p = PATCHES.ray_z * depth.scale + depth.offset_m * PATCHES.ray
+    assert SHARED.corrected(PATCHES) == pytest.approx(p @ depth.T_cam_depth[:3, :3].T + depth.T_cam_depth[:3, 3])
+    assert SHARED.deviation() == pytest.approx(STEP) and not Shared().deviation().any()
+
+
+def test_priors_hold_what_is_believed_and_tell_what_is_identified():
+    by_print, by_depth = (prior_sigma(Estimation(trust=t), True) for t in ("print", "depth"))
+    assert by_print[NAMES.index("print_scale")] == 0 and by_depth[NAMES.index("print_scale")] > 0.1
+    assert by_depth[NAMES.index("scale")] == 0.001  # the specification of the camera
+    assert not prior_sigma(Estimation(), False).any()
+    assert identified(np.where(np.arange(9) == 2, 0.1, 0.9) * by_print, by_print) == ("shift_x_m",)
+    assert identified(by_print, by_print) == ()
+
+
+# ---------------------------------------------------------------------------------------------- the solution
+
+
+def corner_problem(truth, rng, corner_px=0.2, prior=None, fixed=None):
+    seen = [observe(T, rng, corner_px=corner_px).corners for T in truth]
+    view = np.repeat(np.arange(len(seen)), [len(c.board) for c in seen])
+    board, rays = (np.concatenate([getattr(c, name) for c in seen]) for name in ("board", "rays"))
+    term = CornerTerm(view, board, rays, np.array([KINECT.fx, KINECT.fy]), max(corner_px, 0.1))
+    free = np.zeros(len(truth), bool) if fixed is None else np.array(fixed)
+    return Problem([term], np.zeros(9) if prior is None else prior, free)
+
+
+def test_without_noise_every_pose_is_the_true_one_in_few_iterations():
+    rng = np.random.default_rng(0)
+    truth = hand_held(rng, 5)
+    start = np.stack([moved(T, rng.normal(0, 0.02, 6)) for T in truth])
+    found = minimise(corner_problem(truth, rng, 0), start, Shared(), 50)
+    assert found.converged and found.iterations < 15
+    assert max(max(errors(a, b)) for a, b in zip(found.poses, truth, strict=True)) < 1e-4
+    found = minimise(corner_problem(truth, rng), start, Shared(), 1)
+    assert found.iterations == 1 and not found.converged
+
+
+def test_a_fixed_pose_stays_and_a_parameter_without_data_stays_at_its_prior():
+    rng = np.random.default_rng(1)
+    truth = hand_held(rng, 3)
+    start = np.stack([moved(T, rng.normal(0, 0.01, 6)) for T in truth])
+    prior = prior_sigma(Estimation(), True)
+    found = minimise(corner_problem(truth, rng, 0.2, prior, [False, True, False]), start, Shared(), 50)
+    assert np.abs(found.poses[1] - start[1]).max() < 1e-14
+    assert np.abs(found.shared.deviation()).max() < 1e-9
+    sigma = np.sqrt(np.diag(found.covariance()))
+    assert not sigma[6:12].any()
+    assert sigma[18 + NAMES.index("offset_m")] == pytest.approx(prior[0], rel=1e-3)
+
+
+def test_the_covariance_is_the_scatter_of_the_solution():
+    rng, off = np.random.default_rng(2), []
+    truth = hand_held(rng, 1)
+    for _ in range(60):
+        found = minimise(corner_problem(truth, rng), np.stack(truth), Shared(), 20)
+        T = np.linalg.inv(truth[0]) @ found.poses[0]
+        off.append([*T[:3, 3], *logarithm(T[:3, :3])])
+    scatter = np.sqrt(np.mean(np.square(off), axis=0))
+    assert scatter == pytest.approx(np.sqrt(np.diag(found.covariance()[:6, :6])), rel=0.3)
+
+
+# ---------------------------------------------------------------------------------------------- noise
+
+V, N = 40, 60
+OF_VIEW = np.repeat(np.arange(V), N)
+
+
+def residuals(rng, together):
+    """Residuals of planes in sigma: independent, and what a whole view has in common."""
+    J = np.column_stack([np.ones(V * N), rng.uniform(-1, 1, (V * N, 2))])
+    common = rng.normal(0, together, (V, 3))
+    return rng.standard_normal(V * N) + (J * common[OF_VIEW]).sum(axis=1), J
+
+
+def test_patches_that_err_alike_are_inflated_and_misfit_that_unknown_poses_explain_is_not():
+    none = np.zeros((V, 3, 3))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        assert inflation(*residuals(rng, 0.0), OF_VIEW, none) < 1.5
+        assert inflation(*residuals(rng, 0.5), OF_VIEW, none) > 8  # of 60 patches, a common error of half a sigma
+    residual, J = residuals(np.random.default_rng(3), 0.3)
+    assert inflation(residual, J, OF_VIEW, np.tile(0.3**2 * np.eye(3), (V, 1, 1))) < 3
+    assert inflation(residual, J, OF_VIEW, none) > 6
+    few = OF_VIEW < 3
+    assert inflation(residual[few], J[few], OF_VIEW[few], none) == INFLATION_OF_FEW
+
+
+def test_the_sigma_of_a_patch_is_at_1_m_and_no_view_is_better_than_its_floor():
+    rng = np.random.default_rng(5)
+    growth = rng.uniform(0.3, 1.5, 5000)
+    assert patch_sigma(rng.normal(0, 0.002, 5000) * growth, growth) == pytest.approx(0.002, rel=0.05)
+    assert patch_sigma(np.zeros(9), np.ones(9)) == FLOOR_M == patch_sigma(np.zeros(0), np.zeros(0))
+    sigma = np.full(101, 0.001)
+    factor = row_inflation(1.0, sigma, np.array([0] * 100 + [1]))
+    assert 1 / np.sqrt((1 / (sigma**2 * factor))[:100].sum()) == pytest.approx(VIEW_FLOOR_M)
+    assert factor[100] == 1.0  # few patches keep their weight
+
+
+# ---------------------------------------------------------------------------------------------- patches of the object
+
+
+@pytest.fixture(scope="module")
+def around():
+    """(true poses [V, 4, 4], the object's patches of all views, the view of each)."""
+    truth, evidence = make(Virtual(views=14, k=HALF))
+    parts = [o.object_patches for o in evidence.observations]
+    patches, view = gather(parts)
+    assert list(np.bincount(view)) == [len(p) for p in parts]
+    assert np.array_equal(patches.ray_z[view == 1], parts[1].ray_z)
+    return np.stack(truth), patches, view
+
+
+def test_pairs_are_of_two_views_near_each_other_and_on_one_face(around):
+    poses, patches, view = around
+    found = match_patches(patches, view, poses, Shared())
+    a, b = found.pairs.T
+    points, normals = placed(patches, view, poses, Shared())
+    assert len(found.pairs) > 500
+    assert (view[a] != view[b]).all() and (a < b).all() and len(np.unique(found.pairs, axis=0)) == len(found.pairs)
+    assert np.linalg.norm(points[a] - points[b], axis=1).max() <= REACH_M
+    assert np.median(np.abs(((points[a] - points[b]) * found.normal).sum(axis=1))) < 1e-3
+    top = points[:, 2] > BOX[1][2] - 0.002
+    assert top.sum() > 20 and np.median(normals[top, 2]) > 0.97
+    assert (normals * (points - (BOX[0] + BOX[1]) / 2)).sum(axis=1).min() > 0
+    assert match_patches(no_patches(), np.zeros(0, np.int64), poses, Shared()).pairs.shape == (0, 2)
+
+
+def test_a_move_of_the_object_is_found_with_its_view_and_size(around):
+    truth, patches, view = around
+    for shift_m in ((0.03, 0.01, 0), (-0.02, 0.02, 0)):
+        for first in (4, 7, 10):
+            poses = np.stack([(translation(*shift_m) if n >= first else np.eye(4)) @ T for n, T in enumerate(truth)])
+            last, apart_m = moved_after(patches, view, poses, Shared())
+            assert abs(last - (first - 1)) <= 5  # views between that see other faces cannot tell on which side they are
+            assert 0.6 * np.linalg.norm(shift_m) < apart_m < 1.2 * np.linalg.norm(shift_m)
+    assert moved_after(patches, view, truth, Shared()) is None
+    assert moved_after(no_patches(), np.zeros(0, np.int64), truth, Shared()) is None

@@ -1,0 +1,439 @@
+"""A capture's folder from photographs to results, read back and scored; what the user wrote into it wins."""
+
+import dataclasses
+import io
+import json
+import time
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import trimesh
+
+from schemas.base import frozen_array
+from schemas.capture import CaptureCamera, CaptureEstimate, DepthCorrection, Estimates, ViewEstimate
+from schemas.dataset.tables import SCHEMAS
+from schemas.errors import CaptureError, OutputError
+from schemas.job.captures import Board, Captures, Estimation, Fusion
+from schemas.scene.shape import Mesh
+from tests.workers.capture.drawn import KINECT, errors, write_capture
+from tests.workers.capture.simulated import CAPTURES, VIEWS, box, copy_of, processed, true_estimates
+from workers.capture.board import frame_in_board
+from workers.capture.folder import open_folder, pose_text, read_pose, read_truth, read_view, write_pose
+from workers.capture.process import SCHEMA, pose_table, process_folder
+from workers.capture.reconstruct import (
+    MANUAL,
+    ProcessorClock,
+    correct_manually,
+    corrections_of,
+    estimate_poses,
+    estimate_surface,
+    given_files,
+    read_posed,
+    reconstruct,
+    with_notes,
+)
+from workers.capture.results import read_cloud, write_results
+from workers.capture.score import (
+    read_mesh_file,
+    read_whole_truth,
+    score_against_mesh,
+    score_capture,
+    score_measured,
+    score_surface,
+    true_view,
+)
+from workers.capture.views import CaptureViews, read_result, write_mirrors, write_synthesized
+from workers.geometry.distance import distance_to_mesh
+from workers.geometry.frames import half_turn, invert, pose, rotation_about, transform, translation
+
+CORRECTION = pose(rotation_about(np.array([0.0, 0, 1]), 0.02), np.array([0.01, 0.0, 0.005]))
+
+
+def opened(path):
+    return given_files(open_folder(path))
+
+
+# ---------------------------------------------------------------------------------------------- poses of a folder
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """(a drawn capture, its true poses, its estimates)."""
+    path = tmp_path_factory.mktemp("captures") / "box"
+    truth = write_capture(path)
+    return path, truth, estimate_poses(opened(path), Estimation())
+
+
+@pytest.fixture
+def copy(drawn, tmp_path):
+    return copy_of(drawn[0], tmp_path)
+
+
+def test_poses_of_a_drawn_capture_are_the_true_ones_and_the_same_bytes_twice(drawn):
+    path, truth, estimates = drawn
+    assert set(estimates.by_name) == {"markers", "article", "joint"}
+    for view, T in zip(estimates.by_name["markers"].views, truth, strict=True):
+        mm, degrees = errors(view.T_board_cam, T)
+        assert view.status == "used" and mm < 0.5 and degrees < 0.05
+    assert [found.number for found in estimates.detections] == list(range(len(truth)))
+    again = estimate_poses(opened(path), Estimation())
+    for name, estimate in estimates.by_name.items():
+        for a, b in zip(estimate.views, again.by_name[name].views, strict=True):
+            assert np.array_equal(a.T_board_cam, b.T_board_cam)
+    alone = estimate_poses(opened(path), Estimation(estimate="markers", compare=False))
+    assert list(alone.by_name) == ["markers"] and set(alone.seconds) == {"read", "detect", "sample"}
+
+
+def test_a_capture_of_another_dictionary_is_refused_and_the_right_one_is_named(tmp_path):
+    write_capture(tmp_path / "c", 2, board=Board(dictionary="DICT_5X5_50"), box=False)
+    text = (tmp_path / "c" / "board.json").read_text().replace("DICT_5X5_50", "DICT_4X4_50")
+    (tmp_path / "c" / "board.json").write_text(text)
+    words = r"no marker of DICT_4X4_50 .* the image holds 3[0-9] markers of DICT_5X5_50: correct"
+    with pytest.raises(CaptureError, match=words):
+        estimate_poses(opened(tmp_path / "c"), Estimation())
+
+
+@pytest.mark.parametrize("frame", ["centre", "opencv", "opencv_old"])
+def test_poses_that_were_given_are_read_in_the_frame_that_the_flag_names(copy, drawn, frame):
+    text = (copy / "capture.json").read_text().replace('"centre"', f'"{frame}"')
+    (copy / "capture.json").write_text(text)
+    T_board_frame = frame_in_board(Board(), frame)
+    theirs = invert(T_board_frame) @ drawn[1][1]
+    write_pose(copy / "board_00001.txt", theirs)
+    write_pose(copy / "correction_00001.txt", CORRECTION)
+    write_pose(copy / "correction_00002.txt", CORRECTION)
+    after = estimate_poses(opened(copy), Estimation())
+    assert after.estimate.views[1].T_board_cam == pytest.approx(T_board_frame @ CORRECTION @ theirs, abs=1e-9)
+    board = drawn[2].by_name["markers"].views[2].T_board_cam
+    ours = T_board_frame @ CORRECTION @ invert(T_board_frame)
+    assert np.array_equal(after.by_name["markers"].views[2].T_board_cam, board)
+    for name in ("article", "joint"):
+        assert after.by_name[name].views[2].T_board_cam == pytest.approx(ours @ board, abs=1e-12)
+    assert "correction_00002.txt is kept as it was given" in after.estimate.views[2].reasons[-1]
+
+
+def test_a_board_pose_serves_where_no_marker_is_seen_and_our_own_files_of_an_earlier_run_change_nothing(copy, drawn):
+    cv2.imwrite(str(copy / "rgb_00003.png"), np.full((540, 960, 3), 120, np.uint8))
+    write_pose(copy / "board_00003.txt", drawn[1][3])
+    before = estimate_poses(opened(copy), Estimation()).estimate.views
+    assert before[3].status == "used" and before[3].T_board_cam == pytest.approx(drawn[1][3], abs=1e-12)
+    own = {"board_00000.txt": np.eye(4), "correction_00000.txt": CORRECTION, "correction_00002.txt": CORRECTION}
+    write_results(copy, {name: pose_text(T).encode() for name, T in own.items()}, {})
+    for a, b in zip(before, estimate_poses(opened(copy), Estimation()).estimate.views, strict=True):
+        assert np.array_equal(a.T_board_cam, b.T_board_cam)
+    (copy / "board_00003.txt").unlink()
+    write_pose(copy / "correction_00003.txt", CORRECTION)
+    with pytest.raises(CaptureError, match="corrects nothing"):
+        estimate_poses(opened(copy), Estimation())
+
+
+# ---------------------------------------------------------------------------------------------- manual corrections
+
+
+def test_files_of_our_own_are_not_the_users_and_those_that_somebody_changed_are_theirs_and_stay(tmp_path):
+    A, B = CORRECTION, translation(0.001, 0, 0)
+
+    def given():
+        return given_files(dataclasses.replace(open_folder(box()), path=tmp_path))
+
+    files = {"board_00000.txt": pose_text(A).encode(), "correction_00000.txt": pose_text(B).encode()}
+    write_results(tmp_path, files, {})
+    assert given().pose("board", 0) is None and given().pose("correction", 0) is None
+    write_pose(tmp_path / "correction_00000.txt", A)
+    write_pose(tmp_path / "board_00002.txt", A)
+    assert write_results(tmp_path, files, {}) == ["correction_00000.txt"]
+    assert np.array_equal(given().pose("correction", 0), A) and given().pose("board", 0) is None
+    assert np.array_equal(given().pose("board", 2), A) and given().pose("board", 3) is None
+
+
+def test_a_manual_correction_moves_its_pose_and_that_of_no_pose_is_refused(tmp_path):
+    path = copy_of(box(), tmp_path)
+    estimates = true_estimates(path)
+    assert correct_manually(opened(path), estimates) is estimates
+    for number, (board, correction) in corrections_of(opened(path), estimates).items():
+        assert np.allclose(correction @ board, estimates.estimate.views[number].T_board_cam)
+    write_pose(path / "correction_00002.txt", translation(0.01, 0.02, 0.03))
+    moved, before = correct_manually(opened(path), estimates).estimate, estimates.estimate.views
+    assert np.allclose(moved.views[2].T_board_cam[:3, 3] - before[2].T_board_cam[:3, 3], [0.01, 0.02, 0.03])
+    assert MANUAL in moved.views[2].reasons and moved.notes == ("1 pose from manual corrections",)
+    assert moved.views[3] is before[3]
+    write_pose(path / "correction_00004.txt", np.eye(4))
+    with pytest.raises(CaptureError, match=r"correction_00004\.txt corrects a pose that is not known"):
+        correct_manually(opened(path), true_estimates(path, without=(4,)))
+    write_pose(path / "board_00004.txt", before[0].T_board_cam)  # what the correction corrects
+    given = correct_manually(opened(path), true_estimates(path, without=(4,))).estimate.views[4]
+    assert np.allclose(given.T_board_cam, before[0].T_board_cam) and given.status == "used"
+
+
+def test_the_chosen_estimate_has_corrections_and_the_notes_of_the_surface_each_once(tmp_path):
+    path, clock = copy_of(box(), tmp_path), ProcessorClock()
+    write_pose(path / "correction_00002.txt", translation(0.001, 0.0, 0.0))
+    (path / "depth_00003.png").unlink()
+    cv2.imwrite(str(path / "depth_00005.png"), np.zeros((378, 672), np.uint16))
+    quick = Captures(estimation=Estimation(estimate="markers", compare=False), fusion=Fusion(voxel_m=0.004))
+    estimates, merged = estimate_surface(opened(path), quick, clock)
+    assert MANUAL in estimates.estimate.views[2].reasons and merged.notes == ("2 used views have no depth",)
+    assert {*merged.notes, "1 pose from manual corrections"} <= set(estimates.estimate.notes)
+    assert {"estimate", "read", "fuse"} <= set(clock.seconds)
+    true = true_estimates(path)
+    noted = dataclasses.replace(true.estimate, notes=("a", "b"))
+    told = with_notes(dataclasses.replace(true, by_name={**true.by_name, "joint": noted}), ("b", "c"))
+    assert told.estimate.notes == ("a", "b", "c") and told.by_name["markers"].notes == ()
+
+
+def test_waiting_takes_no_processor_time_and_work_does():
+    clock = ProcessorClock()
+    with clock.stage("wait"):
+        time.sleep(0.2)
+    with clock.stage("work"):
+        begun = time.process_time()
+        while time.process_time() - begun < 0.1:
+            pass
+    assert clock.seconds["wait"] < 0.1 <= clock.seconds["work"] < 0.3
+
+
+# ---------------------------------------------------------------------------------------------- the surface
+
+
+def test_the_surface_lies_on_the_true_one():
+    merged = reconstruct(opened(box()), true_estimates(box()).estimate, Fusion())
+    truth = read_whole_truth(open_folder(box()))
+    off, _ = distance_to_mesh(merged.surface.points, truth.surface)
+    # A third of the resolution and a quarter of the views of the bars, 1 mm and 3 mm.
+    assert np.median(off) < 0.0005 and np.quantile(off, 0.95) < 0.0025
+    assert len(merged.body.faces) > len(merged.surface.faces) and merged.notes == ()
+    assert truth.surface.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-3) and len(truth.T_board_cam) == VIEWS
+
+
+def test_a_mask_of_the_user_is_kept_and_a_view_without_a_pose_or_a_capture_without_depth_is_refused(tmp_path):
+    path, mask = copy_of(box(), tmp_path), np.zeros((378, 672), np.uint8)
+    mask[200:300, 400:500] = 255
+    cv2.imwrite(str(path / "mask_00001.png"), mask)
+    estimate = true_estimates(path, without=(2,)).estimate
+    assert np.array_equal(read_posed(opened(path), estimate, 1).mask, mask > 0)
+    assert read_posed(opened(path), estimate, 3).mask is None
+    with pytest.raises(CaptureError, match="view 2 has no pose: left out by the test"):
+        read_posed(opened(path), estimate, 2)
+    for number in range(VIEWS):
+        (path / f"depth_{number:05d}.png").unlink()
+    before = sorted(file.name for file in path.iterdir())
+    for work in (
+        lambda: reconstruct(opened(path), estimate, Fusion()),
+        lambda: process_folder(path, CAPTURES),  # and the folder stays as it was
+    ):
+        with pytest.raises(CaptureError, match=r"none of the \d+ used views .* has depth") as refusal:
+            work()
+        assert refusal.value.reason == "no_depth"
+    assert sorted(file.name for file in path.iterdir()) == before
+
+
+# ---------------------------------------------------------------------------------------------- the processed folder
+
+
+def test_every_view_has_its_files_near_the_truth_and_process_json_names_them():
+    path, done = processed()
+    record, truth = json.loads((path / "process.json").read_bytes()), read_truth(path)
+    kinds = (("board", "txt"), ("correction", "txt"), ("mask", "png"))
+    expected = {f"{kind}_{n:05d}.{end}" for n in range(VIEWS) for kind, end in kinds}
+    assert set(record["files"]) == expected | {"cloud.ply", "mesh.ply", "poses.parquet"}
+    assert len(read_cloud(path)[0]) == record["cloud_points"] == len(done.merged.surface.points)
+    assert {"poses_detect", "poses_joint", "read", "fuse", "masks", "total"} <= set(record["seconds"])
+    assert pq.read_table(path / "poses.parquet").num_rows == 3 * VIEWS
+    assert record["settings"]["fusion"]["voxel_m"] == 0.002
+    for n in range(VIEWS):
+        T = read_pose(path / f"correction_{n:05d}.txt") @ read_pose(path / f"board_{n:05d}.txt")
+        assert np.linalg.norm(T[:3, 3] - truth.T_board_cam[n][:3, 3]) < 0.003
+        mask, true = (cv2.imread(str(p / f"mask_{n:05d}.png"), 0) > 0 for p in (path, path / "truth"))
+        assert (mask & true).sum() / (mask | true).sum() > 0.93
+
+
+def test_a_second_run_writes_the_same_bytes_and_keeps_what_the_user_changed(tmp_path):
+    def results(path):
+        record = json.loads((path / "process.json").read_bytes())
+        return {name: (path / name).read_bytes() for name in record["files"]} | {"record": record | {"seconds": None}}
+
+    path = copy_of(processed()[0], tmp_path)
+    process_folder(path, CAPTURES)
+    assert results(path) == results(processed()[0]) and not list(path.glob(".*"))
+    moved = translation(0.002, 0.0, 0.0) @ read_pose(path / "correction_00001.txt")
+    write_pose(path / "correction_00001.txt", moved)
+    given = cv2.imread(str(path / "truth" / "mask_00002.png"), 0)
+    given[:, :5] = 255
+    cv2.imwrite(str(path / "mask_00002.png"), given)
+    done = process_folder(path, CAPTURES)
+    assert done.users == ("correction_00001.txt", "mask_00002.png")
+    assert "1 pose from manual corrections" in done.notes
+    final = done.estimates.estimate.views[1].T_board_cam
+    assert np.allclose(final, moved @ read_pose(path / "board_00001.txt"), atol=1e-12)
+    assert np.array_equal(cv2.imread(str(path / "mask_00002.png"), 0), given)
+    assert "mask_00002.png" not in json.loads((path / "process.json").read_bytes())["files"]
+
+
+def test_poses_parquet_has_residuals_before_and_after_and_the_camera_columns_of_a_dataset():
+    covariance = np.diag([1e-6, 4e-6, 1e-8, 1e-8, 1e-8, 9e-8])
+    before = tuple(ViewEstimate(n, "used", translation(n, 0, 0), None, 30, 0.5, 4.0) for n in (0, 2))
+    used = ViewEstimate(0, "used", translation(0, 1, 0), covariance, 30, 0.2, 1.0)
+    after = (used, ViewEstimate(2, "refused", None, None, 0, None, None, ("no marker",)))
+    views = {"markers": CaptureEstimate("markers", before), "joint": CaptureEstimate("joint", after)}
+    table = pq.read_table(io.BytesIO(pose_table(Estimates("joint", views, ()), CaptureCamera(KINECT, np.zeros(8)))))
+    rows = table.to_pylist()
+    told = [(row["estimate"], row["number"], row["chosen"]) for row in rows]
+    assert told == [("markers", 0, False), ("markers", 2, False), ("joint", 0, True), ("joint", 2, True)]
+    joint = rows[2]
+    assert (joint["reprojection_before_px"], joint["reprojection_px"]) == (0.5, 0.2)
+    assert (joint["depth_before_mm"], joint["depth_mm"]) == (4.0, 1.0)
+    assert joint["sigma_mm"] == pytest.approx(2.0) and joint["sigma_deg"] == pytest.approx(np.degrees(3e-4))
+    assert rows[3]["T_world_cam"] is None and rows[3]["reasons"] == ["no marker"] and rows[3]["sigma_mm"] is None
+    for name in ("T_world_cam", "width", "height", "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv"):
+        assert SCHEMA.field(name).type == SCHEMAS["views"].field(name).type
+    assert rows[1]["cx"] - rows[1]["cx_opencv"] == 0.5 and np.reshape(rows[1]["T_world_cam"], (4, 4))[0, 3] == 2.0
+
+
+# ---------------------------------------------------------------------------------------------- read back
+
+
+@pytest.fixture(scope="module")
+def result():
+    return read_result(processed()[0])
+
+
+def test_poses_correction_and_surface_are_those_of_the_run(result):
+    done = processed()[1]
+    chosen = done.estimates.estimate
+    for stored, view in zip(result.estimate.views, chosen.views, strict=True):
+        assert (stored.number, stored.status) == (view.number, view.status)
+        assert np.allclose(stored.T_board_cam, view.T_board_cam, atol=1e-12)
+    assert result.estimate.depth.offset_m == chosen.depth.offset_m and result.estimate.depth.scale == chosen.depth.scale
+    assert np.array_equal(result.estimate.depth.T_cam_depth, chosen.depth.T_cam_depth)
+    assert np.allclose(result.surface.vertices, done.merged.surface.vertices, atol=1e-7)
+    assert np.array_equal(result.surface.views, done.merged.surface.views)
+    assert result.captures.fusion == CAPTURES.fusion and len(result.views.body.faces) == len(done.merged.body.faces)
+
+
+def test_a_folder_that_was_not_processed_or_whose_record_is_damaged_is_refused(tmp_path):
+    with pytest.raises(CaptureError, match="run `verso capture process") as refusal:
+        read_result(box())
+    assert refusal.value.reason == "not_processed"
+    path = copy_of(processed()[0], tmp_path)
+    record = json.loads((path / "process.json").read_bytes())
+    for key in ("depth", "settings", "views", "board_as_measured"):
+        (path / "process.json").write_text(json.dumps(record | {key: "nonsense"}))
+        with pytest.raises(CaptureError, match="is damaged"):
+            read_result(path)
+
+
+# ---------------------------------------------------------------------------------------------- views
+
+
+def views_of(result, depth):
+    estimate = dataclasses.replace(true_estimates(box()).estimate, depth=depth)
+    return CaptureViews(opened(box()), estimate, CAPTURES, result.views.body)
+
+
+def test_a_captured_view_keeps_its_picture_and_its_depth_is_what_was_measured_and_corrected(result):
+    depth = DepthCorrection(offset_m=-0.0015, scale=1 / 1.001)
+    images, stored = views_of(result, depth).images(3), read_view(open_folder(box()), 3)
+    assert np.array_equal(images.rgb, stored.rgb)
+    expected = np.where(stored.depth > 0, stored.depth * 0.001 * depth.scale + depth.offset_m, 0)
+    assert np.allclose(images.depth_m, expected, atol=1e-6)
+    seen = result.views.images(3)
+    truth = true_view(read_whole_truth(result.folder).surface, seen.camera)
+    both = seen.mask & (truth > 0) & (seen.depth_m > 0)
+    assert both.sum() > 0.8 * (truth > 0).sum() and abs(np.median((seen.depth_m - truth)[both])) < 0.001
+
+
+def test_depth_is_drawn_anew_where_the_correction_moves_the_depth_camera(result):
+    straight = views_of(result, DepthCorrection()).images(0).depth_m
+    moved = views_of(result, DepthCorrection(T_cam_depth=translation(0.02, 0.0, 0.0))).images(0).depth_m
+    # 20 mm to the right is 20 mm * f / z pixels; depth stays, and the image of the board moves.
+    shift = round(0.02 * result.folder.camera.intrinsics.fx / float(np.median(straight[straight > 0])))
+    a, b = straight[:, : -shift - 1], moved[:, shift:-1]
+    known, still = (a > 0) & (b > 0), (straight > 0) & (moved > 0)
+    assert shift > 5 and np.median(np.abs(a - b)[known]) < 0.5 * np.median(np.abs(straight - moved)[still])
+    assert (moved > 0).sum() > 0.8 * (straight > 0).sum()
+
+
+def test_a_mirror_view_stands_on_the_other_side_and_shows_the_true_depth(result):
+    camera, d_z, view = result.views.mirror(5)
+    T = result.estimate.views[5].T_board_cam
+    pivot = T[:3, 3] + d_z * T[:3, 2]
+    assert np.allclose(camera.position + 1.3 * camera.T_world_cam[:3, 2], pivot)
+    assert np.allclose(camera.T_world_cam[:3, :3], half_turn(np.array([0.0, 0.0, 1.0])) @ T[:3, :3])
+    truth = true_view(read_whole_truth(result.folder).surface, camera)
+    both = view.mask & (truth > 0) & (view.depth_m > 0)
+    assert both.sum() > 0.8 * (truth > 0).sum() and np.median(np.abs(view.depth_m - truth)[both]) < 0.0015
+    assert 0.8 < view.measured_share <= 1.0
+    own = result.views.posed(4).camera  # a view that is left out is no source
+    assert result.views.synthesize(own).sources[0] == 4 and 4 not in result.views.synthesize(own, without=4).sources
+
+
+def test_synthesised_views_are_written_with_pose_and_shares_and_never_into_the_capture(result, tmp_path):
+    T = result.estimate.views[2].T_board_cam
+    told = write_synthesized(result, T, tmp_path / "views")
+    rgb, depth, mask, measured = (
+        cv2.imread(str(tmp_path / "views" / f"{kind}_00000.png"), cv2.IMREAD_UNCHANGED)
+        for kind in ("rgb", "depth", "mask", "measured")
+    )
+    assert rgb.shape == (378, 672, 3) and depth.dtype == np.uint16
+    assert np.array_equal(read_pose(tmp_path / "views" / "board_00000.txt"), T)
+    assert ((mask > 0) & (depth > 0)).sum() > 1000 and not ((measured > 0) & (depth == 0)).any()
+    assert told["measured_share"] == pytest.approx((measured > 0).sum() / (depth > 0).sum())
+    record = json.loads((tmp_path / "views" / "views.json").read_bytes())
+    assert record["views"] == [told] and record["camera"]["width"] == 672 and told["sources"][0] == 2
+    mirrors = write_mirrors(result, tmp_path / "mirrors")
+    assert [one["name"] for one in mirrors] == [f"{n:05d}" for n in range(VIEWS)]
+    assert all(0.3 < one["d_z_m"] < 1.2 for one in mirrors) and len(list(tmp_path.glob("mirrors/rgb_*.png"))) == VIEWS
+    with pytest.raises(OutputError, match="name another folder"):
+        write_synthesized(result, T, result.folder.path)
+
+
+# ---------------------------------------------------------------------------------------------- scores
+
+
+def test_the_score_of_a_good_capture_is_good_and_poses_that_are_off_are_told_by_as_much(result):
+    truth = read_whole_truth(result.folder)
+    score = score_capture(result.estimate, result.surface, result.views, truth, held_out=3)
+    one = score.summary
+    assert one.pose_mm < 2.0 and one.pose_deg < 0.2 and score.worst_mm >= one.pose_mm
+    assert one.cloud_median_mm < 1.0 and one.cloud_p95_mm < 3.0 and one.completeness > 0.9
+    assert one.depth_median_mm < 1.5
+    assert sorted(score.held_out) == [0, 4, 9] and set(one.views) == set(range(VIEWS))
+    assert one.views[4].depth_median_mm == score.held_out[4].depth_median_mm and one.views[5].depth_median_mm is None
+    off = translation(0.0, 0.007, 0.0)
+    views = tuple(
+        dataclasses.replace(view, T_board_cam=frozen_array(off @ truth.T_board_cam[view.number]))
+        for view in result.estimate.views
+    )
+    wrong = dataclasses.replace(result.estimate, views=views)
+    summary = score_capture(wrong, result.surface, result.views, truth, held_out=1).summary
+    assert summary.pose_mm == pytest.approx(7.0) and summary.pose_deg == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_cloud_that_is_off_and_one_that_lacks_a_half_are_told_and_what_had_depth(result):
+    truth, surface = read_whole_truth(result.folder), result.surface
+    cameras = [result.views.posed(n).camera for n in range(3)]
+    inflated = dataclasses.replace(surface, points=surface.points + 0.004 * surface.normals)
+    assert score_surface(inflated, truth.surface, cameras).cloud_median_mm == pytest.approx(4.0, abs=0.5)
+    half = dataclasses.replace(surface, points=surface.points[surface.points[:, 0] > np.median(surface.points[:, 0])])
+    good = score_surface(surface, truth.surface, cameras)
+    assert 0.25 < score_surface(half, truth.surface, cameras).completeness < 0.75 < good.completeness
+    depth, spoilt = (score_measured(one, result.views, truth) for one in (surface, half))
+    assert 0.9 < depth.measured_of_visible <= 1.0 and depth.completeness_of_measured > 0.95
+    assert spoilt.measured_of_visible == depth.measured_of_visible and 0.3 < spoilt.completeness_of_measured < 0.7
+
+
+def test_a_mesh_from_elsewhere_is_aligned_and_scored_as_in_place_and_a_file_that_is_none_refused(result, tmp_path):
+    true = read_whole_truth(result.folder).surface
+    away = pose(rotation_about(np.array([0.0, 0.0, 1.0]), 2.0), np.array([3.0, -1.0, 0.5]))
+    found, alignment = score_against_mesh(result, Mesh(transform(away, true.vertices), true.faces))
+    assert alignment.rms_mm < 1.0
+    assert found.cloud_median_mm < 1.0 and found.cloud_p95_mm < 3.0 and found.completeness > 0.9
+    assert read_whole_truth(dataclasses.replace(open_folder(box()), path=tmp_path)) is None
+    (tmp_path / "bad.ply").write_bytes(b"nonsense")
+    for name, words in (("none.ply", "is not there"), ("bad.ply", "no mesh that can be read")):
+        with pytest.raises(CaptureError, match=words):
+            read_mesh_file(tmp_path / name)
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.stl")
+    assert len(read_mesh_file(tmp_path / "box.stl").faces) == 12

@@ -1,0 +1,179 @@
+"""Detection of a board's markers in a photograph, with corners refined along their edges.
+
+An edge is found on short profiles across it, at the centroid of the gradient of light, which blur moves less than it
+moves the corner itself. Measured on pictures drawn in linear light and stored in sRGB: 0.04 px (rms an axis); OpenCV's
+refinements leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there. On the one real photograph at hand it
+fits the nominal board worse than the contours do (median 1.01 px against 0.44 to a free homography), and best of all
+(0.23 against 0.28) once the side of the printed marker is free: 41.5 mm in place of 40, which AprilTag's corners say as
+well.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.capture import Detection
+from schemas.job.captures import Board
+from workers.capture.board import PREDEFINED
+from workers.geometry.colour import SRGB_STEPS
+
+SAMPLES = 24
+"""Profiles across one edge."""
+STEPS = 13
+"""Places along one profile."""
+MARGIN = 0.12
+"""Share of an edge's length at each end that is left out, where the other edges disturb the profiles."""
+MAX_HALF_PX = 4.0
+MIN_HALF_PX = 1.5
+"""Limits of half a profile's length."""
+ROUNDS = 3
+MAX_SHIFT = 1.0
+"""A corner that moves by more than this many halves of a profile is kept as it was: the edge is not what it seemed."""
+
+LINEAR = SRGB_STEPS.astype(np.float32)
+"""[256]: light of each code. Blur adds up light: in codes the middle of a blurred edge lies 0.1 to 0.2 px on its dark side."""
+
+
+def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: int) -> Array:
+    """[M, 4, 2] float64: corners [M, 4, 2] refined, pixel centres at integers as in OpenCV.
+
+    `bits` is the marker's width in bits, its border included: a profile is shorter than the border is wide.
+    """
+    refined = np.array(corners_px, dtype=np.float64)
+    if not len(refined):
+        return refined
+    light = LINEAR[gray]
+    sides = np.linalg.norm(np.roll(refined, -1, axis=1) - refined, axis=2).min(axis=1)
+    half_px = np.clip(0.5 * sides / bits, MIN_HALF_PX, MAX_HALF_PX)
+    for turn in range(ROUNDS):
+        lines = _edge_lines(light, refined, half_px, only_rising=turn == 0)
+        met = _intersections(lines)
+        near = np.linalg.norm(met - refined, axis=2) <= MAX_SHIFT * half_px[:, None]
+        refined = np.where(near[..., None] & np.isfinite(met), met, refined)
+    return refined
+
+
+def _edge_lines(light: NDArray[np.float32], corners: Array, half_px: Array, only_rising: bool) -> Array:
+    """[M, 4, 3]: line a x + b y = c with unit (a, b), from each corner to the next."""
+    along = np.roll(corners, -1, axis=1) - corners
+    length = np.linalg.norm(along, axis=2, keepdims=True)
+    along = along / length
+    across = np.stack([along[..., 1], -along[..., 0]], axis=2)  # out of the marker: its corners run clockwise
+    place = np.linspace(MARGIN, 1 - MARGIN, SAMPLES) * length  # [M, 4, S]
+    steps = np.linspace(-1, 1, STEPS) * half_px[:, None]  # [M, P]
+    base = corners[:, :, None] + place[..., None] * along[:, :, None]
+    points = base[:, :, :, None] + steps[:, None, None, :, None] * across[:, :, None, None]
+    flat = points.reshape(-1, SAMPLES * STEPS, 2).astype(np.float32)
+    profile = cv2.remap(light, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    bright = profile.reshape(points.shape[:-1]).astype(np.float64)
+    gradient = np.diff(bright, axis=3)
+    if (
+        only_rising
+    ):  # what lies beyond the white of the gap must not count; noise, brighter outside, then moves the centroid
+        gradient = np.maximum(gradient, 0.0)
+    between = 0.5 * (steps[:, 1:] + steps[:, :-1])[:, None, None]
+    weight = np.maximum(gradient.sum(axis=3), 0.0)
+    offset = np.clip((gradient * between).sum(axis=3) / np.maximum(weight, 1e-9), -1e3, 1e3)
+    weight = np.where(weight > 0.5 * np.median(weight, axis=2, keepdims=True), weight, 0.0)
+    shift, slope = _robust_lines(place - 0.5 * length, offset, weight, half_px)
+    normal = across - slope[..., None] * along
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    middle = corners + 0.5 * length * along + shift[..., None] * across
+    return np.concatenate([normal, (normal * middle).sum(axis=2, keepdims=True)], axis=2)
+
+
+def _robust_lines(place: Array, offset: Array, weight: Array, half_px: Array) -> tuple[Array, Array]:
+    """(shift, slope), each [M, 4]: lines offset = shift + slope place through samples [M, 4, S], Cauchy weights."""
+    scale = 0.05 * half_px[:, None, None]
+    robust = np.ones_like(offset)
+    shift, slope = np.median(offset, axis=2), np.zeros(offset.shape[:2])
+    for _ in range(4):
+        residual = offset - shift[..., None] - slope[..., None] * place
+        robust = weight / (1.0 + (residual / scale) ** 2) + 1e-12
+        total = robust.sum(axis=2)
+        x, y = (robust * place).sum(axis=2) / total, (robust * offset).sum(axis=2) / total
+        dx = place - x[..., None]
+        slope = (robust * dx * (offset - y[..., None])).sum(axis=2) / (robust * dx * dx).sum(axis=2)
+        shift = y - slope * x
+    return shift, slope
+
+
+def _intersections(lines: Array) -> Array:
+    """[M, 4, 2]: corner k is where edge k - 1 and edge k meet."""
+    before = np.roll(lines, 1, axis=1)
+    (a, b, c), (d, e, f) = np.moveaxis(before, 2, 0), np.moveaxis(lines, 2, 0)
+    det = a * e - b * d
+    det = np.where(np.abs(det) < 1e-6, np.nan, det)
+    return np.stack([(c * e - b * f) / det, (a * f - c * d) / det], axis=2)
+
+
+MIN_PERIMETER = 0.01
+"""Smallest perimeter of a marker over the larger side of the image: 19 px of 1920, below which bits cannot be read."""
+
+CLEAR_PERIMETER = 0.06
+SEVERAL = 4
+"""Another dictionary is named for so many markers of at least this size: fewer may be chance."""
+
+
+def detect_markers(
+    rgb: NDArray[np.uint8], board: Board, dictionary: "cv2.aruco.Dictionary", number: int = 0
+) -> Detection:
+    """The board's markers in an image [H, W, 3]; ids that are not on the board, or that are seen twice, are dropped."""
+    gray: NDArray[np.uint8] = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+    quads, found, _ = _detector(dictionary).detectMarkers(gray)
+    ids = np.zeros(0, np.int64) if found is None else found.ravel().astype(np.int64)
+    kept, dropped = _usable(ids, board)
+    corners = np.array([quads[k][0] for k in kept], dtype=np.float64).reshape(-1, 4, 2)
+    corners = refine_corners(gray, corners, dictionary.markerSize + 2) + 0.5
+    corners.setflags(write=False)
+    return Detection(number, ids[kept], corners, dropped)
+
+
+def other_dictionaries(rgb: NDArray[np.uint8]) -> str:
+    """What the image holds in place of the board's markers, in words: other dictionaries, or mirrored markers; or nothing.
+
+    Takes a second or so: for the message about a capture in which no marker was found.
+    """
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    best, most = "", SEVERAL - 1
+    for picture, how in ((gray, ""), (np.ascontiguousarray(gray[:, ::-1]), ", mirrored")):
+        for name in PREDEFINED:
+            if name.endswith(("_50", "_100", "_250")) or name != name.upper():
+                continue  # the first markers of the dictionary of 1000, or a second name
+            dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+            _, ids, _ = _detector(dictionary, CLEAR_PERIMETER).detectMarkers(picture)
+            if ids is not None and len(ids) > most:
+                best, most = (
+                    f"the image holds {len(ids)} markers of {_smallest(name, int(np.median(ids)))}{how}",
+                    len(ids),
+                )
+    return best
+
+
+def _smallest(name: str, usual_id: int) -> str:
+    """The smallest dictionary of the family that has the id; a few ids may be misread."""
+    family, _, size = name.rpartition("_")
+    return f"{family}_{next(n for n in (50, 100, 250, 1000) if n > usual_id)}" if size == "1000" else name
+
+
+def _detector(dictionary: "cv2.aruco.Dictionary", min_perimeter: float = MIN_PERIMETER) -> "cv2.aruco.ArucoDetector":
+    settings = cv2.aruco.DetectorParameters()
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    settings.minMarkerPerimeterRate = min_perimeter
+    return cv2.aruco.ArucoDetector(dictionary, settings)
+
+
+def _usable(ids: NDArray[np.int64], board: Board) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+    """(indices of the ids that are used, by ascending id; what is dropped, in words)."""
+    last = board.first_id + board.columns * board.rows - 1
+    values, counts = np.unique(ids, return_counts=True)
+    on_board = (values >= board.first_id) & (values <= last)
+    dropped = [f"marker {value} is not on the board ({board.first_id} to {last})" for value in values[~on_board]]
+    dropped += [
+        f"marker {value} was seen {count} times"
+        for value, count in zip(values[on_board], counts[on_board], strict=True)
+        if count > 1
+    ]
+    kept = np.flatnonzero(np.isin(ids, values[on_board & (counts == 1)]))
+    return kept[np.argsort(ids[kept], kind="stable")], tuple(dropped)

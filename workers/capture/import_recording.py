@@ -1,0 +1,299 @@
+"""From an Azure Kinect recording to the folder of a capture: frames paired, chosen and registered."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import shortest_path
+
+from schemas.base import Array
+from schemas.capture import CapturedView
+from schemas.errors import CaptureError
+from schemas.job.captures import Board
+from workers.capture.folder import CaptureFile, write_description, write_view
+from workers.capture.recording import (
+    DEPTH_FORMAT,
+    DEPTH_UNITS_PER_M,
+    DeviceCalibration,
+    Extent,
+    Recording,
+    decode_color,
+    decode_depth,
+    decode_gray,
+    is_whole,
+    open_recording,
+    read_calibration,
+    read_frames,
+)
+from workers.geometry.zbuffer import register_depth
+
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What is missing of a recording.
+
+    dropped: colour frames missing between the first and the last that were read; without_depth: colour frames without a depth
+    frame; damaged: frames that were cut short; cut: frames missing at the end, or None where the file does not say;
+    is_cut: whether the file ends before its end.
+    """
+
+    dropped: int
+    without_depth: int
+    damaged: int
+    cut: int | None
+    is_cut: bool
+
+
+def pair_frames(color_us: Stamps, depth_us: Stamps, period_us: float, delay_us: float = 0.0) -> dict[int, int]:
+    """Index of the depth frame for colour frames that have one: nearest in time, less than half a period away.
+
+    Depth stamps are `delay_us` later than the colour stamps they belong to. Both ascending.
+    """
+    pairs: dict[int, int] = {}
+    if len(depth_us) == 0:
+        return pairs
+    shifted = depth_us - delay_us
+    after = np.searchsorted(shifted, color_us)
+    for i, stamp in enumerate(color_us.tolist()):
+        near = [k for k in (int(after[i]) - 1, int(after[i])) if 0 <= k < len(shifted)]
+        best = min(near, key=lambda k: abs(float(shifted[k]) - stamp))
+        if abs(float(shifted[best]) - stamp) < 0.5 * period_us:
+            pairs[i] = best
+    return pairs
+
+
+def count_losses(
+    color_us: Stamps, pairs: int, damaged: int, period_us: float, extent: Extent, size_bytes: int
+) -> Losses:
+    """`pairs` colour frames have depth; `size_bytes` is the size of the file as it is. At least one colour frame."""
+    frames = round(float(color_us[-1] - color_us[0]) / period_us) + 1
+    dropped = max(frames - len(color_us) - damaged, 0)
+    is_cut = extent.size_bytes is None or size_bytes < extent.size_bytes
+    cut: int | None = None
+    if extent.duration_us is not None:
+        cut = max(round((extent.duration_us - float(color_us[-1])) / period_us) - 1, 0)
+    elif extent.size_bytes is not None:
+        missing = max(extent.size_bytes - size_bytes, 0)
+        cut = round(missing * len(color_us) / size_bytes)
+    return Losses(dropped, len(color_us) - pairs, damaged, cut if is_cut else 0, is_cut)
+
+
+def describe_losses(losses: Losses) -> list[str]:
+    """Sentences for the user, none where nothing is missing."""
+    told = []
+    if losses.is_cut:
+        lost = "nobody knows how many frames are" if losses.cut is None else f"about {losses.cut} frames are"
+        told.append(f"the recording is cut: {lost} lost at its end")
+    if losses.dropped:
+        told.append(f"{losses.dropped} frames are missing between the first and the last")
+    if losses.damaged:
+        told.append(f"{losses.damaged} frames are damaged")
+    if losses.without_depth:
+        told.append(f"{losses.without_depth} colour frames have no depth")
+    return told
+
+
+LOOK = (32, 18)
+"""Width and height of the small picture by which frames are compared."""
+
+BLURRED = 0.5
+"""A frame with less than this share of the usual sharpness is taken only where there are too few others."""
+
+NEAR = 0.5
+"""Two frames whose looks, of length 1, differ by less show much the same: a correlation of 0.875."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMeasure:
+    """What a frame is chosen by: sharpness, and a small picture [LOOK pixels] without its brightness and contrast."""
+
+    sharpness: float
+    look: Array
+
+
+def measure_frame(gray: NDArray[np.uint8]) -> FrameMeasure:
+    """Sharpness is the variance of the Laplacian, which motion blur lowers; grey levels squared."""
+    look = cv2.resize(gray, LOOK, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
+    look -= look.mean()
+    norm = float(np.sqrt((look * look).sum()))
+    return FrameMeasure(float(cv2.Laplacian(gray, cv2.CV_64F).var()), look / norm if norm > 0.0 else look)
+
+
+def choose_frames(measures: list[FrameMeasure], count: int) -> list[int]:
+    """Ascending indices of `count` frames, or of all where there are fewer.
+
+    First each frame must be the sharpest among its neighbours in time, whose content is the same, so that their sharpness can
+    be compared. Of those the sharpest is taken, then again and again the one that is the farthest way from all that were
+    taken: a camera that stands still or comes back adds no frame while others are left.
+    """
+    if len(measures) <= count:
+        return list(range(len(measures)))
+    sharpness = np.array([measure.sharpness for measure in measures])
+    reach = max(len(measures) // (8 * count), 1)
+    candidates = _sharpest(sharpness, reach)
+    while len(candidates) < count and reach > 0:
+        reach //= 2
+        candidates = _sharpest(sharpness, reach)
+    ways = _ways(np.stack([measures[i].look for i in candidates]))
+    return sorted(candidates[_spread(ways, int(np.argmax(sharpness[candidates])), count)].tolist())
+
+
+def _sharpest(sharpness: Array, reach: int) -> NDArray[np.int64]:
+    """Frames that are the sharpest of those at most `reach` frames away, and not blurred where enough others are sharp."""
+    padded = np.pad(sharpness, reach, constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+    best = np.flatnonzero(windows.argmax(axis=1) == reach)
+    sharp = best[sharpness[best] >= BLURRED * np.median(sharpness[best])]
+    return sharp if reach > 0 else best
+
+
+def _ways(looks: Array) -> Array:
+    """[N, N] float64: how far the camera goes from one frame to another, as a sum of small changes of the look.
+
+    The change between two frames says how far apart they are only while they show much the same; farther on it does not grow.
+    So frames are joined to their neighbours in time and to all that look nearly the same, and the shortest way is taken.
+    """
+    change = np.stack([np.sqrt(((looks - look) ** 2).sum(axis=1)) for look in looks])
+    joined = change < NEAR
+    after = np.arange(len(looks) - 1)
+    joined[after, after + 1] = True
+    return np.asarray(shortest_path(np.where(joined, np.maximum(change, 1e-9), 0.0), directed=False), np.float64)
+
+
+def _spread(ways: Array, first: int, count: int) -> NDArray[np.int64]:
+    """Indices of `count` frames: `first`, then each the farthest from those before it; ties go to the earliest."""
+    chosen = [first]
+    nearest = ways[first].copy()
+    nearest[first] = -1.0
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, ways[chosen[-1]])
+        nearest[chosen] = -1.0
+    return np.array(chosen)
+
+
+RECORDING_FILE = "recording.json"
+"""Where the views come from: the recording, and the time stamp of each view."""
+
+
+@dataclass(frozen=True)
+class ImportedView:
+    """A view and the frame it was made from."""
+
+    number: int
+    color_us: int
+    depth_us: int
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What was made of a recording."""
+
+    views: tuple[ImportedView, ...]
+    frames: int
+    """Colour frames with depth, of which the views were chosen."""
+    losses: Losses
+
+
+def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, views: int) -> Imported:
+    """Writes a capture folder into `out`, which must exist: `views` chosen frames with depth in the colour camera.
+
+    The images keep the lens of the colour camera, which camera.json has. What describes the folder is written last, so that a
+    folder that was left half-made is not taken for a capture. Raises CaptureError for a recording that cannot be used.
+    """
+    recording = open_recording(path)
+    device = _read_device(recording)
+    color_us, measures, depth_us, damaged = _measure(recording)
+    pairs = pair_frames(color_us, depth_us, recording.period_us, recording.depth_delay_us)
+    if not pairs:
+        raise CaptureError(
+            "empty",
+            f"{path}: none of {len(color_us)} colour frames that can be read has one of {len(depth_us)} depth "
+            "frames within half a frame's time: copy the file again",
+        )
+    losses = count_losses(color_us, len(pairs), damaged, recording.period_us, recording.extent, path.stat().st_size)
+    usable = sorted(pairs)
+    chosen = [usable[i] for i in choose_frames([measures[i] for i in usable], views)]
+    made = tuple(
+        ImportedView(n, int(color_us[i]), int(depth_us[pairs[i]]), measures[i].sharpness) for n, i in enumerate(chosen)
+    )
+    _write_views(recording, device, made, out)
+    told = {
+        "recording": path.name,
+        "serial_number": recording.serial_number,
+        "depth_mode": recording.depth_mode,
+        "losses": asdict(losses),
+        "views": [asdict(view) for view in made],
+    }
+    (out / RECORDING_FILE).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    write_description(out, about, device.color, board)
+    return Imported(made, len(pairs), losses)
+
+
+def _read_device(recording: Recording) -> DeviceCalibration:
+    """The recording's cameras. Raises CaptureError that names the file."""
+    path = recording.path
+    try:
+        device = read_calibration(recording.calibration, recording.color_size, recording.depth_mode)
+    except CaptureError as error:
+        raise CaptureError(error.reason, f"{path}: {error.detail}") from error
+    size = (device.depth.intrinsics.width, device.depth.intrinsics.height)
+    if recording.depth_size != size:
+        raise CaptureError(
+            "mode", f"{path}: depth is {recording.depth_size}, and the mode {recording.depth_mode} has {size}"
+        )
+    return device
+
+
+def _measure(recording: Recording) -> tuple[Stamps, list[FrameMeasure], Stamps, int]:
+    """(stamps and measures of the colour frames that can be used, stamps of depth frames, damaged frames), read once."""
+    color: dict[int, FrameMeasure] = {}
+    depth: set[int] = set()
+    damaged = 0
+    for frame in read_frames(recording):
+        if frame.is_depth:
+            if is_whole(frame.data, DEPTH_FORMAT, recording.depth_size):
+                depth.add(frame.stamp_us)
+            continue
+        whole = is_whole(frame.data, recording.color_format, recording.color_size)
+        gray = decode_gray(frame.data, recording.color_format, recording.color_size) if whole else None
+        if gray is None:
+            damaged += 1
+        else:
+            color[frame.stamp_us] = measure_frame(gray)
+    stamps = sorted(color)
+    return np.array(stamps, np.int64), [color[t] for t in stamps], np.array(sorted(depth), np.int64), damaged
+
+
+def _write_views(recording: Recording, device: DeviceCalibration, views: tuple[ImportedView, ...], out: Path) -> None:
+    """Reads the recording again and writes the chosen frames; a view is written as soon as both its frames are there."""
+    color = {view.color_us: [view] for view in views}
+    depth: dict[int, list[ImportedView]] = {}
+    for view in views:
+        depth.setdefault(view.depth_us, []).append(view)
+    half: dict[int, bytes] = {}
+    for frame in read_frames(recording):
+        waiting = (depth if frame.is_depth else color).get(frame.stamp_us, [])
+        for view in waiting:
+            if view.number not in half:
+                half[view.number] = frame.data
+                continue
+            other = half.pop(view.number)
+            pair = (other, frame.data) if frame.is_depth else (frame.data, other)
+            write_view(out, _view(recording, device, view.number, *pair))
+
+
+def _view(recording: Recording, device: DeviceCalibration, number: int, color: bytes, depth: bytes) -> CapturedView:
+    rgb = decode_color(color, recording.color_format, recording.color_size)
+    if rgb is None:
+        raise CaptureError("unreadable", f"{recording.path}: the colour frame of view {number} cannot be decoded")
+    depth_m = decode_depth(depth, recording.depth_size) / DEPTH_UNITS_PER_M
+    seen = register_depth(depth_m, device.depth, device.color.intrinsics, device.color.lens)
+    units = np.rint(seen * DEPTH_UNITS_PER_M)  # depth beyond what 16 bits hold is none
+    return CapturedView(number, rgb, np.where(units < 65536.0, units, 0.0).astype(np.uint16), None)
