@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
@@ -288,26 +288,15 @@ def extract_surface(volume: Volume) -> Mesh:
     seen = volume.weight > 0.0
     if not ((volume.distance_m > 0.0) & seen).any() or not ((volume.distance_m < 0.0) & seen).any():
         return EMPTY
+    # Voxels at the far corner of a cell whose eight voxels were seen: so skimage reads its mask.
+    whole = ndimage.binary_erosion(seen, np.ones((2, 2, 2), np.bool_))
     try:
         vertices, faces, _, _ = marching_cubes(
-            volume.distance_m, 0.0, mask=_whole_cells(seen), allow_degenerate=False, gradient_direction="descent"
+            volume.distance_m, 0.0, mask=whole, allow_degenerate=False, gradient_direction="descent"
         )
     except RuntimeError:  # no surface in the cells that were seen
         return EMPTY
     return Mesh(volume.origin + volume.voxel_m * vertices.astype(np.float64), faces.astype(np.int32))
-
-
-def _whole_cells(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[X, Y, Z] bool: voxels at the far corner of a cell whose eight voxels were seen, as skimage reads its mask."""
-    whole = np.zeros_like(seen)
-    cell = seen[1:, 1:, 1:].copy()
-    for i in (0, 1):
-        for j in (0, 1):
-            for k in (0, 1):
-                stop = [n - 1 + d for n, d in zip(seen.shape, (i, j, k), strict=True)]
-                cell &= seen[i : stop[0], j : stop[1], k : stop[2]]
-    whole[1:, 1:, 1:] = cell
-    return whole
 
 
 def cut_below(mesh: Mesh, plane: tuple[float, float, float], height_m: float) -> Mesh:
