@@ -96,8 +96,6 @@ def assess(path: Path, record, what: str) -> tuple[dict, list]:
         fine = figure is not None and (bound is None or figure <= bound)
         record(f"{what}: {name}", "passed" if fine else "missed", figure, bound)
         missed += [] if fine else [(name, figure, bound)]
-    rounded = {name: None if figure is None else round(figure, 4) for name, (figure, _) in figures.items()}
-    print(what, rounded, clock.seconds, flush=True)
     return poses, missed
 
 
@@ -117,7 +115,6 @@ def test_a_capture_is_as_exact_as_promised(category, number, tmp_path, record_fi
         poses = pose_errors(other, done.estimates)
         better = poses["article"][0] / poses["joint"][0]
         record_figure(f"{category} {number}, {what}: article over joint", "passed", better, 3.0)
-        print(category, number, what, poses, flush=True)
         missed += [] if better >= 3.0 else [(what, better, 3.0)]
     assert not missed, missed
 
@@ -137,5 +134,4 @@ def test_a_print_that_is_two_percent_too_large_is_told_or_measured_by_depth(cate
     record_figure(
         f"{category} {number}, print 2 % too large: markers over joint that trusts depth", "passed", better, 3.0
     )
-    print(category, number, "print", poses, flush=True)
     assert better >= 3.0

@@ -10,9 +10,9 @@ from schemas.capture import CaptureCamera
 from schemas.job.captures import Board, Estimation
 from schemas.scene.view import Intrinsics
 from tests.conftest import SHARED_DATA
-from tests.workers.capture.drawn import HALF, KINECT, QUARTER, hand_held, photograph, printed, true_corners
+from tests.workers.capture.drawn import HALF, KINECT, hand_held, photograph, printed, true_corners
 from workers.capture.board import frame_in_board, marker_corners, open_dictionary
-from workers.capture.detect import detect_markers, other_dictionaries, refine_corners
+from workers.capture.detect import detect_markers, refine_corners
 from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
@@ -73,13 +73,6 @@ def test_markers_that_are_seen_twice_or_are_not_on_the_board_are_dropped():
     assert set(found.dropped) == {f"marker {n} is not on the board (3 to 37)" for n in (0, 1, 2)}
     found = detect_markers(np.full((540, 960, 3), 120, np.uint8), BOARD, DICTIONARY)
     assert found.ids.shape == (0,) and found.corners_px.shape == (0, 4, 2)
-
-
-def test_the_markers_that_a_picture_holds_instead_are_named():
-    rng = np.random.default_rng(7)
-    T = hand_held(rng, 1)[0]
-    assert "DICT_6X6" in other_dictionaries(photograph(Board(dictionary="DICT_6X6_100"), T, QUARTER, rng))
-    assert "mirrored" in other_dictionaries(np.ascontiguousarray(photograph(BOARD, T, QUARTER, rng)[:, ::-1]))
 
 
 # ------------------------------------------------- a real camera, a real print, an older dictionary and board
