@@ -14,8 +14,8 @@ from schemas.scene.view import Camera, Intrinsics, ObjectLabel, crop_box
 from tests.kit.planes import HERE, IMAGES, THERE, K, plane_view
 from tests.kit.shapes import asset_of, box, table
 from workers.geometry.camera import inclination, look_at, orbit_pose
-from workers.geometry.distortion import distort
 from workers.geometry.frames import half_turn, pose, rotation_about, translation
+from workers.geometry.lens import distort
 from workers.geometry.pixels import Extent
 from workers.scene.labels import (
     carry_depth,
