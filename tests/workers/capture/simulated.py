@@ -81,7 +81,7 @@ def _taken(settings: str, seed: int) -> tuple[CapturedView, CaptureCamera, Pose]
     return view, CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion)), T_board_cam
 
 
-def corner_errors(rgb, camera, T, board=None):
+def corner_errors(view, camera, T, board=None):
     """(errors [N, 2] px of corners along straight edges against OpenCV's projection, their outward parts [N]).
 
     The edges are found in linear light; what a drawn square leaves is held by a test of its own. Hidden squares are left out.
@@ -89,7 +89,7 @@ def corner_errors(rgb, camera, T, board=None):
     true = project(marker_corners(board or Board()).reshape(-1, 3), T, camera).reshape(-1, 4, 2) - 0.5
     inside = ((true > 8) & (true < [camera.intrinsics.width - 8, camera.intrinsics.height - 8])).all(axis=(1, 2))
     true = true[inside]
-    found = refine_corners(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), true, 6)
+    found = refine_corners(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), true, 6)
     seen = ((found != true).any(axis=2) & (np.abs(found - true).max(axis=2) < 0.5)).all(axis=1)
     errors, away = (found - true)[seen], true[seen] - true[seen].mean(axis=1, keepdims=True)
     outwards = (errors * away).sum(axis=2) / np.linalg.norm(away, axis=2)
