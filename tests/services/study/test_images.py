@@ -139,6 +139,9 @@ def test_mask_pixels_that_differ_count_per_pixel_of_the_object(seen):
     far[:4, :5], other[tuple(mine[:100].T)] = 3, 4
     for mask, expected in ((np.roll(region, 1, axis=1), 2 / columns), (far, 20 / len(mine)), (other, 100 / len(mine))):
         assert measure(table_and(block()), pair_of(view(depth_m, mask)))["mask_share"] == pytest.approx(expected)
+    # Depth counts only where mask and ray name the same object.
+    off = view(depth_m + np.where(other == 4, 0.05, 0.0), other)
+    assert measure(table_and(block()), pair_of(off))["depth_mm"] == pytest.approx(0.0, abs=1e-3)
     right, wrong = view(*seen), np.where(region == 3, 2, region)
     mirror, aligned = view(depth_m, wrong, "mirror"), view(depth_m, wrong, "aligned")
     for pairs, expected in (
