@@ -4,7 +4,7 @@ import base64
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from string import Template
@@ -52,7 +52,7 @@ def write_tables(study: Study, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     wide = pa.Table.from_pylist([_wide(row) for row in study.rows], wide_schema())
     long = pa.Table.from_pylist([line for row in study.rows for line in _long(row)], LONG_SCHEMA)
-    text = json.dumps({"verso_study": STUDY_VERSION, **_plain(study)}, indent=1, default=_plain) + "\n"
+    text = json.dumps({"verso_study": STUDY_VERSION, **asdict(study)}, indent=1) + "\n"
     return [
         _replace(folder / WIDE_FILE, lambda file: pq.write_table(wide, file)),
         _replace(folder / LONG_FILE, lambda file: pq.write_table(long, file)),
@@ -80,13 +80,6 @@ def _long(row: Row) -> list[dict[str, Any]]:
         | {"unit": ERRORS[name].unit, "group": ERRORS[name].group}
         for name, figure in row.errors.items()
     ]
-
-
-def _plain(value: Any) -> Any:
-    """One level of a value that JSON does not know: a dataclass, a mapping that is no dict, or a number of numpy."""
-    if is_dataclass(value):
-        return {field.name: getattr(value, field.name) for field in fields(value)}
-    return dict(value) if isinstance(value, Mapping) else value.item()
 
 
 def _replace(file: Path, write: Callable[[Path], Any]) -> Path:
