@@ -1,13 +1,11 @@
 """The posed geometry of one stored scene or capture."""
 
 import io
-from collections.abc import Iterator
 
 import numpy as np
 import trimesh
 from trimesh.visual import ColorVisuals
 
-from schemas.base import Pose
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import asset_path
 from schemas.errors import CorruptError, InputError
@@ -21,26 +19,6 @@ from workers.assets.external.plain import read_visual
 from workers.assets.glb import linear_bytes, mesh_of_part
 from workers.scene.plan import SceneChance, plan_scene
 from workers.store.store import Store
-
-
-def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[tuple[str, trimesh.Trimesh, Pose]]:
-    """(name, mesh, T_world_mesh) of board and object. Raises CorruptError where the stored shape cannot be read."""
-    T_world = read_world_poses(row)
-    board = next(asset for asset in stored.rows["assets"] if asset["instance_id"] == row["table_id"])
-    x, y, _ = (0.5 * size for size in board["extents_m"])
-    rectangle = trimesh.Trimesh([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
-    yield f"board {row['table_id']}", rectangle, T_world[REGION_TABLE]
-    path = asset_path(row["category"], row["instance_id"])
-    try:
-        scene = trimesh.load_scene(io.BytesIO(store.read(path)), file_type="glb", process=False)
-    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
-        raise CorruptError(
-            f"{path} cannot be read: {error}; `verso replay {store.name} --repair` makes it again"
-        ) from error
-    for mesh in scene.geometry.values():
-        visual, _ = read_visual(mesh, linear=True)
-        mesh.visual = ColorVisuals(mesh, vertex_colors=visual.colors)
-        yield f"{row['category']} {row['instance_id']}", mesh, T_world[REGION_FIRST_OBJECT]
 
 
 def scene_glb(store: Store, scene_id: int) -> bytes:
@@ -64,10 +42,24 @@ def scene_glb(store: Store, scene_id: int) -> bytes:
 
 def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene:
     """Board and object of a capture, from its stored shape. Raises CorruptError where that cannot be read."""
+    T_world = read_world_poses(row)
+    board = next(asset for asset in stored.rows["assets"] if asset["instance_id"] == row["table_id"])
+    x, y, _ = (0.5 * size for size in board["extents_m"])
+    rectangle = trimesh.Trimesh([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    placed = [(f"board {row['table_id']}", rectangle, ColorVisuals(rectangle), T_world[REGION_TABLE])]
+    path = asset_path(row["category"], row["instance_id"])
+    try:
+        shape = trimesh.load_scene(io.BytesIO(store.read(path)), file_type="glb", process=False)
+    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
+        raise CorruptError(
+            f"{path} cannot be read: {error}; `verso replay {store.name} --repair` makes it again"
+        ) from error
+    for mesh in shape.geometry.values():
+        colors = ColorVisuals(mesh, vertex_colors=read_visual(mesh, linear=True)[0].colors)
+        placed.append((f"{row['category']} {row['instance_id']}", mesh, colors, T_world[REGION_FIRST_OBJECT]))
     scene = trimesh.Scene()
-    for name, mesh, T_world_mesh in captured_geometry(store, stored, row):
-        if isinstance(mesh.visual, ColorVisuals):
-            mesh.visual = ColorVisuals(mesh, vertex_colors=linear_bytes(mesh.visual.vertex_colors / 255.0))
+    for name, mesh, colors, T_world_mesh in placed:
+        mesh.visual = ColorVisuals(mesh, vertex_colors=linear_bytes(colors.vertex_colors / 255.0))
         scene.add_geometry(mesh, geom_name=name, node_name=name, transform=T_world_mesh)
     return scene
 

@@ -1,5 +1,6 @@
 """Every reader on a dataset of captures, whose photographs and mirror views are exact (tests/captures.py)."""
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -15,7 +16,7 @@ from services.read.dataset_reader import find_scene
 from services.read.query import query
 from services.read.repair import repair
 from services.read.replay import replay_scene
-from services.read.scene_geometry import captured_geometry, scene_glb
+from services.read.scene_geometry import scene_glb
 from services.read.status import read_status
 from tests.captures import captures_job, use_exact_captures, write_folder
 from tests.datasets import faults_of, run_here
@@ -69,7 +70,7 @@ def test_a_lost_image_and_a_lost_shape_are_named_and_made_again(copy):
     for damage in (lambda: shape.write_bytes(b"glTF"), shape.unlink):
         damage()
         with pytest.raises(CorruptError, match=f"{shape.name} .*--repair"):
-            list(captured_geometry(copy, stored, stored.scene(0)))
+            scene_glb(copy, 0)
     (copy.root / "mug/depth00001.png").unlink()
     assert len(faults_of(copy)) == 2
     found = repair(copy, [], lambda _: None)
@@ -108,13 +109,14 @@ def test_sql_status_and_the_card_tell_of_captures(virtual):
 
 def test_geometry_of_a_capture_is_its_board_and_its_mesh_where_they_are(virtual):
     store = LocalStore(virtual)
-    assert len(scene_glb(store, 0)) > 1000
-    stored = find_scene(store, 0)
-    board, thing = captured_geometry(store, stored, stored.scene(0))
-    np.testing.assert_allclose(board[1].extents, [0.6, 0.4, 0.0], atol=1e-12)
-    placed = trimesh.transform_points(thing[1].vertices, thing[2])
+    found = trimesh.load_scene(io.BytesIO(scene_glb(store, 0)), file_type="glb")
+    board, thing = sorted(found.graph.nodes_geometry)
+    assert (board.split()[0], thing.split()[0]) == ("board", "mug")
+    np.testing.assert_allclose(found.geometry[board].extents, [0.6, 0.4, 0.0], atol=1e-7)
+    placed = trimesh.transform_points(found.geometry[thing].vertices, found.graph[thing][0])
     assert placed[:, 2].min() == pytest.approx(0.0, abs=1e-6) and abs(placed[:, :2].mean()) < 0.05
-    assert thing[1].visual.vertex_colors[0].tolist() == [120, 120, 120, 255]
+    linear = round(255 * ((120 / 255 + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1, of the grey of its photographs
+    assert np.abs(found.geometry[thing].visual.vertex_colors[0].astype(int) - [linear, linear, linear, 255]).max() <= 1
 
 
 def test_folders_are_captures_and_one_that_cannot_be_used_is_a_row_of_failures(tmp_path, monkeypatch):
