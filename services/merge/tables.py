@@ -168,19 +168,12 @@ class _Parts:
 class _Sink(io.BytesIO):
     """Where a Parquet writer writes to: memory, so that it never fails and hundreds of files need not be open at once."""
 
-    _drained = 0
-
-    def tell(self) -> int:
-        """Bytes so far, drained ones too."""
-        return self._drained + super().tell()
-
     def close(self) -> None:
         """Does nothing: what the writer wrote last is still to be drained."""
 
     def drain(self, file: IO[bytes]) -> None:
         """Moves the bytes since the last call to a file."""
         file.write(self.getvalue())
-        self._drained = self.tell()
         self.seek(0)
         self.truncate()
 

@@ -5,7 +5,6 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -38,23 +37,25 @@ class Counts:
     since: float = 0.0
     phase: str = "planning"
 
+    @property
+    def phases(self) -> dict[str, float]:
+        """1 for the phase of this moment, 0 for others."""
+        return {phase: float(phase == self.phase) for phase in PHASES}
 
-GAUGES = {
-    "verso_scenes_asked": ("asked", "Scenes that this run was to make."),
-    "verso_ranges_in_flight": ("in_flight", "Ranges given to Ray and not reported."),
-    "verso_slots": ("slots", "Shards that may run at once."),
-    "verso_making_since_timestamp_seconds": ("since", "When the making began."),
-}
-COUNTERS = {
-    "verso_scenes_made": ("made", "Scenes made and committed in this run."),
-    "verso_commits": ("commits", "Ranges committed in this run."),
-}
-COUNTERS_BY = {
-    "verso_scenes_failed": ("failed", "reason", "Scenes that could not be made."),
-    "verso_workers_lost": ("lost", "reason", "Workers that died, by cause."),
-    "verso_stage_seconds": ("seconds", "stage", "Time of the workers in each stage."),
-}
-"""By name: the field of `Counts`, the label if there is one, and what it is."""
+
+METRICS = (
+    (GaugeMetricFamily, "verso_scenes_asked", "asked", "", "Scenes that this run was to make."),
+    (GaugeMetricFamily, "verso_ranges_in_flight", "in_flight", "", "Ranges given to Ray and not reported."),
+    (GaugeMetricFamily, "verso_slots", "slots", "", "Shards that may run at once."),
+    (GaugeMetricFamily, "verso_making_since_timestamp_seconds", "since", "", "When the making began."),
+    (CounterMetricFamily, "verso_scenes_made", "made", "", "Scenes made and committed in this run."),
+    (CounterMetricFamily, "verso_commits", "commits", "", "Ranges committed in this run."),
+    (CounterMetricFamily, "verso_scenes_failed", "failed", "reason", "Scenes that could not be made."),
+    (CounterMetricFamily, "verso_workers_lost", "lost", "reason", "Workers that died, by cause."),
+    (CounterMetricFamily, "verso_stage_seconds", "seconds", "stage", "Time of the workers in each stage."),
+    (GaugeMetricFamily, "verso_phase", "phases", "phase", "1 for what the run does now."),
+)
+"""Kind, name, the field of `Counts`, the label by which it is counted or nothing, and what it is."""
 
 
 class Meter(Collector):
@@ -74,21 +75,12 @@ class Meter(Collector):
 
     def collect(self) -> Iterable[Metric]:
         """The metrics of one scrape."""
-        now = self._counts
-        for name, (field_name, what) in GAUGES.items():
-            yield self._family(GaugeMetricFamily, name, what, {None: getattr(now, field_name)})
-        for name, (field_name, what) in COUNTERS.items():
-            yield self._family(CounterMetricFamily, name, what, {None: getattr(now, field_name)})
-        for name, (field_name, label, what) in COUNTERS_BY.items():
-            yield self._family(CounterMetricFamily, name, what, dict(sorted(getattr(now, field_name).items())), label)
-        phases = {phase: float(phase == now.phase) for phase in PHASES}
-        yield self._family(GaugeMetricFamily, "verso_phase", "1 for what the run does now.", phases, "phase")
-
-    def _family(self, kind: Any, name: str, what: str, values: Mapping[Any, float], label: str | None = None) -> Metric:
-        family = kind(name, what, labels=["job", *([label] if label else [])])
-        for key, value in values.items():
-            family.add_metric([self._job, *([key] if label else [])], value)
-        return family
+        for kind, name, counted, label, what in METRICS:
+            values = getattr(self._counts, counted)
+            family = kind(name, what, labels=["job", *([label] if label else [])])
+            for key, value in sorted(values.items()) if label else [("", values)]:
+                family.add_metric([self._job, *([key] if label else [])], value)
+            yield family
 
 
 @contextlib.contextmanager

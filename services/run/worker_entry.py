@@ -71,18 +71,6 @@ def look_at_folder(proof: str, token: str, patience_s: float = LOOK_S) -> str:
                 return "there is no such folder"
             return "it is another folder" if held is None else "it holds the lock of another run"
         time.sleep(0.1)
-    return _why_not_writable(folder)
-
-
-def _token_in(proof: str) -> str | None:
-    try:
-        held = json.loads(Path(proof).read_bytes())
-        return str(held["token"])
-    except (OSError, ValueError, KeyError, TypeError):  # a file that is just being replaced, too
-        return None
-
-
-def _why_not_writable(folder: str) -> str:
     scratch = os.path.join(folder, "_staging", "_tmp", f"node-{uuid.uuid4().hex}")
     try:
         os.makedirs(os.path.dirname(scratch), exist_ok=True)
@@ -91,6 +79,14 @@ def _why_not_writable(folder: str) -> str:
     except OSError as error:
         return f"it cannot be written ({error.strerror})"
     return ""
+
+
+def _token_in(proof: str) -> str | None:
+    try:
+        held = json.loads(Path(proof).read_bytes())
+        return str(held["token"])
+    except (OSError, ValueError, KeyError, TypeError):  # a file that is just being replaced, too
+        return None
 
 
 def see(names: Iterable[str], proof: str, token: str) -> Sight:

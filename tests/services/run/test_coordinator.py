@@ -235,6 +235,7 @@ def test_stalls_are_judged_by_what_changes_between_two_looks():
         assert find_stalls({MUG: late, CAN: Sight(33, 1.0)}, 10.0) == {MUG: late}
     left_behind = Sight(17, 100.0)
     assert find_stalls({MUG: left_behind, AGAIN: Sight(17, 1.0)}, 10.0) == {}
+    assert find_stalls({MUG: Sight(17, 1.0), AGAIN: left_behind}, 10.0) == {}
     assert find_stalls({MUG: left_behind, AGAIN: Sight(17, 20.0)}, 10.0) == {AGAIN: Sight(17, 20.0)}
 
 
