@@ -8,13 +8,14 @@ import re
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, InputError, MachineError, OutputError, plain_line
 from schemas.job.job import Job
+from schemas.scene.shape import Asset
 from services.init.collection import (
     LARGEST,
     SMALLEST,
@@ -36,7 +37,7 @@ from services.init.guess import (
     map_categories,
     plain_axis,
 )
-from services.init.shown import Tile, draw_left_out, draw_sheet, draw_table, show_items
+from services.init.shown import Shown, draw_left_out, draw_sheet, draw_table, show_items
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import MOST_BYTES, MOST_KEYS, validate_job
 from services.run.progress import ProgressLine
@@ -197,8 +198,8 @@ def main(options: argparse.Namespace) -> int:
     catalogue = open_catalogue(job.assets, out.parent, tuple(job.categories))
     shown = show_items(catalogue, items)
     print("\n".join([*draw_table([one.row for one, _ in shown], width), *draw_left_out(left_out, width)]))
-    tiles = [Tile(partial(catalogue.load, ref), one.caption, one.warnings) for one, ref in shown]
-    drawn = _draw(sheet, options.sheet is not None, f"{folder}: {len(items)} objects", tiles, left_out)
+    pictured = [(one, partial(catalogue.load, ref)) for one, ref in shown]
+    drawn = _draw(sheet, options.sheet is not None, f"{folder}: {len(items)} objects", pictured, left_out)
     _write(out, text.encode(), "--out")
     print(f"{out}: {len(items)} objects in {len(job.categories)} categories")
     print("\n".join(f"  {line}" for line in describe_guess(guess)))
@@ -276,10 +277,12 @@ def _read(folder: Path, categories: Mapping[str, str]) -> Reading:
             line.close()
 
 
-def _draw(sheet: Path, asked: bool, title: str, tiles: list[Tile], left_out: list[LeftOut]) -> bool:
+def _draw(
+    sheet: Path, asked: bool, title: str, shown: Sequence[tuple[Shown, Callable[[], Asset]]], left_out: list[LeftOut]
+) -> bool:
     """Writes the pictures; whether it could. MachineError where they were asked for by name and cannot be drawn."""
     try:
-        page = draw_sheet(title, tiles, draw_left_out(left_out, SHEET_WIDTH), shared_renderer())
+        page = draw_sheet(title, shown, draw_left_out(left_out, SHEET_WIDTH), shared_renderer())
     except MachineError as error:
         if asked:
             raise

@@ -176,32 +176,25 @@ EFFECTS = EffectPlan(
 WARNING = "#b03000"
 
 
-@dataclass(frozen=True)
-class Tile:
-    """An object on the page: how it is loaded, its caption, and the lines that ask for attention."""
-
-    load: Callable[[], Asset]
-    caption: tuple[str, ...]
-    warnings: tuple[str, ...] = ()
-
-
-def draw_sheet(title: str, tiles: Sequence[Tile], notes: Sequence[str], renderer: Renderer) -> Image.Image:
-    """The page: a title, up to `MOST` objects, and notes below them."""
-    shown = tiles[:MOST]
-    if len(tiles) > MOST:
-        notes = [f"and {len(tiles) - MOST} objects more, which are not drawn", *notes]
-    columns = min(COLUMNS, max(len(shown), 3))
+def draw_sheet(
+    title: str, objects: Sequence[tuple[Shown, Callable[[], Asset]]], notes: Sequence[str], renderer: Renderer
+) -> Image.Image:
+    """The page: a title, up to `MOST` objects, each loaded when it is drawn, and notes below them."""
+    drawn = objects[:MOST]
+    if len(objects) > MOST:
+        notes = [f"and {len(objects) - MOST} objects more, which are not drawn", *notes]
+    columns = min(COLUMNS, max(len(drawn), 3))
     cell = (TILE[0] + MARGIN, TILE[1] + LINE * LINES + 2 * MARGIN)
-    rows = math.ceil(len(shown) / columns)
+    rows = math.ceil(len(drawn) / columns)
     top = 2 * LINE + MARGIN
     page = Image.new("RGB", (columns * cell[0] + MARGIN, top + rows * cell[1] + LINE * len(notes) + MARGIN), "white")
     pen, font = ImageDraw.Draw(page), ImageFont.load_default(FONT)
     fit = columns * cell[0] // 7
     pen.text((MARGIN, MARGIN), shorten(title, fit), "black", ImageFont.load_default(FONT + 3))
-    for number, tile in enumerate(shown):
+    for number, (one, load) in enumerate(drawn):
         left, upper = MARGIN + number % columns * cell[0], top + number // columns * cell[1]
-        page.paste(draw_object(tile.load(), renderer), (left, upper))
-        lines = [(line, "black") for line in tile.caption] + [(line, WARNING) for line in tile.warnings]
+        page.paste(draw_object(load(), renderer), (left, upper))
+        lines = [(line, "black") for line in one.caption] + [(line, WARNING) for line in one.warnings]
         for row, (line, colour) in enumerate(lines[:LINES]):
             pen.text((left, upper + TILE[1] + 3 + row * LINE), _fit(line, font, TILE[0]), colour, font)
     for row, note in enumerate(notes):

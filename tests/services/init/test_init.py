@@ -20,7 +20,7 @@ from schemas.job.assets import Assets, FolderSource, ProceduralSource
 from services.cli.main import main
 from services.init import collection, command, shown
 from services.init.collection import SUFFIXES, LeftOut, read_folder, walk_folder
-from services.init.shown import MOST_ROWS, TILE, Tile, draw_left_out, draw_object, draw_sheet, draw_table, show_items
+from services.init.shown import MOST_ROWS, TILE, Shown, draw_left_out, draw_object, draw_sheet, draw_table, show_items
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import load_job
 from tests.services.init.own_meshes import cup, mixed_folder, write_mesh
@@ -232,7 +232,8 @@ def test_an_object_of_any_size_fills_its_picture_and_stands_in_it_or_is_seen_to_
 def test_as_many_as_fit_are_drawn_and_the_rest_is_counted(monkeypatch):
     monkeypatch.setattr(shown, "MOST", 2)
     loaded = []
-    tiles = [Tile(lambda: loaded.append(1) or bottle(), ("näme", "mug"), ("a warning " * 20,))] * 5
+    one = Shown("näme", "mug", (1, 1, 1), 8, 12, True, 0, 0, "z", None, None, ("a warning " * 20,))
+    tiles = [(one, lambda: loaded.append(1) or bottle())] * 5
     page, two = (draw_sheet("title", some, ["left out: x"], shared_renderer()) for some in (tiles, tiles[:2]))
     assert len(loaded) == 4 and page.height > two.height, "a line says how many are not drawn"
     assert page.width >= 2 * TILE[0] and (np.asarray(page) < 128).any()
