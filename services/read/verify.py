@@ -267,7 +267,7 @@ def _read_ranges(
         one = check.check(records)
         found.staged += one.staged
         if one.rows is None:
-            spans.spoil(start, records[0].span.stop)
+            spans.unreadable.append((start, records[0].span.stop))
         elif found.mergeable and spans.fits:
             try:
                 merging.add(one)
@@ -281,7 +281,7 @@ def _read_ranges(
 
 def _merge_again(merging: Remerge, found: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
     """`_SUCCESS` and the merged files as the commits give them; None where not every range can be read."""
-    if not (found.mergeable and found.spans.whole):
+    if not (found.mergeable and found.spans.fits and found.spans.done):
         return None
     try:
         return merging.finish()

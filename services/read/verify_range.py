@@ -54,13 +54,8 @@ class Spans:
         """Start of the damaged range just before, whose stop is not known."""
 
     @property
-    def whole(self) -> bool:
-        """Whether every scene asked is committed once, by ranges that can be read."""
-        return not (self.gaps or self.unreadable or self.foreign) and bool(self.done)
-
-    @property
     def fits(self) -> bool:
-        """Whether the ranges taken so far can be merged."""
+        """Whether the ranges taken so far can be merged; after the last, whether every scene asked is committed once."""
         return not (self.gaps or self.unreadable or self.foreign or self._torn is not None)
 
     def take(self, start: int, records: tuple[CommitRecord, ...]) -> None:
@@ -76,10 +71,6 @@ class Spans:
             told = f"{commit_path(start)}: scenes {start} to {stop - 1} are committed, outside of those asked"
             self._verdict.tell(told, f"{self.asked[0]} to {self.asked[1] - 1} are, by job.yaml or _SUCCESS; {COPY}")
         self._awaited = stop
-
-    def spoil(self, start: int, stop: int) -> None:
-        """Marks a range whose tables cannot be read."""
-        self.unreadable.append((start, stop))
 
     def finish(self) -> None:
         """After the last range."""
