@@ -167,6 +167,7 @@ def draw_space(tab) -> None:
 @in_browser
 def test_every_picture_is_shown_a_category_alone_where_asked_and_nothing_is_fetched_or_said(opened):
     draw_space(opened)
+    opened.run("document.querySelector('[data-show=\"\"]').click()")
     opened.run(f"{PICTURES}.forEach((one) => {{ one.loading = 'eager'; }})")
     opened.until(f"{PICTURES}.every((one) => one.complete)")
     widths = opened.run(f"{PICTURES}.map((one) => one.naturalWidth)")
