@@ -18,7 +18,7 @@ from schemas.dataset.layout import MANIFEST
 from schemas.dataset.tables import SCHEMAS
 from services.look.charts import Histogram
 from services.merge.merge import read_success
-from services.read.stored_tables import category_of, read_merged
+from services.read.stored_tables import category_of
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import range_rows, read_range
 from workers.store.store import Store
@@ -55,9 +55,7 @@ class Tables:
         """
         if self.merged:
             prefix = f"{MANIFEST}/{table}/"
-            parts = (
-                part for key in self.merged if key.startswith(prefix) for part in self._merged(table, key, columns)
-            )
+            parts = (part for key in self.merged if key.startswith(prefix) for part in self._merged(key, columns))
         else:
             parts = (range_rows(self.store, records, table) for records in self._records)
         for part in parts:
@@ -68,11 +66,9 @@ class Tables:
     def _records(self) -> list[list[CommitRecord]]:
         return [read_range(self.store, start, retries) for start, retries in self.ranges]
 
-    def _merged(self, table: str, key: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        if self.store.root is None:
-            yield read_merged(table, key, self.store.read(key))
-            return
-        with pq.ParquetFile(self.store.root / key, page_checksum_verification=True) as file:
+    def _merged(self, key: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        with self.store.open(key) as stored_file:
+            file = pq.ParquetFile(stored_file, page_checksum_verification=True)
             stored = set(file.schema_arrow.names)
             wanted = [_INNER.get(name, name) for name in columns if name in stored]
             for batch in file.iter_batches(BATCH_ROWS, columns=wanted):

@@ -240,12 +240,8 @@ def check_card(store: Store, digest: str, verdict: Verdict) -> None:
 def _hash_file(store: Store, path: str, verdict: Verdict) -> dict[str, object] | str:
     """{bytes, sha256} of a stored file, or why it cannot be read; on a disk in constant memory."""
     try:
-        if store.root is None:
-            data = store.read(path)
-            size, digest = len(data), hashlib.sha256(data).hexdigest()
-        else:
-            with open(store.root / path, "rb") as file:
-                digest, size = hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
+        with store.open(path) as file:
+            digest, size = hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
     except FileNotFoundError:
         return "is merged and missing"
     except OSError as error:
@@ -257,8 +253,8 @@ def _hash_file(store: Store, path: str, verdict: Verdict) -> dict[str, object] |
 
 def _same_rows(store: Store, path: str, local: Path) -> bool:
     try:
-        source = pa.BufferReader(store.read(path)) if store.root is None else store.root / path
-        with pq.ParquetFile(source, page_checksum_verification=True) as stored, pq.ParquetFile(local) as remade:
+        with store.open(path) as file, pq.ParquetFile(local) as remade:
+            stored = pq.ParquetFile(file, page_checksum_verification=True)
             pairs = zip_longest(stored.iter_batches(_ROWS), remade.iter_batches(_ROWS))
             return all(a is not None and b is not None and a.equals(b) for a, b in pairs)
     except (pa.ArrowException, OSError, ValueError):

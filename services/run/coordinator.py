@@ -194,7 +194,7 @@ class Coordinator:
 
     def _count_under_way(self) -> int:
         """Scenes made in shards that have not reported; 0 where a look costs much: on an object store, or of many shards."""
-        if self._store.root is None or len(self._running) > MOST_LOOKED_AT:
+        if self._store.at_once > 1 or len(self._running) > MOST_LOOKED_AT:
             return 0
         scenes = scenes_in_progress(self._store, self._order.label)
         return count_under_way(self._running.values(), {attempt.start: scene for attempt, scene in scenes.items()})

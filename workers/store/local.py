@@ -111,6 +111,10 @@ class LocalStore(Store):
         with open(self._at(key), "rb") as file:
             return file.read()
 
+    def open(self, key: str) -> IO[bytes]:
+        """The file at `key`."""
+        return open(self._at(key), "rb")
+
     def stat(self, key: str) -> Entry | None:
         """Size and time of modification, without following what is no file to a later error."""
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):

@@ -5,6 +5,7 @@ other key appears whole, in one step: by `put`, `put_if_absent`, `move` or `repl
 """
 
 import contextlib
+import io
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -71,6 +72,10 @@ class Store(Protocol):
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`. Raises FileNotFoundError."""
+
+    def open(self, key: str) -> IO[bytes]:
+        """A file that gives the bytes at `key`, of a disk a part at a time. Raises FileNotFoundError."""
+        return io.BytesIO(self.read(key))
 
     def stat(self, key: str) -> Entry | None:
         """The file at `key`, None where there is none."""

@@ -78,12 +78,14 @@ def test_files_are_put_listed_moved_and_removed(place):
     assert place.names("mug") == ["a.png", "b.png", "patches"] and place.children("mug") == ["patches"]
     found = place.stat("mugs/c.png")
     assert (found.key, found.bytes, place.size("mugs/c.png")) == ("mugs/c.png", 3, 3)
+    with place.open("mugs/c.png") as file:
+        assert (file.read(2), file.read(), file.tell()) == (b"12", b"3", 3)
     both = {"mug/patches/a.png", "mugs/c.png"}
     assert set(stat_all(place, ["mug/patches", "none"], ["mugs/c.png", "mug/none"])) == both
     place.move("mug/a.png", "new/folder/a.png")
-    for missing in (lambda: place.read("mug/a.png"), lambda: place.move("mug/a.png", "new/folder/a.png")):
+    for missing in (place.read, place.open, lambda key: place.move(key, "new/folder/a.png")):
         with pytest.raises(FileNotFoundError):
-            missing()
+            missing("mug/a.png")
     assert place.read("new/folder/a.png") == b"12"
     assert place.stat("mug/a.png") is place.size("mug/a.png") is None
     for _ in range(2):  # what is gone already need not be removed
