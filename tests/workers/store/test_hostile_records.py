@@ -211,7 +211,7 @@ def outcome(data: bytes, store: LocalStore) -> str:
 
 
 @pytest.mark.parametrize(
-    "numbers", [range(20), pytest.param(range(20, 550), marks=pytest.mark.slow)], ids=["few", "many"]
+    "numbers", [range(50), pytest.param(range(50, 550), marks=pytest.mark.slow)], ids=["few", "many"]
 )
 def test_mutated_records_touch_nothing_but_their_own_range(store, tmp_path, monkeypatch, numbers):
     with monkeypatch.context() as patch:
