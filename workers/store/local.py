@@ -1,6 +1,7 @@
 """A dataset in a folder of a file system that has hard links."""
 
 import contextlib
+import io
 import os
 import re
 import shutil
@@ -111,7 +112,7 @@ class LocalStore(Store):
         with open(self._at(key), "rb") as file:
             return file.read()
 
-    def open(self, key: str) -> IO[bytes]:
+    def open(self, key: str) -> io.BufferedIOBase:
         """The file at `key`."""
         return open(self._at(key), "rb")
 

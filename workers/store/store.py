@@ -73,7 +73,7 @@ class Store(Protocol):
     def read(self, key: str) -> bytes:
         """The bytes at `key`. Raises FileNotFoundError."""
 
-    def open(self, key: str) -> IO[bytes]:
+    def open(self, key: str) -> io.BufferedIOBase:
         """A file that gives the bytes at `key`, of a disk a part at a time. Raises FileNotFoundError."""
         return io.BytesIO(self.read(key))
 
