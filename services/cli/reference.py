@@ -74,12 +74,9 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
 
 def _written(option: Option) -> str:
     """How an option is written, with the name of its value; empty for an argument, which the example shows."""
-    names, settings = option
-    choices = settings.get("choices")
-    value = settings.get("metavar") or ("|".join(map(str, choices)) if choices else "")
-    if not names[0].startswith("-"):
-        return ""
-    return f"{names[0]} {value}" if value and settings.get("action") != "store_true" else names[0]
+    (name,), settings = option
+    value = settings.get("metavar") or "|".join(settings.get("choices", ()))
+    return f"{name} {value}".rstrip() if name.startswith("-") else ""
 
 
 if __name__ == "__main__":

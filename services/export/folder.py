@@ -12,7 +12,7 @@ import shutil
 import urllib.parse
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from schemas.errors import CorruptError, InUseError, OutputError
 
@@ -44,14 +44,21 @@ class ExportFolder:
         Raises OutputError where the folder holds somebody else's files, another export, or cannot be written, InUseError
         where another process works in it.
         """
-        self._refuse_foreign()
         try:
+            names = sorted(os.listdir(self.root)) if self.root.exists() else []
+            if names and WORK not in names:
+                told = f"{self.root} holds {', '.join(names[:3])}{' and more' if len(names) > 3 else ''}"
+                raise OutputError(f"{told}: an export goes into a new or an empty folder, choose another DIR")
             self.work.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(
-                f"{self.root} cannot be written: {error.strerror or error}; choose another DIR"
-            ) from error
-        with _locked(self.work / _LOCK, self.root):
+            told = f"{self.root} cannot be written: {error.strerror or error}"
+            raise OutputError(f"{told}; choose another DIR") from error
+        with open(self.work / _LOCK, "ab") as file:  # a lock ends with the process, however it ends
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                told = f"another export writes into {self.root}: wait for it, or choose another DIR"
+                raise InUseError(told, str(self.root)) from error
             known = _read_tree(self.work / _PLAN)
             if known is None:
                 self._write_work(_PLAN, plan)
@@ -116,17 +123,6 @@ class ExportFolder:
         self.put(MANIFEST, (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode())
         shutil.rmtree(self.work)
 
-    def _refuse_foreign(self) -> None:
-        try:
-            names = sorted(os.listdir(self.root))
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise OutputError(f"{self.root} cannot be written: {error.strerror}; choose another DIR") from error
-        if names and WORK not in names:
-            told = f"{self.root} holds {', '.join(names[:3])}{' and more' if len(names) > 3 else ''}"
-            raise OutputError(f"{told}: an export goes into a new or an empty folder, choose another DIR")
-
     def _cut_parts(self, sizes: dict[str, int]) -> None:
         """Takes away what a killed export appended after its last checkpoint."""
         self._sizes = dict(sizes)
@@ -137,9 +133,8 @@ class ExportFolder:
         for part, size in kept.items():
             with contextlib.suppress(FileNotFoundError):  # installed: it was about to finish
                 if part.stat().st_size < size:
-                    raise CorruptError(
-                        f"{part} is shorter than the export left it: remove {self.root}, and start again"
-                    )
+                    told = f"{part} is shorter than the export left it"
+                    raise CorruptError(f"{told}: remove {self.root}, and start again")
                 os.truncate(part, size)
 
     def _part(self, path: str) -> Path:
@@ -149,19 +144,6 @@ class ExportFolder:
         temporary = self.work / f"{name}.new"
         temporary.write_text(json.dumps(tree))
         os.replace(temporary, self.work / name)
-
-
-@contextlib.contextmanager
-def _locked(path: Path, root: Path) -> Iterator[IO[bytes]]:
-    """Holds a lock that ends with the process, however it ends."""
-    with open(path, "ab") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InUseError(
-                f"another export writes into {root}: wait for it, or choose another DIR", str(root)
-            ) from error
-        yield file
 
 
 def _read_tree(path: Path) -> Tree | None:
@@ -204,9 +186,8 @@ class Rounds:
         for split in sorted(self._shards):
             self._shards.pop(split).close()
             number = self._next.get(split, 0)
-            self._folder.install(
-                self._folder.temporary(f"{split}.shard"), self._pattern.format(split=split, number=number)
-            )
+            path = self._pattern.format(split=split, number=number)
+            self._folder.install(self._folder.temporary(f"{split}.shard"), path)
             self._next[split] = number + 1
 
     def state(self) -> dict[str, Any] | None:

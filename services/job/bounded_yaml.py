@@ -78,24 +78,27 @@ def parse_yaml(text: str, most_values: int = MOST_VALUES) -> Any:
 
 def _check_events(text: str, most_values: int) -> None:
     """Raises JobError at the first event that goes over a bound; nothing is built, and no stack grows."""
-    place = _Place()
+    frames: list[_Frame] = []
     values = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.CollectionEndEvent):
-            place.leave()
+            frames.pop()
         if not isinstance(event, yaml.NodeEvent):
             continue
         values += 1
-        place.pass_on(event)
+        if frames:
+            frames[-1].pass_on(event)
         if isinstance(event, yaml.CollectionStartEvent):
-            place.enter(event)
+            frames.append(_Frame(isinstance(event, yaml.MappingStartEvent)))
         fault = _fault(event)
         if values > most_values:
             fault = f"the text has over {most_values} keys and values"
-        elif place.levels > MOST_LEVELS:
+        elif len(frames) > MOST_LEVELS:
             fault = f"is nested over {MOST_LEVELS} levels deep"
         if fault:
-            raise JobError(f"line {_line_of(event)}: {place.name}{fault}")
+            words = [plain_line(str(frame.key), 40) for frame in frames[:8] if frame.key is not None]
+            place = f"{'.'.join(words)}{'...' * (len(frames) > 8)}: " if words else ""
+            raise JobError(f"line {_line_of(event)}: {place}{fault}")
 
 
 def _line_of(event_or_node: Any) -> int:
@@ -124,40 +127,11 @@ class _Frame:
     key: str | int | None = None
     value_next: bool = False
 
-
-class _Place:
-    """The path of the node that an event begins, kept from event to event."""
-
-    def __init__(self) -> None:
-        self._frames: list[_Frame] = []
-
-    @property
-    def levels(self) -> int:
-        """How many lists and maps are open."""
-        return len(self._frames)
-
-    @property
-    def name(self) -> str:
-        """`physics.rest.speed_mm_s: `, empty at the top."""
-        words = [plain_line(str(frame.key), 40) for frame in self._frames[:8] if frame.key is not None]
-        return f"{'.'.join(words)}{'...' * (self.levels > 8)}: " if words else ""
-
     def pass_on(self, event: yaml.NodeEvent) -> None:
-        """Goes on to the next key, value or item of the innermost list or map."""
-        if not self._frames:
-            return
-        frame = self._frames[-1]
-        if not frame.is_map:
-            frame.key = 0 if frame.key is None else int(frame.key) + 1
-        elif frame.value_next:
-            frame.value_next = False
+        """Goes on to the next key, value or item."""
+        if not self.is_map:
+            self.key = 0 if self.key is None else int(self.key) + 1
+        elif self.value_next:
+            self.value_next = False
         else:
-            frame.key, frame.value_next = getattr(event, "value", None), True
-
-    def enter(self, event: yaml.CollectionStartEvent) -> None:
-        """Into a list or map."""
-        self._frames.append(_Frame(isinstance(event, yaml.MappingStartEvent)))
-
-    def leave(self) -> None:
-        """Out of the innermost list or map."""
-        self._frames.pop()
+            self.key, self.value_next = getattr(event, "value", None), True
