@@ -60,14 +60,8 @@ class Cluster:
     def _command(self, *words: str) -> list[str]:
         enter = [str(HOSTS), "run", "1", "env", "-i", f"PATH={BIN}:{os.environ['PATH']}", f"HOME={self.folder}"]
         enter += ["RAY_UP_enable_autoscaler_v2=0", "TERM=dumb", "sh", "-c", f'cd {ROOT} && exec "$@"', "sh"]
-        return [
-            *enter,
-            str(BIN / "ray"),
-            words[0],
-            *(["-y"] if words[0] in ("up", "down") else []),
-            str(self.file),
-            *words[1:],
-        ]
+        yes = ["-y"] if words[0] in ("up", "down") else []
+        return [*enter, str(BIN / "ray"), words[0], *yes, str(self.file), *words[1:]]
 
     def submit(self, *words: str) -> "subprocess.CompletedProcess[str]":
         """`ray submit deploy/cluster.yaml deploy/submit.py ...`."""

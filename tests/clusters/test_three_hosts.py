@@ -52,13 +52,15 @@ def digest_in(said: str) -> str:
     return (re.findall(r"dataset digest (\w{64})", said) or [said])[0]
 
 
+def here(*words: str) -> str:
+    """What a command prints on this machine alone."""
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run([*VERSO, *words], cwd="/", env=environ, capture_output=True, text=True, check=True).stdout
+
+
 def run_here(job: Path, out: Path, *words: str) -> str:
     """The digest of a run on this machine alone."""
-    run = [*VERSO, "run", str(job), "--out", str(out), *words]
-    done = subprocess.run(
-        run, cwd="/", env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=True
-    )
-    return digest_in(done.stdout)
+    return digest_in(here("run", str(job), "--out", str(out), *words))
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +70,7 @@ def local(job) -> str:
 
 @pytest.fixture(scope="module")
 def packed(job) -> str:
-    done = subprocess.run(
-        [*VERSO, "pack", str(job)],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
-    return done.stdout.strip()
+    return here("pack", str(job)).strip()
 
 
 def await_commits(out: Path, count: int, process: "subprocess.Popen[str]") -> None:
@@ -101,9 +96,8 @@ def on_the_cluster(cluster: Cluster, job: Path, out: str) -> "subprocess.Complet
     token = (cluster.folder / ".verso-token").read_text().strip()
     environ = ["env", f"PYTHONPATH={ROOT}", "RAY_AUTH_MODE=token", f"RAY_AUTH_TOKEN={token}"]
     run = [str(HOSTS), "run", "1", *environ, *VERSO, "run", str(job), "--out", str(cluster.storage / out)]
-    return subprocess.run(
-        [*run, "--address", "10.77.0.1:6379"], capture_output=True, text=True, check=False, timeout=120
-    )
+    run += ["--address", "10.77.0.1:6379"]
+    return subprocess.run(run, capture_output=True, text=True, check=False, timeout=120)
 
 
 def test_a_host_that_would_make_other_bytes_or_keep_them_is_refused_before_the_first_scene(cluster, job, tmp_path):
@@ -166,6 +160,7 @@ def test_a_worker_host_killed_and_one_cut_off_under_way_change_no_byte(cluster, 
     assert made_in_vain(out) <= 2 * 2 * 2, "at most the ranges that the two hosts had"
 
 
+@pytest.mark.slow
 def test_a_killed_head_that_is_brought_back_and_asked_again_makes_the_same_dataset(cluster, packed, local):
     assert digest_in(lose_the_head(cluster, packed, cluster.storage / "headless")) == local
 

@@ -13,6 +13,7 @@ from services.dataset.pair import View
 from tests.datasets import make_dataset
 
 
+@pytest.mark.minute
 def test_no_instance_is_in_two_splits_also_where_a_scene_has_several_objects(few, tmp_path):
     sources = {"objects": [{"source": "procedural", "instances": 3}], "split": {"train": 0.6, "val": 0.1, "test": 0.3}}
     small = {"scenes": 16, "seed": 3, "objects_per_scene": 2, "categories": ["box", "can", "bowl", "jar"]}

@@ -9,8 +9,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Part, Shape
-from services.export.bop import NO_SHAPE, BopModels, model_info, ply_lines
-from services.export.folder import ExportFolder
+from services.export.bop import NO_SHAPE, model_info, ply_lines
 from services.export.shapes import box_of, color_vertices, whole_silhouette
 from services.job.record import require_job
 from tests.bop_reader import load_model, load_shots, points_in_model
@@ -190,25 +189,6 @@ def test_pairs_without_colour_and_hidden_objects_without_a_shape_are_left_out(pi
 
 
 # ------------------------------------------------------------------------------------------------ models
-
-
-def test_numbers_of_models_go_on_from_the_last_state(tmp_path):
-    box = color_vertices(plain_shape(trimesh.creation.box((0.1, 0.2, 0.2))))
-    folder = ExportFolder(tmp_path / "new")
-
-    def asset(name):
-        return {"category": "box", "instance_id": name, "split": "train", "source": "mine", "licence": "CC0, or so"}
-
-    with folder.claimed({}):
-        first = BopModels(folder, None)
-        assert first.number("a") is None and first.add(asset("a"), box) == 1
-        state = first.state()
-        assert first.add(asset("lost"), box) == 2  # after the last state: a kill takes it back
-        first.close()
-        again = BopModels(folder, state)
-        assert (again.number("a"), again.number("lost")) == (1, None)
-        assert again.add(asset("b"), None) == 2 and again.without == 1 and again.count == 2
-        again.close()
 
 
 def plain_shape(mesh):
