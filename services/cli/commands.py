@@ -18,7 +18,7 @@ from schemas.job.job import Job
 from services.cli.environment import host_place
 from services.job.job_file import load_job, pack_job
 from services.job.record import read_job, require_dataset, require_job
-from services.read.verdict import explain_damage
+from services.read.verdict import Verdict, explain_damage
 from services.run.progress import ProgressLine
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -65,8 +65,7 @@ def run(options: argparse.Namespace) -> int:
         return 0
     result = run_job(request)
     complete, answer = tell_result(out, job, result)
-    answer_json(options, {"ok": complete, **answer})
-    return 0 if complete else 1
+    return finish(options, complete, **answer)
 
 
 def tell_result(out: str, job: Job, result: "RunResult") -> tuple[bool, dict[str, Any]]:
@@ -89,18 +88,18 @@ def tell_result(out: str, job: Job, result: "RunResult") -> tuple[bool, dict[str
     return complete, {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
 
 
-def answer_json(options: argparse.Namespace, answer: dict) -> None:
-    """Prints what `--json` asks for: one object in the last line; nothing without it."""
+def finish(options: argparse.Namespace, ok: bool, /, **answer: Any) -> int:
+    """The exit code of a command; prints what `--json` asks for: one object in the last line."""
     if options.json:
-        print(json.dumps(answer))
+        print(json.dumps({"ok": ok, **answer}))
+    return 0 if ok else 1
 
 
 def pack(options: argparse.Namespace) -> int:
     """`verso pack`."""
     packed = pack_job(options.job)
     print(packed)
-    answer_json(options, {"ok": True, "job": packed})
-    return 0
+    return finish(options, True, job=packed)
 
 
 def status(options: argparse.Namespace) -> int:
@@ -129,8 +128,7 @@ def status(options: argparse.Namespace) -> int:
         print(f"  {line}")
     print(f"  digest: {now.digest}" if now.digest else "  not merged: run the job again to finish it")
     whole = now.digest is not None and not now.missing and not now.lost
-    answer_json(options, {"ok": whole, "lives": lives, **dataclasses.asdict(now)})
-    return 0 if whole else 1
+    return finish(options, whole, lives=lives, **dataclasses.asdict(now))
 
 
 def verify(options: argparse.Namespace) -> int:
@@ -140,15 +138,9 @@ def verify(options: argparse.Namespace) -> int:
 
     store = _committed(options.out)
     verdict = _with_progress(_scenes_asked(store), "verify", partial(read_back, store))
-    for fault in verdict.faults:
-        print(fault)
-    if verdict.untold:
-        print(f"and {verdict.untold} more")
-    off = len(verdict.faults) + verdict.untold
-    print(
-        f"{options.out}: {verdict.files} files ({verdict.bytes / 1e6:.1f} MB), {verdict.scenes} scenes, labels of "
-        f"{verdict.pairs} pairs derived again: {off or 'nothing'} off"
-    )
+    off = _tell_faults(verdict)
+    read = f"{verdict.files} files ({verdict.bytes / 1e6:.1f} MB), {verdict.scenes} scenes"
+    print(f"{options.out}: {read}, labels of {verdict.pairs} pairs derived again: {off or 'nothing'} off")
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
     checks: tuple[tuple[str, Callable, Callable], ...] = (
         ("independent", verify_independently, describe_independent),
@@ -167,8 +159,14 @@ def verify(options: argparse.Namespace) -> int:
             print("\n".join(describe(found)))
             faults += found.faults
             answer[name] = dataclasses.asdict(found)
-    answer_json(options, {"ok": not faults, **answer})
-    return 1 if faults else 0
+    return finish(options, not faults, **answer)
+
+
+def _tell_faults(verdict: Verdict) -> int:
+    """Prints what is off, a line each; how many there are."""
+    for line in (*verdict.faults, *([f"and {verdict.untold} more"] if verdict.untold else [])):
+        print(line)
+    return len(verdict.faults) + verdict.untold
 
 
 def _scenes_asked(store: Store) -> int:
@@ -201,11 +199,9 @@ def columns(options: argparse.Namespace) -> int:
     """`verso columns`."""
     from services.read.columns_page import describe_columns, list_columns
 
-    if options.json:
-        answer_json(options, {"ok": True, "columns": list_columns(options.table)})
-    else:
+    if not options.json:
         print("\n".join(describe_columns(options.table)))
-    return 0
+    return finish(options, True, columns=list_columns(options.table))
 
 
 def replay(options: argparse.Namespace) -> int:
@@ -225,8 +221,7 @@ def replay(options: argparse.Namespace) -> int:
     how = "to the byte" if result.same_stack else "within tolerances, because this stack is not the one that made it"
     differ = f"{len(result.differences) or 'none'} differ"
     print(f"scene {scene_id}: {result.compared} files and tables compared {how}: {differ}")
-    answer_json(options, {"ok": not result.differences, **dataclasses.asdict(result)})
-    return 1 if result.differences else 0
+    return finish(options, not result.differences, **dataclasses.asdict(result))
 
 
 def _repair(options: argparse.Namespace) -> int:
@@ -236,14 +231,11 @@ def _repair(options: argparse.Namespace) -> int:
     store = _committed(options.out)
     with explain_damage(store):
         found = _with_progress(_scenes_asked(store), "verify", partial(repair, store, options.scene))
-    verdict = found.verdict
-    print(
-        "\n".join([*found.done, *found.left, *verdict.faults, *([f"and {verdict.untold} more"] * bool(verdict.untold))])
-    )
-    off = len(verdict.faults) + verdict.untold
+    for line in (*found.done, *found.left):
+        print(line)
+    off = _tell_faults(found.verdict)
     print(f"{options.out}: {len(found.done)} files put back or written again; {off or 'nothing'} off")
-    answer_json(options, {"ok": not off, "done": found.done, "left": found.left, "faults": verdict.faults})
-    return 1 if off else 0
+    return finish(options, not off, done=found.done, left=found.left, faults=found.verdict.faults)
 
 
 def _dataset(out: str) -> Store:
@@ -270,8 +262,7 @@ def report(options: argparse.Namespace) -> int:
     seconds = time.monotonic() - began
     print(f"{target}: {made.figures.scenes} scenes, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB")
     answer = {"file": str(target), "bytes": size, "seconds": round(seconds, 2), "scenes": made.figures.scenes}
-    answer_json(options, {"ok": True, **answer, "shown": [one.scene_id for one in made.sample.scenes]})
-    return 0
+    return finish(options, True, **answer, shown=[one.scene_id for one in made.sample.scenes])
 
 
 def serve(options: argparse.Namespace) -> int:
@@ -283,7 +274,7 @@ def serve(options: argparse.Namespace) -> int:
     follower = Follower(open_store(options.out), options.scenes)
     with ended_by_signal() as ended, serving(follower, place) as opened:
         print(f"{options.out}: {opened.address} (Ctrl-C ends it)", flush=True)
-        answer_json(options, {"ok": True, "address": opened.address, "port": opened.port, "token": opened.token})
+        finish(options, True, address=opened.address, port=opened.port, token=opened.token)
         sys.stdout.flush()
         follower.start()
         try:

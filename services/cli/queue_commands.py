@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from schemas.errors import InputError, RunError
 from schemas.queue import JobRequest
-from services.cli.commands import answer_json, tell_result
+from services.cli.commands import finish, tell_result
 from services.cli.environment import default_queue
 from services.job.job_file import load_job, name_of, read_text, refuse_folders
 from services.queue.queue import Queue, make_queue, new_id, open_queue
@@ -45,8 +45,7 @@ def submit(options: argparse.Namespace) -> int:
     print(request.id, flush=True)
     _say(f"job {request.id} ({job.name}, {job.scenes} scenes) waits in {queue.name}; its folder is {request.out}")
     _say(_describe_supervisor(queue))
-    answer_json(options, {"ok": True, "id": request.id, "name": job.name, "out": request.out, "queue": queue.name})
-    return 0
+    return finish(options, True, id=request.id, name=job.name, out=request.out, queue=queue.name)
 
 
 def jobs(options: argparse.Namespace) -> int:
@@ -58,8 +57,7 @@ def jobs(options: argparse.Namespace) -> int:
     print("\n".join(format_rows(rows)) if rows else f"{queue.name} has no jobs")
     if any(row.state in ("queued", "waiting", "running", "cancelling") for row in rows):
         _say(_describe_supervisor(queue))
-    answer_json(options, {"ok": True, "queue": queue.name, "jobs": [as_tree(row) for row in rows]})
-    return 0
+    return finish(options, True, queue=queue.name, jobs=[as_tree(row) for row in rows])
 
 
 def logs(options: argparse.Namespace) -> int:
@@ -74,16 +72,14 @@ def logs(options: argparse.Namespace) -> int:
         for part in follow_logs(queue, drivers, options.id, _say):
             print(part, end="", flush=True)
         view = queue.read(options.id)
-        answer_json(options, {"ok": True, "id": options.id, "state": view.state, "attempts": view.attempt})
-        return 0
+        return finish(options, True, id=options.id, state=view.state, attempts=view.attempt)
     texts = read_logs(queue, drivers, view, _say)
     for attempt, text in texts.items():
         print(f"{header(attempt)}{text}", end="" if text.endswith("\n") else "\n")
     if not texts:
         _say(f"job {view.request.id} is {view.state}: nothing is known of what it wrote")
     known = bool(texts) or view.attempt == 0
-    answer_json(options, {"ok": known, "id": options.id, "state": view.state, "logs": texts})
-    return 0 if known else 1
+    return finish(options, known, id=options.id, state=view.state, logs=texts)
 
 
 def cancel(options: argparse.Namespace) -> int:
@@ -98,8 +94,7 @@ def cancel(options: argparse.Namespace) -> int:
         _say(f"job {options.id} runs: its supervisor stops it; what is committed in {view.request.out} is kept")
         _say(_describe_supervisor(queue))
     print(f"{options.id}: {view.state}")
-    answer_json(options, {"ok": True, "id": options.id, "state": view.state})
-    return 0
+    return finish(options, True, id=options.id, state=view.state)
 
 
 def supervise(options: argparse.Namespace) -> int:
@@ -113,8 +108,7 @@ def supervise(options: argparse.Namespace) -> int:
         supervise(queue, _drivers(options), rules, _say)
     except KeyboardInterrupt:
         _say("supervision ends; jobs that run go on, the others wait for the next `verso supervise`")
-    answer_json(options, {"ok": True, "queue": queue.name})
-    return 0
+    return finish(options, True, queue=queue.name)
 
 
 def drive(options: argparse.Namespace) -> int:
@@ -133,8 +127,8 @@ def drive(options: argparse.Namespace) -> int:
         result = run_job(request)
         complete, answer = tell_result(asked.out, job, result)
         note = "" if complete else "scenes failed: `verso logs` says why"
-        answer_json(options, {"ok": complete, **answer})
-        return Ending(0 if complete else 1, note, sum(answer["scenes"].values()), answer["digest"])
+        code = finish(options, complete, **answer)
+        return Ending(code, note, sum(answer["scenes"].values()), answer["digest"])
 
     return drive(queue, options.id, options.attempt, work)
 
