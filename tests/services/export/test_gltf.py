@@ -8,6 +8,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from services.export.gltf import NO_SOURCES
 from services.job.record import require_job
@@ -29,17 +30,10 @@ def read_glb(path):
 
 def matrix_of(node):
     """[4, 4]; glTF stores columns."""
-    T = np.eye(4)
-    if "matrix" in node:
-        return np.reshape(node["matrix"], (4, 4)).T
-    if "rotation" in node:
-        x, y, z, w = node["rotation"]
-        T[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
     assert "translation" not in node and "scale" not in node
+    T = np.reshape(node.get("matrix", np.eye(4)), (4, 4)).T
+    if "rotation" in node:
+        T[:3, :3] = Rotation.from_quat(node["rotation"]).as_matrix()  # x, y, z, w
     return T
 
 

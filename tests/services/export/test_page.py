@@ -29,7 +29,7 @@ def folder(files, tmp_path_factory):
 
 
 def test_every_command_of_the_page_exports(folder):
-    assert len(COMMANDS) == 7
+    assert len(COMMANDS) == 7 and "`--shard-mb` (256)" in PAGE
     assert {words[words.index("--format") + 1] for words in COMMANDS} == set(FORMATS)
     for words in COMMANDS:
         assert (folder / words[2] / "export.json").exists() and not (folder / words[2] / "_export").exists()
@@ -59,7 +59,3 @@ def test_the_page_names_every_kind_of_file_that_an_export_writes(folder):
             known = re.sub(r"^(segmentIn|depthIn)", "rgbIn", name)
             known = re.sub(r"#\.(aligned|mirror|projected)\.", "#.input.", known)
             assert known in told, f"{words[2]}/{path}"
-
-
-def test_the_page_has_the_command_lines_default():
-    assert "`--shard-mb` (256)" in PAGE
