@@ -113,7 +113,7 @@ class _Export:
             report(stored.stop, self._record.job.stop_scene)
 
     def _count(self, scene_id: int, added: Added) -> None:
-        self._counts.update(scenes=bool(added.pairs), pairs=added.pairs, pairs_left_out=len(added.left_out))
+        self._counts.update(scenes=int(added.pairs > 0), pairs=added.pairs, pairs_left_out=len(added.left_out))
         text = io.StringIO()
         for pose_id, reason in added.left_out:
             self._left_out[reason] += 1

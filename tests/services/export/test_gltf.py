@@ -66,7 +66,7 @@ def exported(pile, tmp_path_factory):
 
 def test_every_object_stands_where_its_row_puts_it_with_y_up(pile, exported):
     path, manifest = exported
-    assert (manifest["scenes"], sum(manifest["files"].values())) == (1, 1)
+    assert (manifest["scenes"], sum(manifest["files"].values())) == (1, 1) and type(manifest["scenes"]) is int
     nodes = placed(read_glb(path)[0])
     (row,) = source_rows(pile.root, "scenes")
     for body in row["bodies"]:
