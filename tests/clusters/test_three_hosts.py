@@ -1,17 +1,119 @@
-"""A cluster of three hosts that `ray up` starts: the dataset is the local one, whatever host is killed or cut off."""
+"""A cluster of three hosts on this machine that `ray up` starts: the dataset is the local one, whatever host is lost."""
 
+import contextlib
 import json
 import os
 import re
+import secrets
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import yaml
 
-from tests.clusters.hosts import HOSTS, ROOT, Cluster, filled_in, hosts, three_hosts
+ROOT = Path(__file__).resolve().parents[2]
+HOSTS = ROOT.parent / "shared" / "tools" / "hosts"
+FOLDER = Path("/tmp/hosts")
+BIN = Path(sys.executable).parent
+
+
+def hosts(*words: str, check: bool = True) -> str:
+    """What the tool says."""
+    done = subprocess.run([str(HOSTS), *words], capture_output=True, text=True, check=False, timeout=120)
+    assert not check or done.returncode == 0, f"hosts {' '.join(words)}: {done.stdout}{done.stderr}"
+    return done.stdout
+
+
+@contextlib.contextmanager
+def three_hosts() -> Iterator[None]:
+    """Hosts 1 to 3 at 10.77.0.1 to .3; this machine's files are theirs too."""
+    hosts("up", "3")
+    try:
+        yield
+    finally:
+        hosts("down")
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """deploy/cluster.yaml, filled in for the hosts; host 1 is the head, and the launcher runs there too."""
+
+    folder: Path
+    file: Path
+
+    @property
+    def storage(self) -> Path:
+        """What VERSO_STORAGE names."""
+        return self.folder / "storage"
+
+    def ray(self, *words: str, timeout: float = 800) -> "subprocess.CompletedProcess[str]":
+        """A command of Ray's launcher, from the root of the checkout as the file says."""
+        return subprocess.run(self._command(*words), capture_output=True, text=True, check=False, timeout=timeout)
+
+    def start(self, *words: str) -> "subprocess.Popen[str]":
+        """The same, running."""
+        pipe = subprocess.PIPE
+        return subprocess.Popen(self._command(*words), stdout=pipe, stderr=subprocess.STDOUT, text=True)
+
+    def _command(self, *words: str) -> list[str]:
+        enter = [str(HOSTS), "run", "1", "env", "-i", f"PATH={BIN}:{os.environ['PATH']}", f"HOME={self.folder}"]
+        enter += ["RAY_UP_enable_autoscaler_v2=0", "TERM=dumb", "sh", "-c", f'cd {ROOT} && exec "$@"', "sh"]
+        yes = ["-y"] if words[0] in ("up", "down") else []
+        return [*enter, str(BIN / "ray"), words[0], *yes, str(self.file), *words[1:]]
+
+    def submit(self, *words: str) -> "subprocess.CompletedProcess[str]":
+        """`ray submit deploy/cluster.yaml deploy/submit.py ...`."""
+        return self.ray("submit", str(ROOT / "deploy" / "submit.py"), *words)
+
+    def nodes(self) -> int:
+        """How many nodes the head counts, 0 where there is no head."""
+        if hosts("run", "1", "bash", "-c", "exec 3<>/dev/tcp/10.77.0.1/6379 && echo open", check=False) != "open\n":
+            return 0
+        environ = ["env", f"PATH={BIN}:{os.environ['PATH']}", "RAY_AUTH_MODE=token"]
+        environ += [f"RAY_AUTH_TOKEN={(self.folder / '.verso-token').read_text().strip()}"]
+        ask = "import ray; ray.init('10.77.0.1:6379', log_to_driver=False); print('alive', sum(n['Alive'] for n in ray.nodes()))"
+        said = hosts("run", "1", *environ, sys.executable, "-c", ask, check=False)
+        return int((re.findall(r"alive (\d+)", said) or ["0"])[0])
+
+    def up(self, nodes: int = 3) -> float:
+        """Starts the cluster, and waits for its nodes; the seconds that it took."""
+        begun = time.monotonic()
+        done = self.ray("up")
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+        while (found := self.nodes()) < nodes:
+            assert time.monotonic() < begun + 200, f"{found} nodes of {nodes}: {done.stdout[-2000:]}"
+            time.sleep(1.0)
+        return time.monotonic() - begun
+
+
+QUICK = "export RAY_health_check_period_ms=1000 RAY_health_check_timeout_ms=1000 RAY_health_check_failure_threshold=5\n"
+"""The head counts a host that was cut off as lost after about 10 s; by default it does so after about a minute."""
+
+
+def filled_in(folder: Path, quick: bool) -> Cluster:
+    """deploy/cluster.yaml with the hosts' addresses, without what installs: the hosts see this machine's Python and code."""
+    tree = yaml.safe_load((ROOT / "deploy" / "cluster.yaml").read_text())
+    tree["provider"] |= {"head_ip": "10.77.0.1", "worker_ips": ["10.77.0.2", "10.77.0.3"]}
+    tree["auth"] = {"ssh_user": "root", "ssh_private_key": str(FOLDER / "key")}
+    (folder / "storage").mkdir()
+    (folder / ".verso-token").write_text(secrets.token_hex(32))
+    env = (ROOT / "deploy" / "cluster.env").read_text()
+    env = env.replace("/mnt/verso", str(folder / "storage")).replace("$HOME/verso/venv/bin", str(BIN))
+    (folder / "env").write_text(f"{env}export PYTHONPATH={ROOT}\n{QUICK if quick else ''}")
+    mounts = tree["file_mounts"]
+    del mounts["~/verso/dist"]
+    mounts |= {"~/verso/env": str(folder / "env"), "~/verso/token": str(folder / ".verso-token")}
+    tree["setup_commands"] = [line for line in tree["setup_commands"] if "verso/venv" not in line]
+    tree["worker_start_ray_commands"][-1] += " --num-cpus=1"
+    tree["head_start_ray_commands"][-1] += " --num-cpus=1"
+    file = folder / "cluster.yaml"
+    file.write_text(yaml.safe_dump(tree))
+    return Cluster(folder, file)
+
 
 VERSO = (sys.executable, "-P", "-m", "services.cli.main")
 SMALL = {

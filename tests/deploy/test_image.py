@@ -32,7 +32,6 @@ def test_the_image_runs_verso_not_as_root_stays_small_and_carries_neither_tests_
     listing = must(docker("run", "--rm", "--entrypoint", "ls", image, "-A", "/opt/verso")).split()
     assert {"schemas", "services", "workers"} <= set(listing)
     assert not {".git", ".venv", "tests"} & set(listing)
-
     size = float(must(docker("image", "inspect", "--format", "{{.Size}}", image)))
     record_figure("image_bytes", "passed", size, MOST_BYTES)
     assert size < MOST_BYTES

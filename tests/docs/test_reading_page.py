@@ -1,6 +1,7 @@
 """Every block of README.md and docs/reading.md runs as it is printed, and answers what plain files say."""
 
 import json
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -12,7 +13,22 @@ import pytest
 
 from services.cli.main import main
 from tests.datasets import make_dataset
-from tests.pages import DOCS, blocks_of, run_blocks
+
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def blocks_of(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a page in one language, in order."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def run_blocks(page: Path) -> dict:
+    """Runs the Python blocks of a page one after the other, in one namespace, which comes back."""
+    names: dict = {}
+    for number, block in enumerate(blocks_of(page, "python")):
+        exec(compile(block, f"{page.name}, block {number + 1}", "exec"), names)
+    return names
 
 
 @pytest.fixture(scope="module")

@@ -3,34 +3,15 @@
 import ast
 import os
 import pkgutil
-import platform
 import re
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3, settings_to_change
 
 ROOT = Path(__file__).resolve().parents[2]
 RIGHT = {**STACK_ENVIRONMENT, **FOR_SPEED}
-FLAGS_OF_THE_HEAP = """
-kept = bytearray(100_000)
-heap = False
-for line in open("/proc/self/smaps"):
-    heap = line.rstrip().endswith("[heap]") if "-" in line.split()[0] else heap
-    if heap and line.startswith("VmFlags:"):
-        print(line)
-"""
-
-
-def no_huge_pages() -> bool:
-    """Whether glibc is too old to ask for huge pages, or the kernel gives them to nobody, or to all."""
-    library, number = platform.libc_ver()
-    too_old = library != "glibc" or tuple(map(int, number.split("."))) < (2, 35)
-    setting = Path("/sys/kernel/mm/transparent_hugepage/enabled")
-    return too_old or not setting.exists() or "[madvise]" not in setting.read_text()
 
 
 def test_settings_are_changed_only_where_they_must_and_only_for_a_processor_that_has_all_that_they_use():
@@ -54,16 +35,6 @@ def python(asks: str, *options: str, **environ: str) -> str:
 def test_numba_compiles_for_the_level_and_not_for_the_processor():
     asks = "from numba.core.registry import cpu_target as c; print(c.target_context.codegen().magic_tuple()[1:])"
     assert ast.literal_eval(python(asks, **ON_X86_64_V3)) == ("x86-64-v3", "+avx2")
-
-
-@pytest.mark.skipif(no_huge_pages(), reason="no huge pages on request")
-def test_the_heap_asks_for_huge_pages():
-    def flags_of_heap(environ: dict[str, str]) -> list[str]:
-        run = [sys.executable, "-c", FLAGS_OF_THE_HEAP]
-        return subprocess.run(run, env=environ, capture_output=True, text=True, check=True).stdout.split()
-
-    assert "hg" in flags_of_heap(RIGHT)
-    assert "hg" not in flags_of_heap(dict(STACK_ENVIRONMENT))
 
 
 def test_numpy_runs_without_avx512_and_does_not_complain():

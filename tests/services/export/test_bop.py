@@ -1,4 +1,4 @@
-"""The BOP layout, read back by a reader that knows nothing but its description (tests/bop_reader.py)."""
+"""The BOP layout, read back by a reader that knows nothing but its description (tests/services/export/bop_reader.py)."""
 
 import csv
 import json
@@ -12,9 +12,9 @@ from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
 from services.export.shapes import box_of, color_vertices, whole_silhouette
 from services.job.record import require_job
-from tests.bop_reader import load_model, load_shots, points_in_model
 from tests.datasets import make_dataset
-from tests.exported import export_to, source_image, source_rows
+from tests.services.export.bop_reader import load_model, load_shots, points_in_model
+from tests.services.export.exported import export_to, source_image, source_rows
 from workers.store.local import LocalStore
 
 PLACES = {"input": 0, "aligned": 1, "mirror": 2}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from services.export.gltf import NO_SOURCES
 from services.job.record import require_job
-from tests.exported import export_to, source_poses, source_rows
+from tests.services.export.exported import export_to, source_poses, source_rows
 from workers.store.local import LocalStore
 
 

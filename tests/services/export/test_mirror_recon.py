@@ -1,4 +1,4 @@
-"""The authors' layout, read back by a reader that knows nothing but its description (tests/authors_loader.py)."""
+"""The authors' layout, read back by a reader that knows nothing but its description (tests/services/export/authors_loader.py)."""
 
 import csv
 
@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from services.export.mirror_recon import in_units
-from tests.authors_loader import load_pairs
 from tests.datasets import make_dataset
-from tests.exported import export_to, source_image, source_poses, source_rows
+from tests.services.export.authors_loader import load_pairs
+from tests.services.export.exported import export_to, source_image, source_poses, source_rows
 from workers.store.images import encode_png
 
 WORDS = {"rgb": "RGB", "depth": "depth", "segment": "segment"}

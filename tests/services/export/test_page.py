@@ -8,7 +8,7 @@ import pytest
 
 from services.cli.main import main
 from services.export.table import FORMATS
-from tests.exported import contents
+from tests.services.export.exported import contents
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "export.md").read_text()
 COMMANDS = [shlex.split(line)[1:] for line in PAGE.splitlines() if line.strip().startswith("./verso export")]

@@ -12,7 +12,7 @@ import yaml
 
 from schemas.dataset.tables import SCHEMAS
 from services.export.huggingface import card_text
-from tests.exported import export_to, source_image, source_poses, source_rows
+from tests.services.export.exported import export_to, source_image, source_poses, source_rows
 
 WORDS = {
     "input": {"rgb": "RGB", "depth": "depth", "region": "segment"},

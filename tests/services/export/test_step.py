@@ -25,7 +25,7 @@ from services.export.shapes import Shapes, color_vertices
 from services.export.source import iter_ranges, scenes_of, unchanged_sources
 from services.export.table import FORMATS
 from services.job.record import require_job
-from tests.exported import contents, export_to, source_rows
+from tests.services.export.exported import contents, export_to, source_rows
 from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
