@@ -14,7 +14,6 @@ import pytest
 from services.cli.main import main
 from tests.datasets import make_dataset
 
-
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
