@@ -188,3 +188,8 @@ class Command:
     quiet: bool = False
     one_of: tuple[Option, ...] = ()
     commands: Mapping[str, "Command"] = field(default_factory=dict)
+
+
+def command(what: str, example: str, *options: Option, **more: Any) -> Command:
+    """A command with these options; `more` are further fields of it."""
+    return Command(what, example, options, **more)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from services.cli import arguments as read
-from services.cli.arguments import Command, choice, flag, number, option, path
+from services.cli.arguments import Command, choice, command, flag, number, option, path
 from services.export.table import FORMATS
 
 KEPT: Final = "what is committed is kept, the same command goes on from there"
@@ -23,161 +23,143 @@ SET_HELP = "change a key of the job, for example physics.step_hz=480 (docs/job.m
 SET = option("--set", "KEY=VALUE", SET_HELP, action="append", default=[], dest="changes")
 
 CAPTURE_COMMANDS: Final[dict[str, Command]] = {
-    "board": Command(
+    "board": command(
         "write the marker board for printing, at true scale and with a ruler to check the print",
         "board.pdf --tiles a4",
-        (
-            path("file", "FILE.pdf", "or FILE.png, for a printer's shop"),
-            choice("--tiles", ("a4",), "several sheets to glue together instead of one large one"),
-            BOARD,
-            number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
-        ),
-        "services.capture:board",
+        path("file", "FILE.pdf", "or FILE.png, for a printer's shop"),
+        choice("--tiles", ("a4",), "several sheets to glue together instead of one large one"),
+        BOARD,
+        number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
+        handler="services.capture:board",
     ),
-    "simulate": Command(
+    "simulate": command(
         "make a virtual capture with known truth",
         "--out data/mug --views 40 --category mug --set captures.simulate.depth_noise.times=1",
-        (
-            NEW_DIR,
-            number("--views", "viewpoints (default: captures.simulate.views, 40)"),
-            option("--seed", "N", "seed of all that is random (default: 0)", read.read_index, default=0),
-            option("--category", "NAME", "what is captured (default: mug)", default="mug"),
-            SET,
-        ),
-        "services.capture:simulate",
+        NEW_DIR,
+        number("--views", "viewpoints (default: captures.simulate.views, 40)"),
+        option("--seed", "N", "seed of all that is random (default: 0)", read.read_index, default=0),
+        option("--category", "NAME", "what is captured (default: mug)", default="mug"),
+        SET,
+        handler="services.capture:simulate",
     ),
-    "import": Command(
+    "import": command(
         "make a capture from an Azure Kinect recording, without its SDK",
         "recording.mkv --out data/mug --frames 40 --board board.json --name mug-1 --category mug",
-        (
-            path("recording", "RECORDING.mkv"),
-            NEW_DIR,
-            number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
-            BOARD,
-            option("--name", "NAME", "of the object (default: the name of DIR)"),
-            option(
-                "--category", "NAME", "folder that the capture has in a dataset (default: object)", default="object"
-            ),
-        ),
-        "services.capture:import_recording",
+        path("recording", "RECORDING.mkv"),
+        NEW_DIR,
+        number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
+        BOARD,
+        option("--name", "NAME", "of the object (default: the name of DIR)"),
+        option("--category", "NAME", "folder that the capture has in a dataset (default: object)", default="object"),
+        handler="services.capture:import_recording",
     ),
-    "process": Command(
+    "process": command(
         "estimate the camera poses of a capture, and merge its views into a cloud and a mesh",
         "data/mug --estimate joint",
-        (
-            FOLDER,
-            choice(
-                "--estimate",
-                ("markers", "article", "joint"),
-                "what the cloud is made with (default: captures.estimation.estimate, joint); all three are reported",
-            ),
-            SET,
+        FOLDER,
+        choice(
+            "--estimate",
+            ("markers", "article", "joint"),
+            "what the cloud is made with (default: captures.estimation.estimate, joint); all three are reported",
         ),
-        "services.capture:process",
+        SET,
+        handler="services.capture:process",
     ),
-    "synthesize": Command(
+    "synthesize": command(
         "make RGB, depth and mask of a processed capture from other poses",
         "data/mug --pose pose.txt --out data/mug/views",
-        (FOLDER, path("--out", "DIR", "where the views go (default: DIR/views)")),
-        "services.capture:synthesize",
+        *(FOLDER, path("--out", "DIR", "where the views go (default: DIR/views)")),
+        handler="services.capture:synthesize",
         one_of=(
             path("--pose", "FILE", "T_board_cam, 4 lines of 4 numbers"),
             flag("--mirror", "the mirror view of every captured view"),
         ),
     ),
-    "evaluate": Command(
+    "evaluate": command(
         "score a processed capture against its truth or a given mesh",
         "data/mug --json",
-        (FOLDER, path("--mesh", "FILE", "the object's mesh, metres, in its own frame")),
-        "services.capture:evaluate",
+        *(FOLDER, path("--mesh", "FILE", "the object's mesh, metres, in its own frame")),
+        handler="services.capture:evaluate",
     ),
 }
 
 REPORT_COMMANDS: Final[dict[str, Command]] = {
-    "report": Command(
+    "report": command(
         "a dataset as one HTML page: pictures, point clouds, figures, effects and their cost, failures",
         "data/tabletop --out tabletop.html",
-        (
-            OUT,
-            path("--out", "FILE.html", "the page to write (default: OUT-report.html, beside the dataset)", dest="file"),
-            PICTURES,
-            option(
-                "--beside",
-                "OUT",
-                "another dataset to show at the side of this one: captures beside scenes, say",
-                read.read_place,
-            ),
+        OUT,
+        path("--out", "FILE.html", "the page to write (default: OUT-report.html, beside the dataset)", dest="file"),
+        PICTURES,
+        option(
+            "--beside",
+            "OUT",
+            "another dataset to show at the side of this one: captures beside scenes, say",
+            read.read_place,
         ),
     ),
-    "serve": Command(
+    "serve": command(
         "the same page live while a job runs: progress, rate, latest pictures, failures; read-only",
         "data/tabletop --port 8722",
-        (
-            OUT,
-            option("--port", "N", "default: 8722; 0: any that is free", read.read_port, default=8722),
-            option(
-                "--host",
-                "ADDR",
-                "listen there (default: 127.0.0.1, this machine alone); where others can reach it, a token is needed",
-                read.read_host,
-                default="127.0.0.1",
-            ),
-            option(
-                "--token",
-                "T|auto",
-                "answer only who has it: at least 16 characters, or `auto` for a random one, printed in the address",
-            ),
-            PICTURES,
+        OUT,
+        option("--port", "N", "default: 8722; 0: any that is free", read.read_port, default=8722),
+        option(
+            "--host",
+            "ADDR",
+            "listen there (default: 127.0.0.1, this machine alone); where others can reach it, a token is needed",
+            read.read_host,
+            default="127.0.0.1",
         ),
+        option(
+            "--token",
+            "T|auto",
+            "answer only who has it: at least 16 characters, or `auto` for a random one, printed in the address",
+        ),
+        PICTURES,
     ),
 }
 
 STUDY_COMMANDS: Final[dict[str, Command]] = {
-    "bench": Command(
+    "bench": command(
         "time by stage on one core, beside the script that people write today and the least that is possible",
         "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
-        (
-            path("job", "JOB.yaml", "default: a job of built-in shapes", nargs="?"),
-            number("--scenes", "how many scenes each side makes", 80),
-            path("--folder", "DIR", "on the disk to measure (default: data)", default=Path("data")),
-            number("--memory", "also watch one worker's memory over N scenes"),
-            number("--workers", "also compare N workers with one, beside N plain processes"),
-            number("--scaling-scenes", "how many scenes that comparison makes", 512),
-            SET,
-            option(
-                "--nodes",
-                "N,N,...",
-                "measure the coordinator instead, on so many simulated nodes whose scenes only take their time",
-                read.read_counts,
-            ),
-            number(
-                "--effects",
-                "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
-            ),
+        path("job", "JOB.yaml", "default: a job of built-in shapes", nargs="?"),
+        number("--scenes", "how many scenes each side makes", 80),
+        path("--folder", "DIR", "on the disk to measure (default: data)", default=Path("data")),
+        number("--memory", "also watch one worker's memory over N scenes"),
+        number("--workers", "also compare N workers with one, beside N plain processes"),
+        number("--scaling-scenes", "how many scenes that comparison makes", 512),
+        SET,
+        option(
+            "--nodes",
+            "N,N,...",
+            "measure the coordinator instead, on so many simulated nodes whose scenes only take their time",
+            read.read_counts,
         ),
-        "services.bench.command:main",
+        number(
+            "--effects",
+            "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
+        ),
+        handler="services.bench.command:main",
         starts_ray=lambda options: options.workers is not None or options.nodes is not None,
         kept="no figures are kept",
     ),
-    "tradeoff": Command(
+    "tradeoff": command(
         "what accuracy costs in time, measured on the job's own scenes",
         "deploy/jobs/tabletop.yaml --out data/tradeoff --target penetration_mm=0.1,depth_mm=0.5",
-        (
-            JOB,
-            path("--out", "DIR", "goes on there where it stopped", required=True),
-            option(
-                "--target",
-                "ERROR=MOST,...",
-                "write DIR/job.yaml: the job with the cheapest setting that keeps these errors",
-            ),
-            option("--knobs", "NAME,...", "default: all that are known"),
-            number("--scenes", "scenes with images (default: 48)", 48),
-            number("--physics-scenes", "scenes that only come to rest (default: 500)", 500),
-            number("--laps", "rounds of timing (default: 3)", 3),
-            number("--workers", "default: the cores this container may use"),
-            SET,
+        JOB,
+        path("--out", "DIR", "goes on there where it stopped", required=True),
+        option(
+            "--target",
+            "ERROR=MOST,...",
+            "write DIR/job.yaml: the job with the cheapest setting that keeps these errors",
         ),
-        "services.study.command:main",
+        option("--knobs", "NAME,...", "default: all that are known"),
+        number("--scenes", "scenes with images (default: 48)", 48),
+        number("--physics-scenes", "scenes that only come to rest (default: 500)", 500),
+        number("--laps", "rounds of timing (default: 3)", 3),
+        number("--workers", "default: the cores this container may use"),
+        SET,
+        handler="services.study.command:main",
     ),
 }
 
@@ -191,58 +173,54 @@ ADDRESS = option("--address", "HTTP", ADDRESS_HELP, read.read_http, default=DASH
 ID = option("id", "ID", kind=read.read_job_id)
 
 QUEUE_COMMANDS: Final[dict[str, Command]] = {
-    "submit": Command(
+    "submit": command(
         "put a job into the queue, and print its id",
         "deploy/jobs/tabletop.yaml --queue /shared/queue --out /shared/tabletop --priority 5",
-        (
-            JOB,
-            QUEUE,
-            OUT_DIR,
-            option("--priority", "N", "-1000 to 1000; higher ones first (default: 0)", read.read_priority, default=0),
-            MORE_SCENES,
-            SET,
-            RETRY,
-        ),
-        "services.cli.queue_commands:submit",
+        JOB,
+        QUEUE,
+        OUT_DIR,
+        option("--priority", "N", "-1000 to 1000; higher ones first (default: 0)", read.read_priority, default=0),
+        MORE_SCENES,
+        SET,
+        RETRY,
+        handler="services.cli.queue_commands:submit",
     ),
-    "jobs": Command(
+    "jobs": command(
         "the jobs of the queue, and how far they are",
         "--queue /shared/queue --json",
-        (QUEUE,),
-        "services.cli.queue_commands:jobs",
+        QUEUE,
+        handler="services.cli.queue_commands:jobs",
     ),
-    "logs": Command(
+    "logs": command(
         "what a job wrote, also after the cluster is gone",
         "j0a1b2c3d --queue /shared/queue --follow",
-        (ID, QUEUE, ADDRESS, flag("--follow", "go on until the job has ended")),
-        "services.cli.queue_commands:logs",
+        *(ID, QUEUE, ADDRESS, flag("--follow", "go on until the job has ended")),
+        handler="services.cli.queue_commands:logs",
     ),
-    "cancel": Command(
+    "cancel": command(
         "end a job of the queue; what it committed is kept",
         "j0a1b2c3d --queue /shared/queue",
-        (ID, QUEUE),
-        "services.cli.queue_commands:cancel",
+        *(ID, QUEUE),
+        handler="services.cli.queue_commands:cancel",
     ),
-    "supervise": Command(
+    "supervise": command(
         "start the queue's jobs on a Ray cluster, and start them again where they died",
         "--queue /shared/queue --at-once 2",
-        (
-            QUEUE,
-            ADDRESS,
-            number("--at-once", "jobs that run at once, and share the cluster evenly (default: 2)", 2),
-            path(
-                "--driver",
-                "PROGRAM",
-                "the program `verso` on the cluster's head (default: this one where HTTP is on this machine, else verso)",
-            ),
+        QUEUE,
+        ADDRESS,
+        number("--at-once", "jobs that run at once, and share the cluster evenly (default: 2)", 2),
+        path(
+            "--driver",
+            "PROGRAM",
+            "the program `verso` on the cluster's head (default: this one where HTTP is on this machine, else verso)",
         ),
-        "services.cli.queue_commands:supervise",
+        handler="services.cli.queue_commands:supervise",
     ),
-    "drive": Command(
+    "drive": command(
         "one attempt at a job of the queue, as `supervise` has it started on the cluster's head",
         "j0a1b2c3d 1 --queue /shared/queue",
-        (ID, option("attempt", "ATTEMPT", kind=read.read_count), QUEUE),
-        "services.cli.queue_commands:drive",
+        *(ID, option("attempt", "ATTEMPT", kind=read.read_count), QUEUE),
+        handler="services.cli.queue_commands:drive",
         starts_ray=lambda options: True,
         kept="what is committed is kept, the queue's supervisor starts the job again",
         quiet=True,
@@ -250,141 +228,129 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
 }
 
 COMMANDS: Final[dict[str, Command]] = {
-    "init": Command(
+    "init": command(
         "write a job file for a folder of your own meshes, with pictures of what was read",
         "~/my_meshes --out my_meshes.yaml",
-        (
-            path("folder", "FOLDER"),
-            path("--out", "JOB.yaml", "default: the folder's name, here; never overwritten"),
-            path("--sheet", "FILE", "the pictures, .jpg or .png (default: beside the job)"),
-            option(
-                "--category-from",
-                "folder|file|NAME",
-                "name categories after the first folder, or after the file without its number, or call all NAME "
-                "(default: folder, and file where there is none)",
-            ),
+        path("folder", "FOLDER"),
+        path("--out", "JOB.yaml", "default: the folder's name, here; never overwritten"),
+        path("--sheet", "FILE", "the pictures, .jpg or .png (default: beside the job)"),
+        option(
+            "--category-from",
+            "folder|file|NAME",
+            "name categories after the first folder, or after the file without its number, or call all NAME "
+            "(default: folder, and file where there is none)",
         ),
-        "services.init.command:main",
+        handler="services.init.command:main",
     ),
-    "run": Command(
+    "run": command(
         "make a dataset, or go on where it stopped",
         "deploy/jobs/tabletop.yaml --scenes 128 --set start.pose=tumbled",
-        (
-            JOB,
-            OUT_DIR,
-            MORE_SCENES,
-            option("--first-scene", "N", "id of the first scene", read.read_index),
-            number("--workers", "default: the cores this container may use, or the cluster's"),
-            number("--shard-size", "scenes in a Ray task, rounded up to whole ranges"),
-            option(
-                "--address",
-                "HOST:PORT",
-                "a Ray cluster that runs already (default: a private Ray here)",
-                read.read_address,
-            ),
-            SET,
-            option(
-                "--metrics",
-                "HOST:PORT",
-                "serve what the run counts to Prometheus there (default: not at all)",
-                read.read_listener,
-            ),
-            flag("--dry-run", "check everything and say what would be done"),
-            RETRY,
+        JOB,
+        OUT_DIR,
+        MORE_SCENES,
+        option("--first-scene", "N", "id of the first scene", read.read_index),
+        number("--workers", "default: the cores this container may use, or the cluster's"),
+        number("--shard-size", "scenes in a Ray task, rounded up to whole ranges"),
+        option(
+            "--address",
+            "HOST:PORT",
+            "a Ray cluster that runs already (default: a private Ray here)",
+            read.read_address,
         ),
+        SET,
+        option(
+            "--metrics",
+            "HOST:PORT",
+            "serve what the run counts to Prometheus there (default: not at all)",
+            read.read_listener,
+        ),
+        flag("--dry-run", "check everything and say what would be done"),
+        RETRY,
         starts_ray=lambda options: not options.dry_run,
         kept=KEPT,
         quiet=True,
     ),
-    "pack": Command(
+    "pack": command(
         "print a job file as one word that no shell changes, to give it to a cluster in place of the file",
         "deploy/jobs/tabletop.yaml",
-        (path("job", "JOB.yaml"),),
+        path("job", "JOB.yaml"),
     ),
-    "status": Command("scenes done, failed and missing; rate; what is running", "data/tabletop", (OUT,)),
-    "verify": Command(
+    "status": command("scenes done, failed and missing; rate; what is running", "data/tabletop", OUT),
+    "verify": command(
         "read every file back and derive the labels again",
         "data/tabletop --independent 16",
-        (
-            OUT,
-            number(
-                "--audit",
-                "also make N scenes again with the effects that were left out, to prove that they did not matter",
-            ),
-            number(
-                "--independent",
-                "also derive the labels of N scenes from the article's definitions, by code that shares nothing with what "
-                "made them",
-            ),
+        OUT,
+        number(
+            "--audit",
+            "also make N scenes again with the effects that were left out, to prove that they did not matter",
+        ),
+        number(
+            "--independent",
+            "also derive the labels of N scenes from the article's definitions, by code that shares nothing with what "
+            "made them",
         ),
     ),
-    "query": Command(
+    "query": command(
         "SQL over the manifests, also while the job runs",
         'data/tabletop "select category, count(*) from scenes group by category"',
-        (OUT, option("sql", "SQL"), choice("--format", ("table", "csv", "parquet", "json"), default="table")),
+        *(OUT, option("sql", "SQL"), choice("--format", ("table", "csv", "parquet", "json"), default="table")),
     ),
-    "columns": Command(
+    "columns": command(
         "every column of the tables, with type, unit, frame and meaning",
         "views",
-        (option("table", "TABLE", "scenes, views, objects, ... (default: all)", nargs="?"),),
+        option("table", "TABLE", "scenes, views, objects, ... (default: all)", nargs="?"),
     ),
-    "replay": Command(
+    "replay": command(
         "make one scene again and compare it with what is stored, or put back what was lost",
         "data/tabletop 17",
-        (
-            OUT,
-            option("scene", "SCENE", kind=read.read_index, nargs="*"),
-            flag(
-                "--repair",
-                "put back what is missing or damaged (with SCENEs: in their ranges) where it comes out as it was",
-            ),
+        OUT,
+        option("scene", "SCENE", kind=read.read_index, nargs="*"),
+        flag(
+            "--repair",
+            "put back what is missing or damaged (with SCENEs: in their ranges) where it comes out as it was",
         ),
     ),
     **REPORT_COMMANDS,
-    "export": Command(
+    "export": command(
         "write the dataset in a layout that other people's loaders read",
         "data/tabletop data/recon --format mirror-recon --category mug",
-        (
-            OUT,
-            option("dir", "DIR", "a new or an empty folder, or one to go on in", read.read_place),
-            choice("--format", tuple(FORMATS), "docs/export.md describes each", required=True),
-            option("--category", "NAME", "only scenes of it; may be repeated", action="append", default=[]),
-            option("--scenes", "FIRST-LAST", "only scenes with these ids; one id is one scene", read.read_span),
-            option("--where", "SQL", "only scenes for which this holds, such as 'support_margin_mm > 5'"),
-            number("--shard-mb", "size of a file of webdataset and huggingface, 10^6 bytes (default: 256)", 256),
-        ),
-        "services.export.export:main",
+        OUT,
+        option("dir", "DIR", "a new or an empty folder, or one to go on in", read.read_place),
+        choice("--format", tuple(FORMATS), "docs/export.md describes each", required=True),
+        option("--category", "NAME", "only scenes of it; may be repeated", action="append", default=[]),
+        option("--scenes", "FIRST-LAST", "only scenes with these ids; one id is one scene", read.read_span),
+        option("--where", "SQL", "only scenes for which this holds, such as 'support_margin_mm > 5'"),
+        number("--shard-mb", "size of a file of webdataset and huggingface, 10^6 bytes (default: 256)", 256),
+        handler="services.export.export:main",
     ),
-    "capture": Command(
+    "capture": command(
         "real photographs of an object on a marker board: print a board, simulate, import, process, make views, score",
         "process data/mug",
         commands=CAPTURE_COMMANDS,
     ),
     **QUEUE_COMMANDS,
-    "test": Command(
+    "test": command(
         "style, types, layer rules and tests of a checkout; says what was skipped, and why",
         "tests/hard_cases --figures f.json",
-        (
-            option("paths", "PATH", "only the tests in this file, folder or FILE::TEST", nargs="*"),
-            flag("--ci", "also what takes a minute, and what needs root or Docker"),
-            flag("--all", "also that, and what takes minutes"),
-            path("--figures", "FILE", "write what the tests measured there, as JSON"),
-            option("-k", "EXPR", "only tests whose name matches, as in pytest"),
-        ),
+        option("paths", "PATH", "only the tests in this file, folder or FILE::TEST", nargs="*"),
+        flag("--ci", "also what takes a minute, and what needs root or Docker"),
+        flag("--all", "also that, and what takes minutes"),
+        path("--figures", "FILE", "write what the tests measured there, as JSON"),
+        option("-k", "EXPR", "only tests whose name matches, as in pytest"),
     ),
     **STUDY_COMMANDS,
-    "doctor": Command("what this machine has, and what is missing", "", (), "services.cli.doctor:main"),
-    "completion": Command(
+    "doctor": command("what this machine has, and what is missing", "", handler="services.cli.doctor:main"),
+    "completion": command(
         'print what completes commands and options in a shell: eval "$(verso completion bash)"',
         "bash",
-        (choice("shell", ("bash", "zsh", "tcsh")),),
-        "services.cli.reference:main",
+        choice("shell", ("bash", "zsh", "tcsh")),
+        handler="services.cli.reference:main",
     ),
-    "extra": Command(
+    "extra": command(
         "install what only some commands need: Mitsuba, MuJoCo as a referee, or the plots of studies",
         "pathtraced",
-        (choice("name", ("pathtraced", "audit", "study")),),
+        choice("name", ("pathtraced", "audit", "study")),
     ),
-    "lock": Command("make the lock files of a checkout anew, with the newest versions that pyproject.toml allows", ""),
+    "lock": command("make the lock files of a checkout anew, with the newest versions that pyproject.toml allows", ""),
 }
 """In the order of `verso --help`."""
