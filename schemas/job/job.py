@@ -76,14 +76,6 @@ PATH_S = 1.0
 """Processor time of each path through every pixel of a pair's three images: 16 paths take 5.6 s an image."""
 
 
-def choose_range_size(scenes: int, most_objects: int, pairs: int, start: Start, render: Render) -> int:
-    """Scenes in a range. It changes no byte of the dataset, and a rough estimate of a scene's time will do."""
-    further = PILED_S if start.arrange == "pile" else FALLING_S
-    traced = PATH_S * render.path_samples * pairs if render.tier == "pathtraced" else 0.0
-    scene_s = SCENE_S * pairs + further * (most_objects - 1) + traced
-    return max(1, min(MOST, int(RANGE_S / scene_s), math.ceil(scenes / FEWEST_RANGES)))
-
-
 PresetName = Literal["fast", "balanced", "exact"]
 
 PRESETS: dict[PresetName, dict[str, Any]] = {
@@ -223,9 +215,14 @@ class Job(Frozen):
 
     @property
     def range_size(self) -> int:
-        """Scenes in a range: `run.range_size`, or what follows from the job."""
-        most, pairs = self.objects_per_scene.high, self.pairs_per_scene
-        return self.run.range_size or choose_range_size(self.scenes, most, pairs, self.start, self.render)
+        """Scenes in a range: `run.range_size`, or what a rough estimate of a scene's time gives. It changes no byte."""
+        if self.run.range_size is not None:
+            return self.run.range_size
+        further = PILED_S if self.start.arrange == "pile" else FALLING_S
+        traced = PATH_S * self.render.path_samples if self.render.tier == "pathtraced" else 0.0
+        pairs, most_objects = self.pairs_per_scene, self.objects_per_scene.high
+        scene_s = SCENE_S * pairs + further * (most_objects - 1) + traced * pairs
+        return max(1, min(MOST, int(RANGE_S / scene_s), math.ceil(self.scenes / FEWEST_RANGES)))
 
     @property
     def stop_scene(self) -> int:
