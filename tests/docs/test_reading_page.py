@@ -55,7 +55,7 @@ def test_the_readme_reads_every_mug_and_can_be_read_in_a_few_minutes(here, monke
 def test_the_python_of_the_page_answers(here, monkeypatch, capsys):
     monkeypatch.chdir(here)
     page = DOCS / "reading.md"
-    assert len(blocks_of(page, "python")) >= 10
+    assert len(blocks_of(page, "python")) > 5
     names = run_blocks(page)
     assert names["pair"].scene_id == 17 and names["pair"].scene["pose"] == "tumbled"
     printed = capsys.readouterr().out.splitlines()

@@ -194,7 +194,9 @@ def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
     assert "2 scenes, labels of 2 pairs derived again: nothing off" in lines[0]
     assert lines[1].startswith("labels of 1 pairs of 1 scenes derived from the article's definitions, and ")
     assert "their rest from contact forces: nothing off" in lines[1]
-    assert told(capsys, "query", made.name, "select scene_id from scenes", "--format", "csv")[1].split()[1:] == [
+    assert told(capsys, "query", made.name, "select scene_id from scenes order by 1", "--format", "csv")[1].split()[
+        1:
+    ] == [
         "0",
         "1",
     ]
