@@ -181,7 +181,7 @@ def test_status_tells_a_run_that_was_killed_from_one_that_runs(tmp_path, capsys)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> LocalStore:
-    return make_dataset(tmp_path_factory.mktemp("made") / "small")[0]
+    return make_dataset(tmp_path_factory.mktemp("made") / "small", categories=["box"])[0]
 
 
 def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
