@@ -26,57 +26,67 @@ from schemas.dataset.tables import (
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
 
-_Check = Callable[[str, Any], None]
+_Check = Callable[[Any], None]
 
 
-def _check_of(field: pa.Field) -> _Check:
-    """What a value of this field must pass: ValueError where one is absent that must not be, or a number is not finite.
+def _check_of(where: str, field: pa.Field) -> _Check | None:
+    """What raises ValueError for an absent value that must be there, or a number that is not finite; None: any value does.
 
     Rows are checked as Python values: a scene has few of them, and each call into Arrow costs more than a value.
     """
-    kind, inside = field.type, _pass
+    kind, inside = field.type, None
     if pa.types.is_floating(kind):
-        inside = _check_finite
+        inside = partial(_check_numbers, where, False)
     elif pa.types.is_struct(kind):
-        children = [(child.name, _check_of(child)) for child in kind]
-        if any(check is not _pass for _, check in children):
-            inside = partial(_check_struct, children)
-    elif (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)) and _check_of(kind.value_field) is not _pass:
-        inside = partial(_check_list, _check_of(kind.value_field))
-    return inside if field.nullable and inside is _pass else partial(_check_present, inside, field.nullable)
+        children = [(child.name, check) for child in kind if (check := _check_of(f"{where}.{child.name}", child))]
+        inside = partial(_check_struct, children) if children else None
+    elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        item = kind.value_field
+        if pa.types.is_floating(item.type):
+            inside = partial(_check_numbers, where, item.nullable)
+        elif check := _check_of(where, item):
+            inside = partial(_check_list, check)
+    if field.nullable:
+        return inside and partial(_check_value, None, inside)
+    return partial(_check_value, where, inside)
 
 
-def _pass(where: str, value: Any) -> None:
-    """Any value does."""
-
-
-def _check_present(inside: _Check, nullable: bool, where: str, value: Any) -> None:
+def _check_value(required: str | None, inside: _Check | None, value: Any) -> None:
     if value is not None:
-        inside(where, value)
-    elif not nullable:
-        raise ValueError(f"{where} is missing")
+        if inside is not None:
+            inside(value)
+    elif required is not None:
+        raise ValueError(f"{required} is missing")
 
 
-def _check_finite(where: str, value: Any) -> None:
-    if not math.isfinite(value):
-        raise ValueError(f"{where} is not finite: {value}")
+def _check_numbers(where: str, may_be_absent: bool, value: Any) -> None:
+    numbers = [value] if isinstance(value, float) else np.ravel(value).tolist()
+    for number in numbers:
+        if number is None:
+            if not may_be_absent:
+                raise ValueError(f"{where} is missing")
+        elif not math.isfinite(number):
+            raise ValueError(f"{where} is not finite: {number}")
 
 
-def _check_struct(children: Sequence[tuple[str, _Check]], where: str, value: Any) -> None:
+def _check_struct(children: Sequence[tuple[str, _Check]], value: Any) -> None:
     for name, check in children:
-        check(f"{where}.{name}", value.get(name))
+        check(value.get(name))
 
 
-def _check_list(check: _Check, where: str, value: Any) -> None:
+def _check_list(check: _Check, value: Any) -> None:
     for one in value:
-        check(where, one)
+        check(one)
 
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
 _ROWS = {table: pa.struct(list(schema)) for table, schema in SCHEMAS.items()}
 """The type of a row, by table: all columns of a table are made in one call."""
-_CHECKS = {table: [(field.name, _check_of(field)) for field in schema] for table, schema in SCHEMAS.items()}
+_CHECKS = {
+    table: [(field.name, check) for field in schema if (check := _check_of(f"{table}.{field.name}", field))]
+    for table, schema in SCHEMAS.items()
+}
 _EMPTY = {table: schema.empty_table() for table, schema in SCHEMAS.items()}
 _RANGE_OPTIONS: dict[str, Any] = {
     "compression": "lz4",
@@ -110,7 +120,7 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
         arrays = [_column(table, field, rows) for field in schema]  # says which column it is
     for row in rows:
         for name, check in _CHECKS[table]:
-            check(f"{table}.{name}", row[name])
+            check(row[name])
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
