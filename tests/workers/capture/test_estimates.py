@@ -130,7 +130,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+QUICK = ("noise", "bias", "print, by depth")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.minute) for name in CASES]
+)
 def test_joint_is_as_accurate_as_it_should_be_and_finds_the_error_of_depth(name, record_figure):
     virtual, spec = CASES[name]
     truth, evidence = make(virtual, **spec)
@@ -154,6 +159,7 @@ def test_joint_is_as_accurate_as_it_should_be_and_finds_the_error_of_depth(name,
     assert {"offset_m", "shift_x_m"} <= set(depth.identified)
 
 
+@pytest.mark.minute
 def test_the_shapes_of_the_surfaces_help_views_with_few_markers():
     few = (1, 4, 7, 10)
     truth, evidence = make(Virtual(views=16, seed=6, few=few, few_ids=(0, 1)))

@@ -321,6 +321,7 @@ def test_the_cloud_lies_on_the_object(record_figure):
     assert red > green > blue and abs(red - 180) < 30
 
 
+@pytest.mark.minute
 def test_the_same_views_give_the_same_bytes():
     views, one = fused()
     two = fuse(views)
