@@ -11,6 +11,7 @@ upper left corner of the image; Rt takes points of the rig to points of the came
 """
 
 import json
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -229,7 +230,8 @@ def _describe(
     path: Path, container: InputContainer, color: VideoStream, depth: VideoStream, extent: Extent
 ) -> Recording:
     tags = {**container.metadata, **color.metadata, **depth.metadata}
-    color_format, depth_format = (_fourcc(stream) for stream in (color, depth))
+    codecs = (stream.codec_context for stream in (color, depth))
+    color_format, depth_format = (codec.codec_tag.strip("\0 ") or codec.name for codec in codecs)
     if color_format not in FORMATS:
         raise CaptureError(
             "format", f"{path}: colour frames are {color_format}, not one of {', '.join(FORMATS)}: {AS_RECORDED}"
@@ -243,6 +245,9 @@ def _describe(
     rate = color.average_rate or depth.average_rate
     if not rate:
         raise CaptureError("format", f"{path} does not say how many frames it has a second: {AS_RECORDED}")
+    delay = tags.get("K4A_DEPTH_DELAY_NS", "0")
+    if not re.fullmatch(r"\s*[+-]?[0-9]+\s*", delay):
+        raise CaptureError("format", f"{path}: the tag K4A_DEPTH_DELAY_NS is {delay!r}, no number: {AS_RECORDED}")
     return Recording(
         path,
         color_format,
@@ -251,16 +256,12 @@ def _describe(
         tags["K4A_DEPTH_MODE"],
         _calibration(path, container),
         1e6 / float(rate),
-        _whole_number(path, tags, "K4A_DEPTH_DELAY_NS") / 1000.0,
+        int(delay) / 1000.0,
         tags.get("K4A_DEVICE_SERIAL_NUMBER", ""),
         extent,
         color.index,
         depth.index,
     )
-
-
-def _fourcc(stream: VideoStream) -> str:
-    return stream.codec_context.codec_tag.strip("\0 ") or stream.codec_context.name
 
 
 def _calibration(path: Path, container: InputContainer) -> bytes:
@@ -276,13 +277,6 @@ def _calibration(path: Path, container: InputContainer) -> bytes:
         f"{path} has no attachment calibration.json, without which depth cannot be brought into the colour camera "
         f"(tools that cut or convert files drop it): {AS_RECORDED}, {PLACES}",
     )
-
-
-def _whole_number(path: Path, tags: dict[str, str], name: str) -> int:
-    try:
-        return int(tags.get(name, "0"))
-    except ValueError:
-        raise CaptureError("format", f"{path}: the tag {name} is {tags[name]!r}, no number: {AS_RECORDED}") from None
 
 
 DEPTH_UNITS_PER_M = 1000.0

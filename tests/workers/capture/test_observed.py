@@ -30,7 +30,6 @@ from workers.capture.board import marker_corners
 from workers.capture.poses.markers import (
     FAR,
     Judged,
-    corrected_points,
     cross_matrix,
     exponential,
     fit_markers,
@@ -293,6 +292,11 @@ def test_a_view_is_used_flagged_or_refused_with_the_number_measured():
     evidence, none = evidence_of([view]), DepthCorrection()
     good = judge(dataclasses.replace(view, board_patches=patches_on_board(0.004)), Judged(T0), evidence, none)
     assert good.status == "used" and good.depth_mm == pytest.approx(4.0) and good.reprojection_px < 0.3
+    lifted = DepthCorrection(0.01, 1.02, translation(0.1, 0, 0))  # scale, then offset, then the depth camera's place
+    board = patches_on_board()
+    expected = transform(T0, board.ray_z * 1.02 + 0.01 * board.ray + np.array([0.1, 0, 0]))[:, 2]
+    told = judge(dataclasses.replace(view, board_patches=board), Judged(T0), evidence, lifted).depth_mm
+    assert told == pytest.approx(1000 * np.median(np.abs(expected)))
     off = judge(view, Judged(moved(T0, np.array([0, 0, 0, 0, 0.01, 0]))), evidence, none)
     assert off.status == "flagged" and "above max_reprojection_px 3" in off.reasons[0]
     assert f"{off.reprojection_px:.2f} px" in off.reasons[0]
@@ -304,10 +308,3 @@ def test_a_view_is_used_flagged_or_refused_with_the_number_measured():
     for nothing in (None, np.full((4, 4), np.nan)):
         refused = judge(view, Judged(nothing), evidence, none)
         assert refused.status == "refused" and refused.T_board_cam is None and refused.reasons
-
-
-def test_the_correction_is_scale_then_offset_then_the_place_of_the_depth_camera():
-    patches = patches_on_board()
-    depth = DepthCorrection(0.01, 1.02, translation(0.1, 0, 0))
-    expected = patches.ray_z * 1.02 + 0.01 * patches.ray + np.array([0.1, 0, 0])
-    assert corrected_points(patches, depth) == pytest.approx(expected)

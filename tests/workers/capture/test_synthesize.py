@@ -34,11 +34,11 @@ from workers.capture.surface.posed_view import (
 )
 from workers.capture.surface.synthesize import (
     Layer,
+    choose_sources,
     fill_holes,
     merge_layers,
     move_depth,
     prepare_source,
-    rank_views,
     synthesize_view,
     warp,
 )
@@ -210,7 +210,7 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
     assert refusal.value.reason == "nothing_seen"
     down = Camera(K, frozen_array(look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))))  # ranked by the cosine of the axes
     axes = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, -0.8], [0.0, 0.0, -1.0], [-0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
-    assert list(rank_views(axes, down)) == [2, 1, 3, 4, 0]
+    assert choose_sources(dict(enumerate(axes)), down, Synthesis()) == [2, 1, 3, 4, 0]
 
 
 def test_the_nearest_surface_is_averaged_and_what_one_from_behind_hides_is_empty():

@@ -396,7 +396,10 @@ def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidenc
             (evidence.observations[start.index].given_by,) if start.fixed else (),
         )
         view = judge(evidence.observations[start.index], pose, evidence, correction, shared.print_scale)
-        views[start.index] = _flag_depth(view)
+        if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:
+            reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
+            view = dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
+        views[start.index] = view
     for index in set(range(len(evidence.observations))) - set(views):
         views[index] = _outside(index, evidence, shared)
     notes = [scale_note(joint, evidence.board, evidence.spec), *noise_notes(joint, problem)]
@@ -409,13 +412,6 @@ def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidenc
         solution.converged,
         tuple(note for note in notes if note),
     )
-
-
-def _flag_depth(view: ViewEstimate) -> ViewEstimate:
-    if view.depth_mm is None or view.depth_mm <= OFF_BOARD_MM or math.isnan(view.depth_mm):
-        return view
-    reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
-    return dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
 
 
 def _mark_moved(estimate: CaptureEstimate, starts: list[Start], last: int, apart_m: float) -> CaptureEstimate:

@@ -180,14 +180,16 @@ def fit_markers(observation: Observation, camera: CaptureCamera, spec: Estimatio
         )
     focal = focal_lengths(camera)
     fits = [fit_pose(start, corners.board, corners.rays, focal, FLOOR_PX) for start in planar_poses(corners)]
-    fits = sorted((fit for fit in fits if _from_above(fit.T_board_cam)), key=lambda fit: fit.cost)
+    above = [fit for fit in fits if np.isfinite(fit.T_board_cam).all() and fit.T_board_cam[2, 3] > 0]
+    fits = sorted(above, key=lambda fit: fit.cost)
     if not fits:
         return MarkerPose(
             number,
             None,
             reason="the markers are seen from below the board: it is mirrored, or not the board of board.json",
         )
-    rival = next((fit for fit in fits[1:] if _tilt_between(fits[0], fit) > SAME_RAD), None)
+    R = fits[0].T_board_cam[:3, :3]
+    rival = next((fit for fit in fits[1:] if angle_between(R, fit.T_board_cam[:3, :3]) > SAME_RAD), None)
     return MarkerPose(number, fits[0], rival)
 
 
@@ -229,14 +231,6 @@ def is_ambiguous(found: MarkerPose, corner_px: float) -> bool:
     if found.fit is None or found.rival is None:
         return False
     return found.rival.cost - found.fit.cost < AMBIGUOUS * corner_px**2
-
-
-def _from_above(T_board_cam: Pose) -> bool:
-    return bool(np.isfinite(T_board_cam).all() and T_board_cam[2, 3] > 0)
-
-
-def _tilt_between(a: Fit, b: Fit) -> float:
-    return angle_between(a.T_board_cam[:3, :3], b.T_board_cam[:3, :3])
 
 
 def observe_view(
@@ -334,13 +328,8 @@ def median_board_distance(patches: Patches, T: Pose, depth: DepthCorrection) -> 
     """Median distance, millimetres, of the board as depth measures it from the board's plane; None without depth there."""
     if not len(patches):
         return None
-    points = transform(T, corrected_points(patches, depth))
+    points = transform(T, transform(depth.T_cam_depth, depth.scale * patches.ray_z + depth.offset_m * patches.ray))
     return 1000 * float(np.median(np.abs(points[:, 2])))
-
-
-def corrected_points(patches: Patches, depth: DepthCorrection) -> Array:
-    """[P, 3] metres, camera axes: the patches' middles after the correction of depth."""
-    return transform(depth.T_cam_depth, depth.scale * patches.ray_z + depth.offset_m * patches.ray)
 
 
 def _widened(covariance: Array | None, reprojection_px: float | None, corners: int, corner_px: float) -> Array | None:

@@ -224,7 +224,9 @@ def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patch
     blocks = _blocks_over_board(T_board_cam, board, camera, side)
     if not len(blocks):
         return sample_patches(depth, np.zeros((0, 1, 2), np.int64), camera)
-    normal, distance = _plane_by_depth(on_board, T_board_cam)
+    # The board's plane n p = d in camera axes: the pose tells the normal, depth the distance.
+    normal = T_board_cam[2, :3]
+    distance = float(np.median(on_board.ray_z @ normal)) if len(on_board) else float(-T_board_cam[2, 3])
     middle = blocks + side // 2
     z = depth[middle[:, 1], middle[:, 0]] / camera.depth_units_per_m
     centres: Array = middle.astype(np.float64) + 0.5
@@ -235,7 +237,7 @@ def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patch
     reach = np.arange(0, side, side // ACROSS)
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     found = sample_patches(depth, blocks[:, None] + offsets, camera)
-    keep = np.flatnonzero(_is_surface(found, normal, distance, setup.spec) & _over_board(found, T_board_cam, board))
+    keep = np.flatnonzero(_on_object(found, found.ray_z @ normal - distance, T_board_cam, setup))
     keep = keep[spread_evenly(len(keep), MOST)]
     return Patches(found.ray_z[keep], found.ray[keep], found.normal[keep], found.pixels[keep], found.sigma_m[keep])
 
@@ -257,23 +259,13 @@ def _blocks_over_board(T_board_cam: Pose, board: Board, camera: CaptureCamera, s
     return np.stack([columns.ravel(), rows.ravel()], axis=1) * side
 
 
-def _plane_by_depth(on_board: Patches, T_board_cam: Pose) -> tuple[Array, float]:
-    """(normal [3] up, distance): the board's plane n p = d in camera axes; the pose tells the normal, depth the distance."""
-    normal = T_board_cam[2, :3]
-    if len(on_board):
-        return normal, float(np.median(on_board.ray_z @ normal))
-    return normal, float(-T_board_cam[2, 3])
-
-
-def _is_surface(found: Patches, normal: Array, distance: float, spec: Estimation) -> NDArray[np.bool_]:
-    height = found.ray_z @ normal - distance
-    z = found.ray_z[:, 2]
+def _on_object(found: Patches, height: Array, T_board_cam: Pose, setup: Setup) -> NDArray[np.bool_]:
+    """[P]: patches of a smooth surface, not seen at a grazing angle, within the space over the board; height [P] over it."""
     cosine = -(found.normal * found.ray).sum(axis=1) / np.linalg.norm(found.ray, axis=1)
-    smooth = found.sigma_m <= NOISY * spec.depth_sigma_m * np.maximum(z, 0.5) ** 2
-    return (height > CLEARANCE_M) & (height < TALLEST_M) & (cosine > MIN_COSINE) & smooth
-
-
-def _over_board(found: Patches, T_board_cam: Pose, board: Board) -> NDArray[np.bool_]:
-    half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
-    inside: NDArray[np.bool_] = np.abs(transform(T_board_cam, found.ray_z)[:, :2]) < half
-    return inside[:, 0] & inside[:, 1]
+    smooth = found.sigma_m <= NOISY * setup.spec.depth_sigma_m * np.maximum(found.ray_z[:, 2], 0.5) ** 2
+    half = 0.5 * setup.board.scale * np.array([setup.board.width_m, setup.board.height_m])
+    inside = (np.abs(transform(T_board_cam, found.ray_z)[:, :2]) < half).all(axis=1)
+    on_object: NDArray[np.bool_] = (
+        (height > CLEARANCE_M) & (height < TALLEST_M) & (cosine > MIN_COSINE) & smooth & inside
+    )
+    return on_object

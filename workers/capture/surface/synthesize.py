@@ -287,16 +287,14 @@ SHARPNESS = 8
 """Power of the cosine between two optical axes that weighs a view: one 30 degrees off counts a third."""
 
 
-def rank_views(axes: Array, camera: Camera) -> NDArray[np.int64]:
-    """[V] indices, best first: by the cosine between each view's z-axis [V, 3] and the camera's; the first among equals."""
-    return np.argsort(-(axes @ camera.T_world_cam[:3, 2]), kind="stable")
-
-
 def choose_sources(axes: Mapping[int, Array], camera: Camera, spec: Synthesis) -> list[int]:
-    """Numbers of the views that a picture is made of, best first, of the z-axes [3] of all views by number."""
+    """Numbers of the views that a picture is made of, best first, of the z-axes [3] of all views by number.
+
+    The best is the one with the largest cosine between its axis and the camera's; the first among equals.
+    """
     numbers = sorted(axes)
-    order = rank_views(np.array([axes[number] for number in numbers]).reshape(-1, 3), camera)
-    return [numbers[n] for n in order[: spec.views]]
+    cosines = np.array([axes[number] for number in numbers]).reshape(-1, 3) @ camera.T_world_cam[:3, 2]
+    return [numbers[n] for n in np.argsort(-cosines, kind="stable")[: spec.views]]
 
 
 def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) -> SynthesizedView:
@@ -314,7 +312,7 @@ def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) 
     if not any(layer.weight.any() for layer in layers):
         raise CaptureError(
             "nothing_seen",
-            f"none of the {len(numbers)} nearest views ({_words(numbers)}) shows anything to this camera",
+            f"none of the {len(numbers)} nearest views ({', '.join(map(str, numbers))}) shows anything to this camera",
         )
     rgb, depth_m, mask = merge_layers(layers, camera)
     filled = fill_holes(rgb, depth_m, mask, spec.fill_px)
@@ -327,10 +325,6 @@ def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) 
         measured_share=float(measured.sum() / max(int((filled[1] > 0.0).sum()), 1)),
         sources=tuple(numbers),
     )
-
-
-def _words(numbers: Sequence[int]) -> str:
-    return ", ".join(str(number) for number in numbers)
 
 
 def merge_layers(layers: Sequence[Layer], camera: Camera) -> tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]:
