@@ -4,16 +4,27 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from functools import cache
 
+import numpy as np
+
+from schemas.base import Pose, frozen_array
 from schemas.job.job import Job
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, Table
+from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box, table
+from workers.geometry.hull import convex_hull
 from workers.physics.effects import called_for, called_for_with
 from workers.physics.fall import FINEST
 from workers.physics.settle import RECHECK_S, moved_by, release_again, settle_scene
 from workers.scene.plan import SceneChance, draw_scene
 
 PHYSICS = Job(name="t").physics
+
+
+def start_at(asset: Asset, T_world_obj: Pose | None = None, region_id: int = 3, placed: bool = False) -> ObjectStart:
+    """The object released there; its own frame is the world's where no pose is given."""
+    T = frozen_array(np.eye(4) if T_world_obj is None else T_world_obj)
+    return ObjectStart(asset, convex_hull(asset.shape.vertices), region_id, T, 0, placed)
 
 
 @cache

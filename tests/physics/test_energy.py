@@ -85,12 +85,7 @@ def test_the_energy_of_all_that_falls_together_never_rises_above_its_running_min
     assert rise.over_bound <= 1.0
 
 
-SPINS = [
-    (0.0, 0.0, 50.0),
-    (30.0, 40.0, 0.0),
-    (0.0, 0.0, 200.0),
-    (0.0, 160.0, 120.0),
-]
+SPINS = [(0.0, 0.0, 50.0), (30.0, 40.0, 0.0), (0.0, 0.0, 200.0), (0.0, 160.0, 120.0)]
 """Angular velocities, rad/s."""
 
 
@@ -107,13 +102,7 @@ def test_what_spins_when_it_is_let_go_gains_no_energy(category, spin, record_fig
     assert rise.over_bound <= 1.0
 
 
-@pytest.mark.parametrize(
-    ("scene_id", "what"),
-    [
-        (385, "bottle on its side"),
-        (334, "bowl that falls onto its rim"),
-    ],
-)
+@pytest.mark.parametrize(("scene_id", "what"), [(385, "bottle on its side"), (334, "bowl that falls onto its rim")])
 def test_what_rolls_gains_no_energy_from_contact_to_contact(scene_id, what, record_figure):
     """Tumbled scenes of the population: what Bullet found of them by turns was pushed up fast."""
     job = Job.model_validate({"name": "population", "seed": 0, "start": {"pose": "tumbled"}})

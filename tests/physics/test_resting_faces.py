@@ -33,10 +33,7 @@ BIAS = 0.1
 some of its speed over the edges of faces that hold it by a low sill; those lose most of their share to deeper ones. It
 would take dissipation without end to make the prediction exact, so that this is a bound on its error and not on ours."""
 
-SAMPLES = [
-    pytest.param(100, 3840, id="100 drops"),
-    pytest.param(600, 7680, id="600 drops", marks=pytest.mark.slow),
-]
+SAMPLES = [pytest.param(100, 3840, id="100 drops"), pytest.param(600, 7680, id="600 drops", marks=pytest.mark.slow)]
 """Drops, and the finest step's rate, Hz."""
 
 FIRST_FINE = 100_000

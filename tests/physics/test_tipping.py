@@ -27,12 +27,7 @@ TIPPED_RAD = 0.1
 
 def hard(rate_hz: int, rolling_friction: float = 0.0) -> Physics:
     """Friction that holds the edge where it is, sharp edges, and no torque against rolling over them."""
-    return physics(
-        step_hz=rate_hz,
-        friction=1.0,
-        rolling_friction=rolling_friction,
-        spinning_friction=0.0,
-    )
+    return physics(step_hz=rate_hz, friction=1.0, rolling_friction=rolling_friction, spinning_friction=0.0)
 
 
 def tips(settings: Physics, nearly_rad: float, angle_rad: float) -> bool:

@@ -1,8 +1,10 @@
-"""Compiled loops over features: boxes near boxes, a corner over a face, and an edge across another.
+"""The contacts of true meshes, steps of bodies from rest, and how objects lie, against what can be worked out by hand.
 
-Features of meshes whose corners, edges and sides are known; what is near, against FCL; and pieces, by what is inside.
-Signed contacts of bodies whose places and normals are known; the compiled loops are tested with them.
+What is near is held against FCL, pieces against manifold3d, one solver against the other.
 """
+
+import itertools
+import math
 
 import fcl
 import manifold3d
@@ -10,20 +12,24 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.shape import Mesh
-from tests.kit.contacts import UP as UPWARDS
-from tests.kit.contacts import box, contacts_between, mesh_of, tipped
-from workers.geometry.frames import pose, rotation_about, uniform_rotation
-from workers.physics.contact_surface import (
-    Surface,
-    crop,
-    faces_within,
-    find_near,
-    skin_of,
-    surface_of,
-)
+from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.shape import REGION_TABLE, Mesh
+from tests.hard_cases.bodies import cube
+from tests.hard_cases.drops import level
+from tests.kit.contacts import UP, box, contacts_between, mesh_of, thing_of, tipped
+from tests.physics.settling import start_at
+from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
+from workers.physics import exact_rest
+from workers.physics.contact_surface import crop, faces_within, find_near, skin_of, surface_of
+from workers.physics.exact_rest import MANY, Motion, Rested, rest, step
+from workers.physics.placement import FARTHEST_M, Form, Support, find_gaps_m, find_overlaps_m, measure_supports, place
+from workers.physics.placement import forms_of as forms
 
-UP, DOWN, NEITHER = np.array([1]), np.array([-1]), np.array([0])
+X = np.array([1.0, 0.0, 0.0])
+EYE = np.eye(4)
+GROUND = box((1.0, 1.0, 0.1), (0, 0, -0.05))
+
+# ---------------------------------------------------------------------------------------------- features
 
 
 def test_the_pairs_that_are_near_are_those_of_every_box_with_every_other():
@@ -38,32 +44,18 @@ def test_the_pairs_that_are_near_are_those_of_every_box_with_every_other():
     assert len(find_near(low, high, others[:0], others[:0], 0.03)) == 0
 
 
-DEEP_M = 1e-3
-
-
-def test_a_box_has_eight_corners_twelve_edges_and_its_body_below_every_face():
-    surface = surface_of(box((0.1, 0.2, 0.3)), True)
-    assert (len(surface.corners), len(surface.edges), len(surface.faces)) == (8, 12, 12)
-    assert (surface.side == 1).all()
-
-
 def test_a_part_has_all_that_shares_a_corner_with_what_overlaps_the_box():
     ball = mesh_of(trimesh.creation.icosphere(3, 0.05))
-    low, high = np.array([-1.0, -1.0, -1.0]), np.array([1.0, 1.0, -0.045])
-    part = crop(ball, low, high)
+    part = crop(ball, np.array([-1.0, -1.0, -1.0]), np.array([1.0, 1.0, -0.045]))
     assert 0 < len(part.faces) < len(ball.faces) / 2
     touched = np.unique(ball.faces[(ball.vertices[ball.faces][:, :, 2].min(axis=1) <= -0.045)])
     sharing = np.isin(ball.faces, touched).any(axis=1)
     assert {tuple(face) for face in ball.faces[sharing].tolist()} <= {tuple(face) for face in part.faces.tolist()}
 
 
-def surface(mesh: trimesh.Trimesh, closed: bool = True) -> Surface:
-    return surface_of(Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)), closed)
-
-
-def distance_m(one: np.ndarray, other: np.ndarray) -> float:
+def distance_m(*triangles: np.ndarray) -> float:
     bodies = []
-    for triangle in (one, other):
+    for triangle in triangles:
         model = fcl.BVHModel()
         model.beginModel(3, 1)
         model.addSubModel(triangle, np.array([[0, 1, 2]]))
@@ -72,25 +64,18 @@ def distance_m(one: np.ndarray, other: np.ndarray) -> float:
     return fcl.distance(*bodies)
 
 
-@pytest.mark.parametrize("within_m", [0.1, 0.15, 0.3])
-def test_faces_are_near_where_fcl_finds_their_triangles_within_the_distance(within_m):
-    """Triangles with two corners at one place are left to nobody: surfaces have none."""
-    chance = np.random.default_rng(7)
+def test_faces_are_near_where_fcl_finds_their_triangles_within_the_distance():
+    """Small triangles that do not pierce one another: of 60 with 60 others below them."""
+    chance, numbers = np.random.default_rng(7), np.arange(180).reshape(60, 3)
     here, there = (chance.uniform(0.0, 1.0, (60, 3, 3)) * [1, 1, 0.5] + [0, 0, z] for z in (0.0, 0.4))
-    here, there = (middles(each) for each in (here, there))
-    numbers = np.arange(180).reshape(60, 3)
-    near = faces_within((here.reshape(-1, 3), numbers), (there.reshape(-1, 3), numbers), within_m)
+    here, there = (each.mean(axis=1, keepdims=True) * 2 / 3 + each / 3 for each in (here, there))
     true = np.array([[distance_m(a, b) for b in there] for a in here])
-    assert np.abs(true - within_m).min() > 1e-6
-    assert near[0].tolist() == np.flatnonzero((true <= within_m).any(axis=1)).tolist()
-    assert near[1].tolist() == np.flatnonzero((true <= within_m).any(axis=0)).tolist()
-    assert 0 < len(near[0]) < 60
-
-
-def middles(triangles: np.ndarray) -> np.ndarray:
-    """The triangles at a third of their size, about their middles."""
-    middle = triangles.mean(axis=1, keepdims=True)
-    return np.ascontiguousarray(middle + (triangles - middle) / 3.0)
+    for within_m in (0.1, 0.15, 0.3):
+        near = faces_within((here.reshape(-1, 3), numbers), (there.reshape(-1, 3), numbers), within_m)
+        assert np.abs(true - within_m).min() > 1e-6
+        assert near[0].tolist() == np.flatnonzero((true <= within_m).any(axis=1)).tolist()
+        assert near[1].tolist() == np.flatnonzero((true <= within_m).any(axis=0)).tolist()
+        assert 0 < len(near[0]) < 60
 
 
 def wedge(angle_deg: float) -> trimesh.Trimesh:
@@ -100,93 +85,79 @@ def wedge(angle_deg: float) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull(np.array(points))
 
 
-@pytest.mark.parametrize(
-    "mesh",
-    [
-        trimesh.creation.annulus(0.03, 0.05, 0.1, sections=24),
-        wedge(60.0),
-        wedge(10.0),
-        wedge(1.0),
-        trimesh.creation.icosphere(2, 0.05),
-    ],
-    ids=["tube", "wedge of 60 degrees", "wedge of 10 degrees", "wedge of 1 degree", "ball"],
-)
-def test_no_piece_reaches_out_of_the_mesh(mesh):
-    whole = manifold3d.Manifold(manifold3d.Mesh64(np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.uint64)))
-    assert whole.volume() > 0.0
-    for piece in skin_of(surface(mesh), np.arange(len(mesh.faces)), DEEP_M):
-        assert (manifold3d.Manifold.hull_points(np.ascontiguousarray(piece)) - whole).volume() < 1e-15
+def test_no_piece_of_a_skin_reaches_out_of_the_mesh():
+    tube, ball = trimesh.creation.annulus(0.03, 0.05, 0.1, sections=24), trimesh.creation.icosphere(2, 0.05)
+    for mesh in (tube, ball, wedge(60.0), wedge(10.0), wedge(1.0)):
+        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        whole = manifold3d.Manifold(manifold3d.Mesh64(vertices, faces.astype(np.uint64)))
+        assert whole.volume() > 0.0
+        for piece in skin_of(surface_of(Mesh(vertices, faces), True), np.arange(len(faces)), 1e-3):
+            assert (manifold3d.Manifold.hull_points(np.ascontiguousarray(piece)) - whole).volume() < 1e-15
 
+
+# ---------------------------------------------------------------------------------------------- contacts
 
 WITHIN_M = 5e-5
-GROUND = box((1.0, 1.0, 0.1), (0, 0, -0.05))
 
 
 def rows(points) -> set[tuple[float, ...]]:
     return {tuple(row) for row in np.round(points, 6) + 0.0}
 
 
-def touching(upper: Mesh, lower: Mesh, within_m: float = WITHIN_M):
+def touching(upper: Mesh, lower: Mesh = GROUND, within_m: float = WITHIN_M):
     return contacts_between([upper, lower], within_m)
 
 
-@pytest.mark.parametrize("gap_m", [0.0, 4e-5, -4e-5])
-def test_a_box_on_a_level_touches_it_with_four_corners_as_far_off_as_it_is(gap_m):
-    found = touching(box((0.1, 0.2, 0.3), (0, 0, 0.15 + gap_m)), GROUND)
-    assert rows(found.points[:, :2]) == {(x, y) for x in (-0.05, 0.05) for y in (-0.1, 0.1)}
-    assert found.normals == pytest.approx(np.tile(UPWARDS, (len(found.gaps), 1)), abs=1e-12)
-    assert found.gaps == pytest.approx(gap_m, abs=1e-12)
-    assert (found.upper == 0).all() and (found.lower == 1).all()
+def test_a_box_on_a_level_touches_it_with_four_corners_as_far_off_as_it_is():
+    for gap_m in (0.0, 4e-5, -4e-5):
+        found = touching(box((0.1, 0.2, 0.3), (0, 0, 0.15 + gap_m)))
+        assert rows(found.points[:, :2]) == {(x, y) for x in (-0.05, 0.05) for y in (-0.1, 0.1)}
+        assert found.normals == pytest.approx(np.tile(UP, (len(found.gaps), 1)), abs=1e-12)
+        assert found.gaps == pytest.approx(gap_m, abs=1e-12)
+        assert (found.upper == 0).all() and (found.lower == 1).all()
 
 
-@pytest.mark.parametrize("gap_m", [2e-5, -2e-5])
-def test_two_edges_across_one_another_touch_in_one_point(gap_m):
+def test_two_edges_across_one_another_touch_in_one_point():
     """Square bars on their edges, one along x and one along y."""
-    along_x = box(
-        (0.3, 0.02, 0.02), (0, 0, 0.02 * np.sqrt(0.5) + gap_m), rotation_about(np.array([1.0, 0, 0]), np.pi / 4)
-    )
-    along_y = box((0.02, 0.3, 0.02), (0, 0, -0.02 * np.sqrt(0.5)), tipped(np.pi / 4))
-    found = touching(along_x, along_y)
-    assert found.points == pytest.approx(np.array([[0, 0, gap_m / 2]]), abs=1e-9)
-    assert found.normals == pytest.approx(UPWARDS[None, :], abs=1e-9)
-    assert found.gaps == pytest.approx(gap_m, abs=1e-9)
+    for gap_m in (2e-5, -2e-5):
+        high = 0.02 * np.sqrt(0.5)
+        along_x = box((0.3, 0.02, 0.02), (0, 0, high + gap_m), rotation_about(X, np.pi / 4))
+        found = touching(along_x, box((0.02, 0.3, 0.02), (0, 0, -high), tipped(np.pi / 4)))
+        assert found.points == pytest.approx(np.array([[0, 0, gap_m / 2]]), abs=1e-9)
+        assert found.normals == pytest.approx(UP[None, :], abs=1e-9)
+        assert found.gaps == pytest.approx(gap_m, abs=1e-9)
 
 
 def test_many_contacts_are_all_found():
     """More than the sixty-four that the loops begin with."""
     feet = [box((0.01, 0.01, 0.02), (x, y, 0.01)) for x in np.arange(-5, 5) * 0.09 for y in np.arange(-5, 5) * 0.09]
-    starts = np.arange(len(feet)) * len(feet[0].vertices)
-    faces = np.concatenate([foot.faces + start for foot, start in zip(feet, starts, strict=True)])
+    faces = np.concatenate([foot.faces + 8 * number for number, foot in enumerate(feet)])
     comb = Mesh(np.concatenate([foot.vertices for foot in feet]), faces.astype(np.int32))
-    assert len(rows(touching(comb, GROUND).points)) == 400
+    assert len(rows(touching(comb).points)) == 400
 
 
 def test_the_way_faces_are_wound_does_not_turn_normals():
     upper = box((0.1, 0.1, 0.1), (0.47, 0, 0.05))
-    inside_out = Mesh(GROUND.vertices, np.ascontiguousarray(GROUND.faces[:, ::-1]))
-    for lower in (GROUND, inside_out):
-        for top in (upper, Mesh(upper.vertices, np.ascontiguousarray(upper.faces[:, ::-1]))):
-            found = touching(top, lower)
-            assert len(found.gaps) >= 4
-            assert found.normals == pytest.approx(np.tile(UPWARDS, (len(found.gaps), 1)), abs=1e-9)
+    for ways in itertools.product((1, -1), repeat=2):
+        wound = zip((upper, GROUND), ways, strict=True)
+        found = touching(*(Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::way])) for mesh, way in wound))
+        assert len(found.gaps) >= 4
+        assert found.normals == pytest.approx(np.tile(UP, (len(found.gaps), 1)), abs=1e-9)
 
 
 def test_a_corner_leaves_a_body_the_shorter_way():
     """A tip 0.02 mm below the top and 0.04 mm inside the side: 0.02 mm up is the way out."""
-    turn = tipped(0.5) @ rotation_about(np.array([1.0, 0, 0]), 0.5)
-    tip = box((0.1, 0.1, 0.1), (0, 0, 0), turn)
+    tip = box((0.1, 0.1, 0.1), (0, 0, 0), tipped(0.5) @ rotation_about(X, 0.5))
     low = tip.vertices[np.argmin(tip.vertices[:, 2])]
-    tip = Mesh(tip.vertices - low + [0.5 - 4e-5, 0, -2e-5], tip.faces)
-    found = touching(tip, GROUND)
+    found = touching(Mesh(tip.vertices - low + [0.5 - 4e-5, 0, -2e-5], tip.faces))
     assert found.gaps.min() == pytest.approx(-2e-5, abs=1e-12)
-    assert found.normals[np.argmin(found.gaps)] == pytest.approx(UPWARDS)
+    assert found.normals[np.argmin(found.gaps)] == pytest.approx(UP)
 
 
 def test_a_ball_on_the_deepest_face_of_a_hollow_is_held_by_it():
     """All faces about the deepest one rise, as they do about the underside of a body; yet the ball is above."""
-    dish = trimesh.creation.box((0.2, 0.2, 0.1)).difference(
-        trimesh.creation.icosphere(3, 0.09).apply_translation([0, 0, 0.07])
-    )
+    hollow = trimesh.creation.icosphere(3, 0.09).apply_translation([0, 0, 0.07])
+    dish = trimesh.creation.box((0.2, 0.2, 0.1)).difference(hollow)
     over = dish.triangles_center
     middle = (np.abs(over[:, :2]).max(axis=1) < 0.02) & (over[:, 2] > -0.04)
     deepest = int(np.flatnonzero(middle)[np.argmin(over[middle, 2])])
@@ -199,11 +170,191 @@ def test_a_ball_on_the_deepest_face_of_a_hollow_is_held_by_it():
     assert found.gaps[nearest] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_body_of_a_thousand_facets_in_any_pose_has_its_lowest_corner_as_its_gap():
-    rng = np.random.default_rng(5)
-    ball = trimesh.creation.icosphere(3, 0.05)
-    for _ in range(10):
-        at = mesh_of(ball, pose(uniform_rotation(rng), np.zeros(3)))
-        lowest = at.vertices[:, 2].min()
-        found = touching(Mesh(at.vertices + np.array([0, 0, 1e-5 - lowest]), at.faces), GROUND)
-        assert found.gaps.min() == pytest.approx(1e-5, abs=1e-12)
+# ---------------------------------------------------------------------------------------------- one step from rest
+
+FALL_M = 1e-4
+G = 9.81
+
+
+def follow(
+    bodies: list[Mesh], ground: Mesh = GROUND, friction: float = 0.5, masses=None, fall_m: float = FALL_M
+) -> Motion:
+    masses = masses or [1.0] * len(bodies)
+    inertias = [thing_of(mesh, mass).inertia(EYE) for mesh, mass in zip(bodies, masses, strict=True)]
+    return step(inertias, contacts_between([*bodies, ground], WITHIN_M), friction, -fall_m * UP, G)
+
+
+def moved(motion: Motion) -> float:
+    """As a share of free fall."""
+    return float(max(np.abs(motion.moves).max(), np.abs(motion.turns).max())) / FALL_M
+
+
+def test_energy_is_never_gained_where_nothing_overlaps():
+    """The height sinks in every direction that a leaning box may go."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        leaning = box((0.1, 0.08, 0.05), turn=rotation_about(UP, rng.uniform(0, 6)) @ tipped(rng.uniform(0.01, 0.4)))
+        low = Mesh(leaning.vertices - [0, 0, leaning.vertices[:, 2].min()], leaning.faces)
+        assert follow([low]).moves[0, 2] < 0.0
+
+
+def test_the_two_solvers_agree(monkeypatch):
+    """DAQP and Clarabel share no code: an active set and an interior point.
+
+    On boxes in columns of five, turned at random about the vertical, with 20 micrometres below each but the lowest.
+    """
+    rng, bodies = np.random.default_rng(7), []
+    for number in range(MANY):
+        turn = rotation_about(UP, rng.uniform(0, 6))
+        at = 0.09 * (number // 5), rng.uniform(-0.005, 0.005), 0.025 + 0.05002 * (number % 5)
+        bodies.append(box((0.06, 0.06, 0.05), at, turn))
+    for fall_m in (1e-4, 1e-2):
+        both = []
+        for least in (MANY, MANY + 1):
+            monkeypatch.setattr(exact_rest, "MANY", least)
+            both.append(follow(bodies, fall_m=fall_m))
+        assert both[0].moves == pytest.approx(both[1].moves, abs=1e-7 * fall_m)
+        assert both[0].turns == pytest.approx(both[1].turns, abs=1e-6 * fall_m)
+        assert np.abs(both[0].moves).max() > 0.1 * FALL_M and not np.array_equal(both[0].moves, both[1].moves)
+
+
+# ---------------------------------------------------------------------------------------------- until nothing moves
+
+CUBE = box((0.1, 0.1, 0.1))
+
+
+def settle(meshes: list[Mesh], poses, ground: Mesh = GROUND, masses=None) -> Rested:
+    masses = masses or [1.0] * len(meshes)
+    things = [thing_of(mesh, mass) for mesh, mass in zip(meshes, masses, strict=True)]
+    return rest(things, poses, surface_of(ground, True), 0.49)
+
+
+def on_ground(mesh: Mesh, R, up_m: float = 0.0):
+    """The pose with this turn and the lowest vertex so high."""
+    return pose(R, np.array([0.0, 0.0, up_m - (mesh.vertices @ R.T)[:, 2].min()]))
+
+
+def test_what_rests_is_left_to_the_bit_and_the_same_bodies_come_to_the_same_bits():
+    T = translation(0.0, 0.0, 0.05)
+    found = settle([CUBE], [T])
+    assert found.steps == 0 and found.poses[0].tobytes() == T.tobytes()
+    at = [pose(uniform_rotation(np.random.default_rng(1)), np.array([0.0, 0.0, 0.09])), translation(0.3, 0.0, 0.0503)]
+    one, other = (settle([CUBE] * 2, at) for _ in range(2))
+    assert [T.tobytes() for T in one.poses] == [T.tobytes() for T in other.poses]
+    assert one.steps == other.steps
+
+
+def test_what_is_balanced_on_an_edge_is_not_at_rest():
+    """A prism exactly on a ridge: in balance, and gone at a breath."""
+    prism = mesh_of(trimesh.creation.cylinder(0.05, 0.2, sections=32))
+    found = settle([prism], [on_ground(prism, rotation_about(X, math.pi / 2))])
+    assert found.still
+    assert found.poses[0][2, 3] == pytest.approx(0.05 * math.cos(math.pi / 32), abs=1e-8)
+
+
+def test_three_that_overlap_or_hover_come_to_a_stack():
+    """By tenths of a millimetre, each turned, the second 20 times as heavy."""
+    at = []
+    for k, off_m in enumerate((-2e-4, 3e-4, -1e-4)):
+        turn = rotation_about(UP, 0.3 * k) @ tipped(1e-3 * (k - 1))
+        at.append(pose(turn, np.array([0.01 * k, 0.0, 0.05 + 0.1 * k + off_m])))
+    found = settle([CUBE] * 3, at, masses=[1.0, 20.0, 1.0])
+    assert found.still
+    for k, T in enumerate(found.poses):
+        assert T[2, 3] == pytest.approx(0.05 + 0.1 * k, abs=1e-8)
+        assert T[2, :3] == pytest.approx(UP, abs=1e-7)
+    placed = [Mesh(transform(T, CUBE.vertices), CUBE.faces) for T in found.poses]
+    assert np.abs(contacts_between([*placed, GROUND], 1e-5).gaps).max() < 1e-8
+
+
+# ---------------------------------------------------------------------------------------------- gaps
+
+CUBE_FORM, GROUND_FORM = Form(CUBE), Form(box((2.0, 2.0, 0.1), (0, 0, -0.05)))
+
+
+def gap(one: Form, T_one, other: Form, T_other) -> float:
+    """Of two, who are told the same."""
+    a, b = find_gaps_m([one, other], [T_one, T_other])
+    assert a == b
+    return a
+
+
+def test_two_boxes_are_as_near_or_as_deep_as_they_were_put():
+    for axis, gap_m in itertools.product(np.eye(3), (1e-5, 0.003, 0.0099, -1e-5, -0.002, -0.03)):
+        found = gap(CUBE_FORM, EYE, CUBE_FORM, translation(*(axis * (0.1 + gap_m))))
+        assert found == pytest.approx(gap_m, abs=1e-9)
+
+
+def test_a_box_over_the_edge_of_a_table_is_as_high_as_its_part_above_the_top():
+    """Turned about y, its lowest corner 10 mm beyond the edge at 1 m: what is over the edge is higher by the slope."""
+    lean, R = 0.1, tipped(0.1)
+    corner = R @ np.array([0.05, 0.0, -0.05])
+    for gap_m in (0.004, -0.003):
+        z = gap_m * math.cos(lean) + (0.01 - gap_m * math.sin(lean)) * math.tan(-lean) - corner[2]
+        found = gap(CUBE_FORM, pose(R, np.array([1.01 - corner[0], 0.0, z])), GROUND_FORM, EYE)
+        assert found == pytest.approx(gap_m * math.cos(lean), rel=0.02)
+
+
+def test_no_two_tilted_boxes_are_apart_where_no_axis_separates_them_nor_the_other_way_round():
+    """Two convex bodies are apart if and only if one of their normals, or of their edges' products, separates them."""
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        turns = [uniform_rotation(rng) for _ in range(2)]
+        poses = [pose(turns[0], np.zeros(3)), pose(turns[1], rng.uniform(-0.1, 0.1, 3))]
+        a, b = (transform(T, CUBE.vertices) for T in poses)
+        axes = [*turns[0].T, *turns[1].T, *(np.cross(u, v) for u, v in itertools.product(turns[0].T, turns[1].T))]
+        apart = max(
+            max(float((b @ n).min() - (a @ n).max()), float((a @ n).min() - (b @ n).max()))
+            for n in (axis / np.linalg.norm(axis) for axis in axes)
+        )
+        found = gap(CUBE_FORM, poses[0], CUBE_FORM, poses[1])
+        if apart > 0.0:
+            assert found >= min(apart, FARTHEST_M) - 1e-9  # no less than along any axis
+        else:
+            assert -0.1 <= found < 0.0
+
+
+def test_an_overlap_is_the_depth_and_nothing_where_two_bodies_only_touch_or_are_apart():
+    for way, expected in {0.098: 0.002, 0.1: 0.0, 0.11: 0.0, 3.0: 0.0}.items():
+        depths = [depth for _, _, depth in find_overlaps_m([CUBE_FORM] * 2, [EYE, translation(0, way, 0)])]
+        assert max(depths, default=0.0) == pytest.approx(expected, abs=1e-9), way
+
+
+# ---------------------------------------------------------------------------------------------- supports
+
+TABLE = level()
+TOP = TABLE.top.height_m
+STARTED = start_at(cube())
+
+
+def held(start: ObjectStart, T: np.ndarray, on: Table = TABLE, friction: float = 0.5) -> Support:
+    return measure_supports(place([start], [T], forms([start]), on, friction), [T])[0]
+
+
+def test_a_box_on_a_level_is_held_by_corners_of_its_face_with_a_margin_of_half_its_side():
+    support = held(STARTED, translation(0.1, 0.0, TOP + 0.05))
+    assert (support.margin_m, support.gap_m) == (pytest.approx(0.05, abs=1e-9), pytest.approx(0.0, abs=1e-9))
+    assert support.unbalanced < 1e-9
+    weight = [0, 0, STARTED.asset.mass.mass_kg * G]
+    assert sum(contact.force for contact in support.forces) == pytest.approx(weight, abs=1e-9)
+    for contact in support.forces:
+        assert contact.with_region == REGION_TABLE
+        assert np.abs(contact.point - [0.1, 0.0, TOP]) == pytest.approx([0.05, 0.05, 0.0], abs=1e-9)
+        assert contact.normal == pytest.approx([0, 0, 1])
+
+
+def test_of_two_each_has_the_others_force_turned_round():
+    starts = [STARTED, start_at(cube(0.05), region_id=4)]
+    poses = [translation(0, 0, TOP + 0.05), translation(0.01, 0, TOP + 0.125)]
+    low, high = measure_supports(place(starts, poses, forms(starts), TABLE, 0.5), poses)
+    down = sum(contact.force for contact in low.forces if contact.with_region == 4)
+    up = sum(contact.force for contact in high.forces if contact.with_region == 3)
+    assert up == pytest.approx(-down) and up[2] == pytest.approx(starts[1].asset.mass.mass_kg * G)
+    assert max(low.unbalanced, high.unbalanced) < 1e-9
+    assert (low.margin_m, high.margin_m) == pytest.approx((0.05, 0.025), abs=1e-9)
+
+
+def test_what_encloses_no_body_counts_as_its_hull_where_overlaps_are_sought():
+    open_cube = Form(Mesh(CUBE.vertices, CUBE.faces[2:]))
+    ((_, _, depth_m),) = find_overlaps_m([open_cube, CUBE_FORM], [EYE, translation(0, 0.098, 0)])
+    assert depth_m == pytest.approx(0.002, abs=1e-9)

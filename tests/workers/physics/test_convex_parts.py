@@ -1,157 +1,208 @@
-"""Convex parts that are kept: in memory, in files, and across torn files.
+"""Convex parts of built-in shapes, by their making, and of meshes from outside, by CoACD; how they are kept and refused.
 
-The process that runs CoACD: parts of an L, by its exit code and its file. Convex parts, against bodies whose parts
-are known, and in processes that must agree.
+Partitions are held against shapely, parts against manifold3d's booleans, rays and Qhull.
 """
 
 import hashlib
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import manifold3d
 import numpy as np
 import pytest
+import shapely
 import trimesh
 from scipy.spatial import ConvexHull
 
 from schemas.errors import MachineError, MeshError
+from schemas.job.assets import CATEGORIES, ProceduralSource
 from schemas.scene.shape import Mesh
+from tests.kit.contacts import mesh_of
+from tests.kit.shapes import box
+from workers.assets.builtin.make import make_asset
+from workers.geometry.distance import distance_to_mesh
 from workers.geometry.hull import convex_hull
-from workers.geometry.mesh import components, weld
-from workers.physics import coacd_process
+from workers.geometry.lathe_decomposition import COARSE, partition_outlines
+from workers.geometry.mesh import solid_of, weld
 from workers.physics import convex_parts as module
-from workers.physics.convex_parts import Parts, PartsCache, decompose
+from workers.physics.convex_parts import Parts, PartsCache, decompose, parts_of
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def built_in(category, number):
+    return make_asset(category, ProceduralSource(source="procedural"), number, 600.0)
+
+
+# ---------------------------------------------------------------------------------------------- outlines
+
+COMB = np.array([(x, y) for k in range(5) for x, y in ((k, 0.0), (k + 0.5, 0.0), (k + 0.5, -2.0), (k + 1.0, -2.0))])
+OUTLINES = {
+    "l": np.array([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], dtype=np.float64),
+    "star": np.array([(np.cos(k * np.pi / 7) * r, np.sin(k * np.pi / 7) * r) for k, r in enumerate([2.0, 0.7] * 7)]),
+    "comb": np.concatenate([COMB, [(5.0, 1.0), (0.0, 1.0)]]),
+}
+
+
+def are_convex_tiles_of(outline, cells) -> bool:
+    tiles, whole = [shapely.Polygon(outline[cell]) for cell in cells], shapely.Polygon(outline)
+    union = shapely.union_all([shapely.set_precision(tile, 1e-9) for tile in tiles])
+    assert sum(tile.area for tile in tiles) == pytest.approx(whole.area, rel=1e-12)
+    convex = all(tile.is_valid and tile.convex_hull.area - tile.area < 1e-12 for tile in tiles)
+    return convex and union.symmetric_difference(whole).area < 1e-7
+
+
+def test_cells_are_convex_and_tile_the_outline_also_of_outlines_that_are_cut_alike():
+    """Of the last two, the second has a reflex corner where the first is straight."""
+    for name, outline in OUTLINES.items():
+        assert are_convex_tiles_of(outline, partition_outlines(outline[None], 0.0)), name
+    alike = np.array([[(0, 0), (2, 0), corner, (2, 2), (0, 2)] for corner in ((2, 1), (1, 1))], dtype=np.float64)
+    cells = partition_outlines(alike, 1e-9)
+    assert len(cells) == 2 and all(are_convex_tiles_of(outline, cells) for outline in alike)
+
+
+# ---------------------------------------------------------------------------------------------- built-in shapes
+
+AIM_M = 5e-5
+"""Largest distance that parts of a shape 0.25 m along its diagonal may stand out, or leave uncovered."""
+
+TWISTED_M = 1.7e-4
+"""Soft squares that turn into circles have twisted facets, which may stand out by four times the tolerance."""
+
+TWISTED = [("bowl", 2), ("jar", 0), ("bottle", 1)]
+ROUND = [("mug", 2), ("bowl", 3), ("jar", 1), ("can", 0), ("bottle", 0)]
+ANGULAR = [("box", 4), ("laptop", 1), ("camera", 0)]
+OUTLINES_THAT_MEET = [("camera", 100026), ("camera", 500199), ("box", 500231)]
+"""Sides that lie on one another but for the last bits, or cross: one camera of a hundred, and fewer boxes."""
+
+
+def outside_m(points, mesh):
+    """How far points are outside of a closed mesh at most, by rays."""
+    away = points[~trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).contains(points)]
+    return float(distance_to_mesh(away, mesh)[0].max(initial=0.0))
+
+
+def middles_of(parts):
+    """At most 4,000 of the middles of the parts' faces and of their edges."""
+    points = []
+    for part in parts:
+        corners = part[ConvexHull(part).simplices]
+        points += [corners.mean(axis=1), corners[:, :2].mean(axis=1), corners[:, 1:].mean(axis=1)]
+    return np.random.default_rng(0).permutation(np.concatenate(points))[:4000]
+
+
+def uncovered_m(parts, points):
+    """How far points lie outside of all parts, at most."""
+    planes = [ConvexHull(part).equations for part in parts]
+    away = [(points @ plane[:, :3].T + plane[:, 3]).max(axis=1) for plane in planes]
+    return float(np.min(away, axis=0).max())
+
+
+@pytest.mark.parametrize(
+    ("category", "number"),
+    [
+        ("mug", 2),
+        ("camera", 0),
+        *(pytest.param(*one, marks=pytest.mark.minute) for one in (*ROUND[1:], *ANGULAR[:2], *TWISTED)),
+    ],
+)
+def test_parts_of_a_built_in_shape_are_the_shape(category, number):
+    asset = built_in(category, number)
+    mesh, parts = weld(asset.shape.mesh), parts_of(asset)
+    assert outside_m(middles_of(parts), mesh) <= (TWISTED_M if (category, number) in TWISTED else AIM_M)
+    inside, _ = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), 1500, seed=0)
+    assert uncovered_m(parts, np.concatenate([inside, mesh.vertices])) <= AIM_M
+    assert ConvexHull(np.concatenate(parts)).volume == pytest.approx(ConvexHull(mesh.vertices).volume, rel=1e-12)
+
+
+def test_parts_have_the_volume_of_the_shape():
+    """Parts are made larger by a hundred-thousandth, so that no two faces lie in one plane."""
+    for category, number in (("mug", 2), ("laptop", 1), ("box", 4)):
+        asset = built_in(category, number)
+        solid = solid_of(weld(asset.shape.mesh))
+        hulls = [
+            manifold3d.Manifold.hull_points(np.ascontiguousarray(1.00001 * part - 0.00001 * part.mean(axis=0)))
+            for part in parts_of(asset)
+        ]
+        both = manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add)
+        assert (both - solid).volume() < 2e-4 * solid.volume()
+        assert (solid - both).volume() < 1e-5 * solid.volume()
+
+
+def test_built_in_shapes_are_never_handed_to_coacd_also_where_outlines_meet_or_cross(monkeypatch):
+    monkeypatch.setattr(module, "_run", lambda *_: pytest.fail("CoACD was asked"))
+    for category in CATEGORIES:
+        assert len(parts_of(built_in(category, 7))) > 1
+
+
+def test_a_shape_whose_outlines_meet_or_cross_has_parts_all_the_same():
+    for category, number in OUTLINES_THAT_MEET:
+        asset = built_in(category, number)
+        parts = parts_of(asset)
+        assert len(parts) > 1
+        for bound in (np.min, np.max):
+            corners = bound(np.concatenate(parts), axis=0)
+            assert corners == pytest.approx(bound(asset.shape.vertices, axis=0), abs=1e-9)
+
+
+def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(monkeypatch):
+    def fails(*_: object) -> None:
+        raise shapely.errors.GEOSException("TopologyException: side location conflict")
+
+    monkeypatch.setattr(module, "decompose_lofts", fails)
+    monkeypatch.setattr(module, "decompose", lambda mesh, digest, threshold: Parts((mesh.vertices,), "coacd"))
+    assert len(parts_of(built_in("laptop", 77))) == 1
+
+
+def test_coarser_parts_are_fewer_and_reach_out_no_further_than_they_may():
+    """A hundredth of 0.25 m."""
+    for category in ("mug", "jar"):
+        asset = built_in(category, 1)
+        coarse = parts_of(asset, share=COARSE)
+        assert len(coarse) < 0.5 * len(parts_of(asset))
+        middles = np.concatenate([(part[:-1] + part[1:]) / 2 for part in coarse])
+        assert outside_m(middles, asset.shape.mesh) < 2.5e-3
+
+
+# ---------------------------------------------------------------------------------------------- meshes from outside
 
 
 def digest_of(parts):
     return hashlib.sha256(b"".join(cloud.tobytes() + b"|" for cloud in parts.clouds)).hexdigest()
 
 
-def test_an_answer_comes_from_memory_then_from_the_folder_and_is_the_same(tmp_path, monkeypatch):
-    made = decompose(angle_iron(), "kept", folder=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(module, "_run", lambda *_: pytest.fail("made once more"))
-    assert digest_of(decompose(angle_iron(), "kept", folder=None)) == digest_of(made), "from memory"
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    again = decompose(angle_iron(), "kept", folder=tmp_path)
-    assert (again.method, digest_of(again)) == (made.method, digest_of(made))
-    assert not again.clouds[0].flags.writeable
-
-
-@pytest.mark.parametrize("harm", [lambda data: data[:-7], lambda _: b"", lambda data: data[:60] + b"x" + data[61:]])
-def test_a_torn_file_is_made_again(tmp_path, monkeypatch, harm):
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    made = decompose(angle_iron(), "torn", folder=tmp_path)
-    (path,) = tmp_path.iterdir()
-    whole = path.read_bytes()
-    path.write_bytes(harm(whole))
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    assert digest_of(decompose(angle_iron(), "torn", folder=tmp_path)) == digest_of(made)
-    assert path.read_bytes() == whole
-
-
-def test_memory_is_bounded_and_the_latest_stay():
-    cache = PartsCache(capacity_bytes=100)
-    for key in "abc":
-        cache.get(key, None, lambda: Parts((np.zeros((2, 3)),), "convex"))
-    for key in "bc":
-        cache.get(key, None, lambda: pytest.fail("forgotten"))
-    made = []
-    for key in ("a", "large", "large"):
-        cache.get(
-            key, None, lambda key=key: made.append(key) or Parts((np.zeros((9 if key == "large" else 2, 3)),), "convex")
-        )
-    assert made == ["a", "large", "large"]
-
-
-OPTIONS = {
-    "threshold": 0.05,
-    "preprocess_mode": "off",
-    "seed": 0,
-    "mcts_iterations": 10,
-    "mcts_nodes": 6,
-    "mcts_max_depth": 1,
-}
-
-
-def test_an_l_is_cut_into_parts_within_its_bounds(tmp_path):
-    outline = [[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]]
-    vertices = np.array([[x, y, z] for z in (0.0, 1.0) for x, y in outline])
-    sides = [f for k in range(6) for f in ([k, (k + 1) % 6, 6 + (k + 1) % 6], [k, 6 + (k + 1) % 6, 6 + k])]
-    cap = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
-    faces = np.array([*sides, *(f[::-1] for f in cap), *([6 + v for v in f] for f in cap)], np.int32)
-    assert trimesh.Trimesh(vertices, faces).volume > 2.9
-    np.savez(tmp_path / "request.npz", vertices=vertices, faces=faces, options=json.dumps(OPTIONS))
-    done = subprocess.run(
-        [sys.executable, "-P", coacd_process.__file__, str(tmp_path), "60", "4096"], capture_output=True
-    )
-    assert done.returncode == 0, done.stderr
-    with np.load(tmp_path / "parts.npz") as parts:
-        assert len(parts["counts"]) >= 2 and parts["counts"].sum() == len(parts["vertices"])
-        assert np.allclose(
-            [parts["vertices"].min(axis=0), parts["vertices"].max(axis=0)], [[0, 0, 0], [2, 2, 1]], atol=0.02
-        )
-
-
-def test_a_package_without_its_library_is_missing_and_no_mesh_that_cannot_be_cut(tmp_path, monkeypatch):
-    """coacd 1.0.14 without its library is imported, and fails at its first call."""
-    (tmp_path / "coacd.py").write_text("def set_log_level(level):\n    _lib.CoACD_setLogLevel(level)\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    command = [sys.executable, "-P", coacd_process.__file__, str(tmp_path), "60", "4096"]
-    done = subprocess.run(command, capture_output=True)
-    assert done.returncode == coacd_process.MISSING, done.stderr
-
-
-ROOT = Path(__file__).resolve().parents[4]
-
-
-def mesh_of(body):
-    return Mesh(np.asarray(body.vertices, dtype=np.float64), np.asarray(body.faces, dtype=np.int32))
-
-
 def angle_iron():
     """An L of two bars 10 mm thick, 0.1 m long each way, as one body."""
-    outline = [(0, 0), (0.1, 0), (0.1, 0.01), (0.01, 0.01), (0.01, 0.1), (0, 0.1)]
-    points = np.array([(x, y, z) for z in (0.0, 0.05) for x, y in outline])
-    caps = [(0, 3, 2), (0, 2, 1), (0, 5, 4), (0, 4, 3)]
-    upper = [(a + 6, c + 6, b + 6) for a, b, c in caps]
-    sides = [t for k in range(6) for t in ((k, (k + 1) % 6, (k + 1) % 6 + 6), (k, (k + 1) % 6 + 6, k + 6))]
-    return Mesh(points, np.array(caps + upper + sides, dtype=np.int32))
+    outline = shapely.Polygon([(0, 0), (0.1, 0), (0.1, 0.01), (0.01, 0.01), (0.01, 0.1), (0, 0.1)])
+    return mesh_of(trimesh.creation.extrude_polygon(outline, 0.05))
 
 
 def tray():
     """A box of 0.2 x 0.2 x 0.05 m without a lid, its walls and bottom 5 mm thick."""
-    outer = trimesh.creation.box((0.2, 0.2, 0.05))
-    inner = trimesh.creation.box((0.19, 0.19, 0.05))
-    inner.apply_translation((0, 0, 0.005))
-    return mesh_of(trimesh.boolean.difference([outer, inner], engine="manifold"))
+    return mesh_of(trimesh.boolean.difference([box(0.2, 0.2, 0.05), box(0.19, 0.19, 0.05, (0, 0, 0.005))]))
 
 
-def holds(cloud, point):
-    hull = ConvexHull(cloud)
-    return bool((hull.equations[:, :3] @ point + hull.equations[:, 3] <= 1e-9).all())
+OPEN_TRAY = Mesh(tray().vertices, tray().faces[2:])
+
+
+def holds(parts, point) -> bool:
+    return uncovered_m(parts.clouds, np.array([point], dtype=np.float64)) <= 1e-9
+
+
+def beyond_m(parts, mesh) -> float:
+    """How far parts reach out of the mesh's hull."""
+    hull = convex_hull(mesh.vertices)
+    return float((np.concatenate(parts.clouds) @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max())
 
 
 def test_nothing_stands_in_a_tray_and_nothing_out_of_it():
-    mesh = tray()
-    parts = decompose(mesh, "tray", folder=None)
+    parts = decompose(tray(), "tray", folder=None)
     assert parts.method == "coacd"
-    hull = convex_hull(mesh.vertices)
-    points = np.concatenate(parts.clouds)
-    assert (points @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max() < 1e-12
-    for x, y, z in ((0, 0, 0), (0.08, 0.08, 0.02), (-0.08, 0, 0.0)):
-        assert not any(holds(cloud, np.array([x, y, z])) for cloud in parts.clouds)
-    for x, y, z in ((0, 0, -0.0225), (0.0975, 0, 0), (-0.0975, -0.09, 0.02)):
-        assert any(holds(cloud, np.array([x, y, z])) for cloud in parts.clouds)
-
-
-def test_pieces_are_those_that_touch_at_a_vertex_once_seams_are_closed():
-    box = trimesh.creation.box((1, 1, 1))
-    loose = Mesh(np.asarray(box.vertices)[np.asarray(box.faces).ravel()], np.arange(36, dtype=np.int32).reshape(-1, 3))
-    assert len(components(loose)) == 12
-    assert len(components(weld(loose))) == 1
+    assert beyond_m(parts, tray()) < 1e-12
+    assert not any(holds(parts, point) for point in ((0, 0, 0), (0.08, 0.08, 0.02), (-0.08, 0, 0.0)))
+    assert all(holds(parts, point) for point in ((0, 0, -0.0225), (0.0975, 0, 0), (-0.0975, -0.09, 0.02)))
 
 
 @pytest.mark.slow
@@ -167,55 +218,73 @@ def test_a_flawed_mesh_has_parts_within_its_hull(flaw):
     }[flaw]
     parts = decompose(Mesh(mesh.vertices, np.ascontiguousarray(faces)), flaw, threshold=0.3, folder=None)
     assert parts.method == "coacd"
-    hull = convex_hull(mesh.vertices)
-    points = np.concatenate(parts.clouds)
-    assert (points @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max() < 1e-9
-    assert not any(holds(cloud, np.array([0.0, 0.0, 0.01])) for cloud in parts.clouds)
+    assert beyond_m(parts, mesh) < 1e-9
+    assert not holds(parts, (0.0, 0.0, 0.01))
 
 
 def test_where_coacd_gives_up_the_hulls_of_the_pieces_serve(monkeypatch):
     """Its voxels must be at least five; with fewer it throws, which ends its process and not ours."""
     monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 1})
-    mesh = tray()
-    parts = decompose(Mesh(mesh.vertices, mesh.faces[2:]), "gives up", folder=None)
+    parts = decompose(OPEN_TRAY, "gives up", folder=None)
     assert parts.method == "pieces"
     assert ConvexHull(parts.clouds[0]).volume == pytest.approx(0.2 * 0.2 * 0.05, rel=1e-6)
 
 
-def slow_mesh(monkeypatch):
-    """An open tray, cut so finely that CoACD takes minutes, with a second of processor time for it."""
+def test_a_mesh_whose_parts_take_too_much_processor_time_is_refused_and_the_refusal_is_kept(monkeypatch, tmp_path):
+    """So fine a cut takes CoACD minutes, and it has a second."""
     monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 1000})
     monkeypatch.setattr(module, "LONGEST_S", 1)
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    return Mesh(tray().vertices, tray().faces[2:])
-
-
-def test_a_mesh_whose_parts_take_too_much_processor_time_is_refused_and_the_refusal_is_kept(monkeypatch, tmp_path):
-    mesh = slow_mesh(monkeypatch)
     begun = module._children_s()
     with pytest.raises(MeshError, match=r"no_convex_parts: .* in 1 s of processor time") as refused:
-        decompose(mesh, "endless", folder=tmp_path)
+        decompose(OPEN_TRAY, "endless", folder=tmp_path)
     assert refused.value.kind == "intrinsic"
     assert 0.9 < module._children_s() - begun < 2.5
-    assert len(list(tmp_path.iterdir())) == 1
     monkeypatch.setattr(module, "_CACHE", PartsCache())
     monkeypatch.setattr(module, "_run", lambda *_: pytest.fail("tried once more"))
     with pytest.raises(MeshError, match="no_convex_parts"):
-        decompose(mesh, "endless", folder=tmp_path)
+        decompose(OPEN_TRAY, "endless", folder=tmp_path)
 
 
-@pytest.mark.parametrize(("code", "message"), [(3, "not installed"), (-9, "killed")])
-def test_a_machine_that_cannot_cut_is_not_taken_for_a_mesh_that_cannot_be_cut(monkeypatch, code, message):
-    monkeypatch.setattr(module.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], code))
-    with pytest.raises(MachineError, match=message):
-        decompose(angle_iron(), f"machine {code}", folder=None)
+def test_a_machine_that_cannot_cut_is_not_taken_for_a_mesh_that_cannot_be_cut(monkeypatch, tmp_path):
+    """coacd 1.0.14 without its library is imported, and fails at its first call."""
+    (tmp_path / "coacd.py").write_text("def set_log_level(level):\n    _lib.CoACD_setLogLevel(level)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(MachineError, match="`coacd` is not installed, or cannot be loaded"):
+        decompose(angle_iron(), "without its library", folder=None)
+    monkeypatch.setattr(module.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], -9))
+    with pytest.raises(MachineError, match="killed from outside"):
+        decompose(angle_iron(), "killed", folder=None)
+
+
+def test_parts_come_from_memory_then_from_the_folder_and_a_torn_file_is_made_again(tmp_path, monkeypatch):
+    made = decompose(angle_iron(), "kept", folder=tmp_path)
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_run", lambda *_: pytest.fail("made once more"))
+        assert digest_of(decompose(angle_iron(), "kept", folder=None)) == digest_of(made), "from memory"
+        patch.setattr(module, "_CACHE", PartsCache())
+        again = decompose(angle_iron(), "kept", folder=tmp_path)
+        assert (again.method, digest_of(again)) == (made.method, digest_of(made))
+        assert not again.clouds[0].flags.writeable
+    for torn in (whole[:-7], b"", whole[:60] + b"x" + whole[61:]):
+        path.write_bytes(torn)
+        monkeypatch.setattr(module, "_CACHE", PartsCache())
+        assert digest_of(decompose(angle_iron(), "kept", folder=tmp_path)) == digest_of(made)
+        assert path.read_bytes() == whole
+
+
+def test_memory_is_bounded_and_the_latest_stay():
+    cache, made = PartsCache(capacity_bytes=100), []
+    for key in ("a", "b", "c", "b", "c", "a", "large", "large"):
+        cloud = np.zeros((9 if key == "large" else 2, 3))
+        cache.get(key, None, lambda key=key, cloud=cloud: made.append(key) or Parts((cloud,), "convex"))
+    assert made == ["a", "b", "c", "a", "large", "large"]
 
 
 SCRIPT = """
 import os, sys, hashlib
 os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[: int(sys.argv[1])]))
-import numpy as np
-from schemas.scene.shape import Mesh
 from schemas.job.assets import ProceduralSource
 from workers.assets.builtin.make import make_asset
 from workers.physics.convex_parts import decompose

@@ -75,8 +75,6 @@ def pixel_of(point: Array, view: Camera) -> tuple[float, float]:
 MITSUBA = importlib.util.find_spec("mitsuba") is not None
 traced = pytest.mark.skipif(not MITSUBA, reason="Mitsuba is not installed: the path-traced tier goes untested")
 
-OVERHEAD = Light(frozen_array([0.0, 0.0, 1.0]), (0.7, 0.7, 0.7))
-
 
 def with_material(shape: Shape, material: Material) -> Shape:
     return Shape(tuple(Part(p.name, p.vertices, p.faces, material, p.normals, p.uv, p.colors) for p in shape.parts))

@@ -170,21 +170,21 @@ def procedural_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
 def five_procedural_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
     """The same with four further objects, none within the circle about another."""
     things, height = procedural_things(rng)
-    catalogue = built_in_assets()
-    taken = [np.array([*things[2].T_world_shape[:2, 3], _reach(things[2].shape)])]
+    catalogue, taken = built_in_assets(), list[Array]()
+
+    def reach(shape: Shape) -> float:
+        return float(np.linalg.norm(shape.vertices, axis=1).max())
+
+    taken.append(np.array([*things[2].T_world_shape[:2, 3], reach(things[2].shape)]))
     while len(taken) < 5:
         category = CATEGORIES[int(rng.integers(len(CATEGORIES)))]
         shape = load_asset(catalogue, choose_object(catalogue, category, rng)).shape
         turn = rotation_about(UP, rng.uniform(-np.pi, np.pi)) if rng.random() < 0.5 else uniform_rotation(rng)
-        spot, reach = rng.uniform(-0.45, 0.45, 2), _reach(shape)
-        if all(np.hypot(*(spot - other[:2])) > reach + other[2] for other in taken):
-            taken.append(np.array([*spot, reach]))
+        spot = rng.uniform(-0.45, 0.45, 2)
+        if all(np.hypot(*(spot - other[:2])) > reach(shape) + other[2] for other in taken):
+            taken.append(np.array([*spot, reach(shape)]))
             things.append(Placed(2 + len(taken), shape, stand(shape, turn, spot, height)))
     return things, height
-
-
-def _reach(shape: Shape) -> float:
-    return float(np.linalg.norm(shape.vertices, axis=1).max())
 
 
 @functools.cache

@@ -1,10 +1,7 @@
-"""Lights of the path tracer, against formulas.
-
-Materials of the path tracer: textures, glass, holes. The path tracer: the camera and its samples, against the label
-pass and against counting.
-"""
+"""The path tracer: lights and materials against formulas, its camera against the label pass, its bytes, and its tier."""
 
 import hashlib
+import importlib.util
 import subprocess
 import sys
 
@@ -13,10 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
+import workers.render.pathtraced
 from schemas.base import frozen_array
+from schemas.errors import InputError
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, Material
-from tests.workers.render.looks import BLACK, OVERHEAD, matte, paths, traced, with_material, without
+from tests.workers.render.looks import BLACK, FLAT, FOUR, RASTER, matte, paths, traced, with_material, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     EYE,
@@ -31,33 +30,23 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
-from workers.geometry.frames import invert, pose, rotation_about, translation
-from workers.render.pathtraced import (
-    encode_light,
-    lamp_directions,
-    sky_directions,
-    sky_picture,
-)
+from workers.geometry.frames import UP, invert, pose, rotation_about, translation
+from workers.render.pathtraced import draw_view, encode_light, lamp_directions, sky_directions, sky_picture
+from workers.render.tiers import require_mitsuba
 
 
 @traced
-@pytest.mark.parametrize("angle", [0.0, 0.5, 1.0])
-def test_a_lit_plane_is_as_bright_as_lambert_says(tracer, angle):
-    """albedo x irradiance / pi, that is albedo x color x cosine, to 2 %: lamps and glow together."""
-    light = Light(frozen_array([np.sin(angle), 0.0, np.cos(angle)]), (0.9, 0.8, 0.7))
+def test_a_plane_is_as_bright_as_lambert_says_under_a_lamp_and_under_a_sky(tracer):
+    """albedo x irradiance / pi, that is albedo x color x cosine, to 2 %: lamps and glow together, or the ambient light."""
+    view, ambient = camera(small(24, 24), orbit_pose(np.zeros(3), 0.8, 0.3, 2.0)), (0.4, 0.5, 0.6)
     ground = Placed(1, with_material(floor().shape, matte(0.5)), EYE)
-    view = camera(small(24, 24), orbit_pose(np.zeros(3), 0.8, 0.3, 2.0))
-    seen = tracer.radiance([ground], Appearance(BLACK, (light,), BLACK), view, *paths(16), 0)[8:16, 8:16].mean((0, 1))
-    assert seen == pytest.approx(0.5 * np.cos(angle) * np.array(light.color), rel=0.02)
-
-
-@traced
-def test_a_plane_under_an_open_sky_sees_the_ambient_light_whatever_the_skys_gradient(tracer):
-    ambient = (0.4, 0.5, 0.6)
-    ground = Placed(1, with_material(floor().shape, matte(0.5)), EYE)
-    view = camera(small(24, 24), orbit_pose(np.zeros(3), 0.8, 0.3, 2.0))
-    seen = tracer.radiance([ground], Appearance(ambient, (), BLACK), view, *paths(16), 0)[8:16, 8:16].mean((0, 1))
-    assert seen == pytest.approx(0.5 * np.array(ambient), rel=0.02)
+    looks = [(Appearance(ambient, (), BLACK), ambient)]
+    for angle in (0.0, 0.5, 1.0):
+        light = Light(frozen_array([np.sin(angle), 0.0, np.cos(angle)]), (0.9, 0.8, 0.7))
+        looks.append((Appearance(BLACK, (light,), BLACK), np.cos(angle) * np.array(light.color)))
+    for look, expected in looks:
+        seen = tracer.radiance([ground], look, view, *paths(16), 0)[8:16, 8:16].mean((0, 1))
+        assert seen == pytest.approx(0.5 * np.array(expected), rel=0.02)
 
 
 def test_lamps_lie_evenly_on_the_disc_and_the_sky_is_as_strong_as_the_lights_say():
@@ -67,9 +56,7 @@ def test_lamps_lie_evenly_on_the_disc_and_the_sky_is_as_strong_as_the_lights_say
     assert np.arccos((spread @ towards).min()) == pytest.approx(0.03, rel=0.03)
     directions = sky_directions((np.arange(64) + 0.5) / 64)
     fill = Light(frozen_array([0.6, 0.0, 0.8]), (0.3, 0.3, 0.3))
-    picture = sky_picture(Appearance(BLACK, (Light(frozen_array([0.0, 0.0, 1.0]), BLACK), fill), BLACK), directions)[
-        ..., 0
-    ]
+    picture = sky_picture(Appearance(BLACK, (Light(frozen_array(UP), BLACK), fill), BLACK), directions)[..., 0]
     height, width = picture.shape
     cell = np.sqrt(1.0 - directions[..., 2] ** 2) * (2 * np.pi / width) * (np.pi / height)
     received = (picture * np.maximum(directions @ fill.direction, 0.0) * cell).sum()
@@ -77,31 +64,33 @@ def test_lamps_lie_evenly_on_the_disc_and_the_sky_is_as_strong_as_the_lights_say
     assert (directions[height // 4, picture[height // 4].argmax()] @ fill.direction) > 0.97
 
 
-RED = Material((0.9, 0.05, 0.05, 1.0), roughness=1.0)
+@traced
+def test_a_pane_of_glass_shows_what_is_behind_it_and_none_does_without_the_effect(tracer):
+    red = Material((0.9, 0.05, 0.05, 1.0), roughness=1.0)
+    wall = Placed(3, with_material(facing(3.0, 9.0), red), EYE)
+    pane = Placed(4, with_material(facing(2.0, 4.0), Material((0.9, 0.9, 0.9, 1.0), transmission=1.0)), EYE)
+    sky, view = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8)), camera(small(9, 9))
+    clear, solid = (
+        tracer.radiance([wall, pane], sky, view, *look, 0).mean((0, 1))
+        for look in (paths(64), without(paths(64), "glass"))
+    )
+    assert clear[0] > 2.0 * clear[1]
+    assert solid[0] == pytest.approx(solid[1], rel=0.05)
 
 
-def through(tracer, material, look=None):
-    """Mean linear colour of a red wall with a pane of this material in front of it."""
-    wall = Placed(3, with_material(facing(3.0, 9.0), RED), EYE)
-    pane = Placed(4, with_material(facing(2.0, 4.0), material), EYE)
-    sky = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8))
-    return tracer.radiance([wall, pane], sky, camera(small(9, 9)), *(look or paths(64)), 0).mean((0, 1))
-
-
-def cast(tracer, things, appearance, view):
+def cast(tracer, things, view):
     """(region [H, W], z along the optical axis [H, W]) of Mitsuba's own hits at pixel centres; 0 where nothing is hit."""
     mi, k = tracer._mi, view.intrinsics
-    scene, sensor = tracer.build(things, appearance, paths(1)[1]).scene, tracer.sensor(view)
+    scene, sensor = tracer.build(things, APPEARANCE, paths(1)[1]).scene, tracer.sensor(view)
     T_cam_world = invert(view.T_world_cam)
     region, z = np.zeros((k.height, k.width), int), np.zeros((k.height, k.width))
-    for v in range(k.height):
-        for u in range(k.width):
-            at = mi.Point2f((u + 0.5) / k.width, (v + 0.5) / k.height)
-            ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5, 0.5))
-            hit = scene.ray_intersect_preliminary(ray, True)
-            if hit.is_valid():
-                region[v, u] = int(hit.shape.id().split("-")[1])
-                z[v, u] = (T_cam_world[:3, :3] @ np.array(ray(hit.t)) + T_cam_world[:3, 3])[2]
+    for v, u in np.ndindex(k.height, k.width):
+        at = mi.Point2f((u + 0.5) / k.width, (v + 0.5) / k.height)
+        ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5, 0.5))
+        hit = scene.ray_intersect_preliminary(ray, True)
+        if hit.is_valid():
+            region[v, u] = int(hit.shape.id().split("-")[1])
+            z[v, u] = (T_cam_world[:3, :3] @ np.array(ray(hit.t)) + T_cam_world[:3, 3])[2]
     return region, z
 
 
@@ -121,60 +110,55 @@ def test_mitsuba_sees_the_same_surface_through_every_pixel_at_the_same_depth(ren
     for seed in (3, 4, 6):
         rng = np.random.default_rng(700 + seed)
         things, height = procedural_things(rng) if seed % 2 else random_things(rng)
-        view = orbit_and_mirror(rng, height)[seed % 2]
-        shifted = small(120, 90, fx=131.0, fy=131.0, cx=52.3 + seed, cy=49.7)
-        view = camera(shifted, view.T_world_cam @ pose(rotation_about(np.array([0.0, 0.0, 1.0]), 0.7), np.zeros(3)))
+        rolled = orbit_and_mirror(rng, height)[seed % 2].T_world_cam @ pose(rotation_about(UP, 0.7), np.zeros(3))
+        view = camera(small(120, 90, fx=131.0, fy=131.0, cx=52.3 + seed, cy=49.7), rolled)
         labels = renderer.draw(things, APPEARANCE, view)
-        region, z = cast(tracer, things, APPEARANCE, view)
-        inside = away_from_edges(labels.region)
-        same = region == labels.region
+        region, z = cast(tracer, things, view)
+        inside, same = away_from_edges(labels.region), region == labels.region
         agree.append(same[inside])
         off_mm.append(1e3 * np.abs(z - labels.depth_m)[inside & same & (region > 0)])
         objects += int((labels.region[inside] >= REGION_FIRST_OBJECT).sum())
     share, median = float(np.concatenate(agree).mean()), float(np.median(np.concatenate(off_mm)))
     record_figure("traced silhouettes: share of pixels off an edge with the label's region", "ok", share, 0.999)
     record_figure("traced depth against the label pass, median mm", "ok", median, 0.05)
-    assert objects > 200
-    assert share > 0.999
-    assert median < 0.05
+    assert objects > 200 and share > 0.999 and median < 0.05
 
 
 @traced
-@pytest.mark.parametrize("k", [small(60, 44, cx=22.0, cy=27.0), small(60, 44, fx=30.0, fy=41.0, cx=22.0, cy=27.0)])
-def test_colour_covers_the_pixels_that_the_mask_covers(renderer, tracer, k):
+def test_colour_covers_the_pixels_that_the_mask_covers(renderer, tracer):
     """Also where pixels are not square: a white sphere off the axis before a black background."""
     ball = Placed(3, shape_of(trimesh.creation.icosphere(3, 0.5)), translation(0.3, -0.2, 2.0))
-    mask = renderer.draw([ball], WHITE, camera(k)).region > 0
     around = Appearance((1.0, 1.0, 1.0), (), BLACK, below=(1.0, 1.0, 1.0))
-    light = tracer.radiance([ball], around, camera(k), *paths(4), 0)[..., 1]
-    inside = away_from_edges(mask)
-    assert mask[inside].any()
-    assert ((light > 0.1) == mask)[inside].all()
-    assert (light[inside & ~mask] == 0.0).all()
+    for focal in ({}, {"fx": 30.0, "fy": 41.0}):
+        view = camera(small(60, 44, cx=22.0, cy=27.0, **focal))
+        mask = renderer.draw([ball], WHITE, view).region > 0
+        light, inside = tracer.radiance([ball], around, view, *paths(4), 0)[..., 1], away_from_edges(mask)
+        assert mask[inside].any() and ((light > 0.1) == mask)[inside].all()
+        assert (light[inside & ~mask] == 0.0).all()
 
 
 RUN = """
-import hashlib, numpy as np
-from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
-from tests.workers.render.looks import paths
-from workers.render.pathtraced import Tracer, encode_light
-rng = np.random.default_rng(5)
-things, height = random_things(rng)
-view = camera(small(96, 72), orbit_and_mirror(rng, height)[1].T_world_cam)
+import hashlib
+from tests.workers.render.test_pathtraced import scene_and_view, APPEARANCE, encode_light, paths
+from workers.render.pathtraced import Tracer
+things, view = scene_and_view(5, 96, 72)
 print(hashlib.sha256(encode_light(Tracer().radiance(things, APPEARANCE, view, *paths(4), 77)).tobytes()).hexdigest())
 """
 
 
+def scene_and_view(seed: int, width: int, height: int):
+    rng = np.random.default_rng(seed)
+    things, level = random_things(rng)
+    return things, camera(small(width, height), orbit_and_mirror(rng, level)[1].T_world_cam)
+
+
 @traced
 def test_the_same_seed_gives_the_same_bytes_here_and_in_another_process(tracer):
-    rng = np.random.default_rng(5)
-    things, height = random_things(rng)
-    view = camera(small(96, 72), orbit_and_mirror(rng, height)[1].T_world_cam)
+    things, view = scene_and_view(5, 96, 72)
 
     def digest(seed):
-        return hashlib.sha256(
-            encode_light(tracer.radiance(things, APPEARANCE, view, *paths(4), seed)).tobytes()
-        ).hexdigest()
+        light = tracer.radiance(things, APPEARANCE, view, *paths(4), seed)
+        return hashlib.sha256(encode_light(light).tobytes()).hexdigest()
 
     first = digest(77)
     tracer._built = None
@@ -186,9 +170,7 @@ def test_the_same_seed_gives_the_same_bytes_here_and_in_another_process(tracer):
 @traced
 def test_sixteen_samples_leave_at_most_half_the_noise_of_four(tracer):
     """Four times the samples halve the noise of independent ones; spread evenly they do better."""
-    rng = np.random.default_rng(5)
-    things, height = random_things(rng)
-    view = camera(small(48, 36), orbit_and_mirror(rng, height)[1].T_world_cam)
+    things, view = scene_and_view(5, 48, 36)
 
     def noise(samples):
         many = [tracer.radiance(things, APPEARANCE, view, *paths(samples), seed) for seed in range(6)]
@@ -199,21 +181,38 @@ def test_sixteen_samples_leave_at_most_half_the_noise_of_four(tracer):
 
 @traced
 def test_without_global_illumination_light_reaches_only_what_sees_a_lamp(tracer):
-    """A ceiling over a lit floor, seen from below: all of its light comes by way of the floor."""
+    """A ceiling over a lit floor, seen from below: all of its light comes by way of the floor, which has Lambert's brightness."""
     ceiling = Placed(3, with_material(facing(1.0, 0.5), matte(0.8)), EYE)
-    ground = Placed(1, with_material(floor().shape, matte(0.8)), EYE)
-    eye = np.eye(4)
-    eye[:3, 3] = [0.0, 0.0, 0.2]
-    look, view = Appearance(BLACK, (OVERHEAD,), BLACK), camera(small(9, 9, fx=40.0, fy=40.0), eye)
-
-    def seen(thing):
-        full, direct = (tracer.radiance([ground, ceiling], look, thing, *one, 0).mean() for one in tiers)
-        return full, direct
-
+    things = [Placed(1, with_material(floor().shape, matte(0.8)), EYE), ceiling]
+    look, k = Appearance(BLACK, (Light(frozen_array(UP), (0.7, 0.7, 0.7)),), BLACK), small(9, 9, fx=40.0, fy=40.0)
     tiers = (paths(64), without(paths(64), "global_illumination"))
-    full, direct = seen(view)
-    assert full > 0.05
-    assert direct < 1e-12
-    full, direct = seen(camera(small(9, 9, fx=40.0, fy=40.0), orbit_pose(np.array([3.0, 0.0, 0.0]), 0.9, 0.0, 2.0)))
-    assert direct == pytest.approx(0.8 * 0.7, rel=0.02), "an open floor has Lambert's brightness"
-    assert full == pytest.approx(direct, rel=0.05)
+    for T, shines in ((translation(0.0, 0.0, 0.2), 0.0), (orbit_pose(np.array([3.0, 0.0, 0.0]), 0.9, 0.0, 2.0), 0.56)):
+        full, direct = (tracer.radiance(things, look, camera(k, T), *one, 0).mean() for one in tiers)
+        assert direct == pytest.approx(shines, rel=0.02, abs=1e-12)
+        assert full == pytest.approx(direct, rel=0.05) if shines else full > 0.05
+
+
+# ---------------------------------------------------------------------------------------------- the tier
+
+
+def test_without_mitsuba_the_message_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"\./verso extra pathtraced.*render\.tier") as caught:
+        require_mitsuba()
+    assert caught.value.exit_code == 2
+
+
+@traced
+def test_labels_are_the_same_to_the_byte_in_all_tiers_and_without_rgb_nothing_is_traced(renderer, monkeypatch):
+    things, view = scene_and_view(900, 64, 48)
+
+    def drawn(look):
+        seen = draw_view(renderer, things, APPEARANCE, view, look[0], lambda: np.random.default_rng(0), look[1])
+        return seen.rgb, (seen.depth_m.tobytes(), seen.region.tobytes())
+
+    looks = (FLAT, RASTER, FOUR, paths(1))
+    coloured = [drawn(look) for look in looks]
+    monkeypatch.setattr(workers.render.pathtraced, "shared_tracer", lambda: pytest.fail("a path was traced"))
+    plain = [drawn(without(look, "rgb")) for look in looks]
+    assert len({labels for _, labels in (*coloured, *plain)}) == 1
+    assert len({rgb.tobytes() for rgb, _ in coloured}) == 4 and {rgb for rgb, _ in plain} == {None}
