@@ -121,7 +121,12 @@ def worst_medians(scenes: range, job: Job = JOB) -> tuple[float, float, float, i
 
 
 @pytest.mark.parametrize(
-    "scenes", [pytest.param(range(12), id="12"), pytest.param(range(200), id="200", marks=pytest.mark.slow)]
+    "scenes",
+    [
+        pytest.param(range(4), id="4"),
+        pytest.param(range(12), id="12", marks=pytest.mark.minute),
+        pytest.param(range(200), id="200", marks=pytest.mark.slow),
+    ],
 )
 def test_input_depth_projected_into_the_mirror_view_agrees(scenes, record_figure):
     whole, objects, as_stored, counted = worst_medians(scenes)
@@ -134,6 +139,7 @@ def test_input_depth_projected_into_the_mirror_view_agrees(scenes, record_figure
     assert objects <= MEDIAN_MM
 
 
+@pytest.mark.minute
 def test_input_depth_of_five_objects_projected_into_the_mirror_view_agrees(record_figure):
     """Both cameras see some of five objects in every scene; a single object is often seen by one camera only."""
     job = JOB.model_copy(update={"objects_per_scene": Counts(5, 5)})

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from schemas.base import Array
-from tests.hard_cases.case import SETTLE, Case
+from tests.hard_cases.case import settles
 from tests.hard_cases.drops import level
 from tests.hard_cases.groups import Group, place, prism, together
 from tests.hard_cases.measures import below, moved
@@ -80,6 +80,6 @@ def _area_and_middle(corners: Array) -> tuple[float, Array]:
 THICK_M, THIN_M = 0.035, 0.006
 
 ARCHES = (
-    Case("arch of seven, thick", SETTLE, moved(1.0), lambda: arch(7, THICK_M), tier="minute"),
-    Case("arch of seven, too thin for its thrust", SETTLE, below(0.05, 3), lambda: arch(7, THIN_M), tier="minute"),
+    settles("arch of seven, thick", moved(1.0), lambda: arch(7, THICK_M), tier="minute"),
+    settles("arch of seven, too thin for its thrust", below(0.05, 3), lambda: arch(7, THIN_M), tier="minute"),
 )

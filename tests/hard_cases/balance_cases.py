@@ -7,7 +7,7 @@ import trimesh
 
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import cube
-from tests.hard_cases.case import FALL, SETTLE, Case
+from tests.hard_cases.case import falls, settles
 from tests.hard_cases.drops import EDGE_M, Drop, Y, level, turn, with_peg
 from tests.hard_cases.groups import TOUCH_M, Group, heavy, place, prism, put, together
 from tests.hard_cases.measures import below, both, height, heights, leaning, moved, tilts
@@ -110,50 +110,39 @@ def ring_on_finger() -> Drop:
 RING_M = (0.02, 0.026)
 
 BALANCE = (
-    Case("centre of mass 1 mm inside of the table's edge", SETTLE, moved(0.3), lambda: ell_over_edge(0.001)),
-    Case("centre of mass 1 mm outside of the table's edge", FALL, None, lambda: ell_over_edge(-0.001)),
-    Case(
+    settles("centre of mass 1 mm inside of the table's edge", moved(0.3), lambda: ell_over_edge(0.001)),
+    falls("centre of mass 1 mm outside of the table's edge", lambda: ell_over_edge(-0.001)),
+    settles(
         "board's centre of mass 1 mm inside of a block's edge",
-        SETTLE,
         heights(0.05, 0.105, bound_mm=0.02),
         lambda: board_over_block(0.001),
     ),
     # Its end comes down to the table. It may lean there on the edge, 100 mm high, which its middle is beyond and so below.
-    Case(
-        "board's centre of mass 1 mm outside of a block's edge",
-        SETTLE,
-        below(0.1, 1),
-        lambda: board_over_block(-0.001),
-    ),
+    settles("board's centre of mass 1 mm outside of a block's edge", below(0.1, 1), lambda: board_over_block(-0.001)),
     *(
-        Case(
+        settles(
             f"see-saw balanced 1 mm inside of its {side} edge",
-            SETTLE,
             both(heights(STAND_M / 2, STAND_M + 0.005, bound_mm=0.02), tilts(0.0, 0.0, bound_deg=0.05)),
             partial(balanced, sign),
         )
         for side, sign in (("left", -1), ("right", 1))
     ),
     *(
-        Case(
+        settles(
             f"see-saw 1 mm outside of its {side} edge",
-            SETTLE,
             leaning(lambda: tipped_deg(STAND_M, 0.001), 1.0, body=1),
             partial(see_saw, sign),
         )
         for side, sign in (("left", -1), ("right", 1))
     ),
     # It needs a friction of 0.14 of the 0.49 that there are.
-    Case(
-        "hook with its centre of mass 4 mm beyond the edge it hangs on", SETTLE, moved(0.5), lambda: hooked(0.03, 0.02)
-    ),
+    settles("hook with its centre of mass 4 mm beyond the edge it hangs on", moved(0.5), lambda: hooked(0.03, 0.02)),
     # At 15 mm and more no friction would do.
-    Case("hook with its centre of mass 26 mm beyond the edge", FALL, None, lambda: hooked(0.03, 0.06)),
-    Case("hook with its centre of mass inside of the edge", SETTLE, moved(0.3), lambda: hooked(0.1, 0.02)),
+    falls("hook with its centre of mass 26 mm beyond the edge", lambda: hooked(0.03, 0.06)),
+    settles("hook with its centre of mass inside of the edge", moved(0.3), lambda: hooked(0.1, 0.02)),
     # As high as the ring's inner side reaches over a tongue 8 mm wide; a corner of the ring may lie on it or a side.
-    Case(
+    settles(
         "ring hung on a finger",
-        SETTLE,
         both(height(-math.sqrt(RING_M[0] ** 2 - 0.004**2), 0.3), leaning(lambda: 90.0, 2.0)),
         ring_on_finger,
     ),

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from tests.hard_cases.drops import Drop
 from tests.hard_cases.groups import Group
@@ -35,3 +36,15 @@ class Case:
     spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tier: str = ""
     again: str = ""
+
+
+def settles(
+    name: str, measure: Measure | None, make: Make, physics: dict[str, float] | None = None, **more: Any
+) -> Case:
+    """A row of what must settle."""
+    return Case(name, SETTLE, measure, make, physics or {}, **more)
+
+
+def falls(name: str, make: Make, physics: dict[str, float] | None = None, **more: Any) -> Case:
+    """A row of what must leave the table."""
+    return Case(name, FALL, None, make, physics or {}, **more)

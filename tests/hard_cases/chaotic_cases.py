@@ -102,14 +102,7 @@ NOTHING_LESS, HARDLY_LESS = 1.0, 0.95
 
 CHAOTIC = (
     # Walls 150 mm high hold twenty boxes of about 105 cm^3, 2.1 l of 13.5. The pile's own bar: 95 % certified.
-    Chaotic(
-        "pile of eight boxes",
-        HARDLY_LESS,
-        within(0.15),
-        lambda seed: pile(8, seed),
-        tier="slow",
-        first="minute",
-    ),
+    Chaotic("pile of eight boxes", HARDLY_LESS, within(0.15), lambda seed: pile(8, seed), tier="slow", first="minute"),
     Chaotic("pile of twenty boxes", HARDLY_LESS, within(0.15), lambda seed: pile(20, seed), tier="slow", first="slow"),
     # 10.5 l within walls 600 mm high, 54 l. They fall from up to 2.5 m: MuJoCo keeps all of them inside in 19 of 20 seeds, and
     # in 5 with walls of 300 mm, which the heap reaches. A crowd is not held: let go again, some slip.

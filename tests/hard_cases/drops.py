@@ -42,11 +42,7 @@ def turn(axis: Array, degrees: float) -> Array:
 
 
 def drop(
-    asset: Asset,
-    table: Table,
-    clearance_m: float = 0.005,
-    R: Array | None = None,
-    xy: tuple[float, float] = (0.0, 0.0),
+    asset: Asset, table: Table, clearance_m: float = 0.005, R: Array | None = None, xy: tuple[float, float] = (0.0, 0.0)
 ) -> Drop:
     """The centre of mass over `xy`, the lowest point `clearance_m` above what is below, as `plan.set_down` has it."""
     hull, R = convex_hull(asset.shape.vertices), np.eye(3) if R is None else R

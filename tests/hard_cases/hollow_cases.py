@@ -12,7 +12,7 @@ from schemas.base import Array
 from schemas.scene.shape import Asset
 from tests.hard_cases import outside
 from tests.hard_cases.bodies import ball, built_in
-from tests.hard_cases.case import EITHER, SETTLE, Case
+from tests.hard_cases.case import EITHER, Case, settles
 from tests.hard_cases.drops import Drop, X, level, table_of, turn
 from tests.hard_cases.groups import FREE_M, Group, heavy, in_a_bowl, in_a_tray, open_box, place, put, together
 from tests.hard_cases.measures import (
@@ -176,58 +176,39 @@ SPOONS = both(tilt(0.5), lowest_within(45.0))
 """In an upright mug, whose axis is 12 mm from the middle of its box, and whose inner radius is at most 41 mm at the rim."""
 
 HOLLOWS = (
-    Case("cube in an open box", SETTLE, heights(6.8 / 280, 0.025, bound_mm=0.02), in_a_tray),
-    Case(
+    settles("cube in an open box", heights(6.8 / 280, 0.025, bound_mm=0.02), in_a_tray),
+    settles(
         "cube in an open box from a file",
-        SETTLE,
         heights(6.8 / 280, 0.025, bound_mm=0.02),
         lambda: in_a_tray(outside.enter(outside.of(open_box().shape.mesh))),
     ),
-    Case("ball in a bowl", SETTLE, at_the_bottom(), in_a_bowl, tier="minute", again="slow"),
-    Case(
+    settles("ball in a bowl", at_the_bottom(), in_a_bowl, tier="minute", again="slow"),
+    settles(
         "ball in a bowl from a file",
-        SETTLE,
         at_the_bottom(),
         lambda: dropped_in(bowl_from_file(), ball(BALL_M, 3), 0.03),
         tier="minute",
         again="slow",
     ),
-    Case(
-        "two bowls in one another",
-        SETTLE,
-        nested_up(2),
-        lambda: nested(built_in("bowl"), 2),
-        tier="minute",
-        again="slow",
-    ),
-    Case("five bowls in one another", SETTLE, nested_up(5), lambda: nested(built_in("bowl"), 5), tier="slow"),
-    Case(
+    settles("two bowls in one another", nested_up(2), lambda: nested(built_in("bowl"), 2), tier="minute", again="slow"),
+    settles("five bowls in one another", nested_up(5), lambda: nested(built_in("bowl"), 5), tier="slow"),
+    settles(
         "two bowls from a file in one another",
-        SETTLE,
         nested_up(2),
         lambda: nested(bowl_from_file(), 2),
         tier="minute",
         again="slow",
     ),
-    Case(
-        "two mugs linked by their handles",
-        SETTLE,
-        both(tilt(0.5), apart(15.0)),
-        linked_mugs,
-        tier="minute",
-        again="slow",
-    ),
-    Case(
+    settles("two mugs linked by their handles", both(tilt(0.5), apart(15.0)), linked_mugs, tier="minute", again="slow"),
+    settles(
         "spoon in a mug from a file",
-        SETTLE,
         SPOONS,
         lambda: dropped_in(mug_from_file(), spoon(), 0.012, -0.012, turn(X, 12.0)),
         tier="minute",
         again="slow",
     ),
-    Case(
+    settles(
         "stick in a mug",
-        SETTLE,
         SPOONS,
         lambda: dropped_in(
             built_in("mug"), asset_of(box(0.006, 0.006, 0.16), mass_kg=0.005), 0.012, -0.012, turn(X, 12.0)
@@ -236,26 +217,23 @@ HOLLOWS = (
         again="slow",
     ),
     # It falls through 10 mm and lies on the table around the peg, which it can be off by no more than the slack.
-    Case(
+    settles(
         "ring over a peg",
-        SETTLE,
         both(flat(0.1), height(RING_M[2] / 2, 0.01), shift(3.1)),
         ring_over_peg,
         tier="minute",
         again="minute",
     ),
     # Steeper than friction holds at 41 degrees; the three or more points around it hold it all the same.
-    Case(
+    settles(
         "ball on a ring",
-        SETTLE,
         heights(RING_M[2] / 2, ball_on_ring_m(), bound_mm=0.1),
         lambda: dropped_in(ring(), heavy(ball(0.02), 0.05), 0.004),
         tier="minute",
         again="slow",
     ),
-    Case(
+    settles(
         "marble 3 mm inside of a bowl's rim",
-        SETTLE,
         at_the_bottom(),
         lambda: dropped_in(built_in("bowl"), heavy(ball(BALL_M, 3), 0.005), 0.079, RIM_INSIDE_M - 0.003),
         tier="minute",

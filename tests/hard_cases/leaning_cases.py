@@ -13,7 +13,7 @@ import shapely
 
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Table
-from tests.hard_cases.case import SETTLE, Case
+from tests.hard_cases.case import settles
 from tests.hard_cases.drops import Drop, Y, level, turn
 from tests.hard_cases.groups import FREE_M, LEAN_DEG, SMALL_M, Group, leaning, place, prism, put, together, tray
 from tests.hard_cases.measures import below, both, flat, heights, moved, tilts
@@ -99,38 +99,33 @@ HOUSE_STEEP_DEG, HOUSE_LOW_DEG = 62.0, 36.0
 
 
 LEANING = (
-    Case(
+    settles(
         "cube against a wall, 4 degrees inside of what friction holds",
-        SETTLE,
         at_angle(lambda: CUBE_DEG + 4.0, 1.0),
         lambda: on_a_wall((SMALL_M, SMALL_M), CUBE_DEG + 4.0),
     ),
-    Case(
+    settles(
         "cube against a wall, 4 degrees outside of what friction holds",
-        SETTLE,
         both(flat(0.1), heights(SMALL_M / 2, bound_mm=0.01)),
         lambda: on_a_wall((SMALL_M, SMALL_M), CUBE_DEG - 4.0),
     ),
-    Case(
+    settles(
         "ladder 8 degrees inside of what friction holds",
-        SETTLE,
         at_angle(lambda: THIN_DEG + 8.0, 1.0),
         lambda: on_a_wall(LADDER_M, THIN_DEG + 8.0),
     ),
-    Case(
+    settles(
         "ladder 8 degrees outside of what friction holds",
-        SETTLE,
         both(flat(0.1), heights(LADDER_M[1] / 2, bound_mm=0.01)),
         lambda: on_a_wall(LADDER_M, THIN_DEG - 8.0),
     ),
-    Case("plank leaning on a cube's edge", SETTLE, tilts(0.0, 90.0 - LEAN_DEG, bound_deg=0.1), leaning),
-    Case("two cards that lean on one another at 55 degrees", SETTLE, moved(0.5), lambda: a_frame(STEEP_DEG)),
-    Case(
+    settles("plank leaning on a cube's edge", tilts(0.0, 90.0 - LEAN_DEG, bound_deg=0.1), leaning),
+    settles("two cards that lean on one another at 55 degrees", moved(0.5), lambda: a_frame(STEEP_DEG)),
+    settles(
         "two cards that lean on one another at 32 degrees",
-        SETTLE,
         both(below(0.006, 0), below(0.006, 1)),
         lambda: a_frame(LOW_DEG),
     ),
-    Case("house of five cards at 62 degrees", SETTLE, moved(0.7), lambda: house(HOUSE_STEEP_DEG)),
-    Case("house of five cards at 36 degrees", SETTLE, below(0.02, 4), lambda: house(HOUSE_LOW_DEG)),
+    settles("house of five cards at 62 degrees", moved(0.7), lambda: house(HOUSE_STEEP_DEG)),
+    settles("house of five cards at 36 degrees", below(0.02, 4), lambda: house(HOUSE_LOW_DEG)),
 )

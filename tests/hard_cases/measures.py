@@ -40,16 +40,11 @@ class Measure:
     of: Callable[[Made, Rest], float]
 
 
-def coms(made: Made, rest: Rest) -> Array:
-    """[N, 3] metres: the centres of mass, z from the table's top."""
-    pairs = zip(made.starts, rest, strict=True)
+def coms(made: Made, rest: Rest | None = None) -> Array:
+    """[N, 3] metres: the centres of mass, z from the table's top, at rest or else where they are let go."""
+    placed: Sequence[ObjectStart | Settled] = rest or made.starts
+    pairs = zip(made.starts, placed, strict=True)
     found = [transform(each.T_world_obj, start.asset.mass.com[None, :])[0] for start, each in pairs]
-    return np.array(found) - [0.0, 0.0, made.table.top.height_m]
-
-
-def coms_at_release(made: Made) -> Array:
-    """[N, 3] metres: the same where they are let go."""
-    found = [transform(start.T_world_obj, start.asset.mass.com[None, :])[0] for start in made.starts]
     return np.array(found) - [0.0, 0.0, made.table.top.height_m]
 
 
@@ -130,7 +125,7 @@ def shift(bound_mm: float, body: int = 0) -> Measure:
     """How far the centre of mass went sideways."""
 
     def off(made: Made, rest: Rest) -> float:
-        return float(np.linalg.norm((coms(made, rest) - coms_at_release(made))[body, :2])) * 1e3
+        return float(np.linalg.norm((coms(made, rest) - coms(made))[body, :2])) * 1e3
 
     return Measure("sideways from the start, mm", bound_mm, off)
 
@@ -139,7 +134,7 @@ def apart(bound_mm: float) -> Measure:
     """How far the farthest went sideways from where it was let go."""
 
     def farthest(made: Made, rest: Rest) -> float:
-        return float(np.linalg.norm((coms(made, rest) - coms_at_release(made))[:, :2], axis=1).max()) * 1e3
+        return float(np.linalg.norm((coms(made, rest) - coms(made))[:, :2], axis=1).max()) * 1e3
 
     return Measure("farthest sideways from the start, mm", bound_mm, farthest)
 
@@ -148,7 +143,7 @@ def moved(bound_mm: float) -> Measure:
     """How far the centre of mass that moved most is from where it was let go, any way."""
 
     def farthest(made: Made, rest: Rest) -> float:
-        return float(np.linalg.norm(coms(made, rest) - coms_at_release(made), axis=1).max()) * 1e3
+        return float(np.linalg.norm(coms(made, rest) - coms(made), axis=1).max()) * 1e3
 
     return Measure("farthest from the start, mm", bound_mm, farthest)
 
@@ -156,9 +151,7 @@ def moved(bound_mm: float) -> Measure:
 def height(expected_m: float, bound_mm: float, body: int = 0) -> Measure:
     """How far the centre of mass is from the height above the table's top at which it must be."""
     return Measure(
-        "height off what it must be, mm",
-        bound_mm,
-        lambda made, rest: abs(coms(made, rest)[body, 2] - expected_m) * 1e3,
+        "height off what it must be, mm", bound_mm, lambda made, rest: abs(coms(made, rest)[body, 2] - expected_m) * 1e3
     )
 
 

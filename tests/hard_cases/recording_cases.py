@@ -49,19 +49,16 @@ class RecordingCase:
     told: Check = lambda made: None
 
 
-def import_made(data: bytes, folder: Path) -> tuple[Imported, Path]:
-    (folder / "recording.mkv").write_bytes(data)
-    out = folder / "capture"
+def worst_table_mm(case: RecordingCase, folder: Path) -> float:
+    """Largest error of depth on the table, over all views, mm; the sphere with its surroundings left out. Checks what is told."""
+    (folder / "recording.mkv").write_bytes(case.make())
+    out, worst = folder / "capture", 0.0
     out.mkdir()
-    return import_recording(folder / "recording.mkv", out, CaptureFile(name="case"), Board(), 40), out
-
-
-def worst_table_mm(made: Imported, out: Path) -> float:
-    """Largest error of depth on the table, over all views, mm; the sphere with its surroundings left out."""
-    capture, worst = open_folder(out), 0.0
+    made = import_recording(folder / "recording.mkv", out, CaptureFile(name="case"), Board(), 40)
+    case.told(made)
     for view in made.views:
         frame = round((view.color_us - START_US) / PERIOD_US)
-        depth = read_view(capture, view.number).depth
+        depth = read_view(open_folder(out), view.number).depth
         assert depth is not None and (depth > 0).mean() > 0.5
         true, _ = true_depth("color", poses(COUNT)[frame])
         table = depth > 0

@@ -8,7 +8,7 @@ import math
 import trimesh
 
 from tests.hard_cases.bodies import ball, built_in, cube, globe, rod
-from tests.hard_cases.case import EITHER, FALL, SETTLE, UNDEFINED, Case
+from tests.hard_cases.case import EITHER, UNDEFINED, Case, falls, settles
 from tests.hard_cases.drops import EDGE_M, X, drop, level, slope, turn
 from tests.hard_cases.measures import Z, both, height, on_a_face, shift, tilt
 from tests.kit.shapes import asset_of, box
@@ -21,47 +21,36 @@ HALF_SIDE_MM = 33.0 * math.sin(math.pi / 48)
 of 0.7 mm times 7.5 degrees, 92 micrometres of height, and a ridge is 71 high: it stays on the side onto which it tips."""
 
 ROLLING = (
-    Case("can lying", SETTLE, on_a_face(), lambda: drop(built_in("can"), level(), R=turn(X, 90) @ turn(Z, 1))),
-    Case(
+    settles("can lying", on_a_face(), lambda: drop(built_in("can"), level(), R=turn(X, 90) @ turn(Z, 1))),
+    settles(
         "can balanced on a ridge between two of its sides",
-        SETTLE,
         both(on_a_face(), shift(HALF_SIDE_MM + 0.5)),
         lambda: drop(rod(0.033, 0.12), level(), R=turn(X, 90)),
     ),
-    Case(
+    settles(
         "can lying, axis 5 mm inside the edge",
-        SETTLE,
         both(on_a_face(), shift(HALF_SIDE_MM + 0.5)),
         lambda: drop(rod(0.033, 0.12), level(), 0.001, turn(X, 90), (EDGE_M - 0.005, 0.0)),
     ),
-    Case(
+    falls(
         "can lying, axis 2 mm outside the edge",
-        FALL,
-        None,
         lambda: drop(rod(0.033, 0.12), level(), 0.001, turn(X, 90), (EDGE_M + 0.002, 0.0)),
     ),
     # Gravity's arm is 33 mm times sin 2 degrees, 1.15 mm, and at the least 0.86 where it begins, on a side: more than 0.7.
     # It goes 0.4 m with 0.09 m/s^2, in 3 s.
-    Case(
+    falls(
         "can of 360 sides rolls off a slope of 2 degrees",
-        FALL,
-        None,
         lambda: drop(rod(0.033, 0.12, 360), slope(2.0), 0.001, turn(X, 90), (0.3, 0.0)),
         tier="minute",
     ),
     # The drop leaves it over a corner, which is 32 micrometres above a face and 24 above an edge. Rolling friction stops it
     # within 1 mm; 20 are for where the landing may send it.
-    Case(
-        "ball on a level, friction",
-        SETTLE,
-        both(on_a_face(), shift(20.0)),
-        lambda: drop(ball(0.04), level()),
-        again="minute",
+    settles(
+        "ball on a level, friction", both(on_a_face(), shift(20.0)), lambda: drop(ball(0.04), level()), again="minute"
     ),
     # No force acts sideways. It rocks, and loses 0.6 % of that at each face.
-    Case(
+    settles(
         "ball on a level, no friction",
-        SETTLE,
         both(on_a_face(), shift(0.1)),
         lambda: drop(ball(0.04), level()),
         SMOOTH,
@@ -78,26 +67,21 @@ ROLLING = (
         tier="minute",
     ),
     # Its meridians are 1 degree apart: it stands on none of them on a slope over half a degree. It goes 0.15 m in 1.6 s.
-    Case(
+    falls(
         "ball on a slope of 1 degree, friction",
-        FALL,
-        None,
         lambda: drop(globe(0.04), slope(1.0), 0.001, turn(X, 90), (0.55, 0.0)),
         NO_ROLLING,
         tier="minute",
     ),
     # It slides: 0.3 m with 0.17 m/s^2.
-    Case(
+    falls(
         "ball on a slope of 1 degree, no friction",
-        FALL,
-        None,
         lambda: drop(ball(0.04), slope(1.0), 0.001, xy=(0.4, 0.0)),
         SMOOTH,
         tier="minute",
     ),
-    Case(
+    settles(
         "ball on a slope of 1 degree, rolling friction of 5 mm",
-        SETTLE,
         shift(20.0),
         lambda: drop(ball(0.04), slope(1.0), 0.001),
         {"rolling_friction": 0.005},
@@ -106,42 +90,36 @@ ROLLING = (
 )
 
 SPINS = (
-    Case(
+    settles(
         "cube spun at 50 rad/s on a level",
-        SETTLE,
         both(tilt(0.1), height(0.05, 0.01)),
         lambda: drop(cube(), level()),
         spin=(0.0, 0.0, 50.0),
     ),
-    Case(
+    settles(
         "cube spun at 200 rad/s on a level",
-        SETTLE,
         both(tilt(0.1), height(0.05, 0.01)),
         lambda: drop(cube(), level()),
         spin=(0.0, 0.0, 200.0),
     ),
     *(
-        Case(
+        settles(
             f"can spun upright at {rad_s:g} rad/s",
-            SETTLE,
             both(tilt(0.1), height(0.06, 0.01)),
             lambda: drop(rod(0.033, 0.12), level()),
             spin=(0.0, 0.0, rad_s),
         )
         for rad_s in (50.0, 200.0)
     ),
-    Case(
+    settles(
         "can spun lying at 50 rad/s",
-        SETTLE,
         on_a_face(),
         lambda: drop(rod(0.033, 0.12), level(), R=turn(X, 90)),
         spin=(0.0, 0.0, 50.0),
     ),
     # It slides until it rolls, at a third of 50 rad/s times 33 mm: rolling friction would stop it after 1.1 m.
-    Case(
+    falls(
         "can of 360 sides spun about its axis at 50 rad/s",
-        FALL,
-        None,
         lambda: drop(rod(0.033, 0.12, 360), level(), R=turn(X, 90), xy=(0.4, 0.0)),
         spin=(0.0, 50.0, 0.0),
         again="minute",
@@ -170,9 +148,8 @@ SPINS = (
     ),
     # A solid cone 30 mm wide and high sleeps on its tip above 90 rad/s: 2 sqrt(m g l I) / I3. The arm of 0.7 mm slows it by
     # 26 rad/s^2, and below that it falls over and lies.
-    Case(
+    settles(
         "top spun at 150 rad/s on its tip, 1 degree aside",
-        SETTLE,
         on_a_face(),
         lambda: drop(asset_of(trimesh.creation.cone(0.03, 0.03, sections=64)), level(), 0.0002, turn(X, 181)),
         spin=(0.0, 0.0, 150.0),

@@ -9,7 +9,7 @@ from schemas.base import Array
 from schemas.scene.scene import Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, cube, rod
-from tests.hard_cases.case import SETTLE, Case
+from tests.hard_cases.case import settles
 from tests.hard_cases.drops import EDGE_M, Drop, X, Y, level, table_of, turn
 from tests.hard_cases.groups import FREE_M, Group, place, prism, put, together
 from tests.hard_cases.measures import Z, below, both, height, leaning, moved
@@ -73,9 +73,8 @@ def slides_to_m(turned_deg: float, angle_deg: float = 27.5, half_m: float = 0.02
 
 SLOPES = (
     *(
-        Case(
+        settles(
             f"cube on a wedge of 25 degrees{how}",
-            SETTLE,
             both(moved(0.4), leaning(lambda: 25.0, 0.05, body=1)),
             partial(lambda turned: on_wedge(cube(0.05), 25.0, turned), turned),
         )
@@ -83,50 +82,43 @@ SLOPES = (
     ),
     # It slides with g (sin - 0.49 cos) = 0.27 m/s^2, down to the table, and may turn on its face while it does.
     *(
-        Case(
+        settles(
             f"cube on a wedge of 27.5 degrees{how}",
-            SETTLE,
             below(slides_to_m(45.0) + 0.001, 1),
             partial(lambda turned: on_wedge(cube(0.05), 27.5, turned), turned),
         )
         for how, turned in (("", 0.0), (", turned by 30 degrees", 30.0))
     ),
     # A column 20 mm wide and 66 high tips at atan (20 / 66) = 16.9 degrees, long before it slides.
-    Case(
+    settles(
         "column on a wedge of 15 degrees, of 16.9",
-        SETTLE,
         leaning(lambda: 15.0, 0.05, body=1),
         lambda: on_wedge(asset_of(box(0.02, 0.05, 0.066)), 15.0),
     ),
-    Case(
+    settles(
         "column on a wedge of 18.5 degrees, of 16.9",
-        SETTLE,
         below(0.06, 1),
         lambda: on_wedge(asset_of(box(0.02, 0.05, 0.066)), 18.5),
     ),
-    Case(
+    settles(
         "cylinder in a groove",
-        SETTLE,
         both(height(over_groove_m(0.02), 0.02), leaning(lambda: 90.0, 0.05)),
         lambda: in_groove(rod(0.02, 0.1, 360), turn(X, 90), ROUND_M),
     ),
-    Case(
+    settles(
         "cylinder let go across a groove at 10 degrees",
-        SETTLE,
         both(height(over_groove_m(0.02), 0.02), leaning(lambda: 90.0, 0.05)),
         lambda: in_groove(rod(0.02, 0.1, 360), turn(Z, 10) @ turn(X, 90), 0.021),
     ),
     # A cube on its edge fits the groove: both lower sides lie flat on it. Half its diagonal is over the groove's bottom.
-    Case(
+    settles(
         "cube on its edge in a groove",
-        SETTLE,
         both(height(over_groove_m(0.02), 0.02), leaning(lambda: 45.0, 0.05)),
         lambda: in_groove(cube(0.04), turn(Y, 45), 0.0),
     ),
     # A ball's faces lie up to 32 micrometres within its sphere of 40 mm. It may roll along the groove.
-    Case(
+    settles(
         "ball in a groove",
-        SETTLE,
         height(over_groove_m(0.02), 0.1),
         lambda: in_groove(ball(0.02), turn(X, 0), ROUND_M),
         tier="minute",

@@ -4,7 +4,7 @@ import math
 from functools import partial
 
 from tests.hard_cases.bodies import ball, cube
-from tests.hard_cases.case import SETTLE, Case
+from tests.hard_cases.case import settles
 from tests.hard_cases.drops import Y, level, turn
 from tests.hard_cases.groups import (
     DOMINO_M,
@@ -92,80 +92,54 @@ def sandwich(top_kg: float, middle_kg: float) -> Group:
 
 
 STACKS = (
-    Case(
+    settles(
         "cube of 10 g on one of 10 kg",
-        SETTLE,
         heights(0.03, 0.09, bound_mm=0.02),
         lambda: stack(heavy(cube(0.06), 10.0), heavy(cube(0.06), 0.01)),
     ),
-    Case(
+    settles(
         "cube of 10 kg on one of 10 g",
-        SETTLE,
         heights(0.03, 0.09, bound_mm=0.02),
         lambda: stack(heavy(cube(0.06), 0.01), heavy(cube(0.06), 10.0)),
         again="slow",
     ),
-    Case(
-        "cube of 10 g between two of 10 kg",
-        SETTLE,
-        cubes_up(3),
-        lambda: sandwich(10.0, 0.01),
-        tier="minute",
-        again="slow",
+    settles(
+        "cube of 10 g between two of 10 kg", cubes_up(3), lambda: sandwich(10.0, 0.01), tier="minute", again="slow"
     ),
-    Case(
-        "cube of 10 kg between two of 10 g",
-        SETTLE,
-        cubes_up(3),
-        lambda: sandwich(0.01, 10.0),
-        tier="minute",
-        again="slow",
+    settles(
+        "cube of 10 kg between two of 10 g", cubes_up(3), lambda: sandwich(0.01, 10.0), tier="minute", again="slow"
     ),
-    Case("stack of ten cubes", SETTLE, cubes_up(10), lambda: stack(*[cube(S)] * 10), again="slow"),
-    Case(
+    settles("stack of ten cubes", cubes_up(10), lambda: stack(*[cube(S)] * 10), again="slow"),
+    settles(
         "stack of ten cubes, each turned by 7 degrees",
-        SETTLE,
         cubes_up(10),
         lambda: stack(*[cube(S)] * 10, turned_deg=7.0),
         again="slow",
     ),
     # Every cube's centre is over the middle of the one below, as at any height.
-    Case("stack of twenty-five cubes", SETTLE, cubes_up(25), lambda: stack(*[cube(S)] * 25), tier="slow", again="slow"),
-    Case(
+    settles("stack of twenty-five cubes", cubes_up(25), lambda: stack(*[cube(S)] * 25), tier="slow", again="slow"),
+    settles(
         "four bricks over one another by 95 % of what balances",
-        SETTLE,
         heights(*(0.03 * k + 0.015 for k in range(4))),
         lambda: stairs(0.95),
     ),
-    Case("four bricks over one another by 105 % of what balances", SETTLE, below(0.09, 3), lambda: stairs(1.05)),
-    Case(
-        "six cubes in a pyramid",
-        SETTLE,
-        heights(*[S / 2] * 3, *[1.5 * S] * 2, 2.5 * S, bound_mm=0.05),
-        pyramid_of_cubes,
-    ),
-    Case("five balls in a pyramid in a tray", SETTLE, balls_up(2), partial(pyramid_of_balls, 2)),
-    Case("fourteen balls in a pyramid in a tray", SETTLE, balls_up(3), partial(pyramid_of_balls, 3), tier="minute"),
-    Case("row of six dominoes", SETTLE, tilts(*[0.0] * 6, bound_deg=0.1), lambda: dominoes(6, 0.0)),
+    settles("four bricks over one another by 105 % of what balances", below(0.09, 3), lambda: stairs(1.05)),
+    settles("six cubes in a pyramid", heights(*[S / 2] * 3, *[1.5 * S] * 2, 2.5 * S, bound_mm=0.05), pyramid_of_cubes),
+    settles("five balls in a pyramid in a tray", balls_up(2), partial(pyramid_of_balls, 2)),
+    settles("fourteen balls in a pyramid in a tray", balls_up(3), partial(pyramid_of_balls, 3), tier="minute"),
+    settles("row of six dominoes", tilts(*[0.0] * 6, bound_deg=0.1), lambda: dominoes(6, 0.0)),
     # The last lies flat, and each before it leans on the next: all have gone beyond 45 degrees.
-    Case(
+    settles(
         "row of six dominoes, the first leaning 14 of 8.9 degrees",
-        SETTLE,
         tilts(*[67.5] * 5, 90.0, bound_deg=22.5),
         lambda: dominoes(6, 14.0),
     ),
-    Case(
+    settles(
         "row of six dominoes, the first leaning 8 of 8.9 degrees",
-        SETTLE,
         tilts(*[0.0] * 6, bound_deg=0.1),
         lambda: dominoes(6, 8.0),
     ),
-    Case(
-        "a domino falls short of the next",
-        SETTLE,
-        tilts(90.0, 0.0, 0.0, 0.0, bound_deg=0.1),
-        far_dominoes,
-    ),
-    Case("board on two cubes", SETTLE, heights(S / 2, S / 2, S + 0.005, bound_mm=0.02), lintel),
-    Case("cube of 50 mm from 300 mm onto one of 100 mm", SETTLE, heights(0.05, 0.125, bound_mm=0.02), onto_another),
+    settles("a domino falls short of the next", tilts(90.0, 0.0, 0.0, 0.0, bound_deg=0.1), far_dominoes),
+    settles("board on two cubes", heights(S / 2, S / 2, S + 0.005, bound_mm=0.02), lintel),
+    settles("cube of 50 mm from 300 mm onto one of 100 mm", heights(0.05, 0.125, bound_mm=0.02), onto_another),
 )

@@ -7,26 +7,23 @@ import trimesh
 
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import built_in, cube, laptop_angles, laptop_leaning, rod
-from tests.hard_cases.case import EITHER, SETTLE, Case
+from tests.hard_cases.case import EITHER, Case, settles
 from tests.hard_cases.drops import X, Y, drop, level, ring, turn
 from tests.hard_cases.measures import Z, both, flat, height, leaning, on_a_face, shift, tilt
 from tests.kit.shapes import asset_of
 
 HIGH = (
-    Case("cube from 1 m", SETTLE, both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level(), 1.0)),
-    Case("cube from 5 m", SETTLE, both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level(), 5.0)),
-    Case(
-        "tumbled mug from 1 m",
-        SETTLE,
-        on_a_face(),
-        lambda: drop(built_in("mug"), level(), 1.0, turn(X, 130) @ turn(Y, 40)),
+    settles("cube from 1 m", both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level(), 1.0)),
+    settles("cube from 5 m", both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level(), 5.0)),
+    settles(
+        "tumbled mug from 1 m", on_a_face(), lambda: drop(built_in("mug"), level(), 1.0, turn(X, 130) @ turn(Y, 40))
     ),
-    Case("cube from 1 m on a ring", SETTLE, tilt(0.1), lambda: drop(cube(), ring(), 1.0, xy=(0.45, 0.0))),
-    Case("cube from 5 m on a ring", SETTLE, tilt(0.1), lambda: drop(cube(), ring(), 5.0, xy=(0.45, 0.0))),
+    settles("cube from 1 m on a ring", tilt(0.1), lambda: drop(cube(), ring(), 1.0, xy=(0.45, 0.0))),
+    settles("cube from 5 m on a ring", tilt(0.1), lambda: drop(cube(), ring(), 5.0, xy=(0.45, 0.0))),
 )
 
 VESSELS = tuple(
-    Case(f"{category} {way}", SETTLE, measure, partial(lambda c, R: drop(built_in(c), level(), R=R), category, R))
+    settles(f"{category} {way}", measure, partial(lambda c, R: drop(built_in(c), level(), R=R), category, R))
     for category in ("mug", "bowl", "jar")
     for way, measure, R in (
         ("upside down", leaning(lambda: 180.0, 0.1), turn(X, 180)),
@@ -56,25 +53,18 @@ def cone_lies_deg() -> float:
 
 
 TIPPING = (
-    Case("open laptop 2 degrees before it tips over", SETTLE, tilt(0.1), lambda: laptop_leaning(-2.0), again="minute"),
-    Case(
+    settles("open laptop 2 degrees before it tips over", tilt(0.1), lambda: laptop_leaning(-2.0), again="minute"),
+    settles(
         "open laptop 2 degrees after it tips over",
-        SETTLE,
         leaning(lambda: laptop_angles()[1], 1.0),
         lambda: laptop_leaning(2.0),
         again="minute",
     ),
-    Case("bottle upright", SETTLE, tilt(0.1), lambda: drop(built_in("bottle"), level())),
-    Case("tall thin rod upright", SETTLE, tilt(0.1), lambda: drop(rod(0.01, 0.3), level())),
-    Case(
-        "tall thin rod at 2 of 3.8 degrees",
-        SETTLE,
-        tilt(0.1),
-        lambda: drop(rod(0.01, 0.3), level(), 0.0002, turn(X, 2)),
-    ),
-    Case(
+    settles("bottle upright", tilt(0.1), lambda: drop(built_in("bottle"), level())),
+    settles("tall thin rod upright", tilt(0.1), lambda: drop(rod(0.01, 0.3), level())),
+    settles("tall thin rod at 2 of 3.8 degrees", tilt(0.1), lambda: drop(rod(0.01, 0.3), level(), 0.0002, turn(X, 2))),
+    settles(
         "tall thin rod at 5 of 3.8 degrees",
-        SETTLE,
         both(leaning(lambda: 90.0, 0.1), height(0.01 * math.cos(math.pi / 48), 0.01)),
         lambda: drop(rod(0.01, 0.3), level(), 0.0002, turn(X, 5) @ turn(Z, 1)),
     ),
@@ -82,17 +72,15 @@ TIPPING = (
     Case(
         "coin on its edge", EITHER, on_a_face(), lambda: drop(rod(0.012, 0.002), level(), R=turn(X, 90) @ turn(Z, 3.75))
     ),
-    Case(
+    settles(
         "coin leaning 10 of 4.8 degrees",
-        SETTLE,
         both(flat(0.1), height(0.001, 0.01)),
         lambda: drop(rod(0.012, 0.002), level(), 0.0002, turn(X, 80)),
     ),
-    Case(
+    settles(
         "cone on its tip, 1 degree aside",
-        SETTLE,
         leaning(cone_lies_deg, 0.1),
         lambda: drop(cone(), level(), 0.0002, turn(X, 181)),
     ),
-    Case("cone on its base", SETTLE, both(tilt(0.1), height(0.015, 0.01)), lambda: drop(cone(), level())),
+    settles("cone on its base", both(tilt(0.1), height(0.015, 0.01)), lambda: drop(cone(), level())),
 )

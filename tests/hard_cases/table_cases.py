@@ -3,7 +3,7 @@
 import math
 
 from tests.hard_cases.bodies import ball, built_in, cube, handle_reach, mug_handle_over_edge, mug_on_peg, over_edge
-from tests.hard_cases.case import EITHER, FALL, SETTLE, Case
+from tests.hard_cases.case import EITHER, Case, falls, settles
 from tests.hard_cases.drops import (
     EDGE_M,
     X,
@@ -34,38 +34,30 @@ def hung_by_its_handle() -> Measure:
 
 
 EDGES = (
-    Case("cube over the edge by 49 %", SETTLE, both(tilt(0.1), shift(0.1)), lambda: over_edge(0.49)),
+    settles("cube over the edge by 49 %", both(tilt(0.1), shift(0.1)), lambda: over_edge(0.49)),
     Case("cube over the edge by 50 %", EITHER, tilt(0.1), lambda: over_edge(0.50)),
-    Case("cube over the edge by 51 %", FALL, None, lambda: over_edge(0.51)),
-    Case("mug hung by its handle on a peg at the edge", SETTLE, hung_by_its_handle(), mug_on_peg, again="minute"),
-    Case("mug with nothing but its handle over the edge", FALL, None, mug_handle_over_edge),
-    Case(
-        "cube over the edge of a sheet by 40 %",
-        SETTLE,
-        tilt(0.1),
-        lambda: drop(cube(), sheet(), xy=(EDGE_M - 0.01, 0.0)),
-    ),
+    falls("cube over the edge by 51 %", lambda: over_edge(0.51)),
+    settles("mug hung by its handle on a peg at the edge", hung_by_its_handle(), mug_on_peg, again="minute"),
+    falls("mug with nothing but its handle over the edge", mug_handle_over_edge),
+    settles("cube over the edge of a sheet by 40 %", tilt(0.1), lambda: drop(cube(), sheet(), xy=(EDGE_M - 0.01, 0.0))),
 )
 
 TABLES = (
-    Case("cube bridging a hole of 60 mm", SETTLE, tilt(0.1), lambda: drop(cube(), with_hole(0.06))),
-    Case("plate bridging a hole of 195 mm", SETTLE, height(0.00025, 0.01), lambda: drop(plate(), with_hole(0.195))),
-    Case("cube of 50 mm over a hole of 60 mm", FALL, None, lambda: drop(cube(0.05), with_hole(0.06))),
-    Case("cube on a ring", SETTLE, tilt(0.1), lambda: drop(cube(), ring(), xy=(0.45, 0.0))),
-    Case("cube over a ring's hole", FALL, None, lambda: drop(cube(), ring())),
-    Case(
+    settles("cube bridging a hole of 60 mm", tilt(0.1), lambda: drop(cube(), with_hole(0.06))),
+    settles("plate bridging a hole of 195 mm", height(0.00025, 0.01), lambda: drop(plate(), with_hole(0.195))),
+    falls("cube of 50 mm over a hole of 60 mm", lambda: drop(cube(0.05), with_hole(0.06))),
+    settles("cube on a ring", tilt(0.1), lambda: drop(cube(), ring(), xy=(0.45, 0.0))),
+    falls("cube over a ring's hole", lambda: drop(cube(), ring())),
+    settles(
         "cube of 150 mm on a raised ring",
-        SETTLE,
         height(0.08, 0.01),
         lambda: drop(cube(0.15), with_raised_ring()),
         again="minute",
     ),
-    Case("cube inside a raised ring", SETTLE, height(0.02, 0.01), lambda: drop(cube(0.04), with_raised_ring())),
-    Case("cube on a sheet without thickness", SETTLE, tilt(0.1), lambda: drop(cube(), sheet())),
-    Case("cube on a slope of 1 degree", SETTLE, leaning(lambda: 1.0, 0.1), lambda: drop(cube(), slope(1.0))),
-    Case(
-        "cube that begins 10 mm inside the table", SETTLE, tilt(1.0), lambda: lowered(drop(cube(), level(), 0.0), 0.01)
-    ),
+    settles("cube inside a raised ring", height(0.02, 0.01), lambda: drop(cube(0.04), with_raised_ring())),
+    settles("cube on a sheet without thickness", tilt(0.1), lambda: drop(cube(), sheet())),
+    settles("cube on a slope of 1 degree", leaning(lambda: 1.0, 0.1), lambda: drop(cube(), slope(1.0))),
+    settles("cube that begins 10 mm inside the table", tilt(1.0), lambda: lowered(drop(cube(), level(), 0.0), 0.01)),
     Case(
         "cube of 20 mm that begins within the table",
         EITHER,
@@ -75,46 +67,35 @@ TABLES = (
 )
 
 SURFACES = (
-    Case("cube, friction 0", SETTLE, both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level()), SMOOTH),
-    Case("cube, friction 2", SETTLE, both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level()), {"friction": 2.0}),
-    Case(
+    settles("cube, friction 0", both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level()), SMOOTH),
+    settles("cube, friction 2", both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level()), {"friction": 2.0}),
+    settles(
         "cube at 30 degrees, friction 2",
-        SETTLE,
         both(flat(0.1), height(0.05, 0.01)),
         lambda: drop(cube(), level(), R=turn(X, 30)),
         {"friction": 2.0},
     ),
-    Case(
+    settles(
         "cube on a slope of 2.5 degrees, friction 2",
-        SETTLE,
         shift(1.0),
         lambda: drop(cube(), slope(2.5), 0.0001, turn(Y, 2.5)),
         {"friction": 2.0},
     ),
-    Case(
-        "cube on a slope of 2.5 degrees, friction 0",
-        FALL,
-        None,
-        lambda: drop(cube(), slope(2.5), xy=(0.4, 0.0)),
-        SMOOTH,
-    ),
-    Case(
+    falls("cube on a slope of 2.5 degrees, friction 0", lambda: drop(cube(), slope(2.5), xy=(0.4, 0.0)), SMOOTH),
+    settles(
         "cube from 100 mm, restitution 0",
-        SETTLE,
         both(tilt(0.1), shift(0.1)),
         lambda: drop(cube(), level(), 0.1),
         {"restitution": 0.0},
     ),
-    Case(
+    settles(
         "cube from 100 mm, restitution 0.9",
-        SETTLE,
         both(flat(0.1), height(0.05, 0.01)),
         lambda: drop(cube(), level(), 0.1),
         {"restitution": 0.9},
     ),
-    Case(
+    settles(
         "ball from 100 mm, restitution 0.9",
-        SETTLE,
         on_a_face(),
         lambda: drop(ball(0.04), level(), 0.1),
         {"restitution": 0.9},

@@ -23,7 +23,7 @@ from tests.hard_cases.leaning_cases import (
     demand,
     on_a_wall,
 )
-from tests.hard_cases.measures import coms_at_release
+from tests.hard_cases.measures import coms
 from tests.hard_cases.stack_cases import BRICK_M, stairs
 from workers.geometry.frames import transform
 
@@ -66,7 +66,7 @@ def test_a_line_of_thrust_fits_into_the_arch_that_must_stand_and_into_no_arch_as
 
 @pytest.mark.parametrize(("share", "stands"), [(0.95, True), (1.05, False)])
 def test_bricks_over_one_another_balance_on_every_edge_or_on_none(share, stands):
-    x = coms_at_release(stairs(share))[:, 0]
+    x = coms(stairs(share))[:, 0]
     margins = [x[k] + BRICK_M[0] / 2 - x[k + 1 :].mean() for k in range(3)]
     assert all((margin > 0.002) == stands and (margin < -0.002) != stands for margin in margins)
 
@@ -85,8 +85,7 @@ def volume_shared(a: ObjectStart, b: ObjectStart) -> float:
 
 
 @pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, id=case.name) for case in SEVERAL if case.outcome == SETTLE and not case.tier],
+    "case", [pytest.param(case, id=case.name) for case in SEVERAL if case.outcome == SETTLE and not case.tier]
 )
 def test_nothing_that_must_settle_begins_inside_of_something_else(case: Case):
     pairs = itertools.combinations(case.make().starts, 2)
