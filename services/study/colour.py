@@ -21,7 +21,8 @@ from schemas.scene.shape import REGION_FLOOR
 from schemas.scene.view import Camera, Intrinsics
 from services.study.rays import Box, cast_patch
 from workers.assets.appearance import draw_appearance
-from workers.render.tiers import draw_view, require_tier
+from workers.render.pathtraced import draw_view
+from workers.render.tiers import require_tier
 from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Scene

@@ -26,7 +26,7 @@ which has the share `GLOW` of the light.
 
 import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from types import ModuleType
@@ -40,11 +40,12 @@ from schemas.errors import InputError
 from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import Appearance, Light, Material, Part
-from schemas.scene.view import Camera, Intrinsics
+from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.colour import HOLE_ALPHA, SRGB_STEPS, decode_srgb, encode_codes, has_holes
 from workers.geometry.frames import transform
 from workers.render.raster.baking import LAMP_RAD
 from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
+from workers.render.raster.gbuffer import Renderer
 from workers.render.raster.lit_shaders import KNEE
 from workers.render.tiers import REMEDY, require_mitsuba
 
@@ -428,3 +429,30 @@ def _shares(count: int, step: float, fine: int) -> Array:
     edges, cells = np.arange(count + 1) * step, np.arange(fine)
     overlap = np.minimum(edges[1:, None], cells + 1.0) - np.maximum(edges[:-1, None], cells)
     return np.maximum(overlap, 0.0) / step
+
+
+SEEDS = 2**32
+"""Number of seeds that Mitsuba's samplers tell apart."""
+
+
+def draw_view(
+    renderer: Renderer,
+    things: Sequence[Placed],
+    appearance: Appearance,
+    camera: Camera,
+    render: Render,
+    rng: Callable[[], np.random.Generator],
+    effects: EffectPlan,
+) -> GBuffer:
+    """What one camera sees in any tier, with the effects of the plan. RGB is None without `rgb`.
+
+    Labels are the label pass's in all tiers; colour is drawn by the same pass or traced. `rng` makes the generator that seeds
+    the paths: a tenth of a millisecond, which tiers without paths do without.
+    """
+    drawn = renderer.draw(things, appearance, camera, render, effects)
+    if render.tier != "pathtraced" or not effects.runs("rgb"):
+        return drawn
+    seed = int(rng().integers(SEEDS))
+    rgb = encode_light(shared_tracer().radiance(things, appearance, camera, render, effects, seed))
+    rgb.setflags(write=False)
+    return replace(drawn, rgb=rgb)

@@ -17,7 +17,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
 from workers.geometry.frames import UP, half_turn, pose, translation
 from workers.geometry.pixels import dequantise_depth, quantise_depth
-from workers.render.tiers import draw_view
+from workers.render.pathtraced import draw_view
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
 from workers.scene.plan import SceneChance, Stream

@@ -42,8 +42,8 @@ from workers.geometry.colour import SRGB_STEPS, encode_codes
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.lens import opencv_lens
 from workers.geometry.zbuffer import register_depth
+from workers.render.pathtraced import draw_view
 from workers.render.raster.gbuffer import shared_renderer
-from workers.render.tiers import draw_view
 from workers.scene.plan import SceneChance, Stream
 from workers.scene.sensor import add_noise, expose, sense_depth
 
