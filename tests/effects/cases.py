@@ -44,9 +44,7 @@ ASKED: dict[str, Case] = {
     "rgb": _asked({}, {"render": {"rgb": False}}, "render.rgb is false"),
     "splat": _asked({"images": {"projection": {"splat": 3}}}, {}, "images.projection.splat is 1"),
     "hidden_point_removal": _asked(
-        {"images": {"projection": {"hidden_point_removal": True}}},
-        {},
-        "images.projection.hidden_point_removal is off",
+        {"images": {"projection": {"hidden_point_removal": True}}}, {}, "images.projection.hidden_point_removal is off"
     ),
     "shadows": _asked(RASTER, FLAT, "render.tier is flat"),
     "ambient_occlusion": _asked(RASTER, FLAT, "render.tier is flat"),

@@ -34,10 +34,7 @@ SMALL: dict[str, Any] = {
 
 ABOVE_THE_HORIZON: dict[str, Any] = {
     "categories": ["bottle"],
-    "cameras": {
-        "orbit": {"inclination_rad": [0.04, 0.04]},
-        "sensor": {"fx": 400.0, "fy": 400.0, "cy": 140.0},
-    },
+    "cameras": {"orbit": {"inclination_rad": [0.04, 0.04]}, "sensor": {"fx": 400.0, "fy": 400.0, "cy": 140.0}},
     "images": {"depth_range_m": [0.2, 3.0]},
 }
 """A camera 10 cm above the table's top whose picture begins above the horizon: it sees bottles, neither table nor floor."""

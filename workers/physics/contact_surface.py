@@ -128,7 +128,10 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     solid = normals.any(axis=1)
     faces, normals = faces[solid], normals[solid]
     edges, across, bent = _edges(vertices, faces, normals, *_half_edges(faces, len(vertices)))
-    starts, members = _star(edges, len(vertices))
+    # The neighbours of each vertex, one after the other, ascending as edges are
+    ends, others = edges[:, ::-1].T.ravel(), edges.T.ravel()
+    starts = np.append(0, np.cumsum(np.bincount(ends, minlength=len(vertices))))
+    members = others[np.argsort(ends, kind="stable")]
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
     edges, across = edges[bent], across[bent]
     return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members, mesh)
@@ -154,14 +157,6 @@ def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
     keys = edge_keys(faces, count)
     which = np.argsort(keys, kind="stable")
     return keys[which], which
-
-
-def _star(edges: Index, count: int) -> tuple[Index, Index]:
-    """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending as edges [E, 2] are."""
-    ends, others = edges[:, ::-1].T.ravel(), edges.T.ravel()
-    starts = np.zeros(count + 1, np.int64)
-    starts[1:] = np.cumsum(np.bincount(ends, minlength=count))
-    return starts, others[np.argsort(ends, kind="stable")]
 
 
 @compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], i8[::1]")

@@ -193,20 +193,16 @@ def find_table_top(shape: Shape) -> TableTop:
     area = np.bincount(inverse, weights=face_areas(vertices, level))
     top = int(np.flatnonzero(area >= TOP_SHARE * area.max()).max())
     points = vertices[numbers_in(level[inverse == top], len(vertices))]
-    return _describe(points, float(area[top]), float(vertices[:, 2].max()))
-
-
-def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
     height = float(points[:, 2].max())
     try:
         hull = ConvexHull(points[:, :2])
     except QhullError as error:
         raise StartError("no_table_top", "the table's level faces have no area: leave this table out") from error
     # A face that leans within `LEVEL` is not flat: a level plane at its highest point would not stand for it.
-    even = height - float(points[:, 2].min()) <= SAME_LEVEL_M
-    convex = even and area_m2 >= FILLED_SHARE * hull.volume and highest_m <= height + SAME_LEVEL_M
+    even = height - float(points[:, 2].min()) <= SAME_LEVEL_M and vertices[:, 2].max() <= height + SAME_LEVEL_M
+    convex = bool(even and area[top] >= FILLED_SHARE * hull.volume)
     middle = bounds_of(points[:, :2]).sum(axis=0) / 2
-    return TableTop(height, frozen_array(middle), frozen_array(points[hull.vertices, :2]), bool(convex))
+    return TableTop(height, frozen_array(middle), frozen_array(points[hull.vertices, :2]), convex)
 
 
 def place_table(asset: Asset) -> Table:
@@ -214,21 +210,16 @@ def place_table(asset: Asset) -> Table:
 
     Found once for each asset, and kept as long as that is.
     """
-    if (placed := _placed.get(asset)) is None:
-        placed = _placed[asset] = _place(asset)
-    return Table(asset, *placed)
+    if asset not in _placed:
+        top, lowest = find_table_top(asset.shape), float(asset.shape.bounds[0, 2])
+        T = translation(-top.centre[0], -top.centre[1], -lowest)
+        mesh = Mesh(frozen_array(transform(T, asset.shape.vertices)), asset.shape.faces)
+        outline, centre = frozen_array(top.outline - top.centre), frozen_array([0.0, 0.0])
+        _placed[asset] = frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex)
+    return Table(asset, *_placed[asset])
 
 
 _placed: WeakKeyDictionary[Asset, tuple[Pose, Mesh, TableTop]] = WeakKeyDictionary()
-
-
-def _place(asset: Asset) -> tuple[Pose, Mesh, TableTop]:
-    top = find_table_top(asset.shape)
-    lowest = float(asset.shape.bounds[0, 2])
-    T = translation(-top.centre[0], -top.centre[1], -lowest)
-    mesh = Mesh(frozen_array(transform(T, asset.shape.vertices)), asset.shape.faces)
-    outline, centre = frozen_array(top.outline - top.centre), frozen_array([0.0, 0.0])
-    return frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex)
 
 
 def inside_margin(points_xy: Array, outline: Array) -> Array:
