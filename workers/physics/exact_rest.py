@@ -68,7 +68,8 @@ def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall: A
     conic programs with quadratic objectives"). Its multipliers are the contact forces; where nothing moves they balance the
     weights, which is static equilibrium. Raises JammedError.
     """
-    roots = [_inverse_root(body.tensor) for body in bodies]
+    # The inverse of the square root of each tensor of inertia
+    roots = [(axes / np.sqrt(moments)) @ axes.T for moments, axes in (np.linalg.eigh(body.tensor) for body in bodies)]
     root_masses = np.sqrt([body.mass_kg for body in bodies])
     edges = _pyramid(contacts.normals, friction)
     matrix = _rows(bodies, roots, contacts, edges)
@@ -109,13 +110,6 @@ def _interior(matrix: Array, least: Array) -> tuple[Array, Array]:
     if found.status != clarabel.SolverStatus.Solved:
         raise JammedError
     return np.array(found.x), np.array(found.z)
-
-
-def _inverse_root(tensor: Array) -> Array:
-    """[3, 3]: the inverse of the square root of a tensor of inertia."""
-    moments, axes = np.linalg.eigh(tensor)
-    root: Array = (axes / np.sqrt(moments)) @ axes.T
-    return root
 
 
 def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array) -> Array:
@@ -226,7 +220,11 @@ def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, fricti
             for T, body, move, turn in zip(at, inertias, motion.moves, motion.turns, strict=True)
         )
         known_m -= share * moved_m
-        fall_m = _next_fall(fall_m, moved_m)
+        # So that bodies move by something below half of `REACH_M`
+        if moved_m > REACH_M / 2:
+            fall_m = max(FALL_M, fall_m / 2)
+        elif moved_m < REACH_M / 4:
+            fall_m = min(LONGEST_FALL_M, 2 * fall_m)
     return Rested(at, False, MOST_STEPS)
 
 
@@ -241,13 +239,6 @@ def _nudge(bodies: Sequence[Inertia], contacts: Contacts, friction: float, reach
     sides = np.array([[x, y, 0.0], [-y, x, 0.0], [-x, -y, 0.0], [y, -x, 0.0]])
     motions = [step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2) for side in sides]
     return max(motions, key=lambda motion: _farthest(motion, reaches))
-
-
-def _next_fall(fall_m: float, moved_m: float) -> float:
-    """The free fall of the next step: so that bodies move by something below half of `REACH_M`."""
-    if moved_m > REACH_M / 2:
-        return max(FALL_M, fall_m / 2)
-    return min(LONGEST_FALL_M, 2 * fall_m) if moved_m < REACH_M / 4 else fall_m
 
 
 def _moved(T: Pose, com: Array, move: Array, turn: Array) -> Pose:

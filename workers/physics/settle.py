@@ -79,7 +79,13 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
     if not drop.effects.runs("dynamics"):
         poses = tuple(start.T_world_obj for start in drop.starts)
         return _describe(_Ending(drop, _place(drop, poses, forms), poses), "placed", judged=True)
-    _require_apart(drop.starts, forms)
+    for i, j, depth_m in find_overlaps_m(forms, [start.T_world_obj for start in drop.starts]):
+        if depth_m > PLACED_M:
+            raise SettleError(
+                "objects_overlap",
+                f"regions {drop.starts[i].region_id} and {drop.starts[j].region_id} begin {depth_m * 1e3:.2f} mm inside one "
+                "another: let them go apart, or one above the other",
+            )
     if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
         return _describe(placed, _support_of(placed), judged=True)
     *earlier, last = drop.ways
@@ -113,16 +119,6 @@ def _support_of(ending: _Ending) -> SupportedBy:
 def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
     """The plan with these effects run too."""
     return dataclasses.replace(effects, ran=(*effects.ran, *names))
-
-
-def _require_apart(starts: Sequence[ObjectStart], forms: Sequence[Form]) -> None:
-    for i, j, depth_m in find_overlaps_m(forms, [start.T_world_obj for start in starts]):
-        if depth_m > PLACED_M:
-            raise SettleError(
-                "objects_overlap",
-                f"regions {starts[i].region_id} and {starts[j].region_id} begin {depth_m * 1e3:.2f} mm inside one another: let "
-                "them go apart, or one above the other",
-            )
 
 
 def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat: bool) -> _Ending | None:

@@ -34,6 +34,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import rank_filter
 
 from schemas.base import Array, Pose
 from schemas.errors import InputError
@@ -384,13 +385,9 @@ def clamp_fireflies(light: Array) -> Array:
     A path that finds the key light in a mirror leaves such a pixel; lines, edges and spots of three pixels stay.
     """
     level = light @ np.array([0.2126, 0.7152, 0.0722])
-    height, width = level.shape
-    around = np.pad(level, 1, mode="reflect" if min(height, width) > 1 else "edge")
-    first, second = np.zeros_like(level), np.zeros_like(level)
-    for v, u in ((v, u) for v in range(3) for u in range(3) if (v, u) != (1, 1)):
-        other = around[v : v + height, u : u + width]
-        np.maximum(second, np.minimum(first, other), out=second)
-        np.maximum(first, other, out=first)
+    ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+    border = "mirror" if min(level.shape) > 1 else "nearest"
+    second = rank_filter(level, -2, footprint=ring, mode=border)
     too_bright = level > FIREFLY_RATIO * second
     result = light.copy()
     result[too_bright] *= (second[too_bright] / level[too_bright])[:, None]
