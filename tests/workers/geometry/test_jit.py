@@ -26,7 +26,7 @@ def _pause(x):
 def kept(*loops): return sum(sum(loop.stats.cache_hits.values()) for loop in loops)
 """
 ONE_LOOP = "@compiled\ndef run(x):\n    return pause(x) + 1\n"
-NAMES = "abcdefgh"
+NAMES = "abcd"
 TOGETHER = (
     f"import {', '.join(NAMES)}; from a import compile_planned; print(compile_planned()); print(a.run(2), kept(a.run))"
 )
@@ -121,6 +121,7 @@ def test_processes_that_start_at_once_share_the_planned_loops_and_later_ones_rea
     assert said(start(tmp_path, program)) == ["0", "3", "1"]
 
 
+@pytest.mark.minute
 def test_what_a_killed_process_was_compiling_is_compiled_by_the_next(tmp_path):
     project(tmp_path, 0.6, **{name: ONE_LOOP.replace("compiled", 'compiled_for("i8")') for name in NAMES})
     program = TOGETHER.replace("kept(", "a.kept(")
@@ -134,6 +135,7 @@ def test_what_a_killed_process_was_compiling_is_compiled_by_the_next(tmp_path):
     assert said(start(tmp_path, program))[0] == "0"
 
 
+@pytest.mark.minute
 def test_two_processes_that_compile_one_loop_at_once_never_mix_up_its_types(tmp_path):
     project(tmp_path, 0.5, loops=ONE_LOOP)
     program = "from loops import *; print(run({0}), kept(run))"
@@ -142,6 +144,7 @@ def test_two_processes_that_compile_one_loop_at_once_never_mix_up_its_types(tmp_
     assert said(start(tmp_path, "from loops import *; print(run(2), run(2.5), kept(run))")) == ["3", "3.5", "2"]
 
 
+@pytest.mark.minute
 def test_loops_that_were_compiled_with_an_image_are_read_where_this_process_keeps_its_own_elsewhere(tmp_path):
     project(tmp_path, loops=ONE_LOOP)
     made = "import sys; from pathlib import Path; import workers.geometry.jit as jit; "
