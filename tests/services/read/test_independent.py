@@ -11,7 +11,7 @@ import services.merge.tables as tables
 import workers.geometry.camera as camera
 import workers.geometry.pixels as pixels
 import workers.geometry.projection as projection
-import workers.render.tiers as tiers
+import workers.render.pathtraced as pathtraced
 import workers.scene.labels as labels
 import workers.scene.pairs as pairs
 from schemas.dataset.shard import Fingerprint
@@ -167,7 +167,7 @@ WRONG = {
     ),
     "yaw": (camera.yaw, lambda f: lambda T: -f(T), "is not the direction from the table to the camera"),
     "half a pixel in rendering": (
-        tiers.draw_view,
+        pathtraced.draw_view,
         lambda f: lambda renderer, things, look, seen, *rest: f(renderer, things, look, shifted(seen, 0, 0.5), *rest),
         "mm off the floor's plane",
     ),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from schemas.scene.view import Camera, Intrinsics
-from tests.workers.labels.planes import HERE as PLANE_HERE
-from tests.workers.labels.planes import IMAGES, plane_view
-from tests.workers.labels.planes import THERE as PLANE_THERE
+from tests.kit.planes import HERE as PLANE_HERE
+from tests.kit.planes import IMAGES, plane_view
+from tests.kit.planes import THERE as PLANE_THERE
 from workers.geometry.camera import orbit_pose, project, unproject
 from workers.geometry.colour import decode_codes, encode_codes, encode_srgb
 from workers.geometry.frames import invert, pose, transform, uniform_rotation

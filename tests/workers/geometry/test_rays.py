@@ -26,7 +26,7 @@ from tests.workers.geometry.made_up_kinect import (
 )
 from workers.geometry.camera import look_at, orbit_pose, project
 from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
-from workers.geometry.rational_lens import project_points
+from workers.geometry.lens import project_points
 from workers.geometry.raycast import NEAR_M, cast_view, edge_distance_px, first_hit
 from workers.geometry.zbuffer import LARGEST_PX, NEAREST_M, count_covered, draw_depth, register_depth
 
