@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from schemas.environment import cache_folder
 from tests.kit.killed_runs import processes_with
 from tests.kit.network import free_port, free_ports
 
@@ -38,6 +39,7 @@ def ray_head(cores: int) -> Iterator[RayHead]:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     environment |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
     environment |= {"PYTHONPATH": str(ROOT), "HOME": str(folder), **dict([mark.split("=")])}
+    environment["NUMBA_CACHE_DIR"] = str(cache_folder("loops"))  # a new home has no compiled loops
     gcs, http, client, agent, agent_grpc = free_ports(5)
     ports = {"port": gcs, "dashboard-port": http, "ray-client-server-port": client}
     ports |= {"dashboard-agent-listen-port": agent, "dashboard-agent-grpc-port": agent_grpc}
