@@ -179,7 +179,7 @@ COOKIE = {"cookie": f"other=1; verso_1={TOKEN}"}
 OURS = ("127.0.0.1:8722", "localhost", "LocalHost:99", "lab7:8722", "[::1]:8722", "10.0.0.3", "lab7.")
 FOREIGN = (
     *("", "evil.example", "evil.example:8722", "127.0.0.1.evil.example", "localhost:80@evil", "[::1", "a:b:c"),
-    "lab7:x",
+    *("lab7:x", "evil@localhost", "lab7/x"),
 )
 ASKED = (
     *((OPEN, method, "/", {}, 405) for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "get")),
