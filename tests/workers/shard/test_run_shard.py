@@ -105,10 +105,13 @@ def test_the_next_range_is_made_while_one_at_a_time_is_committed_and_has_no_scen
 
 
 def test_a_range_that_cannot_be_committed_is_told_and_made_again_by_the_next_run(tmp_path, monkeypatch):
+    begin_scene, begun = Attempt.begin_scene, []
     with monkeypatch.context() as patch:
+        patch.setattr(Attempt, "begin_scene", lambda attempt, n: (begun.append(n), begin_scene(attempt, n)))
         patch.setattr(LocalStage, "flush", raises(MachineError("the disk is full")))
         with pytest.raises(MachineError, match="the disk is full"):
             run(tmp_path, 0, 2, 4)
+    assert begun == [0, 1, 2, 3], "no further range is begun"
     store = LocalStore(tmp_path)
     assert [store.size(commit_path(start)) for start in (0, 2, 4)] == [None] * 3
     assert [span.won for span in run(tmp_path, 0, 2).spans] == [True] * 2
