@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of
@@ -209,13 +210,19 @@ def level_pixels(vertices: Array, faces: NDArray[np.int32], box: Box, hollow: bo
     elevation = top / np.float32(size[2])
     image = cv2.resize(cv2.merge([*soft, elevation]), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
     pixels = np.full((MAP_PX, MAP_PX, 4), 255, np.uint8)
-    pixels[..., :3] = _encode_shares(np.asarray(image, np.float32))
+    _encode_shares(np.asarray(image, np.float32), pixels)
     return pixels
 
 
-def _encode_shares(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Shares of any shape, clipped to [0, 1], in 255ths."""
-    return np.rint(np.float32(255.0) * np.clip(shares, np.float32(0.0), np.float32(1.0))).astype(np.uint8)
+@compiled_for("f4[:,:,::1], u1[:,:,::1]")
+def _encode_shares(shares: NDArray[np.float32], codes: NDArray[np.uint8]) -> None:
+    """Shares [H, W, C], clipped to [0, 1], in 255ths into the first C channels of codes [H, W, D]."""
+    zero, one, most = np.float32(0.0), np.float32(1.0), np.float32(255.0)
+    for row in range(shares.shape[0]):
+        for column in range(shares.shape[1]):
+            for channel in range(shares.shape[2]):
+                share = min(max(shares[row, column, channel], zero), one)
+                codes[row, column, channel] = np.uint8(np.int32(np.rint(most * share)))
 
 
 def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Array) -> NDArray[np.uint8]:
@@ -226,23 +233,58 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     """
     low, high = level.bounds
     step = (high[:2] - low[:2]) / MAP_PX
-    x, y = (low[axis] + (np.arange(MAP_PX) + 0.5) * step[axis] for axis in (0, 1))
-    on_light = [M[0] * x + M[1] * y[:, None] + M[2] * float(low[2]) + M[3] for M in light.unit_from_world[:3]]
-    u, v, z = (place.astype(np.float32) for place in on_light)
-    side_px, half = np.float32(len(depth)), np.float32(0.5)
-    u, v = u * side_px - half, v * side_px - half
+    columns, rows = (low[axis] + (np.arange(MAP_PX) + 0.5) * step[axis] for axis in (0, 1))
+    u, v, z = _place_level(light.unit_from_world, columns, rows, float(low[2]), np.float32(len(depth)))
     nearest = np.asarray(cv2.remap(depth, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0), np.float32)
-    away_m = (z - nearest) * np.float32(light.bounds[1, 2] - light.bounds[0, 2])
-    dark = ((away_m > np.float32(BIAS_M)) & (nearest < 1.0)).astype(np.float32)  # 0 where the level itself is nearest
+    away_m, dark = _compare_depth(nearest, z, np.float32(light.bounds[1, 2] - light.bounds[0, 2]), np.float32(BIAS_M))
     farthest_m = float((high[2] - low[2]) / max(float(towards[2]), LOWEST_SINE))
     wide_px = max(0.3 * LAMP_RAD * farthest_m / float(step[0]), 1.0)
-    blurs = ((dark, 0.8), (dark, wide_px), (away_m * dark, wide_px))
-    narrow, wide, away = (np.asarray(cv2.GaussianBlur(image, (0, 0), px), np.float32) for image, px in blurs)
-    mean_m = away / np.maximum(wide, np.float32(1e-4))
-    blend = np.clip(mean_m / np.float32(farthest_m), np.float32(0.0), np.float32(1.0))
-    blend *= np.minimum(wide * np.float32(50.0), np.float32(1.0))
-    shade = np.clip(narrow + blend * (wide - narrow), np.float32(0.0), np.float32(1.0))
-    return _encode_shares(np.float32(1.0) - shade)
+    narrow = cv2.GaussianBlur(dark, (0, 0), 0.8)
+    wide = cv2.GaussianBlur(dark, (0, 0), wide_px)
+    away = cv2.GaussianBlur(away_m, (0, 0), wide_px)
+    narrow, wide, away = (np.asarray(image, np.float32) for image in (narrow, wide, away))
+    return _blend_shadows(narrow, wide, away, np.float32(farthest_m))
+
+
+@compiled_for("f8[:,::1], f8[::1], f8[::1], f8, f4")
+def _place_level(
+    M: Array, columns: Array, rows: Array, level_m: float, side_px: np.float32
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """(u, v, depth), each [R, C] float32: pixels of a light's map, and depth in units of its box, of points on a level."""
+    shape, half = (len(rows), len(columns)), np.float32(0.5)
+    u, v, z = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            x, y = columns[j], rows[i]
+            u[i, j] = np.float32(M[0, 0] * x + M[0, 1] * y + M[0, 2] * level_m + M[0, 3]) * side_px - half
+            v[i, j] = np.float32(M[1, 0] * x + M[1, 1] * y + M[1, 2] * level_m + M[1, 3]) * side_px - half
+            z[i, j] = np.float32(M[2, 0] * x + M[2, 1] * y + M[2, 2] * level_m + M[2, 3])
+    return u, v, z
+
+
+def _compare_depth(
+    nearest: NDArray[np.float32], z: NDArray[np.float32], depth_m: np.float32, bias_m: np.float32
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(metres to what is nearest to the light, 0 where that is the level itself; 1 where it is not), both [R, C]."""
+    away = (z - nearest) * depth_m
+    dark = ((away > bias_m) & (nearest < 1.0)).astype(np.float32)
+    return away * dark, dark
+
+
+@compiled_for("f4[:,::1], f4[:,::1], f4[:,::1], f4")
+def _blend_shadows(
+    narrow: NDArray[np.float32], wide: NDArray[np.float32], away_m: NDArray[np.float32], farthest_m: np.float32
+) -> NDArray[np.uint8]:
+    """[R, C] uint8: the share of light beside a shadow, blended by the mean distance to what casts it."""
+    codes = np.empty(narrow.shape, np.uint8)
+    zero, one, least = np.float32(0.0), np.float32(1.0), np.float32(1e-4)
+    for i in range(narrow.shape[0]):
+        for j in range(narrow.shape[1]):
+            mean_m = away_m[i, j] / max(wide[i, j], least)
+            share = min(max(mean_m / farthest_m, zero), one) * min(wide[i, j] * np.float32(50.0), one)
+            shade = min(max(narrow[i, j] + share * (wide[i, j] - narrow[i, j]), zero), one)
+            codes[i, j] = np.uint8(np.int32(np.rint(np.float32(255.0) * (one - shade))))
+    return codes
 
 
 def triangles_of(things: Sequence[Placed]) -> Triangles:
@@ -251,6 +293,16 @@ def triangles_of(things: Sequence[Placed]) -> Triangles:
     starts = np.cumsum([0, *(len(one) for one in vertices)])[:-1]
     faces = [thing.shape.faces + start for thing, start in zip(things, starts, strict=True)]
     return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+
+
+def shadow_casters(things: Sequence[Placed]) -> list[Placed]:
+    """Everything but the floor."""
+    return [thing for thing in things if thing.region_id > REGION_FLOOR]
+
+
+def objects_of(things: Sequence[Placed]) -> list[Placed]:
+    """The objects that stand on the table."""
+    return [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
 
 
 def shadow_filter(light: Box) -> tuple[float, float, float]:

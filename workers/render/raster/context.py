@@ -68,6 +68,8 @@ ARRAYS: dict[str, tuple[Any, tuple[Any, ...]]] = {
 }
 """Functions that take an array: its type, where it is always the same, and the types of the arguments."""
 
+GENERATORS = ("glGenBuffers", "glGenTextures", "glGenVertexArrays")
+
 
 class DirectCalls(ModuleType):
     """The module OpenGL.GL, in which the functions above are plain calls."""
@@ -77,6 +79,7 @@ class DirectCalls(ModuleType):
         self._gl = gl
         calls = {name: _plain(name, *types) for name, types in SIGNATURES.items()}
         calls |= {name: _with_array(name, *form) for name, form in ARRAYS.items()}
+        calls |= {name: _generator(name) for name in GENERATORS}
         vars(self).update(calls)
 
     def __getattr__(self, name: str) -> Any:
@@ -106,6 +109,18 @@ def _with_array(name: str, dtype: Any, types: tuple[Any, ...]) -> Callable[..., 
             call(*arguments[:place], held.ctypes.data, *arguments[place + 1 :])
 
     return with_array
+
+
+def _generator(name: str) -> Callable[[int], NDArray[np.uint32] | int]:
+    """The same for a function that makes names: one of them, or an array of several."""
+    call = _plain(name, c_int, c_void_p)
+
+    def generate(count: int) -> NDArray[np.uint32] | int:
+        names = np.zeros(count, np.uint32)
+        call(count, names.ctypes.data)
+        return names if count > 1 else int(names[0])
+
+    return generate
 
 
 REMEDY = (
