@@ -5,6 +5,7 @@ from that triangle's plane, so that neither Embree's float32 nor the rasteriser 
 so ties between coplanar faces of two things are found and go to the lower region id. Both sides of every face count.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -19,9 +20,113 @@ from schemas.base import Array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.geometry.camera import project, project_bounds, unproject
-from workers.geometry.frames import invert, transform
+from workers.geometry.camera import project
+from workers.geometry.frames import dot, invert, transform
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import face_planes
+
+
+@compiled_for("f8[::1], f8[::1], const(i4[:,::1]), i8, i8")
+def row_spans(
+    u: Array, v: Array, faces: NDArray[np.integer], width: int, height: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(first [H], end [H]): the columns of each row between the outermost edges of faces [F, 3], a pixel more on each side.
+
+    u, v [V]: image coordinates of corners, pixels. An edge counts in the rows above and below its own too; rows that no
+    edge comes near have end <= first.
+    """
+    first, end = np.full(height, width, np.int64), np.zeros(height, np.int64)
+    for f in range(len(faces)):
+        for corner in range(3):
+            a, b = faces[f, corner], faces[f, (corner + 1) % 3]
+            if v[a] > v[b]:
+                a, b = b, a
+            top, bottom = max(math.floor(v[a]) - 1.0, 0.0), min(math.ceil(v[b]) + 1.0, float(height))
+            for row in range(int(top), int(bottom)):
+                one, other = u[a], u[b]
+                if v[b] - v[a] > 1.0:  # the part of the edge in this row and the two beside it
+                    slope = (u[b] - u[a]) / (v[b] - v[a])
+                    one = u[a] + slope * (max(row - 1.0, v[a]) - v[a])
+                    other = u[a] + slope * (min(row + 2.0, v[b]) - v[a])
+                left, right = math.floor(min(one, other)) - 1.0, math.ceil(max(one, other)) + 1.0
+                first[row] = min(first[row], int(min(max(left, 0.0), float(width))))
+                end[row] = max(end[row], int(min(max(right, 0.0), float(width))))
+    return first, end
+
+
+@compiled_for("i8[::1], i8[::1], i8")
+def pixels_between(first: NDArray[np.int64], end: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+    """Flat numbers, ascending, of the pixels from column `first` [H] up to and without `end` [H] of each row."""
+    pixels = np.empty(np.maximum(end - first, 0).sum(), np.int64)
+    n = 0
+    for row in range(len(first)):
+        for column in range(first[row], end[row]):
+            pixels[n] = row * width + column
+            n += 1
+    return pixels
+
+
+@compiled_for("i8[::1], i8, UniTuple(f8, 4), f8")
+def pixel_rays(
+    pixels: NDArray[np.int64], width: int, k: tuple[float, float, float, float], near_m: float
+) -> tuple[Array, Array]:
+    """(origins, directions), each [N, 3]: rays with z = 1 through the centres of pixels, from the near plane on.
+
+    k: fx, fy, cx, cy. As `unproject` has them, in the camera's frame.
+    """
+    origins, directions = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
+    for n in range(len(pixels)):
+        row, column = pixels[n] // width, pixels[n] % width
+        x, y = (column + 0.5 - k[2]) / k[0], (row + 0.5 - k[3]) / k[1]
+        directions[n, 0], directions[n, 1], directions[n, 2] = x, y, 1.0
+        origins[n, 0], origins[n, 1], origins[n, 2] = near_m * x, near_m * y, near_m
+    return origins, directions
+
+
+@compiled_for("i4[::1], Tuple((f8[:,::1], f8[::1])), f8[:,::1], f8[:,::1], f8")
+def meet_planes(
+    face: NDArray[np.int32], planes: tuple[Array, Array], origins: Array, directions: Array, grazing: float
+) -> tuple[Array, Array, int]:
+    """(distance, cosine, n): where rays [N, 3] meet the planes of faces [N], and how many of them a plane does not fix.
+
+    planes: normals [F, 3] and offsets [F]. Distances, in lengths of the direction, are inf for face -1, and nan where the
+    cosine of incidence is at most `grazing`.
+    """
+    normals, offsets = planes
+    distance, cosine, open_ended = np.full(len(face), np.inf), np.zeros(len(face)), 0
+    for n in range(len(face)):
+        f = face[n]
+        if f < 0:
+            continue
+        towards = dot(normals[f], directions[n])
+        cosine[n] = abs(towards) / math.sqrt(dot(directions[n], directions[n]))
+        if cosine[n] > grazing:
+            distance[n] = (offsets[f] - dot(normals[f], origins[n])) / towards
+        else:
+            distance[n] = np.nan
+            open_ended += 1
+    return distance, cosine, open_ended
+
+
+@compiled_for("Tuple((f8[::1], u1[::1], f4[::1])), i8[::1], UniTuple(f8[::1], 2), i8, f8, f8")
+def keep_nearer(
+    best: tuple[Array, NDArray[np.uint8], NDArray[np.float32]],
+    rays: NDArray[np.int64],
+    found: tuple[Array, Array],
+    region_id: int,
+    apart_m: float,
+    grazing: float,
+) -> None:
+    """Writes hits that are nearer than the best by more than `apart_m` along the normal over these, in place.
+
+    best: distance, region and incidence_cos of all rays; found: distance and cosine [N] of the rays with the numbers `rays`.
+    """
+    distance, cosine = found
+    for n in range(len(rays)):
+        slant = grazing if cosine[n] < grazing else cosine[n]
+        if distance[n] + apart_m / slant < best[0][rays[n]]:
+            best[0][rays[n]], best[1][rays[n]], best[2][rays[n]] = distance[n], region_id, cosine[n]
+
 
 NEAR_M = 0.05
 """Surfaces nearer than this, along the optical axis, are not seen: the near plane of the fast renderer."""
@@ -66,8 +171,8 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
         pixels = _pixels_in_reach(mesh, camera)
         caster = _Caster(mesh)
         for some in (pixels[block] for block in _blocks(len(pixels))):
-            rays = unproject(some // k.width, some % k.width, np.ones(len(some)), k)
-            distance, cosine = caster.cast(NEAR_M * rays, rays)
+            rays = pixel_rays(some, k.width, (k.fx, k.fy, k.cx, k.cy), NEAR_M)
+            distance, cosine = caster.cast(*rays)
             _keep_nearer(best, some, distance + NEAR_M, cosine, thing.region_id)
     depth, shape = np.where(np.isinf(best.distance), 0.0, best.distance), (k.height, k.width)
     return depth.reshape(shape), best.region.reshape(shape), best.incidence_cos.reshape(shape)
@@ -99,7 +204,7 @@ def edge_distance_px(things: Sequence[Placed], camera: Camera, pixels: NDArray, 
     nearest = np.full(len(centres), np.inf)
     for thing in things:
         mesh = _in_camera(thing, camera)
-        edges = _project_edges(mesh, _edges(mesh, outline_only), camera)
+        edges = np.stack(_project_edges(mesh, _edges(mesh, outline_only), camera), axis=1)
         if len(points) <= FEW_PIXELS:
             edges = edges[_may_be_nearest(edges, points)]
         (own, _), distance = shapely.STRtree(shapely.linestrings(edges)).query_nearest(
@@ -123,17 +228,17 @@ def _no_hits(count: int) -> Hits:
 
 
 def _pixels_in_reach(mesh: Mesh, camera: Camera) -> NDArray[np.int64]:
-    """Flat numbers, ascending, of the pixels whose rays can meet a mesh in the camera's frame: of its projected bounding box.
+    """Flat numbers of the pixels whose rays can meet a mesh in the camera's frame, ascending.
 
-    All where a corner is not beyond the near plane, because it has no place in the image then.
+    In each row those between the outermost projected edges, a pixel wider on each side; all where a corner is not beyond
+    the near plane, because it has no place in the image then.
     """
     k = camera.intrinsics
     if not len(mesh.faces):
         return np.empty(0, np.int64)
-    left, top, right, bottom = project_bounds(mesh.vertices, k, NEAR_M)
-    rows = np.arange(max(np.floor(top) - 1, 0), min(np.ceil(bottom) + 1, k.height), dtype=np.int64)
-    columns = np.arange(max(np.floor(left) - 1, 0), min(np.ceil(right) + 1, k.width), dtype=np.int64)
-    return np.add.outer(rows * k.width, columns).ravel()
+    if (mesh.vertices[:, 2] <= NEAR_M).any():
+        return np.arange(k.height * k.width)
+    return pixels_between(*row_spans(*project(mesh.vertices, k), mesh.faces, k.width, k.height), k.width)
 
 
 class _Caster:
@@ -154,30 +259,17 @@ class _Caster:
             return np.full(len(origins), np.inf), np.zeros(len(origins))
         rays = origins.astype(np.float32), directions.astype(np.float32)
         face = self._scene.run(*rays)  # without distances: embreex takes long to hand them over
-        hit = np.flatnonzero(face >= 0)
-        normals, offsets = self._planes[0][face[hit]], self._planes[1][face[hit]]
-        distance, cosine = np.full(len(face), np.inf), np.zeros(len(face))
-        towards, along = _dot(normals, directions[hit]), directions[hit]
-        cosine[hit] = np.abs(towards) / np.sqrt(_dot(along, along))
-        fixed = cosine[hit] > GRAZING
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance[hit] = (offsets - _dot(normals, origins[hit])) / towards
-        if not fixed.all():
-            these = hit[~fixed]
+        distance, cosine, grazing = meet_planes(face, self._planes, origins, directions, GRAZING)
+        if grazing:
+            these = np.flatnonzero(np.isnan(distance))
             distance[these] = self._scene.run(rays[0][these], rays[1][these], query="DISTANCE")
         return distance, cosine
 
 
-def _dot(one: Array, other: Array) -> Array:
-    """[N]: the scalar products of vectors [N, 3], added as `frames.dot` adds."""
-    return (one[:, 0] * other[:, 0] + one[:, 2] * other[:, 2]) + one[:, 1] * other[:, 1]
-
-
 def _keep_nearer(best: Hits, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int) -> None:
     """Writes into `best` the hits that are nearer than its own by more than `COPLANAR_M` along the normal."""
-    nearer = distance + COPLANAR_M / np.maximum(cosine, GRAZING) < best.distance[rays]
-    kept = rays[nearer]
-    best.distance[kept], best.region[kept], best.incidence_cos[kept] = distance[nearer], region_id, cosine[nearer]
+    so_far = best.distance, best.region, best.incidence_cos
+    keep_nearer(so_far, rays, (distance, cosine), region_id, COPLANAR_M, GRAZING)
 
 
 def _edges(mesh: Mesh, outline_only: bool) -> NDArray[np.int64]:
@@ -197,16 +289,19 @@ def _edges(mesh: Mesh, outline_only: bool) -> NDArray[np.int64]:
     return first[np.stack(np.divmod(key, len(first)), axis=1)]
 
 
-def _project_edges(mesh: Mesh, edges: NDArray[np.int64], camera: Camera) -> Array:
-    """[E', 2, 2] float64: image coordinates of the ends of the parts of edges in front of the near plane."""
-    ends = mesh.vertices[edges]
-    ends = ends[(ends[..., 2] > NEAR_M).any(axis=1)]
-    near, far = ends, ends[:, ::-1]
-    gap = np.where(far[..., 2] == near[..., 2], 1.0, far[..., 2] - near[..., 2])
-    share = np.where(near[..., 2] < NEAR_M, (NEAR_M - near[..., 2]) / gap, 0.0)[..., None]
-    cut = (near + share * (far - near)).reshape(-1, 3)
-    cut[:, 2] = np.maximum(cut[:, 2], NEAR_M)
-    return np.stack(project(cut, camera.intrinsics), axis=1).reshape(-1, 2, 2)
+def _project_edges(mesh: Mesh, edges: NDArray[np.int64], camera: Camera) -> tuple[Array, Array]:
+    """(starts, ends), each [E', 2] float64: image coordinates of the parts of edges in front of the near plane."""
+    a, b = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
+    seen = (a[:, 2] > NEAR_M) | (b[:, 2] > NEAR_M)
+    a, b = a[seen], b[seen]
+    k, ends = camera.intrinsics, []
+    for near, far in ((a, b), (b, a)):
+        gap = np.where(far[:, 2] == near[:, 2], 1.0, far[:, 2] - near[:, 2])
+        share = np.where(near[:, 2] < NEAR_M, (NEAR_M - near[:, 2]) / gap, 0.0)[:, None]
+        cut = near + share * (far - near)
+        z = np.maximum(cut[:, 2], NEAR_M)
+        ends.append(np.stack([k.fx * cut[:, 0] / z + k.cx, k.fy * cut[:, 1] / z + k.cy], axis=1))
+    return ends[0], ends[1]
 
 
 def _may_be_nearest(edges: Array, points: Array) -> NDArray[np.bool_]:

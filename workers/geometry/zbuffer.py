@@ -71,25 +71,41 @@ def draw_depth(mesh: Mesh, camera: Camera, near_m: float = 0.05) -> Array:
     return draw_triangles(pixels, z, mesh.faces, (k.height, k.width), 0.0, True)[0].astype(np.float64)
 
 
+@compiled
 def _lift(depth_m: Array, rays: Array, T_color_depth: Array) -> Array:
     """[h * w, 3] float64: the depth image's points in the colour camera's frame; (0, 0, -1), behind it, where there is none."""
-    known = (depth_m > 0.0) & np.isfinite(depth_m) & np.isfinite(rays[..., 0])
-    z = np.where(known, depth_m, 1.0)
-    x, y = rays[..., 0] * z, rays[..., 1] * z
-    points = np.stack([T[0] * x + T[1] * y + T[2] * z + T[3] for T in T_color_depth[:3]], axis=-1)
-    points[~known] = 0.0, 0.0, -1.0
-    return points.reshape(-1, 3)
+    T = T_color_depth
+    points = np.empty((depth_m.size, 3))
+    for i in range(depth_m.shape[0]):
+        for j in range(depth_m.shape[1]):
+            n, z = i * depth_m.shape[1] + j, depth_m[i, j]
+            if z > 0.0 and math.isfinite(z) and math.isfinite(rays[i, j, 0]):
+                x, y = rays[i, j, 0] * z, rays[i, j, 1] * z
+                for axis in range(3):
+                    points[n, axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+            else:
+                points[n, 0], points[n, 1], points[n, 2] = 0.0, 0.0, -1.0
+    return points
 
 
+@compiled
 def _squares(pixels: Array, depth_m: Array, max_step: float) -> NDArray[np.int32]:
     """[T, 3]: the two triangles of each square between four pixels of a depth image that lie on one surface, by number."""
-    number = np.arange(depth_m.size, dtype=np.int32).reshape(depth_m.shape)
-    corners = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], axis=-1).reshape(-1, 4)
-    corners = corners[~np.isnan(pixels[corners, 0]).any(axis=1)]
-    z = depth_m.ravel()[corners]
-    nearest = z.min(axis=1)
-    whole = corners[z.max(axis=1) - nearest <= max_step * nearest]
-    return np.ascontiguousarray(whole[:, [0, 1, 2, 0, 2, 3]]).reshape(-1, 3)
+    height, columns = depth_m.shape
+    triangles, count = np.empty((2 * depth_m.size, 3), np.int32), 0
+    for i in range(height - 1):
+        for j in range(columns - 1):
+            a, d = i * columns + j, (i + 1) * columns + j
+            if math.isnan(pixels[a, 0] + pixels[a + 1, 0] + pixels[d, 0] + pixels[d + 1, 0]):
+                continue
+            z0, z1, z2, z3 = depth_m[i, j], depth_m[i, j + 1], depth_m[i + 1, j + 1], depth_m[i + 1, j]
+            nearest = min(min(z0, z1), min(z2, z3))
+            if max(max(z0, z1), max(z2, z3)) - nearest > max_step * nearest:
+                continue
+            triangles[count, 0], triangles[count, 1], triangles[count, 2] = a, a + 1, d + 1
+            triangles[count + 1, 0], triangles[count + 1, 1], triangles[count + 1, 2] = a, d + 1, d
+            count += 2
+    return triangles[:count]
 
 
 Drawn = tuple[NDArray[np.floating], NDArray[np.int32], Array]
@@ -199,7 +215,11 @@ def _count_covered(
             _cover(covered, a, c, b)
         elif area > 0 and not closed:
             _cover(covered, a, b, c)
-    return int(np.count_nonzero(covered))
+    pixels = 0
+    for row in range(height):
+        for column in range(width):
+            pixels += covered[row, column]
+    return pixels
 
 
 @compiled
