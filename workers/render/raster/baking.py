@@ -186,10 +186,13 @@ def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -
     return Box(np.eye(4), np.array([[*(centre - half), level_m], [*(centre + half), top]]))
 
 
+@compiled_for("f8[:,::1], f8, const(f8[::1])", "f8[:,::1], f8, f8[::1]")
 def _fall_on_level(vertices: Array, level_m: float, towards: Array) -> Array:
     """[N, 2]: the shadows of vertices [N, 3] on a level, of vertices below it those vertices."""
-    along = np.maximum(vertices[:, 2:] - level_m, 0.0) / towards[2]
-    shadows: Array = vertices[:, :2] - along * towards[:2]
+    shadows = np.empty((len(vertices), 2))
+    for n in range(len(vertices)):
+        along = max(vertices[n, 2] - level_m, 0.0) / towards[2]
+        shadows[n, 0], shadows[n, 1] = vertices[n, 0] - along * towards[0], vertices[n, 1] - along * towards[1]
     return shadows
 
 

@@ -126,8 +126,7 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     for part, albedo in zip(parts, albedos, strict=True):
         faces, source = own_vertices(part.faces, len(part.vertices))
         vertices = _vertex_columns(part, albedo, source)
-        last = faces[:, 2]  # of each face, the vertex that it owns
-        vertices[last, -4:-1], vertices[last, -1] = face_planes(Mesh(part.vertices, part.faces))
+        _write_planes(vertices, faces, *face_planes(Mesh(part.vertices, part.faces)))
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
@@ -138,21 +137,48 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     return Batch(vertices, corners, texture_of(parts[0]), planar, all(map(is_matte, parts)), top_faces, planar_top)
 
 
+@compiled_for("f4[:,::1], i8[:,::1], f4, i8")
 def _tops_first(
     vertices: NDArray[np.float32], faces: NDArray[np.int64], lowest_m: np.float32, plane_z: int
 ) -> tuple[NDArray[np.uint32], int]:
     """(faces [F, 3], those that face up and lie above `lowest_m` before the others; the number of them)."""
-    top = (vertices[faces[:, 2], plane_z] > 0.0) & (vertices[faces, 2] > lowest_m).all(axis=1)
-    return np.concatenate([faces[top], faces[~top]]).astype(np.uint32), int(top.sum())
+    top, count = np.empty(len(faces), np.bool_), 0
+    for face in range(len(faces)):
+        top[face] = vertices[faces[face, 2], plane_z] > np.float32(0.0)
+        for corner in range(3):
+            top[face] &= vertices[faces[face, corner], 2] > lowest_m
+        count += top[face]
+    ordered, first, other = np.empty((len(faces), 3), np.uint32), 0, count
+    for face in range(len(faces)):
+        row = first if top[face] else other
+        for corner in range(3):
+            ordered[row, corner] = faces[face, corner]
+        first, other = first + top[face], other + (not top[face])
+    return ordered, count
 
 
+@compiled_for("f4[:,::1], u4[:,::1], f8")
 def _is_planar(vertices: NDArray[np.float32], faces: NDArray[np.uint32], upright: float) -> bool:
     """Whether horizontal faces [F, 3] have no normals but upright ones, and each has one colour."""
-    corners = vertices[faces]
-    x, y, z = (corners[..., column] for column in (3, 4, 5))
-    square = x * x + y * y + z * z
-    leans = (square > 0.01) & (z < np.float64(upright) * np.sqrt(square))
-    return not (leans.any() or (corners[..., 7:10] != corners[:, 2:, 7:10]).any())
+    for face in range(len(faces)):
+        last = vertices[faces[face, 2]]
+        for corner in range(3):
+            vertex = vertices[faces[face, corner]]
+            x, y, z = vertex[3], vertex[4], vertex[5]
+            if x * x + y * y + z * z > 0.01 and z < upright * np.sqrt(x * x + y * y + z * z):
+                return False
+            for column in range(7, 10):
+                if vertex[column] != last[column]:
+                    return False
+    return True
+
+
+@compiled_for("f4[:,::1], i8[:,::1], f8[:,::1], f8[::1]")
+def _write_planes(vertices: NDArray[np.float32], faces: NDArray[np.int64], normals: Array, offsets: Array) -> None:
+    """Writes each face's plane, normals [F, 3] and offsets [F], into the last columns of its last vertex."""
+    for face in range(len(faces)):
+        row = vertices[faces[face, 2], -4:]
+        row[0], row[1], row[2], row[3] = normals[face, 0], normals[face, 1], normals[face, 2], offsets[face]
 
 
 def _vertex_columns(part: Part, albedo: Array, source: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -163,11 +189,19 @@ def _vertex_columns(part: Part, albedo: Array, source: NDArray[np.int64]) -> NDA
     row = np.zeros(sum(COLUMNS.values()), np.float32)
     row[6], row[7:10], row[10] = part.material.metallic, albedo, part.material.roughness
     columns = np.tile(row, (len(source), 1))
-    columns[:, 0:3] = part.vertices[source]
+    _gather_rows(np.ascontiguousarray(part.vertices), source, columns[:, 0:3])
     if part.normals is not None:
-        columns[:, 3:6] = part.normals[source]
+        _gather_rows(np.ascontiguousarray(part.normals), source, columns[:, 3:6])
     if part.colors is not None:
-        columns[:, 7:10] = (albedo * SRGB_STEPS[part.colors[:, :3]])[source]
+        _gather_rows(albedo * SRGB_STEPS[part.colors[:, :3]], source, columns[:, 7:10])
     if part.uv is not None:
-        columns[:, 11:13] = part.uv[source]
+        _gather_rows(np.ascontiguousarray(part.uv), source, columns[:, 11:13])
     return columns
+
+
+@compiled_for("f8[:,::1], i8[::1], f4[:,:]", "const(f8[:,::1]), i8[::1], f4[:,:]")
+def _gather_rows(values: Array, source: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
+    """Writes values [V, C] at `source` [N] into rows [N, C]."""
+    for n in range(len(source)):
+        for column in range(values.shape[1]):
+            rows[n, column] = values[source[n], column]

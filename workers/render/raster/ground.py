@@ -93,6 +93,7 @@ def _corners(k: Intrinsics) -> tuple[float, float, float, float]:
     return left, (-BORDER_PX - k.cy) / k.fy, right, (k.height + BORDER_PX - k.cy) / k.fy
 
 
+@compiled_for("f8[:,::1], UniTuple(f8, 4), f8")
 def _meet_level(
     T_cam_shape: Pose, corners: tuple[float, float, float, float], z: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -101,22 +102,25 @@ def _meet_level(
     (least distance along the optical axis, least x and y, greatest x and y, metres; least cosine that a ray between them has
     with the level's normal). The first is 0 where a ray meets nothing, the last where one runs the other way.
     """
-    (r00, r01, r02, t0), (r10, r11, r12, t1), (r20, r21, r22, t2), _ = T_cam_shape.tolist()
-    # The eye in the shape's frame
-    x, y = -t0 * r00 - t1 * r10 - t2 * r20, -t0 * r01 - t1 * r11 - t2 * r21
-    eye_z = -t0 * r02 - t1 * r12 - t2 * r22
+    x = y = eye_z = 0.0  # the eye in the shape's frame
+    for i in range(3):
+        x -= T_cam_shape[i, 3] * T_cam_shape[i, 0]
+        y -= T_cam_shape[i, 3] * T_cam_shape[i, 1]
+        eye_z -= T_cam_shape[i, 3] * T_cam_shape[i, 2]
     fall = z - eye_z
     nearest, left, bottom, right, top = np.inf, np.inf, np.inf, -np.inf, -np.inf
     low, high, length2 = np.inf, -np.inf, 0.0
     for u in (corners[0], corners[2]):
         for v in (corners[1], corners[3]):
-            ray_x, ray_y, ray_z = u * r00 + v * r10 + r20, u * r01 + v * r11 + r21, u * r02 + v * r12 + r22
+            ray_x = u * T_cam_shape[0, 0] + v * T_cam_shape[1, 0] + T_cam_shape[2, 0]
+            ray_y = u * T_cam_shape[0, 1] + v * T_cam_shape[1, 1] + T_cam_shape[2, 1]
+            ray_z = u * T_cam_shape[0, 2] + v * T_cam_shape[1, 2] + T_cam_shape[2, 2]
             low, high, length2 = min(low, ray_z), max(high, ray_z), max(length2, u * u + v * v + 1.0)
             away = fall / ray_z if ray_z * fall > 0.0 else 0.0
             nearest = min(nearest, away)
             left, right = min(left, x + away * ray_x), max(right, x + away * ray_x)
             bottom, top = min(bottom, y + away * ray_y), max(top, y + away * ray_y)
-    return nearest, left, bottom, right, top, max(low, -high, 0.0) / math.sqrt(length2)
+    return nearest, left, bottom, right, top, max(low, -high, 0.0) / np.sqrt(length2)
 
 
 @lru_cache(maxsize=1)  # the views of one scene ask about one floor
