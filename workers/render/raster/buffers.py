@@ -21,7 +21,7 @@ from schemas.base import Array
 from schemas.scene.shape import Shape
 from workers.geometry.colour import SRGB_STEPS, has_holes
 from workers.geometry.mesh import bounds_of
-from workers.render.raster.batches import COLUMNS, Batch, pack_shape
+from workers.render.raster.batches import COLUMNS, Batch, Cover, find_cover, pack_shape
 
 MAX_TEXTURE_PX = 2048
 """Greatest width and height of an uploaded texture; a larger picture is scaled down."""
@@ -154,6 +154,9 @@ class Uploaded:
     planar_top: bool
     matte: bool
     bytes: int
+    positions: NDArray[np.float32]
+    faces: NDArray[np.uint32]
+    """Positions [V, 3] in the shape's frame, and faces [F, 3]: for what is decided before drawing. None of many faces."""
 
     @property
     def holes(self) -> bool:
@@ -173,6 +176,14 @@ class UploadedShape:
     batches: tuple[Uploaded, ...]
     corners: Array
     closed: bool
+
+    @cached_property
+    def cover(self) -> Cover | None:
+        """Its top, if that hides what is below it: if it has no holes, also no holes in its texture."""
+        if any(batch.holes for batch in self.batches):
+            return None
+        tops = [batch.positions[batch.faces[: batch.top_count // 3]] for batch in self.batches]
+        return find_cover(np.concatenate(tops))
 
     @property
     def bytes(self) -> int:
@@ -252,5 +263,8 @@ def _upload(gl: ModuleType, batch: Batch, textures: TextureStore) -> Uploaded:
     size = batch.vertices.nbytes + batch.indices.nbytes
     buffers = (vertex_buffer, index_buffer)
     top_count = 3 * batch.top_faces
+    # Copies, so that the other columns are not kept.
+    faces = batch.indices if len(batch.indices) <= FEW_TRIANGLES else batch.indices[:0]
+    positions = batch.vertices[: len(batch.vertices) if len(faces) else 0, :3].copy()
     looks = batch.planar, batch.planar_top, batch.matte
-    return Uploaded(vertex_array, buffers, texture, batch.indices.size, top_count, *looks, size)
+    return Uploaded(vertex_array, buffers, texture, batch.indices.size, top_count, *looks, size, positions, faces)

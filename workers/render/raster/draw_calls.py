@@ -4,7 +4,7 @@ A program takes cameras, lights and poses as uniforms. A draw call is the triang
 bias of its region.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -18,7 +18,7 @@ from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE, Appearance, Shape
 from schemas.scene.view import Intrinsics
 from workers.geometry.frames import transform
-from workers.render.raster.batches import is_matte, texture_of
+from workers.render.raster.batches import Cover, is_matte, seen_ranges, texture_of
 from workers.render.raster.buffers import Uploaded, UploadedShape
 from workers.render.raster.shaders import MAX_LIGHTS, Variant
 
@@ -255,13 +255,15 @@ def sort_draws(
             continue
         shape, ground = fetch(thing.shape), thing.region_id == REGION_FLOOR
         split = raster and has_level_top(thing)
+        hides = thing.region_id == REGION_TABLE and not view.cut
         T_cam_shape = view.T_cam_world @ thing.T_world_shape
         beyond_near = is_beyond_near(shape, T_cam_shape)
         culls = hides_backs(shape, beyond_near, through_holes=not view.labels)
+        cover = shape.cover if hides and beyond_near else None
         for batch in shape.batches:
             textured = view.color and is_drawn(view.effects, "textures", batch.texture is not None)
             cutout = view.cut and textured and is_drawn(view.effects, "transparency", batch.holes)
-            for first, count, top in _ranges(batch, split):
+            for first, count, top in _ranges(batch, split, cover, T_cam_shape):
                 level = (split and top) or (raster and ground and not split)
                 # Each program takes megabytes; only floors and tops of tables are large enough to gain from their own.
                 planar = view.color and batch.few_triangles and (batch.planar_top if top else batch.planar)
@@ -294,12 +296,24 @@ def is_beyond_near(shape: UploadedShape, T_cam_shape: Pose) -> bool:
     return bool((shape.corners @ T_cam_shape[2, :3] + T_cam_shape[2, 3] > NEAR_M).all())
 
 
-def _ranges(batch: Uploaded, split: bool) -> list[tuple[int, int, bool]]:
-    """(first index, count, whether it is the top) of what is drawn of a batch; `split`: its top apart from the rest."""
-    if not split:
-        return [(0, batch.index_count, False)]
-    runs = (0, batch.top_count, True), (batch.top_count, batch.index_count - batch.top_count, False)
-    return [run for run in runs if run[1]]
+def _ranges(batch: Uploaded, split: bool, cover: Cover | None, T_cam_shape: Pose) -> Iterator[tuple[int, int, bool]]:
+    """(first index, count, whether it is the top, apart from the rest) of what is drawn of a batch.
+
+    `split`: its top apart from the rest. With a cover also, and without what that hides from the camera.
+    """
+    hides = cover is not None and len(batch.faces) > 0
+    if not split and not hides:
+        yield 0, batch.index_count, False
+        return
+    if batch.top_count:
+        yield 0, batch.top_count, True
+    if cover is not None and hides:
+        lower = batch.faces[batch.top_count // 3 :]
+        eye = -T_cam_shape[:3, 3] @ T_cam_shape[:3, :3]
+        for first, count in seen_ranges(batch.positions, lower, cover, eye):
+            yield batch.top_count + 3 * first, 3 * count, False
+    elif batch.top_count < batch.index_count:
+        yield batch.top_count, batch.index_count - batch.top_count, False
 
 
 def rank_regions(things: Sequence[Placed], corners: Sequence[Array]) -> dict[int, int]:
