@@ -1,8 +1,10 @@
 """Objects from release to rest, held there and let go again, against mechanics in closed form and geometry."""
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -140,6 +142,23 @@ def test_what_does_not_rest_is_refused_with_what_was_measured(monkeypatch):
         with pytest.raises(SettleError, match=words) as caught:
             settle_single(start, on, physics)
         assert caught.value.reason == reason
+
+
+def test_the_gate_refuses_a_gap_an_overlap_and_an_imbalance_each_by_itself():
+    """At the bounds of docs/rest.md: 0.01 mm and 0.1 % of the weight."""
+    start = at(CUBE, TABLE, (0, 0, 0.03))
+    for gap_mm, unbalanced, words in (
+        (0.0, 0.0, None),
+        (0.0099, 0.0009, None),
+        (-0.0099, 0.0009, None),
+        (0.0101, 0.0, "0.010 mm from anything"),
+        (-0.0101, 0.0, "0.010 mm inside what it touches"),
+        (0.0, 0.0011, "with 0.1% of its weight out of balance"),
+    ):
+        held = SimpleNamespace(gap_m=gap_mm * 1e-3, unbalanced=unbalanced)
+        refused = pytest.raises(SettleError, match=words) if words else contextlib.nullcontext()
+        with refused:
+            settle._require_support(SimpleNamespace(single=True), start, held)
 
 
 def test_an_object_whose_frame_is_far_from_its_centre_of_mass_falls_the_same_way():
