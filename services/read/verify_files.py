@@ -241,7 +241,7 @@ def _hash_file(store: Store, path: str, verdict: Verdict) -> dict[str, object] |
     """{bytes, sha256} of a stored file, or why it cannot be read; on a disk in constant memory."""
     try:
         with store.open(path) as file:
-            digest, size = hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
+            digest, size = hashlib.file_digest(file, "sha256").hexdigest(), file.seek(0, os.SEEK_END)
     except FileNotFoundError:
         return "is merged and missing"
     except OSError as error:
