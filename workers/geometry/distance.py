@@ -1,4 +1,4 @@
-"""Nearest points of a mesh, by comparison with every face's box, and for many points and faces by a tree of boxes."""
+"""Nearest points of triangles, of segments, and of meshes by a tree of boxes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,42 +6,6 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.jit import compiled
-
-
-def nearest_on_mesh(points: Array, mesh: Mesh, within_m: float = np.inf) -> tuple[Array, NDArray[np.int64]]:
-    """(nearest point of the surface [N, 3], its face [N]) for each point [N, 3].
-
-    The first face among equals; nan and -1 where no face is within `within_m` (or as near as it).
-    """
-    corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float64)
-    found = np.full((len(points), 3), np.nan)
-    faces = np.full(len(points), -1, dtype=np.int64)
-    limit2 = np.nextafter(within_m * within_m, np.inf)
-    _nearest(np.ascontiguousarray(points), corners, corners.min(axis=1), corners.max(axis=1), limit2, found, faces)
-    return found, faces
-
-
-@compiled
-def _nearest(
-    points: Array, corners: Array, low: Array, high: Array, limit2: float, found: Array, faces: NDArray[np.int64]
-) -> None:
-    """Compares each point with every face whose box is nearer than the nearest face so far."""
-    here = np.empty(3)
-    for n in range(len(points)):
-        best = limit2
-        for f in range(len(corners)):
-            box2 = 0.0
-            for k in range(3):
-                out = max(low[f, k] - points[n, k], points[n, k] - high[f, k], 0.0)
-                box2 += out * out
-            if box2 >= best:
-                continue
-            nearest_on_triangle(points[n], corners[f], here)
-            d2 = (here[0] - points[n, 0]) ** 2 + (here[1] - points[n, 1]) ** 2 + (here[2] - points[n, 2]) ** 2
-            if d2 < best:
-                best = d2
-                found[n] = here
-                faces[n] = f
 
 
 @compiled

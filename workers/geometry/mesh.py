@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.distance import nearest_on_mesh
+from workers.geometry.distance import distance_to_mesh
 from workers.geometry.jit import compiled_for
 
 
@@ -179,15 +179,10 @@ def concavity_m(mesh: Mesh) -> float:
     hull = manifold3d.Manifold.hull_points(np.ascontiguousarray(mesh.vertices))
     if hull.is_empty():  # flat
         return 0.0
-    a, b, c = triangle_corners(mesh_of(hull))
-    points = np.concatenate([(a + b + c) / 3, (a + b) / 2, (b + c) / 2, (c + a) / 2])
-    found, _ = nearest_on_mesh(points, mesh)
-    return float(np.linalg.norm(found - points, axis=1).max())
-
-
-def triangle_corners(mesh: Mesh) -> tuple[Array, Array, Array]:
-    """The first, second and third corner of every triangle, each [F, 3]."""
-    return mesh.vertices[mesh.faces[:, 0]], mesh.vertices[mesh.faces[:, 1]], mesh.vertices[mesh.faces[:, 2]]
+    surface = mesh_of(hull)
+    corners = surface.vertices[surface.faces]
+    points = np.concatenate([corners.mean(axis=1), ((corners + np.roll(corners, 1, axis=1)) / 2).reshape(-1, 3)])
+    return float(distance_to_mesh(points, mesh)[0].max())
 
 
 def face_planes(mesh: Mesh) -> tuple[Array, Array]:
