@@ -11,7 +11,7 @@ import numpy as np
 
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import SceneError
-from schemas.scene.view import ROLES
+from schemas.scene.view import DRAWN_ROLES
 from services.export.formats import Added, Writer
 from services.export.source import ExportScene, unchanged_sources
 from services.read.scene_geometry import captured_scene, planned_scene
@@ -44,8 +44,9 @@ class Gltf(Writer):
             except SceneError as error:
                 return _left_out(scene, f"its shapes cannot be made again: {error.reason}")
         data: bytes = posed.export(file_type="glb")
-        views = [pair.views[role] for pair in scene.pairs for role in ROLES if role in pair.views]
-        seen = with_cameras(data, [view for view in views if view["role"] != "projected"])
+        seen = with_cameras(
+            data, [pair.views[role] for pair in scene.pairs for role in DRAWN_ROLES if role in pair.views]
+        )
         self.folder.put(f"{scene.category}/{scene.scene_id:06d}.glb", seen)
         self.count("files", scene.category, 1)
         return Added(len(scene.pairs))

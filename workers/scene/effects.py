@@ -6,7 +6,7 @@ give it its two scenes (tests/effects/cases.py) and its proof (tests/effects/pro
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,16 +61,18 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
         raise ValueError(f"no effects of these names: {', '.join(sorted(unknown))}")
     if asked := forced & names_of_kind("asked"):
         raise ValueError(f"switches of the job, which cannot be forced: {', '.join(sorted(asked))}")
-    reasons = {effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}
-    skipped = {name: why for name, why in reasons.items() if why is not None and name not in forced}
-    return EffectPlan(tuple(name for name in reasons if name not in skipped), skipped, forced)
+    return _plan({effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}, forced)
 
 
 def plan_capture(simulate: Simulate) -> EffectPlan:
     """Which effects a simulated capture runs, and why each of the others does not."""
-    reasons = {effect.name: why(simulate) for effect in TABLE if (why := effect.in_captures) is not None}
-    skipped = {name: why for name, why in reasons.items() if why is not None}
-    return EffectPlan(tuple(name for name in reasons if name not in skipped), skipped)
+    return _plan({effect.name: why(simulate) for effect in TABLE if (why := effect.in_captures) is not None})
+
+
+def _plan(reasons: Mapping[str, str | None], forced: frozenset[str] = frozenset()) -> EffectPlan:
+    """The plan that follows from why each effect is not called for; None where it is."""
+    skipped = {name: why for name, why in reasons.items() if why is not None and name not in forced}
+    return EffectPlan(tuple(name for name in reasons if name not in skipped), skipped, forced)
 
 
 def is_raycast_scene(check: Check, chance: SceneChance) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose, frozen_array
-from schemas.dataset.layout import file_pose_id, input_pose_id
+from schemas.dataset.layout import file_pose_id, input_pose_id, is_stored
 from schemas.errors import ViewError
 from schemas.job.job import Job
 from schemas.job.views import Images, Mirror
@@ -30,15 +30,14 @@ def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
 
     T_world_beside = T_world_input Trans(t), t along the input camera's optical axes, same rotation [D].
     """
-    branches = {
-        role.name: attrgetter(role.branch)(job)
+    offsets = {
+        role.name: attrgetter(f"{role.branch}.offset_m")(job)
         for role in VIEW_ROLES.values()
-        if role.beside and role.branch is not None
+        if role.beside and is_stored(role.name, job)
     }
     return {
-        name: Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*branch.offset_m)))
-        for name, branch in branches.items()
-        if branch.enabled
+        name: Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*offset_m)))
+        for name, offset_m in offsets.items()
     }
 
 
