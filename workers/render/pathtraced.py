@@ -34,7 +34,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import rank_filter
 
 from schemas.base import Array, Pose
 from schemas.errors import InputError
@@ -384,6 +383,8 @@ def clamp_fireflies(light: Array) -> Array:
 
     A path that finds the key light in a mirror leaves such a pixel; lines, edges and spots of three pixels stay.
     """
+    from scipy.ndimage import rank_filter  # takes 36 ms to load, and every worker loads this file
+
     level = light @ np.array([0.2126, 0.7152, 0.0722])
     ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
     border = "mirror" if min(level.shape) > 1 else "nearest"
