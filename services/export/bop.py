@@ -92,9 +92,8 @@ class Bop(Writer):
         rgb, region, depth = pair.image(role, "rgb"), pair.pixels(role, "region"), pair.image(role, "depth")
         if rgb is None or region is None or depth is None:
             return f"no {'rgb' if rgb is None else 'labels'} of the {role} view"
-        number = len(DRAWN_ROLES) * pair.number + DRAWN_ROLES.index(
-            role
-        )  # pair k has the images 3 k, 3 k + 1 and 3 k + 2
+        # Pair k has the images 3 k, 3 k + 1 and 3 k + 2
+        number = len(DRAWN_ROLES) * pair.number + DRAWN_ROLES.index(role)
         view, pixels = pair.views[role], decode_png(depth)
         shot = _Shot(number, view, {f"rgb/{number:06d}.png": rgb, f"depth/{number:06d}.png": depth})
         for label in pair.labels(role):

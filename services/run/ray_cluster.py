@@ -173,9 +173,8 @@ def _make(places: Sequence[Path]) -> tuple[Path, int]:
         try:
             folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
             (folder / INNER).mkdir()
-            unnamed = (
-                folder / f"{OWNER}.new"
-            )  # it gets its name when it is locked, so nobody ever finds it unlocked before
+            # It gets its name when it is locked, so nobody ever finds it unlocked before
+            unnamed = folder / f"{OWNER}.new"
             owner = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
             unnamed.rename(folder / OWNER)

@@ -26,8 +26,20 @@ CANARY = Job(name="canary", seed=7, scenes=1)
 CANARY_SCENE = 3
 
 LIBRARIES = (
-    *("coacd", "embreex", "fpng", "llvmlite", "manifold3d", "numba", "numpy", "opencv-contrib-python-headless"),
-    *("pillow", "pybullet", "pyrender", "scipy", "trimesh", "zlib-ng"),
+    "coacd",
+    "embreex",
+    "fpng",
+    "llvmlite",
+    "manifold3d",
+    "numba",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "pillow",
+    "pybullet",
+    "pyrender",
+    "scipy",
+    "trimesh",
+    "zlib-ng",
 )
 """Libraries that the bytes depend on."""
 
