@@ -126,10 +126,13 @@ def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
 
     Raises struct.error or ValueError where it is none.
     """
-    magic, _, _, length, kind = _HEADER.unpack_from(data)
+    magic, version, _, length, kind = _HEADER.unpack_from(data)
+    if magic == b"glTF" and version != 2:
+        raise ValueError(f"binary glTF of version {version}: only 2 is read")
     if magic != b"glTF" or kind != b"JSON":
         raise ValueError("no glTF header")
-    tree: dict[str, Any] = json.loads(data[_HEADER.size : _HEADER.size + length])
+    text = data[_HEADER.size : _HEADER.size + length]
+    tree: dict[str, Any] = json.loads(text.rstrip(b"\0"))  # some exporters fill up with NUL
     return tree, data[_HEADER.size + length + 8 :]
 
 
@@ -141,7 +144,7 @@ def _material(writer: _Writer, part: Part, rgb: list[float], watertight: bool) -
         "metallicFactor": material.metallic,
         "roughnessFactor": material.roughness,
     }
-    see_through = material.base_color[3] < 1.0
+    see_through = material.base_color[3] < 1.0 or (part.colors is not None and bool((part.colors[:, 3] < 255).any()))
     if material.texture is not None and part.uv is not None:
         rough["baseColorTexture"] = {"index": writer.add_texture(material.texture)}
         see_through |= material.texture.shape[2] == 4

@@ -125,7 +125,7 @@ def gltf(name: str = "cube.gltf", buffer: str = "cube.bin", picture: str = "skin
     blocks.append(np.random.default_rng(0).random((8, 2)).astype("<f4").tobytes())
     starts = np.cumsum([0, *map(len, blocks)])
     views = [{"buffer": 0, "byteOffset": int(s), "byteLength": len(b)} for s, b in zip(starts, blocks, strict=False)]
-    colour = {"baseColorTexture": {"index": 1}, "metallicRoughnessTexture": {"index": 0}}
+    colour = {"baseColorTexture": {"index": 1}, "metallicFactor": 0.0}
     tree = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],

@@ -132,7 +132,7 @@ def test_what_was_left_out_of_a_mesh_is_told_by_its_row_in_the_assets_table(tmp_
     for name in ("cube.obj", "thing.urdf"):
         row = asset_row(loaded(source(category_map={name: "mug"}), tmp_path), Job(name="t"))
         (note,) = pa.Table.from_pylist([row], schema=SCHEMAS["assets"])["notes"][0].as_py()
-        assert note.startswith("skin.png cannot be opened") and note.endswith("plain base colour used")
+        assert note.startswith("skin.png is no picture") and note.endswith("plain base colour used")
         assert " at 0x" not in note, "an address is another in every run"
 
 

@@ -1,19 +1,27 @@
-"""Edge: what a mesh from outside may hold and refer to: caps on counts, material files, PNG and JPEG textures."""
+"""Edge: what a mesh from outside may hold and refer to: caps on counts, material files, pictures."""
 
 import io
+import os
 import re
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 
-_IMAGE_KINDS = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG"}
+_PICTURES = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "TGA")
+_OTHERS = {
+    b"\xabKTX": "is a KTX picture, which is not read: convert it to PNG",
+    b"DDS ": "is a DDS picture, which is not read: convert it to PNG",
+    b"version https://git-lfs": "is a pointer of Git LFS: run `git lfs pull`",
+}
+"""What other files begin with, and what is said of them."""
 _UNDECODABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError)
 """What reading a stranger's picture may raise."""
 LONGEST_NAME = 1024
@@ -34,6 +42,24 @@ def check_nodes(path: Path, count: int, what: str, limits: MeshLimits) -> None:
     """MeshError `too_large` where an asset has more nodes, or parts, or links than the cap."""
     if count > limits.max_nodes:
         raise MeshError("too_large", f"{path} has {count} {what}, over max_nodes = {limits.max_nodes}")
+
+
+_FOLDERS = ("textures", "../textures", "../materials/textures")
+"""Where pictures lie beside a mesh that names them without their folder."""
+
+
+def _other_case(path: Path) -> Path:
+    """The only file whose name is this one but for upper and lower case; the path itself where there is not one."""
+    try:
+        found = [entry.name for entry in os.scandir(path.parent) if entry.name.lower() == path.name.lower()]
+    except (OSError, ValueError):
+        return path
+    return path.parent / found[0] if len(found) == 1 else path
+
+
+def decode_names(names: Iterable[bytes]) -> list[str]:
+    """File names as text."""
+    return [name.decode("utf-8", "replace").strip() for name in names]
 
 
 def find_inside(root: Path, *candidates: Path) -> Path | None:
@@ -65,7 +91,7 @@ class Budget:
         return f"is over max_asset_mb = {cap:g} with the files before it" if self.size > cap * 1e6 else None
 
     def take_image(self, data: bytes) -> str | None:
-        """Counts the pixels of a PNG or JPEG; why it may not be decoded, None where it may."""
+        """Counts the pixels of a picture; why it may not be decoded, None where it may."""
         size, why = open_image(data, self.limits)
         if why is not None:
             return why
@@ -77,10 +103,10 @@ class Budget:
 
 
 class FolderResolver:
-    """Hands a reader the material files and PNG or JPEG textures of one folder, and nothing else; a resolver of trimesh's.
+    """Hands a reader the material files and pictures of one folder, and nothing else; a resolver of trimesh's.
 
     Names are relative to the mesh, may use either slash, and must stay below `root`. A file that is refused or missing
-    leaves a note in `notes`, and the mesh is loaded without it.
+    leaves a note in `notes`, and the mesh is loaded without it; one that is found elsewhere or in other case a note, too.
     """
 
     def __init__(self, mesh: Path, root: Path, limits: MeshLimits, budget: Budget | None = None) -> None:
@@ -112,14 +138,22 @@ class FolderResolver:
             raise self.refuse(name, f"is larger than max_file_mb = {self.limits.max_file_mb:g}")
         if (why := self.budget.take_file(path.stat().st_size)) is not None:
             raise self.refuse(name, why)
+        if path.name != Path(name).name:
+            self.notes.append(one_line(f"{name} is missing: {path.name} was read in its place"))
         return path.read_bytes()
 
     def find(self, name: str) -> Path | None:
-        """The file of a name, relative to the mesh or else beside it; None where there is none below `root`."""
+        """The file of a name; None where there is none below `root`.
+
+        Looked for relative to the mesh, then beside it, in its folders of pictures (`textures`, and `../materials/textures` as
+        Google's scanned objects have them), then in other case.
+        """
         name = name.strip().replace("\\", "/")
         if len(name) > LONGEST_NAME:
             return None
-        return find_inside(self.root, self.folder / name, self.folder / Path(name).name)
+        last = Path(name).name
+        places = [self.folder / name, self.folder / last, *(self.folder / folder / last for folder in _FOLDERS)]
+        return find_inside(self.root, *places) or find_inside(self.root, *map(_other_case, places[:2]))
 
     def refuse(self, name: str, why: str) -> FileNotFoundError:
         """Notes why a file is not read, and returns the error that says so."""
@@ -151,15 +185,17 @@ def one_line(text: str, most: int = 1000) -> str:
 
 
 def open_image(data: bytes, limits: MeshLimits) -> tuple[tuple[int, int], str | None]:
-    """Width and height, and why these bytes may not be a texture; None for a PNG or JPEG of a size within the cap."""
-    kind = next((kind for magic, kind in _IMAGE_KINDS.items() if data.startswith(magic)), None)
-    if kind is None:
-        return (0, 0), "is not a PNG or JPEG file"
+    """Width and height, and why these bytes may not be a texture; None for a picture of a size within the cap."""
+    for magic, why in _OTHERS.items():
+        if data.startswith(magic):
+            return (0, 0), why
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(data), formats=(kind,)) as image:
+            with Image.open(io.BytesIO(data), formats=_PICTURES) as image:
                 size = image.size
+    except UnidentifiedImageError:
+        return (0, 0), f"is no picture that can be read ({', '.join(_PICTURES)})"
     except _UNDECODABLE as error:
         return (0, 0), f"cannot be opened ({describe_error(error)})"
     if max(size) > limits.max_texture_px:
@@ -170,15 +206,18 @@ def open_image(data: bytes, limits: MeshLimits) -> tuple[tuple[int, int], str | 
 def decode_picture(source: bytes | Image.Image, notes: list[str]) -> NDArray[np.uint8] | None:
     """[h, w, 3 or 4] uint8, read-only, with alpha where it has some; None with a note where it is damaged.
 
-    source: bytes that `Budget.take_image` let pass, or a picture that was opened from such.
+    source: bytes that `Budget.take_image` let pass, or a picture that was opened from such. Grey of 16 bits becomes 8.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            kinds = tuple(_IMAGE_KINDS.values())
-            image = source if isinstance(source, Image.Image) else Image.open(io.BytesIO(source), formats=kinds)
-            alpha = "A" in image.getbands() or "transparency" in image.info
-            pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
+            image = source if isinstance(source, Image.Image) else Image.open(io.BytesIO(source), formats=_PICTURES)
+            if image.mode.startswith("I"):  # Pillow would cut what is over 255
+                grey = np.round(np.clip(np.asarray(image, np.float64), 0.0, 65535.0) / 257.0)
+                pixels = np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
+            else:
+                alpha = "A" in image.getbands() or "transparency" in image.info
+                pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
     except _UNDECODABLE as error:
         notes.append(f"a texture cannot be decoded ({describe_error(error)}): plain base colour used")
         return None

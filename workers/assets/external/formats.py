@@ -4,7 +4,6 @@ A new format is a row, and a module that lists what a file names and reads its m
 `make_material` and a picture of `decode_picture`.
 """
 
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -16,8 +15,8 @@ from workers.assets.external import plain
 from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.assets.external.gltf import named_by_gltf, read_gltf
 from workers.assets.external.mesh import LoadedMesh, RawMesh, clean_shape, place_mesh
-
-_MAP_KD = re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
+from workers.assets.external.obj import count_obj, named_by_mtl, named_by_obj, read_obj
+from workers.assets.external.ply import count_ply, named_by_ply, read_ply
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,8 @@ class Format:
 FORMATS: Mapping[str, Format] = {
     ".glb": Format(named_by_gltf, read_gltf),
     ".gltf": Format(named_by_gltf, read_gltf),
-    ".obj": Format(plain.named_by_obj, plain.read_obj, plain.count_obj),
-    ".ply": Format(plain.named_by_ply, plain.read_plain, plain.count_ply),
+    ".obj": Format(named_by_obj, read_obj, count_obj),
+    ".ply": Format(named_by_ply, read_ply, count_ply),
     ".stl": Format(lambda *_: [], plain.read_plain, plain.count_stl),
 }
 """The formats of mesh files by suffix, the one that says most about a thing first."""
@@ -79,7 +78,7 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
     resolver = FolderResolver(path, root, limits)
     found = _find(resolver, row.named(path, data))
     for material in [file for file in found if file.suffix.lower() == ".mtl"]:
-        found += _find(resolver, plain.decode_names(_MAP_KD.findall(material.read_bytes())))
+        found += _find(resolver, named_by_mtl(material.read_bytes()))
     return list(dict.fromkeys([path, *found]))
 
 

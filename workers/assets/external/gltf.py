@@ -3,8 +3,7 @@
 A reader of its own, because none of the libraries fits: trimesh reads files and refuses `../` with a resolver, but decodes every
 picture, and ignores texCoord, sparse accessors, texture transforms, alphaMode and required extensions without a word; pygltflib
 reads the tree and leaves buffers, pictures, node poses and every check to its user, which is this file. Whatever a file states
-can be obeyed or named here: an attribute in `_mesh`, a property of a material in `_material`, a required extension in
-`_refuse_extensions`.
+is obeyed or named: an attribute in `_mesh`, a property of a material in gltf_materials.py, a required extension by `_REQUIRED`.
 
 Everything that the tree says is a stranger's: counts are held to the caps before anything is built, names go through the folder's
 resolver, and whatever malformed JSON raises becomes a MeshError.
@@ -15,6 +14,7 @@ import json
 import math
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -22,30 +22,25 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Pose
+from schemas.base import Array, Pose
 from schemas.errors import MeshError
-from schemas.scene.shape import Material
-from workers.assets.external.caps import (
-    LONGEST_NAME,
-    FolderResolver,
-    check_counts,
-    check_nodes,
-    decode_picture,
-    unreadable,
-)
-from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, make_material
+from workers.assets.external.caps import LONGEST_NAME, FolderResolver, check_counts, check_nodes, unreadable
+from workers.assets.external.gltf_materials import Materials, image_of, read_references
+from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh
 from workers.assets.glb import split_glb
 from workers.geometry.colour import encode_srgb
 
 MALFORMED = (struct.error, ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
 """What reading a stranger's JSON may raise."""
 
-COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
-"""Extensions that hide coordinates from a reader that does not know them."""
+INSTANCING = "EXT_mesh_gpu_instancing"
+_REQUIRED = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_texture_basisu", "KHR_lights_punctual", INSTANCING)
+"""Extensions that a file may require: those that are obeyed here, and those that leave the shape as it is."""
+_HARMLESS = ("KHR_materials_", "EXT_texture_", "MSFT_texture_", "KHR_xmp", "KHR_animation_")
+"""Beginnings of names of extensions that leave the shape as it is."""
 
-_GLOSS = "KHR_materials_pbrSpecularGlossiness"
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
@@ -53,10 +48,9 @@ def named_by_gltf(path: Path, data: bytes) -> list[str]:
     """Names of the files that a glTF file refers to, buffers first, each once; MeshError `unreadable`."""
     try:
         tree, _ = _parse(path, data)
-        pictures = [
-            _picture_of(tree, reference) for material in tree.get("materials", []) if (reference := _colour(material))
-        ]
-        images = [tree["images"][number] for number in pictures if number is not None]
+        references = [found for material in tree.get("materials", []) for found in read_references(material)]
+        pictures = [image_of(tree, reference)[0] for reference in references]
+        images = [tree["images"][number] for number in dict.fromkeys(pictures) if number is not None]
         uris = [item["uri"] for item in (*tree.get("buffers", []), *images) if isinstance(item.get("uri"), str)]
         return list(dict.fromkeys(unquote(uri) for uri in uris if not uri.startswith("data:") and not _is_address(uri)))
     except MALFORMED as error:
@@ -90,11 +84,12 @@ def _parse(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _refuse_extensions(path: Path, tree: dict[str, Any]) -> None:
-    """MeshError `format` where the file keeps its coordinates in an extension that is not read."""
-    needed = tree.get("extensionsRequired", [])
-    for name in COMPRESSED:
-        if name in needed:
-            raise MeshError("format", f"{path} needs the glTF extension {name}, which is not read: export it without")
+    """MeshError `format` where the file requires an extension that is neither obeyed nor harmless."""
+    for name in tree.get("extensionsRequired", []):
+        if name not in _REQUIRED and not str(name).startswith(_HARMLESS):
+            raise MeshError(
+                "format", f"{path} needs the glTF extension {name!s:.80}, which is not read: export it without"
+            )
 
 
 def _check_caps(path: Path, tree: dict[str, Any], size: int, resolver: FolderResolver) -> None:
@@ -109,10 +104,19 @@ def _check_caps(path: Path, tree: dict[str, Any], size: int, resolver: FolderRes
         faces = sum(counts[place if indices is None else indices] // 3 for place, indices in primitives)
         of_mesh.append((sum(counts[place] for place, _ in primitives), faces, len(primitives)))
     nodes = tree.get("nodes", [])
-    shown = [of_mesh[node["mesh"]] for node in nodes if "mesh" in node]
+    shown = [[_times(counts, node) * n for n in of_mesh[node["mesh"]]] for node in nodes if "mesh" in node]
     vertices, faces, parts = (sum(column) for column in zip((0, 0, 0), *shown, strict=True))
     check_nodes(path, max(len(nodes), parts), "nodes or parts", resolver.limits)
     check_counts(path, vertices, faces, resolver.limits)
+
+
+def _instances(node: dict[str, Any]) -> dict[str, int]:
+    """The accessors that place copies of a node's mesh, by attribute; none where it is shown once."""
+    return dict(node.get("extensions", {}).get(INSTANCING, {}).get("attributes", {}))
+
+
+def _times(counts: list[int], node: dict[str, Any]) -> int:
+    return max((counts[number] for number in _instances(node).values()), default=1)
 
 
 class _File:
@@ -121,23 +125,35 @@ class _File:
     def __init__(self, path: Path, tree: dict[str, Any], chunk: bytes, resolver: FolderResolver) -> None:
         self.path, self.tree, self.resolver = path, tree, resolver
         self.buffers = [self._buffer(number, buffer, chunk) for number, buffer in enumerate(tree.get("buffers", []))]
-        self._pictures: dict[int, NDArray[np.uint8] | None] = {}
-        self._materials: dict[tuple[int, bool], Material] = {}
+        self.materials = Materials(tree, resolver, self._image)
 
     def meshes(self) -> Iterator[RawMesh]:
         """The primitives of triangles, in the order in which a walk of the scene's nodes meets them."""
-        for node, matrix in self._nodes():
-            if "mesh" in node:
-                for primitive in self.tree["meshes"][node["mesh"]]["primitives"]:
-                    if primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN):
-                        yield self._mesh(primitive, matrix)
+        poses: dict[int, Pose] = {}
+        for node, _, matrix in self._nodes(self._roots()):
+            if "mesh" not in node:
+                continue
+            mesh, bones = self.tree["meshes"][node["mesh"]], None
+            weights = node.get("weights", mesh.get("weights", []))
+            if "skin" in node:
+                poses = poses or {n: matrix for _, n, matrix in self._nodes(None)}
+                bones, matrix = self._bones(self.tree["skins"][node["skin"]], poses), np.eye(4)
+            placed = [matrix @ copy for copy in self._copies(node)]
+            for primitive in mesh["primitives"]:
+                if primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN):
+                    yield from (self._mesh(primitive, matrix, weights, bones) for matrix in placed)
 
-    def _nodes(self) -> Iterator[tuple[dict[str, Any], Pose]]:
-        """The scene's nodes, each with its pose in the scene [4, 4]; ValueError where one is met twice."""
-        nodes, scenes = self.tree.get("nodes", []), self.tree.get("scenes", [])
-        children = {child for node in nodes for child in node.get("children", [])}
-        roots = scenes[self.tree.get("scene", 0)].get("nodes", []) if scenes else set(range(len(nodes))) - children
-        waiting = [(int(root), np.eye(4)) for root in sorted(roots, reverse=True)]
+    def _roots(self) -> list[int] | None:
+        """The roots of the scene that is shown; None for those of all nodes, where the file has no scene."""
+        scenes = self.tree.get("scenes", [])
+        return sorted(int(root) for root in scenes[self.tree.get("scene", 0)].get("nodes", [])) if scenes else None
+
+    def _nodes(self, roots: list[int] | None) -> Iterator[tuple[dict[str, Any], int, Pose]]:
+        """Nodes below `roots`, or all: each, its number, its pose in the scene [4, 4]. ValueError where one is met twice."""
+        nodes = self.tree.get("nodes", [])
+        if roots is None:
+            roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
+        waiting = [(root, np.eye(4)) for root in reversed(roots)]
         seen = set[int]()
         while waiting:
             number, above = waiting.pop()
@@ -145,75 +161,72 @@ class _File:
                 raise ValueError("a node has two parents")
             seen.add(number)
             matrix = above @ _pose(nodes[number])
-            yield nodes[number], matrix
+            yield nodes[number], number, matrix
             waiting += [(int(child), matrix) for child in reversed(nodes[number].get("children", []))]
 
-    def _mesh(self, primitive: dict[str, Any], matrix: Pose) -> RawMesh:
-        attributes = primitive["attributes"]
+    def _bones(self, skin: dict[str, Any], poses: dict[int, Pose]) -> Array:
+        """[J, 4, 4]: what takes a point of a skinned mesh with each joint; the node's own pose means nothing then."""
+        joints = np.stack([poses[int(joint)] for joint in skin["joints"]])
+        if "inverseBindMatrices" not in skin:
+            return joints
+        back = self._accessor(skin["inverseBindMatrices"], 16).reshape(-1, 4, 4).transpose(0, 2, 1)
+        return np.asarray(joints @ back[: len(joints)])
+
+    def _copies(self, node: dict[str, Any]) -> list[Pose]:
+        """The poses [4, 4] in the node at which its mesh is shown: one, or those of EXT_mesh_gpu_instancing."""
+        attributes = _instances(node)
+        columns = {name: self._accessor(number, None) for name, number in attributes.items()}
+        names = [name for name in ("TRANSLATION", "ROTATION", "SCALE") if name in columns]
+        count = min((len(columns[name]) for name in names), default=0)
+        return [_pose({name.lower(): columns[name][k] for name in names}) for k in range(count)] or [np.eye(4)]
+
+    def _mesh(self, primitive: dict[str, Any], matrix: Pose, weights: list[float], bones: Array | None) -> RawMesh:
+        attributes, targets = primitive["attributes"], primitive.get("targets", [])
         vertices = self._accessor(attributes["POSITION"], 3)
         indices = primitive.get("indices")
         corners = np.arange(len(vertices)) if indices is None else self._accessor(indices, 1)[:, 0].astype(np.int64)
         normals = self._accessor(attributes["NORMAL"], 3) if "NORMAL" in attributes else None
-        number, uv, colors, material = primitive.get("material"), None, None, DEFAULT
-        if number is not None:
-            reference = _colour(self.tree["materials"][number]) or {}
-            name = f"TEXCOORD_{int(reference.get('texCoord', 0))}"
-            uv = self._accessor(attributes[name], 2) if name in attributes else None
-            if uv is not None and (uv.shape != (len(vertices), 2) or not np.isfinite(uv).all()):
-                uv = None
-        if "COLOR_0" in attributes:
-            colors = _colors(self._accessor(attributes["COLOR_0"], None), len(vertices))
-            material = DEFAULT if colors is None else WHITE
-        if number is not None:
-            material = self._material(number, uv is not None)
-        if uv is not None:
-            uv = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])  # glTF's v runs down
-        visual = MeshVisual(material, uv, colors)
+        for weight, target in zip(weights, targets, strict=False):
+            if weight and "POSITION" in target:
+                vertices, normals = vertices + float(weight) * self._accessor(target["POSITION"], 3), None
+        if bones is not None and "JOINTS_0" in attributes:
+            vertices, normals = self._skinned(attributes, bones, vertices), None
+        visual = self._visual(primitive, len(vertices))
         return RawMesh(vertices, _triangles(corners, primitive.get("mode", _TRIANGLES)), normals, visual, matrix)
 
-    def _material(self, number: int, textured: bool) -> Material:
-        """A material; linear factors become sRGB. A picture only where the mesh has coordinates for it."""
-        if (number, textured) not in self._materials:
-            source = self.tree["materials"][number]
-            rough, gloss = source.get("pbrMetallicRoughness", {}), source.get("extensions", {}).get(_GLOSS)
-            reference = _colour(source)
-            picture = self._picture(reference) if reference and textured else None
-            factor, metallic = rough.get("baseColorFactor"), float(rough.get("metallicFactor", 1.0))
-            roughness = float(rough.get("roughnessFactor", 1.0))
-            if gloss is not None and not rough:
-                factor, metallic = gloss.get("diffuseFactor"), 0.0
-                roughness = 1.0 - float(gloss.get("glossinessFactor", 1.0))
-            linear = np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64).reshape(4)
-            color = np.append(encode_srgb(np.clip(linear[:3], 0.0, 1.0)), linear[3])
-            self._materials[number, textured], notes = make_material(color, metallic, roughness, picture)
-            self.resolver.notes += notes
-        return self._materials[number, textured]
+    def _skinned(self, attributes: dict[str, Any], bones: Array, vertices: Array) -> Array:
+        """Points [V, 3] moved by up to four joints each, or more where there are more sets."""
+        moved, total = np.zeros((len(vertices), 3)), np.zeros((len(vertices), 1))
+        points = np.column_stack([vertices, np.ones(len(vertices))])
+        for k in range(len(attributes)):
+            if f"JOINTS_{k}" not in attributes:
+                break
+            joints = self._accessor(attributes[f"JOINTS_{k}"], 4).astype(np.int64)
+            shares = self._accessor(attributes[f"WEIGHTS_{k}"], 4)
+            for joint, share in zip(joints.T, shares.T, strict=True):
+                moved += share[:, None] * np.einsum("vij,vj->vi", bones[joint, :3], points)
+                total += share[:, None]
+        return moved / np.where(total > 0.0, total, 1.0)
 
-    def _picture(self, reference: dict[str, Any]) -> NDArray[np.uint8] | None:
-        """The picture that a reference to a texture means, [h, w, 3 or 4] uint8; None with a note where it cannot be had."""
-        number = _picture_of(self.tree, reference)
-        if number is None:
-            self.resolver.note("a texture", "is neither PNG nor JPEG")
-            return None
-        if number not in self._pictures:
-            self._pictures[number] = self._decode(number)
-        return self._pictures[number]
+    def _visual(self, primitive: dict[str, Any], count: int) -> MeshVisual:
+        attributes, number, colors = primitive["attributes"], primitive.get("material"), None
+        look = None if number is None else self.materials.look(number)
+        if "COLOR_0" in attributes:
+            colors = _colors(self._accessor(attributes["COLOR_0"], None), count)
+        if colors is not None and (look is None or look.opaque):
+            colors[:, 3] = 255
+        if look is None:  # the default material of the format is white; of a file without any it is told by nothing
+            plain = WHITE if colors is not None or self.tree.get("materials") else DEFAULT
+            return MeshVisual(plain, None, colors)
+        uv = self._accessor(attributes[look.coordinates], 2) if look.coordinates in attributes else None
+        if uv is None or uv.shape != (count, 2) or not np.isfinite(uv).all():
+            return MeshVisual(replace(look.material, texture=None), None, colors)
+        return self.materials.visual(look, uv, colors)
 
-    def _decode(self, number: int) -> NDArray[np.uint8] | None:
-        image = self.tree["images"][number]
-        uri, name = image.get("uri"), f"image {number}"
-        if isinstance(uri, str):
-            name = name if uri.startswith("data:") else unquote(uri)
-            try:
-                data = _read(uri, self.resolver)
-            except FileNotFoundError:
-                return None  # the resolver has noted it
-        else:
-            data = self._view(image["bufferView"]).tobytes()
-        if (why := self.resolver.budget.take_image(data)) is not None:
-            self.resolver.note(name, why)
-            return None
-        return decode_picture(data, self.resolver.notes)
+    def _image(self, image: dict[str, Any], name: str) -> bytes:
+        """The bytes of a picture; FileNotFoundError where it is missing or refused, which is noted."""
+        uri = image.get("uri")
+        return _read(uri, self.resolver) if isinstance(uri, str) else self._view(image["bufferView"]).tobytes()
 
     def _buffer(self, number: int, buffer: dict[str, Any], chunk: bytes) -> NDArray[np.uint8]:
         """A buffer's bytes, as many as it declares."""
@@ -308,19 +321,6 @@ def _colors(values: NDArray, count: int) -> NDArray[np.uint8] | None:
     share[:, : values.shape[1]] = np.clip(values, 0.0, 1.0)
     share[:, :3] = encode_srgb(share[:, :3])
     return np.round(255.0 * share).astype(np.uint8)
-
-
-def _colour(material: dict[str, Any]) -> dict[str, Any] | None:
-    """A material's reference to the texture of its base colour."""
-    gloss = material.get("extensions", {}).get(_GLOSS, {})
-    found = material.get("pbrMetallicRoughness", {}).get("baseColorTexture") or gloss.get("diffuseTexture")
-    return found if isinstance(found, dict) else None
-
-
-def _picture_of(tree: dict[str, Any], reference: dict[str, Any]) -> int | None:
-    """The number of the picture that a reference to a texture means; None where it is in a format of an extension."""
-    number = tree["textures"][reference["index"]].get("source")
-    return None if number is None else int(number)
 
 
 def _is_address(uri: str) -> bool:

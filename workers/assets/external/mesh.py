@@ -284,7 +284,7 @@ def clean_shape(path: Path, pieces: list[RawMesh]) -> tuple[Shape, list[str]]:
     faces, owner, bodies = _unify_winding(vertices, faces, owner, point)
     watertight = bool(bodies.closed.all()) and float(bodies.volume.sum()) > thin_volume(vertices, faces)
     if not watertight:
-        solid = ~_slivers(vertices, faces)
+        solid = ~_slivers(vertices, faces) | bodies.closed[bodies.body]  # one may close a gap of its body
         faces, owner = faces[solid], owner[solid]
         if not len(faces):
             raise MeshError("no_faces", f"{path} has only faces without area")

@@ -1,10 +1,8 @@
-"""Edge: reads OBJ, PLY and STL files from outside by trimesh, to which `FolderResolver` gives material files and pictures."""
+"""Edge: reads STL files from outside by trimesh, and what trimesh made of a stored GLB."""
 
 import io
-import re
 import struct
 import warnings
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
@@ -20,61 +18,26 @@ from workers.assets.external.caps import FolderResolver, decode_picture, unreada
 from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, make_material
 from workers.geometry.colour import encode_srgb
 
-_OBJ_COUNTED_BACK = re.compile(rb"^f[ \t][^\n]*-\d", re.MULTILINE)
-_MTLLIB = re.compile(rb"mtllib[ \t]+([^\r\n]+)")
-_PLY_TEXTURE = re.compile(rb"^comment TextureFile[ \t]+([^\r\n]+)", re.MULTILINE)
-_PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
-
-
-def decode_names(names: Iterable[bytes]) -> list[str]:
-    """File names as text."""
-    return [name.decode("utf-8", "replace").strip() for name in names]
-
-
-def named_by_obj(path: Path, data: bytes) -> list[str]:
-    """Names of the material files that an OBJ file asks for."""
-    # Anchoring the expression to line starts would make it ten times slower, and it reads every byte of every mesh.
-    matches = _MTLLIB.finditer(data)
-    return decode_names(m.group(1) for m in matches if m.start() == 0 or data[m.start() - 1 : m.start()].isspace())
-
-
-def named_by_ply(path: Path, data: bytes) -> list[str]:
-    """Names of the pictures that a PLY file asks for."""
-    return decode_names(_PLY_TEXTURE.findall(data))
-
-
-def count_obj(data: bytes) -> tuple[int, int]:
-    """Vertices and faces of an OBJ file, found without parsing it."""
-    return data.count(b"\nv "), data.count(b"\nf ")
-
-
-def count_ply(data: bytes) -> tuple[int, int]:
-    """Vertices and faces that a PLY file's header declares; MeshError `unreadable` where its bytes cannot hold them."""
-    counts = {name: int(count) for name, count in _PLY_ELEMENT.findall(data[: data.find(b"end_header")][:65536])}
-    if any(count > len(data) for count in counts.values()):
-        promised = min(max(counts.values()), 10**18)
-        raise MeshError("unreadable", f"the PLY header promises {promised} elements in {len(data)} bytes")
-    return counts.get(b"vertex", 0), counts.get(b"face", 0)
-
 
 def count_stl(data: bytes) -> tuple[int, int]:
     """Vertices and faces of an STL file; of the vertices of one in text nothing is known."""
-    if len(data) >= 84 and len(data) == 84 + 50 * struct.unpack_from("<I", data, 80)[0]:
-        faces = (len(data) - 84) // 50
-        return 3 * faces, faces
-    return 0, data.count(b"endfacet")
+    faces = _binary_faces(data)
+    return (3 * faces, faces) if faces else (0, data.count(b"endfacet"))
 
 
-def read_obj(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
-    """The meshes of an OBJ file; MeshError as `read_plain`."""
-    if _OBJ_COUNTED_BACK.search(data) is not None and data.rfind(b"\nv ") > data.find(b"\nf "):
-        raise MeshError("unreadable", f"{path} counts vertices back from each face, which is not supported")
-    return read_plain(path, data, resolver)
+def _binary_faces(data: bytes) -> int:
+    """How many faces a binary STL file has; 0 for one in text. Some programs leave bytes behind the last face."""
+    faces = int(struct.unpack_from("<I", data, 80)[0]) if len(data) >= 84 else 0
+    behind = len(data) - 84 - 50 * faces
+    text = data[:5].lower() == b"solid" and b"facet" in data[:1024]
+    return faces if behind == 0 or (0 < behind < 1024 and not text) else 0
 
 
 def read_plain(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
     """The meshes of a file that trimesh reads; MeshError `index_out_of_range` or `unreadable`."""
     kind = path.suffix.lower()[1:]
+    if kind == "stl" and (count := _binary_faces(data)):
+        data = data[: 84 + 50 * count]  # trimesh takes a file with bytes behind the last face for text
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

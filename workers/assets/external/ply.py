@@ -1,0 +1,192 @@
+"""Edge: reads PLY files from outside by the library plyfile.
+
+What the elements mean is not in the format. Read are the names that MeshLab, CloudCompare, Blender, the Stanford scans and BOP
+write: colours of vertices and faces, coordinates of pictures by vertex or by corner, several pictures, and strips of triangles.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+
+from schemas.base import Array
+from schemas.errors import MeshError
+from schemas.scene.shape import Material
+from workers.assets.external.caps import FolderResolver, decode_names, decode_picture, unreadable
+from workers.assets.external.mesh import DEFAULT, WHITE, Indices, MeshVisual, RawMesh, make_material
+
+_TEXTURE = re.compile(rb"^comment TextureFile[ \t]+([^\r\n]+)", re.MULTILINE)
+_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
+_COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_CORNERS = ("vertex_indices", "vertex_index")
+_SPLATS = ("f_dc_0", "scale_0", "rot_0")
+_ROUGHNESS = 0.9
+"""Of a scan's picture or colours: nothing in the format says how they shine."""
+
+
+def named_by_ply(path: Path, data: bytes) -> list[str]:
+    """Names of the pictures that a PLY file asks for."""
+    return decode_names(_TEXTURE.findall(_head(data)))
+
+
+def count_ply(data: bytes) -> tuple[int, int]:
+    """Vertices and faces that a PLY file's header declares; MeshError `unreadable` where its bytes cannot hold them."""
+    counts = {name: int(count) for name, count in _ELEMENT.findall(_head(data)[:65536])}
+    if any(count > len(data) for count in counts.values()):
+        promised = min(max(counts.values()), 10**18)
+        raise MeshError("unreadable", f"the PLY header promises {promised} elements in {len(data)} bytes")
+    return counts.get(b"vertex", 0), counts.get(b"face", 0)
+
+
+def _head(data: bytes) -> bytes:
+    return data[: max(data.find(b"end_header"), 0)]
+
+
+def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
+    """One mesh for each picture of a PLY file. Polygons are cut as fans.
+
+    Raises MeshError `index_out_of_range`, `no_faces` for points and splats, or `unreadable`.
+    """
+    try:
+        elements = {element.name: element for element in _parse(path)}
+        vertices, faces = elements["vertex"], elements.get("face", elements.get("faces"))
+        points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
+        if faces is not None and len(faces):
+            corners, face = _triangles(path, faces, len(points))
+        elif "tristrips" in elements:
+            corners, face = _strips(elements["tristrips"]), None
+        else:
+            splats = set(_SPLATS) <= {prop.name for prop in vertices.properties}
+            what = "Gaussian splats" if splats else "a cloud of points"
+            raise MeshError("no_faces", f"{path} is {what} without triangles: make a mesh of it")
+        return _meshes(path, vertices, points, faces, corners, face, resolver)
+    except (PlyParseError, KeyError, ValueError, TypeError, IndexError, StopIteration) as error:
+        raise unreadable(path, error) from error
+
+
+def _parse(path: Path) -> list[PlyElement]:
+    """The elements. Lists as of a file of triangles, which are read at once, or else list by list."""
+    lengths = dict.fromkeys(_CORNERS, 3) | {"texcoord": 6}
+    try:
+        return list(PlyData.read(str(path), known_list_len={"face": lengths}).elements)
+    except PlyParseError:
+        return list(PlyData.read(str(path)).elements)
+
+
+def _triangles(path: Path, faces: PlyElement, count: int) -> tuple[Indices, Indices]:
+    """[T, 3, 2]: the triangles of all faces, each corner a vertex and a place in its face; and [T] the face of each."""
+    name = next(prop.name for prop in faces.properties if prop.name in _CORNERS)
+    lists = faces[name]
+    if lists.dtype != object:  # all are triangles
+        lists = lists.reshape(-1, 3).astype(np.int64)
+        places = np.broadcast_to(np.arange(3), lists.shape)
+        return _checked(path, np.stack([lists, places], axis=-1), count), np.arange(len(lists))
+    sizes = np.array([len(row) for row in lists])
+    made, owners = [], []
+    for size in np.unique(sizes[sizes >= 3]):
+        which = np.flatnonzero(sizes == size)
+        table = np.stack(lists[which]).astype(np.int64)
+        fan = np.array([[0, k, k + 1] for k in range(1, size - 1)])
+        places = np.broadcast_to(fan, (len(which), *fan.shape))
+        made.append(np.stack([table[:, fan], places], axis=-1).reshape(-1, 3, 2))
+        owners.append(np.repeat(which, size - 2))
+    if not made:
+        raise MeshError("no_faces", f"{path} has no triangles")
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return _checked(path, np.concatenate(made)[order], count), owner[order]
+
+
+def _checked(path: Path, corners: Indices, count: int) -> Indices:
+    worst = int(corners[..., 0].max())
+    if worst >= count or corners[..., 0].min() < 0:
+        raise MeshError("index_out_of_range", f"{path}: a face names vertex {worst} of {count}")
+    return corners
+
+
+def _strips(strips: PlyElement) -> Indices:
+    """[T, 3, 1]: the triangles of strips, in which -1 begins another one; every second triangle is turned."""
+    made = []
+    for row in strips["vertex_indices"]:
+        ends = np.flatnonzero(np.asarray(row) < 0)
+        for strip in np.split(np.asarray(row, np.int64), ends):
+            strip = strip[strip >= 0]
+            faces = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
+            faces[1::2] = faces[1::2, [1, 0, 2]]
+            made.append(faces)
+    return np.concatenate(made)[..., None]
+
+
+def _meshes(
+    path: Path,
+    vertices: PlyElement,
+    points: Array,
+    faces: PlyElement | None,
+    corners: Indices,
+    face: Indices | None,
+    resolver: FolderResolver,
+) -> list[RawMesh]:
+    names = {prop.name for prop in vertices.properties}
+    pictures = [_picture(name, resolver) for name in named_by_ply(path, path.read_bytes()[:65536])]
+    normals = np.column_stack([vertices[n] for n in ("nx", "ny", "nz")]) if {"nx", "ny", "nz"} <= names else None
+    colors = _colors(vertices)
+    by_face = _colors(faces) if faces is not None and colors is None else None
+    uv = next((np.column_stack([vertices[a], vertices[b]]) for a, b in _COORDINATES if {a, b} <= names), None)
+    index = corners[..., 0]
+    if faces is not None and face is not None and "texcoord" in {prop.name for prop in faces.properties} and pictures:
+        uv = _corner_coordinates(faces["texcoord"], face, corners[..., 1])
+        points, index = points[index.ravel()], np.arange(index.size).reshape(-1, 3)
+        flat = corners[..., 0].ravel()
+        normals, colors = (None if array is None else array[flat] for array in (normals, colors))
+    if uv is None or not pictures or not np.isfinite(uv).all():
+        visual = MeshVisual(WHITE if colors is not None or by_face is not None else DEFAULT, colors=colors)
+        shown = None if by_face is None or face is None else by_face[face]
+        return [RawMesh(points, index, normals, MeshVisual(visual.material, None, colors, shown), np.eye(4))]
+    which = np.zeros(len(index), np.int64)
+    if faces is not None and face is not None and "texnumber" in {prop.name for prop in faces.properties}:
+        which = np.clip(np.asarray(faces["texnumber"], np.int64)[face], 0, len(pictures) - 1)
+    return [
+        RawMesh(points, index[which == k], normals, MeshVisual(pictures[k], np.asarray(uv, np.float64)), np.eye(4))
+        for k in np.unique(which).tolist()
+    ]
+
+
+def _corner_coordinates(lists: NDArray, face: Indices, place: Indices) -> Array:
+    """[3 T, 2] of triangles [T, 3] that are corners `place` of faces: a list u, v, u, v ... a face; 0 where it is short."""
+    widest = max((len(row) for row in lists), default=0) // 2 * 2
+    table = np.zeros((len(lists), max(widest, 2)))
+    for row, values in zip(table, lists, strict=True):
+        row[: min(len(values), widest)] = values[:widest]
+    at = np.minimum(place, table.shape[1] // 2 - 1)
+    return table.reshape(len(lists), -1, 2)[face[:, None], at].reshape(-1, 2)
+
+
+def _colors(element: PlyElement) -> NDArray[np.uint8] | None:
+    """[N, 4] uint8 sRGB of an element's own colours: whole numbers up to 255, or floats in [0, 1]."""
+    names = {prop.name for prop in element.properties if not isinstance(prop, PlyListProperty)}
+    rgb = next((found for found in _COLORS if set(found) <= names), None)
+    if rgb is None:
+        return None
+    columns = [element[name] for name in (*rgb, *(["alpha"] if "alpha" in names else []))]
+    table = np.full((len(element), 4), 255, np.uint8)
+    for k, column in enumerate(columns):
+        values: NDArray[Any] = np.asarray(column)
+        if values.dtype.kind == "f":
+            values = np.nan_to_num(values) * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)
+        elif values.dtype.itemsize > 1 and values.max(initial=0) > 255:
+            values = values / np.iinfo(values.dtype).max * 255.0
+        table[:, k] = np.clip(np.round(values), 0, 255)
+    return table
+
+
+def _picture(name: str, resolver: FolderResolver) -> Material:
+    """The material of a picture: as it is, or the neutral grey where it cannot be had."""
+    try:
+        picture = decode_picture(resolver.get(name), resolver.notes)
+    except FileNotFoundError:
+        return DEFAULT  # the resolver has noted it
+    return DEFAULT if picture is None else make_material(np.ones(4), 0.0, _ROUGHNESS, picture)[0]
