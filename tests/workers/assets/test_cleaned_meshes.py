@@ -141,7 +141,7 @@ def test_scanned_things_come_in_closed_with_a_volume_that_their_own_collision_me
         assert welded(scanned.shape).volume <= hulls[0]
         missing = [note for note in scanned.notes if "texture_map.png is missing" in note]
         assert missing or name != "mug"
-        assert scanned.notes == () or name != "blue_cup"
+        assert [note[:11] for note in scanned.notes] == ["a grey Kd o"] or name != "blue_cup"
 
 
 # ------------------------------------------------------------------------------------------------ mass

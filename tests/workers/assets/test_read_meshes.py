@@ -37,7 +37,6 @@ from workers.assets.external.mesh import DEFAULT, is_solid
 from workers.assets.external.urdf import load_urdf
 from workers.assets.glb import asset_glb, split_glb
 
-
 NORMALS = "not drawn: normalTexture"
 """The note on the map of the glTF cube that nothing reads."""
 

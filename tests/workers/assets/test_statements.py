@@ -246,9 +246,9 @@ APART = [f"v {x:g} {y:g} {z:g}" for side in SIDES for x, y, z in CORNERS[list(si
 BACK = [f"f {' '.join(str(4 * k + i - 24) for i in range(4))}" for k in range(6)]
 
 
-def ply_by_vertex(u, v):
+def ply_by_vertex(u, v, more=""):
     names = f"property float {u}\nproperty float {v}\n"
-    files = ply(names, "", "comment TextureFile t.png\n", False, lambda k, c: f"{k % 2} 0")
+    files = ply(names, "", "comment TextureFile t.png\n", False, lambda k, c: f"{k % 2} 0{more}")
     return files | {"t.png": image(SKIN)}
 
 
@@ -341,7 +341,9 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     # OBJ and MTL
     "obj": (obj(), Right(roughness=(2 / 3) ** 0.25)),
     "no Kd": (obj("map_Kd t.png\n"), Right()),
-    "black Kd": (obj("Kd 0 0 0\nmap_Kd t.png\n"), Right()),
+    "black Kd": (obj("Kd 0 0 0\nmap_Kd t.png\n"), Right(note="grey Kd")),
+    "grey Kd": (obj("Kd 0.588 0.588 0.588\nmap_Kd t.png\n"), Right(note="a grey Kd of 0.588")),
+    "red Kd": (obj("Kd 1 0 0\nmap_Kd t.png\n"), Right(((200, 0, 0),))),
     "no material file": (obj(first="", use=""), Right((GREY,))),
     "a material file that is missing": (
         obj(first="mtllib n.mtl", files={"a.mtl": b""}),
@@ -413,6 +415,7 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
         | {"t.png": image(RED), "u.png": image(GREEN)},
         Right((RED, GREEN)),
     ),
+    "ply with more in a line than its head says": (ply_by_vertex("s", "t", " 7"), Right()),
     "ply strips": (ply(faces=STRIPS, rows=STRIP), Right((GREY,))),
     "ply points": (ply(faces="", rows=""), "cloud of points"),
     # STL

@@ -148,12 +148,13 @@ class FolderResolver:
         Looked for relative to the mesh, then beside it, in its folders of pictures (`textures`, and `../materials/textures` as
         Google's scanned objects have them), then in other case.
         """
-        name = name.strip().replace("\\", "/")
+        name = name.replace("\\", "/")
         if len(name) > LONGEST_NAME:
             return None
+        exact, name = self.folder / name, name.strip()
         last = Path(name).name
-        places = [self.folder / name, self.folder / last, *(self.folder / folder / last for folder in _FOLDERS)]
-        return find_inside(self.root, *places) or find_inside(self.root, *map(_other_case, places[:2]))
+        places = [exact, self.folder / name, self.folder / last, *(self.folder / folder / last for folder in _FOLDERS)]
+        return find_inside(self.root, *places) or find_inside(self.root, *map(_other_case, places[1:3]))
 
     def refuse(self, name: str, why: str) -> FileNotFoundError:
         """Notes why a file is not read, and returns the error that says so."""

@@ -340,6 +340,10 @@ def _material(stated: dict[str, str], resolver: FolderResolver) -> Material:
         picture.setflags(write=False)
     emitted, given = _numbers(stated.get("ke")), _numbers(stated.get("kd"))
     rgb = given if given is not None else np.ones(3) if "map_kd" in stated else np.array(DEFAULT.base_color[:3])
+    if picture is not None and rgb.min() == rgb.max() < 1.0:
+        # Blender writes 0.8 and 3ds Max 0.588 beside every picture, and neither darkens the picture by it.
+        resolver.notes.append(f"a grey Kd of {rgb[0]:.3g} beside a picture was not used")
+        rgb = np.ones(3)
     if emitted is not None and emitted.max() > 0.0 and rgb.max() == 0.0 and picture is None:
         rgb = emitted
         resolver.notes.append("a colour of light (Ke) was drawn as a plain colour")

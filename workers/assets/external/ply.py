@@ -5,6 +5,7 @@ write: colours of vertices and faces, coordinates of pictures by vertex or by co
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from schemas.errors import MeshError
 from schemas.scene.shape import Material
 from workers.assets.external.caps import FolderResolver, decode_names, decode_picture, unreadable
 from workers.assets.external.mesh import DEFAULT, WHITE, Indices, MeshVisual, RawMesh, make_material
+from workers.assets.external.plain import read_plain
 
 _TEXTURE = re.compile(rb"^comment TextureFile[ \t]+([^\r\n]+)", re.MULTILINE)
 _ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
@@ -53,6 +55,13 @@ def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     """
     try:
         elements = {element.name: element for element in _parse(path)}
+    except (
+        PlyParseError,
+        UnicodeDecodeError,
+    ):  # a strict reader: trimesh takes lines that are too long, and strange heads
+        meshes = read_plain(path, data, resolver)
+        return [replace(mesh, visual=_as_it_is(mesh.visual)) for mesh in meshes]
+    try:
         vertices, faces = elements["vertex"], elements.get("face", elements.get("faces"))
         points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
         if faces is not None and len(faces):
@@ -64,8 +73,14 @@ def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
             what = "Gaussian splats" if splats else "a cloud of points"
             raise MeshError("no_faces", f"{path} is {what} without triangles: make a mesh of it")
         return _meshes(path, vertices, points, faces, corners, face, resolver)
-    except (PlyParseError, KeyError, ValueError, TypeError, IndexError, StopIteration) as error:
+    except (KeyError, ValueError, TypeError, IndexError, StopIteration) as error:
         raise unreadable(path, error) from error
+
+
+def _as_it_is(visual: MeshVisual) -> MeshVisual:
+    """The look without the colour of 0.4 by which trimesh multiplies a picture."""
+    plain = visual.material.texture is not None
+    return replace(visual, material=replace(visual.material, base_color=WHITE.base_color)) if plain else visual
 
 
 def _parse(path: Path) -> list[PlyElement]:
