@@ -23,7 +23,7 @@ from tests.kit.killed_runs import ROOT, processes_with
 
 pytestmark = pytest.mark.ray
 
-KILLS = {"ci": 4, "all": 50}
+KILLS = {"ci": 2, "all": 50}
 ACTORS = {
     "driver": "services.cli.main",
     "worker": "ray::",

@@ -124,6 +124,7 @@ SMALL = {
 
 pytestmark = [
     pytest.mark.root,
+    pytest.mark.slow,
     pytest.mark.timeout(900),
     pytest.mark.skipif(not HOSTS.exists(), reason="no ../shared/tools/hosts beside the checkout"),
 ]
@@ -262,12 +263,10 @@ def test_a_worker_host_killed_and_one_cut_off_under_way_change_no_byte(cluster, 
     assert made_in_vain(out) <= 2 * 2 * 2, "at most the ranges that the two hosts had"
 
 
-@pytest.mark.slow
 def test_a_killed_head_that_is_brought_back_and_asked_again_makes_the_same_dataset(cluster, packed, local):
     assert digest_in(lose_the_head(cluster, packed, cluster.storage / "headless")) == local
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_two_hundred_scenes_of_the_first_job_are_the_same_dataset_whatever_is_lost(cluster, tmp_path):
     """Full-size scenes, and Ray's own patience with hosts that do not answer."""

@@ -222,7 +222,7 @@ HOLLOWS = (
         both(flat(0.1), height(RING_M[2] / 2, 0.01), shift(3.1)),
         ring_over_peg,
         tier="minute",
-        again="minute",
+        again="slow",
     ),
     # Steeper than friction holds at 41 degrees; the three or more points around it hold it all the same.
     settles(

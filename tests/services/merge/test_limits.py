@@ -101,7 +101,7 @@ print(json.dumps({"rows": result.rows, "rss_mib": list(store.rss_mib.values()), 
 @pytest.mark.parametrize(
     ("ranges", "limits", "most_mib"),
     [
-        (2_000, [512, 512, 2 << 10], 16.0),
+        pytest.param(2_000, [512, 512, 2 << 10], 16.0, marks=pytest.mark.minute),
         pytest.param(20_000, [8_192, 4_096, 16 << 10], 48.0, marks=pytest.mark.slow),
     ],
 )

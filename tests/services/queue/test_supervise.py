@@ -167,6 +167,7 @@ def test_a_supervisor_killed_at_any_step_loses_nothing_and_starts_nothing_twice(
     at_each_step(tmp_path, die)
 
 
+@pytest.mark.minute
 def test_a_second_supervisor_that_acts_in_the_middle_of_any_step_or_in_turn_doubles_nothing(tmp_path):
     at_each_step(tmp_path, lambda world, supervisors: world.supervisor().look())
     world = world_of(tmp_path / "in turn")

@@ -60,6 +60,7 @@ def test_a_driver_that_sees_no_avx512_makes_the_same_bytes(cluster, job, private
     assert digest_of(cluster.verso(*words, GLIBC_TUNABLES=hidden)) == private
 
 
+@pytest.mark.slow
 def test_a_driver_whose_c_library_rounds_otherwise_is_told_both_stacks(cluster, job):
     if "fma" not in processor_flags():
         pytest.skip("this processor has no fused multiplication")

@@ -57,6 +57,7 @@ def labels(axes: Axes) -> list[Annotation]:
     return [text for text in axes.texts if isinstance(text, Annotation)]
 
 
+@pytest.mark.minute
 def test_no_text_lies_outside_the_picture_and_no_label_covers_another():
     for picture in itertools.chain.from_iterable(map(drawn, STUDIES)):
         picture.draw_without_rendering()

@@ -266,6 +266,7 @@ def test_the_boards_plane_is_where_depth_has_it():
     assert (region.low[:2] > [-0.07, -0.06]).all() and (region.high[:2] < [0.08, 0.06]).all()
 
 
+@pytest.mark.minute
 def test_the_largest_thing_is_the_object_and_what_is_none_is_refused_with_the_height():
     pen = (np.array([0.15, 0.10, 0.0]), np.array([0.20, 0.15, 0.05]))
     region = find_object(capture(Thing(boxes=[*Thing().boxes, pen])), BOARD, Fusion())

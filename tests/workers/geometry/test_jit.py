@@ -156,7 +156,7 @@ def test_loops_that_were_compiled_with_an_image_are_read_where_this_process_keep
     assert list((tmp_path / "own").rglob("*.nbc"))
 
 
-@pytest.mark.minute
+@pytest.mark.slow
 def test_a_scene_needs_no_loop_that_was_not_planned(tmp_path):
     """Else each worker compiles it by itself, in the middle of a job."""
     assert said(start(tmp_path, SCENES)) == ["[]"]

@@ -153,6 +153,7 @@ def scene_and_view(seed: int, width: int, height: int):
 
 
 @traced
+@pytest.mark.minute
 def test_the_same_seed_gives_the_same_bytes_here_and_in_another_process(tracer):
     things, view = scene_and_view(5, 96, 72)
 
