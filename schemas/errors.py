@@ -162,3 +162,8 @@ def describe_seconds(seconds: float) -> str:
     _, one, name = next(span for span in _SPANS if seconds < span[0])
     value = seconds / one
     return f"{float(f'{value:.2g}') if value < 100.0 else round(value):g} {name}"
+
+
+def plural(count: int, one: str, many: str | None = None) -> str:
+    """A number with its noun: "1 scene", "1,200 scenes"."""
+    return f"{count:,} {one if count == 1 else many or f'{one}s'}"

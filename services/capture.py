@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from schemas.capture import CaptureEstimate
-from schemas.errors import CaptureError, InputError, OutputError
+from schemas.errors import CaptureError, InputError, OutputError, plural
 from schemas.job.captures import Board, Captures
 from schemas.job.job import Job
 from schemas.job.keys import set_key
@@ -47,7 +47,7 @@ def capture_settings(changes: Sequence[str] = (), keys: Mapping[str, Any] | None
 
 
 def board(options: argparse.Namespace) -> int:
-    """Writes options.file (.pdf or .png); reads `board`, `tiles` (None or "a4"), `dpi` and `json`. Returns 0."""
+    """Writes options.file (.pdf or .png), and a board.json beside it; reads `board`, `tiles`, `dpi` and `json`. Returns 0."""
     from workers.capture.folder import read_board
     from workers.capture.sheets import board_pdf, board_png, tiled_pdf
 
@@ -62,17 +62,26 @@ def board(options: argparse.Namespace) -> int:
         data = board_png(spec, options.dpi)
     else:
         raise InputError(f"{path}: name a file that ends in .pdf or .png")
+    described = path.with_suffix(".json")
+    new = not described.exists()  # else it may hold what somebody measured
+    if not new and read_board(described).model_copy(update={"measured_ruler_m": spec.measured_ruler_m}) != spec:
+        raise InputError(f"{described} is of another board: print that with --board {described}, or name another file")
+    measured = spec.model_copy(update={"measured_ruler_m": spec.measured_ruler_m or spec.ruler_m})
     try:
         path.write_bytes(data)
+        if new:
+            described.write_text(measured.model_dump_json(indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}") from error
     told = "A4 pages to glue" if options.tiles else "print at 100 %"
     print(f"{path}: {spec.columns} x {spec.rows} markers of {spec.marker_m * 1000:g} mm ({spec.dictionary}); {told}")
+    print(f"{described}: {'the board, for --board' if new else 'was there and is kept'}")
     print(
-        f"measure the printed ruler; if it is not {spec.ruler_m * 1000:g} mm, say so in board.json (measured_ruler_m)"
+        f"measure the printed ruler; if it is not {spec.ruler_m * 1000:g} mm, say so in {described} (measured_ruler_m)"
     )
     if options.json:
-        print(json.dumps({"ok": True, "file": str(path), "board": spec.model_dump(mode="json")}))
+        answer = {"file": str(path), "board_file": str(described), "board": spec.model_dump(mode="json")}
+        print(json.dumps({"ok": True, **answer}))
     return 0
 
 
@@ -104,7 +113,9 @@ def simulate(options: argparse.Namespace) -> int:
     truth = simulate_capture(settings, job.captures.board, asset, chance, path)
     seconds, ran = time.perf_counter() - begun, [name for name in CAPTURE_EFFECTS if plan.runs(name)]
     views = len(truth.T_board_cam)
-    print(f"{path}: {views} views of {asset.instance_id} in {seconds:.1f} s; effects: {', '.join(ran) or 'none'}")
+    print(
+        f"{path}: {plural(views, 'view')} of {asset.instance_id} in {seconds:.1f} s; effects: {', '.join(ran) or 'none'}"
+    )
     print(f"{path / 'truth'}: poses and the true mesh, which only `verso capture evaluate` reads")
     if options.json:
         answer = {"ok": True, "out": str(path), "views": views, "category": asset.category}
@@ -133,9 +144,8 @@ def import_recording(options: argparse.Namespace) -> int:
         raise InputError(f"{recording}: no such file")
     made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
     notes = work.describe_losses(made.losses)
-    print(
-        f"{out}: {len(made.views)} views of {made.frames} frames, depth registered by the recording's own calibration"
-    )
+    views = f"{plural(len(made.views), 'view')} of {plural(made.frames, 'frame')}"
+    print(f"{out}: {views}, depth registered by the recording's own calibration")
     print("\n".join(f"  {note}" for note in notes), end="\n" if notes else "")
     if not options.board:
         print(f"  no --board: board.json is the default board ({board.columns} x {board.rows}, {board.dictionary})")
@@ -232,7 +242,7 @@ def synthesize(options: argparse.Namespace) -> int:
     for one in made:
         what = f"{one['name']}: {one['measured_share']:.1%} measured, from views {', '.join(map(str, one['sources']))}"
         print(f"{what}; d_z {one['d_z_m']:.3f} m" if "d_z_m" in one else what)
-    print(f"{out}: {len(made)} view{'s' * (len(made) > 1)}")
+    print(f"{out}: {plural(len(made), 'view')}")
     if options.json:
         print(json.dumps({"ok": True, "out": str(out), "views": made}))
     return 0

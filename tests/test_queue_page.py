@@ -14,7 +14,7 @@ from services.queue.supervise import PAUSES_S
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "queue.md").read_text()
 LINES = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
-COMMANDS = [shlex.split(line)[1:] for line in LINES if line.startswith("verso ")]
+COMMANDS = [shlex.split(line)[1:] for line in LINES if line.startswith("./verso ")]
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)

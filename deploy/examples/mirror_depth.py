@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Picture
+from PIL import ImageDraw
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
@@ -229,6 +231,30 @@ def score(predicted: Image, example: Example) -> Scores:
     parts = (known, known & example.mask, known & example.unseen)
     l1, in_mask, unseen = (float(error[part].mean()) if part.any() else float("nan") for part in parts)
     return Scores(l1, in_mask, unseen, ms_ssim(np.where(known, predicted, 0), example.depth))
+
+
+ERROR_M = 0.02
+"""Error that is drawn white."""
+
+
+def draw_row(pair: Pair, example: Example, predicted: Image) -> NDArray[np.uint8]:
+    """[H, 4 W, 3] uint8 RGB: the input view about the object, true depth, predicted depth, and error, black to white."""
+    patch = pair.input.patch()
+    seen = cv2.resize((pair.input if patch is None else patch).rgb(), CROP[::-1], interpolation=cv2.INTER_AREA)
+    low, high = np.percentile(example.depth[example.depth > 0], [1, 99])
+    depths = (example.depth, predicted)
+    near = [np.uint8(255 * (1 - np.clip((one - low) / max(high - low, 1e-6), 0, 1))) for one in depths]
+    shown = [cv2.applyColorMap(one, cv2.COLORMAP_VIRIDIS)[..., ::-1] for one in near]
+    error = np.where(example.depth > 0, np.abs(predicted - example.depth) / ERROR_M, 0)
+    return np.concatenate([seen, *shown, np.repeat(np.uint8(255 * np.clip(error, 0, 1))[..., None], 3, axis=2)], axis=1)
+
+
+def draw_sheet(rows: list[NDArray[np.uint8]]) -> Picture.Image:
+    """The rows below one another, with a line that says what they show."""
+    sheet = Picture.fromarray(np.concatenate([np.full((16, *rows[0].shape[1:]), 255, np.uint8), *rows]))
+    for at, words in enumerate(("input", "truth", "prediction", f"error, 0 to {1000 * ERROR_M:g} mm")):
+        ImageDraw.Draw(sheet).text((4 + at * CROP[1], 2), words, fill=0)
+    return sheet
 
 
 MS_SSIM_WEIGHTS = np.array([0.0448, 0.2856, 0.3001, 0.2363])

@@ -1,6 +1,6 @@
 """Pairs of one split, so that no object of the training pairs is in a test pair."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Literal
 
 import pyarrow.compute as pc
@@ -11,14 +11,15 @@ from services.dataset.pair import Pair
 Split = Literal["train", "val", "test"]
 
 
-def pairs_of_split(dataset: Dataset, split: Split) -> Iterator[Pair]:
+def pairs_of_split(dataset: Dataset, split: Split, splits: Mapping[str, str] | None = None) -> Iterator[Pair]:
     """Every pair whose objects are all of instances of this split.
 
-    The split is a column of `assets` and follows from the instance's id, so it is the same in every dataset. A scene of
-    several objects of different splits is in none.
+    `splits`: by instance; by default the column of `assets`, which follows from the instance's id and is the same in every
+    dataset. `dataset.splits()` has the shares in each category. A scene of several objects of different splits is in none.
     """
-    splits = dict(zip(*_columns(dataset, "instance_id", "split"), strict=True))
-    for pair in dataset.pairs(pc.field("asset", "split") == split):
+    if splits is None:
+        splits = dict(zip(*_columns(dataset, "instance_id", "split"), strict=True))
+    for pair in dataset.pairs(pc.field("instance_id").isin([name for name in splits if splits[name] == split])):
         if all(splits[name] == split for name in instances_of(pair)):
             yield pair
 

@@ -1,6 +1,6 @@
 """Trains a small network to predict the mirror view's depth from the input view, and scores it on held-out instances.
 
-PYTHONPATH=. .venv/bin/python deploy/examples/train_mirror_depth.py data/training [--epochs N]
+PYTHONPATH=. .venv/bin/python deploy/examples/train_mirror_depth.py data/training [--epochs N] [--out DIR]
 
 The network sees what the baseline is made of (mirror_depth.py), and says for each pixel whether the object is there and how
 deep. The baseline is the projection of the input view, splatted and its holes filled, with the planes of table top and
@@ -11,10 +11,11 @@ import argparse
 import dataclasses
 import json
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
-from mirror_depth import CHANNELS, SCALE_M, Example, make_example, score
+from mirror_depth import CHANNELS, SCALE_M, Example, draw_row, draw_sheet, make_example, score
 from splits import pairs_of_split
 from torch import Tensor, nn
 from torch.nn import functional
@@ -109,34 +110,51 @@ def complete(net: Net, example: Example) -> np.ndarray:
     return np.where(logit[0, 0].numpy() > 0, depth[0, 0].numpy(), example.background).astype(np.float32)
 
 
-def evaluate(net: Net, place: str) -> dict[str, dict[str, float]]:
-    """Mean scores over the test split: of the network, of the baseline, and of the planes alone."""
+SHOWN = 12
+"""Rows of the sheet."""
+
+
+def evaluate(net: Net, place: str) -> tuple[dict[str, dict[str, float]], list[np.ndarray]]:
+    """(mean scores over the test split of the network, the baseline and the planes alone; rows of the sheet)."""
     found: dict[str, list] = {"network": [], "baseline": [], "half turn": [], "planes alone": []}
+    rows: list[np.ndarray] = []
     for pair in pairs_of_split(open_dataset(place), "test"):
         example = make_example(pair)
         if example is not None:
             answers = (complete(net, example), example.baseline, example.turned, example.background)
             for scores, answer in zip(found.values(), answers, strict=True):
                 scores.append(dataclasses.asdict(score(answer, example)))
-    return {
+            if len(rows) < SHOWN:
+                rows.append(draw_row(pair, example, answers[0]))
+    means = {
         name: {key: float(np.nanmean([one[key] for one in scores])) for key in scores[0]}
         for name, scores in found.items()
     }
+    return means, rows
 
 
 def main() -> None:
-    """Train, score, print."""
+    """Train, score, print, and keep the network and a sheet of pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("place", metavar="DATASET", help="a folder, or a bucket")
     parser.add_argument("--epochs", type=int, default=12, help="default: 12")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="folder for network.pt and sheet.png")
     options = parser.parse_args()
     torch.manual_seed(options.seed)
     data = load(options.place)
     net = Net()
     print(f"{len(data['mask'])} training pairs, {sum(p.numel() for p in net.parameters()) / 1e3:.0f} thousand weights")
     train(net, data, options.epochs)
-    scores = evaluate(net, options.place)
+    scores, rows = evaluate(net, options.place)
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        torch.save(
+            {"weights": net.state_dict(), "scores": scores, "epochs": options.epochs, "seed": options.seed},
+            options.out / "network.pt",
+        )
+        draw_sheet(rows).save(options.out / "sheet.png")
+        print(f"{options.out}: network.pt, sheet.png")
     print(f"{'':14}{'L1':>10}{'in mask':>10}{'unseen':>10}{'MS-SSIM':>10}")
     for name, one in scores.items():
         print(

@@ -14,7 +14,8 @@ class Fingerprint(Frozen):
     `canary` is the SHA-256 of a small scene, made from plan to encoded files; `code` that of the project's source;
     `libraries` holds the versions of libraries that make bytes; `simd` is the widest instruction set that numpy may use;
     `renderer` is GL's name of itself; `maths` is the SHA-256 of what the C library's and numpy's functions give for many
-    numbers, of which the canary scene may meet none that shows a difference.
+    numbers, of which the canary scene may meet none that shows a difference; `python` is the interpreter; `binaries` is the
+    SHA-256 of how the libraries were built, and of the loaded PyBullet.
     """
 
     canary: str
@@ -23,6 +24,8 @@ class Fingerprint(Frozen):
     simd: str
     renderer: str
     maths: str = ""
+    python: str = ""
+    binaries: str = ""
 
     @property
     def digest(self) -> str:
@@ -33,6 +36,12 @@ class Fingerprint(Frozen):
         """What makes the two the same, by what differs: a clause without a full stop."""
         if self.code != other.code or self.libraries != other.libraries:
             return "install the same wheel and requirements.lock, or the same image, on both"
+        if self.python != other.python:
+            return "use the same Python on both, or the same image"
+        if self.binaries != other.binaries:
+            return (
+                "install the wheels of requirements.lock, none built here (pip --only-binary :all:), or the same image"
+            )
         if self.renderer != other.renderer:
             return "install the same Mesa (libgl1-mesa-dri), or the same GPU and driver, on both"
         if self.simd != other.simd:

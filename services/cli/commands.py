@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.dataset.layout import COMMITS
-from schemas.errors import InputError, RunError, VersoError
+from schemas.errors import InputError, RunError, VersoError, plural
 from schemas.job.job import Job
 from services.cli.environment import host_place
 from services.job.job_file import load_job, pack_job
@@ -75,11 +75,13 @@ def tell_result(out: str, job: Job, result: "RunResult") -> tuple[bool, dict[str
     share = failed / job.scenes
     complete = merged.complete and share <= job.run.max_failure_share
     rate = f", {result.made_now / result.seconds:.1f} scenes/s" if result.made_now else ""
-    print(f"{result.made_now} scenes made now, {made} in all, {failed} failed, in {result.seconds:.1f} s{rate}")
+    print(
+        f"{plural(result.made_now, 'scene')} made now, {made} in all, {failed} failed, in {result.seconds:.1f} s{rate}"
+    )
     print(f"{out}{host_place(out)}: dataset digest {merged.digest}")
     print(f'next: verso report {out} · verso query {out} "select category, count(*) from scenes group by category"')
     if again := merged.scenes["environmental"]:
-        told = f"{again} scenes failed for environmental reasons: try again with --retry-failed"
+        told = f"{plural(again, 'scene')} failed for environmental reasons: try again with --retry-failed"
         print(f"verso: {told}", file=sys.stderr)
     elif not complete:
         told = f"{share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}"
@@ -112,7 +114,7 @@ def status(options: argparse.Namespace) -> int:
         job = require_job(store).job
         now = read_status(store, job.first_scene, job.stop_scene)
     done = now.made + sum(now.failed.values())
-    print(f"{options.out}: {done} of {now.asked} scenes done, {now.missing} missing")
+    print(f"{options.out}: {done} of {plural(now.asked, 'scene')} done, {now.missing} missing")
     for reason, count in sorted(now.failed.items()):
         print(f"  failed, {reason}: {count}")
     if now.scenes_per_s:
@@ -139,8 +141,8 @@ def verify(options: argparse.Namespace) -> int:
     store = _committed(options.out)
     verdict = _with_progress(_scenes_asked(store), "verify", partial(read_back, store))
     off = _tell_faults(verdict)
-    read = f"{verdict.files} files ({verdict.bytes / 1e6:.1f} MB), {verdict.scenes} scenes"
-    print(f"{options.out}: {read}, labels of {verdict.pairs} pairs derived again: {off or 'nothing'} off")
+    read = f"{plural(verdict.files, 'file')} ({verdict.bytes / 1e6:.1f} MB), {plural(verdict.scenes, 'scene')}"
+    print(f"{options.out}: {read}, labels of {plural(verdict.pairs, 'pair')} derived again: {off or 'nothing'} off")
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
     checks: tuple[tuple[str, Callable, Callable], ...] = (
         ("independent", verify_independently, describe_independent),
@@ -234,7 +236,7 @@ def _repair(options: argparse.Namespace) -> int:
     for line in (*found.done, *found.left):
         print(line)
     off = _tell_faults(found.verdict)
-    print(f"{options.out}: {len(found.done)} files put back or written again; {off or 'nothing'} off")
+    print(f"{options.out}: {plural(len(found.done), 'file')} put back or written again; {off or 'nothing'} off")
     return finish(options, not off, done=found.done, left=found.left, faults=found.verdict.faults)
 
 
@@ -260,7 +262,9 @@ def report(options: argparse.Namespace) -> int:
     with explain_damage(store):
         size, made = write_report(store, options.scenes, target, beside)
     seconds = time.monotonic() - began
-    print(f"{target}: {made.figures.scenes} scenes, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB")
+    print(
+        f"{target}: {plural(made.figures.scenes, 'scene')}, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB"
+    )
     answer = {"file": str(target), "bytes": size, "seconds": round(seconds, 2), "scenes": made.figures.scenes}
     return finish(options, True, **answer, shown=[one.scene_id for one in made.sample.scenes])
 

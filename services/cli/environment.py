@@ -1,9 +1,14 @@
 """Edge: restarts a command in the environment variables that its bytes depend on (schemas/environment.py), and reads settings."""
 
+import io
 import os
+import re
+import shutil
 import sys
+from pathlib import Path
 
 from schemas.environment import settings_to_change
+from services.cli.rows import COMMANDS
 from services.run.worker_entry import processor_flags
 
 
@@ -27,6 +32,49 @@ def host_place(out: str) -> str:
     host = os.environ.get("VERSO_HOST_DATA")
     place = os.path.realpath(out) if "://" not in out else ""
     return f" (on the host: {host}{place.removeprefix('/data')})" if host and place.startswith("/data/") else ""
+
+
+def typed_program() -> str:
+    """What starts the program where its user is: `./verso` in a checkout, `verso` where that is found, else its path.
+
+    The launcher and the containers' file say it in $VERSO_TYPED.
+    """
+    typed = os.environ.get("VERSO_TYPED") or (sys.argv[0] if Path(sys.argv[0]).name == "verso" else "verso")
+    found = shutil.which("verso")
+    same = found is not None and os.path.isfile(typed) and os.path.samefile(found, typed)
+    return "verso" if same else typed
+
+
+def as_typed(text: str) -> str:
+    """The text with every command of ours as it is typed here."""
+    return _COMMAND.sub(typed_program().replace("\\", r"\\"), text) if "verso " in text else text
+
+
+_COMMAND = re.compile(rf"(?<![\w./-])verso(?= (?:{'|'.join([*COMMANDS, 'COMMAND', '--help'])})\b)")
+
+
+class _Stream(io.TextIOWrapper):
+    """A text stream that writes commands as they are typed."""
+
+    def write(self, text: str) -> int:
+        return super().write(as_typed(text))
+
+
+def speak_as_typed() -> None:
+    """From here on this process prints commands as they are typed; nothing changes where that is `verso`."""
+    if typed_program() == "verso":
+        return
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper) and not isinstance(stream, _Stream):
+            _KEPT.append(stream)
+            stream.flush()
+            lines, through = stream.line_buffering, stream.write_through
+            setattr(sys, name, _Stream(stream.buffer, stream.encoding, stream.errors, None, lines, through))
+
+
+_KEPT: list[io.TextIOWrapper] = []
+"""The streams below: one that nothing holds would close its file."""
 
 
 if __name__ == "__main__":  # what the launcher sets for tools that it starts itself

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from schemas.errors import VersoError
 from services.cli.arguments import Command, Parser
-from services.cli.environment import enter_stack_environment
+from services.cli.environment import enter_stack_environment, speak_as_typed, typed_program
 from services.cli.rows import COMMANDS, JSON, KEPT
 from services.run.supervisor import supervise
 
@@ -27,15 +27,22 @@ def main(argv: list[str] | None = None) -> int:
     from_shell = argv is None
     if argv is None:
         enter_stack_environment()
+        speak_as_typed()
         argv = sys.argv[1:]
-    options = build_parser().parse_args(argv)
+    options = build_parser(typed_program() if from_shell else "verso").parse_args(argv)
     if from_shell and options.starts_ray(options):
-        return supervise(partial(_run, options), options.kept, quiet=options.quiet, answers=options.json)
+        return supervise(partial(_run_child, options), options.kept, quiet=options.quiet, answers=options.json)
     try:
         return _run(options)
     except KeyboardInterrupt:
         print(f"verso: interrupted; {KEPT}", file=sys.stderr)
         return 1
+
+
+def _run_child(options: argparse.Namespace) -> int:
+    """As `_run`, in a child of the supervisor, which has another standard error."""
+    speak_as_typed()
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -59,32 +66,32 @@ def _run(options: argparse.Namespace) -> int:
         return 1
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Every command and option.
+def build_parser(program: str = "verso") -> argparse.ArgumentParser:
+    """Every command and option of the program, which is called so in usages and examples.
 
     `options.handler` names the function of a command as `module:function`; `options.starts_ray(options)` tells whether
     it starts Ray, `options.kept` what remains of its work where it dies, and `options.quiet` whether the terminal is
     spared what C++ code says.
     """
     parser = Parser(
-        prog="verso",
+        prog=program,
         description="View-dependent RGB-D datasets for reconstructing objects from a single view.",
-        epilog="`verso COMMAND --help` explains a command and gives an example.",
+        epilog=f"`{program} COMMAND --help` explains a command and gives an example.",
     )
     parser.add_argument("--version", action="version", version=_version())
-    _add_commands(parser.add_subparsers(title="commands", metavar="COMMAND", required=True), COMMANDS)
+    _add_commands(parser.add_subparsers(title="commands", metavar="COMMAND", required=True), COMMANDS, f"{program} ")
     return parser
 
 
-def _add_commands(parsers: "Commands", commands: Mapping[str, Command], above: str = "") -> None:
-    """Adds a parser for each command and, below it, for each of its own commands; `above` are the words before them."""
+def _add_commands(parsers: "Commands", commands: Mapping[str, Command], above: str) -> None:
+    """Adds a parser for each command and, below it, for each of its own commands; `above`: the program and words before."""
     for name, entry in commands.items():
         words = f"{above}{name}"
         command = parsers.add_parser(
             name,
             help=entry.what,
             description=entry.what[0].upper() + entry.what[1:] + ".",
-            epilog=f"example: verso {words} {entry.example}".rstrip(),
+            epilog=f"example: {words} {entry.example}".rstrip(),
         )
         if entry.commands:
             below = command.add_subparsers(title="commands", metavar="COMMAND", required=True)

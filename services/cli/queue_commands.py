@@ -9,7 +9,7 @@ import urllib.parse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, RunError
+from schemas.errors import InputError, RunError, plural
 from schemas.queue import JobRequest
 from services.cli.commands import finish, tell_result
 from services.cli.environment import default_queue
@@ -43,7 +43,9 @@ def submit(options: argparse.Namespace) -> int:
     while not queue.put_request(request):
         request = request.model_copy(update={"id": new_id()})
     print(request.id, flush=True)
-    _say(f"job {request.id} ({job.name}, {job.scenes} scenes) waits in {queue.name}; its folder is {request.out}")
+    _say(
+        f"job {request.id} ({job.name}, {plural(job.scenes, 'scene')}) waits in {queue.name}; its folder is {request.out}"
+    )
     _say(_describe_supervisor(queue))
     return finish(options, True, id=request.id, name=job.name, out=request.out, queue=queue.name)
 

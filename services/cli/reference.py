@@ -46,8 +46,8 @@ EXIT_CODES = (
 
 HEAD = """# Commands
 
-`verso COMMAND --help` explains every option. `--json` makes the last line of standard output one JSON object.
-Messages go to standard error.
+`./verso COMMAND --help` explains every option (installed: `verso`). `--json` makes the last line of standard output one JSON
+object. Messages go to standard error.
 
 | exit code | meaning |
 |---|---|"""
@@ -67,7 +67,7 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
             yield from (f"\n## {words}\n", what)
             yield from _describe(command.commands, f"{words} ")
             continue
-        yield from (f"\n##{'#' * bool(above)} {words}\n", what, "", f"    verso {words} {command.example}".rstrip())
+        yield from (f"\n##{'#' * bool(above)} {words}\n", what, "", f"    ./verso {words} {command.example}".rstrip())
         if options := [f"`{written}`" for one in (*command.options, *command.one_of) if (written := _written(one))]:
             yield from ("", f"Options: {', '.join(options)}.")
 

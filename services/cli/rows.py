@@ -44,7 +44,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     ),
     "import": command(
         "make a capture from an Azure Kinect recording, without its SDK",
-        "recording.mkv --out data/mug --frames 40 --board board.json --name mug-1 --category mug",
+        "recording.mkv --out data/mug-1 --frames 40 --board board.json --name mug-1 --category mug",
         path("recording", "RECORDING.mkv"),
         NEW_DIR,
         number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
@@ -67,7 +67,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     ),
     "synthesize": command(
         "make RGB, depth and mask of a processed capture from other poses",
-        "data/mug --pose pose.txt --out data/mug/views",
+        "data/mug --pose data/mug/board_00000.txt --out data/mug/views",
         *(FOLDER, path("--out", "DIR", "where the views go (default: DIR/views)")),
         handler="services.capture:synthesize",
         one_of=(
@@ -244,7 +244,7 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
     "run": command(
         "make a dataset, or go on where it stopped",
-        "deploy/jobs/tabletop.yaml --scenes 128 --set start.pose=tumbled",
+        "deploy/jobs/tabletop.yaml --out data/tumbled --scenes 128 --set start.pose=tumbled",
         JOB,
         OUT_DIR,
         MORE_SCENES,
@@ -319,8 +319,16 @@ COMMANDS: Final[dict[str, Command]] = {
         choice("--format", tuple(FORMATS), "docs/export.md describes each", required=True),
         option("--category", "NAME", "only scenes of it; may be repeated", action="append", default=[]),
         option("--scenes", "FIRST-LAST", "only scenes with these ids; one id is one scene", read.read_span),
-        option("--where", "SQL", "only scenes for which this holds, such as 'support_margin_mm > 5'"),
+        option("--where", "SQL", "only scenes for which this holds, such as 'support_margin_mm > 30'"),
+        choice(
+            "--split",
+            ("category", "instance"),
+            "the shares of train, val and test hold in each category (default), or as the column `assets.split` has them",
+            default="category",
+        ),
+        option("--held-out", "CATEGORY", "put all its objects into test; may be repeated", action="append", default=[]),
         number("--shard-mb", "size of a file of webdataset and huggingface, 10^6 bytes (default: 256)", 256),
+        number("--points", "also draw N points on each shape, of webdataset and huggingface"),
         handler="services.export.export:main",
     ),
     "capture": command(

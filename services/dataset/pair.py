@@ -172,17 +172,31 @@ class Pair:
         """[4, 4] float64 pose in the world of the table (2) and of every object (3 and up), by region id, metres."""
         return MappingProxyType(read_world_poses(self.scene))
 
-    def mesh(self, region_id: int = REGION_FIRST_OBJECT, view: View | None = None) -> trimesh.Trimesh:
+    def mesh(
+        self, region_id: int = REGION_FIRST_OBJECT, view: View | None = None, *, welded: bool = False
+    ) -> trimesh.Trimesh:
         """An object's shape (or the table's, 2) where it rests: in the world, or in the frame of a view's camera, metres.
 
-        Raises InputError where there is no such region, or where its shape is stored nowhere.
+        welded: one vertex at each place and no look, for what needs a closed surface. Stored shapes have several at the seams
+        of their textures and normals, so that trimesh calls them not watertight. Raises InputError where there is no such
+        region, or where its shape is stored nowhere.
         """
         if region_id not in self.T_world:
             raise InputError(f"scene {self.scene_id} has the regions {sorted(self.T_world)}, and no {region_id}")
         mesh = self._files.mesh(dict(self.scene), region_id)
+        if welded:
+            mesh = weld(mesh)
         T = self.T_world[region_id]
         mesh.apply_transform(T if view is None else np.linalg.inv(view.T_world_cam) @ T)
         return mesh
+
+
+def weld(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The surface with one vertex at each place, without triangles of two corners and without colours."""
+    places, at = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = at.reshape(-1)[mesh.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return trimesh.Trimesh(places, faces[whole], process=False)
 
 
 def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> Pair:

@@ -21,6 +21,7 @@ from scipy.spatial.distance import cdist
 
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
+from schemas.errors import plural
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part
 from schemas.scene.view import DRAWN_ROLES, Role
 from services.export.folder import ExportFolder
@@ -143,7 +144,11 @@ class Bop(Writer):
             "images": self.kept["images"],
             "models": self._models.count - missing,
             "not_exported": [
-                *([f"{missing} models: neither their shapes nor the job's sources are here"] if missing else []),
+                *(
+                    [f"{plural(missing, 'model')}: neither their shapes nor the job's sources are here"]
+                    if missing
+                    else []
+                ),
                 "the table and the floor as objects, projected views, patches, textures (models have vertex colours)",
             ],
             "poses": "model to camera, and world to camera; millimetres, optical frame (x right, y down, z forward)",

@@ -16,10 +16,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import OutputError
+from schemas.errors import OutputError, plural
 from services.export.folder import ExportFolder
 from services.export.formats import Added, Choice, Chooser, ExportRequest, Writer
-from services.export.source import iter_ranges, scenes_of
+from services.export.source import iter_ranges, scenes_of, splits_of
 from services.export.table import FORMATS
 from services.job.record import JobRecord, require_dataset, require_job
 from services.merge.merge import read_success
@@ -80,6 +80,8 @@ class _Export:
     ) -> None:
         self._request, self._record, self._chooser, self._folder, self._codes = request, record, chooser, folder, codes
         begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
+        asked, shares = request.choice, record.job.assets.split
+        self._splits = splits_of(request.store, codes, shares, asked.held_out, every=asked.split == "category")
         self._finished: bool = begun["finished"]
         self._next_scene: int = begun["next_scene"]
         self._counts, self._left_out = Counter(begun["counts"]), Counter(begun["left_out"])
@@ -106,7 +108,7 @@ class _Export:
         store = self._request.store
         for stored in iter_ranges(store, self._codes, self._next_scene):
             chosen = [scene for scene in self._chooser.choose(stored) if scene >= self._next_scene]
-            for scene in scenes_of(store, stored, chosen):
+            for scene in scenes_of(store, stored, chosen, self._splits):
                 self._count(scene.scene_id, self._writer.add(scene))
                 self._checkpoint(scene.scene_id + 1)
             self._checkpoint(max(self._next_scene, stored.stop))
@@ -136,7 +138,7 @@ def _plan(request: ExportRequest, record: JobRecord) -> dict[str, Any]:
         "job_digest": record.digest,
         "dataset_digest": (read_success(request.store) or {}).get("digest"),
         "choice": request.choice.model_dump(mode="json", exclude_defaults=True),
-        **({"shard_mb": request.shard_mb} if FORMATS[request.format].sharded else {}),
+        **({"shard_mb": request.shard_mb, "points": request.points} if FORMATS[request.format].sharded else {}),
     }
 
 
@@ -160,8 +162,15 @@ def main(options: argparse.Namespace) -> int:
         raise OutputError(f"{options.dir} is not a folder: export into one on this machine, and copy it there")
     store = require_dataset(open_store(options.out))
     first, last = options.scenes or (None, None)
-    choice = Choice(categories=tuple(options.category), first_scene=first, last_scene=last, where=options.where)
-    request = ExportRequest(store, Path(options.dir), options.format, choice, options.shard_mb)
+    choice = Choice(
+        categories=tuple(options.category),
+        first_scene=first,
+        last_scene=last,
+        where=options.where,
+        split=options.split,
+        held_out=tuple(options.held_out),
+    )
+    request = ExportRequest(store, Path(options.dir), options.format, choice, options.shard_mb, options.points or 0)
     begun = time.monotonic()
     with explain_damage(store), closing(ProgressLine(0, "export")) as line:
 
@@ -178,9 +187,10 @@ def _tell(options: argparse.Namespace, result: ExportResult, seconds: float) -> 
     """Prints what the export holds and what it leaves out."""
     manifest = result.manifest
     now = f" ({result.pairs_now} now, in {seconds:.1f} s)" if result.pairs_now else " (nothing was left to do)"
-    print(f"{options.dir}: {options.format}, {manifest['pairs']} pairs of {manifest['scenes']} scenes{now}")
+    told = f"{plural(manifest['pairs'], 'pair')} of {plural(manifest['scenes'], 'scene')}"
+    print(f"{options.dir}: {options.format}, {told}{now}")
     for reason, count in manifest["left_out"].items():
-        print(f"  left out: {count} pairs, {reason}")
+        print(f"  left out: {plural(count, 'pair')}, {reason}")
     if manifest["pairs_left_out"]:
         print(f"  {Path(options.dir) / LEFT_OUT} names each of them")
     for line in manifest.get("not_exported", ()):

@@ -1,16 +1,23 @@
 """What is asked of an export (a dataset, a place, a format, a choice of scenes), and what a writer of a format has."""
 
 import copy
-from collections.abc import Sequence
+import hashlib
+import io
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Literal
 
 import duckdb
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
 
 from schemas.base import Frozen
+from schemas.dataset.layout import asset_path
 from schemas.dataset.tables import SCHEMAS
-from schemas.errors import InputError
+from schemas.errors import CorruptError, InputError
 from services.export.folder import ExportFolder, Rounds
 from services.export.source import ExportScene
 from services.job.record import JobRecord
@@ -39,10 +46,14 @@ class Choice(Frozen):
     """Included."""
     where: str | None = None
     """An SQL condition on the columns of `scenes`; subqueries may ask the other tables about the same scene."""
+    split: Literal["category", "instance"] = "category"
+    """Whether the job's shares of train, val and test hold in each category, or over all instances (`assets.split`)."""
+    held_out: tuple[str, ...] = ()
+    """Categories whose objects are all of `test`."""
 
 
 EVERYTHING: Final = Choice()
-_EXAMPLE: Final = "it is an SQL condition on the columns of scenes, such as 'support_margin_mm > 5'"
+_EXAMPLE: Final = "it is an SQL condition on the columns of scenes, such as 'support_margin_mm > 30'"
 
 
 class Chooser:
@@ -94,6 +105,8 @@ class ExportRequest:
     choice: Choice = EVERYTHING
     shard_mb: int = 256
     """Size that ends a shard, of formats that have shards; 10^6 bytes."""
+    points: int = 0
+    """Points that formats with shards draw on each shape."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +174,7 @@ class ShardedWriter(Writer):
 
     def begin(self, request: ExportRequest, fresh: bool) -> None:
         """Goes on behind the last files that were ended."""
-        most_bytes = 1_000_000 * request.shard_mb
+        most_bytes, self._points = 1_000_000 * request.shard_mb, request.points
         self.rounds = Rounds(self.folder, self.open_shard, self.PATTERN, most_bytes, self.kept["rounds"])
 
     def open_shard(self, path: Path) -> Any:
@@ -181,11 +194,48 @@ class ShardedWriter(Writer):
         """Closes open files."""
         self.rounds.close()
 
+    def put_shapes(self, scene: ExportScene) -> None:
+        """Writes `shapes/<category>/<instance id>.glb` of all that stands in a scene, and points on it where asked for."""
+        for instance_id in (scene.row["table_id"], *(name for _, name in scene.instances.values())):
+            category = scene.assets[instance_id]["category"]
+            path = f"shapes/{category}/{instance_id}"
+            if (self.folder.root / f"{path}.glb").exists():
+                continue
+            try:
+                data = scene.read(asset_path(category, instance_id))
+            except CorruptError:  # it is not stored: only shapes that may be passed on are
+                self.kept["without_shape"] = sorted({*self.kept["without_shape"], scene.assets[instance_id]["source"]})
+                continue
+            if self._points:
+                self.folder.put(f"{path}.npz", encode_npz(points_on(data, self._points, instance_id)))
+            self.folder.put(f"{path}.glb", data)
+
     def conventions(self, depth: str) -> dict[str, Any]:
         """What the manifest says of every such format; `depth` describes the encoding of depth."""
+        kept_back = [f"shapes of the source {source}, which are not stored" for source in self.kept["without_shape"]]
         return {
-            "not_exported": ["patches, shapes of objects, the quality figures of scenes"],
+            "not_exported": ["patches, the quality figures of scenes", *kept_back],
+            "shapes": "shapes/<category>/<instance_id>.glb, object frame, metres, z up; T_world_obj, T_cam_obj place them",
             "depth": f"{depth}, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
             "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
             "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
         }
+
+
+def points_on(glb: bytes, count: int, name: str) -> dict[str, NDArray]:
+    """points and normals [count, 3] float32, uniform over the surface, metres; `name` seeds the draw."""
+    mesh = trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False).to_mesh()
+    seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)[:2]
+    return {"points": points.astype(np.float32), "normals": mesh.face_normals[faces].astype(np.float32)}
+
+
+def encode_npz(arrays: Mapping[str, NDArray]) -> bytes:
+    """What numpy.load reads, the same bytes for the same arrays."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, array, allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), zipfile.ZIP_DEFLATED, 1)
+    return stream.getvalue()

@@ -13,9 +13,11 @@ from typing import Any, ClassVar, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from schemas.dataset.citation import ARTICLE
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import stored_images, stored_roles
 from schemas.dataset.tables import SCHEMAS
+from schemas.errors import plural
 from schemas.job.job import Job
 from services.export.formats import OF_SCENE, Added, ShardedWriter
 from services.export.source import ExportPair, ExportScene
@@ -35,7 +37,7 @@ _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
 class HuggingFace(ShardedWriter):
     """Writes data/train-00000.parquet and so on, and README.md."""
 
-    FRESH: ClassVar = {"rounds": None, "rows": {}, "licences": []}
+    FRESH: ClassVar = {"rounds": None, "rows": {}, "licences": [], "without_shape": []}
     PATTERN = "data/{split}-{number:05d}.parquet"
 
     @cached_property
@@ -47,7 +49,8 @@ class HuggingFace(ShardedWriter):
         return _Parquet(path, self._schema)
 
     def add(self, scene: ExportScene) -> Added:
-        """Writes a row for each pair of the scene."""
+        """Writes a row for each pair of the scene, and its shapes."""
+        self.put_shapes(scene)
         split = SPLITS[scene.split]
         shard = self.rounds.shard(split)
         for pair in scene.pairs:
@@ -147,7 +150,7 @@ def _feature(kind: pa.DataType) -> dict[str, Any]:
 def card_text(name: str, schema: pa.Schema, rows: Mapping[str, int], licences: Sequence[str]) -> str:
     """README.md: the head that Hugging Face reads, and what a person wants to know."""
     files = "".join(f"\n  - split: {split}\n    path: data/{split}-*.parquet" for split in sorted(rows)) or " []"
-    counts = "".join(f"- {split}: {count} pairs\n" for split, count in sorted(rows.items()))
+    counts = "".join(f"- {split}: {plural(count, 'pair')}\n" for split, count in sorted(rows.items()))
     columns = "".join(f"- `{field.name}`: {_describe(field)}\n" for field in schema)
     return f"""---
 license: {"cc0-1.0" if set(licences) <= {"CC0-1.0"} else "other"}
@@ -163,8 +166,8 @@ configs:
 # {name}
 
 View-dependent RGB-D pairs for reconstructing objects from a single view: an input view of an object on a table, and the mirror
-view from the other side. Made by Verso after Staszak and Belter, "Dataset for object reconstruction from a single view", Data in
-Brief 55, 2024 (CC BY). A row is a pair. Splits are by object: no object of `test` or `validation` is seen in `train`.
+view from the other side. Made by Verso after {ARTICLE}. A row is a pair. Splits are by object: no object of `test` or
+`validation` is seen in `train`.
 
 {counts}
 Licences of the shapes: {", ".join(licences) or "none"}.
@@ -185,6 +188,7 @@ pairs = datasets.load_dataset("path/to/this/folder", split="train")
 - Poses are row-major 4 x 4 matrices in metres: `T_world_cam` takes camera to world coordinates, `T_cam_obj` object to camera
   coordinates. Camera frames are optical: x right, y down, z forward. The world's z is up.
 - `cx`, `cy` have pixel centres at +0.5; `cx_opencv`, `cy_opencv` have them on integers, as OpenCV does.
+- `shapes/<category>/<instance_id>.glb` is the shape of an object of `objects`, in the object frame: metres, z up.
 """
 
 

@@ -1,10 +1,11 @@
 """Format `mirror-recon`: the layout that the authors' own loader reads (Staszak and Belter 2024, their published code).
 
 A folder for each category, whose ids run 0, 1, 2, ... without gaps: even ids are input poses, the odd one after each its
-mirror pose. Depth in 5000 units a metre, camera poses camera to world, object poses object to camera, both in the optical frame.
+mirror pose. A scene of several objects is in the folder of its first one; object k, of line k + 1 of `objects%05d.dat`, has
+the patches `obj<k>`, as their class for several objects looks for them. Depth in 5000 units a metre, camera poses camera to
+world, object poses object to camera, both in the optical frame.
 """
 
-from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import cv2
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
-from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.errors import plural
 from schemas.scene.view import Role
 from services.export.formats import Added, ExportRequest, Writer
 from services.export.source import ExportPair, ExportScene
@@ -30,10 +31,10 @@ _KINDS: tuple[tuple[PixelKind, str], ...] = (("rgb", "rgb"), ("depth", "depth"),
 
 
 class MirrorRecon(Writer):
-    """Writes pairs of scenes with one object, whose every image and patch exists."""
+    """Writes pairs whose every image exists, and every patch of one of their objects at least."""
 
-    FRESH: ClassVar = {"next": {}}
-    """The next even id by category."""
+    FRESH: ClassVar = {"next": {}, "objects": {}}
+    """The next even id by category; objects `with` all their patches and those `without`."""
 
     def begin(self, request: ExportRequest, fresh: bool) -> None:
         """Begins the list of pairs."""
@@ -44,11 +45,17 @@ class MirrorRecon(Writer):
         """Writes the scene's pairs that are whole."""
         left_out = []
         for pair in scene.pairs:
-            images, reason = _images_of(scene, pair)
+            images, reason = _images_of(pair)
             if reason:
                 left_out.append((pair.pose_id, reason))
-            else:
-                self._write(scene, pair, images)
+                continue
+            patches, reasons = _patches_of(pair, sorted(scene.instances))
+            if not patches:
+                left_out.append((pair.pose_id, reasons[0]))
+                continue
+            self._write(scene, pair, {**images, **patches})
+            self.count("objects", "without", len(reasons))
+            self.count("objects", "with", len(scene.instances) - len(reasons))
         return Added(len(scene.pairs) - len(left_out), tuple(left_out))
 
     def _write(self, scene: ExportScene, pair: ExportPair, images: dict[str, bytes]) -> None:
@@ -64,8 +71,11 @@ class MirrorRecon(Writer):
 
     def describe(self) -> dict[str, Any]:
         """Views by category, and the conventions."""
+        lost = self.kept["objects"].get("without", 0)
         return {
             "views": dict(sorted(self.kept["next"].items())),
+            "objects": self.kept["objects"].get("with", 0),
+            "not_exported": [f"patches of {plural(lost, 'object')}: in part outside an image"] if lost else [],
             "depth_units_per_m": UNITS_PER_M,
             "camera_poses": "camera to world, optical frame (x right, y down, z forward), metres; pitch, yaw in radians",
             "object_poses": "object to camera, optical frame, metres",
@@ -73,38 +83,48 @@ class MirrorRecon(Writer):
         }
 
 
-def _images_of(scene: ExportScene, pair: ExportPair) -> tuple[dict[str, bytes], str]:
-    """(PNG bytes by name without ending, a reason why the pair cannot be exported, empty where it can)."""
-    if len(scene.instances) != 1:
-        return {}, "several objects"
-    images: dict[str, bytes] = {}
-    for name, role, kind, data in _stored(pair):
+Images = dict[str, bytes]
+"""PNG bytes by name without ending, with places for the ids `even` and `odd`."""
+
+
+def _images_of(pair: ExportPair) -> tuple[Images, str]:
+    """(the images of the whole views, a reason why the pair cannot be exported, empty where it can)."""
+    views = [
+        (f"{name}{{{('even', 'odd')[more]}:05d}}", role, kind) for role, more, _ in _VIEWS for kind, name in _KINDS
+    ]
+    views += [(f"{name}Proj{{even:05d}}", "projected", kind) for kind, name in _KINDS[:2]]
+    return _take(pair, [(name, role, kind, pair.image(role, kind)) for name, role, kind in views], "")
+
+
+def _patches_of(pair: ExportPair, regions: list[int]) -> tuple[Images, list[str]]:
+    """(the patches of every object that has all of them, the reason of each other one)."""
+    found: Images = {}
+    reasons, objects = [], len(regions)
+    for number, region in enumerate(regions):
+        place = f"obj{number}"
+        parts = [
+            (f"{name}In{{even:05d}}{word}{place}", role, kind) for role, _, word in _VIEWS for kind, name in _KINDS
+        ]
+        parts += [(f"{name}Proj{{even:05d}}yaw-179{place}", "projected", kind) for kind, name in _KINDS[:2]]
+        images, reason = _take(
+            pair, [(name, role, kind, pair.patch(role, kind, region, objects)) for name, role, kind in parts], "patch"
+        )
+        if reason:
+            reasons.append(reason)
+            continue
+        distance = _distance_patch(pair, region, images[f"rgbIn{{even:05d}}yaw0{place}"])
+        found |= images | {f"distIn{{even:05d}}yaw0{place}": encode_png(distance)}
+    return found, reasons
+
+
+def _take(pair: ExportPair, stored: list[tuple[str, Role, PixelKind, bytes | None]], what: str) -> tuple[Images, str]:
+    """(the images by name, depth in `UNITS_PER_M`, the reason why one of them is not there)."""
+    images: Images = {}
+    for name, role, kind, data in stored:
         if data is None:
-            return {}, _reason(pair, role, kind, "patch" in name)
-        units = pair.views[role]["depth_units_per_m"]
-        images[name.removeprefix("patch ")] = data if kind != "depth" else in_units(data, units)
-    images["distIn{even:05d}yaw0obj0"] = encode_png(_distance_patch(pair, images["rgbIn{even:05d}yaw0obj0"]))
+            return {}, f"no {role} view" if role not in pair.views else f"no {what or kind} of the {role} view"
+        images[name] = data if kind != "depth" else in_units(data, pair.views[role]["depth_units_per_m"])
     return images, ""
-
-
-def _stored(pair: ExportPair) -> Iterator[tuple[str, Role, PixelKind, bytes | None]]:
-    """(name, role, kind, PNG bytes or None) of every image that the layout has and the dataset stores."""
-    for role, _, word in _VIEWS:
-        number = "{even:05d}" if role == "input" else "{odd:05d}"
-        for kind, name in _KINDS:
-            yield f"{name}{number}", role, kind, pair.image(role, kind)
-        for kind, name in _KINDS:
-            yield f"patch {name}In{{even:05d}}{word}obj0", role, kind, pair.patch(role, kind, REGION_FIRST_OBJECT, 1)
-    for kind, name in _KINDS[:2]:
-        yield f"{name}Proj{{even:05d}}", "projected", kind, pair.image("projected", kind)
-        patch = pair.patch("projected", kind, REGION_FIRST_OBJECT, 1)
-        yield f"patch {name}Proj{{even:05d}}yaw-179obj0", "projected", kind, patch
-
-
-def _reason(pair: ExportPair, role: Role, kind: PixelKind, is_patch: bool) -> str:
-    if role not in pair.views:
-        return f"no {role} view"
-    return f"no patch of the {role} view" if is_patch else f"no {kind} of the {role} view"
 
 
 def in_units(data: bytes, units_per_m: float) -> bytes:
@@ -115,15 +135,13 @@ def in_units(data: bytes, units_per_m: float) -> bytes:
     return encode_png(np.where(depth <= np.iinfo(np.uint16).max, depth, 0).astype(np.uint16))
 
 
-def _distance_patch(pair: ExportPair, patch: bytes) -> NDArray[np.uint16]:
-    """[h, w] distance in pixels, rounded, of each pixel of the input patch to the nearest pixel of the object."""
+def _distance_patch(pair: ExportPair, region_id: int, patch: bytes) -> NDArray[np.uint16]:
+    """[h, w] distance in pixels, rounded, of each pixel of an input patch to the nearest pixel of its object."""
     region = pair.pixels("input", "region")
     assert region is not None
     height, width = decode_png(patch).shape[:2]
-    (label,) = (row for row in pair.labels("input") if row["region_id"] == REGION_FIRST_OBJECT)
-    distance = cv2.distanceTransform(
-        (region != REGION_FIRST_OBJECT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
-    )
+    (label,) = (row for row in pair.labels("input") if row["region_id"] == region_id)
+    distance = cv2.distanceTransform((region != region_id).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     top, left = label["v"] - height // 2, label["u"] - width // 2
     return np.rint(distance[top : top + height, left : left + width]).astype(np.uint16)
 

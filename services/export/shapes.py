@@ -124,7 +124,7 @@ _FARTHEST = 3
 """Silhouettes are followed so many image sizes beyond the image."""
 
 Box = tuple[int, int, int, int]
-"""x, y, width, height, pixels; all -1 where there is nothing."""
+"""x, y, width, height, pixels, where a single pixel has no width; all -1 where there is nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,17 +154,17 @@ def whole_silhouette(label: Row, view: Row, visible: NDArray[np.bool_], shape: S
     inside = np.s_[-top : k.height - top, -left : k.width - left]
     whole[inside] |= visible  # at an edge, rays and the renderer may differ by a pixel
     x, y, width, height = box_of(whole)
-    box = (x + left, y + top, width, height) if width > 0 else (x, y, width, height)
+    box = (x + left, y + top, width, height) if width >= 0 else (x, y, width, height)
     return Silhouette(whole[inside], int(whole.sum()), box)
 
 
 def box_of(mask: NDArray[np.bool_]) -> Box:
-    """The bounding box of a mask."""
+    """The bounding box of a mask, as bop_toolkit's `calc_2d_bbox` has it: from the first pixel to the last, their difference."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return -1, -1, -1, -1
     x, y = int(columns[0]), int(rows[0])
-    return x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y
+    return x, y, int(columns[-1]) - x, int(rows[-1]) - y
 
 
 def _window(shape: Shape, T_cam_obj: NDArray, camera: Camera) -> tuple[int, int, int, int]:

@@ -1,7 +1,7 @@
 """What an export reads: the scenes and pairs of a dataset that were chosen, and the sources of their shapes."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -12,17 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
+from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import PixelKind, patch_index
-from schemas.errors import CorruptError, VersoError
+from schemas.errors import CorruptError, InputError, VersoError
+from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
+from services.dataset.splits import split_by_category
 from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
 from services.read.stored_tables import patch_paths, view_paths
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
 from workers.store.commit import read_committed, split_code
-from workers.store.ledger import read_range
+from workers.store.ledger import range_rows, read_range
 from workers.store.store import Store
 
 
@@ -110,21 +113,50 @@ class ExportScene:
         return _STRICTNESS[max(places)]
 
 
+def iter_records(store: Store, codes: NDArray[np.int64]) -> Iterator[list[CommitRecord]]:
+    """The records of the committed ranges that `codes` name, in order."""
+    for start, group in groupby(map(split_code, codes), key=itemgetter(0)):
+        yield read_range(store, start, [retry for _, retry in group])
+
+
 def iter_ranges(store: Store, codes: NDArray[np.int64], first_scene: int) -> Iterator[StoredRange]:
     """The committed ranges that `codes` name and that hold scenes from `first_scene` on, in order."""
-    for start, group in groupby(map(split_code, codes), key=itemgetter(0)):
-        records = read_range(store, start, [retry for _, retry in group])
+    for records in iter_records(store, codes):
         if records[0].span.stop > first_scene:
             yield read_stored(store, records)
 
 
-def scenes_of(store: Store, stored: StoredRange, chosen: Sequence[int]) -> Iterator[ExportScene]:
-    """The chosen scenes of a range, in order. Files are read when they are asked for; tars are read once."""
+def splits_of(
+    store: Store, codes: NDArray[np.int64], shares: SplitShares, held_out: Collection[str], every: bool
+) -> dict[str, str]:
+    """The splits by id of the instances in the ranges that `codes` name: of `every` one, or of those held out alone.
+
+    Raises InputError for a category to be held out that no instance has.
+    """
+    found: dict[str, set[str]] = {}
+    for records in iter_records(store, codes) if every or held_out else ():
+        for row in range_rows(store, records, "assets").select(["instance_id", "category"]).to_pylist():
+            found.setdefault(row["category"], set()).add(row["instance_id"])
+    if unknown := sorted(set(held_out) - found.keys()):
+        raise InputError(f"--held-out {unknown[0]}: the dataset has no such object; its are {', '.join(sorted(found))}")
+    return split_by_category({key: found[key] for key in (found if every else held_out)}, shares, held_out)
+
+
+def scenes_of(
+    store: Store, stored: StoredRange, chosen: Sequence[int], splits: Mapping[str, str]
+) -> Iterator[ExportScene]:
+    """The chosen scenes of a range, in order. Files are read when they are asked for; tars are read once.
+
+    `splits`: of instances by id; of others that in `assets`.
+    """
     if not chosen:
         return
     read_plain = _committed_reader(store, stored)
     read = file_reader(read_plain, stored)
-    assets = {row["instance_id"]: row for row in stored.rows["assets"]}
+    assets = {
+        row["instance_id"]: {**row, "split": splits.get(row["instance_id"], row["split"])}
+        for row in stored.rows["assets"]
+    }
     rows = {row["scene_id"]: row for row in stored.rows["scenes"]}
     for scene_id in chosen:
         pairs = tuple(

@@ -1,27 +1,23 @@
 """Format `webdataset`: tar shards of bounded size, a sample for each pair, by split.
 
-The members of a sample are `<pose id>.<role>.rgb.png`, `<pose id>.<role>.region.png`, `<pose id>.depth.npz` with an array for
-each role, and `<pose id>.json` with the rows of scene, views and objects. Depth is no PNG, because the usual decoders of
-WebDataset turn 16-bit pictures into 8-bit RGB.
+The members of a sample are `<pose id>.<role>.rgb.png`, `<pose id>.depth.npz` and `<pose id>.region.npz` with an array for each
+role, and `<pose id>.json` with the rows of scene, views and objects. Numbers are no PNG, because the usual decoders of
+WebDataset turn every picture into colours: 16 bits into 8, and region ids into shares of 255.
 """
 
 import io
 import json
 import tarfile
-import zipfile
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from schemas.dataset.codec import Row
 from schemas.scene.view import MODALITIES, ROLES
-from services.export.formats import OF_SCENE, Added, ShardedWriter
+from services.export.formats import OF_SCENE, Added, ShardedWriter, encode_npz
 from services.export.source import ExportPair, ExportScene
 
-_PICTURES: Final = tuple(name for name in MODALITIES if name != "depth")
-"""Modalities that are stored as PNG files; depth is an array."""
+_PICTURES: Final = tuple(name for name, modality in MODALITIES.items() if modality.channels == 3)
+"""Modalities that are stored as PNG files; those of numbers are arrays."""
 _OF_SCENE: Final = (*OF_SCENE, "effects")
 _NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "capture")
 _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id", "role")
@@ -30,7 +26,7 @@ _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id", "role")
 class WebDataset(ShardedWriter):
     """Writes train-000000.tar and so on; every pair that the dataset has is a sample."""
 
-    FRESH: ClassVar = {"rounds": None, "samples": {}}
+    FRESH: ClassVar = {"rounds": None, "samples": {}, "without_shape": []}
     PATTERN = "{split}-{number:06d}.tar"
 
     def open_shard(self, path: Path) -> "_Tar":
@@ -38,7 +34,8 @@ class WebDataset(ShardedWriter):
         return _Tar(path)
 
     def add(self, scene: ExportScene) -> Added:
-        """Writes a sample for each pair of the scene."""
+        """Writes a sample for each pair of the scene, and its shapes."""
+        self.put_shapes(scene)
         shard = self.rounds.shard(scene.split)
         for pair in scene.pairs:
             for name, data in members_of(scene, pair):
@@ -56,14 +53,14 @@ class WebDataset(ShardedWriter):
 def members_of(scene: ExportScene, pair: ExportPair) -> list[tuple[str, bytes]]:
     """(name behind the key, bytes) of every member of a sample, in order."""
     members: list[tuple[str, bytes]] = []
-    depths: dict[str, NDArray] = {}
-    for role in ROLES:
-        for kind in _PICTURES:
-            if (data := pair.image(role, kind)) is not None:
-                members.append((f"{role}.{kind}.png", data))
-        if (depth := pair.pixels(role, "depth")) is not None:
-            depths[role] = depth
-    return [*members, ("depth.npz", _npz(depths)), ("json", _json(scene, pair))]
+    for kind in MODALITIES:
+        if kind in _PICTURES:
+            images = {role: pair.image(role, kind) for role in ROLES}
+            members += [(f"{role}.{kind}.png", data) for role, data in images.items() if data is not None]
+        else:
+            arrays = {role: pair.pixels(role, kind) for role in ROLES}
+            members.append((f"{kind}.npz", encode_npz({role: one for role, one in arrays.items() if one is not None})))
+    return [*members, ("json", _json(scene, pair))]
 
 
 def _json(scene: ExportScene, pair: ExportPair) -> bytes:
@@ -76,17 +73,6 @@ def _json(scene: ExportScene, pair: ExportPair) -> bytes:
             columns = {name: value for name, value in row.items() if name not in _NOT_OF_VIEWS}
             tree["views"][role] = {**columns, "objects": labels}
     return json.dumps(tree).encode()
-
-
-def _npz(arrays: dict[str, NDArray]) -> bytes:
-    """What numpy.load reads, the same bytes for the same arrays."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, array, allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), zipfile.ZIP_DEFLATED, 1)
-    return stream.getvalue()
 
 
 class _Tar:

@@ -112,27 +112,41 @@ class Chart:
     """What the figure is, in a sentence."""
     tell: Callable[[float], str]
     """A value of the histogram in words, with its unit."""
+    note: str = ""
+    """What is told of values that the histograms do not have."""
 
 
 def chart_html(chart: Chart) -> str:
-    """A figure with bars, the ends and the middle of its axis, and its median and spread in words; empty without values."""
+    """A figure with bars, the ends and the middle of its axis, and its median and spread in words.
+
+    Values that are all equal are a sentence and no bar. Empty without values.
+    """
     series = {name: histogram for name, histogram in chart.series.items() if histogram.count}
-    if not series:
+    lines = [(name, _summary(chart, one)) for name, one in series.items()]
+    words = "".join(_legend(at, *line) for at, line in enumerate(lines)) + (
+        _legend(0, "", chart.note) if chart.note else ""
+    )
+    if not words:
         return ""
+    head = f"<figcaption><h3>{escape(chart.title)}</h3><p>{escape(chart.about)}</p></figcaption>\n"
+    varies = any(one.least < one.most for one in series.values())
+    drawn = _drawing(chart, series, lines) if varies else ""
+    return f'<figure class="chart">{head}{drawn}<dl>{words}</dl></figure>\n'
+
+
+def _drawing(chart: Chart, series: Mapping[str, Histogram], lines: Sequence[tuple[str, str]]) -> str:
+    """The bars, and the ends and the middle of their axis."""
     window = window_of(list(series.values()), BARS)
     most = max(int(one.bars(window).max()) for one in series.values())
     first = next(iter(series.values()))
     ends = [first.edge(window, 0), first.edge(window, window.number)]
     ticks = [ends[0], sum(ends) / 2, ends[1]]
-    lines = [(name, _summary(chart, one)) for name, one in series.items()]
     told = "; ".join(f"{name}: {line}" if name else line for name, line in lines)
     drawn = "".join(_draw(chart, one, window, most, at) for at, one in enumerate(series.values()))
     return (
-        f'<figure class="chart"><figcaption><h3>{escape(chart.title)}</h3><p>{escape(chart.about)}</p></figcaption>\n'
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none" role="img" '
         f'aria-label="{escape(f"{chart.title}. {told}")}">{drawn}</svg>\n'
         f'<div class="ticks">{"".join(f"<span>{escape(chart.tell(tick))}</span>" for tick in ticks)}</div>\n'
-        f"<dl>{''.join(_legend(at, *line) for at, line in enumerate(lines))}</dl></figure>\n"
     )
 
 
@@ -155,6 +169,8 @@ def _draw(chart: Chart, one: Histogram, window: Window, most: int, at: int) -> s
 
 
 def _summary(chart: Chart, one: Histogram) -> str:
+    if one.least == one.most:
+        return f"always {chart.tell(one.least)}, n = {one.count:,}"
     low, middle, high = (chart.tell(one.percentile(share)) for share in (0.05, 0.5, 0.95))
     return f"median {middle}, 5 to 95 %: {low} to {high}, n = {one.count:,}"
 

@@ -15,6 +15,7 @@ from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_world_poses
 from schemas.errors import VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
+from services.look.collect import choose_spread
 from services.look.pictures import PairImages, metres_of, read_pair
 from services.read.dataset_reader import file_reader, find_scene
 from services.read.scene_geometry import scene_glb
@@ -23,6 +24,9 @@ from workers.store.store import Store
 
 MOST_POINTS = 90_000
 """Points of one cloud; of more, the floor is thinned first and objects last."""
+
+MOST_SPACES, FEWER_POINTS = 8, 24_000
+"""Scenes that may be chosen in the 3-D view, and the points of a cloud where there are several."""
 
 FLOOR_SHARE = 0.15
 """Largest share of the points that the floor has, where there are too many."""
@@ -79,7 +83,14 @@ class Space:
     """Why there is no mesh; empty where there is."""
 
 
-def read_space(store: Store, scene_id: int) -> Space | None:
+def read_spaces(store: Store, scene_ids: Sequence[int]) -> tuple[Space, ...]:
+    """At most `MOST_SPACES` of these scenes, evenly. Raises CorruptError for damaged images."""
+    chosen = choose_spread(scene_ids, MOST_SPACES)
+    most = MOST_POINTS if len(chosen) == 1 else FEWER_POINTS
+    return tuple(filter(None, (read_space(store, scene_id, most) for scene_id in chosen)))
+
+
+def read_space(store: Store, scene_id: int, most_points: int = MOST_POINTS) -> Space | None:
     """Clouds and mesh of a scene's first pair; None where it has no depth. Raises CorruptError for damaged images."""
     stored = find_scene(store, scene_id)
     scene = stored.scene(scene_id)
@@ -89,7 +100,9 @@ def read_space(store: Store, scene_id: int) -> Space | None:
     images = read_pair(file_reader(store.read, stored), views)
     target = np.mean([pose[:3, 3] for region, pose in read_world_poses(scene).items() if region > 2], axis=0)
     clouds = tuple(
-        cloud_of(role, images, views[role], target) for role in ("input", "mirror") if (role, "depth") in images
+        cloud_of(role, images, views[role], target, most_points)
+        for role in ("input", "mirror")
+        if (role, "depth") in images
     )
     if not clouds:
         return None
@@ -97,7 +110,7 @@ def read_space(store: Store, scene_id: int) -> Space | None:
     return Space(scene_id, scene["category"], target, clouds, bodies, missing)
 
 
-def cloud_of(role: str, images: PairImages, view: Row, target: Array) -> Cloud:
+def cloud_of(role: str, images: PairImages, view: Row, target: Array, most_points: int) -> Cloud:
     """The cloud of one view's depth, in its colours; grey without RGB."""
     camera = read_camera(view)
     depth = metres_of(images[role, "depth"], view)
@@ -109,7 +122,7 @@ def cloud_of(role: str, images: PairImages, view: Row, target: Array) -> Cloud:
     region = regions[rows, columns]
     near = np.hypot(*(points[:, :2] - target[:2]).T) < REACH_M
     groups = (near & (region >= REGION_FIRST_OBJECT), near & (region == REGION_TABLE), near & (region == REGION_FLOOR))
-    kept = _thin([np.flatnonzero(group) for group in groups])
+    kept = _thin([np.flatnonzero(group) for group in groups], most_points)
     rgb = images.get((role, "rgb"))
     colors = np.full((len(kept), 3), 150, np.uint8) if rgb is None else rgb[rows[kept], columns[kept]]
     ours = z[region >= REGION_FIRST_OBJECT]
@@ -117,10 +130,10 @@ def cloud_of(role: str, images: PairImages, view: Row, target: Array) -> Cloud:
     return Cloud(role, points[kept], colors, size_m, T)
 
 
-def _thin(groups: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """At most `MOST_POINTS` indices: of the first groups as many as there are, and then of the last, the floor, its share."""
-    floor = _evenly(groups[-1], max(int(FLOOR_SHARE * MOST_POINTS), MOST_POINTS - sum(map(len, groups[:-1]))))
-    room, chosen = MOST_POINTS - len(floor), [floor]
+def _thin(groups: Sequence[NDArray[np.int64]], most: int) -> NDArray[np.int64]:
+    """At most `most` indices: of the first groups as many as there are, and then of the last, the floor, its share."""
+    floor = _evenly(groups[-1], max(int(FLOOR_SHARE * most), most - sum(map(len, groups[:-1]))))
+    room, chosen = most - len(floor), [floor]
     for group in groups[:-1]:
         chosen.append(_evenly(group, room))
         room -= len(chosen[-1])
@@ -161,6 +174,11 @@ def coarsen(body: Body) -> Body:
     faces = faces[(a != b) & (b != c) & (c != a)]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     return Body(body.kind, low + keys * cell, faces[np.sort(first)])
+
+
+def pack_spaces(spaces: Sequence[Space]) -> str:
+    """JSON for the page: a list of what `pack_space` makes."""
+    return f"[{','.join(map(pack_space, spaces))}]"
 
 
 def pack_space(space: Space) -> str:

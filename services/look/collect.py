@@ -181,7 +181,9 @@ class Figures:
     distance: Histogram = field(default_factory=lambda: Histogram(*DISTANCE_M))
     """d_z of each pair, metres."""
     gap: Histogram = field(default_factory=lambda: Histogram(*GAP_DECADES))
-    """Resting gap, decimal logarithm of millimetres; what is smaller than a nanometre counts as one."""
+    """Resting gaps of a nanometre and more, decimal logarithm of millimetres."""
+    no_gap: int = 0
+    """Scenes whose resting gap is less: none."""
     effects: dict[str, Cost] = field(default_factory=dict)
     """The costliest first."""
     stages: dict[str, Cost] = field(default_factory=dict)
@@ -213,8 +215,9 @@ def _read_scenes(tables: Tables, figures: Figures) -> None:
     columns = ("scene_id", "category", "effects", "skipped", "hover_gap_mm", "capture")
     for rows in tables.batches("scenes", columns):
         figures.by_category.update(_counts(rows.column("category")))
-        gap_mm = np.maximum(_numbers(rows, "hover_gap_mm"), 10 ** GAP_DECADES[0])
-        figures.gap = figures.gap.add(np.log10(gap_mm))
+        gap_mm = _numbers(rows, "hover_gap_mm")
+        figures.no_gap += int((gap_mm < 10 ** GAP_DECADES[0]).sum())
+        figures.gap = figures.gap.add(np.log10(gap_mm[gap_mm >= 10 ** GAP_DECADES[0]]))
         for name, runs in _counts(_flat(rows, "effects")).items():
             figures.effects.setdefault(name, Cost()).runs += runs
         skipped = _flat(rows, "skipped")

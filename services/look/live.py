@@ -10,7 +10,7 @@ from typing import Literal
 from cachetools import LRUCache
 
 from schemas.dataset.layout import commit_path
-from schemas.errors import OutputError, VersoError, describe_seconds
+from schemas.errors import OutputError, VersoError, describe_seconds, plural
 from services.job.record import read_job
 from services.look.charts import Histogram
 from services.look.pictures import DEPTH_M, Picture, ShownScene, show_scene
@@ -139,12 +139,14 @@ def _state(progress: Progress) -> str:
     state = f'<span class="state {progress.phase}">{STATES[progress.phase]}</span>'
     if progress.phase == "empty":
         job = (
-            f"The job {progress.name} asks for {progress.asked:,} scenes." if progress.name else "There is no job yet."
+            f"The job {progress.name} asks for {plural(progress.asked, 'scene')}."
+            if progress.name
+            else "There is no job yet."
         )
         return f'<p class="lead">{state}</p><p class="empty">{escape(job)} This page follows the folder.</p>'
     if progress.phase == "unreadable":
         return f'<p class="lead">{state}</p>'
-    facts = [f"{progress.done:,} of {progress.asked:,} scenes"]
+    facts = [f"{progress.done:,} of {plural(progress.asked, 'scene')}"]
     if progress.scenes_per_s is not None:
         facts.append(f"{number(float(f'{progress.scenes_per_s:.2g}'))} a second")
     if progress.left_s:
@@ -210,6 +212,8 @@ class Follower:
         self._latest: list[ShownScene] = []
         self._sections: tuple[Section, ...] = ()
         self._version, self._reported, self._not_before = 0, (-1, ""), 0.0
+        self._tried: str = ""
+        """The phase at the last try of a report."""
         self._shown = Progress("empty")
         self.view = View("Verso", "Verso", live_html(self._shown, (), self.shelf.put), (), 0)
 
@@ -236,8 +240,10 @@ class Follower:
         """Makes the sections anew where the dataset has changed and the last time is long enough ago."""
         progress, now = self._shown, time.monotonic()
         about = (progress.done, progress.phase)
-        if about == self._reported or now < self._not_before:
+        ended = progress.phase not in ("making", self._tried)  # nothing newer comes, so it need not wait
+        if about == self._reported or (now < self._not_before and not ended):
             return
+        self._tried = progress.phase
         sections = self._read_sections() if progress.done else ()
         self._not_before = time.monotonic() + max(REPORT_S, 10.0 * (time.monotonic() - now))
         if sections is not None:

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from schemas.dataset.codec import Row
+from schemas.dataset.layout import patch_index
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from services.look.charts import Histogram
 from services.look.collect import Tables
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, find_scene, read_image
-from services.read.stored_tables import view_paths
+from services.read.stored_tables import patch_paths, view_paths
 from workers.store.store import Store
 
 MOST_WIDTH = 480
@@ -217,6 +218,7 @@ def show_scene(read: ReadFile, stored: StoredRange, scene: Row, depth: dict[str,
     pictures: dict[str, Picture] = {}
     for role in ("input", "mirror"):
         pictures |= _view_pictures(role, images, views)
+        pictures |= _patch_pictures(read, role, views, len(scene["bodies"] or [scene]))
         if {(role, "depth"), (role, "region")} <= images.keys():
             metres = metres_of(images[role, "depth"], views[role])
             depth[role] = depth[role].add(metres[(images[role, "region"] >= REGION_FIRST_OBJECT) & (metres > 0)])
@@ -234,6 +236,18 @@ def show_scene(read: ReadFile, stored: StoredRange, scene: Row, depth: dict[str,
         {role: views[role]["visible_fraction"] for role in ("input", "mirror") if role in views},
         first["d_z_m"],
     )
+
+
+def _patch_pictures(read: ReadFile, role: str, views: Mapping[str, Row], objects: int) -> dict[str, Picture]:
+    """The stored crop of a view about the scene's first object: its colours, or its depth."""
+    paths = patch_paths(views[role], patch_index(REGION_FIRST_OBJECT, objects)) if role in views else {}
+    name, words = f"{role} patch", f"{role} view, patch about the object"
+    if "rgb" in paths:
+        return {name: picture_of_colour(read_image(read, paths["rgb"]), words)}
+    if "depth" in paths:
+        metres = metres_of(read_image(read, paths["depth"]), views[role])
+        return {name: picture_of_depth(metres, depth_span(metres), words)}
+    return {}
 
 
 def _view_pictures(role: str, images: PairImages, views: Mapping[str, Row]) -> dict[str, Picture]:

@@ -11,10 +11,10 @@ from urllib.parse import quote
 
 import trimesh
 
-from schemas.errors import MachineError, OutputError
+from schemas.errors import MachineError, OutputError, plural
 from schemas.job.job import Job
 from services.job.record import JobRecord, require_job
-from services.look.clouds import Space, pack_space, read_space
+from services.look.clouds import Space, pack_spaces, read_spaces
 from services.look.collect import Figures, collect, open_tables
 from services.look.pictures import Sample, choose_scenes, show_scenes
 from services.look.sections import (
@@ -163,7 +163,7 @@ class Report:
     """Of the finished dataset."""
     figures: Figures
     sample: Sample
-    space: Space | None
+    spaces: tuple[Space, ...]
 
 
 def read_report(store: Store, scenes: int) -> Report:
@@ -175,8 +175,8 @@ def read_report(store: Store, scenes: int) -> Report:
     tables = open_tables(store)
     figures = collect(tables)
     sample = show_scenes(store, choose_scenes(tables, figures.by_category, scenes))
-    space = next(filter(None, (read_space(store, one.scene_id) for one in sample.scenes)), None)
-    return Report(record, (read_success(store) or {}).get("digest"), figures, sample, space)
+    spaces = read_spaces(store, [one.scene_id for one in sample.scenes])
+    return Report(record, (read_success(store) or {}).get("digest"), figures, sample, spaces)
 
 
 def page_of(report: Report, address: Address, other: Report | None = None) -> Page:
@@ -187,7 +187,7 @@ def page_of(report: Report, address: Address, other: Report | None = None) -> Pa
         Section("overview", "Overview", overview_html(figures, job, failed)),
         Section("pictures", "Pictures", sheets_html(sample.scenes, address)),
         Section("compare", "Compare", compare_html(sample.scenes)),
-        Section("space", "In space", space_html(report.space, pack_space(report.space) if report.space else "")),
+        Section("space", "In space", space_html(report.spaces, pack_spaces(report.spaces))),
         Section("figures", "Figures", charts_html(figures, sample.depth)),
         Section("effects", "Effects", effects_html(figures)),
         Section("failures", "Failures", failures_html(figures.failures, figures.scenes + failed)),
@@ -223,6 +223,6 @@ def _subtitle(job: Job, digest: str | None) -> str:
 def _footer(report: Report) -> str:
     shown = len(report.sample.scenes)
     return (
-        f"Pictures are of {shown} scenes, chosen evenly from each category. Job {report.record.digest[:12]}. "
+        f"Pictures are of {plural(shown, 'scene')}, chosen evenly from each category. Job {report.record.digest[:12]}. "
         "Made by verso report; this page fetches nothing."
     )

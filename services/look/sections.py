@@ -7,7 +7,7 @@ from html import escape
 import cv2
 import numpy as np
 
-from schemas.errors import describe_seconds
+from schemas.errors import describe_seconds, plural
 from schemas.job.job import Job
 from services.look.charts import Chart, Histogram, amount, chart_html, length_of_decade
 from services.look.clouds import Space
@@ -71,7 +71,11 @@ _ROWS: dict[str, Callable[[Side], str]] = {
 }
 
 
-CELLS = ("input rgb", "input depth", "input mask", "mirror rgb", "mirror depth", "mirror mask", "over")
+CELLS = (
+    *(f"{role} {kind}" for role in ("input", "mirror") for kind in ("rgb", "depth", "mask")),
+    "over",
+    *(f"{role} patch" for role in ("input", "mirror")),
+)
 
 
 STRIP = ("input rgb", "mirror rgb", "mirror depth", "mirror mask")
@@ -171,23 +175,30 @@ def compare_html(scenes: Sequence[ShownScene]) -> str:
     )
 
 
-def space_html(space: Space | None, data: str) -> str:
+def space_html(spaces: Sequence[Space], data: str) -> str:
     """The 3-D view with its controls; `data` is what its script reads. Empty where there is nothing to show."""
-    if space is None:
+    if not spaces:
         return ""
-    switches = [(f"{cloud.role} cloud", cloud.role) for cloud in space.clouds]
-    switches += [("mesh", "mesh")] if space.bodies else []
+    roles = dict.fromkeys(cloud.role for space in spaces for cloud in space.clouds)
+    switches = [(f"{role} cloud", role) for role in roles]
+    switches += [("mesh", "mesh")] if any(space.bodies for space in spaces) else []
     switches += [("cameras", "cameras")]
     boxes = "".join(
         f'<label><input type="checkbox" data-part="{part}" checked> {escape(name)}</label>' for name, part in switches
     )
     boxes += '<label><input type="checkbox" data-part="tint"> colour by camera</label>'
-    missing = f" There is no mesh: {escape(space.missing)}." if space.missing else ""
-    about = "the stored depth of both cameras as points, with the mesh as it was posed."
+    options = "".join(
+        f'<option value="{at}" data-missing="{escape(f" There is no mesh: {one.missing}." if one.missing else "")}">'
+        f"{escape(one.category)}, scene {one.scene_id}</option>"
+        for at, one in enumerate(spaces)
+    )
+    about = "The stored depth of both cameras as points, with the mesh as it was posed."
+    missing = f" There is no mesh: {escape(spaces[0].missing)}." if spaces[0].missing else ""
     keys = "Arrow keys turn, plus and minus zoom, 0 resets."
     return (
-        f'<p class="sub">{escape(space.category)}, scene {space.scene_id}: {about}{missing}</p>'
-        f'<div class="tools">{boxes}<button type="button" class="quiet" id="space-reset">Reset</button></div>'
+        f'<p class="sub">{about}<span id="space-missing">{missing}</span></p>'
+        f'<div class="tools"><label>Scene <select id="space-scene">{options}</select></label>{boxes}'
+        '<button type="button" class="quiet" id="space-reset">Reset</button></div>'
         '<div class="space"><canvas id="space-canvas" tabindex="0" role="img" '
         f'aria-label="3-D view of the point clouds and the mesh. {keys}"></canvas></div>'
         f'<p class="note" id="space-note">Drag to turn. {keys} Click it before you zoom with the wheel.</p>'
@@ -212,8 +223,8 @@ def overview_html(figures: Figures, job: Job, failed: int) -> str:
     tiles = [
         ("scenes", f"{figures.scenes:,}", f"of {job.scenes:,} asked"),
         ("failed", f"{failed:,}", f"{number(round(100 * failed / max(failed + figures.scenes, 1), 2))} % of those tried"),
-        ("pairs of views", f"{figures.pairs:,}", f"{figures.views:,} views"),
-        ("objects", f"{figures.instances:,}", f"different ones in {_plural(len(figures.by_category), 'category', 'categories')}"),
+        ("pairs of views", f"{figures.pairs:,}", plural(figures.views, 'view')),
+        ("objects", f"{figures.instances:,}", f"different ones in {plural(len(figures.by_category), 'category', 'categories')}"),
         ("images", f"{figures.files:,}", size(figures.bytes / 1e3)),
         ("time", describe_seconds(figures.seconds), f"{milliseconds(1e3 * figures.seconds / max(figures.scenes, 1))} a scene"),
     ]  # fmt: skip
@@ -253,8 +264,11 @@ def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
         Chart(
             "Resting gap",
             {"": figures.gap},
-            "Largest height at which an object of the scene hovers; logarithmic, less than 1 nm counts as 1 nm.",
+            "Largest height at which an object of the scene hovers; logarithmic.",
             length_of_decade,
+            f"0 in {figures.no_gap:,} of {plural(figures.no_gap + figures.gap.count, 'scene')}"
+            if figures.no_gap
+            else "",
         ),
     )
     return f'<div class="charts">{"".join(map(chart_html, shown))}</div>'
@@ -280,7 +294,7 @@ def effects_html(figures: Figures) -> str:
         for name, cost in sorted(never.items())
     )
     left_out = (
-        f'<details><summary>{_plural(len(never), "effect")} that ran in no scene, and why</summary><dl class="why">{never_rows}'
+        f'<details><summary>{plural(len(never), "effect")} that ran in no scene, and why</summary><dl class="why">{never_rows}'
         "</dl></details>"
     )
     return (
@@ -292,7 +306,7 @@ def effects_html(figures: Figures) -> str:
 def failures_html(failures: Iterable[Failure], scenes: int) -> str:
     """Each way of failing, with its reason in full and scenes to look at."""
     items = [
-        f'<li><p><strong>{escape(one.reason.replace("_", " "))}</strong> <span class="count">{_plural(one.scenes, "scene")}'
+        f'<li><p><strong>{escape(one.reason.replace("_", " "))}</strong> <span class="count">{plural(one.scenes, "scene")}'
         f"</span></p><p>{escape(one.detail)}</p><p class=\"note\">Stage {escape(one.stage)}, {escape(one.kind)}; for example "
         f"{escape(_listed(one.examples))}.</p></li>"
         for one in failures
@@ -372,10 +386,6 @@ def _share(part: int, whole: int) -> str:
 
 def _figure(value: float | None, unit: str, times: float = 1.0) -> str:
     return "–" if value is None else f"{number(value * times)} {unit}"
-
-
-def _plural(count: int, one: str, many: str | None = None) -> str:
-    return f"{count:,} {one if count == 1 else many or f'{one}s'}"
 
 
 def _listed(scenes: Iterable[int]) -> str:

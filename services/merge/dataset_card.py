@@ -1,6 +1,7 @@
 """OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
 from schemas.base import Counts
+from schemas.dataset.citation import ARTICLE
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
 from schemas.dataset.shard import Fingerprint
 from schemas.job.assets import ProceduralSource
@@ -10,11 +11,6 @@ from services.merge.merge import MergeResult
 from workers.assets.catalogue import Catalogue
 from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
-
-ARTICLE = (
-    "R. Staszak and D. Belter, *3D object reconstruction: A comprehensive view-dependent dataset*, Data in Brief 55 "
-    "(2024) 110569, https://doi.org/10.1016/j.dib.2024.110569, CC BY"
-)
 
 SHAPES_OF_CAPTURES = (
     "- reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing\n"

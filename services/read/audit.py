@@ -16,7 +16,7 @@ from schemas.base import Pose
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
 from schemas.dataset.shard import Fingerprint
-from schemas.errors import CorruptError, InputError, SceneError
+from schemas.errors import CorruptError, InputError, SceneError, plural
 from schemas.scene.scene import Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import Camera, View
@@ -169,11 +169,9 @@ def verify_independently(
 def describe_independent(found: IndependentVerdict) -> Iterator[str]:
     """Every fault, what was derived and what was not, line by line."""
     yield from found.faults
-    yield (
-        f"labels of {found.pairs} pairs of {found.scenes} scenes derived from the article's definitions, and their rest from "
-        "contact forces: "
-        f"{len(found.faults) or 'nothing'} off"
-    )
+    labels = f"labels of {plural(found.pairs, 'pair')} of {plural(found.scenes, 'scene')}"
+    off = len(found.faults) or "nothing"
+    yield f"{labels} derived from the article's definitions, and their rest from contact forces: {off} off"
     yield from (f"  {line}" for line in found.underived)
 
 
@@ -315,7 +313,7 @@ def describe_audit(found: Audit) -> Iterator[str]:
         "what is stored" if found.same_stack else "a plain scene made here, because another stack made what is stored"
     )
     yield (
-        f"audit of {found.scenes} scenes: {found.forced} no-ops forced, {found.files} files "
+        f"audit of {plural(found.scenes, 'scene')}: {plural(found.forced, 'no-op')} forced, {plural(found.files, 'file')} "
         f"({found.bytes / 1e6:.1f} MB) compared to the byte with {against}"
     )
     motion = found.motion
@@ -327,5 +325,5 @@ def describe_audit(found: Audit) -> Iterator[str]:
     yield describe_held(found.held)
     for name, tally in found.effects.items():
         if tally.skipped:
-            yield f"  {name} ({tally.kind}): left out in {tally.skipped} scenes, proven in {tally.proven}"
+            yield f"  {name} ({tally.kind}): left out in {plural(tally.skipped, 'scene')}, proven in {tally.proven}"
     yield f"  {len(found.faults) or 'nothing'} off"

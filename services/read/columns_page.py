@@ -12,7 +12,7 @@ WIDTH = 100
 HEADER = """\
 # Columns of the tables
 
-Written from `schemas/dataset/` by `python -m services.read.columns_page`; a test holds the two together. `verso columns TABLE`
+Written from `schemas/dataset/` by `python -m services.read.columns_page`; a test holds the two together. `./verso columns TABLE`
 prints the same.
 
 A column name ends in its unit where it has one: `_m` metres, `_mm` millimetres, `_rad` radians, `_deg` degrees, `_s` seconds.

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
+from schemas.errors import plural
 from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, ScenePlan, Settled
 from workers.geometry.frames import invert, motion_between, transform
@@ -61,9 +62,9 @@ def describe_held(held: Held | None) -> str:
     """What an audit says of it, in a line."""
     if held is None:
         return "  no second engine held the scenes: MuJoCo is not installed (`./verso extra audit`)"
-    shapes = "; ".join(f"{count} objects {what}" for what, count in sorted(held.shapes.items()))
+    shapes = "; ".join(f"{plural(count, 'object')} {what}" for what, count in sorted(held.shapes.items()))
     return (
-        f"  MuJoCo held {held.scenes} scenes for {HOLD_S:g} s: moved at most {held.moved_mm:.4f} mm, turned at most "
+        f"  MuJoCo held {plural(held.scenes, 'scene')} for {HOLD_S:g} s: moved at most {held.moved_mm:.4f} mm, turned at most "
         f"{held.turned_deg:.5f} degrees ({shapes or 'the tables are not convex'})"
     )
 

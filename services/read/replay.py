@@ -21,7 +21,7 @@ from schemas.dataset.layout import (
     range_table_path,
 )
 from schemas.dataset.shard import Fingerprint
-from schemas.dataset.tables import DETERMINISTIC_TABLES
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SORT_KEYS
 from schemas.errors import CorruptError, MachineError
 from schemas.job.identity import job_digest
 from schemas.scene.scene import SceneOutput
@@ -118,19 +118,25 @@ def _compare_pixels(before: bytes, now: bytes) -> tuple[bool, str]:
 
 
 def compare_rows(stored: StoredRange, output: SceneOutput, ignored: frozenset[str] = frozenset()) -> list[str]:
-    """Differences of a scene's new rows from the stored ones in all columns but `ignored`, a sentence each."""
+    """Differences of a scene's new rows from the stored ones in all columns but `ignored`, a sentence each; rows pair by key."""
     differences = []
     for table in DETERMINISTIC_TABLES:
         made = output.rows.get(table, [])
         key = "instance_id" if table == "assets" else "scene_id"
         wanted = {row["instance_id"] for row in made} if table == "assets" else {output.scene_id}
-        before = [row for row in stored.rows[table] if row[key] in wanted]
-        now = table_of_rows(table, made).to_pylist()
-        before, now = ([{k: v for k, v in row.items() if k not in ignored} for row in rows] for rows in (before, now))
-        if sorted(map(repr, before)) != sorted(map(repr, now)):
-            pairs = zip(before, now, strict=False)
-            columns = sorted({name for a, b in pairs for name in a if repr(a[name]) != repr(b.get(name))})
-            differences.append(f"rows of {table}: {', '.join(columns) or f'{len(before)} stored, {len(now)} made now'}")
+        before, now = (
+            {tuple(row[name] for name in SORT_KEYS[table]): row for row in rows}
+            for rows in (
+                [row for row in stored.rows[table] if row[key] in wanted],
+                table_of_rows(table, made).to_pylist(),
+            )
+        )
+        told = [f"{len(before)} stored, {len(now)} made now"] if before.keys() != now.keys() else []
+        names = [name for name in SCHEMAS[table].names if name not in ignored]
+        both = [(before[one], now[one]) for one in before.keys() & now.keys()]
+        told += [name for name in sorted(names) if any(repr(a.get(name)) != repr(b.get(name)) for a, b in both)]
+        if told:
+            differences.append(f"rows of {table}: {', '.join(told)}")
     return differences
 
 

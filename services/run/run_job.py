@@ -11,7 +11,7 @@ from pathlib import Path
 from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.dataset.shard import JobChange, ShardOrder
-from schemas.errors import FingerprintError
+from schemas.errors import FingerprintError, plural
 from schemas.job.job import Job
 from services.job.record import JobRecord, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import write_card
@@ -140,7 +140,9 @@ def make_missing(run: Run, cluster: contextlib.AbstractContextManager[Slots] | N
     own = os.environ.get("NUMBA_CACHE_DIR")  # noqa: TID251 - numba itself reads it nowhere else
     note = "" if request.address or are_kept(own) else " (a first start compiles for up to a minute)"
     print(
-        f"{job.name}: {run.plan.scenes} scenes to make{there}; starting the workers{note}", file=sys.stderr, flush=True
+        f"{job.name}: {plural(run.plan.scenes, 'scene')} to make{there}; starting the workers{note}",
+        file=sys.stderr,
+        flush=True,
     )
     with cluster or open_ray(request.address, job.run.workers) as slots:
         if request.address is not None:

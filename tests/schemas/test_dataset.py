@@ -125,6 +125,8 @@ def test_each_difference_of_two_stacks_has_its_remedy_and_what_can_be_installed_
         ({"renderer": "llvmpipe, 512 bits"}, f"renderer: {renderer}, llvmpipe, 512 bits", "libgl1-mesa-dri"),
         ({"simd": "X86_V2"}, "simd: X86_V2 X86_V3, X86_V2", "NPY_DISABLE_CPU_FEATURES"),
         ({"maths": "m"}, "maths: , m", "GLIBC_TUNABLES"),
+        ({"python": "CPython 3.12.1"}, "python: , CPython 3.12.1", "the same Python"),
+        ({"binaries": "b"}, "binaries: , b", "--only-binary"),
         ({"canary": "x"}, "canary: c, x", "machines of one kind"),
     ):
         other = mine.model_copy(update=change)

@@ -113,6 +113,8 @@ def _view_numbers(path: Path) -> list[int]:
 
 def read_board(path: Path) -> Board:
     """The board of a board.json, wherever it is. Raises CaptureError that names the file."""
+    if not path.exists():
+        raise CaptureError("missing", f"{path} is not there: `verso capture board` writes one beside the print")
     return _read_json(path, Board)
 
 

@@ -129,6 +129,11 @@ GroundShape = float | Mesh | Array | tuple[Mesh, ...]
 """Level ground at a height, metres, without an end; a mesh, or several; or the vertices [N, 3] of a convex body."""
 
 
+def bullet_file() -> str:
+    """The shared library that is loaded as PyBullet."""
+    return str(pybullet.__file__)
+
+
 @dataclass(frozen=True)
 class World:
     """A ground of one shape or more, and bodies, numbered in order. `advance` takes `steps` steps."""

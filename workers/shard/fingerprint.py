@@ -2,18 +2,25 @@
 
 import hashlib
 import math
-from importlib.metadata import version
+import mmap
+import platform
+from collections.abc import Sequence
+from importlib.metadata import distribution, version
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
+from zlib_ng import zlib_ng
 
 from schemas.dataset.shard import Fingerprint
 from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.views import Tier
 from workers.assets.catalogue import open_catalogue
+from workers.geometry.frames import pose, rotation_about
+from workers.physics.bullet import bullet_file, open_world
+from workers.physics.rigid_body import Body
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import make_scene
@@ -24,6 +31,9 @@ CANARY = Job(name="canary", seed=7, scenes=1)
 """Changed with the schema version only: a new canary makes every stored fingerprint foreign."""
 
 CANARY_SCENE = 3
+
+BULLET_STEPS = 20
+"""Steps between two states of `bullet_digest`: eight states are 0.17 s, in which all three boxes have met."""
 
 LIBRARIES = (
     "coacd",
@@ -56,18 +66,54 @@ def take_fingerprint(renderer: Renderer, tier: Tier) -> Fingerprint:
 
     Takes about a second, most of it Python's and GL's first use.
     """
+    names = (*LIBRARIES, *TIER_LIBRARIES.get(tier, ()))
     return Fingerprint(
         canary=canary_digest(renderer),
         code=code_digest(),
-        libraries={name: version(name) for name in (*LIBRARIES, *TIER_LIBRARIES.get(tier, ()))},
+        libraries={name: version(name) for name in names},
         simd=numpy_simd(),
         renderer=renderer.name,
         maths=maths_digest(),
+        python=f"{platform.python_implementation()} {platform.python_version()}",
+        binaries=binaries_digest(names, bullet_file()),
     )
 
 
+def binaries_digest(names: Sequence[str], loaded: str) -> str:
+    """SHA-256, hex, of how libraries were built: what they say of the shared libraries that were installed, and a loaded one.
+
+    Wheels and what pip builds itself list each file's SHA-256. `loaded` is read as a whole, by a check sum and its size: 133 MB
+    take 12 ms.
+    """
+    digest = hashlib.sha256()
+    for name in names:
+        lines = (distribution(name).read_text("RECORD") or "").splitlines()
+        digest.update("\n".join(sorted(line for line in lines if ".so" in line.partition(",")[0])).encode())
+    with open(loaded, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        digest.update(f"{zlib_ng.crc32(data)} {len(data)}".encode())
+    return digest.hexdigest()
+
+
+def bullet_digest() -> str:
+    """SHA-256, hex, of the states of two boxes that are thrown, spinning, onto a third one in flight, in PyBullet.
+
+    The canary scene lands upright and is brought to exact rest: its poses need not show how PyBullet was built.
+    """
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (0.03, 0.04, 0.05)
+    body = Body(0.6, np.array([8.2e-4, 6.8e-4, 5.0e-4]), (corners,))
+    axis, digest = np.array([0.6, 0.0, 0.8]), hashlib.sha256()
+    places = [pose(rotation_about(axis, 0.7 * k), np.array([0.01 * k, 0.0, 0.06 + 0.1 * k])) for k in range(3)]
+    with open_world([(body, place) for place in places], 0.0, CANARY.physics, BULLET_STEPS) as world:
+        for number in (1, 2):
+            world.set_velocity((0.3, -0.1 * number, -1.0), (7.0, 3.0 * number, -5.0), number)
+        for _ in range(8):
+            world.advance()
+            digest.update(repr([(world.pose(number), world.velocity(number)) for number in range(3)]).encode())
+    return digest.hexdigest()
+
+
 def canary_digest(renderer: Renderer) -> str:
-    """SHA-256, hex, of the canary scene's files and rows."""
+    """SHA-256, hex, of the canary scene's files and rows, and of PyBullet's states in a pile that falls."""
     catalogue = open_catalogue(CANARY.assets, Path(), tuple(CANARY.categories))
     context = WorkerContext(CANARY, catalogue, renderer, settings_digest(CANARY, catalogue.digest))
     stopwatch = Stopwatch()
@@ -77,6 +123,7 @@ def canary_digest(renderer: Renderer) -> str:
         digest.update(file.path.encode())
         digest.update(bytes.fromhex(file.sha256))
     digest.update(repr(sorted(output.rows.items())).encode())
+    digest.update(bullet_digest().encode())
     return digest.hexdigest()
 
 

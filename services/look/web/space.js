@@ -54,6 +54,13 @@ function fill(data) {
   const input = new THREE.Vector3(data.clouds[0].camera[3], data.clouds[0].camera[7], 0).sub(new THREE.Vector3(target.x, target.y, 0));
   space.yaw = Math.atan2(input.y, input.x) + 1.2;
 }
+function choose(number) { // shows another scene, with the same parts of it
+  space.scene.clear();
+  Object.assign(space, { parts: {}, clouds: [] });
+  fill(space.all[number]);
+  document.querySelectorAll("[data-part]").forEach((box) => setPart(box.dataset.part, box.checked));
+  reset();
+}
 function reset() {
   Object.assign(space.eye, { yaw: space.yaw, low: 0.55, far: 0.95 });
   space.eye.target.set(0, 0, 0);
@@ -116,7 +123,7 @@ function draw() {
   canvas.dataset.drawn = String(Number(canvas.dataset.drawn || 0) + 1);
 }
 function setPart(name, on) {
-  if (name !== "tint") { space.parts[name].visible = on; return; }
+  if (name !== "tint") { if (space.parts[name]) space.parts[name].visible = on; return; }
   for (const points of space.clouds) {
     points.material.vertexColors = !on;
     points.material.color.set(on ? points.userData.tint : "#ffffff");
@@ -145,16 +152,20 @@ function begin(canvas, data) {
   space.camera.up.set(0, 0, 1);
   connectPointer(canvas);
   canvas.addEventListener("keydown", turn);
-  fill(data);
+  space.all = data;
   document.querySelectorAll("[data-part]").forEach((box) => {
     box.addEventListener("change", () => { setPart(box.dataset.part, box.checked); draw(); });
-    setPart(box.dataset.part, box.checked);
+  });
+  const scenes = document.getElementById("space-scene");
+  scenes.addEventListener("change", () => {
+    document.getElementById("space-missing").textContent = scenes.selectedOptions[0].dataset.missing;
+    choose(scenes.value);
   });
   document.getElementById("space-reset").addEventListener("click", reset);
   document.addEventListener("verso:theme", draw);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   new ResizeObserver(draw).observe(canvas);
-  reset();
+  choose(scenes.value); // which a browser may have kept from before
 }
 function connectSpace() { // the view is made when it is about to be seen
   const canvas = document.getElementById("space-canvas"), data = document.getElementById("space-data");

@@ -30,8 +30,10 @@ def test_no_instance_is_in_two_splits_also_where_a_scene_has_several_objects(few
     mixed = set(shown) - {number for ids in chosen.values() for number in ids}
     assert mixed, "no scene mixes the splits: the test would not see a leak"
     single = open_dataset(few.root)  # of one object: each pair is in exactly one split
-    ids = [pair.pose_id for split in ("train", "val", "test") for pair in pairs_of_split(single, split)]
-    assert sorted(ids) == [pair.pose_id for pair in single.pairs()]
+    for splits in (None, single.splits(), held := single.splits(held_out=["box"])):
+        ids = [pair.pose_id for split in ("train", "val", "test") for pair in pairs_of_split(single, split, splits)]
+        assert sorted(ids) == [pair.pose_id for pair in single.pairs()]
+    assert all(held[pair.instance_id] == "test" for pair in single.pairs() if pair.category == "box")
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +110,18 @@ def test_scores_are_those_of_known_errors(examples):
     assert found.mask_l1_mm == pytest.approx(20, abs=1e-3) == found.unseen_l1_mm
     assert found.l1_mm == pytest.approx(20 * one.mask.sum() / (one.depth > 0).sum(), abs=1e-3)
     assert ms_ssim(one.baseline, one.depth) < 1
+
+
+def test_the_sheet_shows_the_input_the_truth_the_prediction_and_the_error(pairs, examples):
+    pair, one = pairs[0], examples[0]
+    height, width = CROP
+    wrong = np.where(one.mask, one.depth + np.float32(mirror_depth.ERROR_M), one.depth)
+    rows = [mirror_depth.draw_row(pair, one, depth) for depth in (one.depth, wrong)]
+    seen, truth, predicted, error = np.split(rows[1], 4, axis=1)
+    np.testing.assert_array_equal(seen, pair.input.patch().rgb())
+    assert np.array_equal(error[..., 0] > 250, one.mask & (one.depth > 0)) and error[..., 0][~one.mask].max() == 0
+    assert np.array_equal(truth[~one.mask], predicted[~one.mask]) and not np.array_equal(truth, predicted)
+    assert mirror_depth.draw_sheet(rows).size == (4 * width, 16 + 2 * height)
 
 
 def test_likeness_falls_with_noise_and_one_scale_of_flat_images_is_the_formula():

@@ -65,9 +65,13 @@ def python(*arguments: str) -> str:
 
 
 @pytest.mark.minute
-def test_a_loader_stacks_the_split_a_network_learns_from_it_and_the_script_prints_all_scores(few):
+def test_a_loader_stacks_the_split_a_network_learns_from_it_and_the_script_prints_all_scores(few, tmp_path):
     python("-c", CHECKS, few.name)
-    *lines, last = python(str(EXAMPLES / "train_mirror_depth.py"), few.name, "--epochs", "1").splitlines()
+    script, kept = str(EXAMPLES / "train_mirror_depth.py"), tmp_path / "kept"
+    *lines, last = python(script, few.name, "--epochs", "1", "--out", str(kept)).splitlines()
+    assert sorted(path.name for path in kept.iterdir()) == ["network.pt", "sheet.png"]
+    load = "import sys, torch; from train_mirror_depth import Net; Net().load_state_dict(torch.load(sys.argv[1])['weights'])"
+    python("-c", load, str(kept / "network.pt"))
     assert list(json.loads(last)) == ["network", "baseline", "half turn", "planes alone"]
     assert any("MS-SSIM" in line for line in lines)
 

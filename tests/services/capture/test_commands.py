@@ -11,7 +11,7 @@ from services.capture import capture_job, capture_settings
 from services.cli.main import main
 from tests.workers.capture.recordings import recording
 from tests.workers.capture.simulated import VIEWS, box, copy_of, processed
-from workers.capture.folder import open_folder, read_truth
+from workers.capture.folder import open_folder, read_board, read_truth
 
 
 @pytest.fixture
@@ -52,6 +52,12 @@ def test_board_writes_the_sheet_that_was_asked_for_or_says_why_not(run, tmp_path
         data = (tmp_path / name).read_bytes()
         assert code == 0 and data.startswith(start) and data.count(b"/MediaBox") == pages
         assert answer["board"]["columns"] == 7
+        written = (tmp_path / name).with_suffix(".json")
+        assert answer["board_file"] == str(written) and read_board(written).measured_ruler_m == 0.2
+    (tmp_path / "b.json").write_text('{"measured_ruler_m": 0.1987}')
+    assert "was there and is kept" in run("board", tmp_path / "b.pdf")[1]
+    assert read_board(tmp_path / "b.json").measured_ruler_m == 0.1987
+    (tmp_path / "x.json").write_text('{"columns": 3}')
     own, wrong = tmp_path / "own.json", tmp_path / "wrong.json"
     own.write_text('{"columns": 3, "rows": 3, "width_m": 0.3, "height_m": 0.28}')
     wrong.write_text('{"columns": 30}')
@@ -62,6 +68,8 @@ def test_board_writes_the_sheet_that_was_asked_for_or_says_why_not(run, tmp_path
         ((tmp_path / "b.png", "--tiles", "a4"), InputError, "ends in"),
         ((tmp_path / "x.pdf", "--board", wrong), CaptureError, "wrong.json"),
         ((tmp_path / "none" / "b.pdf",), OutputError, "cannot be written"),
+        ((tmp_path / "x.pdf",), InputError, "x.json is of another board"),
+        ((tmp_path / "x.pdf", "--board", tmp_path / "no.json"), CaptureError, "`verso capture board` writes one"),
     ):
         code, _, err, _ = run("board", *words)
         assert code == refusal.exit_code and told in err and not words[0].exists()

@@ -192,7 +192,7 @@ def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
     assert (code, found["ok"], found["scenes"], found["pairs"]) == (0, True, 2, 2)
     assert (found["independent"]["scenes"], found["independent"]["faults"]) == (1, [])
     assert "2 scenes, labels of 2 pairs derived again: nothing off" in lines[0]
-    assert lines[1].startswith("labels of 1 pairs of 1 scenes derived from the article's definitions, and ")
+    assert lines[1].startswith("labels of 1 pair of 1 scene derived from the article's definitions, and ")
     assert "their rest from contact forces: nothing off" in lines[1]
     assert told(capsys, "query", made.name, "select scene_id from scenes order by 1", "--format", "csv")[1].split()[
         1:

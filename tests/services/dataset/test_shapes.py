@@ -11,6 +11,7 @@ import trimesh
 import yaml
 
 from schemas.errors import CorruptError, InputError, JobError, SceneError
+from schemas.job.assets import CATEGORIES
 from services.dataset.dataset import open_dataset
 from services.dataset.one_scene import make_scene
 from services.job.job_file import validate_job
@@ -58,6 +59,29 @@ def test_a_mesh_in_the_world_is_the_glb_at_the_pose_of_objects_dat(files):
     world = trimesh.transform_points(seen, pair.input.T_world_cam)
     for mesh, points in ((pair.mesh(3, pair.input), seen), (pair.mesh(), world)):
         assert mesh.bounds == pytest.approx(np.stack([points.min(axis=0), points.max(axis=0)]), abs=1e-6)
+
+
+def test_a_welded_mesh_is_watertight_where_the_asset_is_and_is_the_same_surface(tmp_path):
+    make_dataset(
+        tmp_path, scenes=16, categories={**dict.fromkeys(CATEGORIES, 1.0)}, images={"projection": {"enabled": False}}
+    )
+    closed = {row["instance_id"]: row for row in open_dataset(tmp_path).table("assets").to_table().to_pylist()}
+    split = 0
+    for pair in open_dataset(tmp_path).pairs():
+        for region, name in ((2, pair.scene["table_id"]), (3, pair.instance_id)):
+            plain, welded = pair.mesh(region), pair.mesh(region, welded=True)
+            assert welded.is_watertight == closed[name]["watertight"], name
+            assert welded.bounds == pytest.approx(plain.bounds) and welded.area == pytest.approx(plain.area)
+            if welded.is_watertight:
+                assert welded.is_winding_consistent and welded.volume == pytest.approx(
+                    closed[name]["volume_m3"], rel=1e-4
+                )
+            split += not plain.is_watertight
+    assert split > 8, "no mesh is split at seams: the test would see nothing"
+    (pair, *_) = open_dataset(tmp_path).pairs()
+    seen = pair.mesh(3, pair.input, welded=True)
+    assert seen.bounds == pytest.approx(pair.mesh(3, pair.input).bounds)
+    assert trimesh.proximity.closest_point(seen, seen.triangles_center[:5])[1].max() < 1e-9  # which asks rtree
 
 
 def test_each_of_several_objects_has_its_own_shape(tmp_path):

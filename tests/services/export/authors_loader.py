@@ -86,3 +86,39 @@ def read_images(folder: Path, front: int, back: int) -> Iterator[tuple[str, NDAr
         kind = np.uint16 if name.startswith(("depth", "dist")) else np.uint8
         assert pixels.dtype == kind, f"{path.name} is {pixels.dtype}"
         yield name, pixels[..., ::-1] if name.startswith("rgb") else pixels
+
+
+@dataclass
+class One:
+    """An object of a pair as the class for several objects reads it: its place among them, and its images."""
+
+    number: int
+    place: int
+    front: Object
+    back: Object
+    images: dict[str, NDArray]
+
+
+def load_several(folder: Path) -> Iterator[One]:
+    """Every object whose line is the same in both files of a pair and whose images all exist; line 0 is the table."""
+    files = sorted(folder.glob("objects*.dat"))
+    for front, back in zip(files[::2], files[1::2], strict=True):
+        number = int(front.stem.removeprefix("objects"))
+        sides = [list(map(read_object, path.read_text().splitlines())) for path in (front, back)]
+        for line, (a, b) in enumerate(zip(*sides, strict=True)):
+            if not line or (a.category, a.instance, a.region) != (b.category, b.instance, b.region):
+                continue
+            names = {f"{kind}{side}": f"{kind}{number + bool(side):05d}" for kind in KINDS for side in ("", "_back")}
+            names |= {f"{k}In{s}": f"{k}In{number:05d}{s}obj{line - 1}" for k in KINDS for s in ("yaw0", "yaw-179")}
+            names |= {f"{kind}Proj": f"{kind}Proj{number:05d}yaw-179obj{line - 1}" for kind in KINDS[:2]}
+            if all((folder / f"{name}.png").exists() for name in names.values()):
+                yield One(
+                    number,
+                    line - 1,
+                    a,
+                    b,
+                    {k: np.asarray(cv2.imread(str(folder / f"{v}.png"), -1)) for k, v in names.items()},
+                )
+
+
+KINDS = ("rgb", "depth", "segment")

@@ -15,9 +15,9 @@ from workers.store.store import Store
 
 
 def export_to(store: Store, target: Path, name: Any, **asked: Any) -> ExportResult:
-    """The result of an export; `asked` are fields of Choice, and shard_mb: 0 ends a shard after each scene."""
-    shard_mb = asked.pop("shard_mb", 256)
-    return export(ExportRequest(store, target, name, Choice(**asked), shard_mb))
+    """The result of an export; `asked`: fields of Choice, points, and shard_mb: 0 ends a shard after each scene."""
+    shard_mb, points = asked.pop("shard_mb", 256), asked.pop("points", 0)
+    return export(ExportRequest(store, target, name, Choice(**asked), shard_mb, points))
 
 
 def contents(folder: Path) -> dict[str, bytes]:

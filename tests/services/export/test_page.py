@@ -46,6 +46,9 @@ def test_the_examples_run(example, folder, monkeypatch):
     exec(example, names)
     if found[1] == "webdataset":
         assert names["colour"].shape == (120, 160, 3) and names["depth"].dtype == "uint16" and len(names["pose"]) == 16
+        last = names["pair"]["json"]  # the loop's last pair: as many pixels of its object as were counted
+        (thing,) = (one for one in last["views"]["mirror"]["objects"] if one["region_id"] == 3)
+        assert names["mask"].sum() == thing["pixels"] > 100
     else:
         assert names["depth"].size == (160, 120) and names["depth"].mode.startswith("I")
 
@@ -56,6 +59,8 @@ def test_the_page_names_every_kind_of_file_that_an_export_writes(folder):
     for words in COMMANDS[: len(FORMATS)]:
         for path in contents(folder / words[2]):
             name = re.sub(r"[0-9]{5,}", "#", path.rpartition("/")[2])
+            if path.startswith("shapes/"):
+                name = "<instance_id>.glb"
             known = re.sub(r"^(segmentIn|depthIn)", "rgbIn", name)
             known = re.sub(r"#\.(aligned|mirror|projected)\.", "#.input.", known)
             assert known in told, f"{words[2]}/{path}"

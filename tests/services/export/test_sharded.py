@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import trimesh
 import yaml
 
+from schemas.dataset.citation import ARTICLE
 from schemas.dataset.tables import SCHEMAS
 from services.export.huggingface import card_text
 from tests.services.export.exported import export_to, source_image, source_poses, source_rows
@@ -20,6 +22,7 @@ WORDS = {
     "mirror": {"rgb": "RGB", "depth": "depth", "region": "segment"},
     "projected": {"rgb": "RGBprojected", "depth": "depthProjected"},
 }
+POINTS = 64
 POSE_IDS = [0, 2, 4, 6, 8, 10, 12, 14]
 
 
@@ -28,7 +31,9 @@ def exported(files, tmp_path_factory):
     """(folder, manifest) by format; a shard ends after each scene."""
     place = tmp_path_factory.mktemp("sharded")
     names = ("webdataset", "huggingface")
-    return {name: (place / name, export_to(files, place / name, name, shard_mb=0).manifest) for name in names}
+    return {
+        name: (place / name, export_to(files, place / name, name, shard_mb=0, points=POINTS).manifest) for name in names
+    }
 
 
 def check_pixels(files, category, pose_id, read):
@@ -41,6 +46,21 @@ def check_pixels(files, category, pose_id, read):
 def decode(data):
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     return pixels[..., ::-1] if pixels.ndim == 3 else pixels
+
+
+def check_shapes(files, folder, instances):
+    """Each shape is the stored one, and its points lie on it."""
+    assert {path.stem for path in folder.glob("shapes/*/*.glb")} == set(instances)
+    for path in folder.glob("shapes/*/*.glb"):
+        assert path.read_bytes() == (files.root / "assets" / path.parent.name / path.name).read_bytes()
+        drawn, mesh = np.load(path.with_suffix(".npz")), trimesh.load_mesh(path, process=False)
+        assert drawn["points"].shape == drawn["normals"].shape == (POINTS, 3)
+        nearest = trimesh.triangles.closest_point(
+            np.tile(mesh.triangles, (8, 1, 1)), np.repeat(drawn["points"][:8], len(mesh.faces), axis=0)
+        )
+        gaps = np.linalg.norm(nearest - np.repeat(drawn["points"][:8], len(mesh.faces), axis=0), axis=1)
+        assert gaps.reshape(8, -1).min(axis=1).max() < 1e-6
+        np.testing.assert_allclose(np.linalg.norm(drawn["normals"], axis=1), 1.0, atol=1e-5)
 
 
 def check_poses(files, pose_id, input_view, mirror_view):
@@ -66,44 +86,52 @@ def samples_of(folder):
 def test_every_pair_is_a_sample_with_the_pixels_poses_and_split_of_the_dataset(files, exported):
     folder, manifest = exported["webdataset"]
     samples = samples_of(folder)
-    splits = {row["instance_id"]: row["split"] for row in source_rows(files.root, "assets")}
     assert sorted(int(key) for _, key in samples) == POSE_IDS
+    check_shapes(files, folder, [row["instance_id"] for row in source_rows(files.root, "assets")])
     assert (manifest["pairs"], manifest["pairs_left_out"], sum(manifest["samples"].values())) == (8, 0, 8)
     assert len(list(folder.glob("*.tar"))) == sum(manifest["shards"].values()) == 4  # full after each scene
     for (split, key), sample in samples.items():
-        told, depths = json.loads(sample["json"]), np.load(io.BytesIO(sample["depth.npz"]))
-        assert (told["pose_id"], told["split"], splits[told["instance_id"]]) == (int(key), split, split)
+        told, arrays = (
+            json.loads(sample["json"]),
+            {k: np.load(io.BytesIO(sample[f"{k}.npz"])) for k in ("depth", "region")},
+        )
+        assert (told["pose_id"], told["split"]) == (int(key), split)
         check_poses(files, int(key), told["views"]["input"], told["views"]["mirror"])
 
-        def read(role, kind, sample=sample, depths=depths):
-            return depths[role] if kind == "depth" else decode(sample[f"{role}.{kind}.png"])
+        def read(role, kind, sample=sample, arrays=arrays):
+            return arrays[kind][role] if kind in arrays else decode(sample[f"{role}.{kind}.png"])
 
         check_pixels(files, told["category"], int(key), read)
 
 
 def test_small_shards_hold_the_same_samples_as_one_and_captures_are_samples_too(files, captures, tmp_path, exported):
-    export_to(files, tmp_path / "one", "webdataset")
+    export_to(files, tmp_path / "one", "webdataset", points=POINTS)
     assert samples_of(tmp_path / "one") == samples_of(exported["webdataset"][0])
     assert export_to(captures, tmp_path / "new", "webdataset").manifest["pairs"] == 4
     for sample in samples_of(tmp_path / "new").values():
         assert set(np.load(io.BytesIO(sample["depth.npz"]))) == {"input", "mirror", "projected"}
+        assert set(np.load(io.BytesIO(sample["region.npz"]))) == {"input", "mirror"}
+    assert [path.parent.name for path in (tmp_path / "new").glob("shapes/*/*")] == ["mug", "mug"]  # no board is stored
 
 
 # The package leaves it to the garbage collector to close the shards that it opened.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
-def test_the_webdataset_package_reads_every_sample(files, exported):
+@pytest.mark.parametrize("decoder", ["rgb", "rgb8", "pil", "l"])
+def test_the_webdataset_package_reads_every_sample_with_any_of_its_decoders(decoder, files, exported):
     webdataset = pytest.importorskip("webdataset")
     urls = [str(path) for path in sorted(exported["webdataset"][0].glob("*.tar"))]
-    samples = list(webdataset.WebDataset(urls, shardshuffle=False, empty_check=False).decode("rgb8"))
+    samples = list(webdataset.WebDataset(urls, shardshuffle=False, empty_check=False).decode(decoder))
     assert sorted(int(one["__key__"]) for one in samples) == POSE_IDS
     for one in samples:
-
-        def read(role, kind, one=one):
-            if kind == "depth":
-                return one["depth.npz"][role]
-            return one[f"{role}.rgb.png"] if kind == "rgb" else one[f"{role}.region.png"][..., 0]
-
-        check_pixels(files, one["json"]["category"], one["json"]["pose_id"], read)
+        for role, kind, word in ((role, *each) for role, words in WORDS.items() for each in words.items()):
+            number = one["json"]["pose_id"] + (role == "mirror")
+            stored = source_image(files.root, one["json"]["category"], word, number)
+            if kind != "rgb":
+                assert one[f"{kind}.npz"][role].dtype == stored.dtype
+                np.testing.assert_array_equal(one[f"{kind}.npz"][role], stored)
+            elif decoder in ("rgb8", "pil"):
+                np.testing.assert_array_equal(np.asarray(one[f"{role}.rgb.png"]), stored)
+        assert 3 in one["region.npz"]["mirror"]
 
 
 # ------------------------------------------------------------------------------------------------ Hugging Face
@@ -116,6 +144,7 @@ def rows_of(folder):
 def test_every_pair_is_a_row_with_the_pixels_poses_and_objects_of_the_dataset(files, captures, exported, tmp_path):
     folder, manifest = exported["huggingface"]
     rows, objects = rows_of(folder), source_rows(files.root, "objects")
+    check_shapes(files, folder, {one["instance_id"] for one in objects})
     assert sorted(row["pose_id"] for row in rows) == POSE_IDS
     assert (manifest["pairs"], manifest["pairs_left_out"], sum(manifest["rows"].values())) == (8, 0, 8)
     for row in rows:
@@ -148,7 +177,7 @@ def test_the_card_names_the_files_the_licence_and_every_column(exported):
         text = card_text("a: b", schema, {}, licences)
         head = yaml.safe_load(text.split("---\n")[1])
         assert (head["license"], head["pretty_name"], head["configs"][0]["data_files"]) == (licence, "a: b", [])
-        assert ", ".join(licences) in text
+        assert ", ".join(licences) in text and ARTICLE in text
 
 
 def test_the_datasets_package_reads_every_image(files, exported, tmp_path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import hashlib
 import itertools
 import json
 import os
@@ -13,23 +14,28 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow.dataset as ds
 import pytest
 from obstore.store import MemoryStore
 
 from schemas.errors import CorruptError, InputError, InUseError, OutputError
+from schemas.job.assets import SplitShares
 from schemas.job.job import Job
 from schemas.scene.shape import Material, Part, Shape
 from services.cli.main import main
+from services.dataset.splits import split_by_category
 from services.export.folder import ExportFolder, Rounds
 from services.export.shapes import Shapes, color_vertices
 from services.export.source import iter_ranges, scenes_of, unchanged_sources
 from services.export.table import FORMATS
 from services.job.record import require_job
+from tests.datasets import make_dataset
 from tests.services.export.exported import contents, export_to, source_rows
 from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
+SPLITS = ("train", "val", "test")
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -269,7 +275,7 @@ def test_an_image_that_is_lost_is_an_error_and_never_left_out(copy, tmp_path):
 
 
 def first_scene(store):
-    (scene,) = scenes_of(store, next(iter_ranges(store, list_codes(store), 0)), [0])
+    (scene,) = scenes_of(store, next(iter_ranges(store, list_codes(store), 0)), [0], {})
     return scene
 
 
@@ -279,6 +285,41 @@ def test_the_split_of_a_scene_is_the_strictest_of_its_objects(pile):
     for position, (_, name) in enumerate(scene.instances.values()):
         scene.assets[name] = {**scene.assets[name], "split": ("val", "test", "train")[position]}
     assert scene.split == "test"
+
+
+def test_each_split_has_its_share_of_every_category_and_what_is_held_out_is_test_alone(files, tmp_path):
+    ids = {
+        "laptop": [f"laptop-{k}" for k in range(30)],
+        "jar": ["jar-1", "jar-2", "jar-3"],
+        "box": ["box-1"],
+        "can": [],
+    }
+    shares = SplitShares(train=0.8, val=0.1, test=0.1)
+    found = split_by_category(ids, shares)
+    counts = {key: [[found[name] for name in names].count(one) for one in SPLITS] for key, names in ids.items()}
+    assert counts == {"laptop": [24, 3, 3], "jar": [1, 1, 1], "box": [1, 0, 0], "can": [0, 0, 0]}
+    assert found == split_by_category({key: names[::-1] for key, names in ids.items()}, shares)
+    place = {name: int(hashlib.sha256(name.encode()).hexdigest(), 16) for name in ids["laptop"]}
+    order = sorted(place, key=place.get)  # as the column has them: by their hash
+    assert [found[name] for name in order] == ["train"] * 24 + ["val"] * 3 + ["test"] * 3
+    held = split_by_category(ids, shares, ["jar"])
+    assert {held[name] for name in ids["jar"]} == {"test"} and held["laptop-0"] == found["laptop-0"]
+    assert set(split_by_category(ids, SplitShares(train=0.0, val=0.5, test=0.5)).values()) == {"val", "test"}
+
+    def exported(name, **asked):
+        export_to(files, tmp_path / name, "huggingface", **asked)
+        rows = ds.dataset(tmp_path / name / "data").to_table(columns=["instance_id", "split"]).to_pylist()
+        return {row["instance_id"]: row["split"].replace("validation", "val") for row in rows}
+
+    column = {row["instance_id"]: row["split"] for row in source_rows(files.root, "assets")}
+    assert exported("column", split="instance").items() <= column.items()
+    for split in ("instance", "category"):
+        rows = exported(split + "-held", split=split, held_out=("can",))
+        assert {split for name, split in rows.items() if name.startswith("can")} == {"test"}
+    boxes = sorted(name for name in column if name.startswith("box"))
+    assert {name: exported("new")[name] for name in boxes} == split_by_category({"box": boxes}, shares)
+    with pytest.raises(InputError, match="--held-out mug: the dataset has no such object; its are box, can, table"):
+        export_to(files, tmp_path / "none", "huggingface", held_out=("mug",))
 
 
 # ------------------------------------------------------------------------------------------------ shapes
@@ -321,7 +362,7 @@ def test_a_vertex_has_the_colour_of_its_texel_times_the_base_colour():
 # ------------------------------------------------------------------------------------------------ the command
 
 
-def test_the_command_says_what_is_there_and_what_was_left_out(files, pile, tmp_path, capsys):
+def test_the_command_says_what_is_there_and_what_was_left_out(files, tmp_path, capsys):
     asked = ["export", files.name, str(tmp_path / "new"), "--format", "mirror-recon"]
     assert main([*asked, "--scenes", "0-1", "--json"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -329,9 +370,10 @@ def test_the_command_says_what_is_there_and_what_was_left_out(files, pile, tmp_p
     answer = json.loads(lines[-1])
     assert (answer["ok"], answer["pairs"], answer["pairs_now"]) == (True, 4, 4)
     assert answer["choice"] == {"first_scene": 0, "last_scene": 1}
-    assert main(["export", pile.name, str(tmp_path / "pile"), *asked[3:]]) == 1
+    bare, _ = make_dataset(tmp_path / "bare", scenes=1, categories=["can"], images={"projection": {"enabled": False}})
+    assert main(["export", bare.name, str(tmp_path / "none"), *asked[3:]]) == 1
     told = capsys.readouterr()
-    assert "left out: 1 pairs, several objects" in told.out and "left_out.csv" in told.out
+    assert "left out: 1 pair, no projected view" in told.out and "left_out.csv" in told.out
     assert "holds no pair: every pair was left out" in told.err
 
 

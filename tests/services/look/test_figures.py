@@ -36,7 +36,8 @@ def test_tables_made_by_hand_give_the_figures_that_can_be_counted(figures):
     assert figures.visibility["mirror"].most == 1.0
     assert figures.inclination["input"].mean == pytest.approx(46.0)
     assert figures.distance.count == 2 and figures.distance.mean == pytest.approx(2.3)
-    assert (figures.gap.count, figures.gap.least, figures.gap.most) == (3, -6.0, pytest.approx(-2.0))  # 0 is 1 nm
+    assert (figures.gap.count, figures.gap.least, figures.gap.most) == (2, -3.0, pytest.approx(-2.0))
+    assert figures.no_gap == 1  # a gap of 0 is none, and no nanometre
     first, second = figures.failures
     assert (first.reason, first.scenes, first.examples, first.detail) == ("left_table", 2, (2, 4), "at 0.7 m")
     assert (second.reason, second.scenes) == ("no_rest", 1)
@@ -155,12 +156,19 @@ def test_bars_are_as_high_as_their_counts_and_told_in_words():
     first, _, last = re.findall(r"<span>([\d.]+) m</span>", html)
     assert html.count('<path class="line"') == 1 and float(first) <= 1.0 and float(last) >= 5.0
     assert chart(input=[]) == ""
+    html = chart(input=[2.5] * 9, mirror=[0.0])  # what is always the same is a sentence
+    assert "<svg" not in html and "always 2.5 m, n = 9" in html and "always 0 m, n = 1" in html
+    assert "<svg" in chart(input=[2.5] * 9, mirror=[0.0, 0.1])
     lengths = {-6.0: "1 nm", -4.5: "31.6 nm", -3.0: "1 µm", -2.0: "10 µm", 0.0: "1 mm", 3.0: "1 m"}
     assert {decade: length_of_decade(decade) for decade in lengths} == lengths
     assert (amount(45.678, "°"), amount(0.5, "%")) == ("45.7°", "0.5 %")
 
 
 # ---------------------------------------------------------------------------------------------- sections
+
+
+def html_of_gap(figures) -> str:
+    return charts_html(figures, {}).partition("<h3>Resting gap</h3>")[2]
 
 
 def test_sections_say_what_was_asked_made_left_out_and_failed(figures):
@@ -182,7 +190,9 @@ def test_sections_say_what_was_asked_made_left_out_and_failed(figures):
     assert failures_html((), 9) == '<p class="empty">No scene failed of 9.</p>'
     html = charts_html(figures, {"input": Histogram(0.0, 9.6)})
     titles = ["Distance to the object", "Visibility", "Inclination", "Resting gap"]  # no depth: it has no values
-    assert re.findall("<h3>(.*?)</h3>", html) == titles
+    assert re.findall("<h3>(.*?)</h3>", html) == titles and "0 in 1 of 3 scenes" in html
+    still = html_of_gap(replace(figures, gap=Histogram(-6.0, 4.0), no_gap=64))
+    assert "0 in 64 of 64 scenes" in still and "<svg" not in still and "nm" not in still
 
 
 def test_what_comes_from_the_dataset_is_text_and_never_markup(figures):

@@ -169,6 +169,19 @@ def test_a_report_is_not_made_again_while_nothing_changes_nor_at_once(shown, mon
     assert len(made) == 2
 
 
+def test_what_is_finished_is_told_at_once_also_after_a_report_that_took_long(shown, monkeypatch):
+    follower, sections = Follower(shown, 2), []
+    begun = progress_of("x", Status(96, 80, {}, 16, 3.0, digest=None, running=(), holder=None), True)
+    monkeypatch.setattr(follower, "_read_sections", lambda: sections.append(follower._shown.done) or ())
+    for done, phase, told in ((80, "making", [80]), (84, "making", [80]), (88, "finished", [80, 88])):
+        follower._shown = replace(begun, made=done, phase=phase)
+        follower.report()
+        assert sections == told
+    follower._shown = replace(follower._shown, made=96, phase="making")  # somebody extends it
+    follower.report()
+    assert sections == [80, 88] and follower._not_before > time.monotonic() + 5
+
+
 # ---------------------------------------------------------------------------------------------- who may read
 
 TOKEN = "a-token-of-some-length"

@@ -171,7 +171,7 @@ def test_every_picture_is_shown_a_category_alone_where_asked_and_nothing_is_fetc
     opened.run(f"{PICTURES}.forEach((one) => {{ one.loading = 'eager'; }})")
     opened.until(f"{PICTURES}.every((one) => one.complete)")
     widths = opened.run(f"{PICTURES}.map((one) => one.naturalWidth)")
-    assert len(widths) == 4 * 7 + 2 and min(widths) > 0
+    assert len(widths) == 4 * 9 + 2 and min(widths) > 0
     shown = "[...document.querySelectorAll('.scene:not([hidden])')].map((one) => one.dataset.category)"
     for name, kept in (("mug", {"mug"}), ("", {"box", "mug"})):
         opened.run(f"document.querySelector('[data-show=\"{name}\"]').click()")
@@ -209,6 +209,9 @@ def test_the_view_in_space_draws_turns_with_keys_and_hides_its_parts(opened, tmp
     assert np.abs(picture(opened, "#space-canvas", tmp_path) - first).mean() > 2
     opened.press("0", 48)
     assert np.abs(picture(opened, "#space-canvas", tmp_path) - first).mean() < 0.5
+    chosen = "document.getElementById('space-scene')"
+    opened.run(f"{chosen}.value = {chosen}.options.length - 1; {chosen}.dispatchEvent(new Event('change'))")
+    assert np.abs(picture(opened, "#space-canvas", tmp_path) - first).mean() > 0.5
     for part in ("input", "mirror", "mesh", "cameras"):
         before = picture(opened, "#space-canvas", tmp_path)
         opened.run(f"document.querySelector('[data-part=\"{part}\"]').click()")

@@ -14,7 +14,7 @@ from PIL import Image
 
 from schemas.errors import CorruptError, MachineError
 from services.look import clouds as module
-from services.look.clouds import Body, Cloud, Space, coarsen, pack_space, read_space
+from services.look.clouds import Body, Cloud, Space, coarsen, pack_space, pack_spaces, read_space, read_spaces
 from services.look.pictures import (
     FIXED_REGIONS,
     MOST_WIDTH,
@@ -114,8 +114,13 @@ def test_a_scene_has_its_pictures_and_depth_is_counted_of_objects_alone(shown):
     assert [scene.scene_id for scene in sample.scenes] == [0, 3]
     first = sample.scenes[0]
     roles = {f"{role} {kind}" for role in ("input", "mirror") for kind in ("rgb", "depth", "mask")}
-    assert set(first.pictures) == roles | {"over"} and all(picture.data for picture in first.pictures.values())
+    patches = {"input patch", "mirror patch"}
+    assert set(first.pictures) == roles | {"over"} | patches and all(
+        picture.data for picture in first.pictures.values()
+    )
     assert 0.0 < first.visible["input"] <= 1.0 and 1.9 < first.d_z_m < 3.0
+    crop = cv2.imread(str(shown.root / first.category / "patches" / "RGB00000.png"))[..., ::-1].astype(int)
+    assert np.abs(decoded(first.pictures["input patch"]) - crop).mean() < 12 and crop.std() > 12  # JPEG
     depth = show_scenes(shown, [0]).depth
     assert 0 < depth["input"].count < 160 * 120 / 10 and np.isfinite(depth["mirror"].mean)
     assert abs(depth["input"].percentile(0.02) - first.d_z_m) < 0.05
@@ -167,8 +172,7 @@ def test_of_too_many_points_those_of_objects_stay_and_a_mesh_of_too_many_faces_k
     shown, space, monkeypatch
 ):
     vertices = np.concatenate([body.vertices for body in space.bodies if body.kind == "object"])
-    monkeypatch.setattr(module, "MOST_POINTS", 500)
-    whole, thin = space.clouds[0].points, read_space(shown, 1).clouds[0].points
+    whole, thin = space.clouds[0].points, read_space(shown, 1, 500).clouds[0].points
     low, high = vertices.min(axis=0) + np.array([0, 0, 0.01]), vertices.max(axis=0) + 0.005
     of_object = [((points > low) & (points < high)).all(axis=1).sum() for points in (whole, thin)]
     assert len(thin) <= 500 < len(whole) and of_object[0] == of_object[1] > 10
@@ -192,6 +196,18 @@ def test_what_is_packed_is_what_is_shown(space):
     assert np.array_equal(numbers(packed["bodies"][0]["faces"], "<u4"), space.bodies[0].faces)
 
 
+def test_several_scenes_may_be_chosen_in_space_with_fewer_points_each(shown, monkeypatch):
+    monkeypatch.setattr(module, "MOST_SPACES", 2)
+    monkeypatch.setattr(module, "FEWER_POINTS", 700)
+    spaces = read_spaces(shown, [0, 1, 2, 3])
+    assert [space.scene_id for space in spaces] == [0, 3]
+    assert all(len(cloud.points) <= 700 for space in spaces for cloud in space.clouds)
+    assert [one["scene"] for one in json.loads(pack_spaces(spaces))] == [0, 3]
+    options = re.findall(r'<option value="(\d)" data-missing="">([^<]+)<', space_html(spaces, ""))
+    assert options == [("0", f"{spaces[0].category}, scene 0"), ("1", f"{spaces[1].category}, scene 3")]
+    assert len(read_spaces(shown, [1])[0].clouds[0].points) > 700
+
+
 def test_the_view_in_space_has_a_switch_for_each_part_and_says_why_there_is_no_mesh(shown, monkeypatch):
     def gone(*_):
         raise MachineError("the files of the asset <folders> do not hold what they held")
@@ -202,7 +218,7 @@ def test_the_view_in_space_has_a_switch_for_each_part_and_says_why_there_is_no_m
     cloud = Cloud("input", np.zeros((1, 3)), np.zeros((1, 3), np.uint8), 0.01, np.eye(4))
     body = Body("object", np.zeros((3, 3)), np.array([[0, 1, 2]]))
     for bodies, missing, parts in (((), found.missing, []), ((body,), "", ["mesh"])):
-        html = space_html(Space(3, "box", np.zeros(3), (cloud,), bodies, missing), "{}")
+        html = space_html([Space(3, "box", np.zeros(3), (cloud,), bodies, missing)], "{}")
         assert re.findall(r'data-part="(\w+)"', html) == ["input", *parts, "cameras", "tint"]
         assert ("There is no mesh: the files of the asset &lt;folders&gt;" in html) == (not bodies)
-    assert space_html(None, "") == ""
+    assert space_html((), "") == ""

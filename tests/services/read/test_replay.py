@@ -37,6 +37,13 @@ def test_a_scene_replays_to_the_byte_and_a_difference_is_told_by_file_table_and_
     differences = compare_rows(other, output)
     assert differences[0] == "rows of scenes: settle_s" and differences[1].startswith("rows of objects: 0 stored, ")
     assert len(compare_rows(other, output, frozenset({"settle_s"}))) == 1
+    views = [{**row, "d_z_m": 9.0} if row["role"] == "mirror" else row for row in stored.rows["views"]]
+    for mixed in (views, views[::-1], views[2:] + views[:2]):  # one column, whatever the order of the rows
+        assert compare_rows(dataclasses.replace(stored, rows={**stored.rows, "views": mixed}), output) == [
+            "rows of views: d_z_m"
+        ]
+    few = dataclasses.replace(stored, rows={**stored.rows, "views": views[1:]})
+    assert compare_rows(few, output) == [f"rows of views: {len(views) - 1} stored, {len(views)} made now, d_z_m"]
     number, depth = next((i, file) for i, file in enumerate(output.files) if "/depth0" in file.path)
     for pixels, too_many in ((4, False), (4000, True)):  # another stack may differ in few pixels, the same in none
         image = decode_png(depth.data)
@@ -176,7 +183,7 @@ def test_the_command_says_what_it_did_and_exits_by_what_verify_says(copy, capsys
     (copy / "can/RGB00000.png").unlink()
     assert main(["replay", str(copy), "--repair"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].endswith(".png: put back") and lines[-1].endswith("1 files put back or written again; nothing off")
+    assert lines[0].endswith(".png: put back") and lines[-1].endswith("1 file put back or written again; nothing off")
     (copy / "stray").touch()
     assert main(["replay", str(copy), "--repair"]) == 1
     assert "stray: is in no commit: move it away" in capsys.readouterr().out

@@ -2,12 +2,16 @@
 
 import itertools
 import os
+import platform
+import re
 import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from importlib.metadata import distribution
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,10 +23,19 @@ from services.job.job_file import validate_job
 from services.run.worker_entry import processor_flags
 from tests.effects.scenes import SMALL
 from tests.workers.shard import shards
+from workers.physics.bullet import World
 from workers.render.raster.gbuffer import shared_renderer
+from workers.shard import fingerprint
 from workers.shard import run_shard as module
 from workers.shard.code import SOURCE_PACKAGES, code_digest
-from workers.shard.fingerprint import TIER_LIBRARIES, maths_digest, numpy_simd, take_fingerprint
+from workers.shard.fingerprint import (
+    TIER_LIBRARIES,
+    binaries_digest,
+    canary_digest,
+    maths_digest,
+    numpy_simd,
+    take_fingerprint,
+)
 from workers.shard.run_shard import describe, explain, keep_traceback
 from workers.store.attempt import Attempt, blamed_scene, staged_attempts
 from workers.store.commit import read_record
@@ -218,10 +231,34 @@ def test_a_worker_of_another_stack_is_refused_unless_the_job_records_stacks(tmp_
 def test_the_same_stack_has_the_same_fingerprint_and_names_what_the_bytes_depend_on():
     first, second = (take_fingerprint(shared_renderer(), "raster") for _ in range(2))
     assert first == second and first.digest == second.digest
-    assert first.libraries["numpy"] == np.__version__
+    assert first.libraries["numpy"] == np.__version__ and first.python.endswith(platform.python_version())
     assert first.code == code_digest() and len(first.canary) == 64
     assert first.simd == numpy_simd() and first.renderer == shared_renderer().name
     assert TIER_LIBRARIES["pathtraced"][0] not in first.libraries
+
+
+def test_another_build_of_a_library_is_another_stack_under_the_same_versions(tmp_path, monkeypatch):
+    (tmp_path / "bullet.so").write_bytes(b"as it was built" * 1000)
+    digests = [binaries_digest(("pybullet", "numpy"), str(tmp_path / "bullet.so"))]
+    assert digests == [binaries_digest(("pybullet", "numpy"), str(tmp_path / "bullet.so"))]
+    (tmp_path / "bullet.so").write_bytes(b"as it was Built" * 1000)
+    digests.append(binaries_digest(("pybullet", "numpy"), str(tmp_path / "bullet.so")))
+    record = distribution("numpy").read_text("RECORD")
+    changed = SimpleNamespace(read_text=lambda _: re.sub(r"(\.so,sha256=)....", r"\1AAAA", record))
+    monkeypatch.setattr(fingerprint, "distribution", lambda name: changed if name == "numpy" else distribution(name))
+    digests.append(binaries_digest(("pybullet", "numpy"), str(tmp_path / "bullet.so")))
+    assert len(set(digests)) == 3
+    before = canary_digest(shared_renderer())  # and what PyBullet computes reaches the canary, in its last bits too
+    advance = World.advance
+
+    def nudged(world: World) -> None:
+        advance(world)
+        if len(world.bodies) == 3:
+            (x, y, z), spin = world.velocity(1)
+            world.set_velocity((x, y, float(np.nextafter(z, 0.0))), spin, 1)
+
+    monkeypatch.setattr(World, "advance", nudged)
+    assert canary_digest(shared_renderer()) != before
 
 
 def asked(code: str, cwd: Path = ROOT, **environ: str) -> list[str]:

@@ -1,0 +1,182 @@
+"""Every command and every Python block of every page, as a user types them: in the order of the page, in a fresh checkout.
+
+The checkout holds README's first dataset, which the other pages are about, and what a user brings: meshes, a recording, a scan.
+"""
+
+import importlib.util
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.services.init.own_meshes import cup, write_mesh
+from tests.workers.capture.recordings import recording
+
+ROOT = Path(__file__).resolve().parents[2]
+DIGEST = "724b3dddcac8b293848aa243cc456f058255ce99e4018df878151f3ca5da96e3"
+FIRST = "./verso run deploy/jobs/tabletop.yaml"
+
+ELSEWHERE = {
+    r"docker |kubectl ": "tests/deploy/test_compose.py",
+    r"RAY_UP\w*=\S+ |\.venv/bin/ray ": "tests/clusters and tests/deploy/test_submit.py",
+    r"\./verso lock": "tests/launcher; it asks PyPI for what is newest",
+    r"\./verso drive |\./verso supervise --address http://head": "tests/services/queue, with a Ray of their own",
+    r"\.venv/bin/python -m pip install torch": "some gigabytes",
+}
+"""Commands that cannot run on any machine, and what runs them or why nothing does."""
+
+FOR_A_WHILE = r"\./verso (serve|supervise|logs .*--follow)"
+"""Commands that end when they are told to."""
+
+SMALLER = {
+    r"--scenes 600\b": "--scenes 16",
+    r"^\./verso test$": "./verso test tests/test_layers.py",
+    r"tests/hard_cases": "tests/test_layers.py",
+    r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
+    r"(\./verso tradeoff .*)": r"\1 --scenes 6 --physics-scenes 6 --laps 1 --knobs physics.step_hz",
+    r"~/my_meshes": "meshes",
+    r"/shared/": "shared/",
+    r"s3://bucket/": "bucket/",
+    r"(train_mirror_depth.py data/training)": r"\1 --epochs 1",
+}
+"""The same command with less to do, or in places that are here."""
+
+PAGES = {
+    "README.md": pytest.mark.minute,
+    "docs/captures.md": pytest.mark.slow,
+    "docs/commands.md": pytest.mark.slow,
+    "docs/export.md": pytest.mark.minute,
+    "docs/measured.md": pytest.mark.minute,
+    "docs/own_meshes.md": pytest.mark.minute,
+    "docs/queue.md": pytest.mark.minute,
+    "docs/reading.md": pytest.mark.minute,
+    "docs/report.md": pytest.mark.minute,
+    "deploy/README.md": pytest.mark.minute,
+    "deploy/examples/README.md": pytest.mark.slow,
+}
+
+_BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$|((?:^ {4,}[^\n]*\n)+)", re.MULTILINE | re.DOTALL)
+_COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\./verso|verso|docker|kubectl|\.venv/bin/\w+|export) ?")
+
+
+def steps(text: str) -> Iterator[tuple[str, str]]:
+    """(language, what to run) of every block of a page: Python as a whole, of others each command."""
+    for language, fenced, indented in _BLOCK.findall(text):
+        if language == "python":
+            yield "python", fenced
+            continue
+        lines = (fenced or indented).replace("\\\n", " ").splitlines()
+        while lines:
+            line = lines.pop(0).strip()
+            while line.count('"') % 2 and lines:
+                line += " " + lines.pop(0).strip()
+            line = line.removeprefix("$ ")
+            if language != "yaml" and _COMMAND.match(line):
+                yield "sh", " ".join(re.sub(r"\s#\s.*", "", f"{line} ").split()) if '"' not in line else line
+
+
+def test_every_page_with_a_block_is_run_and_steps_are_found_in_order():
+    pages = [ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/**/*.md")]
+    assert {str(page.relative_to(ROOT)) for page in pages if list(steps(page.read_text()))} <= PAGES.keys()
+    text = 'x\n\n    $ ./verso run a  # so\n    made\n\n```python\nx = 1\n```\n\n- y\n\n      ./verso query d "a\n      b"\n'
+    assert list(steps(text)) == [("sh", "./verso run a"), ("python", "x = 1\n"), ("sh", './verso query d "a b"')]
+    assert next(line for _, line in steps((ROOT / "README.md").read_text())) == FIRST
+    every = "\n".join(line for page in PAGES for _, line in steps((ROOT / page).read_text()))
+    for pattern in (*ELSEWHERE, *SMALLER, FOR_A_WHILE):
+        assert re.search(pattern, every, re.MULTILINE), f"{pattern} is not on any page any more"
+
+
+def checkout_at(root: Path) -> Path:
+    """A copy of the files that git has, with a `.venv` that the launcher takes for its own, and what a user brings."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, listed.split("\0")):
+        if (ROOT / name).is_file():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, root / name)
+    (root / ".venv").mkdir()
+    for entry in Path(sys.prefix).iterdir():
+        if not entry.name.startswith("verso-"):
+            (root / ".venv" / entry.name).symlink_to(entry)
+    stamp = re.search(r"^stamp_of\(\) \{.*?^\}\n", (root / "verso").read_text(), re.MULTILINE | re.DOTALL)
+    assert stamp is not None
+    for name in ("base", "dev", "study", "audit", "pathtraced"):
+        script = f'root={root} venv={root}/.venv; {stamp[0]} stamp_of {name} >"$venv/verso-{name}"'
+        subprocess.run(["bash", "-c", script], check=True)
+    write_mesh(root / "meshes/mug/a.obj", cup())
+    write_mesh(root / "meshes/mug/b.ply", cup(0.12, 0.05))
+    write_mesh(root / "scan.ply", cup())
+    (root / "recording.mkv").write_bytes(recording())
+    return root
+
+
+def type_it(line: str, root: Path, timeout: float = 900) -> str:
+    """What a command prints. It must succeed, and name no program that is not there."""
+    run = ["bash", "-c", line]
+    done = subprocess.run(run, cwd=root, capture_output=True, text=True, check=False, timeout=timeout, errors="replace")
+    told = done.stdout + done.stderr
+    assert done.returncode == 0, f"{line}\n{told[-3000:]}"
+    assert not re.search(r"(?<![\w./-])verso (?:run|report|query|status|verify|replay)\b", told), f"{line}\n{told}"
+    return told
+
+
+def type_for_a_while(line: str, root: Path) -> None:
+    """Starts a command, waits until it says something, and interrupts it: it must end without a word of Python's."""
+    run = ["bash", "-c", f"exec {line}"]
+    process = subprocess.Popen(run, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    time.sleep(6)
+    process.send_signal(signal.SIGINT)
+    told, _ = process.communicate(timeout=60)
+    assert process.returncode in (0, 1) and "Traceback" not in told, f"{line}\n{told}"
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory) -> Path:
+    """A checkout in which README's first command was typed."""
+    root = checkout_at(tmp_path_factory.mktemp("first"))
+    told = type_it(FIRST, root)
+    assert DIGEST in told and "next: ./verso report data/tabletop · ./verso query data/tabletop" in told
+    return root
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+@pytest.mark.parametrize("page", [pytest.param(page, marks=mark) for page, mark in PAGES.items()])
+def test_a_page_runs_from_top_to_bottom(page, first, tmp_path, monkeypatch):
+    root = checkout_at(tmp_path)
+    if page != "README.md":
+        shutil.copytree(first / "data", root / "data")
+    monkeypatch.chdir(root)
+    monkeypatch.setenv("PYTHONPATH", "")
+    names: dict = {}
+    job = "j0a1b2c3d"
+    for language, line in steps((ROOT / page).read_text()):
+        if language == "python":
+            if all(map(importlib.util.find_spec, re.findall(r"^import (\w+)$", line, re.MULTILINE))):
+                exec(compile(line, page, "exec"), names)
+            continue
+        if any(re.match(pattern, line) for pattern in ELSEWHERE) or ("train_" in line and not has_torch()):
+            continue
+        for pattern, less in SMALLER.items():
+            line = re.sub(pattern, less, line)
+        line = line.replace("j0a1b2c3d", job)
+        if line.startswith("export "):
+            name, _, value = shlex.split(line, comments=True)[1].partition("=")
+            monkeypatch.setenv(name, value)
+        elif re.match(FOR_A_WHILE, line):
+            type_for_a_while(line, root)
+        else:
+            told = type_it(line, root)
+            if line.startswith("./verso submit"):
+                job = re.findall(r"\bj[0-9a-f]{8}\b", told)[0]
+
+
+def has_torch() -> bool:
+    return importlib.util.find_spec("torch") is not None
