@@ -39,6 +39,7 @@ class Material:
     `transmission` is the share of light not mirrored that crosses the surface as through glass, in the path-traced tier
     alone; `transmission_map` [h, w] uint8 multiplies it, and `ior` is the index of refraction. A transmitting surface is a
     thin sheet; an `ior` of 1 lets all light pass, for the second side of a wall whose first side stands for both.
+    `jpeg` is the file that the texture was read from, if it was a JPEG of the same pixels: a copy as PNG has five times its size.
     """
 
     base_color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
@@ -48,6 +49,7 @@ class Material:
     transmission: float = 0.0
     transmission_map: NDArray[np.uint8] | None = None
     ior: float = 1.5
+    jpeg: bytes | None = None
 
 
 @dataclass(frozen=True, eq=False)

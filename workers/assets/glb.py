@@ -68,12 +68,13 @@ class _Writer:
         )
         return len(self.accessors) - 1
 
-    def add_texture(self, pixels: NDArray[np.uint8]) -> int:
-        """The number of a texture [h, w, 3 or 4]; parts that share the array share the texture."""
+    def add_texture(self, pixels: NDArray[np.uint8], jpeg: bytes | None) -> int:
+        """The number of a texture [h, w, 3 or 4], as the JPEG that it came from; parts that share the array share the texture."""
         if id(pixels) not in self._numbers:
-            png = self._encode_opaque(pixels) if pixels.shape[2] == 3 else encode_with_pillow(pixels)
+            data = jpeg or (self._encode_opaque(pixels) if pixels.shape[2] == 3 else encode_with_pillow(pixels))
             self._numbers[id(pixels)] = len(self.images)
-            self.images.append({"bufferView": self.add_view(png), "mimeType": "image/png"})
+            kind = "image/png" if jpeg is None else "image/jpeg"
+            self.images.append({"bufferView": self.add_view(data), "mimeType": kind})
         return self._numbers[id(pixels)]
 
 
@@ -146,7 +147,7 @@ def _material(writer: _Writer, part: Part, rgb: list[float], watertight: bool) -
     }
     see_through = material.base_color[3] < 1.0 or (part.colors is not None and bool((part.colors[:, 3] < 255).any()))
     if material.texture is not None and part.uv is not None:
-        rough["baseColorTexture"] = {"index": writer.add_texture(material.texture)}
+        rough["baseColorTexture"] = {"index": writer.add_texture(material.texture, material.jpeg)}
         see_through |= material.texture.shape[2] == 4
     result: dict[str, Any] = {"name": part.name, "pbrMetallicRoughness": rough}
     return result | ({"alphaMode": "BLEND"} if see_through else {}) | ({} if watertight else {"doubleSided": True})

@@ -34,6 +34,7 @@ from tests.workers.assets.oracles import (
 from workers.assets.builtin.make import make_asset
 from workers.assets.external.formats import list_mesh_files, load_shape
 from workers.assets.external.mesh import DEFAULT, is_solid
+from workers.assets.external.reader import pack_asset, unpack_asset
 from workers.assets.external.urdf import load_urdf
 from workers.assets.glb import asset_glb, split_glb
 
@@ -181,6 +182,24 @@ def test_a_texture_comes_along_with_its_coordinates_right_way_up_and_its_alpha(t
     Image.fromarray(np.full((2, 2, 4), 77, np.uint8)).save(tmp_path / "skin.png")
     part = only_part(textured_cube(tmp_path, more="d 0.5\n"))
     assert part.material.texture.shape == (2, 2, 4) and part.material.base_color[3] == 0.5
+
+
+def test_a_jpeg_is_stored_as_it_is_and_once(tmp_path):
+    data = picture("JPEG", (64, 64), None)
+    write(tmp_path / "skin.jpg", data)
+    files = textured_obj("skin.jpg")
+    half = files["cube.obj"].replace(b"\nf 4/1", b"\nusemtl other\nf 4/1")
+    path = write_all(
+        tmp_path, files | {"cube.obj": half, "cube.mtl": files["cube.mtl"] + b"newmtl other\nmap_Kd skin.jpg\n"}
+    )
+    parts = load(path).shape.parts
+    assert [part.material.jpeg for part in parts] == [data, data]
+    asset = unpack_asset(pack_asset(replace(asset_of(trimesh.creation.box((1, 1, 1))), shape=Shape(parts[:1]))))
+    assert asset.shape.parts[0].material.jpeg == data
+    stored = asset_glb(asset)
+    assert data in stored and split_glb(stored)[0]["images"][0]["mimeType"] == "image/jpeg"
+    again = load(write(tmp_path / "b.glb", stored)).shape.parts[0].material
+    assert again.texture.tolist() == parts[0].material.texture.tolist() and again.jpeg == data
 
 
 def test_colours_of_gltf_are_linear_and_become_srgb(tmp_path):

@@ -115,6 +115,28 @@ class FolderResolver:
         self.limits = limits
         self.budget = budget or Budget(limits)
         self.notes: list[str] = []
+        self._jpegs: dict[int, tuple[NDArray[np.uint8], bytes]] = {}
+        self._pictures: dict[str, NDArray[np.uint8] | None] = {}
+
+    def picture(self, name: str) -> NDArray[np.uint8] | None:
+        """The picture of a name, read once; None, and a note, where it is missing, refused or damaged."""
+        if name not in self._pictures:
+            try:
+                self._pictures[name] = self.decode(self.get(name))
+            except FileNotFoundError:
+                self._pictures[name] = None
+        return self._pictures[name]
+
+    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
+        """The picture of bytes that `budget.take_image` let pass, as `decode_picture`."""
+        pixels = decode_picture(data, self.notes)
+        if pixels is not None and data.startswith(b"\xff\xd8\xff"):
+            self._jpegs[id(pixels)] = pixels, data
+        return pixels
+
+    def jpeg_of(self, pixels: NDArray[np.uint8] | None) -> bytes | None:
+        """The file that a picture was decoded from, if it was a JPEG."""
+        return self._jpegs[id(pixels)][1] if id(pixels) in self._jpegs else None
 
     def get(self, key: str) -> bytes:
         """The bytes of a material file or a picture; FileNotFoundError, and a note, where it is missing or refused."""

@@ -5,12 +5,13 @@ A new format is a row, and a module that lists what a file names and reads its m
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
+from schemas.scene.shape import Part
 from workers.assets.external import plain
 from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.assets.external.gltf import named_by_gltf, read_gltf
@@ -63,7 +64,13 @@ def load_shape(path: Path, limits: MeshLimits, root: Path | None = None, budget:
     if not meshes:
         raise MeshError("no_faces", f"{path} has no triangles")
     shape, mended = clean_shape(path, [place_mesh(path, mesh) for mesh in meshes])
-    return LoadedMesh(shape, tuple(dict.fromkeys([*resolver.notes, *mended])))
+    parts = tuple(_with_jpeg(part, resolver) for part in shape.parts)
+    return LoadedMesh(replace(shape, parts=parts), tuple(dict.fromkeys([*resolver.notes, *mended])))
+
+
+def _with_jpeg(part: Part, resolver: FolderResolver) -> Part:
+    jpeg = resolver.jpeg_of(part.material.texture)
+    return part if jpeg is None else replace(part, material=replace(part.material, jpeg=jpeg))
 
 
 def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:

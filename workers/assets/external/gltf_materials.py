@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver, decode_picture
+from workers.assets.external.caps import FolderResolver
 from workers.assets.external.mesh import MIN_TINT, MeshVisual, make_material
 from workers.geometry.colour import encode_srgb
 
@@ -176,7 +176,7 @@ class Materials:
         if (why := self._resolver.budget.take_image(data)) is not None:
             self._resolver.note(name, why)
             return None
-        return decode_picture(data, self._resolver.notes)
+        return self._resolver.decode(data)
 
     def _sampler(self, reference: Tree) -> Tree:
         number = self._tree["textures"][reference["index"]].get("sampler") if reference else None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver, decode_picture
+from workers.assets.external.caps import FolderResolver
 from workers.assets.external.mesh import DEFAULT, WHITE, Indices, MeshVisual, RawMesh, make_material
 
 _LIBRARY = re.compile(r"^[ \t]*mtllib[ \t]+(.+?)[ \t]*$", re.MULTILINE)
@@ -368,13 +368,9 @@ def _picture(words: str | None, resolver: FolderResolver) -> NDArray[np.uint8] |
     if "<UDIM>" in name:
         resolver.note(name, "is a set of pictures (UDIM), of which none is read: bake it into one")
         return None
-    try:
-        data = resolver.get(name)
-    except FileNotFoundError:
-        return None  # the resolver has noted it
     if options:
         resolver.notes.append(f"{name}: ignored {' '.join(options)}")
-    return decode_picture(data, resolver.notes)
+    return resolver.picture(name)
 
 
 _PLAIN_OPTIONS = {"-s": {1.0}, "-o": {0.0}, "-t": {0.0}}

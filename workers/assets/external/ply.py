@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver, decode_names, decode_picture, unreadable
+from workers.assets.external.caps import FolderResolver, decode_names, unreadable
 from workers.assets.external.mesh import DEFAULT, WHITE, Indices, MeshVisual, RawMesh, make_material
 from workers.assets.external.plain import read_plain
 
@@ -200,8 +200,5 @@ def _colors(element: PlyElement) -> NDArray[np.uint8] | None:
 
 def _picture(name: str, resolver: FolderResolver) -> Material:
     """The material of a picture: as it is, or the neutral grey where it cannot be had."""
-    try:
-        picture = decode_picture(resolver.get(name), resolver.notes)
-    except FileNotFoundError:
-        return DEFAULT  # the resolver has noted it
+    picture = resolver.picture(name)
     return DEFAULT if picture is None else make_material(np.ones(4), 0.0, _ROUGHNESS, picture)[0]

@@ -285,16 +285,17 @@ def pack_asset(asset: Asset) -> bytes:
     """
     arrays: dict[int, NDArray] = {}
 
-    def number(array: NDArray | None) -> int | None:
+    def number(array: NDArray | bytes | None) -> int | None:
         if array is None:
             return None
-        arrays.setdefault(id(array), array)
+        arrays.setdefault(id(array), np.frombuffer(array, np.uint8) if isinstance(array, bytes) else array)
         return list(arrays).index(id(array))
 
     parts = [
         {name: number(getattr(part, name)) for name in _ARRAYS}
         | {"name": part.name, "color": part.material.base_color, "texture": number(part.material.texture)}
         | {"metallic": part.material.metallic, "roughness": part.material.roughness}
+        | {"jpeg": number(part.material.jpeg)}
         for part in asset.shape.parts
     ]
     mass = asset.mass
@@ -321,10 +322,11 @@ def unpack_asset(data: bytes) -> Asset:
         arrays = [np.lib.format.read_array(stream, allow_pickle=False) for _ in range(tree["arrays"])]
         for array in arrays:
             array.setflags(write=False)
+        jpegs = {k: arrays[k].tobytes() for k in {part["jpeg"] for part in tree["parts"]} - {None}}
         mass_kg, com, inertia, solid = tree["mass"]
         return Asset(
             **{name: tree[name] for name in _PLAIN},
-            shape=Shape(tuple(_part(part, arrays) for part in tree["parts"]), tree["closed"]),
+            shape=Shape(tuple(_part(part, arrays, jpegs) for part in tree["parts"]), tree["closed"]),
             mass=MassProperties(mass_kg, frozen_array(com), frozen_array(inertia), solid),
             T_source_to_object=frozen_array(tree["T_source_to_object"]),
             notes=tuple(tree["notes"]),
@@ -333,7 +335,7 @@ def unpack_asset(data: bytes) -> Asset:
         raise MeshError("unreadable", f"the mesh reader's answer makes no sense: {error!r:.200}") from error
 
 
-def _part(tree: dict[str, Any], arrays: list[NDArray]) -> Part:
+def _part(tree: dict[str, Any], arrays: list[NDArray], jpegs: dict[int, bytes]) -> Part:
     given = {name: None if tree[name] is None else arrays[tree[name]] for name in (*_ARRAYS, "texture")}
     vertices, faces, texture = given["vertices"], given["faces"], given.pop("texture")
     if vertices is None or faces is None:
@@ -351,5 +353,11 @@ def _part(tree: dict[str, Any], arrays: list[NDArray]) -> Part:
     if not len(faces) or int(faces.min()) < 0 or int(faces.max()) >= count:
         raise ValueError("a face names a vertex that is not there")
     red, green, blue, alpha = (float(value) for value in tree["color"])
-    material = Material((red, green, blue, alpha), float(tree["metallic"]), float(tree["roughness"]), texture)
+    material = Material(
+        base_color=(red, green, blue, alpha),
+        metallic=float(tree["metallic"]),
+        roughness=float(tree["roughness"]),
+        texture=texture,
+        jpeg=jpegs.get(tree["jpeg"]),
+    )
     return Part(str(tree["name"]), vertices, faces, material, given["normals"], given["uv"], given["colors"])
