@@ -66,7 +66,8 @@ IMAGES = tuple(
 
 _UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\\]|(?:^|/)\.{0,2}(?:/|\Z)")
 """A letter that no path may have, or a part that is empty, `.` or `..`."""
-_CATEGORY = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_CATEGORY = re.compile(r"[^\W_][^\s\x00-,./:-@\[-^`{-\xa9]*")
+"""A letter or digit of any script, then anything but blanks and ASCII's signs other than - and _."""
 _IMAGE = re.compile(
     rf"{_CATEGORY.pattern}/(?:patches/)?(?:{'|'.join(sorted({image.content for image in IMAGES}))})([0-9]{{5,19}})"
     r"(?:obj[0-9]{1,4})?\.png"

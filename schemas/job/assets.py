@@ -2,7 +2,7 @@
 
 import itertools
 import math
-import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -82,17 +82,26 @@ def instance_id(category: str, seed: int, index: int) -> str:
 MOST_TOLD = 20
 """Categories that a message names."""
 
-_ALLOWED = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+LONGEST, LONGEST_BYTES = 64, 200
+"""Letters of a category, and bytes of them in UTF-8: a file system allows 255 for a name."""
 
 _TAKEN = frozenset({"assets", "manifest"})
 """Names of a dataset's own folders."""
 
 
+def is_letter(c: str) -> bool:
+    """Whether a character is a letter, a mark on one, or a digit, of any script."""
+    return unicodedata.category(c)[0] in "LMN"
+
+
 def _usable(name: str) -> str:
-    if not _ALLOWED.fullmatch(name):
+    letters = all(is_letter(c) or c in "-_" for c in name) and name[:1].isalnum()
+    if not letters or len(name) > LONGEST or len(name.encode()) > LONGEST_BYTES:
         raise ValueError(
-            "a category is 1 to 64 letters, digits, - and _, the first a letter or digit: it names a folder"
+            f"a category is 1 to {LONGEST} letters, digits, - and _, the first a letter or digit: it names a folder"
         )
+    if unicodedata.normalize("NFC", name) != name:
+        raise ValueError("write its letters composed (Unicode NFC): file systems differ on others")
     if name.lower() in _TAKEN:
         raise ValueError("a dataset has a folder of this name: choose another")
     if name.isdigit():
@@ -123,7 +132,7 @@ def offered_by(sources: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
     for source in sources:
         kind, mapped = source.get("source"), source.get("category_map")
         names |= dict.fromkeys({"procedural": CATEGORIES, "shapenet": IN_SHAPENET}.get(str(kind), ()))
-        if kind == "urdf" and isinstance(mapped, dict):
+        if kind in (FILES, FORMER) and isinstance(mapped, dict):
             names |= dict.fromkeys(name for name in mapped.values() if isinstance(name, str) and name != TABLE)
     return tuple(names)
 
@@ -194,10 +203,14 @@ class ShapeNetSource(Frozen):
     """Whether the cleaned shapes may be written into the dataset."""
 
 
-class FolderSource(Frozen):
-    """A folder of URDFs or meshes, with a map from file patterns to categories."""
+FILES, FORMER = "files", "urdf"
+"""The kind of a source that is a folder, and its former name, which means the same."""
 
-    source: Literal["urdf"]
+
+class FolderSource(Frozen):
+    """A folder of meshes and of URDFs, with a map from file patterns to categories."""
+
+    source: Literal["files", "urdf"]
     """Which kind of source this is."""
     weight: Weight = 1.0
     """Share of this source among the sources that offer a scene's category."""
@@ -217,6 +230,11 @@ class FolderSource(Frozen):
     """Licence of these shapes, for the `assets` table."""
     copy_assets: bool = False
     """Whether the cleaned shapes may be written into the dataset."""
+
+    @field_validator("source")
+    @classmethod
+    def _renamed(cls, value: str) -> str:
+        return FILES
 
     @field_validator("up", mode="before")
     @classmethod

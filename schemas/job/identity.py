@@ -7,7 +7,7 @@ import hashlib
 import json
 from typing import Any
 
-from schemas.job.assets import deciding_limits
+from schemas.job.assets import FILES, FORMER, deciding_limits
 from schemas.job.job import Job
 
 RUN_KEYS = frozenset({"scenes", "run"})
@@ -42,6 +42,7 @@ def dataset_keys(job: Job) -> dict[str, Any]:
     keys = job.model_dump(mode="json", exclude=set(RUN_KEYS))
     for source in (*keys["assets"]["objects"], *keys["assets"]["tables"]):
         source.pop("folder", None)
+        source["source"] = FORMER if source["source"] == FILES else source["source"]  # as the first datasets have it
     keys["assets"]["limits"] = deciding_limits(keys["assets"]["limits"])
     if job.captures is not None:
         for unused in ("folders", "simulate", "board") if job.captures.folders else ("folders", "category"):

@@ -236,9 +236,9 @@ COMMANDS: Final[dict[str, Command]] = {
         path("--sheet", "FILE", "the pictures, .jpg or .png (default: beside the job)"),
         option(
             "--category-from",
-            "folder|file|NAME",
-            "name categories after the first folder, or after the file without its number, or call all NAME "
-            "(default: folder, and file where there is none)",
+            "folder|parent|file|NAME",
+            "name categories after the first folder that not all share, the folder that a file lies in, or the file without "
+            "its number, or call all NAME (default: the folder that holds one object or several of a kind)",
         ),
         handler="services.init.command:main",
     ),

@@ -4,96 +4,36 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError, plain_line
-from schemas.job.assets import Assets, FolderSource, MeshLimits, UpAxis
+from schemas.job.assets import Assets, FolderSource, MeshLimits
+from services.init.copies import find_copies
+from services.init.found import COPY, PART, Item, LeftOut, Reading
 from workers.assets.external.formats import FORMATS
 from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import URDF, Measured, read_measured
+from workers.assets.external.placement import URDF, read_measured
 from workers.assets.external.reader import Kind, Request, Task, ask_all
-
-PART = "part"
-"""The reason why a mesh that a URDF names is not an object by itself."""
-
-
-@dataclass(frozen=True)
-class Item:
-    """A file that can be used, what was measured of it, and one digest over all files that it reads."""
-
-    path: str
-    category: str
-    measured: Measured
-    digest: str
-
-    @property
-    def suffix(self) -> str:
-        """The end of its name, in small letters."""
-        return self.path[self.path.rfind(".") :].lower()
-
-    @property
-    def diagonal(self) -> float:
-        """Of its bounding box, in units of the file."""
-        return float(sum(extent * extent for extent in self.measured.extents) ** 0.5)
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A file that is not used: why in a word, and in a sentence with the remedy."""
-
-    path: str
-    reason: str
-    why: str
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Everything that a folder has. `refused`: those left out because they cannot be read, which a job leaves out too."""
-
-    items: tuple[Item, ...]
-    left_out: tuple[LeftOut, ...]
-    refused: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How the files of some formats are scaled: `factor` to metres, or to `diagonal_m` where sizes are normalised; why."""
-
-    suffixes: tuple[str, ...]
-    factor: float
-    why: str
-    diagonal_m: float | None = None
-
-
-@dataclass(frozen=True)
-class UpRule:
-    """The axis that is up in the files that a pattern finds, how far that is to be believed, and why."""
-
-    pattern: str
-    axis: UpAxis
-    why: str
-
-
-@dataclass(frozen=True)
-class Guess:
-    """What a job says of a folder: scales, the axes that are up (the first rule that matches), and patterns of categories."""
-
-    scales: tuple[Scale, ...]
-    ups: tuple[UpRule, ...]
-    category_map: dict[str, str]
-    """Category by pattern; the first match wins."""
-
 
 SUFFIXES = (URDF, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
 
-FOREIGN = (
-    *(".dae", ".fbx", ".blend", ".3ds", ".usd", ".usda", ".usdc", ".usdz", ".off", ".3mf", ".x3d", ".wrl"),
-    *(".step", ".stp", ".iges", ".igs", ".max", ".mb", ".abc", ".c4d"),
-)
-"""3-D files that are not read."""
+FOREIGN: Mapping[str, str] = {
+    **dict.fromkeys(
+        (".fbx", ".blend", ".3ds", ".usd", ".usda", ".usdc", ".usdz"), "export it as .glb, such as by Blender"
+    ),
+    **dict.fromkeys((".3mf", ".x3d", ".wrl", ".abc", ".dae", ".off"), "export it as .glb, such as by Blender"),
+    **dict.fromkeys((".max", ".mb", ".ma", ".c4d", ".lwo", ".skp"), "export it as .glb by the program that wrote it"),
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".fcstd", ".sldprt"), "export it as .stl by a CAD program"),
+    **dict.fromkeys(
+        (".pcd", ".las", ".laz", ".xyz", ".e57", ".splat", ".spz"), "it has points and no faces, so make a mesh of it"
+    ),
+    **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar"), "unpack it"),
+    ".xacro": "run `xacro FILE > FILE.urdf`",
+}
+"""Other files that may hold objects, and what to do with them."""
 
 MOST_FILES = 100_000
 """More files are no folder of meshes that a person looks at."""
@@ -139,7 +79,7 @@ def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
 def _unusable(path: Path, root: Path) -> tuple[str, str] | None:
     """Why a file is left out before it is opened: in a word, and in a sentence."""
     if path.suffix.lower() in FOREIGN:
-        return "format", f"{path.suffix} is not read: export it as .glb or .obj"
+        return "format", f"{path.suffix.lower()} is not read: {FOREIGN[path.suffix.lower()]}"
     if not str(path.relative_to(root)).isprintable():
         return "name", "its name is not printable UTF-8: rename it"
     if not path.resolve().is_relative_to(root):
@@ -156,31 +96,33 @@ def _relative(path: str, root: Path) -> str:
 ANY_SIZE = MeshLimits(min_size_m=1e-12, max_size_m=1e12)
 """Sizes are judged when the unit is known."""
 
-SMALLEST, LARGEST = MeshLimits().min_size_m, MeshLimits().max_size_m
-
 DONE: Mapping[Kind, str] = {"names": "URDFs read", "list": "files listed", "measure": "meshes read"}
 """What progress says."""
 
 Watch = Callable[[str, int, int], None]
 
 
-def read_folder(folder: Path, categories: Mapping[str, str], watch: Watch) -> Reading:
-    """What every file is, in the order given, by its path below the folder with its category; `folder` is resolved."""
-    source = FolderSource(source="urdf", folder=str(folder))
-    request = Request(source, folder, Assets(limits=ANY_SIZE), ())
+def read_folder(folder: Path, paths: Sequence[str], watch: Watch, beside: Sequence[str] = ()) -> Reading:
+    """What every file is, by its path below the folder, in the order given; `folder` is resolved.
+
+    `beside`: meshes that are not read, of which others may be copies.
+    """
+    request = Request(FolderSource(source="files", folder=str(folder)), folder, Assets(limits=ANY_SIZE), ())
 
     def ask(kind: Kind, entries: Mapping[str, Entry | None]) -> Iterator[tuple[str, bytes | MeshError]]:
-        tasks = tuple(Task(kind, folder / path, categories[path], entry) for path, entry in entries.items())
+        tasks = tuple(Task(kind, folder / path, "", entry) for path, entry in entries.items())
         answers = ask_all(replace(request, tasks=tasks), partial(watch, DONE[kind]))
         return zip(entries, (answer for _, answer in answers), strict=True)
 
-    parts: dict[str, str] = {}
-    for urdf, answer in ask("names", {path: None for path in categories if path.lower().endswith(URDF)}):
+    left_out = dict[str, LeftOut]()
+    for posed, answer in ask("names", {path: None for path in paths if path.lower().endswith(URDF)}):
         for part in [] if isinstance(answer, MeshError) else json.loads(answer):
-            parts.setdefault(part, urdf)
+            left_out.setdefault(part, LeftOut(part, PART, f"part of {posed}"))
+    copies = find_copies(paths, [*paths, *beside])
+    left_out = {path: LeftOut(path, COPY, why) for path, why in copies.items()} | left_out
     entries, items, refused = dict[str, Entry | None](), list[Item](), list[LeftOut]()
     digests: dict[str, str] = {}
-    for path, answer in ask("list", {path: None for path in categories if path not in parts}):
+    for path, answer in ask("list", {path: None for path in paths if path not in left_out}):
         if isinstance(answer, MeshError):
             refused.append(_refusal(path, folder, answer))
         else:
@@ -191,32 +133,10 @@ def read_folder(folder: Path, categories: Mapping[str, str], watch: Watch) -> Re
         if isinstance(answer, MeshError):
             refused.append(_refusal(path, folder, answer))
         else:
-            items.append(Item(path, categories[path], read_measured(answer), digests[path]))
-    kept, doubled = drop_doubles(items)
-    left_out = [LeftOut(path, PART, f"is a part of {urdf}") for path, urdf in parts.items()]
-    return Reading(tuple(kept), (*refused, *left_out, *doubled), frozenset(one.path for one in refused))
+            items.append(Item(path, read_measured(answer), digests[path]))
+    return Reading(tuple(items), (*refused, *left_out.values()), frozenset(one.path for one in refused))
 
 
 def _refusal(path: str, folder: Path, error: MeshError) -> LeftOut:
     why = error.detail.replace(f"{folder}/", "").removeprefix(path).lstrip(": ")
-    return LeftOut(path, error.reason, plain_line(why, 300))
-
-
-def drop_doubles(items: Sequence[Item]) -> tuple[list[Item], list[LeftOut]]:
-    """The items without those that are another one again: of the same bytes, or beside it in another format.
-
-    Of one name in one folder, that with pictures stays, then the one whose format comes first in `SUFFIXES`;
-    `nontextured` counts as `textured`.
-    """
-    left_out = dict[str, LeftOut]()
-    best = dict[tuple[str, str], Item]()
-    for item in sorted(items, key=lambda item: (not item.measured.textures, SUFFIXES.index(item.suffix), item.path)):
-        path = PurePosixPath(item.path)
-        first = best.setdefault((str(path.parent), path.stem.removeprefix("non").lower()), item)
-        if first is not item and first.suffix != item.suffix:
-            left_out[item.path] = LeftOut(item.path, "double", f"is {first.path} in another format")
-    seen = dict[str, Item]()
-    for item in items:
-        if item.path not in left_out and (first := seen.setdefault(item.digest, item)) is not item:
-            left_out[item.path] = LeftOut(item.path, "double", f"has the content of {first.path}")
-    return [item for item in items if item.path not in left_out], list(left_out.values())
+    return LeftOut(path, error.reason, plain_line(why, 1000))

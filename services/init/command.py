@@ -8,36 +8,21 @@ import re
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, InputError, MachineError, OutputError, plain_line
+from schemas.job.assets import matches
 from schemas.job.job import Job
 from schemas.scene.shape import Asset
-from services.init.collection import (
-    LARGEST,
-    SMALLEST,
-    Guess,
-    Item,
-    LeftOut,
-    Reading,
-    Scale,
-    read_folder,
-    walk_folder,
-)
-from services.init.guess import (
-    BY_FILE,
-    BY_FOLDER,
-    category_of,
-    guess_scales,
-    guess_ups,
-    is_category,
-    map_categories,
-    plain_axis,
-)
-from services.init.shown import Shown, draw_left_out, draw_sheet, draw_table, show_items
+from services.init.categories import BY_FILE, BY_FOLDER, BY_PARENT, is_category, map_categories, name_categories
+from services.init.collection import SUFFIXES, read_folder, walk_folder
+from services.init.copies import find_doubles
+from services.init.found import COPY, PART, Item, LeftOut, Reading
+from services.init.guess import Group, Guess, guess_groups, guess_ups, length, plain_axis
+from services.init.shown import Shown, draw_left_out, draw_sheet, draw_table, plural, show_items
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import MOST_BYTES, MOST_KEYS, validate_job
 from services.run.progress import ProgressLine
@@ -79,11 +64,11 @@ start:
 """
 
 SOURCE = """\
-    - source: urdf # a folder of meshes or URDFs
+    - source: files # a folder of meshes, and of what poses them
       folder: {folder}
       weight: {weight} # its number of files
 
-      # {scale_why}.
+{scale_why}
       # Objects keep their own size; in place of that, `diagonal_m: 0.25` makes each as large as the article's objects are,
       # for which the cameras stand where they do. Or move them: cameras.orbit.radius_m and cameras.mirror.T_z_m.
 {scale}
@@ -101,55 +86,44 @@ SOURCE = """\
 """
 
 
-def write_job(
-    name: str, job: str, folder: str, sheet: str | None, items: Sequence[tuple[str, str]], guess: Guess
-) -> str:
+def write_job(name: str, job: str, folder: str, sheet: str | None, categories: Mapping[str, str], guess: Guess) -> str:
     """The text of the job file.
 
-    name: of the dataset; job: what the file will be called; folder: as the job file names it; items: category and end of
-    the name, in small letters, of each file.
+    name: of the dataset; job: what the file will be called; folder: as the job file names it; categories: by path.
     """
-    counts, suffixes = Counter(category for category, _ in items), Counter(suffix for _, suffix in items)
-    sources = [
-        _source(folder, scale, guess, sum(suffixes[suffix] for suffix in scale.suffixes)) for scale in guess.scales
-    ]
-    total, kinds = counts.total(), len(counts)
+    counts = Counter(categories.values())
     return HEAD.format(
-        objects=f"{total} object{'s' * (total != 1)}",
-        categories=f"{kinds} categor{'ies' if kinds != 1 else 'y'}",
+        objects=plural(counts.total(), "object"),
+        categories=plural(len(counts), "category"),
         folder=_comment(folder),
         sheet=f" ({_comment(sheet)})" if sheet else "",
         job=_comment(job),
         name=name,
         scenes=SCENES,
         weights="\n".join(
-            f"  {_quoted(category)}: 1 # {count} file{'s' * (count != 1)}" for category, count in sorted(counts.items())
+            f"  {_quoted(category)}: 1 # {plural(count, 'file')}" for category, count in sorted(counts.items())
         ),
-        sources="\n".join(sources),
+        sources="\n".join(_source(folder, group, guess) for group in guess.groups),
     )
 
 
-def _source(folder: str, scale: Scale, guess: Guess, count: int) -> str:
-    """A source of `count` files: all of the folder, or where scales differ those of some formats."""
-
-    def mine(pattern: str) -> bool:
-        return len(guess.scales) == 1 or pattern[pattern.rfind(".") :].lower() in scale.suffixes
-
-    rules = [rule for rule in guess.ups if mine(rule.pattern)]
+def _source(folder: str, group: Group, guess: Guess) -> str:
+    """The source of the files of one scale."""
+    rules = [rule for rule in guess.ups if any(matches(path, rule.pattern) for path in group.paths)]
     if (axis := plain_axis(rules)) is not None:
         up = [*(f"      # {_comment(rule.pattern)}: {_comment(rule.why)}." for rule in rules), f"      up: {axis}"]
     else:
         by_pattern = (f"        # {_comment(rule.why)}\n        {_quoted(rule.pattern)}: {rule.axis}" for rule in rules)
         up = ["      up: # by file pattern; the first match wins", *by_pattern]
-    patterns = [(pattern, category) for pattern, category in guess.category_map.items() if mine(pattern)]
+    patterns = (f"        {_quoted(pattern)}: {_quoted(category)}" for pattern, category in group.category_map.items())
     return SOURCE.format(
         folder=_quoted(folder),
-        weight=count,
-        scale_why=_comment(scale.why),
-        scale=f"      scale: {scale.factor:g}"
-        + (f"\n      diagonal_m: {scale.diagonal_m:g}" if scale.diagonal_m else ""),
+        weight=len(group.paths),
+        scale_why="\n".join(f"      # {_comment(why)}." for why in group.why),
+        scale=f"      scale: {group.factor:g}"
+        + (f"\n      diagonal_m: {group.diagonal_m:g}" if group.diagonal_m else ""),
         up="\n".join(up),
-        category_map="\n".join(f"        {_quoted(pattern)}: {_quoted(category)}" for pattern, category in patterns),
+        category_map="\n".join(patterns),
     )
 
 
@@ -163,8 +137,8 @@ def _comment(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
-SHEET_WIDTH = 200
-"""Letters in a line below the pictures."""
+SMALLEST_M, LARGEST_M = 0.008, 20.0
+"""Sizes of what a job of defaults can show: 2.5 m away, some cameras see no pixel of a smaller thing."""
 
 MOST_NAMED = 5
 """Files with another axis than their neighbours that are named; the job has them all."""
@@ -177,31 +151,38 @@ def main(options: argparse.Namespace) -> int:
     """`verso init`."""
     folder: Path = options.folder
     by = options.category_from
-    if by not in (None, BY_FOLDER, BY_FILE) and not is_category(by):
-        raise InputError(f"--category-from {plain_line(by)}: write folder, file, or a name of letters, digits, - and _")
+    if by not in (None, BY_FOLDER, BY_FILE, BY_PARENT) and not is_category(by):
+        raise InputError(
+            f"--category-from {plain_line(by)}: write folder, parent, file, or a name of letters, digits, - and _"
+        )
     out: Path = options.out or Path(f"{dataset_name(folder)}.yaml")
     sheet: Path = options.sheet or out.with_suffix(".jpg")
     _check_targets(out, sheet)
     paths, unusable = walk_folder(folder)
-    reading = _read(folder.resolve(), {path: category_of(path, by) for path in paths})
-    guess, items, wrong_size = make_guess(reading)
-    left_out = sorted((*unusable, *reading.left_out, *wrong_size), key=lambda one: one.path)
-    width = shutil.get_terminal_size((100, 24)).columns
+    reading = _read(folder.resolve(), paths, [one.path for one in unusable])
+    guess, items, more = make_guess(reading, by)
+    left_out = sorted((*unusable, *reading.left_out, *more), key=lambda one: (one.reason in (PART, COPY), one.path))
+    # What goes to a file or another program is not folded.
+    width = shutil.get_terminal_size((100, 24)).columns if sys.stdout.isatty() else None
     if not items:
         print("\n".join(draw_left_out(left_out, width)), file=sys.stderr)
-        raise AssetSourceError(f"{plain_line(str(folder), 300)}: none of its {len(left_out)} meshes can be used")
+        raise AssetSourceError(
+            f"{plain_line(str(folder), 300)}: none of its meshes can be used: {len(left_out)} left out"
+        )
     near = os.path.relpath(folder.resolve(), out.parent.resolve())
     far = near.split("/")[: MOST_UPS + 1] == [".."] * (MOST_UPS + 1)
-    named, kinds = str(folder.resolve()) if far else near, [(item.category, item.suffix) for item in items]
-    text = write_job(dataset_name(folder), str(out), named, sheet.name, kinds, guess)
+    categories = {item.path: item.category for item in items}
+    text = write_job(
+        dataset_name(folder), str(out), str(folder.resolve()) if far else near, sheet.name, categories, guess
+    )
     job = check_text(text)
     catalogue = open_catalogue(job.assets, out.parent, tuple(job.categories))
     shown = show_items(catalogue, items)
     print("\n".join([*draw_table([one.row for one, _ in shown], width), *draw_left_out(left_out, width)]))
     pictured = [(one, partial(catalogue.load, ref)) for one, ref in shown]
-    drawn = _draw(sheet, options.sheet is not None, f"{folder}: {len(items)} objects", pictured, left_out)
+    drawn = _draw(sheet, options.sheet is not None, f"{folder}: {plural(len(items), 'object')}", pictured, left_out)
     _write(out, text.encode(), "--out")
-    print(f"{out}: {len(items)} objects in {len(job.categories)} categories")
+    print(f"{out}: {plural(len(items), 'object')} in {plural(len(job.categories), 'category')}")
     print("\n".join(f"  {line}" for line in describe_guess(guess)))
     look = f"  look at {sheet}, and change in {out} what is wrong; then" if drawn else "then"
     print(look, f"verso run {out} --scenes 8")
@@ -218,7 +199,7 @@ def describe_guess(guess: Guess) -> list[str]:
     others = [f"{rule.pattern} {rule.axis}" for rule in guess.ups if not rule.pattern.startswith("**/")]
     more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
     told = [f"up differs: {', '.join(others[:MOST_NAMED])}{more}: stands on this axis alone"] if others else []
-    return [scale.why for scale in guess.scales] + ups + told
+    return [why for group in guess.groups for why in group.why] + ups + told
 
 
 def _check_targets(out: Path, sheet: Path) -> None:
@@ -234,24 +215,41 @@ def dataset_name(folder: Path) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64] or "meshes"
 
 
-def make_guess(reading: Reading) -> tuple[Guess, list[Item], list[LeftOut]]:
-    """What the job says, the files that it uses, and those whose size at that scale is none of a thing on a table."""
-    scales, items, left_out = guess_scales(reading.items), [], []
-    for item in reading.items:
-        (scale,) = (scale for scale in scales if item.suffix in scale.suffixes)
-        size = scale.diagonal_m or item.diagonal * scale.factor
-        if SMALLEST <= size <= LARGEST:
-            items.append(item)
+def make_guess(reading: Reading, category_from: str | None) -> tuple[Guess, list[Item], list[LeftOut]]:
+    """What the job says, the files that it uses, and those that are another one again, or of no size for a table."""
+    of = {path: group for group in guess_groups(reading.items) for path in group.paths}
+    doubles = find_doubles(reading.items, lambda item: of[item.path].size_m(item), SUFFIXES)
+    dropped = {one.path for one in doubles}
+    different = [item for item in reading.items if item.path not in dropped]
+    groups, kept, left_out = guess_groups(different), dict[str, Item](), list[LeftOut]()
+    of = {path: group for group in groups for path in group.paths}
+    for item in different:
+        size = of[item.path].size_m(item)
+        if SMALLEST_M <= size <= LARGEST_M:
+            kept[item.path] = item
         else:
-            why = f"would be {size:.3g} m across at scale {scale.factor:g}: put it into a folder of its own, and init that"
-            left_out.append(LeftOut(item.path, "size", why))
-    others = {one.path for one in (*reading.left_out, *left_out)}
-    harmless = {*reading.refused, *(one.path for one in left_out)}
-    found = {item.path: item.category for item in items}
-    patterns = map_categories(found, others, harmless)
-    used = {item.suffix for item in items}
-    kept = tuple(scale for scale in scales if used & set(scale.suffixes))
-    return Guess(kept, tuple(guess_ups(items)), patterns), items, left_out
+            how = "small to be seen on" if size < SMALLEST_M else "large for"
+            why = f"is too {how} a table: {length(size)} at scale {of[item.path].factor:g}; put it into a folder of its own, "
+            left_out.append(LeftOut(item.path, "size", f"{why}and init that"))
+    categories = name_categories(kept, category_from)
+    items = [replace(item, category=categories[path]) for path, item in kept.items()]
+    others = {one.path for one in (*reading.left_out, *left_out, *doubles)}
+    return (
+        Guess(tuple(_map_groups(groups, categories, others, reading.refused)), tuple(guess_ups(items))),
+        items,
+        [*left_out, *doubles],
+    )
+
+
+def _map_groups(
+    groups: Sequence[Group], categories: Mapping[str, str], others: Collection[str], refused: Collection[str]
+) -> Iterator[Group]:
+    """The groups with the files that are used, and patterns that find exactly these."""
+    for group in groups:
+        mine = {path: categories[path] for path in group.paths if path in categories}
+        if mine:
+            patterns = map_categories(mine, {*others, *(categories.keys() - mine.keys())}, refused)
+            yield replace(group, paths=tuple(mine), category_map=patterns)
 
 
 def check_text(text: str) -> Job:
@@ -264,14 +262,14 @@ def check_text(text: str) -> Job:
     return validate_job(parse_yaml(text, MOST_KEYS), "the new job")
 
 
-def _read(folder: Path, categories: Mapping[str, str]) -> Reading:
+def _read(folder: Path, paths: Sequence[str], beside: Sequence[str]) -> Reading:
     lines = dict[str, ProgressLine]()
 
     def watch(what: str, done: int, asked: int) -> None:
         lines.setdefault(what, ProgressLine(asked, what, "file")).show(done)
 
     try:
-        return read_folder(folder, categories, watch)
+        return read_folder(folder, paths, watch, beside)
     finally:
         for line in lines.values():
             line.close()
@@ -282,7 +280,7 @@ def _draw(
 ) -> bool:
     """Writes the pictures; whether it could. MachineError where they were asked for by name and cannot be drawn."""
     try:
-        page = draw_sheet(title, shown, draw_left_out(left_out, SHEET_WIDTH), shared_renderer())
+        page = draw_sheet(title, shown, draw_left_out(left_out, None), shared_renderer())
     except MachineError as error:
         if asked:
             raise

@@ -1,116 +1,79 @@
-"""Pure: what a job says about a folder of meshes: categories by pattern, units, and the axis that is up."""
+"""Pure: what a job says about a folder of meshes: units, and the axis that is up."""
 
 import math
-import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from glob import escape
 from pathlib import PurePosixPath
 from statistics import median
 
-from pydantic import TypeAdapter, ValidationError
+from schemas.job.assets import UpAxis, matches
+from services.init.found import Item
+from workers.assets.external.placement import POSED
 
-from schemas.job.assets import CategoryName, UpAxis, matches
-from services.init.collection import Item, Scale, UpRule
-
-BY_FOLDER, BY_FILE = "folder", "file"
-"""The ways to name a category; any other word names them all."""
-
-LONGEST = 64
-_NAME: TypeAdapter[str] = TypeAdapter(CategoryName)
-
-
-def category_of(path: str, source: str | None) -> str:
-    """The category of a file below the folder.
-
-    `folder` and by default: the name of the first folder in its path; `file`, or where it lies in none: its own name
-    without the number at the end. Any other `source` is the category itself.
-    """
-    if source not in (None, BY_FOLDER, BY_FILE):
-        return str(source)
-    first, *rest = path.split("/")
-    if rest and source != BY_FILE:
-        return usable_name(first)
-    stem = PurePosixPath(path).stem
-    return usable_name(re.sub(r"[\s_.-]*\d+$", "", stem) or stem)
-
-
-def usable_name(text: str) -> str:
-    """The text as the name of a category: other characters than letters, digits, - and _ become one -."""
-    name = re.sub(r"[^A-Za-z0-9_-]+", "-", text).strip("-_")[:LONGEST] or "object"
-    if name.isdigit():
-        name = f"n{name}"[:LONGEST]
-    return name if is_category(name) else f"{name[: LONGEST - 5]}_mesh"  # a name that is taken
-
-
-def is_category(name: str) -> bool:
-    """Whether a category of objects may have this name."""
-    try:
-        _NAME.validate_python(name)
-    except ValidationError:
-        return False
-    return True
-
-
-def map_categories(items: Mapping[str, str], others: Collection[str], harmless: Collection[str]) -> dict[str, str]:
-    """Category by pattern: together they find exactly the files of `items`, a category by path.
-
-    `others` are further files of the folder, which no pattern finds, but for the `harmless` ones, which a job leaves out by
-    itself.
-    """
-    everything = sorted({*items, *others})
-    groups: dict[tuple[str, str], list[str]] = {}
-    for path, category in items.items():
-        groups.setdefault((category, PurePosixPath(path).suffix), []).append(path)
-    found: dict[str, str] = {}
-    for (category, _), paths in sorted(groups.items()):
-        allowed = {*paths, *harmless} - (items.keys() - set(paths))
-        found |= dict.fromkeys(_cover(sorted(paths), everything, allowed), category)
-    return found
-
-
-def _cover(paths: Sequence[str], everything: Iterable[str], allowed: Collection[str]) -> list[str]:
-    """One pattern that finds all of the paths and otherwise only what is allowed; else a pattern for each."""
-    if len(paths) > 1:
-        start = _common_start(paths)
-        folder = start[: start.rfind("/") + 1]
-        near = [path for path in everything if path.startswith(folder)]
-        for pattern in _patterns(paths, escape(folder)):
-            hit = {path for path in near if matches(path, pattern)}
-            if set(paths) <= hit <= set(allowed):
-                return [pattern]
-    return [escape(path) for path in paths]
-
-
-def _patterns(paths: Sequence[str], folder: str) -> Iterator[str]:
-    """Patterns below a folder that may find the paths, the plainest first."""
-    suffix, names = escape(PurePosixPath(paths[0]).suffix), [PurePosixPath(path).name for path in paths]
-    start = escape(_common_start([PurePosixPath(name).stem for name in names]))
-    for between in ("", "*/", "**/"):
-        if len(set(names)) == 1:
-            yield f"{folder}{between}{escape(names[0])}"
-        else:
-            yield f"{folder}{between}*{suffix}"
-            yield f"{folder}{between}{start}*{suffix}"
-            yield f"{folder}{between}{start}*[0-9]{suffix}"
-
-
-def _common_start(words: Sequence[str]) -> str:
-    first, last = min(words), max(words)
-    same = (k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
-    return first[: next(same, min(len(first), len(last)))]
-
-
-METRIC = frozenset({".glb", ".gltf", ".urdf"})
+METRIC = frozenset({".glb", ".gltf", *POSED})
 """Formats whose specification says metres."""
 
+SPECIFIED_UP: Mapping[str, UpAxis] = {".glb": "y", ".gltf": "y"}
+"""Formats whose specification says which axis is up: believed, unless most of all files show that it is not."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Files with one scale, a source of the job: `factor` to metres, or to `diagonal_m` where sizes are normalised.
+
+    why: a line for each format.
+    """
+
+    paths: tuple[str, ...]
+    factor: float
+    why: tuple[str, ...]
+    diagonal_m: float | None = None
+    category_map: Mapping[str, str] = field(default_factory=dict)
+    """Category by pattern; the first match wins."""
+
+    def size_m(self, item: Item) -> float:
+        """The diagonal of one of its files, metres."""
+        return self.diagonal_m or self.factor * item.diagonal
+
+
+@dataclass(frozen=True)
+class UpRule:
+    """The axis that is up in the files that a pattern finds, and why."""
+
+    pattern: str
+    axis: UpAxis
+    why: str
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What a job says of a folder: its sources, and the axes that are up (the first rule that matches)."""
+
+    groups: tuple[Group, ...]
+    ups: tuple[UpRule, ...]
+
+
 UNITS = ((1.0, "metres"), (0.01, "centimetres"), (0.001, "millimetres"))
+STATED = {**dict(UNITS), 0.0254: "inches", 0.3048: "feet"}
 
 USUAL_M = 0.2
 """Size of a thing that stands on a table: of several units, the one that comes nearest is meant."""
 
-PLAUSIBLE_M = (0.01, 2.5)
-"""Sizes at which metres are not doubted."""
+BELIEVED_M, NOT_METRES, TOO_LARGE = 2.5, 0.5, 2.0
+"""Up to this size metres are rather believed than another unit, which costs `NOT_METRES` as the logarithm of a size does;
+beyond it nothing stands on a table, and each such unit of the logarithm costs so many more."""
+
+SPLIT = 3.0
+"""What it costs that a folder or file has another unit than the folder that it lies in."""
+
+POSSIBLE_M = (0.001, 20.0)
+"""Sizes at which a specification that says metres is believed."""
+IMPOSSIBLE = 100.0
+
+ON_TABLE_M = (0.01, 1.0)
+"""Sizes of things on a table: what is smaller or larger is told."""
 
 NORMALISED, SPREAD = (0.9, 2.0), 0.005
 """A size that shapes are normalised to, and by how much those of several may differ."""
@@ -119,40 +82,109 @@ AGREE = 2 / 3
 """Share of the files that tell which axis is up that must agree."""
 
 
-def guess_scales(items: Sequence[Item]) -> list[Scale]:
-    """A scale for each group of formats that have the same one."""
-    found: dict[tuple[float, float | None], list[tuple[str, str]]] = {}
+def guess_groups(items: Sequence[Item]) -> list[Group]:
+    """The files by their scale, with the reasons of each format."""
+    found: dict[tuple[float, float | None], list[tuple[list[Item], str]]] = {}
     for suffix in sorted({item.suffix for item in items}):
-        scale = _guess_scale(suffix, [item.diagonal for item in items if item.suffix == suffix])
-        found.setdefault((scale.factor, scale.diagonal_m), []).append((suffix, scale.why))
+        mine = [item for item in items if item.suffix == suffix]
+        for factor, diagonal_m, some, why in _guess_scales(suffix, mine):
+            found.setdefault((factor, diagonal_m), []).append((some, why))
     return [
-        Scale(tuple(suffix for suffix, _ in told), factor, "; ".join(why for _, why in told), diagonal_m)
+        Group(tuple(item.path for some, _ in told for item in some), factor, tuple(why for _, why in told), diagonal_m)
         for (factor, diagonal_m), told in found.items()
     ]
 
 
-def _guess_scale(suffix: str, diagonals: Sequence[float]) -> Scale:
-    size = median(diagonals)
-    told = f"{suffix}: {size:.3g} units across" + (" (the middle one)" if len(diagonals) > 1 else "")
-    low, high = PLAUSIBLE_M
-    if len(diagonals) >= 3 and max(diagonals) <= (1 + SPREAD) * min(diagonals) and NORMALISED[0] < size < NORMALISED[1]:
-        return Scale((suffix,), 1.0, f"{told}, all alike, as shapes without a unit have it: resized to 0.25 m", 0.25)
-    if low <= size <= high:
-        by = ", as the format says" if suffix in METRIC else ""
-        return Scale((suffix,), 1.0, f"{told}: taken for metres{by}")
-    by_distance = sorted(UNITS, key=lambda unit: abs(math.log(size * unit[0] / USUAL_M)))
-    factor, unit = by_distance[0]
-    told += f": taken for {unit}, {_length(size * factor)}"
-    if factor == 1.0:
-        return Scale((suffix,), 1.0, f"{told}, which is very small: look at it")
-    other, name = by_distance[1]
-    if low <= size * other <= high:
-        told += f" (as {name}, {other:g}, it would be {_length(size * other)})"
-    return Scale((suffix,), factor, told)
+def _guess_scales(suffix: str, items: Sequence[Item]) -> list[tuple[float, float | None, list[Item], str]]:
+    """Of the files of one format: scale, diagonal where sizes are normalised, the files that it holds for, and why."""
+    found = list[tuple[float, float | None, list[Item], str]]()
+    for unit in sorted({item.measured.unit_m for item in items if item.measured.unit_m is not None}):
+        some = [item for item in items if item.measured.unit_m == unit]
+        found.append((unit, None, some, f"{_told(suffix, some, items)}: {STATED[unit]}, as the files say"))
+    rest = [item for item in items if item.measured.unit_m is None]
+    sizes = [item.diagonal for item in rest]
+    alike = (
+        len(sizes) >= 3 and max(sizes) <= (1 + SPREAD) * min(sizes) and NORMALISED[0] < median(sizes) < NORMALISED[1]
+    )
+    if alike and suffix not in METRIC:
+        why = f"{_told(suffix, rest, items)}, all alike, as shapes without a unit have it: resized to 0.25 m"
+        return [*found, (1.0, 0.25, rest, why)]
+    units = _guess_units({item.path: item.diagonal for item in rest}, suffix in METRIC)
+    for number, (factor, name) in enumerate(UNITS):
+        if some := [item for item in rest if units[item.path] == number]:
+            found.append((factor, None, some, f"{_told(suffix, some, items)}: {_reading(suffix, some, factor, name)}"))
+    return found
 
 
-def _length(metres: float) -> str:
-    return f"{100 * metres:.3g} cm" if metres < 1 else f"{metres:.3g} m"
+def _told(suffix: str, some: Sequence[Item], items: Sequence[Item]) -> str:
+    """What files these are, of those of a format, and how large."""
+    size = median(item.diagonal for item in some)
+    folders = dict.fromkeys(str(PurePosixPath(item.path).parent) for item in some)
+    where = f" in {', '.join(list(folders)[:3])}{' ...' * (len(folders) > 3)}" if len(some) < len(items) else ""
+    return f"{suffix}{where}: {size:.3g} units across" + (" (the middle one)" if len(some) > 1 else "")
+
+
+def _reading(suffix: str, items: Sequence[Item], factor: float, name: str) -> str:
+    """The unit that is taken, and the other one that may be meant."""
+    size, specified = median(item.diagonal for item in items), suffix in METRIC and factor == 1.0
+    others = sorted((_cost(size, k, False), unit, word) for k, (unit, word) in enumerate(UNITS) if unit != factor)
+    doubt = not specified or not ON_TABLE_M[0] <= size <= ON_TABLE_M[1]
+    near = [(unit, word) for _, unit, word in others if ON_TABLE_M[0] <= size * unit <= ON_TABLE_M[1]]
+    other = f" (as {near[0][1]}, {near[0][0]:g}, it would be {length(size * near[0][0])})" if near and doubt else ""
+    return f"taken for {name}{', as the format says' if specified else ''}, {length(size * factor)}{other}"
+
+
+def _cost(size: float, unit: int, specified: bool) -> float:
+    """How unlikely it is that a thing of this size, in units of its file, has it in `UNITS[unit]`."""
+    if specified and POSSIBLE_M[0] <= size <= POSSIBLE_M[1]:
+        return IMPOSSIBLE * (unit != 0)
+    metres = size * UNITS[unit][0]
+    unusual = abs(math.log(metres / USUAL_M)) + TOO_LARGE * max(0.0, math.log(metres / BELIEVED_M))
+    return unusual + NOT_METRES * (unit != 0) + IMPOSSIBLE * (specified and unit == 0)
+
+
+@dataclass
+class _Folder:
+    """A folder, or a file, which has nothing below it: what each unit costs for all that lies in it."""
+
+    below: "dict[str, _Folder]"
+    costs: list[float]
+
+    def finish(self) -> list[float]:
+        """Sets and returns the costs, from what lies below: as its folder has it, or for `SPLIT` more as it likes best."""
+        for folder in self.below.values():
+            costs = folder.finish()
+            self.costs = [sum_ + min(cost, min(costs) + SPLIT) for sum_, cost in zip(self.costs, costs, strict=True)]
+        return self.costs
+
+    def units(self, unit: int, path: str = "") -> dict[str, int]:
+        """The number of the unit of every file below, where the folder above has `unit`."""
+        if self.costs[unit] > min(self.costs) + SPLIT:
+            unit = self.costs.index(min(self.costs))
+        if not self.below:
+            return {path[1:]: unit}
+        return {one: k for name, below in self.below.items() for one, k in below.units(unit, f"{path}/{name}").items()}
+
+
+def _guess_units(sizes: Mapping[str, float], specified: bool) -> dict[str, int]:
+    """For each file the number of its unit in `UNITS`: the cheapest that is the same for neighbours.
+
+    A folder has one unit, unless what lies in it says another by more than `SPLIT`; so do its own folders.
+    """
+    root = _Folder({}, [0.0] * len(UNITS))
+    for path, size in sizes.items():
+        at = root
+        for name in path.split("/"):
+            at = at.below.setdefault(name, _Folder({}, [0.0] * len(UNITS)))
+        at.costs = [_cost(size, unit, specified) for unit in range(len(UNITS))]
+    costs = root.finish()
+    return root.units(costs.index(min(costs))) if sizes else {}
+
+
+def length(metres: float) -> str:
+    """A length in the unit that people use."""
+    unit, name = next(((u, n) for u, n in ((1.0, "m"), (0.01, "cm")) if metres >= u), (0.001, "mm"))
+    return f"{metres / unit:.3g} {name}"
 
 
 def guess_ups(items: Sequence[Item]) -> list[UpRule]:
@@ -160,14 +192,15 @@ def guess_ups(items: Sequence[Item]) -> list[UpRule]:
     files, folders, formats = list[UpRule](), list[UpRule](), list[UpRule]()
     for suffix in sorted({PurePosixPath(item.path).suffix for item in items}):
         group = [item for item in items if item.path.endswith(suffix)]
-        whole = UpRule(f"**/*{escape(suffix)}", *_decide(group, suffix.lower()))
+        specified = SPECIFIED_UP.get(suffix.lower())
+        whole = UpRule(f"**/*{escape(suffix)}", *_decide(group, specified))
         formats.append(whole)
         for first in sorted({item.path.split("/")[0] for item in group if "/" in item.path}):
-            axis, sure, told = _majority([item for item in group if item.path.startswith(f"{first}/")])
-            if axis is not None and axis != whole.axis and sure > 1:
+            axis, count, told = _majority([item for item in group if item.path.startswith(f"{first}/")], specified)
+            if axis is not None and axis != whole.axis and count > (1 if specified is None else 2):
                 pattern = f"{escape(first)}/**/*{escape(suffix)}"
                 folders.append(UpRule(pattern, axis, f"{told}, unlike other {suffix} files"))
-        for item in group:
+        for item in group if specified is None else ():
             held = next((rule.axis for rule in folders if matches(item.path, rule.pattern)), whole.axis)
             if item.measured.confidence == "sure" and item.measured.up not in (None, held):
                 assert item.measured.up is not None
@@ -182,13 +215,18 @@ def plain_axis(rules: Sequence[UpRule]) -> UpAxis | None:
     return axes.pop() if len(axes) == 1 else None
 
 
-def _decide(items: Sequence[Item], suffix: str) -> tuple[UpAxis, str]:
+def _decide(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis, str]:
     """The axis that is up in the files of one format, and why."""
-    axis, _, told = _majority(items)
+    axis, count, told = _majority(items, specified)
     if axis is not None:
         return axis, told
-    if suffix in (".glb", ".gltf"):
-        return "y", "by the format's specification; nothing in the shapes speaks against it"
+    if specified is not None:
+        against = sum(item.measured.confidence == "sure" and item.measured.up != specified for item in items)
+        return specified, "by the format's specification" + (
+            f", though {told.removeprefix('sure: ')}: look at the pictures"
+            if against
+            else "; nothing in the shapes speaks against it"
+        )
     likely = Counter(item.measured.up for item in items if item.measured.up is not None)
     for found, count in likely.most_common(1):
         if count >= AGREE * likely.total():
@@ -196,13 +234,17 @@ def _decide(items: Sequence[Item], suffix: str) -> tuple[UpAxis, str]:
     return "z", "not known: the shapes stand on several axes or on none; look at the pictures"
 
 
-def _majority(items: Sequence[Item]) -> tuple[UpAxis | None, int, str]:
-    """The axis that enough of those files name that are sure, None where none does; how many are sure; and the reason."""
+def _majority(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis | None, int, str]:
+    """The axis that enough files are sure of, None where none is; how many are sure of it or of another; and the reason.
+
+    Enough are most of those that are sure; against a specification, most of all files.
+    """
     votes = Counter(item.measured.up for item in items if item.measured.confidence == "sure")
     axis, count = votes.most_common(1)[0] if votes else (None, 0)
     told = (
-        f"sure: {count} of {len(items)} stand on this axis alone"
+        f"sure: {count} of {len(items)} stand on {'this axis' if specified is None else axis} alone"
         if len(items) > 1
         else "sure: it stands on this axis alone"
     )
-    return axis if count >= AGREE * votes.total() else None, votes.total(), told
+    enough = count >= AGREE * votes.total() if specified in (None, axis) else 2 * count > len(items)
+    return axis if enough else None, votes.total(), told

@@ -2,8 +2,10 @@
 
 import math
 import unicodedata
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -14,56 +16,76 @@ from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics
-from services.init.collection import PART, Item, LeftOut
+from services.init.found import Item, LeftOut
+from services.init.guess import ON_TABLE_M, length
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import AnySource, Catalogue, InstanceRef
 from workers.assets.external.mesh import transform_shape
+from workers.assets.external.placement import FLAT
 from workers.geometry.frames import pose, translation
 from workers.render.raster.gbuffer import Renderer
 
 MOST_ROWS = 40
-"""Rows that a terminal shows; `--json` has all."""
+"""Rows that a terminal shows; a pipe and `--json` have all."""
 
 HEADINGS = ("file", "category", "size, cm", "faces", "closed", "pictures", "up", "notes")
-LEAST = (12, 8, 19, 5, 6, 6, 4, 5)
-"""Widths to which columns may shrink."""
+LEAST = 5
+"""Width to which a column may shrink."""
+
+BREAKS = " /;,_-"
+"""Letters after which a line is rather broken than within a word."""
 
 
-def draw_table(rows: Sequence[Sequence[str]], width: int) -> list[str]:
-    """Lines of at most `width` characters; a cell that does not fit is cut in its middle, where … stands."""
-    shown = [HEADINGS, *rows[:MOST_ROWS]]
+def draw_table(rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
+    """Lines of at most `width` characters, None: of any; what does not fit goes on below, in the same column."""
+    shown = [HEADINGS, *(rows if width is None else rows[:MOST_ROWS])]
     widths = [max(len(row[column]) for row in shown) for column in range(len(HEADINGS))]
-    least = [min(wanted, low) for wanted, low in zip(widths, LEAST, strict=True)]
-    while sum(widths) + 2 * (len(widths) - 1) > width and widths != least:
-        widest = max((k for k in range(len(widths)) if widths[k] > least[k]), key=lambda k: widths[k])
-        widths[widest] -= 1
-    cells = [[shorten(cell, most).ljust(most) for cell, most in zip(row, widths, strict=True)] for row in shown]
-    lines = [shorten("  ".join(row).rstrip(), width) for row in cells]
-    if len(rows) > MOST_ROWS:
+    while width is not None and sum(widths) + 2 * (len(widths) - 1) > width and max(widths) > LEAST:
+        widths[widths.index(max(widths))] -= 1
+    lines = []
+    for row in shown:
+        cells = [fold(cell, most) for cell, most in zip(row, widths, strict=True)]
+        for parts in zip_longest(*cells, fillvalue=""):
+            lines.append("  ".join(part.ljust(most) for part, most in zip(parts, widths, strict=True)).rstrip())
+    if len(shown) - 1 < len(rows):
         lines.append(f"and {len(rows) - MOST_ROWS} more: --json lists all")
     return lines
 
 
-def draw_left_out(left_out: Sequence[LeftOut], width: int) -> list[str]:
-    """A line for each file that is not used, and how many there are; the parts of URDFs are counted."""
+def draw_left_out(left_out: Sequence[LeftOut], width: int | None) -> list[str]:
+    """A line for each reason why files are not used, with the first of them, and how many there are."""
     if not left_out:
         return []
-    told = [one for one in left_out if one.reason != PART]
-    lines = [f"left out: {len(told)} file{'s' * (len(told) != 1)}"] if told else []
-    lines += [shorten(f"  {one.path} ({one.reason}): {one.why}", width) for one in told[:MOST_ROWS]]
-    if len(told) > MOST_ROWS:
-        lines.append(f"  and {len(told) - MOST_ROWS} more: --json lists all")
-    if parts := len(left_out) - len(told):
-        lines.append(f"{parts} mesh{'es' * (parts != 1)} not offered by themselves: parts of the URDFs")
-    return lines
+    by_reason: dict[tuple[str, str], list[str]] = {}
+    for one in left_out:
+        by_reason.setdefault((one.reason, one.why), []).append(one.path)
+    told = list(by_reason.items())
+    shown = told if width is None else told[:MOST_ROWS]
+    lines = [f"left out: {plural(len(left_out), 'file')}"]
+    for (reason, why), paths in shown:
+        more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+        first, *rest = fold(f"{paths[0]}{more} ({reason}): {why}", width and width - 4)
+        lines += [f"  {first}", *(f"    {line}" for line in rest)]
+    hidden = sum(len(paths) for _, paths in told[len(shown) :])
+    return [*lines, f"  and {hidden} more: --json lists all"] if hidden else lines
 
 
-def shorten(text: str, most: int) -> str:
-    """The text with … in its middle where it is longer than `most`."""
-    if len(text) <= most:
-        return text
-    head = max(1, (most - 1) // 2)
-    return f"{text[:head]}…{text[len(text) - (most - 1 - head) :]}"
+def fold(text: str, most: float | None, measure: Callable[[str], float] = len) -> list[str]:
+    """The text in lines of at most `most`, nothing left out; at least one."""
+    lines = []
+    while most is not None and text and measure(text) > most:
+        count = bisect_right(range(1, len(text)), most, key=lambda n: measure(text[:n])) or 1
+        cut = max(text.rfind(letter, 1, count) for letter in BREAKS) + 1 or count
+        lines.append(text[:cut].rstrip())
+        text = text[cut:].lstrip(" ")
+    return [*lines, text] if text or not lines else lines
+
+
+def plural(count: int, word: str) -> str:
+    """`1 mesh`, `2 meshes`, `2 categories`."""
+    if count != 1:
+        word = f"{word[:-1]}ies" if word.endswith("y") else f"{word}es" if word.endswith("sh") else f"{word}s"
+    return f"{count} {word}"
 
 
 @dataclass(frozen=True)
@@ -143,6 +165,10 @@ def _show(item: Item, settings: AnySource) -> Shown:
     up = settings.up_of(item.path)
     scale = settings.scale if settings.diagonal_m is None else settings.diagonal_m / item.diagonal
     x, y, z = (scale * extent for extent in measured.extents)
+    notes = [f"flat: {length(measured.thin * scale * item.diagonal)} thick"] if measured.thin < FLAT else []
+    if not ON_TABLE_M[0] <= scale * item.diagonal <= ON_TABLE_M[1]:
+        how = "small" if scale * item.diagonal < ON_TABLE_M[0] else "large"
+        notes.append(f"{length(scale * item.diagonal)} across, {how} for a table: see `scale`")
     return Shown(
         path=item.path,
         category=item.category,
@@ -155,7 +181,7 @@ def _show(item: Item, settings: AnySource) -> Shown:
         up=up,
         shape_says=measured.up,
         confidence=measured.confidence,
-        notes=measured.notes,
+        notes=(*notes, *measured.notes),
     )
 
 
@@ -163,7 +189,7 @@ MOST = 60
 """Pictures on a page."""
 
 COLUMNS, TILE = 5, (300, 260)
-LINE, LINES, MARGIN = 17, 5, 10
+LINE, MARGIN = 17, 10
 FONT = 13
 
 SIZE_M = 0.25
@@ -182,24 +208,45 @@ def draw_sheet(
     """The page: a title, up to `MOST` objects, each loaded when it is drawn, and notes below them."""
     drawn = objects[:MOST]
     if len(objects) > MOST:
-        notes = [f"and {len(objects) - MOST} objects more, which are not drawn", *notes]
+        notes = [f"and {plural(len(objects) - MOST, 'object')} more, which are not drawn", *notes]
     columns = min(COLUMNS, max(len(drawn), 3))
-    cell = (TILE[0] + MARGIN, TILE[1] + LINE * LINES + 2 * MARGIN)
-    rows = math.ceil(len(drawn) / columns)
-    top = 2 * LINE + MARGIN
-    page = Image.new("RGB", (columns * cell[0] + MARGIN, top + rows * cell[1] + LINE * len(notes) + MARGIN), "white")
-    pen, font = ImageDraw.Draw(page), ImageFont.load_default(FONT)
-    fit = columns * cell[0] // 7
-    pen.text((MARGIN, MARGIN), shorten(title, fit), "black", ImageFont.load_default(FONT + 3))
-    for number, (one, load) in enumerate(drawn):
-        left, upper = MARGIN + number % columns * cell[0], top + number // columns * cell[1]
-        page.paste(draw_object(load(), renderer), (left, upper))
-        lines = [(line, "black") for line in one.caption] + [(line, WARNING) for line in one.warnings]
-        for row, (line, colour) in enumerate(lines[:LINES]):
-            pen.text((left, upper + TILE[1] + 3 + row * LINE), _fit(line, font, TILE[0]), colour, font)
-    for row, note in enumerate(notes):
-        pen.text((MARGIN, top + rows * cell[1] + row * LINE), _fit(note, font, page.width - 2 * MARGIN), "black", font)
+    step, font, large = TILE[0] + MARGIN, ImageFont.load_default(FONT), ImageFont.load_default(FONT + 3)
+    inside = columns * step - MARGIN
+    head = [(line, "black", large) for line in fold(_letters(title), inside, large.getlength)]
+    foot = [(line, "black", font) for note in notes for line in fold(_letters(note), inside, font.getlength)]
+    captions = [_caption(one, font) for one, _ in drawn]
+    rows = [range(k, min(k + columns, len(drawn))) for k in range(0, len(drawn), columns)]
+    heights = [TILE[1] + LINE * max(len(captions[k]) for k in row) + 2 * MARGIN for row in rows]
+    page = Image.new(
+        "RGB", (inside + 2 * MARGIN, LINE * (len(head) + len(foot) + 1) + sum(heights) + 2 * MARGIN), "white"
+    )
+    pen, top = ImageDraw.Draw(page), MARGIN
+    top = _write_lines(pen, (MARGIN, top), head) + MARGIN
+    for row, height in zip(rows, heights, strict=True):
+        for column, k in enumerate(row):
+            page.paste(draw_object(drawn[k][1](), renderer), (MARGIN + column * step, top))
+            _write_lines(pen, (MARGIN + column * step, top + TILE[1] + 3), captions[k])
+        top += height
+    _write_lines(pen, (MARGIN, top), foot)
     return page
+
+
+Line = tuple[str, str, ImageFont.FreeTypeFont | ImageFont.ImageFont]
+"""Text, colour and font."""
+
+
+def _caption(one: Shown, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[Line]:
+    told = [(line, "black") for line in one.caption] + [(line, WARNING) for line in one.warnings]
+    return [(line, colour, font) for text, colour in told for line in fold(_letters(text), TILE[0], font.getlength)]
+
+
+def _write_lines(pen: ImageDraw.ImageDraw, at: tuple[int, int], lines: Sequence[Line]) -> int:
+    """Writes lines one below the other; where the next one would be."""
+    left, top = at
+    for text, colour, font in lines:
+        pen.text((left, top), text, colour, font)
+        top += LINE
+    return top
 
 
 def draw_object(asset: Asset, renderer: Renderer) -> Image.Image:
@@ -234,10 +281,7 @@ def _ground() -> Shape:
     return Shape((Part("ground", frozen_array(corners), faces, Material((0.75, 0.75, 0.74, 1.0), roughness=0.9)),))
 
 
-def _fit(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> str:
-    """The text in the letters that the font has, cut in its middle where it is wider than `width` pixels."""
-    text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
-    most = len(text)
-    while most > 4 and font.getlength(shorten(text, most)) > width:
-        most -= 1
-    return shorten(text, most)
+def _letters(text: str) -> str:
+    """The text in the letters that the font has: without accents, and of other scripts the numbers of their letters."""
+    plain = "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
+    return plain.encode("ascii", "backslashreplace").decode()

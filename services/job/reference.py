@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from schemas.base import Counts, Range
+from schemas.job.assets import FORMER
 from schemas.job.job import Job
 from schemas.job.physics import MOST_OBJECTS
 
@@ -36,7 +37,7 @@ def list_keys(model: type[BaseModel] = Job, prefix: str = "") -> Iterator[tuple[
 def _branches(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         source = annotation.model_fields.get("source")
-        kinds = typing.get_args(source.annotation) if source is not None else ()
+        kinds = [kind for kind in typing.get_args(source.annotation) if kind != FORMER] if source is not None else []
         kind = f"[{kinds[0]}]" if len(kinds) == 1 else ""
         yield kind, annotation
         return

@@ -20,6 +20,8 @@ from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
     BUILT_IN,
+    FILES,
+    FORMER,
     TABLE,
     VERSION,
     Assets,
@@ -259,6 +261,7 @@ def _digest(
     for settings, listing in zip((*assets.objects, *assets.tables), (*objects, *tables), strict=True):
         # The folder's path is left out: the same files elsewhere are the same catalogue.
         plain = settings.model_dump(mode="json", exclude={"folder"})
+        plain["source"] = FORMER if settings.source == FILES else settings.source  # as the first datasets have it
         files: dict[str, Any] | None = None
         if listing is not None:
             files = {

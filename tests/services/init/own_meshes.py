@@ -70,8 +70,8 @@ def mixed_folder(folder: Path) -> Path:
     (folder / "002_can/copy").mkdir()
     for name in ("textured.obj", "material.mtl", "material_0.png"):
         (folder / "002_can/copy" / name).write_bytes((textured.parent / name).read_bytes())
-    write_gltf(folder / "gltf cup", cup())
-    write_urdf(folder / "robot", cup(0.12))
+    write_gltf(folder / "gltf cup", cup(0.1, 0.045))
+    write_urdf(folder / "robot", cup(0.13))
     write_mesh(folder / "table/1.stl", trimesh.creation.cylinder(50, 90))
     write_mesh(folder / "huge.stl", trimesh.creation.box((1e6, 1e6, 1e6)))
     (folder / "broken.obj").write_text("v 0 0 0\nf 1 2 3\n")

@@ -1,29 +1,48 @@
-"""Categories by pattern, units and the axis that is up, guessed for a folder of meshes; and the job that says so."""
+"""Categories by pattern, copies, units and the axis that is up, guessed for a folder of meshes; and the job that says so."""
+
+from dataclasses import replace
+from glob import escape
 
 from schemas.job.assets import FolderSource
-from services.init.collection import Guess, Item, drop_doubles
-from services.init.command import write_job
-from services.init.guess import category_of, guess_scales, guess_ups, is_category, map_categories, plain_axis
+from services.init.categories import is_category, map_categories, name_categories
+from services.init.collection import SUFFIXES
+from services.init.command import make_guess, write_job
+from services.init.copies import find_copies, find_doubles
+from services.init.found import Item, Reading
+from services.init.guess import guess_groups, guess_ups, plain_axis
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import validate_job
 from workers.assets.external.placement import Measured
 
 CATEGORIES = (
-    ("mug/a.obj", None, "mug"),
-    ("mug/b/c.obj", None, "mug"),
-    ("002_master_chef_can/google_16k/textured.obj", None, "002_master_chef_can"),
-    ("mug_03.obj", None, "mug"),
-    ("mug 3.obj", "folder", "mug"),
-    ("Blue Cup-12.glb", None, "Blue-Cup"),
-    ("mug/a_7.obj", "file", "a"),
-    ("mug/a_7.obj", "thing", "thing"),
-    ("007.obj", None, "n007"),
-    ("12/a.obj", None, "n12"),
-    ("table/a.obj", None, "table_mesh"),
-    ("Assets/a.obj", None, "Assets_mesh"),
-    ("ä/ö.obj", None, "object"),
-    ("näme/a.obj", None, "n-me"),
-    (f"{'long' * 40}/a.obj", None, "long" * 16),
+    (None, {"mug/a.obj": "mug"}),
+    (None, {"mug/a.obj": "mug", "mug/b/c.obj": "mug", "can/d.obj": "can"}),
+    (None, {"002_master_chef_can/google_16k/textured.obj": "002_master_chef_can"}),
+    (None, {"mug_03.obj": "mug", "mug 4.obj": "mug", "007.obj": "n007", "Blue Cup-12.glb": "Blue-Cup"}),
+    ("folder", {"mug 3.obj": "mug", "all/can/a.obj": "all", "12/b.obj": "n12"}),
+    ("folder", {"all/can/a.obj": "can", "all/mug/blue/b.obj": "mug"}),
+    ("parent", {"all/can/a.obj": "can", "all/mug/blue/b.obj": "blue", "c_1.obj": "c"}),
+    ("file", {"mug/a_7.obj": "a"}),
+    ("thing", {"mug/a_7.obj": "thing", "b.obj": "thing"}),
+    (None, {"table/a.obj": "table_mesh", "Manifest/a.obj": "Manifest_mesh"}),
+    (
+        None,
+        {"杯子/a.obj": "杯子", "чашка/b.obj": "чашка", "näme/a.obj": "näme", "a\u0308/b.obj": "ä", "मग/c.obj": "मग"},
+    ),
+    (None, {f"{'long' * 40}/a.obj": "long" * 16, f"{'杯' * 99}/a.obj": "杯" * 64, "\u0301!/a.obj": "object"}),
+    # A repository: what all share says nothing, nor do identifiers and what says `mesh`; numbers that tell several apart go.
+    (None, {"p/ycb/Banana/model.urdf": "Banana", "p/ycb/Mug/model.urdf": "Mug", "p/rand/000/000.urdf": "rand"}),
+    (None, {"x/mug/a1b2c3d4/model.obj": "mug", "x/mug/b1b2c3d4/model.obj": "mug", "x/can/c1b2c3d4/model.obj": "can"}),
+    (None, {"mug/1a2b3c4d/model.obj": "mug", "mug/9a2b3c4d/model.obj": "mug"}),
+    (None, {"mug_01/model.obj": "mug", "mug_02/model.obj": "mug", "can_1/model.obj": "can_1"}),
+    (None, {"Shoe_A/meshes/model.obj": "Shoe_A", "Shoe_B/meshes/model.obj": "Shoe_B"}),
+    (None, {"food/OBJ format/pear.obj": "food", "food/OBJ format/fig.obj": "food", "car/OBJ format/van.obj": "car"}),
+    (None, {"kit/Models/GLB format/fig.glb": "fig", "kit/Models/GLB format/pear.glb": "pear"}),
+    (None, {"chair/train/chair_1.off": "chair", "chair/test/chair_2.off": "chair", "bed/train/bed_1.off": "bed"}),
+    (
+        None,
+        {"k/mugs/a.obj": "mugs", "k/mugs/b.obj": "mugs", "k/jars/c.obj": "jars", "k/jars/d.obj": "jars", "e.obj": "e"},
+    ),
 )
 FOLDERS = {
     "one folder each": ({"mug/a.obj": "mug", "mug/b.obj": "mug", "can/a.obj": "can"}, (), ()),
@@ -39,9 +58,10 @@ FOLDERS = {
 }
 
 
-def test_a_category_follows_from_where_a_file_lies():
-    for path, source, category in CATEGORIES:
-        assert category_of(path, source) == category and is_category(category)
+def test_categories_follow_from_where_files_lie_and_what_they_and_their_folders_are_called():
+    for source, categories in CATEGORIES:
+        assert name_categories(categories, source) == categories
+        assert all(is_category(name) for name in categories.values())
 
 
 def test_patterns_find_the_files_of_their_category_and_no_others(tmp_path):
@@ -58,66 +78,148 @@ def test_patterns_find_the_files_of_their_category_and_no_others(tmp_path):
         assert {path: category for path, category in found.items() if path not in harmless} == items, name
 
 
-def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure"):
-    return Item(path, "c", Measured(extents, 8, 12, True, 0, (), up, confidence if up else None), path)
+def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure", **more):
+    return Item(path, Measured(extents, 8, 12, True, 0, (), up, confidence if up else None, **more), path)
 
 
-def cubes(*diagonals, suffix=".obj"):
-    return [item(f"{k}{suffix}", (d / 3**0.5,) * 3) for k, d in enumerate(diagonals)]
+def cubes(*diagonals, suffix=".obj", folder=""):
+    return [item(f"{folder}{k}{suffix}", (d / 3**0.5,) * 3) for k, d in enumerate(diagonals)]
 
 
-def test_the_unit_is_one_that_things_on_a_table_have_and_what_is_normalised_is_resized():
-    for diagonals, factor, diagonal_m, words in (
-        ((0.2, 0.3), 1.0, None, "metres"),
-        ((250.0,), 0.001, None, "millimetres, 25 cm"),
-        ((25.0,), 0.01, None, "centimetres, 25 cm (as millimetres, 0.001, it would be 2.5 cm)"),
-        ((1.0, 0.4, 0.7), 1.0, None, "metres"),
-        ((0.0001,), 1.0, None, "very small"),
-        ((3000.0, 150.0, 200.0), 0.001, None, "millimetres"),
-        ((1.0, 1.0, 1.001), 1.0, 0.25, "all alike"),
-        ((1.0,), 1.0, None, "metres"),  # a single one
-        ((0.12, 0.12, 0.12), 1.0, None, "metres"),  # three cups of one size
-    ):
-        (scale,) = guess_scales(cubes(*diagonals))
-        assert (scale.factor, scale.diagonal_m) == (factor, diagonal_m) and words in scale.why
-    scales = guess_scales([*cubes(250.0), *cubes(0.2, suffix=".glb"), *cubes(300.0, suffix=".stl")])
-    assert {scale.suffixes: scale.factor for scale in scales} == {(".glb",): 1.0, (".obj", ".stl"): 0.001}
+UNITS = (
+    (cubes(0.2, 0.3), {1.0: 2}, "metres"),
+    (cubes(250.0), {0.001: 1}, "millimetres, 25 cm"),
+    (cubes(25.0), {0.01: 1}, "centimetres, 25 cm (as millimetres, 0.001, it would be 2.5 cm)"),
+    (cubes(1.0, 0.4, 0.7), {1.0: 3}, "metres"),
+    (cubes(0.0001), {1.0: 1}, "metres, 0.1 mm"),
+    (cubes(3000.0, 150.0, 200.0), {0.001: 3}, "millimetres"),
+    (cubes(1.0), {1.0: 1}, "metres"),
+    (cubes(0.12, 0.12, 0.12), {1.0: 3}, "metres"),  # three cups of one size
+    # Specifications say metres, and are believed unless that is impossible; the other reading stands beside.
+    (
+        cubes(2.72, suffix=".glb"),
+        {1.0: 1},
+        "metres, as the format says, 2.72 m (as centimetres, 0.01, it would be 2.72 cm)",
+    ),
+    (cubes(5.0, 3.0, suffix=".urdf"), {1.0: 2}, "metres, as the format says"),
+    (cubes(*[0.004] * 59, suffix=".gltf"), {1.0: 59}, "metres, as the format says, 4 mm"),
+    (cubes(150.0, 90.0, suffix=".glb"), {0.001: 2}, "millimetres"),
+    # Folders and files of a folder may differ, as sizes tell.
+    (
+        [*cubes(0.4, 0.3, 0.5, folder="a/"), *cubes(400.0, 300.0, folder="b/")],
+        {1.0: 3, 0.001: 2},
+        ".obj in b: 350 units",
+    ),
+    ([*cubes(6.0, 22.0, 15.0, folder="hope/"), *cubes(0.2, 0.1, folder="x/")], {0.01: 3, 1.0: 2}, "centimetres, 15 cm"),
+    (cubes(0.2, 0.3, 250.0), {1.0: 2, 0.001: 1}, "metres"),
+    (cubes(250.0, 90.0, 4.0), {0.001: 3}, "millimetres"),  # a screw among millimetres is small
+    # A remark in the file.
+    ([item("a.obj", (8.0, 8.0, 12.0), unit_m=0.0254)], {0.0254: 1}, "inches, as the files say"),
+)
 
 
-def test_up_follows_the_files_that_are_sure_and_others_are_named_apart():
+def test_the_unit_is_what_a_file_says_or_what_things_on_a_table_have_by_folder():
+    for items, factors, words in UNITS:
+        groups = guess_groups(items)
+        assert {group.factor: len(group.paths) for group in groups} == factors, items
+        assert any(words in why for group in groups for why in group.why)
+    for suffix, diagonal_m in ((".obj", 0.25), (".glb", None)):  # what is normalised is resized; glTF is in metres
+        (group,) = guess_groups(cubes(1.0, 1.0, 1.001, suffix=suffix))
+        assert (group.factor, group.diagonal_m) == (1.0, diagonal_m)
+    groups = guess_groups([*cubes(250.0), *cubes(0.2, suffix=".glb"), *cubes(300.0, suffix=".stl")])
+    assert {group.paths: group.factor for group in groups} == {("0.glb",): 1.0, ("0.obj", "0.stl"): 0.001}
+
+
+def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_all_files_speak_against_it():
     def ups(*items):
         return {rule.pattern: rule.axis for rule in guess_ups(items)}
 
     sure = [item(f"{k}.obj", up="y") for k in range(5)]
     assert ups(*sure, item("box.obj")) == {"**/*.obj": "y"} and plain_axis(guess_ups(sure)) == "y"
     assert ups(*sure, item("odd [1].obj", up="z")) == {"odd [[]1].obj": "z", "**/*.obj": "y"}
-    mine, theirs = (
-        [item(f"{name}/{k}.obj", up=up) for k in range(n)] for name, up, n in (("a", "z", 6), ("b", "y", 2))
-    )
-    assert ups(*mine, *theirs, item("b/box.obj")) == {"b/**/*.obj": "y", "**/*.obj": "z"}, "a folder has a line"
+    for suffix in (".obj", ".glb"):
+        z, y = (
+            [item(f"{name}/{k}{suffix}", up=up) for k in range(n)] for name, up, n in (("a", "z", 9), ("b", "y", 3))
+        )
+        found = ups(*z, *y, item(f"b/box{suffix}"))
+        line = {"b/**/*.obj": "y"} if suffix == ".obj" else {"b/**/*.glb": "y"}
+        assert found == {**line, f"**/*{suffix}": "z"}, "a folder has a line"
     assert ups(item("box.glb"), item("a.gltf", up="z", confidence="likely")) == {"**/*.glb": "y", "**/*.gltf": "y"}
-    assert ups(item("mug.glb", up="z")) == {"**/*.glb": "z"}, "by the specification, unless the shapes are sure"
+    assert ups(item("mug.glb", up="z")) == {"**/*.glb": "z"}, "most of all files are sure"
+    boxes = [item(f"{k}.glb") for k in range(3)]
+    (rule,) = guess_ups([*boxes, *(item(f"s{k}.glb", up="x") for k in range(3))])
+    assert rule.axis == "y" and "3 of 6 stand on x alone" in rule.why, "half of them are not most"
     assert ups(item("a.obj", up="y"), item("b.obj", up="x")) == {"a.obj": "y", "b.obj": "x", "**/*.obj": "z"}
     for confidence, axis, why in (("likely", "y", "likely: 1 of 2"), (None, "z", "not known")):
         (rule,) = guess_ups([item("a.obj", up=confidence and "y", confidence=confidence), item("b.obj")])
         assert rule.axis == axis and rule.why.startswith(why)
 
 
-def test_of_one_mesh_in_several_formats_the_first_stays_and_different_names_are_different_meshes():
-    items = [item(f"a/m{suffix}") for suffix in (".stl", ".obj", ".glb")] + [item("a/n.obj"), item("b/m.obj")]
-    kept, left_out = drop_doubles(items)
-    assert [one.path for one in kept] == ["a/m.glb", "a/n.obj", "b/m.obj"]
-    assert {one.path for one in left_out} == {"a/m.stl", "a/m.obj"}
+COPIES = {
+    "model.obj": (
+        "model_collision_0.obj",
+        "model_collision_31.obj",
+        "model_vhacd.obj",
+        "model_coacd.obj",
+        "model_col.obj",
+    ),
+    "soup/textured.obj": ("soup/alphabet_soup_coll.obj", "soup/collision/textured_ch.stl"),
+    "ur5/visual/base.dae": ("ur5/collision/base.obj",),
+    "car_LOD0.glb": ("car_LOD1.glb", "car_LOD2.glb"),
+    "jar.obj": ("jar_lod1.obj", "UCX_jar_01.obj"),
+    "lamp_lod2.obj": ("lamp_lod3.obj",),
+}
+ORIGINALS = ("column.obj", "school.obj", "alone_collision.obj", "x/coll/mug.obj", "free_hull.obj", "mocha-col1.obj")
+
+
+def test_collision_shapes_and_coarser_levels_are_left_out_with_what_they_belong_to():
+    everything = [*COPIES, *(path for paths in COPIES.values() for path in paths)]
+    found = find_copies(everything, everything)
+    assert {path: why.rpartition(" of ")[2] for path, why in found.items()} == {
+        path: of for of, paths in COPIES.items() for path in paths
+    }
+    for path in ORIGINALS:
+        assert find_copies([path], [path, "other.obj", "more.obj"]) == {}, f"{path} is all that there is of it"
+
+
+def solid(path, size=1.0, turned=False, faces=200, look=None, volume=0.3, **more):
+    extents = (0.1 * size, 0.3 * size, 0.2 * size) if turned else (0.1 * size, 0.2 * size, 0.3 * size)
+    measured = Measured(extents, 8, faces, True, 0, (), area=0.2 * size**2, volume=volume * size**3, look=look)
+    return Item(path, replace(measured, **more), path)
+
+
+def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
+    doubles = (
+        (solid("a/model.urdf", textures=1), solid("a/visual.ply", 1000.0)),  # in another unit
+        (solid("a.urdf"), solid("b/c.ply", turned=True)),
+        (solid("a/m.glb", faces=12), solid("a/m.obj", faces=12)),
+        (solid("a/textured.obj", textures=1, faces=12), solid("a/nontextured.ply", faces=12)),
+        (solid("x/a.urdf", faces=12), solid("x/visual/b.obj", faces=12)),
+        (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b/a.obj", look=(203.0, 9.0, 9.0), textures=1)),
+        (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b/a.obj", look=(90.0, 9.0, 9.0))),
+    )
+    for first, second in doubles:
+        for pair in ((first, second), (second, first)):
+            (one,) = find_doubles(pair, lambda item: item.diagonal, SUFFIXES)
+            assert (one.path, one.why) == (second.path, f"double of {first.path}")
+    for first, second in (
+        (solid("a/m.obj"), solid("a/n.obj", 1.1)),  # of another size
+        (solid("a/m.obj"), solid("b/m.stl", 1000.0)),
+        (solid("a.obj"), solid("b.obj", volume=0.31)),
+        (solid("a.obj"), solid("b.obj", faces=201)),
+        (solid("a/box.obj", faces=12), solid("b/box.obj", faces=12)),
+        (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b.obj", look=(9.0, 9.0, 200.0), textures=1)),
+    ):
+        assert find_doubles([first, second], lambda item: item.diagonal, SUFFIXES) == []
+    assert len(find_doubles([item("a.obj"), replace(item("b.obj"), digest="a.obj")], lambda one: 1.0, SUFFIXES)) == 1
 
 
 # ------------------------------------------------------------------------------------------------ the text of the job
 
 
-def job_of(items, folder="meshes", category_map=None):
-    found = category_map or {one.path: "thing" for one in items}
-    guess = Guess(tuple(guess_scales(items)), tuple(guess_ups(items)), found)
-    kinds = [(found.get(one.path, next(iter(found.values()))), one.suffix) for one in items]
-    text = write_job("mine", "mine.yaml", folder, "s.jpg", kinds, guess)
+def job_of(items, folder="meshes", by="thing"):
+    guess, kept, _ = make_guess(Reading(tuple(items), ()), by)
+    text = write_job("mine", "mine.yaml", folder, "s.jpg", {one.path: one.category for one in kept}, guess)
     return text, validate_job(parse_yaml(text), "j")
 
 
@@ -137,14 +239,21 @@ def test_axes_that_differ_are_a_map_by_pattern_and_units_that_differ_are_sources
     text, job = job_of(items)
     assert job.assets.objects[0].up == {"odd: {1}.obj": "y", "**/*.glb": "y", "**/*.obj": "z"}
     assert '# stands on this axis alone, unlike its neighbours\n        "odd: {1}.obj": y' in text
-    _, job = job_of([*cubes(250.0, 260.0), *cubes(0.2, suffix=".glb")])
+    _, job = job_of([*cubes(250.0, 260.0), *cubes(0.2, suffix=".glb", folder="g/")])
     maps = {tuple(source.category_map): (source.scale, source.weight) for source in job.assets.objects}
-    assert maps == {("0.glb",): (1.0, 1.0), ("0.obj", "1.obj"): (0.001, 2.0)}, "which weigh as many as they have"
+    assert maps == {("g/0.glb",): (1.0, 1.0), ("*.obj",): (0.001, 2.0)}, "which weigh as many as they have"
+    _, job = job_of([*cubes(0.4, 0.3, folder="a/"), *cubes(400.0, 350.0, folder="b/")], by=None)
+    maps = [(source.scale, dict(source.category_map), source.up) for source in job.assets.objects]
+    assert maps == [(1.0, {"a/*.obj": "a"}, "z"), (0.001, {"b/*.obj": "b"}, "z")]
+    _, kept, left_out = make_guess(Reading((*cubes(0.2, 0.3, 0.006),), ()), None)
+    assert len(kept) == 2 and left_out[0].why.startswith("is too small to be seen on a table: 6 mm at scale 1;")
 
 
 def test_strange_names_are_written_as_they_are():
     for name in ("~", "null", "a b", "ü", "a'b\"c", "[x]", "#1", "yes", "a\\b", "- x", "1e3", "%x", "&a", "*", "0_1"):
         _, job = job_of([item(f"{name}.obj")], folder=name)
-        assert job.assets.objects[0].folder == name and list(job.assets.objects[0].category_map) == [f"{name}.obj"]
-    for category in ("no", "null", "0_1e", "1_000a", "on", "1e3", "thing"):
-        assert list(job_of(cubes(0.2), category_map={"*.obj": category})[1].categories) == [category]
+        assert job.assets.objects[0].folder == name and list(job.assets.objects[0].category_map) == [
+            escape(f"{name}.obj")
+        ]
+    for category in ("no", "null", "0_1e", "1_000a", "on", "1e3", "thing", "杯子"):
+        assert list(job_of(cubes(0.2), by=category)[1].categories) == [category]

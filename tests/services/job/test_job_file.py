@@ -200,7 +200,7 @@ def test_every_key_is_documented_and_the_page_is_current():
         ("start.offset_m", "[low, high]"),
         ("cameras.depth.offset_m", "3 numbers"),
         ("run.workers", "integer >=1,<=100000 or `null`"),
-        ("assets.objects[urdf].up", "`x`/`y`/`z` or map"),
+        ("assets.objects[files].up", "`x`/`y`/`z` or map"),
     ):
         assert describe_allowed(keys[key]) == words
     assert allowed_keys(["assets", "split", "trian"]) == ["test", "train", "val"]

@@ -162,7 +162,7 @@ def find_files(
     """
     folder = locate_folder(settings.folder, job_folder)
     if not folder.is_dir():
-        remedy = f"Set `folder` of the urdf source to one, or to `{PYBULLET_DATA}`."
+        remedy = f"Set `folder` of the source to one, or to `{PYBULLET_DATA}`."
         raise AssetSourceError(f"{folder} is not a folder. {remedy}")
     category_map = settings.category_map or (PYBULLET_MAP if settings.folder == PYBULLET_DATA else {})
     if not category_map:

@@ -6,6 +6,7 @@ file (`measure_asset`).
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,11 +18,11 @@ from scipy.spatial import ConvexHull, QhullError
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
-from schemas.scene.shape import Asset, Hull
+from schemas.scene.shape import Asset, Hull, Shape
 from workers.assets.external.caps import MOST_NOTES, one_line
 from workers.assets.external.formats import list_mesh_files, load_shape
 from workers.assets.external.listing import Entry, check_unchanged, mesh_root
-from workers.assets.external.mesh import LoadedMesh, transform_shape
+from workers.assets.external.mesh import DEFAULT, LoadedMesh, transform_shape
 from workers.assets.external.urdf import load_urdf, seen_meshes
 from workers.assets.mass import mass_properties
 from workers.geometry.frames import pose
@@ -37,7 +38,8 @@ OBJECT_SCALE, TABLE_SCALE = 0.25, 1.5
 
 
 URDF = ".urdf"
-"""The end of the name of a file that poses mesh files."""
+POSED = (URDF,)
+"""The ends of the names of files that pose mesh files."""
 
 
 def list_files(
@@ -146,6 +148,9 @@ two; it rolls where both shares are smaller. What lies between is not decided.""
 TIPS_DEG = 3.0
 """A shape that needs less of a lean to tip over does not stand."""
 
+FLAT = 0.02
+"""Least extent, by its diagonal, below which a shape is flat: how it stands tells nothing, because it lies."""
+
 LIKELY_DEG = 10.0
 """A shape is likely to be upright where it stands by this much firmer than upside down, and so on no other axis."""
 
@@ -191,8 +196,10 @@ def find_upright(hull_vertices: Array, com: Array) -> Upright | None:
     hull_vertices [H, 3] of the convex hull and com [3], any units, in the frame whose axes are asked about. `sure`: with
     this axis up or down the shape stands, and on both sides of the two others it rolls or tips. `likely`: it stands on
     several, and with this one up by `LIKELY_DEG` firmer than upside down, which no other is. Of an axis, the positive side
-    is meant.
+    is meant. Of what is flat (`FLAT`) nothing is told.
     """
+    if measure_thinness(hull_vertices) < FLAT:
+        return None
     stands = {name: measure_stand(hull_vertices, com, name) for name in DIRECTIONS}
     for axis in AXES:
         others = [stand.verdict for name, stand in stands.items() if axis not in name]
@@ -203,6 +210,14 @@ def find_upright(hull_vertices: Array, com: Array) -> Upright | None:
     if not order or firmer[order[0]] - max((firmer[axis] for axis in order[1:]), default=0.0) < LIKELY_DEG:
         return None
     return Upright(order[0], "likely")
+
+
+def measure_thinness(points: Array) -> float:
+    """The least extent of points [N, 3], along their principal axes or those of their frame, by the longest diagonal."""
+    centred = points - points.mean(axis=0)
+    along = np.concatenate([centred, centred @ np.linalg.eigh(centred.T @ centred)[1]], axis=1)
+    extents = np.ptp(along, axis=0)
+    return float(extents.min() / max(np.linalg.norm(extents[:3]), np.finfo(np.float64).tiny))
 
 
 def measure_stand(hull_vertices: Array, com: Array, up: str) -> Stand:
@@ -243,7 +258,10 @@ PLACEHOLDER_PX = 2
 class Measured:
     """One file: sizes along its own axes, in units of its source's `scale`; what was mended, left out or is missing.
 
-    textures: how many pictures its parts have. up, confidence: what its shape tells about the axis that is up, or None.
+    area, volume: of its surface, and between the surface and the middle of its bounding box, in the same units; thin: its
+    least extent in any direction, by its diagonal; textures: how many pictures its parts have; look: their mean colour, of
+    255, None where it has none; unit_m: its unit in metres, where the file says so; up, confidence: what its shape tells
+    about the axis that is up, or None.
     """
 
     extents: tuple[float, float, float]
@@ -254,13 +272,20 @@ class Measured:
     notes: tuple[str, ...]
     up: UpAxis | None = None
     confidence: Confidence | None = None
+    area: float = 0.0
+    volume: float = 0.0
+    thin: float = 1.0
+    look: tuple[float, float, float] | None = None
+    unit_m: float | None = None
 
 
-def measure_asset(asset: Asset, hull: Hull | None) -> str:
-    """The measures of an asset whose source has z up, as JSON."""
+def measure_asset(asset: Asset, hull: Hull | None, path: Path) -> str:
+    """The measures of an asset whose source has z up, read from a file at `path`, as JSON."""
     x, y, z = (float(extent) for extent in asset.extents_m)
     textures = [part.material.texture for part in asset.shape.parts if part.material.texture is not None]
     found = None if hull is None else find_upright(hull.vertices, asset.mass.com)
+    a, b, c = (asset.shape.vertices[asset.shape.faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
     measured = Measured(
         extents=(x, y, z),
         vertices=sum(len(part.vertices) for part in asset.shape.parts),
@@ -270,6 +295,11 @@ def measure_asset(asset: Asset, hull: Hull | None) -> str:
         notes=asset.notes,
         up=None if found is None else found.axis,
         confidence=None if found is None else found.confidence,
+        area=0.5 * float(np.linalg.norm(across, axis=1).sum()),
+        volume=abs(float((a * np.cross(b, c)).sum())) / 6.0,
+        thin=1.0 if hull is None else measure_thinness(hull.vertices),
+        look=_mean_colour(asset.shape),
+        unit_m=find_unit(path),
     )
     return json.dumps(asdict(measured))
 
@@ -277,4 +307,41 @@ def measure_asset(asset: Asset, hull: Hull | None) -> str:
 def read_measured(data: bytes) -> Measured:
     """The measures of `measure_asset`'s JSON. Raises ValueError, TypeError or KeyError where it is none."""
     tree = json.loads(data)
-    return Measured(**{**tree, "extents": tuple(tree["extents"]), "notes": tuple(tree["notes"])})
+    look = None if tree["look"] is None else tuple(tree["look"])
+    return Measured(**{**tree, "extents": tuple(tree["extents"]), "notes": tuple(tree["notes"]), "look": look})
+
+
+def _mean_colour(shape: Shape) -> tuple[float, float, float] | None:
+    """The mean of the pictures, vertex colours and plain colours of all parts by their faces, of 255; None for no material."""
+    total, weight = np.zeros(3), 0
+    for part in shape.parts:
+        if part.material.texture is not None:
+            colour = part.material.texture.reshape(-1, part.material.texture.shape[-1])[:, :3].mean(axis=0)
+        elif part.colors is not None:
+            colour = part.colors[:, :3].mean(axis=0)
+        elif part.material == DEFAULT:
+            continue
+        else:
+            colour = 255.0 * np.array(part.material.base_color[:3])
+        total, weight = total + len(part.faces) * colour, weight + len(part.faces)
+    red, green, blue = total / max(weight, 1)
+    return (float(red), float(green), float(blue)) if weight else None
+
+
+_UNIT = re.compile(rb"^#[^\n]*\bunits?\b[\s=:]*(?:(?:is|are|in)\b)?[\s=:]*([a-z]+)", re.IGNORECASE | re.MULTILINE)
+"""A remark in an OBJ file, as SketchUp's `# File units = inches`."""
+_UNITS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, "centimetre": 0.01, "mm": 0.001}
+_UNITS |= {"millimeter": 0.001, "millimetre": 0.001, "inch": 0.0254, "inche": 0.0254, "in": 0.0254}
+_UNITS |= {"foot": 0.3048, "feet": 0.3048, "ft": 0.3048}
+HEAD_BYTES = 4096
+"""Bytes of a file that are looked at for a remark on its unit, or for what it really is."""
+
+
+def find_unit(path: Path) -> float | None:
+    """Metres in a unit of an OBJ file that states its unit in a remark at its start; else None."""
+    if path.suffix.lower() != ".obj":
+        return None
+    with path.open("rb") as stream:
+        found = _UNIT.search(stream.read(HEAD_BYTES))
+    word = found[1].decode().lower() if found else ""
+    return _UNITS.get(word, _UNITS.get(word.removesuffix("s")))

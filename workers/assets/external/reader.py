@@ -253,7 +253,7 @@ def _answer(request: Request, task: Task) -> bytes:
         return pack_asset(asset)
     hull = _check_fit(asset, task.path)
     if task.kind == "measure":
-        return measure_asset(asset, hull).encode()
+        return measure_asset(asset, hull, task.path).encode()
     doubt = None if hull is None else find_doubt(asset, request.settings, hull.vertices)
     return (doubt or "").encode()
 

@@ -1,0 +1,153 @@
+"""Pure: of the meshes of a folder, those that are another one again: a collision shape, a coarser level, a double."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import PurePosixPath
+
+from services.init.found import COPY, Item, LeftOut
+from workers.assets.external.placement import POSED
+
+_COLLIDES = "col|coll|collisions?|colliders?|v-?hacd|coacd|convex|hulls?|ch|physics|phys"
+_NAMED = re.compile(rf"(.+?)(?:[\s_.-]+(?:{_COLLIDES})(?:[\s_.-]*\d+)*)+", re.IGNORECASE)
+_NAMED_BEFORE = re.compile(r"(?:UCX|UBX|USP|UCP)_(.+?)(?:_\d+)?")
+"""As Unreal has it."""
+_FOLDER = re.compile(rf"(?:{_COLLIDES})(?:[\s_.-]*mesh(?:es)?)?", re.IGNORECASE)
+_LEVEL = re.compile(r"(.+?)[\s_.-]*lod[\s_.-]*(\d+)", re.IGNORECASE)
+_SEEN = re.compile(r"[\s_.-]+(?:vis|visual)$", re.IGNORECASE)
+
+
+def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, str]:
+    """Of the paths, by their names: collision shapes and coarser levels of detail, with the file that each belongs to.
+
+    Only what belongs to some file of `everything` is a copy: a collision shape alone is all that there is of an object.
+    """
+    split = {path: _split(path) for path in everything}
+    originals = [path for path, (_, level) in split.items() if level is None]
+    levels: dict[tuple[str, str], tuple[int, str]] = {}
+    for path, (stem, level) in split.items():
+        if level is not None and level >= 0:
+            key = _parent(path), stem
+            levels[key] = min(levels.get(key, (level, path)), (level, path))
+    by_folder: dict[str, list[str]] = {}
+    for path in originals:
+        by_folder.setdefault(_parent(path), []).append(path)
+    found = {}
+    for path in paths:
+        stem, level = split[path]
+        if level is None:
+            continue
+        finest = levels.get((_parent(path), stem), (0, path))[1] if level >= 0 else None
+        near = _near(path, by_folder) if finest in (None, path) else []
+        of = next((one for one in near if _stem(one) == stem), near[0] if len(near) == 1 and level < 0 else None)
+        if of is None and level < 0 and near and _in_folder(path):
+            of = min(near, key=lambda one: (not stem.startswith(_stem(one)), one))
+        of = of or (finest if finest != path else None)
+        if of is not None:
+            found[path] = f"{'collision shape' if level < 0 else 'coarser level of detail'} of {of}"
+    return found
+
+
+def _split(path: str) -> tuple[str, int | None]:
+    """The name of what a file is a copy of, and the level of detail, -1 for a collision shape, None where it is no copy."""
+    stem = _stem(path)
+    if match := _LEVEL.fullmatch(stem):
+        return match[1], int(match[2])
+    if match := _NAMED.fullmatch(stem) or _NAMED_BEFORE.fullmatch(PurePosixPath(path).stem):
+        return match[1].lower(), -1
+    return (stem, -1) if _in_folder(path) else (stem, None)
+
+
+def _in_folder(path: str) -> bool:
+    """Whether it lies in a folder of collision shapes."""
+    return any(_FOLDER.fullmatch(name) for name in PurePosixPath(path).parts[:-1])
+
+
+def _near(path: str, by_folder: Mapping[str, list[str]]) -> list[str]:
+    """What lies in its folder or, where it lies in a folder of collision shapes, in or below the one above that."""
+    parts = PurePosixPath(path).parts[:-1]
+    depth = next((k for k, name in enumerate(parts) if _FOLDER.fullmatch(name)), None)
+    if depth is None:
+        return by_folder.get("/".join(parts), [])
+    above = "/".join(parts[:depth])
+    return [
+        one
+        for folder, some in by_folder.items()
+        if f"{folder}/".startswith(f"{above}/" if above else "")
+        for one in some
+    ]
+
+
+def _parent(path: str) -> str:
+    return path.rpartition("/")[0]
+
+
+def _stem(path: str) -> str:
+    return _SEEN.sub("", PurePosixPath(path).stem).lower()
+
+
+ALIKE = 1e-3
+"""Relative difference of sizes, areas and volumes up to which two meshes are the same shape: formats round."""
+
+FEW = 50
+"""Faces below which shapes are alike by chance, as boxes are, unless name or folder speak for it too."""
+
+SMALL = 0.02
+"""Below this, metres or a share of a size, a difference counts as that of something so large."""
+
+ALIKE_COLOUR = 6.0
+"""Difference of mean colours, of 255, up to which two meshes may be one: pictures are compressed again."""
+
+
+def find_doubles(items: Sequence[Item], size_m: Callable[[Item], float], formats: Sequence[str]) -> list[LeftOut]:
+    """The items that are another one again: the same shape and size in metres, or in one folder the same shape.
+
+    Two shapes are the same that have as many faces, and extents, area and volume alike in whatever order of axes; unless
+    both have pictures, or neither has, and their colours differ. That stays which has pictures, then colours, then the
+    format that comes first in `formats`.
+    """
+    order = sorted(
+        items,
+        key=lambda one: (not one.measured.textures, one.measured.look is None, formats.index(one.suffix), one.path),
+    )
+    seen, left_out = dict[int, list[tuple[Item, str]]](), list[LeftOut]()
+    for item in order:
+        same = seen.setdefault(item.measured.faces, [])
+        original = next((of for one, of in same if _is_double(item, one, size_m)), None)
+        same.append((item, original or item.path))
+        if original is not None:
+            left_out.append(LeftOut(item.path, COPY, f"double of {original}"))
+    return left_out
+
+
+def _is_double(item: Item, other: Item, size_m: Callable[[Item], float]) -> bool:
+    if item.digest == other.digest:
+        return True
+    mine, theirs = item.measured, other.measured
+    coloured_alike = bool(mine.textures) == bool(theirs.textures) and mine.look is not None and theirs.look is not None
+    if (
+        coloured_alike
+        and max(abs(a - b) for a, b in zip(mine.look or (), theirs.look or (), strict=True)) > ALIKE_COLOUR
+    ):
+        return False
+    near = item.suffix != other.suffix and _nested(_parent(item.path), _parent(other.path))
+    if mine.faces < FEW and not (near and (_name(item) == _name(other) or {item.suffix, other.suffix} & set(POSED))):
+        return False
+    ours, others = _shape(item), _shape(other)
+    pairs = zip(ours if near else (*ours, size_m(item)), others if near else (*others, size_m(other)), strict=True)
+    return all(abs(a - b) <= ALIKE * max(abs(a), abs(b), SMALL) for a, b in pairs)
+
+
+def _name(item: Item) -> str:
+    return _stem(item.path).removeprefix("non")
+
+
+def _nested(one: str, other: str) -> bool:
+    """Whether two folders are the same, or one lies in the other."""
+    return one == other or (bool(one) and other.startswith(f"{one}/")) or (bool(other) and one.startswith(f"{other}/"))
+
+
+def _shape(item: Item) -> tuple[float, ...]:
+    """What does not depend on unit and axes: extents in order, area and volume, by the diagonal."""
+    size = item.diagonal
+    extents = (extent / size for extent in sorted(item.measured.extents))
+    return *extents, item.measured.area / size**2, item.measured.volume / size**3
