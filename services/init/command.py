@@ -35,8 +35,8 @@ HEAD = """\
 # A dataset of your own meshes: {objects} in {categories}, from {folder}
 # Written by `verso init`. What it guessed is said beside each key: look at the pictures{sheet}, and change what is wrong.
 #
-#   verso run {job} --scenes 8        a first look, then
-#   verso run {job} --scenes 10000    goes on from there
+#   ./verso run {job} --scenes 8        a first look, then
+#   ./verso run {job} --scenes 10000    goes on from there
 #
 # Every key that is not here has the default that docs/job.md tells.
 

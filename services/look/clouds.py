@@ -1,14 +1,12 @@
 """Point clouds of a pair from both cameras with the posed mesh, packed for the page's 3-D view; world frame, metres, z up."""
 
 import base64
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from schemas.base import Array
@@ -18,7 +16,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from services.look.collect import choose_spread
 from services.look.pictures import PairImages, metres_of, read_pair
 from services.read.dataset_reader import file_reader, find_scene
-from services.read.scene_geometry import scene_glb
+from services.read.scene_geometry import posed_scene
 from workers.geometry.camera import unproject
 from workers.store.store import Store
 
@@ -147,7 +145,7 @@ def _evenly(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 def _read_bodies(store: Store, scene_id: int) -> tuple[tuple[Body, ...], str]:
     """(the meshes of a scene but for the floor, why there are none)."""
     try:
-        scene = trimesh.load_scene(io.BytesIO(scene_glb(store, scene_id)), file_type="glb", process=False)
+        scene = posed_scene(store, scene_id)
     except VersoError as error:
         return (), str(error)
     bodies = []

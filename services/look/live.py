@@ -226,7 +226,7 @@ class Follower:
         """Ends the thread, after the look that it is at."""
         self._ended.set()
         if self._thread.is_alive():
-            self._thread.join(10)
+            self._thread.join(30)
 
     def look(self) -> None:
         """One look at the folder, without the report."""

@@ -21,8 +21,8 @@ from workers.scene.plan import SceneChance, plan_scene
 from workers.store.store import Store
 
 
-def scene_glb(store: Store, scene_id: int) -> bytes:
-    """A GLB file with floor, table and objects where the stored rows put them: world frame, z up, metres.
+def posed_scene(store: Store, scene_id: int) -> trimesh.Scene:
+    """Floor, table and objects where the stored rows put them: world frame, z up, metres.
 
     Shapes come from the job's sources; poses from the manifest. Raises InputError where the scene was not made.
     """
@@ -32,12 +32,9 @@ def scene_glb(store: Store, scene_id: int) -> bytes:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
     if record.job.captures is not None:
-        scene = captured_scene(store, stored, row)
-    else:
-        context = open_context(record)
-        scene = planned_scene(context.job, context.catalogue, scene_id, row)
-    data: bytes = scene.export(file_type="glb")
-    return data
+        return captured_scene(store, stored, row)
+    context = open_context(record)
+    return planned_scene(context.job, context.catalogue, scene_id, row)
 
 
 def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene:

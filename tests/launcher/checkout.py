@@ -27,7 +27,7 @@ case "$*" in
   "-m pytest "*) printf '%s|' pytest "${@:3}" "path=$PYTHONPATH" "threads=$OMP_NUM_THREADS" "in=$PWD"
      exit "$(cat "$FAULTS/pytest" 2>/dev/null || echo 0)" ;;
   "-m ruff "* | "-m mypy") echo "${@:2}"; [ ! -e "$FAULTS/$2-fails" ] ;;
-  "-P -m services.cli.main"*) printf '%s|' "${@:4}" "path=${PYTHONPATH-}" "in=$PWD"
+  "-P -m services.cli.main"*) printf '%s|' "${@:4}" "path=${PYTHONPATH-}" "in=$PWD" "typed=$VERSO_TYPED"
      [ ! -e "$FAULTS/exit" ] || exit "$(cat "$FAULTS/exit")" ;;
   *) echo "unexpected: $*" >&2; exit 99 ;;
 esac

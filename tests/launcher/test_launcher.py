@@ -14,15 +14,16 @@ from tests.launcher.checkout import LOCKS, ROOT, Checkout, locked, project
 
 def test_the_first_start_installs_the_lock_then_the_project_and_the_second_nothing(checkout, tmp_path):
     code, out, err = checkout.run("status", "a b", "*")
-    assert (code, out) == (0, f"status|a b|*|path=|in={checkout.faults}|")  # and none of pip's chatter
+    typed = f"typed={checkout.root / 'verso'}|"
+    assert (code, out) == (0, f"status|a b|*|path=|in={checkout.faults}|{typed}")  # and none of pip's chatter
     assert "first start" in err
     assert checkout.calls() == ["venv", locked("requirements.lock", checkout.root), project(checkout.root)]
-    assert checkout.run("status") == (0, f"status|path=|in={checkout.faults}|", "")
+    assert checkout.run("status") == (0, f"status|path=|in={checkout.faults}|{typed}", "")
     link, elsewhere = checkout.bin / "verso", tmp_path / "elsewhere"
     link.symlink_to(checkout.root / "verso")
     elsewhere.mkdir()
     (checkout.faults / "exit").write_text("2")  # the command's exit code is the launcher's
-    assert checkout.run("doctor", launcher=link, cwd=elsewhere)[:2] == (2, f"doctor|path=|in={elsewhere}|")
+    assert checkout.run("doctor", launcher=link, cwd=elsewhere)[:2] == (2, f"doctor|path=|in={elsewhere}|typed={link}|")
     assert checkout.calls() == []
 
 

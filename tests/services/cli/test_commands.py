@@ -16,6 +16,7 @@ from schemas.environment import KEEP, STACK_ENVIRONMENT
 from services.cli import doctor
 from services.cli.commands import default_page
 from services.cli.doctor import Finding
+from services.cli.environment import as_typed
 from services.cli.main import main
 from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job
@@ -50,6 +51,33 @@ def verso(*arguments: str, cwd: Path = ROOT, **more: str) -> subprocess.Complete
     command = [sys.executable, "-P", "-m", "services.cli.main", *arguments]
     environ = {**os.environ, "PYTHONPATH": str(ROOT), **more}
     return subprocess.run(command, cwd=cwd, env=environ, capture_output=True, text=True, check=False, timeout=120)
+
+
+# ------------------------------------------------------------------------------------------------ how it is called
+
+
+def test_commands_are_printed_as_they_are_typed_here(tmp_path, monkeypatch):
+    (tmp_path / "verso").write_text("#!/bin/sh\n")
+    (tmp_path / "verso").chmod(0o755)
+    text = "run `verso status OUT`, verso verify x; /opt/verso run, verso: no, my-verso run, verso COMMAND"
+    for path, typed, called in (
+        ("/nowhere", "./verso", "./verso"),
+        ("/nowhere", "", "verso"),
+        ("/nowhere", "docker compose run --rm job", "docker compose run --rm job"),
+        (str(tmp_path), str(tmp_path / "verso"), "verso"),  # the shell finds it
+        ("/nowhere", str(tmp_path / "verso"), str(tmp_path / "verso")),
+    ):
+        monkeypatch.setenv("VERSO_TYPED", typed)
+        monkeypatch.setenv("PATH", path)
+        told = (
+            f"run `{called} status OUT`, {called} verify x; /opt/verso run, verso: no, my-verso run, {called} COMMAND"
+        )
+        assert as_typed(text) == told
+    monkeypatch.undo()
+    done = verso("logs", "j0a1b2c3d", "--queue", str(tmp_path / "none"), VERSO_TYPED="./verso")
+    assert done.returncode == 2 and "`./verso submit` or `./verso supervise` makes a new queue" in done.stderr
+    told = verso("run", "--help", VERSO_TYPED="./verso").stdout
+    assert told.startswith("usage: ./verso run") and "example: ./verso run deploy" in told
 
 
 # ------------------------------------------------------------------------------------------------ what is refused

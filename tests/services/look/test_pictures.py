@@ -212,7 +212,7 @@ def test_the_view_in_space_has_a_switch_for_each_part_and_says_why_there_is_no_m
     def gone(*_):
         raise MachineError("the files of the asset <folders> do not hold what they held")
 
-    monkeypatch.setattr(module, "scene_glb", gone)
+    monkeypatch.setattr(module, "posed_scene", gone)
     found = read_space(shown, 1)
     assert len(found.clouds) == 2 and found.bodies == () and "asset <folders>" in found.missing
     cloud = Cloud("input", np.zeros((1, 3)), np.zeros((1, 3), np.uint8), 0.01, np.eye(4))

@@ -1,6 +1,5 @@
 """Every reader on a dataset of captures, whose photographs and mirror views are exact (tests/captures.py)."""
 
-import io
 import json
 import shutil
 from pathlib import Path
@@ -16,7 +15,7 @@ from services.read.dataset_reader import find_scene
 from services.read.query import query
 from services.read.repair import repair
 from services.read.replay import replay_scene
-from services.read.scene_geometry import scene_glb
+from services.read.scene_geometry import posed_scene
 from services.read.status import read_status
 from tests.captures import captures_job, use_exact_captures, write_folder
 from tests.datasets import faults_of, run_here
@@ -70,7 +69,7 @@ def test_a_lost_image_and_a_lost_shape_are_named_and_made_again(copy):
     for damage in (lambda: shape.write_bytes(b"glTF"), shape.unlink):
         damage()
         with pytest.raises(CorruptError, match=f"{shape.name} .*--repair"):
-            scene_glb(copy, 0)
+            posed_scene(copy, 0)
     (copy.root / "mug/depth00001.png").unlink()
     assert len(faults_of(copy)) == 2
     found = repair(copy, [], lambda _: None)
@@ -109,7 +108,7 @@ def test_sql_status_and_the_card_tell_of_captures(virtual):
 
 def test_geometry_of_a_capture_is_its_board_and_its_mesh_where_they_are(virtual):
     store = LocalStore(virtual)
-    found = trimesh.load_scene(io.BytesIO(scene_glb(store, 0)), file_type="glb")
+    found = posed_scene(store, 0)
     board, thing = sorted(found.graph.nodes_geometry)
     assert (board.split()[0], thing.split()[0]) == ("board", "mug")
     np.testing.assert_allclose(found.geometry[board].extents, [0.6, 0.4, 0.0], atol=1e-7)

@@ -19,7 +19,7 @@ from services.merge.merge import merge
 from services.read.columns_page import describe_columns, list_columns, write_page
 from services.read.dataset_reader import choose_evenly, choose_scenes, file_reader, find_scene, iter_stored, read_image
 from services.read.query import query
-from services.read.scene_geometry import scene_glb
+from services.read.scene_geometry import posed_scene
 from services.read.status import read_status
 from services.read.stored_tables import patch_paths, view_paths
 from services.run.lock import hold_lock
@@ -93,7 +93,7 @@ def materials(data: bytes) -> list[list[float]]:
 
 
 def test_a_scene_as_glb_has_every_object_where_its_row_puts_it_in_the_colours_of_its_stored_shape(three_objects):
-    data = scene_glb(three_objects, 0)
+    data = posed_scene(three_objects, 0).export(file_type="glb")
     found = trimesh.load_scene(io.BytesIO(data), file_type="glb")
     (row,) = query(three_objects, "select bodies from scenes").to_pylist()
     shown, compared = np.array(materials(data)), 0
@@ -110,7 +110,7 @@ def test_a_scene_as_glb_has_every_object_where_its_row_puts_it_in_the_colours_of
     assert compared
     assert {"floor", "table"} <= {node.split("/")[0].split(" ")[0] for node in found.graph.nodes_geometry}
     with pytest.raises(InputError, match="scene 7 is not in"):
-        scene_glb(three_objects, 7)
+        posed_scene(three_objects, 7)
 
 
 def test_a_part_keeps_its_corners_faces_and_colour_as_a_mesh():

@@ -1,14 +1,12 @@
 """Datasets from the job file to the merged files and back: of several objects, of few instances, and with less in them."""
 
 import csv
-import io
 import re
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
-import trimesh
 
 import services.read.verify_range
 import workers.assets.catalogue
@@ -24,7 +22,7 @@ from services.merge.dataset_card import describe_dataset
 from services.merge.merge import MergeResult, read_success
 from services.read.query import query
 from services.read.replay import open_context, replay_scene
-from services.read.scene_geometry import scene_glb
+from services.read.scene_geometry import posed_scene
 from tests.datasets import SMALL, faults_of, images_of, make_dataset, overlaid, run_here
 from workers.assets.catalogue import Catalogue, InstanceRef, open_cache
 from workers.store.images import decode_png
@@ -285,7 +283,7 @@ def test_shapes_are_made_once_and_are_the_same_in_ranges_of_any_size_in_an_exten
     (row,) = rows(store, "select bodies from scenes")
     assert len({body["instance_id"] for body in row["bodies"]}) == 1
     assert rows(store, "select count(*) as n from assets where category = 'mug'") == [{"n": 1}]
-    names = trimesh.load_scene(io.BytesIO(scene_glb(store, 0)), file_type="glb").graph.nodes_geometry
+    names = posed_scene(store, 0).graph.nodes_geometry
     assert len({name.partition("/")[0] for name in names if name.startswith("mug ")}) == 3
 
 
