@@ -22,7 +22,7 @@ from schemas.job.job import Job
 from schemas.scene.view import ROLES
 from services.dataset.pair import Files, Pair, read_pair
 from services.dataset.shapes import RangeFiles, StoredFiles
-from services.dataset.splits import split_by_category
+from services.dataset.splits import Splits, collect_ids, split_by_category
 from services.job.record import require_job
 from services.merge.merge import read_success
 from services.read.dataset_reader import find_records
@@ -121,10 +121,9 @@ class Dataset:
         The objects of the categories in `held_out` are all in test. What a dataset holds decides: after an extension ask
         again. The column `split` of `assets` follows from the id alone.
         """
-        found: dict[str, set[str]] = {}
-        for row in self.table("assets").to_table(columns=["instance_id", "category"]).to_pylist():
-            found.setdefault(row["category"], set()).add(row["instance_id"])
-        return split_by_category(found, self.job.assets.split, held_out)
+        rows = self.table("assets").to_table(columns=["instance_id", "category", "split"]).to_pylist()
+        splits = Splits(split_by_category(collect_ids([rows]), self.job.assets.split), frozenset(held_out))
+        return {row["instance_id"]: splits.of(row) for row in rows}
 
     def pairs(self, where: pc.Expression | None = None, part: tuple[int, int] = (0, 1)) -> Iterator[Pair]:
         """Every pair for which `where` is true, in order of pose id, one range of scenes in memory at a time.

@@ -81,7 +81,7 @@ class _Export:
         self._request, self._record, self._chooser, self._folder, self._codes = request, record, chooser, folder, codes
         begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
         asked, shares = request.choice, record.job.assets.split
-        self._splits = splits_of(request.store, codes, shares, asked.held_out, every=asked.split == "category")
+        self._splits = splits_of(request.store, codes, shares, asked.held_out, asked.split == "category")
         self._finished: bool = begun["finished"]
         self._next_scene: int = begun["next_scene"]
         self._counts, self._left_out = Counter(begun["counts"]), Counter(begun["left_out"])

@@ -1,7 +1,7 @@
 """What an export reads: the scenes and pairs of a dataset that were chosen, and the sources of their shapes."""
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -18,7 +18,7 @@ from schemas.errors import CorruptError, InputError, VersoError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
-from services.dataset.splits import split_by_category
+from services.dataset.splits import Splits, collect_ids, split_by_category
 from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
 from services.read.stored_tables import patch_paths, view_paths
@@ -127,36 +127,27 @@ def iter_ranges(store: Store, codes: NDArray[np.int64], first_scene: int) -> Ite
 
 
 def splits_of(
-    store: Store, codes: NDArray[np.int64], shares: SplitShares, held_out: Collection[str], every: bool
-) -> dict[str, str]:
-    """The splits by id of the instances in the ranges that `codes` name: of `every` one, or of those held out alone.
+    store: Store, codes: NDArray[np.int64], shares: SplitShares, held_out: Collection[str], by_category: bool
+) -> Splits:
+    """The splits of the instances in the ranges that `codes` name. Raises InputError for a category that none has."""
+    if not by_category and not held_out:
+        return Splits({})
+    columns = ["instance_id", "category"]
+    ids = collect_ids(
+        range_rows(store, records, "assets").select(columns).to_pylist() for records in iter_records(store, codes)
+    )
+    if unknown := sorted(set(held_out) - ids.keys()):
+        raise InputError(f"--held-out {unknown[0]}: the dataset has no such object; its are {', '.join(sorted(ids))}")
+    return Splits(split_by_category(ids, shares) if by_category else {}, frozenset(held_out))
 
-    Raises InputError for a category to be held out that no instance has.
-    """
-    found: dict[str, set[str]] = {}
-    for records in iter_records(store, codes) if every or held_out else ():
-        for row in range_rows(store, records, "assets").select(["instance_id", "category"]).to_pylist():
-            found.setdefault(row["category"], set()).add(row["instance_id"])
-    if unknown := sorted(set(held_out) - found.keys()):
-        raise InputError(f"--held-out {unknown[0]}: the dataset has no such object; its are {', '.join(sorted(found))}")
-    return split_by_category({key: found[key] for key in (found if every else held_out)}, shares, held_out)
 
-
-def scenes_of(
-    store: Store, stored: StoredRange, chosen: Sequence[int], splits: Mapping[str, str]
-) -> Iterator[ExportScene]:
-    """The chosen scenes of a range, in order. Files are read when they are asked for; tars are read once.
-
-    `splits`: of instances by id; of others that in `assets`.
-    """
+def scenes_of(store: Store, stored: StoredRange, chosen: Sequence[int], splits: Splits) -> Iterator[ExportScene]:
+    """The chosen scenes of a range, in order. Files are read when they are asked for; tars are read once."""
     if not chosen:
         return
     read_plain = _committed_reader(store, stored)
     read = file_reader(read_plain, stored)
-    assets = {
-        row["instance_id"]: {**row, "split": splits.get(row["instance_id"], row["split"])}
-        for row in stored.rows["assets"]
-    }
+    assets = {row["instance_id"]: {**row, "split": splits.of(row)} for row in stored.rows["assets"]}
     rows = {row["scene_id"]: row for row in stored.rows["scenes"]}
     for scene_id in chosen:
         pairs = tuple(

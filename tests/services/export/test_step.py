@@ -23,7 +23,8 @@ from schemas.job.assets import SplitShares
 from schemas.job.job import Job
 from schemas.scene.shape import Material, Part, Shape
 from services.cli.main import main
-from services.dataset.splits import split_by_category
+from services.dataset import splits
+from services.dataset.splits import Splits, collect_ids, split_by_category
 from services.export.folder import ExportFolder, Rounds
 from services.export.shapes import Shapes, color_vertices
 from services.export.source import iter_ranges, scenes_of, unchanged_sources
@@ -275,7 +276,7 @@ def test_an_image_that_is_lost_is_an_error_and_never_left_out(copy, tmp_path):
 
 
 def first_scene(store):
-    (scene,) = scenes_of(store, next(iter_ranges(store, list_codes(store), 0)), [0], {})
+    (scene,) = scenes_of(store, next(iter_ranges(store, list_codes(store), 0)), [0], Splits({}))
     return scene
 
 
@@ -287,7 +288,7 @@ def test_the_split_of_a_scene_is_the_strictest_of_its_objects(pile):
     assert scene.split == "test"
 
 
-def test_each_split_has_its_share_of_every_category_and_what_is_held_out_is_test_alone(files, tmp_path):
+def test_each_split_has_its_share_of_every_category_and_what_is_held_out_is_test_alone(files, tmp_path, monkeypatch):
     ids = {
         "laptop": [f"laptop-{k}" for k in range(30)],
         "jar": ["jar-1", "jar-2", "jar-3"],
@@ -302,8 +303,11 @@ def test_each_split_has_its_share_of_every_category_and_what_is_held_out_is_test
     place = {name: int(hashlib.sha256(name.encode()).hexdigest(), 16) for name in ids["laptop"]}
     order = sorted(place, key=place.get)  # as the column has them: by their hash
     assert [found[name] for name in order] == ["train"] * 24 + ["val"] * 3 + ["test"] * 3
-    held = split_by_category(ids, shares, ["jar"])
-    assert {held[name] for name in ids["jar"]} == {"test"} and held["laptop-0"] == found["laptop-0"]
+    rows = [{"category": "mug", "instance_id": f"mug-{k}", "split": "val"} for k in range(9)]
+    assert collect_ids([rows, rows]) == {"mug": {f"mug-{k}" for k in range(9)}}
+    monkeypatch.setattr(splits, "MOST_INSTANCES", 8)
+    assert collect_ids([rows[:5], rows]) == {"mug": None} and split_by_category({"mug": None}, shares) == {}
+    assert Splits({}).of(rows[0]) == "val" and Splits({"mug-0": "train"}, frozenset({"mug"})).of(rows[0]) == "test"
     assert set(split_by_category(ids, SplitShares(train=0.0, val=0.5, test=0.5)).values()) == {"val", "test"}
 
     def exported(name, **asked):
