@@ -35,12 +35,16 @@ ELSEWHERE = {
 FOR_A_WHILE = r"\./verso (serve|supervise|logs .*--follow)"
 """Commands that end when they are told to."""
 
+TINY = "--set captures.simulate.image_scale=0.3"
+
 SMALLER = {
     r"--scenes 600\b": "--scenes 16",
     r"^\./verso test$": "./verso test tests/test_layers.py",
     r"tests/hard_cases": "tests/test_layers.py",
     r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
     r"(\./verso tradeoff .*)": r"\1 --scenes 6 --physics-scenes 6 --laps 1 --knobs physics.step_hz",
+    r"(run deploy/jobs/captures.yaml)": r"\1 --scenes 1 --set captures.simulate.views=8 " + TINY,
+    r"--views 40 --category mug": f"--views 10 --category mug {TINY}",
     r"~/my_meshes": "meshes",
     r"/shared/": "shared/",
     r"s3://bucket/": "bucket/",

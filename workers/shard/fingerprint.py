@@ -128,12 +128,13 @@ def canary_digest(renderer: Renderer) -> str:
 
 
 def maths_digest() -> str:
-    """SHA-256, hex, of elementary functions, products and decompositions of fixed numbers, in about 10 ms.
+    """SHA-256, hex, of elementary functions, sums, products and decompositions of fixed numbers, in 10 ms.
 
     The C library chooses its own by the processor: without fused multiplication, scenes differ in their last bits.
     """
     numbers = [0.05 + 0.0037 * step for step in range(2000)]
     one = [function(x) for function in (*LIBM, math.exp, math.log, math.sqrt) for x in numbers]
+    one += [sum(numbers[:count]) for count in range(2, 200)]  # which Python 3.12 rounds once and 3.11 at every term
     two = [function(x, y) for function in (math.atan2, math.pow, math.hypot) for x, y in pairwise(numbers)]
     array = np.array(numbers)
     several = [function(array) for function in (np.exp, np.log, np.sin, np.cos, np.arctan)]
