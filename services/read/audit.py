@@ -1,23 +1,25 @@
 """`verso verify --independent N` and `--audit N`: labels derived a second time, and what was skipped proven not to matter.
 
 Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored. Approximations: the
-scene at rest is released again with every effect of physics on. Where MuJoCo is installed, it holds every scene as a
-referee (referee.py): its figures are told, and have no bound.
+scene at rest is released again with every effect of physics on, and must stay; and it is dropped again from its start. A drop
+is chaotic, so that single ends differ; what must agree is how far things go on average. Where MuJoCo is installed, it holds
+every scene as a referee (referee.py): its figures are told, and have no bound.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from schemas.base import Pose
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
 from schemas.dataset.shard import Fingerprint
 from schemas.errors import CorruptError, InputError, SceneError, plural
-from schemas.scene.scene import Placed, PosedScene, SceneOutput
+from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import Camera, View
 from services.job.record import require_job
@@ -30,7 +32,7 @@ from services.read.replay import compare_files, compare_rows, open_context
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px
-from workers.physics.settle import release_again
+from workers.physics.settle import release_again, settle_scene
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects
@@ -45,6 +47,9 @@ RELEASE_S = 1.0
 MOST_MM = 0.05
 MOST_DEG = 0.01
 """Largest motion of an object: a few pixels of a mask at most."""
+
+MOST_WAY = 0.05
+"""Largest change of the mean way from start to rest, as a share of an object's diagonal, when dropped with every effect."""
 
 EDGE_PX = 1.0 / 128.0
 """Rounding of vertices by the rasteriser: 1/256 px in each of two images."""
@@ -128,6 +133,61 @@ def shift_px(before: Placed, after: Placed, camera: Camera) -> float:
 
 
 @dataclass
+class Drops:
+    """Objects dropped again from their starts with every effect.
+
+    apart_m: how far their ends are from those of before; longer: by which share of their diagonals their ways across the
+    ground are longer; lost: how many came to no rest.
+    """
+
+    apart_m: list[float] = field(default_factory=list)
+    longer: list[float] = field(default_factory=list)
+    lost: int = 0
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Where the mean of `longer` lies, 95 %, by Student's t; nan of fewer than two."""
+        if len(self.longer) < 2:
+            return math.nan, math.nan
+        spread = float(np.std(self.longer, ddof=1)) / math.sqrt(len(self.longer))
+        half, mean = float(student_t.ppf(0.975, len(self.longer) - 1)) * spread, float(np.mean(self.longer))
+        return mean - half, mean + half
+
+    def add(self, starts: Sequence[ObjectStart], before: Sequence[Pose], after: Sequence[Pose]) -> None:
+        """Counts objects by where they began and their two ends, [4, 4] each."""
+        for start, one, other in zip(starts, before, after, strict=True):
+            com = start.asset.mass.com[None, :]
+            begun, first, second = (transform(T, com)[0] for T in (start.T_world_obj, one, other))
+            ways = [float(np.linalg.norm((end - begun)[:2])) for end in (first, second)]
+            self.apart_m.append(move_between(start.asset.shape, one, other).moved_mm / 1e3)
+            self.longer.append((ways[1] - ways[0]) / float(np.linalg.norm(start.asset.extents_m)))
+
+    def describe(self) -> str:
+        """One line."""
+        if not self.apart_m:
+            return f"  dropped again with every effect: nothing came to rest, {self.lost} did not"
+        near = sum(apart <= MOST_MM / 1e3 for apart in self.apart_m)
+        mean, low, high = (100.0 * share for share in (float(np.mean(self.longer)), *self.interval))
+        return (
+            f"  dropped again from the start with every effect: {near} of {plural(len(self.apart_m), 'object')} end in the same "
+            f"place, the farthest {max(self.apart_m) * 1e3:.1f} mm away; ways differ by {mean:+.2f} % of the diagonal on average "
+            f"[{low:+.2f}, {high:+.2f}]; {self.lost} came to no rest"
+        )
+
+
+def drop_again(context: WorkerContext, scene: Scene, drops: Drops) -> None:
+    """Drops the objects of a scene from their starts with every effect of physics, and counts where they end."""
+    facts = Facts(context.job, scene.plan, scene.raycast_checked)
+    try:
+        rest = settle_scene(scene.plan, context.job.physics, plan_effects(facts, names_of_kind("approximation")))
+    except SceneError:
+        drops.lost += len(scene.plan.objects)
+        return
+    before, after = ([each.T_world_obj for each in one] for one in (scene.settled, rest.settled))
+    drops.add(scene.plan.objects, before, after)
+
+
+@dataclass
 class IndependentVerdict:
     """Counts of what was derived, what has no second derivation for this job, and the faults, a sentence each."""
 
@@ -202,6 +262,7 @@ class Audit:
     """Scenes released again."""
     motion: Motion = field(default_factory=Motion)
     """Largest motion of any scene, and changed pixels of all."""
+    drops: Drops = field(default_factory=Drops)
     held: Held | None = None
     """What MuJoCo found; None where it is not installed."""
     effects: dict[str, Tally] = field(default_factory=dict)
@@ -224,6 +285,9 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     for scene_id in choose_scenes(store, count, record.job.seed):
         _audit_scene(context, store, scene_id, found)
         progress(found)
+    low, high = found.drops.interval
+    if low > MOST_WAY or high < -MOST_WAY:
+        found.faults.append(f"what was left out changes how far objects go: {found.drops.describe().strip()}")
     return found
 
 
@@ -253,6 +317,7 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Aud
         found.held = found.held.join(held or Held())
     if approximations:
         motion = measure_motion(context, scene)
+        drop_again(context, scene, found.drops)
         found.released += 1
         found.motion = found.motion.join(motion)
         released = f"scene {scene_id}, {', '.join(approximations)}: released with every effect"
@@ -322,6 +387,7 @@ def describe_audit(found: Audit) -> Iterator[str]:
         f"{motion.turned_deg:.5f} degrees; {motion.pixels_changed} mask pixels changed, {motion.pixels_outside} of them "
         "away from any silhouette"
     )
+    yield found.drops.describe()
     yield describe_held(found.held)
     for name, tally in found.effects.items():
         if tally.skipped:

@@ -13,6 +13,7 @@ from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.dataset.shard import JobChange, ShardOrder
 from schemas.errors import FingerprintError, plural
 from schemas.job.job import Job
+from services.job.idle_keys import describe_idle
 from services.job.record import JobRecord, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import write_card
 from services.merge.merge import MergeResult, merge
@@ -112,7 +113,7 @@ def open_inputs(request: RunRequest) -> tuple[Catalogue, Store]:
         require_tier(request.job.drawn)
         catalogue = open_sources(request.job, request.job_folder, watch)
         store = open_store(request.out)
-    for line in (*catalogue.describe_left_out(), *catalogue.describe_doubts()):
+    for line in (*describe_idle(request.job), *catalogue.describe_left_out(), *catalogue.describe_doubts()):
         print(f"verso: {line}", file=sys.stderr)
     return catalogue, store
 

@@ -51,7 +51,7 @@ ASKED: dict[str, Case] = {
     "antialiasing": _asked(RASTER, FLAT, "render.tier is flat"),
     "samples": _asked({"render": {"samples": 4}}, {}, "render.samples is 1"),
     "global_illumination": _asked(TRACED, {**TRACED, **RASTER}, "render.tier is raster"),
-    "glass": _asked(TRACED, {**TRACED, **RASTER}, "render.tier is raster"),
+    "glass": Case(Setting({**TRACED, "categories": ["bottle"]}, scene_id=1), Setting(TRACED), "no surface is of glass"),
     "sensor_depth_noise": _sensor("depth_noise"),
     "sensor_distortion": _sensor("distortion", k1=-0.1),
     "sensor_rgb_noise": _sensor("rgb_noise"),

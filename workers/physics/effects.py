@@ -22,6 +22,12 @@ ROUND_SHARE = 0.03
 """A stretch is round if the height of the centre of mass over it varies by less than this share: a prism of 13 sides or more.
 The height over the faces of a box grows by a sixth within 10 degrees."""
 
+TURN_RAD, RISE_SHARE = math.radians(61.0), 0.16
+"""The same of what begins tilted: a nut tips from one of its six sides to the next, over an edge that is 15 % higher."""
+
+TILTED_RAD = math.radians(1.0)
+"""What begins with a face of its hull closer to level than this is set down on it, and does not tip onto others."""
+
 SAME_PLANE_RAD = 0.02
 """Greatest angle between normals of one plane: a hull's faces are triangles, known to rounding."""
 
@@ -36,19 +42,28 @@ AT_REST = "placed in a statically stable pose"
 Predicate = Callable[[Sequence[ObjectStart], Table, Physics], str | None]
 
 
-def is_round(hull: Hull, com: Array) -> bool:
+def is_round(hull: Hull, com: Array, turn_rad: float = NEIGHBOUR_RAD, rise: float = ROUND_SHARE) -> bool:
     """Whether the object may rest on a stretch of its hull over which it rolls; com [3], object frame.
 
-    At rest the centre of mass is lower over the plane than over all its neighbours, and on a round stretch hardly lower
-    than over some of them.
+    At rest the centre of mass is lower over the plane than over all its neighbours, which are at most `turn_rad` on, and on a
+    round stretch lower than over some of them by at most the share `rise`.
     """
     normals = hull.normals[is_first(np.rint(hull.normals / CELL).astype(np.int64))]
-    return _rests_on_round(hull.vertices, normals, com, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
+    return _rests_on_round(hull.vertices, normals, com, math.cos(turn_rad), math.cos(SAME_PLANE_RAD), rise)
 
 
-@compiled_for("const(f8[:,::1]), f8[:,::1], const(f8[::1]), f8, f8")
-def _rests_on_round(points: Array, normals: Array, com: Array, far: float, near: float) -> bool:
-    """Whether com [3] is at most as high over a normal's plane as over its neighbours', and hardly lower than over one.
+def rolls(start: ObjectStart) -> bool:
+    """Whether an object rolls as it comes to rest: it is round, or begins tilted and tips easily from side to side."""
+    hull, com = start.hull, start.asset.mass.com
+    if is_round(hull, com):
+        return True
+    down = -start.T_world_obj[2, :3]
+    return bool((hull.normals @ down).max() < math.cos(TILTED_RAD)) and is_round(hull, com, TURN_RAD, RISE_SHARE)
+
+
+@compiled_for("const(f8[:,::1]), f8[:,::1], const(f8[::1]), f8, f8, f8")
+def _rests_on_round(points: Array, normals: Array, com: Array, far: float, near: float, rise: float) -> bool:
+    """Whether com [3] is at most as high over a normal's plane as over its neighbours', and over one higher by `rise` at most.
 
     points [V, 3] and normals [N, 3] of the hull. Most normals have a lower neighbour, and one that has none ends the search:
     few heights are ever asked for.
@@ -62,7 +77,7 @@ def _rests_on_round(points: Array, normals: Array, com: Array, far: float, near:
                 lowest = min(lowest, _height(points, normals, com, j, heights))
                 if lowest < here:
                     break
-        if here <= lowest <= here * (1.0 + ROUND_SHARE):
+        if here <= lowest <= here * (1.0 + rise):
             return True
     return False
 
@@ -144,7 +159,15 @@ def called_for_with(name: str, starts: Sequence[ObjectStart], physics: Physics) 
 
 
 def _rolling(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return None if any(is_round(start.hull, start.asset.mass.com) for start in starts) else "nothing here is round"
+    stated = physics.rolling_friction, physics.spinning_friction
+    if not any(stated):
+        return "physics.rolling_friction and physics.spinning_friction are 0"
+    if stated != _USUAL_ROLLING:  # asked for
+        return None
+    return None if any(rolls(start) for start in starts) else "nothing here is round"
+
+
+_USUAL_ROLLING = (Physics().rolling_friction, Physics().spinning_friction)
 
 
 PREDICATES: dict[str, Predicate] = {

@@ -157,6 +157,9 @@ _HOLES = _where(
 )
 
 
+_GLASS = _where(lambda facts: any(part.material.transmission > 0.0 for part in _parts(facts)), "no surface is of glass")
+
+
 def _floor(facts: Facts) -> str | None:
     return _outside(facts, facts.plan.floor.vertices)
 
@@ -232,7 +235,7 @@ TABLE: tuple[Effect, ...] = (
     Effect("antialiasing", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render"),
     Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "render"),
     Effect("global_illumination", "asked", _tier("pathtraced"), "render", _of_tier("pathtraced")),
-    Effect("glass", "asked", _tier("pathtraced"), "render", _of_tier("pathtraced")),
+    Effect("glass", "asked", _first_of(_tier("pathtraced"), _GLASS), "render", _of_tier("pathtraced")),
     *(Effect(f"sensor_{name}", "asked", _sensor(name), "sensor") for name in SensorEffects.model_fields),
     Effect("raycast_check", "asked", _RAYCAST, "raycast"),
     Effect("release_again", "asked", _RAYCAST, "recheck"),
