@@ -6,11 +6,12 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_serializer, model_validator
+from pydantic import SerializerFunctionWrapHandler as Dump
 
-from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight
+from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight, left_out
 from schemas.errors import did_you_mean
 
 
@@ -60,11 +61,18 @@ BUILT_IN: Mapping[str, Category] = {
         Category("bowl", 6, "crockery:make_bowl", "02880940"),
         Category("box", 7, "box:make_box", None),
         Category(TABLE, 8, "table:make_table", "04379243"),
+        Category("tray", 9, "table:make_tray", None),
+        Category("bin", 10, "table:make_bin", None),
     )
 }
 """The built-in categories by name."""
 
-CATEGORIES = tuple(name for name in BUILT_IN if name != TABLE)
+TableKind = Literal["table", "tray", "bin"]
+"""What a built-in table is; each is a row of `BUILT_IN`."""
+
+TABLE_KINDS: tuple[str, ...] = get_args(TableKind)
+
+CATEGORIES = tuple(name for name in BUILT_IN if name not in TABLE_KINDS)
 """The built-in categories of objects; the first eight are the article's."""
 
 IN_SHAPENET = tuple(name for name in CATEGORIES if BUILT_IN[name].synset)
@@ -184,6 +192,17 @@ class ProceduralSource(Frozen):
     """`article`: bounding-box diagonal `diagonal_m`; `metric`: the true size of such an object. Tables are metric."""
     diagonal_m: Positive = 0.25
     """Bounding-box diagonal of every object where `size` is `article`."""
+    kind: TableKind = "table"
+    """Of tables: a table; a tray with a rim of 2 to 6 cm; or a bin with walls of 12 to 26 cm. Both stand on legs."""
+
+    @model_serializer(mode="wrap")
+    def _leave_out_kind(self, dump: Dump) -> dict[str, Any]:
+        """A source is written, and digested, as it was before there were kinds."""
+        return left_out(dump(self), kind="table")
+
+    def named(self, category: str) -> str:
+        """The row of `BUILT_IN` that makes its instances of a category."""
+        return self.kind if category == TABLE else category
 
 
 class ShapeNetSource(Frozen):
@@ -326,3 +345,10 @@ class Assets(Frozen):
     """Density of a watertight solid."""
     shell_kg_m2: Positive = 3.0
     """Surface density of a mesh that is not watertight: its mass is that of a thin shell."""
+
+    @field_validator("objects")
+    @classmethod
+    def _are_objects(cls, sources: tuple[Source, ...]) -> tuple[Source, ...]:
+        if kinds := [one.kind for one in sources if isinstance(one, ProceduralSource) and one.kind != TABLE]:
+            raise ValueError(f"kind: {kinds[0]} makes what objects lie in: write it in a source of assets.tables")
+        return sources

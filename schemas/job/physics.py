@@ -1,12 +1,13 @@
 """The `start` and `physics` branches of a job: how objects begin, and how they come to rest."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import BeforeValidator, Field, PlainSerializer, model_serializer
+from pydantic import SerializerFunctionWrapHandler as Dump
 
-from schemas.base import Counts, Frozen, Interval, NonNegative, NonNegativeInt, Positive, Range, Share
+from schemas.base import Counts, Frozen, Interval, NonNegative, NonNegativeInt, Positive, Range, Share, left_out
 
-MOST_OBJECTS = 20
+MOST_OBJECTS = 50
 """Largest number of objects in a scene."""
 
 ONE_OBJECT = Counts(1, 1)
@@ -44,7 +45,14 @@ class Start(Frozen):
     clearance_m: Interval = Range(0.005, 0.05)
     """Height of the lowest point above the table, or above what is below it in a pile, at the start of a drop."""
     max_redraws: NonNegativeInt = 20
-    """Most redraws of a position that is not over the table or has no room."""
+    """Most redraws of a position that is not over the table or has no room, and of an object that leaves the table."""
+    if_lost: Literal["redraw", "remove", "fail"] = "redraw"
+    """What becomes of an object that leaves the table: it is dropped again from a new start, or removed, or the scene fails."""
+
+    @model_serializer(mode="wrap")
+    def _leave_out_if_lost(self, dump: Dump) -> dict[str, Any]:
+        """A start is written, and digested, as it was before objects were drawn again."""
+        return left_out(dump(self), if_lost="redraw")
 
 
 Collision = Literal["planned", "box", "hull", "parts"]

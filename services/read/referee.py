@@ -105,7 +105,7 @@ def _convex_parts(start: ObjectStart, physics: Physics) -> tuple[Sequence[Array]
     if len(parts) == 1:
         return parts, "as hulls, because they cannot be cut into parts"
     if start.asset.lofted is None:
-        return parts, "as CoACD's parts, which fill hollows by millimetres, being from files and not convex"
+        return parts, "as halved parts, which fill hollows by millimetres, being from files and not convex"
     return parts, "as parts from their making, not being convex"
 
 

@@ -53,17 +53,20 @@ class ProgressLine:
         if self._bar is not None:
             self._bar.total = asked
 
-    def show(self, done: int, failed: int | None = None) -> None:
-        """Shows the number done, and `failed` where failures are counted."""
+    def show(self, done: int, failed: int | None = None, name: str = "") -> None:
+        """Shows the number done, `failed` where failures are counted, and the name of the last one where it has one."""
         if self._bar is not None:
             self._bar.n = done
-            self._bar.set_postfix({} if failed is None else {"failed": failed}, refresh=True)
+            self._bar.set_postfix(
+                {"last": name} if name else {} if failed is None else {"failed": failed}, refresh=True
+            )
             return
         passed_s = time.monotonic() - self._begun
         if passed_s >= _line_s(self._lines):
             while passed_s >= _line_s(self._lines):
                 self._lines += 1
-            print(f"{self._what}: {_tell(done, self._asked, self._unit, failed, passed_s)}", file=sys.stderr)
+            last = f", last {name}" if name else ""
+            print(f"{self._what}: {_tell(done, self._asked, self._unit, failed, passed_s)}{last}", file=sys.stderr)
 
     def close(self) -> None:
         """Ends the bar."""

@@ -21,6 +21,7 @@ from services.run.coordinator import Coordinator, Limits
 from services.run.joining import Pattern, join_cluster, terms_of_driver, with_own_stack
 from services.run.lock import Lock, explain_lost_folder, hold_lock
 from services.run.metrics import Meter, Tally, serve
+from services.run.parts import find_parts
 from services.run.progress import ProgressLine, event_log, log_event, show_counts
 from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_shards, plan_spans
 from services.run.ray_cluster import Slots, open_ray, share_slots
@@ -115,6 +116,7 @@ def open_inputs(request: RunRequest) -> tuple[Catalogue, Store]:
         store = open_store(request.out)
     for line in (*describe_idle(request.job), *catalogue.describe_left_out(), *catalogue.describe_doubts()):
         print(f"verso: {line}", file=sys.stderr)
+    find_parts(request.job, catalogue)
     return catalogue, store
 
 

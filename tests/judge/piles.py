@@ -21,7 +21,7 @@ from services.read.referee import is_installed
 from tests.judge.scenes import CRASHED, Asked, Outcome, try_scene
 from tests.judge.table import describe, is_within, summary, tabulate
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.plan import SceneChance, plan_scene, pouring_of
 
 
 @functools.cache
@@ -33,11 +33,12 @@ def _catalogue(job_json: str) -> Catalogue:
 
 def try_pile(job: Job, asked: Asked, scene_id: int) -> Outcome:
     """A scene as its job draws it."""
+    chance = SceneChance(job.seed, scene_id)
     try:
-        plan = plan_scene(job, _catalogue(job.model_dump_json()), SceneChance(job.seed, scene_id))
+        plan = plan_scene(job, _catalogue(job.model_dump_json()), chance)
     except SceneError as error:
         return Outcome(scene_id, 0, 0.0, {}, error.reason, error.detail)
-    return try_scene(scene_id, plan, job.physics, asked)
+    return try_scene(scene_id, plan, job.physics, asked, pouring_of(job.start, chance, plan))
 
 
 def _try_hollow(job: Job, asked: Asked, scene_id: int) -> Outcome:
@@ -53,6 +54,11 @@ def main() -> int:
     document.pop("verso", None)
     job = Job.model_validate(document)
     changes = {"objects_per_scene": given.objects, "seed": given.seed}
+    if given.table:
+        document = {
+            **document,
+            "assets": {**document["assets"], "tables": [{"source": "procedural", "kind": given.table}]},
+        }
     job = Job.model_validate(document | {key: value for key, value in changes.items() if value is not None})
     if given.mujoco and not is_installed():
         print("NOT HELD IN MUJOCO: `mujoco` is not installed here, so its columns stay empty", file=sys.stderr)
@@ -79,6 +85,7 @@ def _arguments() -> argparse.Namespace:
     ask.add_argument("--scenes", type=int, default=200)
     ask.add_argument("--first", type=int, default=0, help="number of the first scene")
     ask.add_argument("--objects", type=int, help="objects in each scene, instead of the job's")
+    ask.add_argument("--table", choices=("table", "tray", "bin"), help="what objects fall onto or into")
     ask.add_argument("--seed", type=int, help="instead of the job's")
     ask.add_argument("--processes", type=int, default=1)
     ask.add_argument("--hollows", action="store_true", help="objects from files dropped into hollows from files")

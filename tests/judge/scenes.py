@@ -1,5 +1,6 @@
 """One scene through production's physics alone, judged, and let go again: figures in mm, degrees, shares and seconds."""
 
+import dataclasses
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -17,6 +18,7 @@ from workers.geometry.frames import transform
 from workers.physics import settle
 from workers.physics.effects import called_for
 from workers.physics.fall import FINEST
+from workers.physics.pour import NOTHING_MORE, Pouring
 from workers.physics.settle import recheck_scene, settle_scene
 
 PARTS = ("release", "rest")
@@ -52,6 +54,8 @@ class Outcome:
     turned_deg: float | None = None
     mujoco_mm: float | None = None
     mujoco_deg: float | None = None
+    redrawn: int = 0
+    """Starts that were drawn again because an object had left the table."""
 
     @property
     def worst(self) -> Verdict:
@@ -68,13 +72,15 @@ def worst_of(verdicts: Sequence[Verdict]) -> Verdict:
     )
 
 
-def try_scene(scene_id: int, plan: ScenePlan, physics: Physics, asked: Asked) -> Outcome:
+def try_scene(
+    scene_id: int, plan: ScenePlan, physics: Physics, asked: Asked, pouring: Pouring = NOTHING_MORE
+) -> Outcome:
     """Settle a scene and judge it. What it raises is told in the outcome."""
     effects = EffectPlan(tuple(sorted(called_for(plan.objects, plan.table, physics))), {})
     began = time.process_time()
     with _timed() as parts_s:
         try:
-            rest = settle_scene(plan, physics, effects)
+            rest = settle_scene(plan, physics, effects, pouring)
         except SceneError as error:
             refused, detail = error.reason, error.detail
         except Exception:
@@ -84,6 +90,7 @@ def try_scene(scene_id: int, plan: ScenePlan, physics: Physics, asked: Asked) ->
     seconds = time.process_time() - began
     if refused:
         return Outcome(scene_id, len(plan.objects), seconds, parts_s, refused, detail)
+    drawn, plan = plan, dataclasses.replace(plan, objects=rest.starts)
     began = time.process_time()
     verdicts = judge(things_at_rest(plan.objects, rest.settled), plan.table.mesh, physics.friction**2)
     judge_s = time.process_time() - began
@@ -106,6 +113,7 @@ def try_scene(scene_id: int, plan: ScenePlan, physics: Physics, asked: Asked) ->
         turned_deg=moved[1],
         mujoco_mm=None if held is None else held.moved_mm,
         mujoco_deg=None if held is None else held.turned_deg,
+        redrawn=sum(one.redraws for one in plan.objects) - sum(one.redraws for one in drawn.objects),
     )
 
 

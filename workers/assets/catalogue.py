@@ -105,7 +105,8 @@ class Catalogue:
         """Instance `index` of a category in a source, by its number among those of objects or of tables."""
         settings, listing = self._sources(category)[number]
         if isinstance(settings, ProceduralSource):
-            return InstanceRef(number, category, index, instance_id(category, settings.seed, index))
+            name = instance_id(settings.named(category), settings.seed, index)
+            return InstanceRef(number, category, index, name)
         assert listing is not None
         return InstanceRef(number, category, index, listing.entries[category][index].instance_id)
 

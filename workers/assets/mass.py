@@ -1,26 +1,52 @@
 """Pure: mass, centre of mass and inertia of a mesh, by exact integrals over its triangles."""
 
+import itertools
+
+import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
-from schemas.scene.shape import MassProperties, Shape
+from schemas.scene.shape import MassProperties, Mesh, Shape
 from workers.assets.external.mesh import is_solid
 from workers.geometry.jit import compiled_for
-from workers.geometry.mesh import bounds_of
+from workers.geometry.mesh import bounds_of, components, hold_to_one_thread, mesh_of, weld
+
+MOST_UNITED = 512
+"""Bodies of a file from which overlaps are not looked for: it takes as long as the pairs are many."""
+
+SAME = 1e-9
+"""Share of the volume below which an overlap is rounding."""
 
 
 def mass_properties(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> MassProperties:
     """Mass properties in the shape's own frame: of a solid where the shape is watertight, else of a thin shell.
 
     Watertight means: after merging vertices at one place over all parts, every body is closed and consistently wound.
-    Bodies are weighed one by one and added: where two closed bodies overlap, the overlap weighs twice, as glued pieces
-    would; a body wound inwards is a void and is taken away.
+    A body wound inwards is a void and is taken away. Where closed bodies overlap, their union is weighed.
     """
     vertices, faces = shape.vertices, shape.faces.astype(np.int64)
     if is_solid(vertices, faces):
-        return solid_mass(vertices, faces, density_kg_m3)
+        return solid_mass(*_united(vertices, faces), density_kg_m3)
     return shell_mass(vertices, faces, shell_kg_m2)
+
+
+def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """The surface of the union of closed bodies; as they are where none meet another, one is a void, or there are very many."""
+    bodies = components(weld(Mesh(vertices, faces.astype(np.int32))))
+    bounds = [bounds_of(body.vertices) for body in bodies[: MOST_UNITED + 1]]
+    if len(bounds) > MOST_UNITED or not any(
+        (a[0] < b[1]).all() and (b[0] < a[1]).all() for a, b in itertools.combinations(bounds, 2)
+    ):
+        return vertices, faces
+    hold_to_one_thread()
+    solids = [manifold3d.Manifold(manifold3d.Mesh64(body.vertices, body.faces.astype(np.uint64))) for body in bodies]
+    volumes = [solid.volume() for solid in solids]
+    united = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
+    if min(volumes) <= 0.0 or united.volume() >= (1.0 - SAME) * sum(volumes):
+        return vertices, faces
+    mesh = mesh_of(united)
+    return np.ascontiguousarray(mesh.vertices), mesh.faces.astype(np.int64)
 
 
 def solid_mass(vertices: Array, faces: np.ndarray, density_kg_m3: float) -> MassProperties:

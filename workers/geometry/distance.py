@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 
 
 @compiled
@@ -83,30 +83,41 @@ def distance_to_mesh(points: Array, mesh: Mesh) -> tuple[Array, NDArray[np.int64
     return distance, face
 
 
+@compiled_for("f8[:,:,::1]")
 def _build(corners: Array) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], NDArray[np.int64]]:
     """A balanced tree as a heap: (faces in order of the leaves; low, high [nodes, 3]; first, count [nodes] of each node's faces).
 
     Every node is halved at the median centre along its longest side.
     """
-    faces = len(corners)
-    depth = max(int(np.ceil(np.log2(faces / LEAF))), 0)
+    faces, depth = len(corners), 0
+    while LEAF << depth < faces:
+        depth += 1
     nodes = 2 ** (depth + 1) - 1
     order = np.arange(faces)
     first, count = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64)
     low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
-    centre, least, most = corners.mean(axis=1), corners.min(axis=1), corners.max(axis=1)
+    centre, least, most = np.empty((faces, 3)), np.empty((faces, 3)), np.empty((faces, 3))
+    for face in range(faces):
+        for k in range(3):
+            x, y, z = corners[face, 0, k], corners[face, 1, k], corners[face, 2, k]
+            centre[face, k], least[face, k], most[face, k] = (x + y + z) / 3.0, min(x, y, z), max(x, y, z)
     count[0] = faces
     for node in range(nodes):
         start, stop = first[node], first[node] + count[node]
         if start == stop:
             continue
-        mine = order[start:stop]
-        low[node], high[node] = least[mine].min(axis=0), most[mine].max(axis=0)
+        mine = order[start:stop].copy()
+        axis, longest = 0, -1.0
+        for k in range(3):
+            near, far = np.inf, -np.inf
+            for face in mine:
+                low[node, k], high[node, k] = min(low[node, k], least[face, k]), max(high[node, k], most[face, k])
+                near, far = min(near, centre[face, k]), max(far, centre[face, k])
+            if far - near > longest:
+                axis, longest = k, far - near
         if 2 * node + 2 < nodes:
-            middles = centre[mine]
-            axis = int(np.argmax(middles.max(axis=0) - middles.min(axis=0)))
             half = (stop - start) // 2
-            order[start:stop] = mine[np.argsort(middles[:, axis], kind="stable")]
+            order[start:stop] = mine[np.argsort(centre[mine, axis], kind="mergesort")]
             first[2 * node + 1], count[2 * node + 1] = start, half
             first[2 * node + 2], count[2 * node + 2] = start + half, stop - start - half
     return order, low, high, first, count

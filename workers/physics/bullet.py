@@ -125,6 +125,9 @@ MOST_KEPT = 64
 NO_THRESHOLD = 1e18
 """Bullet's default: contacts are solved as soon as they are predicted."""
 
+AWAY_M = 100.0
+"""Between bodies that are put away, and from the world's middle."""
+
 GroundShape = float | Mesh | Array | tuple[Mesh, ...]
 """Level ground at a height, metres, without an end; a mesh, or several; or the vertices [N, 3] of a convex body."""
 
@@ -177,6 +180,14 @@ class World:
         """
         asleep = pybullet.ACTIVATION_STATE_SLEEP
         pybullet.changeDynamics(self.bodies[body], -1, activationState=asleep, physicsClientId=self.client)
+
+    def put_away(self, body: int) -> None:
+        """Hold a body for ever where nothing meets it, at the height that it has."""
+        (_, _, z), _ = self.pose(body)
+        at = [AWAY_M * (body + 1), 0.0, z]
+        pybullet.changeDynamics(self.bodies[body], -1, mass=0.0, physicsClientId=self.client)
+        pybullet.resetBasePositionAndOrientation(self.bodies[body], at, [0, 0, 0, 1], physicsClientId=self.client)
+        self.set_velocity((0.0, 0.0, 0.0), body=body)
 
     def set_restitution(self, restitution: float) -> None:
         """Set the restitution of ground and bodies; a contact's is the product of the two.

@@ -181,6 +181,12 @@ PREDICATES: dict[str, Predicate] = {
 }
 
 
+REMOVED = "lost_removed"
+
+ONLY_LATE: dict[str, str] = {REMOVED: "an object left the table's top"}
+"""Effects that are in no plan, and in the receipt only where they ran, and why each does."""
+
+
 def called_for(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> frozenset[str]:
     """The names of the effects of physics that these objects need."""
     return frozenset(name for name, skipped in PREDICATES.items() if skipped(starts, table, physics) is None)

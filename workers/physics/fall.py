@@ -190,7 +190,7 @@ class Outcome:
 
     speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and simulation.
     stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its bound.
-    face: of its hull that an object stands on, where that ended it.
+    face: of its hull that an object stands on, where that ended it. lost: the numbers of those that were put away.
     """
 
     poses: tuple[Pose, ...]
@@ -200,6 +200,7 @@ class Outcome:
     stopped_by: str | None = None
     rise: float = 0.0
     face: Face | None = None
+    lost: tuple[int, ...] = ()
 
 
 def choose_steps(
@@ -230,12 +231,14 @@ def fall(
     sleeping: bool = False,
     standing: StandingCondition | None = None,
     reach_m: float = math.inf,
+    leaves: StopCondition | None = None,
 ) -> Outcome:
     """Release objects at `poses` (`T_world_obj`) until all rest, `physics.max_settle_s` is over, or a stop condition holds.
 
     The first `free_m` metres are fallen in closed form, which is exact: nothing turns in the air. sleeping: what rests costs no
     time until something that moves touches it. standing: ends the fall of a single object sooner. reach_m: contact distance, if
-    less than Bullet's own; on a mesh it follows from the steps.
+    less than Bullet's own; on a mesh it follows from the steps. leaves: what holds of an object that is put away, while the
+    others go on.
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)
     placed = [(one, translation(0, 0, -fallen_m) @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
@@ -247,7 +250,7 @@ def fall(
     with open_world(placed, ground, physics, steps.looked, reach_m, steps.kept) as world:
         for number in range(len(bodies)):
             world.set_velocity((0.0, 0.0, -speed_m_s), body=number)
-        outcome = _simulate(world, bodies, physics, steps, end_s, stops or {}, sleeping, standing)
+        outcome = _simulate(world, bodies, physics, steps, end_s, stops or {}, sleeping, standing, leaves)
     ended = tuple(T @ invert(one.T_obj_body) for T, one in zip(outcome.poses, bodies, strict=True))
     return dataclasses.replace(outcome, poses=ended, seconds=outcome.seconds + fallen_s)
 
@@ -270,6 +273,7 @@ def _simulate(
     stops: Mapping[str, StopCondition],
     sleeping: bool,
     standing: StandingCondition | None,
+    leaves: StopCondition | None,
 ) -> Outcome:
     """Step until all rest, the time is over or a stop condition holds; the poses are those of the body frames.
 
@@ -284,6 +288,7 @@ def _simulate(
     time, rate, bounces, asked = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0, -1.0
     moving = [world.velocity(k) for k in range(len(bodies))]
     speeds, energy = _speeds(bodies, moving), EnergyRecord(bodies, [one.anchor for one in still], moving)
+    lost = list[int]()
     while True:
         wanted = steps.rate_hz(max(speeds))
         if bounces and max(speeds) < BOUNCES_M_S:
@@ -297,10 +302,17 @@ def _simulate(
             at, moving = [world.pose(k) for k in range(len(bodies))], [world.velocity(k) for k in range(len(bodies))]
             energy.add(at, moving)
         time += SAMPLE_STEPS / rate
+        for number in range(len(bodies)):
+            if leaves is not None and number not in lost and leaves(number, at[number]):
+                world.put_away(number)
+                lost.append(number)
+                at[number], moving[number] = world.pose(number), world.velocity(number)
         speeds = _speeds(bodies, moving)
         for name, stop in stops.items():
             if any(stop(number, one) for number, one in enumerate(at)):
-                return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, name)
+                return Outcome(
+                    tuple(map(as_pose, at)), max(speeds), time, False, name, energy.rise() if name == "below" else 0.0
+                )
         for number, (one, now, body, speed) in enumerate(zip(still, at, bodies, speeds, strict=True)):
             turned = _angle(one.anchor[1], now[1])
             one.moved_m = math.dist(one.anchor[0], now[0]) + turned * body.reach_m
@@ -313,7 +325,7 @@ def _simulate(
             asked, face = time, standing(at[0], moving[0])
         if face is not None or all(time - one.since >= rest.window_s for one in still):
             drift_m_s = max(one.moved_m / (time - one.since) for one in still)
-            return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True, rise=energy.rise(), face=face)
+            return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True, None, energy.rise(), face, tuple(lost))
         if time >= end_s:
             return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, rise=energy.rise())
 

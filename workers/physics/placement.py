@@ -21,7 +21,7 @@ from workers.physics.exact_rest import FALL_M, Inertia, Motion, Thing, step
 from workers.physics.support import support_margin
 
 FARTHEST_M = 0.01
-"""Farthest distance that is measured: CoACD's parts stand out of a surface by less."""
+"""Farthest distance that is measured: convex parts stand out of a surface by less."""
 
 NEAR_M = 1e-3
 """Distance within which others are looked for first: what rests has one."""

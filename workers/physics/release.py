@@ -39,6 +39,7 @@ from workers.physics.fall import (
     strays,
 )
 from workers.physics.placement import Placement, farthest_m
+from workers.physics.pour import NOTHING_MORE, Pouring
 from workers.physics.rigid_body import build_body, choose_collision_shape, make_body
 from workers.physics.support import inside_margin, split_by_side
 
@@ -105,7 +106,8 @@ PACES_MANY = (Pace(rate=0.5, iterations=0.25, window=0.1, speed=10.0, thin=0.25,
 class Drop:
     """Objects to be released over a table, with the settings and the plan of effects.
 
-    room_m: how far the centre of mass of a single object may go sideways.
+    room_m: how far the centre of mass of a single object may go sideways. lying, ready: the numbers of those that have fallen
+    already, and of those that were drawn again and start from where they are.
     """
 
     starts: tuple[ObjectStart, ...]
@@ -113,6 +115,9 @@ class Drop:
     physics: Physics
     effects: EffectPlan
     room_m: float = math.inf
+    pouring: Pouring = NOTHING_MORE
+    lying: frozenset[int] = frozenset()
+    ready: frozenset[int] = frozenset()
 
     @property
     def many(self) -> bool:
@@ -129,7 +134,7 @@ class Drop:
         """The paces to fall at, and those to fall at once more where what comes to rest is refused."""
         if self.single:
             return (PACES,)
-        if len(self.starts) >= CROWD:
+        if len(self.starts) >= CROWD and not self.pouring.waves:
             return (PACES_TOGETHER[-1:],)
         return (PACES_MANY[:1], PACES_MANY[1:]) if self.many else (PACES_TOGETHER, PACES_TOGETHER[-1:])
 
@@ -163,7 +168,9 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
     steps = dataclasses.replace(steps, looked=looked, kept=pace.kept)
     reach_m = max(body.reach_m for body in bodies)
     lowest_m = table.top.height_m - LEFT_M if drop.many else float(table.mesh.vertices[:, 2].min())
-    stops = {"below": falls_below(lowest_m - reach_m)}
+    below = falls_below(lowest_m - reach_m)
+    goes_on = drop.pouring.goes_on and not drop.single
+    stops = {} if goes_on else {"below": below}
     ground: GroundShape = table.mesh
     standing = None
     if flat and drop.single and physics.exact_rest:
@@ -171,12 +178,14 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
     if flat and not drop.many:
         hover_m = bodies[0].margin_m * (1.0 - SLOP_SHARE)
         ground, stops = table.top.height_m - hover_m, {"edge": leaves_outline(table.top.outline, reach_m)}
+        goes_on = False
     elif flat:
         levels = (np.full((len(table.top.outline), 1), z) for z in (table.top.height_m, table.top.height_m - PRISM_M))
         ground = np.concatenate([np.hstack([table.top.outline, level]) for level in levels])
     if math.isfinite(drop.room_m):
         stops["room"] = strays((poses[0] @ bodies[0].T_obj_body)[None, :2, 3], drop.room_m)
-    return fall(bodies, poses, ground, physics, steps, free_m, stops, drop.many, standing)
+    leaves = below if goes_on else None
+    return fall(bodies, poses, ground, physics, steps, free_m, stops, drop.many, standing, leaves=leaves)
 
 
 def settings_of(drop: Drop, pace: Pace) -> Physics:

@@ -16,7 +16,7 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, SupportedBy
 from workers.geometry.frames import motion_between, transform, translation
-from workers.physics.effects import called_for_with, rooms_m
+from workers.physics.effects import ONLY_LATE, REMOVED, called_for_with, rooms_m
 from workers.physics.exact_rest import rest
 from workers.physics.fall import FINEST, Outcome
 from workers.physics.placement import (
@@ -33,6 +33,7 @@ from workers.physics.placement import (
     place_on_top,
     placed_mesh,
 )
+from workers.physics.pour import NOTHING_MORE, LostError, Pouring, lift, moved_to, next_wave, points_of, renumbered
 from workers.physics.release import LEFT_M, Drop, Pace, hold, let_go, release
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
@@ -50,8 +51,8 @@ MOST_RELEASES = 3
 """Times that objects are released, each from where exact rest gave up the time before."""
 
 
-class UnsupportedError(SettleError):
-    """No balance was found, or none that holds."""
+class UnsupportedError(LostError):
+    """No balance was found, or none that holds, for these objects."""
 
 
 class LeftRoomError(Exception):
@@ -69,16 +70,16 @@ class _Ending:
     speed_m_s: float = 0.0
 
 
-def settle(drop: Drop) -> tuple[Settled, ...]:
-    """Settle a single object, or several that may touch one another.
+def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
+    """Settle a single object, or several that may touch one another; with where each began, and without what was removed.
 
     Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`, and LeftRoomError
     where a single object leaves its room.
     """
-    forms = forms_of(drop.starts)
+    forms, again = forms_of(drop.starts), dict[int, int]()
     if not drop.effects.runs("dynamics"):
         poses = tuple(start.T_world_obj for start in drop.starts)
-        return _describe(_Ending(drop, _place(drop, poses, forms), poses), "placed", judged=True)
+        return drop.starts, _describe(_Ending(drop, _place(drop, poses, forms), poses), "placed", judged=True)
     for i, j, depth_m in find_overlaps_m(forms, [start.T_world_obj for start in drop.starts]):
         if depth_m > PLACED_M:
             raise SettleError(
@@ -87,7 +88,39 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
                 "another: let them go apart, or one above the other",
             )
     if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
-        return _describe(placed, _support_of(placed), judged=True)
+        return drop.starts, _describe(placed, _support_of(placed), judged=True)
+    while True:
+        try:
+            return drop.starts, _settle_in_ways(drop, forms)
+        except LostError as lost:
+            drop = _without_lost(drop, lost, again)
+            forms = forms_of(drop.starts)
+
+
+def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
+    """The drop once more, with what was lost drawn again above what has fallen, or removed; raises `lost` where neither may be.
+
+    again: how often each was drawn, by its region, which is counted.
+    """
+    pouring, starts = drop.pouring, list(moved_to(drop.starts, lost.poses))
+    kept = [number for number in range(len(starts)) if number not in lost.numbers]
+    if pouring.remove and kept and lost.reason == "left_table":
+        lying, ready = (frozenset(kept.index(n) for n in kept if n in of) for of in (lost.fallen, drop.ready))
+        starts = [starts[number] for number in kept]
+        return dataclasses.replace(drop, starts=renumbered(starts), lying=lying, ready=ready)
+    there = [points_of(starts[number]) for number in sorted(lost.fallen)]
+    for number in lost.numbers:
+        region = starts[number].region_id
+        again[region] = again.get(region, 0) + 1
+        if pouring.draw is None or again[region] > pouring.most:
+            raise lost
+        starts[number] = pouring.draw(drop.starts[number], again[region], there)
+        there.append(points_of(starts[number]))
+    ready = drop.ready.union(lost.numbers)
+    return dataclasses.replace(drop, starts=tuple(starts), lying=lost.fallen, ready=ready)
+
+
+def _settle_in_ways(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
     *earlier, last = drop.ways
     for paces in earlier:
         with suppress(UnsupportedError):
@@ -127,7 +160,11 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
     as they tip or slip, and released again where that takes them far.
     """
-    seconds, placement = 0.0, None
+    poured = _pour(drop, flat)
+    if poured is None:
+        return None
+    drop, seconds = poured
+    placement = None
     for _ in range(MOST_RELEASES):
         outcome = release(drop, flat, paces)
         if outcome.stopped_by == "room":
@@ -146,13 +183,50 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
         rested = hold(drop, placement, outcome.poses)
         if rested.still:
             return dataclasses.replace(ending, poses=rested.poses)
+        moved_m = [
+            farthest_m([one], [before], [after])
+            for one, before, after in zip(drop.starts, outcome.poses, rested.poses, strict=True)
+        ]
         starts = (dataclasses.replace(one, T_world_obj=T) for one, T in zip(drop.starts, rested.poses, strict=True))
         drop = dataclasses.replace(drop, starts=tuple(starts))
+    every = range(len(drop.starts))
     raise UnsupportedError(
         "unsupported",
         f"{'it tips or slips' if drop.single else 'something tips or slips'} on without end: released {MOST_RELEASES} times, "
         f"for {seconds:.1f} s in all, it never came into balance: lower physics.rest.speed_mm_s, or raise physics.friction",
+        [int(np.argmax(moved_m))],
+        rested.poses,
+        every,
     )
+
+
+def _pour(drop: Drop, flat: bool) -> tuple[Drop, float] | None:
+    """The drop with all waves but the last where they lie, after so many seconds; None where one left the flat top."""
+    count, seconds = len(drop.starts), 0.0
+    while drop.pouring.waves:
+        wave = next_wave(count, drop.lying)
+        starts = list(drop.starts)
+        for number in wave if drop.lying else ():
+            if number not in drop.ready:
+                now = [starts[each] for each in sorted(drop.lying.union(wave[: wave.index(number)]))]
+                starts[number] = lift(drop.starts, now, number, drop.table)
+        drop = dataclasses.replace(drop, starts=tuple(starts), ready=drop.ready.union(wave))
+        part = sorted(drop.lying.union(wave))
+        if len(part) == count:
+            break
+        few = dataclasses.replace(drop, starts=tuple(starts[number] for number in part))
+        outcome = release(few, flat, few.ways[0][:1])
+        if outcome.stopped_by == "edge":
+            return None
+        seconds += outcome.seconds
+        poses = [start.T_world_obj for start in starts]
+        for number, T in zip(part, outcome.poses, strict=True):
+            poses[number] = T
+        _require_calm(
+            drop, dataclasses.replace(outcome, poses=tuple(poses), lost=tuple(part[k] for k in outcome.lost)), part
+        )
+        drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part))
+    return drop, seconds
 
 
 def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
@@ -184,12 +258,14 @@ def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     return _Ending(drop, place_on_top(start, T, table, drop.physics.friction**2), (T,), seconds, outcome.speed_m_s)
 
 
-def _require_calm(drop: Drop, outcome: Outcome) -> None:
-    if outcome.rested:
+def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = None) -> None:
+    """Raises SettleError where objects were lost or still move; fallen: the numbers of those that were let go, if not all."""
+    known = range(len(drop.starts)) if fallen is None else list(fallen)
+    coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
+    if outcome.rested and not outcome.lost:
         return
-    for start, T in zip(drop.starts, outcome.poses, strict=True):
-        if _is_low(drop, _com(start, T)[2]):
-            raise _left_table(drop, start, T, outcome.seconds)
+    if lost := outcome.lost or [number for number in known if _is_low(drop, coms[number][2])]:
+        raise _left_table(drop, lost, outcome.poses, outcome.seconds, known)
     raise SettleError(
         "not_at_rest",
         f"{'still moving' if drop.single else 'something still moves'} at {outcome.speed_m_s * 1e3:.2f} mm/s after "
@@ -205,27 +281,33 @@ def _com(start: ObjectStart, T: Pose) -> list[float]:
     return list(transform(T, start.asset.mass.com[None])[0].tolist())
 
 
-def _left_table(drop: Drop, start: ObjectStart, T: Pose, seconds: float) -> SettleError:
-    x, y, z = _com(start, T)
+def _left_table(
+    drop: Drop, lost: Sequence[int], poses: Sequence[Pose], seconds: float, fallen: Iterable[int]
+) -> LostError:
+    start = drop.starts[lost[0]]
+    x, y, z = _com(start, poses[lost[0]])
     whose, advice = "", "narrow start.offset_m or use larger tables"
     if not drop.single:
         whose = f" of region {start.region_id}"
         advice = "fewer objects_per_scene, a narrower start.offset_m or larger tables"
-    return SettleError(
-        "left_table",
-        f"after {seconds:.2f} s the centre of mass{whose} was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off the table's top: {advice}",
-    )
+    told = f"after {seconds:.2f} s the centre of mass{whose} was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off the table's top: {advice}"
+    return LostError("left_table", told, lost, poses, fallen)
 
 
 def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Settled, ...]:
     """The rest poses with their figures, measured between the true meshes and not taken from the simulator."""
-    supports = measure_supports(ending.placement, ending.poses)
-    for start, T, held in zip(ending.drop.starts, ending.poses, supports, strict=True):
-        # What is this low may hang on the table by a handle, or stand on its foot
-        if _is_low(ending.drop, _com(start, T)[2]) and _is_low(ending.drop, held.highest_m):
-            raise _left_table(ending.drop, start, T, ending.seconds)
-        if judged:
-            _require_support(ending.drop, start, held)
+    drop, supports = ending.drop, measure_supports(ending.placement, ending.poses)
+    each = list(zip(drop.starts, ending.poses, supports, strict=True))
+    # What is this low may hang on the table by a handle, or stand on its foot
+    low = [
+        n
+        for n, (start, T, held) in enumerate(each)
+        if _is_low(drop, _com(start, T)[2]) and _is_low(drop, held.highest_m)
+    ]
+    if low:
+        raise _left_table(drop, low, ending.poses, ending.seconds, range(len(each)))
+    for number in range(len(each)) if judged else ():
+        _require_support(ending, number, supports[number])
     return tuple(
         Settled(
             T_world_obj=frozen_array(T),
@@ -242,16 +324,19 @@ def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Sett
     )
 
 
-def _require_support(drop: Drop, start: ObjectStart, held: Support) -> None:
-    """Raises SettleError `unsupported` where an object overlaps another or the table, hovers, or is out of balance."""
+def _require_support(ending: _Ending, number: int, held: Support) -> None:
+    """Raises UnsupportedError where an object overlaps another or the table, hovers, or is out of balance."""
     if abs(held.gap_m) <= TOUCHING_M and held.unbalanced <= UNBALANCED:
         return
-    where = "inside what it touches" if held.gap_m < 0.0 else "from anything"
+    drop, where = ending.drop, "inside what it touches" if held.gap_m < 0.0 else "from anything"
     raise UnsupportedError(
         "unsupported",
-        f"{'it' if drop.single else f'region {start.region_id}'} came to rest {abs(held.gap_m) * 1e3:.3f} mm {where}, with "
-        f"{held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and {UNBALANCED:.1%}: "
-        "lower physics.rest.speed_mm_s",
+        f"{'it' if drop.single else f'region {drop.starts[number].region_id}'} came to rest {abs(held.gap_m) * 1e3:.3f} mm "
+        f"{where}, with {held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and "
+        f"{UNBALANCED:.1%}: lower physics.rest.speed_mm_s",
+        [number],
+        ending.poses,
+        range(len(drop.starts)),
     )
 
 
@@ -267,13 +352,14 @@ LEFT_TOP, LEFT_ROOM = "a footprint left the table's flat top", "an object left t
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Every object of a scene at rest, and the reasons why effects that the plan had skipped ran after all."""
+    """Every object of a scene at rest, with where each began at last, and effects that the plan had skipped and why they ran."""
 
+    starts: tuple[ObjectStart, ...]
     settled: tuple[Settled, ...]
     called: Mapping[str, str] = field(default_factory=dict)
 
 
-def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest:
+def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, pouring: Pouring = NOTHING_MORE) -> Rest:
     """Drop the scene's objects, wait until they rest, and correct the simulator's gap and tilt of single ones.
 
     Objects that cannot meet settle one by one. Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`,
@@ -281,27 +367,51 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
     """
     starts, table, called = plan.objects, plan.table, dict[str, str]()
     if len(starts) > 1 and effects.runs("object_contacts"):
-        settled = settle(Drop(starts, table, physics, effects))
+        began, settled = settle(Drop(starts, table, physics, effects, pouring=pouring))
     else:
         try:
-            rooms = zip(starts, rooms_m(starts), strict=True)
-            settled = tuple(settle(Drop((start,), table, physics, effects, room_m))[0] for start, room_m in rooms)
+            began, settled = _settle_alone(plan, physics, effects, pouring)
         except LeftRoomError:
             called = dict.fromkeys(called_for_with("object_contacts", starts, physics), LEFT_ROOM)
-            settled = settle(Drop(starts, table, physics, add_effects(effects, called)))
+            began, settled = settle(Drop(starts, table, physics, add_effects(effects, called), pouring=pouring))
     if any(rest.support == "mesh" for rest in settled):
         called |= dict.fromkeys(called_for_with("table_mesh", starts, physics), LEFT_TOP)
-    return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
+    if len(began) < len(starts):
+        called[REMOVED] = ONLY_LATE[REMOVED]
+    return Rest(began, settled, {name: why for name, why in called.items() if not effects.runs(name)})
+
+
+def _settle_alone(
+    plan: ScenePlan, physics: Physics, effects: EffectPlan, pouring: Pouring
+) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
+    """Objects that cannot meet, one by one, without those that leave the table where these are removed."""
+    began, settled, alone = list[ObjectStart](), list[Settled](), len(plan.objects) == 1
+    for start, room_m in zip(plan.objects, rooms_m(plan.objects), strict=True):
+        try:
+            (one,), (rest,) = settle(
+                Drop((start,), plan.table, physics, effects, room_m, pouring if alone else NOTHING_MORE)
+            )
+        except LostError as lost:
+            if pouring.draw is not None and not alone:
+                raise LeftRoomError from None  # a new start has another room
+            if not pouring.remove or alone or lost.reason != "left_table":
+                raise
+            continue
+        began.append(one)
+        settled.append(rest)
+    if not began:
+        raise SettleError("left_table", "every object left the table's top: narrow start.offset_m or use larger tables")
+    return renumbered(began), tuple(settled)
 
 
 def recheck_scene(
     plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan, level_rate: float = RECHECK_RATE
 ) -> Rest:
     """The same rest, with the motion of every object after a second release of all. level_rate: as of `release_again`."""
-    effects = add_effects(effects, rest.called)
+    effects, plan = add_effects(effects, rest.called), dataclasses.replace(plan, objects=rest.starts)
     poses = release_again(plan, rest.settled, physics, effects, RECHECK_S, level_rate)
     settled = []
-    for start, before, after in zip(plan.objects, rest.settled, poses, strict=True):
+    for start, before, after in zip(rest.starts, rest.settled, poses, strict=True):
         moved_mm, turned_deg = moved_by(start, before.T_world_obj, after)
         settled.append(dataclasses.replace(before, recheck_move_mm=moved_mm, recheck_turn_deg=turned_deg))
     return dataclasses.replace(rest, settled=tuple(settled))

@@ -21,7 +21,7 @@ from schemas.scene.shape import Part
 from schemas.scene.view import VIEW_ROLES, Camera, Role
 from workers.geometry.camera import is_outside_views
 from workers.geometry.colour import has_holes
-from workers.physics.effects import PREDICATES
+from workers.physics.effects import ONLY_LATE, PREDICATES
 from workers.scene.pairs import place_beside, place_mirror_camera
 from workers.scene.plan import SceneChance, Stream
 
@@ -49,7 +49,7 @@ class Effect:
     name: str
     kind: EffectKind
     skipped_because: Reason | None
-    """Of scenes; None where they do not have the effect."""
+    """Of scenes; None where they do not have the effect, or where no scene is known to call for it before it runs."""
     stage: str
     in_captures: CaptureReason | None = None
     """Of simulated captures; None where they do not have it."""
@@ -86,7 +86,7 @@ def write_receipt(plan: EffectPlan, called: Iterable[str] = ()) -> tuple[list[st
     `called` names effects that the plan had left out and that were found to be called for after all: they ran.
     """
     late = frozenset(called)
-    ran = [effect.name for effect in EFFECTS if plan.runs(effect.name) or effect.name in late]
+    ran = [effect.name for effect in TABLE if plan.runs(effect.name) or effect.name in late]
     return ran, [{"effect": name, "why": why} for name, why in plan.skipped.items() if name not in late]
 
 
@@ -224,6 +224,7 @@ CAPTURE_EFFECTS: tuple[str, ...] = tuple(name for name, key in Simulate.model_fi
 
 TABLE: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,
+    *(Effect(name, "asked", None, "physics") for name in ONLY_LATE),
     *(Effect(str(role.effect), "asked", _stored(role.name), "render") for role in VIEW_ROLES.values() if role.beside),
     Effect("mirror", "asked", _stored("mirror"), "render"),
     Effect("projection", "asked", _PROJECTION, "projection"),

@@ -1,7 +1,7 @@
 """One scene from its id to what is written: the list of steps."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from workers.physics.settle import recheck_scene, settle_scene
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene, plan_effects
 from workers.scene.pairs import SettledScene, make_pair
-from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.plan import SceneChance, plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
 
 
@@ -44,7 +44,8 @@ def make_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> S
         facts = Facts(job, plan, is_raycast_scene(job.check, chance))
         effects = plan_effects(facts, context.forced).without(*context.withdrawn)
     with stopwatch.stage("physics", "dynamics" if effects.runs("dynamics") else None):
-        rest = settle_scene(plan, job.physics, effects)
+        rest = settle_scene(plan, job.physics, effects, pouring_of(job.start, chance, plan))
+    plan = replace(plan, objects=rest.starts)
     if effects.runs("release_again"):
         with stopwatch.stage("recheck", "release_again"):
             rest = recheck_scene(plan, rest, job.physics, effects)

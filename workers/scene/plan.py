@@ -4,7 +4,8 @@ Each step has a named stream of random numbers. Several objects begin each on a 
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -22,6 +23,7 @@ from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choo
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
+from workers.physics.pour import Pouring, points_of
 from workers.physics.support import place_table, sample_elevation, support_height, support_margin
 
 
@@ -44,6 +46,7 @@ class Stream(IntEnum):
     HIDDEN_MARKERS = 13
     MOTION = 14
     HELD_OUT = 15
+    LOST = 16
 
 
 @dataclass(frozen=True)
@@ -73,11 +76,6 @@ _ANGLES = math.pi * np.arange(90) / 90
 AXES = frozen_array(np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1))
 """[90, 2] the horizontal axes that are tried for a separating plane. None is further than 1 degree from the best one, so
 that two footprints of 0.2 m that are more than 4 mm apart are found to be so."""
-
-
-def points_of(start: ObjectStart) -> Array:
-    """[N, 3] world: the corners of an object's hull where it begins."""
-    return transform(start.T_world_obj, start.hull.vertices)
 
 
 def columns_apart(points: Array, others: Array) -> bool:
@@ -157,9 +155,43 @@ def draw_start(
     A position with no table under the centre of mass, or in the column of an earlier object, is redrawn. In a pile an
     object begins above all earlier ones, about the place of the first.
     """
-    number, piled, others = len(earlier), bool(earlier) and spec.arrange == "pile", [points_of(one) for one in earlier]
-    middle, reach = (earlier[0].T_world_obj[:2, 3], spec.pile_offset_m) if piled else (np.zeros(2), spec.offset_m)
+    number = len(earlier)
+    others = [points_of(one) for one in earlier]
+    middle = earlier[0].T_world_obj[:2, 3] if earlier and spec.arrange == "pile" else np.zeros(2)
     rng = chance.object_stream(Stream.START, number)
+    return _find_place(
+        spec, (rng, lambda: chance.object_stream(Stream.REDRAW, number)), (asset, number), table, others, middle
+    )
+
+
+def pouring_of(spec: Start, chance: SceneChance, plan: ScenePlan) -> Pouring:
+    """How the scene's objects are let go, and drawn again where they leave the table, each from its own stream.
+
+    A pile's object then begins above all that have fallen, about the middle one of them; another on a place of its own.
+    """
+    piled = spec.arrange == "pile"
+
+    def draw(start: ObjectStart, attempt: int, others: Sequence[Array]) -> ObjectStart:
+        number = start.region_id - REGION_FIRST_OBJECT
+        rng, middle = chance.stream(Stream.LOST, number, attempt), np.zeros(2)
+        if piled and others:
+            middle = np.median([(points.min(axis=0) + points.max(axis=0))[:2] / 2 for points in others], axis=0)
+        again = _find_place(spec, (rng, lambda: rng), (start.asset, number), plan.table, others, middle)
+        return replace(again, redraws=start.redraws + again.redraws + 1)
+
+    return Pouring(piled, draw if spec.if_lost == "redraw" else None, spec.max_redraws, spec.if_lost == "remove")
+
+
+Streams = tuple[np.random.Generator, Callable[[], np.random.Generator]]
+"""What a place is drawn from, and what makes the one that it is drawn again from."""
+
+
+def _find_place(
+    spec: Start, streams: Streams, of: tuple[Asset, int], table: Table, others: Sequence[Array], middle: Array
+) -> ObjectStart:
+    """The start of an asset, by its number, above or beside `others` (points [N, 3], world), about `middle` [2] in a pile."""
+    (rng, redraw), (asset, number), piled = streams, of, bool(others) and spec.arrange == "pile"
+    reach = spec.pile_offset_m if piled else spec.offset_m
     xy = middle + rng.uniform(reach.low, reach.high, size=2)
     yaw = rng.uniform(-math.pi, math.pi)
     clearance = rng.uniform(spec.clearance_m.low, spec.clearance_m.high)
@@ -178,7 +210,7 @@ def draw_start(
                 placed = spec.pose == "placed" and not piled and stands_on(rested, hull, asset.mass.com, table.mesh)
                 T = rested if placed else translation(0.0, 0.0, lift + clearance) @ rested
                 return ObjectStart(asset, hull, REGION_FIRST_OBJECT + number, frozen_array(T), redraws, placed)
-        redraw_rng = redraw_rng or chance.object_stream(Stream.REDRAW, number)
+        redraw_rng = redraw_rng or redraw()
         xy = middle + redraw_rng.uniform(reach.low, reach.high, size=2)
     raise _no_start(spec, number + 1, over_table)
 

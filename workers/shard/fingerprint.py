@@ -36,7 +36,6 @@ BULLET_STEPS = 20
 """Steps between two states of `bullet_digest`: eight states are 0.17 s, in which all three boxes have met."""
 
 LIBRARIES = (
-    "coacd",
     "embreex",
     "fpng",
     "llvmlite",

@@ -172,7 +172,7 @@ def test_finer_spheres_come_closer_to_the_ball_by_a_quarter_each_time():
     assert np.array(errors[1:]) / np.array(errors[:-1]) == pytest.approx(np.full((2, 2), 0.25), abs=0.02)
 
 
-def test_bodies_weigh_one_by_one_a_void_is_taken_away_and_cuts_weigh_nothing():
+def test_bodies_that_overlap_weigh_as_their_union_a_void_is_taken_away_and_cuts_weigh_nothing():
     outer, void = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((0.8, 0.8, 0.8))
     void.apply_translation((0, 0, 0.05))
     void.invert()
@@ -182,7 +182,13 @@ def test_bodies_weigh_one_by_one_a_void_is_taken_away_and_cuts_weigh_nothing():
     beside = trimesh.creation.box((1, 1, 1))
     beside.apply_translation((0.5, 0, 0))
     both = mass_properties(shape_of(outer, beside), 1.0, 3.0)
-    assert both.mass_kg == pytest.approx(2.0, rel=1e-12) and both.com == pytest.approx([0.25, 0, 0], abs=1e-12)
+    assert both.mass_kg == pytest.approx(1.5, rel=1e-12) and both.com == pytest.approx([0.25, 0, 0], abs=1e-12)
+    assert both.inertia == pytest.approx(box_inertia(1.5, 1.5, 1.0, 1.0), rel=1e-9, abs=1e-12)
+    hidden, touching = trimesh.creation.box((0.2, 0.2, 0.2)), trimesh.creation.box((1, 1, 1))
+    hidden.apply_translation((0.3, 0, 0))
+    touching.apply_translation((1.0, 0, 0))
+    assert mass_properties(shape_of(outer, hidden), 1.0, 3.0).com == pytest.approx([0, 0, 0], abs=1e-12)
+    assert mass_properties(shape_of(outer, touching), 1.0, 3.0).mass_kg == pytest.approx(2.0, rel=1e-12)
     ball = trimesh.creation.icosphere(3, 0.2)
     upper = ball.triangles_center[:, 2] > 0
     halves = [ball.submesh([np.flatnonzero(side)], append=True) for side in (upper, ~upper)]

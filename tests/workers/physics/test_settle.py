@@ -34,6 +34,7 @@ from workers.physics.effects import called_for
 from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, fall
 from workers.physics.placement import Placement, forms_of, place
+from workers.physics.pour import Pouring
 from workers.physics.release import (
     DOUBTFUL_RISE,
     FAR_M,
@@ -307,3 +308,48 @@ def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatc
     assert held.still == (slips < MOST_HOLDS)
     assert held.poses[1][0, 3] == pytest.approx(2.0 * HELD_M * slips, abs=1e-9)
     assert seen == pytest.approx([2.0 * HELD_M * k for k in range(min(slips + 1, MOST_HOLDS))], abs=1e-9)
+
+
+def test_what_leaves_the_table_is_drawn_again_above_the_others_or_removed_or_the_scene_fails():
+    """The second of three, a larger cube, begins beyond the edge, then there again, and the third time above the first."""
+    starts = together(
+        TABLE, [at(CUBE, TABLE, (0.0, 0.0, 0.031)), over_edge(0.6).start, at(CUBE, TABLE, (0.2, 0, 0.04))]
+    ).starts
+    drawn = []
+
+    def draw(start, attempt, others):
+        drawn.append((start.region_id, attempt, [points[:, 2].max() - TOP for points in others]))
+        place = over_edge(0.6).start.T_world_obj if attempt == 1 else at(CUBE, TABLE, (0.0, 0.0, 0.2)).T_world_obj
+        return dataclasses.replace(start, T_world_obj=place, redraws=start.redraws + 1)
+
+    def settled(**how):
+        return settle_scene(scene_of(starts, TABLE), PHYSICS, EffectPlan(ALL, {}), Pouring(**how))
+
+    redrawn = settled(draw=draw, most=3)
+    assert [(region, attempt) for region, attempt, _ in drawn] == [(4, 1), (4, 2)]
+    assert all(tops == pytest.approx([0.06, 0.06], abs=1e-4) for _, _, tops in drawn)
+    assert [start.redraws for start in redrawn.starts] == [0, 2, 0]
+    heights = [rest.T_world_obj[2, 3] - TOP for rest in redrawn.settled]
+    assert heights == pytest.approx([0.03, 0.11, 0.03], abs=1e-5)
+    fewer = settled(remove=True)
+    assert [start.region_id for start in fewer.starts] == [3, 4] and "lost_removed" in fewer.called
+    assert {contact.with_region for rest in fewer.settled for contact in rest.contacts} == {2}
+    for how in ({}, {"draw": draw, "most": 1}):
+        with pytest.raises(SettleError, match=r"of region 4 .* off the table's top"):
+            settled(**how)
+
+
+def test_a_pile_of_many_falls_in_waves_from_no_higher_than_five_of_its_objects(monkeypatch):
+    """Twelve cubes in a column of 1.2 m: each wave is released above what lies, by the clearance that was drawn."""
+    starts = together(TABLE, [at(CUBE, TABLE, (0.01 * (k % 3), 0.0, 0.04 + 0.1 * k)) for k in range(12)]).starts
+    waves, usual = [], release
+
+    def noted(drop, flat, paces):
+        heights = [start.T_world_obj[2, 3] - TOP - 0.03 for start in drop.starts]
+        waves.append((len(drop.starts), max(heights)))
+        return usual(drop, flat, paces)
+
+    monkeypatch.setattr(settle, "release", noted)
+    rest = settle_scene(scene_of(starts, TABLE), PHYSICS, EffectPlan(ALL, {}), Pouring(waves=True))
+    assert len(rest.settled) == 12 and [count for count, _ in waves][:3] == [5, 10, 12]
+    assert waves[0][1] == pytest.approx(0.41, abs=1e-9) and max(height for _, height in waves) < 0.9

@@ -67,9 +67,7 @@ def test_a_stream_is_a_function_of_seed_scene_step_and_object():
     draws = [chance.object_stream(Stream.START, number).random() for number in range(4)]
     assert draws[0] == chance.stream(Stream.START).random() and len(set(draws)) == 4
     names = "CATEGORY OBJECT TABLE START REDRAW CAMERA APPEARANCE RAYCAST_CHECK SENSOR_DEPTH SENSOR_RGB SENSOR_EXPOSURE"
-    names += (
-        " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT"  # append-only: another number changes every dataset ever made
-    )
+    names += " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT LOST"  # append-only: another number changes every dataset ever made
     assert [(one.name, int(one)) for one in Stream] == [(name, n) for n, name in enumerate(names.split())]
 
 

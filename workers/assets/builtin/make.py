@@ -34,7 +34,7 @@ def _generator(name: str) -> Callable[[np.random.Generator], Model]:
 
 def make_asset(category: str, settings: ProceduralSource, index: int, density_kg_m3: float) -> Asset:
     """Instance `index` of a category as an asset; objects are scaled to `diagonal_m` unless `size` is metric."""
-    model = make_model(category, settings.seed, index)
+    model = make_model(settings.named(category), settings.seed, index)
     lofts, (lower, upper) = model.solid.lofts, bounds_of(model.solid.vertices)
     centre, extent = 0.5 * (lower + upper), upper - lower
     scale = 1.0
@@ -43,7 +43,7 @@ def make_asset(category: str, settings: ProceduralSource, index: int, density_kg
     shape = cut_into_parts(model.solid, model.surfaces, centre, scale)
     mass = solid_mass((model.solid.vertices - centre) * scale, model.solid.faces, density_kg_m3)
     return Asset(
-        instance_id=instance_id(category, settings.seed, index),
+        instance_id=instance_id(settings.named(category), settings.seed, index),
         category=category,
         source="procedural",
         licence=LICENCE,

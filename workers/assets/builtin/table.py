@@ -42,6 +42,29 @@ def make_table(rng: np.random.Generator) -> Model:
     return Model(union([_top(rng, plan), *make_base(rng, plan)]), _surfaces(rng, plan))
 
 
+def make_tray(rng: np.random.Generator) -> Model:
+    """A tray on legs, 0.3 to 0.55 m wide, its floor level and its rim 2 to 6 cm high."""
+    return _vessel(rng, rng.uniform(0.3, 0.55), rng.uniform(0.02, 0.06), rng.uniform(0.0, 0.02))
+
+
+def make_bin(rng: np.random.Generator) -> Model:
+    """A bin on legs, 0.4 to 0.6 m wide as stacking boxes are, its floor level and its walls 12 to 26 cm high."""
+    return _vessel(rng, rng.uniform(0.4, 0.6), rng.uniform(0.12, 0.26), rng.uniform(0.01, 0.025))
+
+
+def _vessel(rng: np.random.Generator, width: float, deep: float, draft: float) -> Model:
+    """A rectangular vessel this wide and deep inside, whose walls lean outwards by `draft`, on the legs of a table."""
+    depth, thick, wall = width * rng.uniform(0.65, 0.9), rng.uniform(0.012, 0.018), rng.uniform(0.005, 0.009)
+    radius = draft + wall + rng.uniform(0.004, 0.03)
+    plan = TableSize(width - 2 * draft, depth - 2 * draft, thick, rng.uniform(0.45, 0.75), False)
+    low, floor, rim = plan.under, plan.height, plan.height + deep
+    edge = 0.2 * wall
+    outside = [[draft + edge, low], [draft, low + edge], [0.0, rim - edge], [edge, rim]]
+    profile = np.array([*outside, [wall - edge, rim], [wall, rim - edge], [draft + wall, floor]])
+    vessel = prism(profile, (width, depth), radius, [TOP] * 8, 4)
+    return Model(union([vessel, *pick(rng, (_legs, _apron_legs, _sled))(rng, plan)]), _surfaces(rng, plan))
+
+
 def _top(rng: np.random.Generator, plan: TableSize) -> Solid:
     edge = min(rng.uniform(0.001, 0.008), 0.3 * plan.thick)
     low, high = plan.under, plan.height
