@@ -1,6 +1,6 @@
 """Convex parts of a body by cutting it in two until no part fills a hollow deeper than is allowed; and the body of a sheet. Pure.
 
-It ends on every mesh: a cut is a plane, one of a few, and there are at most `MOST_PARTS` parts.
+It ends on every mesh: a cut is a plane, one of a few, and so many parts are made at most.
 """
 
 import heapq
@@ -14,9 +14,6 @@ from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.mesh import concavity_m, face_areas, face_normals, hold_to_one_thread, mesh_of
-
-MOST_PARTS = 64
-"""Most parts of a body: a pile's time grows with them."""
 
 WAYS = np.array(
     [way for way in itertools.product((1, 0, -1), repeat=3) if 0 < np.abs(way).sum() < 3 and way > (0, 0, 0)]
@@ -36,7 +33,7 @@ LEVELS = 2
 SCRAP = 1e-6
 """Share of the whole length, or of its cube, below which what a cut leaves is rounding."""
 
-WRAPPED = 48
+WRAPPED = 40
 """Cells along the longest side of a sheet that is wrapped. Holes of two cells are closed."""
 
 AROUND = 0.75
@@ -73,10 +70,10 @@ def wrap(mesh: Mesh) -> tuple[Manifold, float]:
     return Manifold.level_set(sample, bounds, cell, 0.0), AROUND * cell
 
 
-def halve(solid: Manifold, most_m: float) -> tuple[list[Array], float]:
+def halve(solid: Manifold, most_m: float, most_parts: int) -> tuple[list[Array], float]:
     """(vertices [N, 3] of convex parts, metres; the deepest hollow that one of them fills, metres).
 
-    The piece with the deepest hollow is cut first, until none is deeper than `most_m` or there are `MOST_PARTS`.
+    The piece with the deepest hollow is cut first, until none is deeper than `most_m` or there are `most_parts`.
     """
     hold_to_one_thread()
     size_m = float(np.ptp(_surface(solid).vertices, axis=0).max())
@@ -86,7 +83,7 @@ def halve(solid: Manifold, most_m: float) -> tuple[list[Array], float]:
         return -concavity_m(_surface(piece)), next(order), piece
 
     pieces, done = [rank(solid)], list[tuple[float, int, Manifold]]()
-    while pieces and -pieces[0][0] > most_m and len(pieces) + len(done) < MOST_PARTS:
+    while pieces and -pieces[0][0] > most_m and len(pieces) + len(done) < most_parts:
         worst = heapq.heappop(pieces)
         parts = _cut(worst[2], size_m)
         done += [] if parts else [worst]

@@ -115,11 +115,14 @@ THRESHOLD = 0.05
 SIMPLER = 2e-3
 """Tolerance, as a share of its size, to which a piece is made coarser first: halving takes longer the more faces there are."""
 
-MOST_FACES = 8_000
+MOST_FACES = 4_000
 """Faces of a piece that is halved: where it has more, the tolerance is doubled until it has not."""
 
 MOST_PIECES = 128
 """A mesh in more pieces than this is cut as one."""
+
+MOST_PARTS = 64
+"""Parts after which the pieces that are left, the smaller ones, get their hulls: a pile's time grows with them."""
 
 LIBRARIES = ("manifold3d", "numpy", "scipy")
 """Libraries whose versions change the parts of a mesh."""
@@ -170,9 +173,10 @@ def _decompose(mesh: Mesh, threshold: float) -> Parts:
         pieces = [welded]
     low, high = welded.vertices.min(axis=0), welded.vertices.max(axis=0)
     most_m, clouds, depth_m = threshold * float((high - low).max()) / 2, list[Array](), 0.0
+    pieces.sort(key=lambda piece: -float(np.ptp(piece.vertices, axis=0).max()))
     for piece in pieces:
         if _has_hull(piece.vertices):
-            parts = _parts_of(piece, most_m)
+            parts = _parts_of(piece, most_m, MOST_PARTS - len(clouds))
             clouds += [cloud for cloud in parts.clouds if _has_hull(cloud)]
             depth_m = max(depth_m, parts.depth_m)
         else:
@@ -192,18 +196,18 @@ def _has_hull(points: Array) -> bool:
     return True
 
 
-def _parts_of(piece: Mesh, most_m: float) -> Parts:
+def _parts_of(piece: Mesh, most_m: float, most_parts: int) -> Parts:
     """The parts of a connected piece of a mesh, of which none fills a hollow deeper than `most_m` if that may be."""
     hull, solid = convex_hull(piece.vertices), solid_of(piece)
     if is_convex_surface(piece, solid):
         return Parts((hull.vertices,))
-    if (depth_m := concavity_m(piece)) <= most_m:
+    if (depth_m := concavity_m(piece)) <= most_m or most_parts < 2:
         return Parts((hull.vertices,), depth_m)
     coarse, moved_m = wrap(_fewer(piece)) if solid is None else (solid, 0.0)
     step_m = SIMPLER * float(np.linalg.norm(np.ptp(piece.vertices, axis=0)))
     while (simpler := coarse.simplify(step_m)).num_tri() > MOST_FACES:
         step_m *= 2.0
-    parts, depth_m = halve(simpler, most_m)
+    parts, depth_m = halve(simpler, most_m, most_parts)
     fitted = _fit(parts, hull.vertices, hull.normals)
     return Parts(tuple(fitted) or (hull.vertices,), depth_m + step_m + moved_m)
 

@@ -205,7 +205,10 @@ def test_nothing_stands_in_a_tray_and_nothing_out_of_it():
     assert all(holds(parts, point) for point in ((0, 0, -0.0225), (0.0975, 0, 0), (-0.0975, -0.09, 0.02)))
 
 
-@pytest.mark.parametrize("flaw", ["open", "inside out", "mixed", "sheet", "double"])
+@pytest.mark.parametrize(
+    "flaw",
+    ["inside out", "double", *(pytest.param(one, marks=pytest.mark.minute) for one in ("open", "mixed", "sheet"))],
+)
 def test_a_flawed_mesh_has_parts_within_its_hull_and_nothing_in_its_hollow(flaw):
     mesh = tray()
     faces = {
@@ -261,7 +264,12 @@ HOLLOWS = {
 }
 
 
-@pytest.mark.parametrize("hollow", HOLLOWS)
+QUICK = {"cup of 48", "pegs", "one triangle", "flat sheet"}
+
+
+@pytest.mark.parametrize(
+    "hollow", [one if one in QUICK else pytest.param(one, marks=pytest.mark.minute) for one in HOLLOWS]
+)
 def test_every_mesh_has_parts_and_they_fill_no_deeper_hollow_than_they_say(hollow):
     """Asked for is a fortieth of the longest side; what sticks out of the mesh is measured by rays."""
     make, (fewest, most) = HOLLOWS[hollow]
