@@ -193,7 +193,7 @@ class ProceduralSource(Frozen):
     diagonal_m: Positive = 0.25
     """Bounding-box diagonal of every object where `size` is `article`."""
     kind: TableKind = "table"
-    """Of tables: a table; a tray with a rim of 2 to 6 cm; or a bin with walls of 12 to 26 cm. Both stand on legs."""
+    """Of tables: a tray has a rim of 2 to 6 cm, a bin walls of 12 to 26 cm."""
 
     @model_serializer(mode="wrap")
     def _leave_out_kind(self, dump: Dump) -> dict[str, Any]:

@@ -45,9 +45,9 @@ class Start(Frozen):
     clearance_m: Interval = Range(0.005, 0.05)
     """Height of the lowest point above the table, or above what is below it in a pile, at the start of a drop."""
     max_redraws: NonNegativeInt = 20
-    """Most redraws of a position that is not over the table or has no room, and of an object that leaves the table."""
+    """Most redraws of a position that is not over the table or has no room, and of `if_lost`."""
     if_lost: Literal["redraw", "remove", "fail"] = "redraw"
-    """What becomes of an object that leaves the table: it is dropped again from a new start, or removed, or the scene fails."""
+    """An object that leaves the table, or finds no balance: dropped again from a new start; removed, if it left; or a failure."""
 
     @model_serializer(mode="wrap")
     def _leave_out_if_lost(self, dump: Dump) -> dict[str, Any]:

@@ -69,12 +69,20 @@ def next_wave(count: int, lying: frozenset[int]) -> list[int]:
     return left if len(left) <= (WAVE if lying else AT_ONCE) else left[:WAVE]
 
 
-def lift(starts: Sequence[ObjectStart], now: Sequence[ObjectStart], number: int, table: Table) -> ObjectStart:
-    """An object as high above those that are there `now`, or above the table, as it is above those before it in `starts`."""
-    below_m = support_height(points_of(starts[number])[:, :2], table.mesh)
-    was_m, is_m = (max([below_m, *(float(points_of(one)[:, 2].max()) for one in of)]) for of in (starts[:number], now))
-    (raised,) = moved_to([starts[number]], [translation(0.0, 0.0, is_m - was_m) @ starts[number].T_world_obj])
-    return raised
+def clearances_m(starts: Sequence[ObjectStart], table: Table) -> tuple[float, ...]:
+    """How far each object begins above the table and all objects before it."""
+    return tuple(float(points_of(one)[:, 2].min()) - _top_m(one, starts[:n], table) for n, one in enumerate(starts))
+
+
+def lift(start: ObjectStart, others: Sequence[ObjectStart], table: Table, clearance_m: float) -> ObjectStart:
+    """The object, moved along z until it is so far above the table and these others."""
+    up_m = _top_m(start, others, table) + clearance_m - float(points_of(start)[:, 2].min())
+    return moved_to([start], [translation(0.0, 0.0, up_m) @ start.T_world_obj])[0]
+
+
+def _top_m(start: ObjectStart, others: Sequence[ObjectStart], table: Table) -> float:
+    below_m = support_height(points_of(start)[:, :2], table.mesh)
+    return max([below_m, *(float(points_of(one)[:, 2].max()) for one in others)])
 
 
 def renumbered(starts: Sequence[ObjectStart]) -> tuple[ObjectStart, ...]:

@@ -107,7 +107,7 @@ class Drop:
     """Objects to be released over a table, with the settings and the plan of effects.
 
     room_m: how far the centre of mass of a single object may go sideways. lying, ready: the numbers of those that have fallen
-    already, and of those that were drawn again and start from where they are.
+    already, and of those that were drawn again and start from where they are. clearances_m: of each over those before it.
     """
 
     starts: tuple[ObjectStart, ...]
@@ -118,6 +118,7 @@ class Drop:
     pouring: Pouring = NOTHING_MORE
     lying: frozenset[int] = frozenset()
     ready: frozenset[int] = frozenset()
+    clearances_m: tuple[float, ...] = ()
 
     @property
     def many(self) -> bool:

@@ -33,7 +33,17 @@ from workers.physics.placement import (
     place_on_top,
     placed_mesh,
 )
-from workers.physics.pour import NOTHING_MORE, LostError, Pouring, lift, moved_to, next_wave, points_of, renumbered
+from workers.physics.pour import (
+    NOTHING_MORE,
+    LostError,
+    Pouring,
+    clearances_m,
+    lift,
+    moved_to,
+    next_wave,
+    points_of,
+    renumbered,
+)
 from workers.physics.release import LEFT_M, Drop, Pace, hold, let_go, release
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
@@ -89,6 +99,8 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
             )
     if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
         return drop.starts, _describe(placed, _support_of(placed), judged=True)
+    if drop.pouring.waves:
+        drop = dataclasses.replace(drop, clearances_m=clearances_m(drop.starts, drop.table))
     while True:
         try:
             return drop.starts, _settle_in_ways(drop, forms)
@@ -106,8 +118,9 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
     kept = [number for number in range(len(starts)) if number not in lost.numbers]
     if pouring.remove and kept and lost.reason == "left_table":
         lying, ready = (frozenset(kept.index(n) for n in kept if n in of) for of in (lost.fallen, drop.ready))
-        starts = [starts[number] for number in kept]
-        return dataclasses.replace(drop, starts=renumbered(starts), lying=lying, ready=ready)
+        clear_m = tuple(drop.clearances_m[number] for number in kept) if drop.clearances_m else ()
+        fewer = renumbered([starts[number] for number in kept])
+        return dataclasses.replace(drop, starts=fewer, lying=lying, ready=ready, clearances_m=clear_m)
     there = [points_of(starts[number]) for number in sorted(lost.fallen)]
     for number in lost.numbers:
         region = starts[number].region_id
@@ -209,7 +222,7 @@ def _pour(drop: Drop, flat: bool) -> tuple[Drop, float] | None:
         for number in wave if drop.lying else ():
             if number not in drop.ready:
                 now = [starts[each] for each in sorted(drop.lying.union(wave[: wave.index(number)]))]
-                starts[number] = lift(drop.starts, now, number, drop.table)
+                starts[number] = lift(starts[number], now, drop.table, drop.clearances_m[number])
         drop = dataclasses.replace(drop, starts=tuple(starts), ready=drop.ready.union(wave))
         part = sorted(drop.lying.union(wave))
         if len(part) == count:

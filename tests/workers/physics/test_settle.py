@@ -34,7 +34,7 @@ from workers.physics.effects import called_for
 from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, fall
 from workers.physics.placement import Placement, forms_of, place
-from workers.physics.pour import Pouring
+from workers.physics.pour import Pouring, points_of
 from workers.physics.release import (
     DOUBTFUL_RISE,
     FAR_M,
@@ -159,7 +159,9 @@ def test_the_gate_refuses_a_gap_an_overlap_and_an_imbalance_each_by_itself():
         held = SimpleNamespace(gap_m=gap_mm * 1e-3, unbalanced=unbalanced)
         refused = pytest.raises(SettleError, match=words) if words else contextlib.nullcontext()
         with refused:
-            settle._require_support(SimpleNamespace(single=True), start, held)
+            settle._require_support(
+                SimpleNamespace(drop=SimpleNamespace(single=True, starts=[start]), poses=()), 0, held
+            )
 
 
 def test_an_object_whose_frame_is_far_from_its_centre_of_mass_falls_the_same_way():
@@ -339,17 +341,18 @@ def test_what_leaves_the_table_is_drawn_again_above_the_others_or_removed_or_the
             settled(**how)
 
 
-def test_a_pile_of_many_falls_in_waves_from_no_higher_than_five_of_its_objects(monkeypatch):
-    """Twelve cubes in a column of 1.2 m: each wave is released above what lies, by the clearance that was drawn."""
-    starts = together(TABLE, [at(CUBE, TABLE, (0.01 * (k % 3), 0.0, 0.04 + 0.1 * k)) for k in range(12)]).starts
+def test_a_pile_of_more_than_eight_falls_in_waves_above_what_lies(monkeypatch):
+    """Nine cubes in a column of 0.9 m: five fall, then four, which begin 40 mm above what lies and above one another."""
+    starts = together(TABLE, [at(CUBE, TABLE, (0.03 * (k % 3), 0.0, 0.07 + 0.1 * k)) for k in range(9)]).starts
     waves, usual = [], release
 
     def noted(drop, flat, paces):
-        heights = [start.T_world_obj[2, 3] - TOP - 0.03 for start in drop.starts]
-        waves.append((len(drop.starts), max(heights)))
+        waves.append([points_of(start)[:, 2] for start in drop.starts])
         return usual(drop, flat, paces)
 
     monkeypatch.setattr(settle, "release", noted)
     rest = settle_scene(scene_of(starts, TABLE), PHYSICS, EffectPlan(ALL, {}), Pouring(waves=True))
-    assert len(rest.settled) == 12 and [count for count, _ in waves][:3] == [5, 10, 12]
-    assert waves[0][1] == pytest.approx(0.41, abs=1e-9) and max(height for _, height in waves) < 0.9
+    assert len(rest.settled) == 9 and [len(wave) for wave in waves[:2]] == [5, 9]
+    for wave, lying in zip(waves[:2], (0, 5), strict=True):
+        tops = np.maximum.accumulate([TOP, *(heights.max() for heights in wave)])[lying:]
+        assert [heights.min() for heights in wave[lying:]] == pytest.approx(tops[:-1] + 0.04, abs=1e-9)
