@@ -14,17 +14,18 @@ from services.init.copies import find_copies
 from services.init.found import COPY, PART, Item, LeftOut, Reading
 from workers.assets.external.formats import FORMATS
 from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import URDF, read_measured
+from workers.assets.external.placement import read_measured
 from workers.assets.external.reader import Kind, Request, Task, ask_all
+from workers.assets.external.urdf import POSED
 
-SUFFIXES = (URDF, *FORMATS)
+SUFFIXES = (*POSED, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
 
 FOREIGN: Mapping[str, str] = {
     **dict.fromkeys(
         (".fbx", ".blend", ".3ds", ".usd", ".usda", ".usdc", ".usdz"), "export it as .glb, such as by Blender"
     ),
-    **dict.fromkeys((".3mf", ".x3d", ".wrl", ".abc", ".dae", ".off"), "export it as .glb, such as by Blender"),
+    **dict.fromkeys((".3mf", ".x3d", ".wrl", ".abc", ".dae"), "export it as .glb, such as by Blender"),
     **dict.fromkeys((".max", ".mb", ".ma", ".c4d", ".lwo", ".skp"), "export it as .glb by the program that wrote it"),
     **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".fcstd", ".sldprt"), "export it as .stl by a CAD program"),
     **dict.fromkeys(
@@ -64,6 +65,8 @@ def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
             if file.startswith(".") or suffix not in (*SUFFIXES, *FOREIGN):
                 continue
             path = Path(parent, file)
+            if suffix == ".xml" and not _is_mjcf(path):
+                continue
             if (why := _unusable(path, root)) is not None:
                 left_out.append(LeftOut(_relative(str(path), root), *why))
             else:
@@ -74,6 +77,15 @@ def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
         what = "is empty" if empty else f"has no mesh ({', '.join(SUFFIXES)})"
         raise AssetSourceError(f"{name} {what}: name a folder that has some")
     return sorted(paths), left_out
+
+
+def _is_mjcf(path: Path) -> bool:
+    """Whether an XML file is one of MuJoCo's: others are of no concern."""
+    try:
+        with path.open("rb") as stream:
+            return b"<mujoco" in stream.read(1 << 16)
+    except OSError:
+        return False
 
 
 def _unusable(path: Path, root: Path) -> tuple[str, str] | None:
@@ -96,7 +108,7 @@ def _relative(path: str, root: Path) -> str:
 ANY_SIZE = MeshLimits(min_size_m=1e-12, max_size_m=1e12)
 """Sizes are judged when the unit is known."""
 
-DONE: Mapping[Kind, str] = {"names": "URDFs read", "list": "files listed", "measure": "meshes read"}
+DONE: Mapping[Kind, str] = {"names": "models read", "list": "files listed", "measure": "meshes read"}
 """What progress says."""
 
 Watch = Callable[[str, int, int], None]
@@ -114,9 +126,9 @@ def read_folder(folder: Path, paths: Sequence[str], watch: Watch, beside: Sequen
         answers = ask_all(replace(request, tasks=tasks), partial(watch, DONE[kind]))
         return zip(entries, (answer for _, answer in answers), strict=True)
 
-    left_out = dict[str, LeftOut]()
-    for posed, answer in ask("names", {path: None for path in paths if path.lower().endswith(URDF)}):
-        for part in [] if isinstance(answer, MeshError) else json.loads(answer):
+    left_out, known = dict[str, LeftOut](), set(paths)
+    for posed, answer in ask("names", {path: None for path in paths if path.lower().endswith(tuple(POSED))}):
+        for part in known & set([] if isinstance(answer, MeshError) else json.loads(answer)):
             left_out.setdefault(part, LeftOut(part, PART, f"part of {posed}"))
     copies = find_copies(paths, [*paths, *beside])
     left_out = {path: LeftOut(path, COPY, why) for path, why in copies.items()} | left_out

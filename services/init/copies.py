@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 
 from services.init.found import COPY, Item, LeftOut
-from workers.assets.external.placement import POSED
+from workers.assets.external.urdf import POSED
 
 _COLLIDES = "col|coll|collisions?|colliders?|v-?hacd|coacd|convex|hulls?|ch|physics|phys"
 _NAMED = re.compile(rf"(.+?)(?:[\s_.-]+(?:{_COLLIDES})(?:[\s_.-]*\d+)*)+", re.IGNORECASE)
@@ -38,9 +38,11 @@ def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, st
             continue
         finest = levels.get((_parent(path), stem), (0, path))[1] if level >= 0 else None
         near = _near(path, by_folder) if finest in (None, path) else []
-        of = next((one for one in near if _stem(one) == stem), near[0] if len(near) == 1 and level < 0 else None)
-        if of is None and level < 0 and near and _in_folder(path):
-            of = min(near, key=lambda one: (not stem.startswith(_stem(one)), one))
+        of = next((one for one in near if _stem(one) == stem), None)
+        if of is None and level < 0:
+            alike = [one for one in near if stem in _stem(one) or _stem(one) in stem]
+            meshes = [one for one in near if PurePosixPath(one).suffix.lower() not in POSED] or near
+            of = min(alike or (meshes if len(meshes) == 1 or _in_folder(path) else []), default=None)
         of = of or (finest if finest != path else None)
         if of is not None:
             found[path] = f"{'collision shape' if level < 0 else 'coarser level of detail'} of {of}"

@@ -10,7 +10,7 @@ from statistics import median
 
 from schemas.job.assets import UpAxis, matches
 from services.init.found import Item
-from workers.assets.external.placement import POSED
+from workers.assets.external.urdf import POSED
 
 METRIC = frozenset({".glb", ".gltf", *POSED})
 """Formats whose specification says metres."""

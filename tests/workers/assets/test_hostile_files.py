@@ -20,7 +20,7 @@ from workers.assets.external import urdf as urdf_file
 from workers.assets.external.formats import load_shape
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.reader import Request, Task, ask_all, unpack_asset
-from workers.assets.external.urdf import load_urdf
+from workers.assets.external.urdf import load_posed
 from workers.assets.external.verdicts import Verdicts
 from workers.scene.context import Stopwatch, open_worker
 from workers.scene.plan import SceneChance, draw_scene
@@ -41,7 +41,9 @@ end_header
 0 1 0
 3 0 1 2
 """
-HUGE_PLY = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\nend_header\n"
+HUGE_PLY = (
+    "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\nelement face 1\nend_header\n"
+)
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 BOX = '<box size="0.1 0.1 0.1"/>'
 MESH = '<mesh filename="cube.obj"{}/>'
@@ -81,7 +83,7 @@ HOSTILE = {
     # What no file can be
     "none.obj": (None, "missing", "No such file"),
     "scene.dae": ("<x/>", "format", "is not one of"),
-    "empty.obj": ("", "no_faces", "has no triangles"),
+    "empty.obj": ("", "no_faces", "is empty"),
     # OBJ, PLY and STL
     "index.obj": (TRIANGLE + "f 1 2 9\n", "index_out_of_range", "a face names"),
     "nan.obj": ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not_finite", "not a finite number"),
@@ -128,7 +130,7 @@ HOSTILE = {
     "digits.glb": (glb('{"accessors": [{"count": ' + "9" * 4000 + "}]}"), "unreadable", "no `asset`"),
     "deep.glb": (glb("[" * 100_000), "unreadable", "is not a glb file that can be read"),
     "nodes.glb": (nested_nodes(100_000), "too_large", "over max_nodes"),
-    "empty.gltf": ("", "unreadable", "is not a gltf file that can be read"),
+    "empty.gltf": ("", "no_faces", "is empty"),
     "open.gltf": ("[", "unreadable", "is not a gltf file that can be read"),
     "deep.gltf": ("[" * 100_000, "unreadable", "is not a gltf file that can be read"),
     "number.gltf": ("7", "unreadable", "no `asset`"),
@@ -249,7 +251,7 @@ CAPS = (
 def refusal(path: Path, **limits) -> str:
     """Why a file is too large."""
     with pytest.raises(MeshError) as caught:
-        (load_urdf if path.suffix == ".urdf" else load_shape)(path, MeshLimits(**limits), path.parent)
+        (load_posed if path.suffix == ".urdf" else load_shape)(path, MeshLimits(**limits), path.parent)
     assert caught.value.reason == "too_large"
     return caught.value.detail
 
@@ -259,7 +261,7 @@ def test_what_is_over_a_cap_is_refused_before_it_is_parsed_and_what_is_not_is_re
     for limits, says in CAPS:
         assert says in refusal(cube, **limits)
     boxes = write(tmp_path / "a.urdf", urdf(visual(BOX) * 3))
-    assert "36 faces" in refusal(boxes, max_faces=35) and load_urdf(boxes, MeshLimits(max_faces=36), tmp_path)
+    assert "36 faces" in refusal(boxes, max_faces=35) and load_posed(boxes, MeshLimits(max_faces=36), tmp_path)
     shown = write_all(tmp_path, gltf(nodes=[{"mesh": 0}] * 20, scenes=[{"nodes": list(range(20))}]))
     assert "240 faces" in refusal(shown, max_faces=239), "counted each time that a node shows it"
     assert len(load_shape(shown, MeshLimits(max_faces=240)).shape.faces) == 12, "and what lies in one place is one"
@@ -303,7 +305,7 @@ def test_a_mesh_that_a_urdf_names_a_thousand_times_is_read_once(tmp_path, monkey
     path = write(tmp_path / "a.urdf", urdf(visual(MESH.format(' scale="0.1 0.1 0.1"')) * 1000))
     read = []
     monkeypatch.setattr(urdf_file, "load_shape", lambda *given: read.append(given) or load_shape(*given))
-    assert len(load_urdf(path, MeshLimits(), tmp_path).shape.faces) == 12_000
+    assert len(load_posed(path, MeshLimits(), tmp_path).shape.faces) == 12_000
     assert len(read) == 1
 
 

@@ -35,7 +35,7 @@ from workers.assets.builtin.make import make_asset
 from workers.assets.external.formats import list_mesh_files, load_shape
 from workers.assets.external.mesh import DEFAULT, is_solid
 from workers.assets.external.reader import pack_asset, unpack_asset
-from workers.assets.external.urdf import load_urdf
+from workers.assets.external.urdf import load_posed
 from workers.assets.glb import asset_glb, split_glb
 
 NORMALS = "not drawn: normalTexture"
@@ -242,7 +242,7 @@ def test_colours_of_vertices_and_of_faces_are_kept_and_a_bare_mesh_has_the_defau
 
 
 def load_body(folder, text, **limits):
-    return load_urdf(write(folder / "a.urdf", text), MeshLimits(**limits), folder).shape
+    return load_posed(write(folder / "a.urdf", text), MeshLimits(**limits), folder).shape
 
 
 def test_visuals_are_scaled_then_turned_then_shifted_about_the_fixed_axes(tmp_path):

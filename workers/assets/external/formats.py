@@ -16,6 +16,7 @@ from workers.assets.external import plain
 from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.assets.external.gltf import named_by_gltf, read_gltf
 from workers.assets.external.mesh import LoadedMesh, RawMesh, clean_shape, place_mesh
+from workers.assets.external.mjcf import count_msh, read_msh
 from workers.assets.external.obj import count_obj, named_by_mtl, named_by_obj, read_obj
 from workers.assets.external.ply import count_ply, named_by_ply, read_ply
 
@@ -38,6 +39,8 @@ FORMATS: Mapping[str, Format] = {
     ".gltf": Format(named_by_gltf, read_gltf),
     ".obj": Format(named_by_obj, read_obj, count_obj),
     ".ply": Format(named_by_ply, read_ply, count_ply),
+    ".msh": Format(lambda *_: [], read_msh, count_msh),
+    ".off": Format(lambda *_: [], plain.read_plain),
     ".stl": Format(lambda *_: [], plain.read_plain, plain.count_stl),
 }
 """The formats of mesh files by suffix, the one that says most about a thing first."""
@@ -92,7 +95,9 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
 def read_bytes(path: Path, limits: MeshLimits) -> bytes:
     """A mesh file's bytes; MeshError `missing`, `format` or `too_large`."""
     if path.suffix.lower() not in FORMATS:
-        raise MeshError("format", f"{path}: {path.suffix or 'no suffix'} is not one of {', '.join(FORMATS)}")
+        raise MeshError(
+            "format", f"{path}: {path.suffix or 'no suffix'} is not one of {', '.join(FORMATS)}: export it as .glb"
+        )
     try:
         size = path.stat().st_size
         if size > limits.max_file_mb * 1e6:

@@ -5,6 +5,7 @@ ShapeNetCore is a user's own copy, version 1 or 2 (dataset.md section 1, "ShapeN
 
 import hashlib
 import importlib.util
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,6 +109,50 @@ def _environmental(reason: str, detail: str) -> MeshError:
     error = MeshError(reason, detail)
     error.kind = "environmental"
     return error
+
+
+HEAD_BYTES = 4096
+"""Bytes of a file that are looked at for what it really is, or for a remark on its unit."""
+
+_OTHER = (
+    (
+        re.compile(rb"version https://git-lfs"),
+        "missing",
+        "is a Git LFS pointer and not the file: run `git lfs pull` there",
+    ),
+    (re.compile(rb"\s*<(!doctype html|html|head)\b", re.I), "format", "is a web page: download the file itself"),
+    (re.compile(rb"PK\x03\x04|\x1f\x8b|7z\xbc\xaf|Rar!"), "format", "is an archive: unpack it"),
+    (
+        re.compile(rb"glTF\x01\0\0\0"),
+        "format",
+        "is a glTF of version 1: open it in Blender or gltf-pipeline and write version 2",
+    ),
+    (
+        re.compile(rb"ply\s(?!.*\belement +(?:face|tristrips)\b).*property +float +f_dc_0.*end_header", re.S),
+        "no_faces",
+        "holds Gaussian splats, a point cloud without faces: make a mesh of it",
+    ),
+    (
+        re.compile(rb"ply\s(?!.*\belement +(?:face|tristrips)\b).*end_header", re.S),
+        "no_faces",
+        "is a point cloud without faces: make a mesh of it, such as by MeshLab's screened Poisson reconstruction",
+    ),
+)
+"""What a file may be under the name of a mesh, by its first bytes: the reason, and the sentence with the remedy."""
+
+
+def refuse_other(path: Path) -> None:
+    """MeshError for a file that is something else than its name says: empty, a pointer, a web page, points, ..."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES)
+    except OSError:
+        return  # whoever reads it says why
+    if not head:
+        raise MeshError("no_faces", f"{path} is empty: copy or download it again")
+    for pattern, reason, why in _OTHER:
+        if pattern.match(head):
+            raise MeshError(reason, f"{path} {why}")
 
 
 def describe_folder(folder: Path, most: int = 5) -> str:

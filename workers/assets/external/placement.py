@@ -20,10 +20,10 @@ from schemas.errors import MeshError
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset, Hull, Shape
 from workers.assets.external.caps import MOST_NOTES, one_line
-from workers.assets.external.formats import list_mesh_files, load_shape
-from workers.assets.external.listing import Entry, check_unchanged, mesh_root
+from workers.assets.external.formats import FORMATS, list_mesh_files, load_shape
+from workers.assets.external.listing import HEAD_BYTES, Entry, check_unchanged, mesh_root, refuse_other
 from workers.assets.external.mesh import DEFAULT, LoadedMesh, transform_shape
-from workers.assets.external.urdf import load_urdf, seen_meshes
+from workers.assets.external.urdf import POSED, list_seen, load_posed
 from workers.assets.mass import mass_properties
 from workers.geometry.frames import pose
 
@@ -37,18 +37,15 @@ OBJECT_SCALE, TABLE_SCALE = 0.25, 1.5
 """The article's factors on ShapeNetCore's normalised units."""
 
 
-URDF = ".urdf"
-POSED = (URDF,)
-"""The ends of the names of files that pose mesh files."""
-
-
 def list_files(
     settings: ShapeNetSource | FolderSource, folder: Path, path: Path, limits: MeshLimits
 ) -> tuple[Path, ...]:
     """A candidate and every file that it refers to, each once; MeshError where one of them, or all together, is refused."""
-    if path.suffix.lower() == URDF:
-        meshes = seen_meshes(path, folder, limits)
-        files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits))]
+    if path.suffix.lower() in (*POSED, *FORMATS):
+        refuse_other(path)
+    if path.suffix.lower() in POSED:
+        meshes, pictures = list_seen(path, folder, limits)
+        files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits)), *pictures]
     else:
         files = list_mesh_files(path, mesh_root(settings, folder, path), limits)
     files = list(dict.fromkeys(files))
@@ -67,8 +64,8 @@ def load_entry(
     """One instance, cleaned, z up, scaled; MeshError where its mesh is refused or has changed."""
     check_unchanged(folder, entry)
     path = folder / entry.files[0].path
-    if path.suffix.lower() == URDF:
-        loaded = load_urdf(path, assets.limits, folder)
+    if path.suffix.lower() in POSED:
+        loaded = load_posed(path, assets.limits, folder)
     else:
         loaded = load_shape(path, assets.limits, mesh_root(settings, folder, path))
     return place_asset(loaded, entry, category, settings, assets)
@@ -333,8 +330,6 @@ _UNIT = re.compile(rb"^#[^\n]*\bunits?\b[\s=:]*(?:(?:is|are|in)\b)?[\s=:]*([a-z]
 _UNITS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, "centimetre": 0.01, "mm": 0.001}
 _UNITS |= {"millimeter": 0.001, "millimetre": 0.001, "inch": 0.0254, "inche": 0.0254, "in": 0.0254}
 _UNITS |= {"foot": 0.3048, "feet": 0.3048, "ft": 0.3048}
-HEAD_BYTES = 4096
-"""Bytes of a file that are looked at for a remark on its unit, or for what it really is."""
 
 
 def find_unit(path: Path) -> float | None:

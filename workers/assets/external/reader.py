@@ -40,7 +40,7 @@ from schemas.scene.shape import Asset, Hull, MassProperties, Material, Part, Sha
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, hash_files
 from workers.assets.external.placement import find_doubt, list_files, load_entry, measure_asset
-from workers.assets.external.urdf import find_mesh, mesh_names, parse_urdf
+from workers.assets.external.urdf import list_named
 from workers.geometry.hull import convex_hull
 
 Kind = Literal["list", "check", "load", "measure", "names"]
@@ -242,11 +242,8 @@ def _answer(request: Request, task: Task) -> bytes:
         files = hash_files(paths, request.folder)
         return json.dumps([[file.path, file.size, file.sha256] for file in files]).encode()
     if task.kind == "names":
-        found = []
-        for name in mesh_names(parse_urdf(task.path, request.assets.limits), "*"):
-            with suppress(MeshError):
-                found.append(find_mesh(name, task.path, request.folder).relative_to(request.folder).as_posix())
-        return json.dumps(found).encode()
+        found = list_named(task.path, request.folder, request.assets.limits)
+        return json.dumps([path.relative_to(request.folder).as_posix() for path in found]).encode()
     assert task.entry is not None
     asset = load_entry(request.settings, request.folder, task.entry, task.category, request.assets)
     if task.kind == "load":

@@ -1,115 +1,168 @@
-"""Edge: the visible geometry of a URDF file from outside, parsed with the standard library."""
+"""Edge: what is seen of a URDF, SDF or MJCF from outside as one shape; and the readers of URDF and SDF."""
 
-import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
+from os.path import relpath
+from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 import numpy as np
-import trimesh
+from numpy.typing import NDArray
 
-from schemas.base import Array, Pose, frozen_array
+from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.external.caps import LONGEST_NAME, Budget, check_counts, check_nodes, find_inside
+from workers.assets.external.caps import (
+    LONGEST_NAME,
+    Budget,
+    FolderResolver,
+    check_counts,
+    check_nodes,
+    decode_picture,
+    find_inside,
+)
 from workers.assets.external.formats import load_shape
 from workers.assets.external.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
-from workers.geometry.frames import pose
-
-_DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
-MAX_URDF_BYTES = 10_000_000
-SEGMENTS = 48
-"""Facets around a URDF's cylinders and spheres."""
+from workers.assets.external.mjcf import read_mjcf
+from workers.assets.external.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled, turned
 
 
-MOST_JOINTS_ABOVE = 256
-"""Joints between a link and its root: the pose of a link is the product of all of theirs."""
+def find_named(name: str, path: Path, root: Path) -> Path:
+    """The file inside `root` that a posing file at `path` names; MeshError `missing`.
 
-
-def parse_urdf(path: Path, limits: MeshLimits) -> ElementTree.Element:
-    """The root element; MeshError `missing`, `too_large` or `unreadable`. Documents with a DTD or entities are refused."""
-    try:
-        if path.stat().st_size > MAX_URDF_BYTES:
-            raise MeshError("too_large", f"{path} has {path.stat().st_size} bytes, over {MAX_URDF_BYTES}")
-        data = path.read_bytes()
-    except OSError as error:
-        raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
-    if b"<!" in data.replace(b"<!--", b"") or b"\0" in data:
-        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
-    try:
-        # pybullet's own files declare XML version 0.0, which no parser accepts.
-        robot = ElementTree.fromstring(_DECLARATION.sub(b"", data, count=1))
-    except ElementTree.ParseError as error:
-        raise MeshError("unreadable", f"{path} is not XML: {error}") from error
-    if robot.tag != "robot":
-        raise MeshError("unreadable", f"{path} is not a URDF: its root is <{robot.tag:.40}>")
-    for what in ("link", "joint", "link/visual"):
-        check_nodes(path, len(robot.findall(what)), f"{what.rpartition('/')[2]}s", limits)
-    return robot
-
-
-def mesh_names(robot: ElementTree.Element, kind: str = "visual") -> list[str]:
-    """The file names of the meshes of all visuals, or `*`: also of those that only collide; each once, in their order."""
-    return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind(f"link/{kind}/geometry/mesh")))
-
-
-def seen_meshes(urdf: Path, root: Path, limits: MeshLimits) -> list[Path]:
-    """The files of the meshes of all visuals, each once; MeshError where one is not inside `root`."""
-    return list(dict.fromkeys(find_mesh(name, urdf, root) for name in mesh_names(parse_urdf(urdf, limits))))
-
-
-def find_mesh(name: str, urdf: Path, root: Path) -> Path:
-    """The file of a mesh name inside `root`; MeshError `missing`."""
-    bare = re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
-    tail = bare.split("/", 1)[-1]
-    found = find_inside(root.resolve(), urdf.parent / bare, root / bare, root / tail, urdf.parent / tail)
+    `package://`, `model://` and folders that are not there are passed over: every tail of the name is looked for, the longest
+    first, in the file's own folder and in those above it up to `root`.
+    """
+    parts = PurePosixPath(
+        re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
+    ).parts
+    above = [folder for folder in (path.parent, *path.parent.parents) if folder.is_relative_to(root)]
+    tails = [PurePosixPath(*parts[k:]) for k in range(min(len(parts), MOST_TAILS))]
+    found = find_inside(root.resolve(), *(folder / tail for tail in tails for folder in above))
     if found is None:
-        raise MeshError("missing", f"{urdf} names the mesh {name!r:.200}, which is not inside {root}")
+        raise MeshError("missing", f"{path} names the mesh {name!r:.200}, which is not inside {root}")
     return found
 
 
-def load_urdf(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
-    """All visuals of all links, joints at zero, in the frame of the first root link, metres; MeshError as load_shape."""
-    robot, budget = parse_urdf(path, limits), Budget(limits)
-    colors = {m.get("name", ""): _color(path, m) for m in robot.iterfind("material")}
-    parts, notes, vertices, faces = list[Part](), list[str](), 0, 0
+MOST_TAILS = 32
+"""Folders of a name that may be passed over."""
+
+
+def read_model(path: Path, limits: MeshLimits) -> Model:
+    """What a URDF, SDF or MJCF poses; MeshError as `parse_xml`, `no_faces` where nothing of it is seen."""
+    model = POSED[path.suffix.lower()](path, limits)
+    check_nodes(path, len(model.visuals), "visuals", limits)
+    if not model.visuals:
+        raise MeshError("no_faces", f"{path} has no visual geometry")
+    return model
+
+
+def list_seen(path: Path, root: Path, limits: MeshLimits) -> tuple[list[Path], list[Path]]:
+    """The meshes of all that is seen, each once, and the pictures that are there; MeshError where a mesh is not inside `root`."""
+    visuals = read_model(path, limits).visuals
+    names = dict.fromkeys(visual.mesh for visual in visuals if visual.mesh is not None)
+    pictures = dict.fromkeys(visual.texture for visual in visuals if visual.texture is not None)
+    return list(dict.fromkeys(find_named(name, path, root) for name in names)), _found(pictures, path, root)
+
+
+def list_named(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
+    """The meshes of all that is seen or collides, of those inside `root`."""
+    return _found(POSED[path.suffix.lower()](path, limits).meshes, path, root)
+
+
+def _found(names: Iterable[str], path: Path, root: Path) -> list[Path]:
+    found = []
+    for name in names:
+        with suppress(MeshError):
+            found.append(find_named(name, path, root))
+    return list(dict.fromkeys(found))
+
+
+def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
+    """All that is seen, joints at zero, in the frame of the first root, metres; MeshError as `load_shape`."""
+    model, budget = read_model(path, limits), Budget(limits)
+    resolver = FolderResolver(path, root, limits, budget)
+    parts, notes, vertices, faces = list[Part](), list(model.notes), 0, 0
 
     @cache
     def load(name: str) -> LoadedMesh:
-        return load_shape(find_mesh(name, path, root), limits, root, budget)
+        return load_shape(find_named(name, path, root), limits, root, budget)
 
+    @cache
+    def picture(name: str) -> NDArray[np.uint8] | None:
+        return _read_picture(name, path, root, resolver)
+
+    for visual in model.visuals:
+        loaded = (
+            load(visual.mesh)
+            if visual.mesh is not None
+            else LoadedMesh(Shape((visual.body,)), ())
+            if visual.body
+            else None
+        )
+        assert loaded is not None
+        notes += loaded.notes
+        for part in transform_shape(loaded.shape, visual.T).parts:
+            check_coordinates(path, part.vertices)
+            parts.append(replace(_dressed(part, visual, picture, notes), name=f"part{len(parts)}"))
+            vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
+        check_nodes(path, len(parts), "parts", limits)
+        check_counts(path, vertices, faces, limits)
+    return LoadedMesh(Shape(tuple(parts)), tuple(dict.fromkeys([*notes, *resolver.notes])))
+
+
+def _read_picture(name: str, path: Path, root: Path, resolver: FolderResolver) -> NDArray[np.uint8] | None:
+    """[h, w, 3 or 4] uint8; None with a note where it is missing or refused."""
+    try:
+        file = find_named(name, path, root)
+        return decode_picture(resolver.get(relpath(file, path.parent)), resolver.notes)
+    except MeshError:
+        resolver.note(name, "is missing")
+    except FileNotFoundError:
+        pass  # the resolver has noted it
+    return None
+
+
+def _dressed(part: Part, visual: Visual, picture: Callable[[str], NDArray[np.uint8] | None], notes: list[str]) -> Part:
+    """The part in the colour and picture that the file gives it."""
+    own = part.material is not DEFAULT or part.colors is not None
+    if (visual.colour is None and visual.texture is None) or (own and not visual.dresses):
+        return part
+    texture = None if visual.texture is None else picture(visual.texture)
+    if texture is not None and part.uv is None:
+        notes.append(f"{visual.texture:.200} needs texture coordinates, which the mesh has not: plain base colour used")
+        texture = None
+    if visual.colour is None and texture is None:
+        return part
+    red, green, blue, alpha = (1.0, 1.0, 1.0, 1.0) if visual.colour is None else visual.colour.tolist()
+    return replace(part, material=Material((red, green, blue, alpha or 1.0), texture=texture), colors=None)
+
+
+def read_urdf(path: Path, limits: MeshLimits) -> Model:
+    """The visuals of all links of a URDF, joints at zero; the frame of the first root link."""
+    robot = parse_xml(path, limits, "robot", "a URDF")
+    looks = {m.get("name", ""): _look(path, m) for m in robot.iterfind("material")}
+    visuals = []
     for link, T_root_link in _link_poses(path, robot):
         for visual in link.iterfind("visual"):
-            loaded = _load_visual(path, visual, load)
-            notes += loaded.notes
             material = visual.find("material")
-            color = None if material is None else _color(path, material) or colors.get(material.get("name", ""))
-            shape = transform_shape(loaded.shape, T_root_link @ _origin(path, visual))
-            for part in shape.parts:
-                check_coordinates(path, part.vertices)
-                parts.append(replace(_colored(part, color), name=f"part{len(parts)}"))
-                vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
-            check_nodes(path, len(parts), "parts", limits)
-            check_counts(path, vertices, faces, limits)
-    if not parts:
-        raise MeshError("no_faces", f"{path} has no visual geometry")
-    return LoadedMesh(Shape(tuple(parts)), tuple(dict.fromkeys(notes)))
+            look = (None, None) if material is None else _look(path, material)
+            if material is not None and look[0] is None and look[1] is None:
+                look = looks.get(material.get("name", ""), look)
+            one = _geometry(path, visual, T_root_link @ _origin(path, visual))
+            visuals.append(replace(one, colour=look[0], texture=look[1]))
+    names = (mesh.get("filename", "") for mesh in robot.iterfind("link/*/geometry/mesh"))
+    return Model(tuple(visuals), tuple(dict.fromkeys(names)))
 
 
-def _colored(part: Part, color: tuple[float, ...] | None) -> Part:
-    """The part in the URDF's colour, unless it has a material or colours of its own."""
-    if color is None or part.material is not DEFAULT or part.colors is not None:
-        return part
-    return replace(part, material=Material(base_color=(color[0], color[1], color[2], color[3] or 1.0)))
-
-
-def _color(path: Path, material: ElementTree.Element) -> tuple[float, ...] | None:
-    color = material.find("color")
-    return None if color is None else tuple(min(max(c, 0.0), 1.0) for c in _numbers(path, color.get("rgba"), 4))
+def _look(path: Path, material: ElementTree.Element) -> tuple[Array | None, str | None]:
+    colour, texture = material.find("color"), material.find("texture")
+    rgba = None if colour is None else np.clip(numbers(path, colour.get("rgba"), 4), 0.0, 1.0)
+    return rgba, None if texture is None else texture.get("filename")
 
 
 def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTree.Element, Pose]]:
@@ -122,71 +175,106 @@ def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTre
     placed = []
     for link in robot.iterfind("link"):
         name, T = link.get("name", ""), np.eye(4)
-        for _ in range(MOST_JOINTS_ABOVE + 1):
+        for _ in range(MOST_ABOVE + 1):
             if name not in joints:
                 break
             name, step = joints[name]
             T = step @ T
         else:
             above = f"{path}: the joints above link {link.get('name')!r:.80}"
-            raise MeshError("unreadable", f"{above} go round in a circle, or are more than {MOST_JOINTS_ABOVE}")
+            raise MeshError("unreadable", f"{above} go round in a circle, or are more than {MOST_ABOVE}")
         placed.append((link, T))
     return placed
 
 
-def _load_visual(path: Path, visual: ElementTree.Element, load: Callable[[str], LoadedMesh]) -> LoadedMesh:
-    """One visual's geometry in its own frame; `load` reads a mesh by its name."""
+def _geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual:
+    """What a visual shows, its own frame at T."""
     for kind in visual.iterfind("geometry/*"):
         if kind.tag == "mesh":
-            loaded = load(kind.get("filename", ""))
-            scale = _numbers(path, kind.get("scale", "1 1 1"), 3)
-            if 0.0 in scale:
-                raise MeshError("no_size", f"{path} scales a mesh by {scale}")
-            return replace(loaded, shape=transform_shape(loaded.shape, np.diag([*scale, 1.0])))
-        return LoadedMesh(Shape((_primitive(path, kind),)), ())
+            return Visual(T @ scaled(path, numbers(path, kind.get("scale", "1 1 1"), 3)), kind.get("filename", ""))
+        sizes = (
+            [("size", 3)] if kind.tag == "box" else [("radius", 1), ("length", 1)][: 1 if kind.tag == "sphere" else 2]
+        )
+        known = kind.tag in ("box", "sphere", "cylinder", "capsule")
+        given = [numbers(path, kind.get(name), count, positive=True) for name, count in sizes if known]
+        return Visual(T, body=make_body(path, kind.tag, np.concatenate(given or [np.zeros(0)])))
     raise MeshError("unreadable", f"{path} has a visual without geometry")
 
 
-def _primitive(path: Path, kind: ElementTree.Element) -> Part:
-    def number(name: str) -> float:
-        return float(_numbers(path, kind.get(name), 1, positive=True)[0])
-
-    if kind.tag == "box":
-        mesh = trimesh.creation.box(_numbers(path, kind.get("size"), 3, positive=True))
-    elif kind.tag == "sphere":
-        mesh = trimesh.creation.uv_sphere(number("radius"), count=[SEGMENTS, SEGMENTS])
-    elif kind.tag == "cylinder":
-        mesh = trimesh.creation.cylinder(number("radius"), number("length"), sections=SEGMENTS)
-    elif kind.tag == "capsule":
-        mesh = trimesh.creation.capsule(radius=number("radius"), height=number("length"))
-    else:
-        raise MeshError("unreadable", f"{path}: geometry <{kind.tag:.40}> is not known")
-    return Part(kind.tag, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
-
-
 def _origin(path: Path, element: ElementTree.Element) -> Pose:
-    """[4, 4] of an <origin>: fixed-axis roll, pitch, yaw, then the shift (URDF: R = Rz Ry Rx)."""
+    """[4, 4] of an <origin>."""
     origin = element.find("origin")
-    if origin is None:
+    return np.eye(4) if origin is None else turned(path, origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0"))
+
+
+_SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
+_SIZES |= {"ellipsoid": ("radii",)}
+"""The sizes of SDF's bodies."""
+
+
+def read_sdf(path: Path, limits: MeshLimits) -> Model:
+    """The visuals of all links of an SDF's model, joints at zero."""
+    root = parse_xml(path, limits, "sdf", "an SDF")
+    for tag in ("world", "include", "submesh", "heightmap", "polyline"):
+        if root.find(f".//{tag}") is not None:
+            what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
+            raise MeshError("format", f"{path} {what}: init its models' own files")
+    visuals = [visual for model in root.iterfind("model") for visual in _of_model(path, model, np.eye(4), 0)]
+    names = dict.fromkeys((mesh.findtext("uri") or "").strip() for mesh in root.iterfind(".//geometry/mesh"))
+    return Model(tuple(visuals), tuple(names))
+
+
+def _of_model(path: Path, model: ElementTree.Element, T_above: Pose, depth: int) -> Iterator[Visual]:
+    if depth > MOST_ABOVE:
+        raise MeshError("unreadable", f"{path} has more than {MOST_ABOVE} models inside one another")
+    T = T_above @ _sdf_pose(path, model)
+    for link in model.iterfind("link"):
+        for visual in link.iterfind("visual"):
+            one = _sdf_geometry(path, visual, T @ _sdf_pose(path, link) @ _sdf_pose(path, visual))
+            if one is not None:
+                diffuse, albedo = visual.findtext("material/diffuse"), visual.findtext("material/pbr/metal/albedo_map")
+                rgba = (
+                    None
+                    if diffuse is None
+                    else np.clip([*numbers(path, diffuse, len(diffuse.split())), 1.0][:4], 0.0, 1.0)
+                )
+                yield replace(one, colour=rgba, texture=albedo and albedo.strip())
+    for inner in model.iterfind("model"):
+        yield from _of_model(path, inner, T, depth + 1)
+
+
+def _sdf_geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual | None:
+    """What a visual shows; None for a plane without end."""
+    for kind in visual.iterfind("geometry/*"):
+        if kind.tag == "mesh":
+            scale = scaled(path, numbers(path, kind.findtext("scale", "1 1 1"), 3))
+            return Visual(T @ scale, (kind.findtext("uri") or "").strip())
+        if kind.tag in _SIZES:
+            given = (kind.findtext(name) or "" for name in _SIZES[kind.tag])
+            sizes = np.concatenate(
+                [numbers(path, text, 3 if kind.tag in ("box", "ellipsoid") else 1, True) for text in given]
+            )
+            return Visual(T, body=make_body(path, kind.tag, sizes))
+        if kind.tag not in ("plane", "empty"):
+            raise MeshError("unreadable", f"{path}: geometry <{kind.tag:.40}> is not known")
+    return None
+
+
+def _sdf_pose(path: Path, element: ElementTree.Element) -> Pose:
+    """[4, 4] of a <pose>: a shift, then roll, pitch and yaw about fixed axes."""
+    found = element.find("pose")
+    if found is None or not (found.text or "").strip():
         return np.eye(4)
-    roll, pitch, yaw = _numbers(path, origin.get("rpy", "0 0 0"), 3)
-    return pose(_turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll), _numbers(path, origin.get("xyz", "0 0 0"), 3))
+    if (
+        found.get("relative_to", "__model__") not in ("", "__model__")
+        or found.get("rotation_format", "euler_rpy") != "euler_rpy"
+    ):
+        raise MeshError("format", f"{path} has poses relative to other frames, or as quaternions, which are not read")
+    values = (found.text or "").split()
+    return turned(
+        path, " ".join(values[:3]), " ".join(values[3:]), np.pi / 180 if found.get("degrees") == "true" else 1.0
+    )
 
 
-def _turn(axis: int, angle: float) -> Array:
-    a, b = ((1, 2), (2, 0), (0, 1))[axis]
-    R = np.eye(3)
-    R[a, a] = R[b, b] = math.cos(angle)
-    R[a, b], R[b, a] = -math.sin(angle), math.sin(angle)
-    return R
-
-
-def _numbers(path: Path, text: str | None, count: int, positive: bool = False) -> Array:
-    """[count] finite float64; MeshError `unreadable`."""
-    try:
-        values = np.array([float(word) for word in (text or "").split()])
-    except ValueError:
-        values = np.array([])
-    if len(values) != count or not np.isfinite(values).all() or (positive and (values <= 0).any()):
-        raise MeshError("unreadable", f"{path}: {text!r:.60} is not {count} {'positive ' if positive else ''}numbers")
-    return values
+POSED: Mapping[str, Callable[[Path, MeshLimits], Model]] = {".urdf": read_urdf, ".xml": read_mjcf, ".sdf": read_sdf}
+"""The formats of files that pose meshes, by suffix."""

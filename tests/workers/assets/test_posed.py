@@ -1,0 +1,244 @@
+"""MJCF and SDF beside URDF: what is seen of them, where it lies and how it looks; MuJoCo itself is the judge of MJCF."""
+
+import struct
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.errors import MeshError
+from schemas.job.assets import MeshLimits
+from tests.workers.assets.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
+from workers.assets.external.formats import load_shape
+from workers.assets.external.urdf import find_named, list_named, list_seen, load_posed
+
+LIMITS = MeshLimits()
+
+BODY = """
+<mujoco><compiler {compiler}/>
+<default><geom rgba="0.2 0.4 0.6 1"/><default class="seen"><geom contype="0" conaffinity="0" group="2"/></default>
+<default class="small"><mesh scale="0.1 0.2 0.3"/></default></default>
+<asset><mesh name="m" file="cube.obj" class="small"/><mesh name="r" file="cube.obj" scale="0.3 0.2 0.1" refpos="0.1 0.2 0.3"
+refquat="0.9 0.1 0.2 0.3"/></asset>
+<worldbody><body pos="0.3 0.1 0.2" {turn}><freejoint/>
+<geom type="mesh" mesh="m" class="seen" pos="0.5 0 0" {turn}/><geom type="mesh" mesh="r" class="seen" quat="0.5 0.1 0.7 0.2"/>
+<geom type="box" size="0.9 0.9 0.9"/><geom type="box" size="0.8 0.8 0.8" group="3"/>
+<body childclass="seen" {turn} pos="1 2 3"><geom type="cylinder" size="0.1 0.2" {turn}/><geom type="capsule" size="0.1"
+fromto="1 0 0 1.5 0.4 0.7"/><geom type="ellipsoid" size="0.1 0.2 0.3"/><geom size="0.2" pos="2 2 2"/></body>
+<body><geom type="box" size="0.1 0.2 0.3" fromto="3 0 0 3 0 -1"/></body></body></worldbody></mujoco>"""
+
+TURNS = (
+    ("", ""),
+    ('angle="radian"', 'euler="0.3 0.5 0.7"'),
+    ("", 'euler="30 -50 70"'),
+    ('eulerseq="zyX"', 'euler="30 -50 70"'),
+    ("", 'axisangle="1 2 3 40"'),
+    ("", 'xyaxes="1 2 0 -1 1 1"'),
+    ("", 'zaxis="1 -2 0.5"'),
+    ("", 'zaxis="0 0 -1"'),
+    ("", 'quat="1 2 3 4"'),
+)
+
+
+def seen_by_mujoco(path, group=2):
+    """The middle, mean square and extents [3, 3] of all that MuJoCo has in a group, from points of its own surfaces."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    found = []
+    for geom in range(model.ngeom):
+        kind, size = model.geom_type[geom], model.geom_size[geom]
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = model.geom_dataid[geom]
+            start = model.mesh_vertadr[mesh]
+            points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+        else:
+            made = {
+                mujoco.mjtGeom.mjGEOM_BOX: lambda s: trimesh.creation.box(2 * s),
+                mujoco.mjtGeom.mjGEOM_CYLINDER: lambda s: trimesh.creation.cylinder(s[0], 2 * s[1], sections=48),
+                mujoco.mjtGeom.mjGEOM_CAPSULE: lambda s: trimesh.creation.capsule(radius=s[0], height=2 * s[1]),
+                mujoco.mjtGeom.mjGEOM_SPHERE: lambda s: trimesh.creation.uv_sphere(s[0], count=[48, 48]),
+                mujoco.mjtGeom.mjGEOM_ELLIPSOID: lambda s: trimesh.creation.uv_sphere(1.0, count=[48, 48]).apply_scale(
+                    s
+                ),
+            }[mujoco.mjtGeom(kind)](size)
+            points = made.vertices
+        in_body = model.geom_contype[geom] == 0 or model.body_geomnum[model.geom_bodyid[geom]] == 1
+        if in_body and model.geom_group[geom] < 3:
+            found.append(points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+    return [np.stack([points.min(axis=0), points.max(axis=0)]) for points in found]
+
+
+def boxes(shape):
+    return [np.stack([part.vertices.min(axis=0), part.vertices.max(axis=0)]) for part in shape.parts]
+
+
+@pytest.mark.parametrize(("compiler", "turn"), TURNS)
+def test_bodies_of_an_mjcf_lie_where_mujoco_has_them_and_collision_shapes_are_not_seen(tmp_path, compiler, turn):
+    write(tmp_path / "cube.obj", CUBE)
+    path = write(tmp_path / "a.xml", BODY.format(compiler=compiler, turn=turn))
+    ours, theirs = boxes(load_posed(path, LIMITS, tmp_path).shape), seen_by_mujoco(path)
+    assert len(ours) == len(theirs) == 7
+    for mine, its in zip(ours, theirs, strict=True):
+        assert mine == pytest.approx(its, abs=2e-3), "capsules and spheres have other facets"
+    assert ours[0] == pytest.approx(theirs[0], abs=1e-6) and ours[1] == pytest.approx(theirs[1], abs=1e-6)
+
+
+def test_a_body_with_a_look_has_its_picture_or_colour_and_one_without_coordinates_says_so(tmp_path):
+    write_all(tmp_path / "m", textured_obj())
+    write(tmp_path / "m/plain.obj", CUBE)
+    write(tmp_path / "m/t/green.png", picture(colour=(0, 200, 0)))
+    assets = """<mujoco><compiler meshdir="m" texturedir="m/t"/><asset><mesh file="{}.obj"/>{}<material name="k" texture="green"
+    rgba="1 1 0.5 0.5"/></asset><worldbody><geom type="mesh" mesh="{}" {}/></worldbody></mujoco>"""
+    flat = '<texture type="2d" file="green.png"/>'
+    about = '<texture type="cube" name="green" file="green.png"/>'
+    sdf = """<sdf><model><link><visual><geometry><mesh><uri>model://any/m/plain.obj</uri></mesh></geometry><material>
+    <diffuse>0 0 1</diffuse></material></visual></link></model></sdf>"""
+    of_urdf = urdf(
+        visual('<mesh filename="package://a/m/cube.obj"/>', material='<material name="green"/>'),
+        more=('<material name="green"><texture filename="package://a/m/t/green.png"/></material>'),
+    )
+    bare = textured_obj()["cube.obj"].replace(b"mtllib cube.mtl\n", b"").replace(b"usemtl skin\n", b"")
+    for name, text, colour, green, note in (
+        ("a.xml", assets.format("cube", flat, "cube", 'material="k"'), (1.0, 1.0, 0.5, 0.5), True, ""),
+        ("b.xml", assets.format("cube", about, "cube", 'material="k" rgba="1 0 0 1"'), (1.0, 0.0, 0.0, 1.0), False, ""),
+        (
+            "c.xml",
+            assets.format("plain", flat, "plain", 'material="k"'),
+            (1.0, 1.0, 0.5, 0.5),
+            False,
+            "needs texture coord",
+        ),
+        ("d.sdf", sdf, (0.0, 0.0, 1.0, 1.0), False, ""),
+        ("e.urdf", of_urdf, (1.0, 1.0, 1.0, 1.0), True, ""),
+    ):
+        if name == "e.urdf":
+            write(tmp_path / "m/cube.obj", bare)
+        path = write(tmp_path / name, text)
+        loaded = load_posed(path, LIMITS, tmp_path)
+        (part,) = loaded.shape.parts
+        assert part.material.base_color == pytest.approx(colour), name
+        assert (part.material.texture is not None and part.material.texture[0, 0].tolist() == [0, 200, 0]) == green, (
+            name
+        )
+        assert any(note in one for one in (*loaded.notes, "" if not note else "none")) == True  # noqa: E712
+        meshes, pictures = list_seen(path, tmp_path, LIMITS)
+        assert len(meshes) == 1 and len(pictures) == (name in ("a.xml", "c.xml", "e.urdf"))
+
+
+SDF = """<sdf version="1.6"><model name="m"><pose>0 0 1 0 0 0</pose><link name="l"><pose degrees="true">1 0 0 0 0 90</pose>
+<collision name="c"><geometry><mesh><uri>hull.obj</uri></mesh></geometry></collision>
+<visual name="v"><pose>1 0 0 0 0 0</pose><geometry><mesh><uri>model://mug/meshes/cube.obj</uri><scale>0.1 0.2 0.3</scale></mesh>
+</geometry></visual>
+<visual name="w"><geometry><cylinder><radius>0.1</radius><length>0.4</length></cylinder></geometry></visual>
+<visual name="x"><geometry><plane><normal>0 0 1</normal></plane></geometry></visual></link>
+<model name="inner"><pose>5 0 0 0 0 0</pose><link name="k"><visual name="y"><geometry><box><size>1 2 3</size></box></geometry>
+</visual></link></model></model></sdf>"""
+
+
+def test_an_sdf_is_read_as_its_poses_say_and_what_it_does_not_hold_is_named(tmp_path):
+    for name in ("meshes/cube.obj", "hull.obj"):
+        write(tmp_path / name, CUBE)
+    path = write(tmp_path / "model.sdf", SDF)
+    mesh, cylinder, box = boxes(load_posed(path, LIMITS, tmp_path).shape)
+    # A quarter turn about z takes the mesh's x in [0, 0.1] and y in [0, 0.2] to y and -x, from the link's place at (1, 1, 1).
+    assert mesh == pytest.approx(np.array([[0.8, 1.0, 1.0], [1.0, 1.1, 1.3]]))
+    assert cylinder == pytest.approx(np.array([[0.9, -0.1, 0.8], [1.1, 0.1, 1.2]]), abs=1e-3)
+    assert box == pytest.approx(np.array([[4.5, -1.0, -0.5], [5.5, 1.0, 2.5]]))
+    named = {file.name for file in list_named(path, tmp_path, LIMITS)}
+    assert named == {"cube.obj", "hull.obj"}, "collision shapes are parts too"
+
+
+WRONG = (
+    ("a.sdf", "<sdf><world><model/></world></sdf>", "format", "is a world, and no object"),
+    (
+        "a.sdf",
+        SDF.replace("<pose>1 0 0 0 0 0", '<pose relative_to="k">1 0 0 0 0 0'),
+        "format",
+        "relative to other frames",
+    ),
+    (
+        "a.sdf",
+        SDF.replace("<cylinder>", "<torus>").replace("</cylinder>", "</torus>"),
+        "unreadable",
+        "<torus> is not known",
+    ),
+    ("a.sdf", "<sdf/>", "no_faces", "no visual geometry"),
+    ("a.xml", "<mujoco/>", "no_faces", "no visual geometry"),
+    ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "format", "has <include>"),
+    (
+        "a.xml",
+        '<mujoco><worldbody><geom type="mesh" mesh="m"/></worldbody></mujoco>',
+        "unreadable",
+        "no file of the mesh 'm'",
+    ),
+    (
+        "a.xml",
+        '<mujoco><worldbody><geom type="box" size="1 1"/></worldbody></mujoco>',
+        "unreadable",
+        "is not 3 positive",
+    ),
+    ("a.xml", '<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>', "no_faces", "no visual"),
+    (
+        "a.xml",
+        f"<mujoco><worldbody>{'<body>' * 300}{'</body>' * 300}</worldbody></mujoco>",
+        "unreadable",
+        "more than 256 bodies",
+    ),
+    ("a.xml", "<robot/>", "unreadable", "its root is <robot>"),
+    ("a.xml", f"<mujoco><worldbody>{'<geom/>' * 9000}</worldbody></mujoco>", "too_large", "9000 geoms, over max_nodes"),
+    ("a.msh", b"$MeshFormat\n4.1 0 8", "format", "a mesh of Gmsh"),
+    ("a.msh", struct.pack("<4i", 3, 0, 0, 1), "unreadable", "does not tell its length"),
+    ("a.msh", struct.pack("<4i", -3, 0, 0, 1), "unreadable", "does not tell its length"),
+)
+
+
+@pytest.mark.parametrize(("name", "text", "reason", "words"), WRONG)
+def test_what_cannot_be_read_of_them_is_one_reason(tmp_path, name, text, reason, words):
+    path = write(tmp_path / name, text)
+    with pytest.raises(MeshError, match=words) as caught:
+        load_posed(path, LIMITS, tmp_path) if name != "a.msh" else load_shape(path, LIMITS)
+    assert caught.value.reason == reason
+
+
+def test_names_are_found_by_every_tail_of_them_in_the_folders_above_and_never_outside(tmp_path):
+    root, path = tmp_path / "in", tmp_path / "in/robot/urdf/r.urdf"
+    for name in ("robot/meshes/a.obj", "robot/urdf/b.obj", "c.obj", "textures/d.png"):
+        write(root / name, "")
+    write(tmp_path / "out.obj", "")
+    for name, found in (
+        ("package://robot/meshes/a.obj", "robot/meshes/a.obj"),
+        ("package://other_name/meshes/a.obj", "robot/meshes/a.obj"),
+        ("/home/me/robot/meshes/a.obj", "robot/meshes/a.obj"),
+        ("..\\meshes\\a.obj", "robot/meshes/a.obj"),
+        ("b.obj", "robot/urdf/b.obj"),
+        ("model://x/y/c.obj", "c.obj"),
+        ("../../textures/d.png", "textures/d.png"),
+    ):
+        assert find_named(name, path, root) == root / found
+    for name in ("../../../out.obj", str(tmp_path / "out.obj"), "", "x" * 9999, "a" + "/x" * 500, "gone.obj"):
+        with pytest.raises(MeshError, match="is not inside"):
+            find_named(name, path, root)
+
+
+def test_mujocos_own_meshes_and_off_are_read(tmp_path):
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    uv = np.random.default_rng(0).random((8, 2))
+    head = struct.pack("<4i", 8, 8, 8, 12)
+    blocks = (box.vertices, box.vertex_normals, uv, box.faces)
+    kinds = ("<f4", "<f4", "<f4", "<i4")
+    data = head + b"".join(np.asarray(b).astype(kind).tobytes() for b, kind in zip(blocks, kinds, strict=True))
+    shape = load_shape(write(tmp_path / "a.msh", data), LIMITS).shape
+    assert shape.closed and np.ptp(shape.vertices, axis=0) == pytest.approx([0.1, 0.2, 0.3])
+    (part,) = shape.parts
+    theirs = mujoco.MjModel.from_xml_string(
+        '<mujoco><asset><mesh name="a" file="a.msh"/></asset><worldbody><geom type="mesh" mesh="a"/></worldbody></mujoco>',
+        {"a.msh": data},
+    )
+    assert theirs.mesh_facenum[0] == len(part.faces) == 12
+    assert part.uv == pytest.approx(
+        np.column_stack([uv[:, 0], 1 - uv[:, 1]])[np.lexsort(box.vertices.T)], abs=1
+    ) and part.uv.shape == (8, 2)
+    box.export(tmp_path / "b.off")
+    assert load_shape(tmp_path / "b.off", LIMITS).shape.closed

@@ -1,0 +1,132 @@
+"""Edge: files that pose meshes and simple bodies, parsed with the standard library: their XML, and what of them is seen."""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import trimesh
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.errors import MeshError
+from schemas.job.assets import MeshLimits
+from schemas.scene.shape import Part
+from workers.assets.external.caps import check_nodes
+from workers.assets.external.mesh import DEFAULT
+from workers.geometry.frames import pose
+
+_DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
+MAX_XML_BYTES = 10_000_000
+SEGMENTS = 48
+"""Facets around cylinders and spheres."""
+
+MOST_ABOVE = 256
+"""Joints or bodies between one and its root: the pose is the product of all of theirs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Visual:
+    """One thing that a file poses: a mesh by the name of its file, or a simple body.
+
+    T: affine, [4, 4], to the frame of the whole, metres; colour: sRGB and alpha; texture: the name of a picture; dresses:
+    whether these replace what the mesh has of its own, and are not only for what has none.
+    """
+
+    T: Pose
+    mesh: str | None = None
+    body: Part | None = None
+    colour: Array | None = None
+    texture: str | None = None
+    dresses: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What a file poses: what is seen of it, the names of all its meshes, also of those that only collide, and notes."""
+
+    visuals: tuple[Visual, ...]
+    meshes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+def parse_xml(path: Path, limits: MeshLimits, tag: str, kind: str) -> ElementTree.Element:
+    """The root element; MeshError `missing`, `too_large` or `unreadable`. Documents with a DTD or entities are refused."""
+    try:
+        if path.stat().st_size > MAX_XML_BYTES:
+            raise MeshError("too_large", f"{path} has {path.stat().st_size} bytes, over {MAX_XML_BYTES}")
+        data = path.read_bytes()
+    except OSError as error:
+        raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
+    if b"<!" in data.replace(b"<!--", b"") or b"\0" in data:
+        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
+    try:
+        # pybullet's own files declare XML version 0.0, which no parser accepts.
+        root = ElementTree.fromstring(_DECLARATION.sub(b"", data, count=1))
+    except ElementTree.ParseError as error:
+        raise MeshError("unreadable", f"{path} is not XML: {error}") from error
+    if root.tag != tag:
+        raise MeshError("unreadable", f"{path} is not {kind}: its root is <{root.tag:.40}>")
+    for what, many in (
+        ("link", "links"),
+        ("joint", "joints"),
+        ("visual", "visuals"),
+        ("body", "bodies"),
+        ("geom", "geoms"),
+    ):
+        check_nodes(path, sum(1 for _ in root.iter(what)), many, limits)
+    return root
+
+
+def make_body(path: Path, kind: str, sizes: Array) -> Part:
+    """A body about its middle, along z; MeshError `unreadable` for a kind that is not known.
+
+    sizes: of a `box` its sides [3], of an `ellipsoid` its half axes [3], of a `sphere` its radius [1], of a `cylinder` or
+    `capsule` its radius and length [2].
+    """
+    if kind == "box":
+        mesh = trimesh.creation.box(sizes)
+    elif kind in ("sphere", "ellipsoid"):
+        mesh = trimesh.creation.uv_sphere(1.0, count=[SEGMENTS, SEGMENTS])
+        mesh.vertices = mesh.vertices * sizes
+    elif kind == "cylinder":
+        mesh = trimesh.creation.cylinder(sizes[0], sizes[1], sections=SEGMENTS)
+    elif kind == "capsule":
+        mesh = trimesh.creation.capsule(radius=sizes[0], height=sizes[1])
+    else:
+        raise MeshError("unreadable", f"{path}: geometry <{kind:.40}> is not known")
+    return Part(kind, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
+
+
+def scaled(path: Path, scale: Array) -> Pose:
+    """[4, 4] of a scale [3] of a mesh; MeshError `no_size` where it is 0."""
+    if 0.0 in scale:
+        raise MeshError("no_size", f"{path} scales a mesh by {scale}")
+    return np.diag([*scale, 1.0])
+
+
+def turned(path: Path, xyz: str, rpy: str, unit: float = 1.0) -> Pose:
+    """[4, 4] of a shift, and of roll, pitch and yaw about fixed axes, each times `unit` radians (R = Rz Ry Rx)."""
+    roll, pitch, yaw = unit * numbers(path, rpy, 3)
+    return pose(turn(2, yaw) @ turn(1, pitch) @ turn(0, roll), numbers(path, xyz, 3))
+
+
+def turn(axis: int, angle: float) -> Array:
+    """[3, 3] of a turn about x, y or z (0, 1, 2), radians."""
+    a, b = ((1, 2), (2, 0), (0, 1))[axis]
+    R = np.eye(3)
+    R[a, a] = R[b, b] = math.cos(angle)
+    R[a, b], R[b, a] = -math.sin(angle), math.sin(angle)
+    return R
+
+
+def numbers(path: Path, text: str | None, count: int, positive: bool = False) -> Array:
+    """[count] finite float64; MeshError `unreadable`."""
+    try:
+        values = np.array([float(word) for word in (text or "").split()])
+    except ValueError:
+        values = np.array([])
+    if len(values) != count or not np.isfinite(values).all() or (positive and (values <= 0).any()):
+        raise MeshError("unreadable", f"{path}: {text!r:.60} is not {count} {'positive ' if positive else ''}numbers")
+    return values
