@@ -62,19 +62,11 @@ class _Stream(io.TextIOWrapper):
 
 def speak_as_typed() -> None:
     """From here on this process prints commands as they are typed; nothing changes where that is `verso`."""
-    if typed_program() == "verso":
-        return
-    for name in ("stdout", "stderr"):
-        stream = getattr(sys, name)
-        if isinstance(stream, io.TextIOWrapper) and not isinstance(stream, _Stream):
-            _KEPT.append(stream)
-            stream.flush()
-            lines, through = stream.line_buffering, stream.write_through
-            setattr(sys, name, _Stream(stream.buffer, stream.encoding, stream.errors, None, lines, through))
-
-
-_KEPT: list[io.TextIOWrapper] = []
-"""The streams below: one that nothing holds would close its file."""
+    for name in ("stdout", "stderr") if typed_program() != "verso" else ():
+        old = getattr(sys, name)
+        if isinstance(old, io.TextIOWrapper) and not isinstance(old, _Stream):
+            how = (old.encoding, old.errors, None, old.line_buffering, old.write_through)
+            setattr(sys, name, _Stream(old.detach(), *how))
 
 
 if __name__ == "__main__":  # what the launcher sets for tools that it starts itself

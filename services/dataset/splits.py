@@ -43,20 +43,15 @@ def split_by_category(instances: Mapping[str, Collection[str] | None], shares: S
     """The split of every instance; `instances`: ids by category, as `collect_ids` has them.
 
     A category's instances stand in the order of their ids' hashes, as in `assets.split`, and are cut where the shares say;
-    as long as there are enough, each split that has a share has one. The same ids give the same splits.
+    as long as there are enough, train has one, then test, then val. The same ids give the same splits.
     """
     found: dict[str, str] = {}
     for names in instances.values():
         order = sorted(names or (), key=lambda name: hashlib.sha256(name.encode()).digest())
-        val, test = _counts(len(order), shares)
-        kinds = ["train"] * (len(order) - val - test) + ["val"] * val + ["test"] * test
+        room = len(order) - (shares.train > 0)
+        test = max(min(max(round(len(order) * shares.test), shares.test > 0), room), 0)
+        val = max(min(max(round(len(order) * shares.val), shares.val > 0), room - test), 0)
+        train = len(order) - val - test if shares.train else 0
+        kinds = ["train"] * train + ["val"] * (len(order) - train - test) + ["test"] * test
         found |= dict(zip(order, kinds, strict=True))
     return found
-
-
-def _counts(count: int, shares: SplitShares) -> tuple[int, int]:
-    """How many of a category's instances are in val and in test: train goes first, then test, then val."""
-    room = count - (shares.train > 0)
-    test = min(max(round(count * shares.test), int(shares.test > 0)), max(room, 0))
-    val = min(max(round(count * shares.val), int(shares.val > 0)), max(room - test, 0))
-    return (val, test) if shares.train > 0 else (count - test, test)

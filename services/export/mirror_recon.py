@@ -87,43 +87,33 @@ Images = dict[str, bytes]
 """PNG bytes by name without ending, with places for the ids `even` and `odd`."""
 
 
-def _images_of(pair: ExportPair) -> tuple[Images, str]:
-    """(the images of the whole views, a reason why the pair cannot be exported, empty where it can)."""
-    views = [
-        (f"{name}{{{('even', 'odd')[more]}:05d}}", role, kind) for role, more, _ in _VIEWS for kind, name in _KINDS
-    ]
-    views += [(f"{name}Proj{{even:05d}}", "projected", kind) for kind, name in _KINDS[:2]]
-    return _take(pair, [(name, role, kind, pair.image(role, kind)) for name, role, kind in views], "")
-
-
 def _patches_of(pair: ExportPair, regions: list[int]) -> tuple[Images, list[str]]:
     """(the patches of every object that has all of them, the reason of each other one)."""
     found: Images = {}
-    reasons, objects = [], len(regions)
+    reasons = []
     for number, region in enumerate(regions):
-        place = f"obj{number}"
-        parts = [
-            (f"{name}In{{even:05d}}{word}{place}", role, kind) for role, _, word in _VIEWS for kind, name in _KINDS
-        ]
-        parts += [(f"{name}Proj{{even:05d}}yaw-179{place}", "projected", kind) for kind, name in _KINDS[:2]]
-        images, reason = _take(
-            pair, [(name, role, kind, pair.patch(role, kind, region, objects)) for name, role, kind in parts], "patch"
-        )
+        images, reason = _images_of(pair, (region, len(regions)), f"obj{number}")
         if reason:
             reasons.append(reason)
             continue
-        distance = _distance_patch(pair, region, images[f"rgbIn{{even:05d}}yaw0{place}"])
-        found |= images | {f"distIn{{even:05d}}yaw0{place}": encode_png(distance)}
+        distance = _distance_patch(pair, region, images[f"rgbIn{{even:05d}}yaw0obj{number}"])
+        found |= images | {f"distIn{{even:05d}}yaw0obj{number}": encode_png(distance)}
     return found, reasons
 
 
-def _take(pair: ExportPair, stored: list[tuple[str, Role, PixelKind, bytes | None]], what: str) -> tuple[Images, str]:
-    """(the images by name, depth in `UNITS_PER_M`, the reason why one of them is not there)."""
+def _images_of(pair: ExportPair, patch: tuple[int, int] | None = None, place: str = "") -> tuple[Images, str]:
+    """(images by name, the reason why one is not there): of whole views, or patches of (region, objects), called `place`."""
     images: Images = {}
-    for name, role, kind, data in stored:
-        if data is None:
-            return {}, f"no {role} view" if role not in pair.views else f"no {what or kind} of the {role} view"
-        images[name] = data if kind != "depth" else in_units(data, pair.views[role]["depth_units_per_m"])
+    for role, number, word in (*_VIEWS, ("projected", 0, "yaw-179")):
+        middle = "Proj" if role == "projected" else "In" if patch else ""
+        ending = f"{{{'even' if patch or not number else 'odd'}:05d}}{word + place if patch else ''}"
+        for kind, name in _KINDS if role != "projected" else _KINDS[:2]:
+            data = pair.patch(role, kind, *patch) if patch else pair.image(role, kind)
+            if data is None:
+                what = "patch" if patch else kind
+                return {}, f"no {role} view" if role not in pair.views else f"no {what} of the {role} view"
+            in_depth = in_units(data, pair.views[role]["depth_units_per_m"]) if kind == "depth" else data
+            images[f"{name}{middle}{ending}"] = in_depth
     return images, ""
 
 
