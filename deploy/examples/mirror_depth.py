@@ -243,10 +243,11 @@ def draw_row(pair: Pair, example: Example, predicted: Image) -> NDArray[np.uint8
     seen = cv2.resize((pair.input if patch is None else patch).rgb(), CROP[::-1], interpolation=cv2.INTER_AREA)
     low, high = np.percentile(example.depth[example.depth > 0], [1, 99])
     depths = (example.depth, predicted)
-    near = [np.uint8(255 * (1 - np.clip((one - low) / max(high - low, 1e-6), 0, 1))) for one in depths]
-    shown = [cv2.applyColorMap(one, cv2.COLORMAP_VIRIDIS)[..., ::-1] for one in near]
-    error = np.where(example.depth > 0, np.abs(predicted - example.depth) / ERROR_M, 0)
-    return np.concatenate([seen, *shown, np.repeat(np.uint8(255 * np.clip(error, 0, 1))[..., None], 3, axis=2)], axis=1)
+    near = [255 * (1 - np.clip((one - low) / max(high - low, 1e-6), 0, 1)) for one in depths]
+    shown = [cv2.applyColorMap(one.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1] for one in near]
+    error = 255 * np.clip(np.where(example.depth > 0, np.abs(predicted - example.depth) / ERROR_M, 0), 0, 1)
+    grey = np.repeat(error.astype(np.uint8)[..., None], 3, axis=2)
+    return np.concatenate([seen, *shown, grey], axis=1).astype(np.uint8)
 
 
 def draw_sheet(rows: list[NDArray[np.uint8]]) -> Picture.Image:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,7 @@ SMALLER = {
     r"^\./verso test$": "./verso test tests/test_layers.py",
     r"tests/hard_cases": "tests/test_layers.py",
     r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
-    r"(\./verso tradeoff .*)": r"\1 --scenes 6 --physics-scenes 6 --laps 1 --knobs physics.step_hz",
+    r"(\./verso tradeoff .*)": r"\1 --scenes 6 --physics-scenes 6 --laps 1 --knobs step",
     r"(run deploy/jobs/captures.yaml)": r"\1 --scenes 1 --set captures.simulate.views=8 " + TINY,
     r"--views 40 --category mug": f"--views 10 --category mug {TINY}",
     r"~/my_meshes": "meshes",
@@ -117,6 +118,7 @@ def checkout_at(root: Path) -> Path:
     write_mesh(root / "meshes/mug/b.ply", cup(0.12, 0.05))
     write_mesh(root / "scan.ply", cup())
     (root / "recording.mkv").write_bytes(recording())
+    (root / "shared").mkdir()  # what hosts see under one name
     return root
 
 
@@ -131,13 +133,19 @@ def type_it(line: str, root: Path, timeout: float = 900) -> str:
 
 
 def type_for_a_while(line: str, root: Path) -> None:
-    """Starts a command, waits until it says something, and interrupts it: it must end without a word of Python's."""
+    """Starts a command, gives it time to say something, and interrupts it: it must end without a word of Python's."""
     run = ["bash", "-c", f"exec {line}"]
-    process = subprocess.Popen(run, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert process.stdout is not None
-    time.sleep(6)
-    process.send_signal(signal.SIGINT)
-    told, _ = process.communicate(timeout=60)
+    hears = partial(
+        signal.signal, signal.SIGINT, signal.default_int_handler
+    )  # also where these tests run in the background
+    out, err = subprocess.PIPE, subprocess.STDOUT
+    with subprocess.Popen(run, cwd=root, preexec_fn=hears, stdout=out, stderr=err, text=True) as process:
+        try:
+            time.sleep(6)
+            process.send_signal(signal.SIGINT)
+            told, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode in (0, 1) and "Traceback" not in told, f"{line}\n{told}"
 
 
