@@ -119,7 +119,7 @@ class Chart:
 def chart_html(chart: Chart) -> str:
     """A figure with bars, the ends and the middle of its axis, and its median and spread in words.
 
-    Values that are all equal are a sentence and no bar. Empty without values.
+    Values that are all equal, or nearly all, are a sentence and no bar. Empty without values.
     """
     series = {name: histogram for name, histogram in chart.series.items() if histogram.count}
     lines = [(name, _summary(chart, one)) for name, one in series.items()]
@@ -129,7 +129,7 @@ def chart_html(chart: Chart) -> str:
     if not words:
         return ""
     head = f"<figcaption><h3>{escape(chart.title)}</h3><p>{escape(chart.about)}</p></figcaption>\n"
-    varies = any(one.least < one.most for one in series.values())
+    varies = any(one.percentile(0.05) < one.percentile(0.95) for one in series.values())
     drawn = _drawing(chart, series, lines) if varies else ""
     return f'<figure class="chart">{head}{drawn}<dl>{words}</dl></figure>\n'
 
@@ -172,6 +172,8 @@ def _summary(chart: Chart, one: Histogram) -> str:
     if one.least == one.most:
         return f"always {chart.tell(one.least)}, n = {one.count:,}"
     low, middle, high = (chart.tell(one.percentile(share)) for share in (0.05, 0.5, 0.95))
+    if one.percentile(0.05) == one.percentile(0.95):
+        return f"nearly always {middle}; {chart.tell(one.least)} to {chart.tell(one.most)}, n = {one.count:,}"
     return f"median {middle}, 5 to 95 %: {low} to {high}, n = {one.count:,}"
 
 

@@ -8,7 +8,6 @@ function setTheme(name) {
   if (name) root.dataset.theme = name; else delete root.dataset.theme;
   const buttons = [...document.querySelectorAll("[data-theme-to]")];
   press(buttons, buttons.find((one) => one.dataset.themeTo === name));
-  document.dispatchEvent(new Event("verso:theme"));
 }
 function kept(value) { // a page opened from a file may have no storage
   try { if (value === undefined) return localStorage.getItem("verso-theme") || ""; localStorage.setItem("verso-theme", value); } catch { /* not kept */ }

@@ -7,7 +7,6 @@ THREE.ColorManagement.legacyMode = false; // colours are given in sRGB and lit i
 const TINTS = { input: "#2f7fd6", mirror: "#e07b39" };
 
 function bytes(text) { return Uint8Array.from(atob(text), (one) => one.charCodeAt(0)).buffer; }
-function styleColor(name) { return new THREE.Color(getComputedStyle(document.documentElement).getPropertyValue(name).trim()); }
 
 function cloudOf(cloud, quantum) {
   const whole = new Int16Array(bytes(cloud.points)), shape = new THREE.BufferGeometry();
@@ -118,7 +117,6 @@ function draw() {
   space.renderer.setSize(width, height, false);
   space.camera.aspect = width / height;
   space.camera.updateProjectionMatrix();
-  space.scene.background = styleColor("--panel");
   space.renderer.render(space.scene, space.camera);
   canvas.dataset.drawn = String(Number(canvas.dataset.drawn || 0) + 1);
 }
@@ -145,7 +143,7 @@ function begin(canvas, data) {
     document.getElementById("space-note").textContent = "This browser draws no 3-D here: it has no WebGL 2, or it is switched off.";
     return;
   }
-  space.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+  space.renderer = new THREE.WebGLRenderer({ canvas, alpha: true, antialias: true, preserveDrawingBuffer: true }); // the page shows through
   space.renderer.outputEncoding = THREE.sRGBEncoding;
   space.scene = new THREE.Scene();
   space.camera = new THREE.PerspectiveCamera(FIELD_DEG, 1, 0.02, 60);
@@ -162,8 +160,6 @@ function begin(canvas, data) {
     choose(scenes.value);
   });
   document.getElementById("space-reset").addEventListener("click", reset);
-  document.addEventListener("verso:theme", draw);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   new ResizeObserver(draw).observe(canvas);
   choose(scenes.value); // which a browser may have kept from before
 }

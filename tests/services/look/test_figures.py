@@ -159,6 +159,8 @@ def test_bars_are_as_high_as_their_counts_and_told_in_words():
     html = chart(input=[2.5] * 9, mirror=[0.0])  # what is always the same is a sentence
     assert "<svg" not in html and "always 2.5 m, n = 9" in html and "always 0 m, n = 1" in html
     assert "<svg" in chart(input=[2.5] * 9, mirror=[0.0, 0.1])
+    html = chart(input=[2.5] * 99 + [2.0])
+    assert "<svg" not in html and "nearly always 2.5 m; 2 m to 2.5 m, n = 100" in html
     lengths = {-6.0: "1 nm", -4.5: "31.6 nm", -3.0: "1 µm", -2.0: "10 µm", 0.0: "1 mm", 3.0: "1 m"}
     assert {decade: length_of_decade(decade) for decade in lengths} == lengths
     assert (amount(45.678, "°"), amount(0.5, "%")) == ("45.7°", "0.5 %")

@@ -264,11 +264,11 @@ def test_the_live_page_follows_a_folder_without_a_word_in_the_console(tab, shown
             tab.until("document.getElementById('live-now').innerText.includes('Waiting')")
             out.unlink()
             out.symlink_to(shown.root)
-            tab.until("document.getElementById('live-now').innerText.includes('Finished')")
+            tab.until("document.getElementById('live-now')?.innerText.includes('Finished')")
             tab.until("document.querySelectorAll('.scene').length > 0", 40)
             tab.until("[...document.querySelectorAll('.latest img')].every((one) => one.naturalWidth > 0)")
             draw_space(tab)
         finally:
             follower.stop()
         assert tab.run("document.title") == "small" and tab.said == []
-    tab.until("!document.getElementById('live-gone').hidden")
+    tab.until("!document.getElementById('live-gone')?.hidden")
