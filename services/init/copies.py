@@ -131,8 +131,9 @@ def _is_double(item: Item, other: Item, size_m: Callable[[Item], float]) -> bool
         and max(abs(a - b) for a, b in zip(mine.look or (), theirs.look or (), strict=True)) > ALIKE_COLOUR
     ):
         return False
-    near = item.suffix != other.suffix and _nested(_parent(item.path), _parent(other.path))
-    if mine.faces < FEW and not (near and (_name(item) == _name(other) or {item.suffix, other.suffix} & set(POSED))):
+    posed = (item.suffix in POSED) != (other.suffix in POSED)
+    near = item.suffix != other.suffix and _nested(_parent(item.path), _parent(other.path), posed)
+    if mine.faces < FEW and not (near and (_name(item) == _name(other) or posed)):
         return False
     ours, others = _shape(item), _shape(other)
     pairs = zip(ours if near else (*ours, size_m(item)), others if near else (*others, size_m(other)), strict=True)
@@ -143,9 +144,10 @@ def _name(item: Item) -> str:
     return _stem(item.path).removeprefix("non")
 
 
-def _nested(one: str, other: str) -> bool:
-    """Whether two folders are the same, or one lies in the other."""
-    return one == other or (bool(one) and other.startswith(f"{one}/")) or (bool(other) and one.startswith(f"{other}/"))
+def _nested(one: str, other: str, anywhere: bool) -> bool:
+    """Whether two folders are the same, or one lies in the other; in the topmost one, `anywhere`, all others do."""
+    above, below = sorted((one, other), key=len)
+    return one == other or (bool(above) and below.startswith(f"{above}/")) or (anywhere and not above)
 
 
 def _shape(item: Item) -> tuple[float, ...]:

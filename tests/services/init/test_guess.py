@@ -198,6 +198,7 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("a.urdf"), solid("b/c.ply", turned=True)),
         (solid("a/m.glb", faces=12), solid("a/m.obj", faces=12)),
         (solid("a/textured.obj", textures=1, faces=12), solid("a/nontextured.ply", faces=12)),
+        (solid("bread.xml"), solid("meshes/bread.obj", 1.25)),  # which the model scales
         (solid("x/a.urdf", faces=12), solid("x/visual/b.obj", faces=12)),
         (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b/a.obj", look=(203.0, 9.0, 9.0), textures=1)),
         (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b/a.obj", look=(90.0, 9.0, 9.0))),

@@ -18,6 +18,7 @@ from workers.assets.external.mesh import DEFAULT
 from workers.geometry.frames import pose
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
+_PREFIX = re.compile(rb"(</?|\s)([A-Za-z_][\w.-]*):(?=[A-Za-z_])")
 MAX_XML_BYTES = 10_000_000
 SEGMENTS = 48
 """Facets around cylinders and spheres."""
@@ -61,9 +62,12 @@ def parse_xml(path: Path, limits: MeshLimits, tag: str, kind: str) -> ElementTre
         raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
     if b"<!" in data.replace(b"<!--", b"") or b"\0" in data:
         raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
+    # pybullet's own files declare XML version 0.0, which no parser accepts.
+    data = _DECLARATION.sub(b"", data, count=1)
+    if b"xmlns:" not in data:
+        data = _PREFIX.sub(rb"\1\2_", data)  # robots' own parsers know no namespaces, and let such pass undeclared
     try:
-        # pybullet's own files declare XML version 0.0, which no parser accepts.
-        root = ElementTree.fromstring(_DECLARATION.sub(b"", data, count=1))
+        root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
         raise MeshError("unreadable", f"{path} is not XML: {error}") from error
     if root.tag != tag:
