@@ -39,7 +39,14 @@ from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNet
 from schemas.scene.shape import Asset, Hull, MassProperties, Material, Part, Shape
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, hash_files
-from workers.assets.external.placement import find_doubt, list_files, load_entry, measure_asset
+from workers.assets.external.placement import (
+    THINNEST,
+    find_doubt,
+    list_files,
+    load_entry,
+    measure_asset,
+    measure_thinness,
+)
 from workers.assets.external.urdf import list_named
 from workers.geometry.hull import convex_hull
 
@@ -256,13 +263,17 @@ def _answer(request: Request, task: Task) -> bytes:
 
 
 def _check_fit(asset: Asset, path: Path) -> Hull | None:
-    """The convex hull, which is what an object collides and is placed by; None for a table. MeshError `no_hull`."""
+    """The convex hull, which is what an object collides and is placed by; None for a table. MeshError `no_hull` or `no_size`."""
     if asset.category == TABLE:
         return None
     try:
-        return convex_hull(asset.shape.vertices)
+        hull = convex_hull(asset.shape.vertices)
     except (QhullError, ValueError) as error:
         raise MeshError("no_hull", f"{path} is no body: it needs four points apart that are not in a line") from error
+    if measure_thinness(asset.shape.vertices) < THINNEST:
+        more = "it would lie unseen in the table's top: give it a thickness, such as by Blender's Solidify"
+        raise MeshError("no_size", f"{path} is flat, without thickness: {more}")
+    return hull
 
 
 _PLAIN = (
