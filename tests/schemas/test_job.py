@@ -33,6 +33,9 @@ def test_without_categories_a_job_has_all_that_its_sources_offer_once():
     packaged = {"source": "urdf", "folder": "pybullet_data"}  # may offer anything until it is listed
     assert tuple(job(assets={"objects": [packaged]}).categories) == CATEGORIES
     assert job(assets={"objects": [packaged]}, categories=["brick"]).categories == {"brick": 1.0}
+    assert {
+        job(assets={"objects": [{**URDF, "source": name}]}).assets.objects[0].source for name in ("files", "urdf")
+    } == {"files"}
     assert offered_by([{}, {"source": 3}, {"source": "urdf", "category_map": 7}, {"source": "urdf"}]) == ()
 
 
@@ -42,6 +45,10 @@ def test_a_name_that_cannot_be_is_refused_with_the_remedy():
         ("mugg", "no source offers it; did you mean 'mug'[?] offered: banana, Pear-2, bottle"),
         ("zebra", "no source offers it; offered: banana"),
         ("../x", "1 to 64 letters, digits, - and _"),
+        ("a b", "1 to 64 letters"),
+        ("\u202emug", "1 to 64 letters"),
+        ("杯" * 65, "1 to 64 letters"),
+        ("a\u0308", "composed"),
         ("", "letters, digits"),
         ("x" * 65, "1 to 64"),
         ("002", "write a letter too, such as n002"),

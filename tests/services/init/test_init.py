@@ -167,8 +167,14 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
         (tmp_path / "in" / link).symlink_to(target)
     # The system is asked through `os`, because root may read everything.
     monkeypatch.setattr(collection.os, "access", lambda path, how: "locked" not in str(path))
+    write(tmp_path / "in/a/robot.xml", "<!-- x --><mujoco/>")
+    for name, text in (("package.xml", "<package/>"), ("a/r.urdf.xacro", ""), ("a/all.tar.gz", ""), ("a/scan.FBX", "")):
+        write(tmp_path / "in" / name, text)
     paths, left_out = walk_folder(tmp_path / "in")
-    assert paths == ["a/b/c.GLB", "a/x.urdf", "b.obj"]
+    told = {one.path: one.why for one in left_out if one.reason == "format"}
+    assert set(told) == {"a/r.urdf.xacro", "a/all.tar.gz", "a/scan.FBX"} and "`xacro FILE" in told["a/r.urdf.xacro"]
+    left_out = [one for one in left_out if one.path not in told]
+    assert paths == ["a/b/c.GLB", "a/robot.xml", "a/x.urdf", "b.obj"]
     reasons = {"bad\\nname.obj": "name", "bad\\udcff.obj": "name", "dead.obj": "missing", "link.obj": "link"}
     assert {one.path: one.reason for one in left_out} == {**reasons, "locked.obj": "permission"}
     with pytest.raises(AssetSourceError, match=r"bad\\nname is not there"):

@@ -24,6 +24,7 @@ from tests.workers.assets.oracles import (
 from workers.assets.catalogue import list_source
 from workers.assets.external.listing import find_files, find_licence, list_licences, locate_folder
 from workers.assets.external.placement import load_entry
+from workers.assets.external.verdicts import Verdicts, check_listing
 from workers.scene.rows import asset_row
 
 LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
@@ -91,6 +92,36 @@ def test_an_entry_has_all_that_it_needs_and_broken_ones_are_counted(tmp_path):
     files = ["a.urdf", "cube.obj", "cube.mtl", "skin.png"], ["cube.gltf", "cube.bin", "skin.png"]
     assert found == {"mug": list(files)}
     assert listing.skipped == {"format": 1, "missing": 1, "unreadable": 1}
+
+
+OTHER = {
+    "pointer.obj": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "missing", "git lfs pull"),
+    "pointer.urdf": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "missing", "git lfs pull"),
+    "page.stl": (b"\n<!DOCTYPE html><html>404", "format", "is a web page"),
+    "page.obj": (b"<html><body>v 0 0 0", "format", "is a web page"),
+    "empty.glb": (b"", "no_faces", "is empty"),
+    "old.glb": (b"glTF\x01\0\0\0\x20\0\0\0", "format", "glTF of version 1"),
+    "packed.ply": (b"PK\x03\x04 and more", "format", "is an archive"),
+    "cloud.ply": (
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n",
+        "no_faces",
+        "a point cloud",
+    ),
+    "splat.ply": (b"ply\nelement vertex 1\nproperty float f_dc_0\nend_header\n", "no_faces", "Gaussian splats"),
+    "paper.obj": (b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n", "no_size", "is flat, without thickness"),
+    "tilted.obj": (b"v 0 0 0\nv 1 0 1\nv 1 1 2\nv 0 1 1\nf 1 2 3 4\n", "no_size", "is flat, without thickness"),
+}
+
+
+def test_what_a_file_really_is_is_told_with_what_to_do(tmp_path):
+    write_all(tmp_path, {"cube.obj": CUBE.encode(), **{name: data for name, (data, _, _) in OTHER.items()}})
+    settings = source(category_map={"*": "mug"})
+    listing = check_listing(settings, list_source(settings, tmp_path, {"mug"}, LIMITS), ASSETS, Verdicts(None))
+    for name, (_, reason, says) in OTHER.items():
+        settings = source(category_map={name: "mug"})
+        one = check_listing(settings, list_source(settings, tmp_path, {"mug"}, LIMITS), ASSETS, Verdicts(None))
+        assert one.skipped == {reason: 1} and says in one.examples[0], name
+    assert listing.count("mug") == 1, "the cube is read"
 
 
 def test_what_cannot_be_used_of_a_source_is_refused_with_the_remedy(tmp_path):
