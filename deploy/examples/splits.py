@@ -18,7 +18,8 @@ def pairs_of_split(dataset: Dataset, split: Split, splits: Mapping[str, str] | N
     dataset. `dataset.splits()` has the shares in each category. A scene of several objects of different splits is in none.
     """
     if splits is None:
-        splits = dict(zip(*_columns(dataset, "instance_id", "split"), strict=True))
+        rows = dataset.table("assets").to_table(columns=["instance_id", "split"]).to_pylist()
+        splits = {row["instance_id"]: row["split"] for row in rows}
     for pair in dataset.pairs(pc.field("instance_id").isin([name for name in splits if splits[name] == split])):
         if all(splits[name] == split for name in instances_of(pair)):
             yield pair
@@ -27,8 +28,3 @@ def pairs_of_split(dataset: Dataset, split: Split, splits: Mapping[str, str] | N
 def instances_of(pair: Pair) -> set[str]:
     """The ids of all objects of a pair's scene."""
     return {pair.instance_id, *(body["instance_id"] for body in pair.scene["bodies"] or ())}
-
-
-def _columns(dataset: Dataset, *names: str) -> list[list]:
-    objects = dataset.table("assets").to_table(columns=list(names), filter=pc.field("category") != "table")
-    return [objects.column(name).to_pylist() for name in names]

@@ -42,6 +42,12 @@ MAX_SCENE = 10**15
 MAX_RETRIES = 1 << 13
 _PLAIN_COMMIT = len("0000000000.json")
 
+ARTICLE = (
+    "R. Staszak and D. Belter, *3D object reconstruction: A comprehensive view-dependent dataset*, Data in Brief 55 "
+    "(2024) 110569, https://doi.org/10.1016/j.dib.2024.110569, CC BY"
+)
+"""The article that the layout and the geometry follow, as every page that goes with a dataset cites it."""
+
 Content = str
 """The word in an image's name."""
 

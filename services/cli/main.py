@@ -31,7 +31,7 @@ def main(argv: list[str] | None = None) -> int:
         argv = sys.argv[1:]
     options = build_parser(typed_program() if from_shell else "verso").parse_args(argv)
     if from_shell and options.starts_ray(options):
-        return supervise(partial(_run_child, options), options.kept, quiet=options.quiet, answers=options.json)
+        return supervise(partial(_run, options), options.kept, quiet=options.quiet, answers=options.json)
     try:
         return _run(options)
     except KeyboardInterrupt:
@@ -39,14 +39,9 @@ def main(argv: list[str] | None = None) -> int:
         return 1
 
 
-def _run_child(options: argparse.Namespace) -> int:
-    """As `_run`, in a child of the supervisor, which has another standard error."""
-    speak_as_typed()
-    return _run(options)
-
-
 def _run(options: argparse.Namespace) -> int:
     """The exit code of a command; errors are told in one line. KeyboardInterrupt passes."""
+    speak_as_typed()  # once more: a child of the supervisor has another standard error
     try:
         module, _, function = options.handler.partition(":")
         return int(getattr(importlib.import_module(module), function)(options) or 0)

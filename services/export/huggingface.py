@@ -13,9 +13,8 @@ from typing import Any, ClassVar, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.dataset.citation import ARTICLE
 from schemas.dataset.codec import Row
-from schemas.dataset.layout import stored_images, stored_roles
+from schemas.dataset.layout import ARTICLE, stored_images, stored_roles
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import plural
 from schemas.job.job import Job

@@ -12,9 +12,6 @@ from services.study.model import number
 FINE = 960
 """Number of equal steps that are counted: a multiple of every number of bars that a chart may have."""
 
-LEAST_STEPS = FINE // 10
-"""A window is at least so wide: values that are all equal are seen as one bar with room beside it."""
-
 
 @dataclass(frozen=True)
 class Histogram:
@@ -82,14 +79,11 @@ class Window:
 
 
 def window_of(histograms: Sequence[Histogram], bars: int) -> Window:
-    """About `bars` bars over the steps that any of these histograms, of one range, occupies, and over `LEAST_STEPS`."""
+    """About `bars` bars over the steps that any of these histograms, of one range, occupies."""
     used = np.flatnonzero(np.sum([one.counts for one in histograms], axis=0))
     if not used.size:
         return Window(0, FINE // bars, bars)
     low, high = int(used[0]), int(used[-1]) + 1
-    short = max(0, LEAST_STEPS - (high - low))
-    low = max(0, min(low - short // 2, FINE - LEAST_STEPS))
-    high = max(high, low + min(LEAST_STEPS, FINE))
     width = max(1, -(-(high - low) // bars))
     first = low // width * width
     return Window(first, width, -(-(high - first) // width))

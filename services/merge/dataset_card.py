@@ -1,8 +1,7 @@
 """OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
 from schemas.base import Counts
-from schemas.dataset.citation import ARTICLE
-from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
+from schemas.dataset.layout import ARTICLE, FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
 from schemas.dataset.shard import Fingerprint
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures

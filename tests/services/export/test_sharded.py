@@ -11,7 +11,7 @@ import pytest
 import trimesh
 import yaml
 
-from schemas.dataset.citation import ARTICLE
+from schemas.dataset.layout import ARTICLE
 from schemas.dataset.tables import SCHEMAS
 from services.export.huggingface import card_text
 from tests.services.export.exported import export_to, source_image, source_poses, source_rows
