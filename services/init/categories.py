@@ -16,7 +16,7 @@ BY_FOLDER, BY_FILE, BY_PARENT = "folder", "file", "parent"
 """The ways to name a category; any other word names them all."""
 
 _GENERIC = re.compile(
-    "mesh(es)?|models?|objects?|assets?|data|visuals?|textured|collada|train|test|val|"
+    "mesh(es)?|models?|files?|objects?|assets?|data|visuals?|textured|collada|train|test|val|"
     r"(obj|stl|ply|glb|gltf|urdf|mjcf|sdf|dae|off|fbx|3d)( format| files)?",
     re.IGNORECASE,
 )

@@ -21,19 +21,16 @@ from workers.assets.external.urdf import POSED
 SUFFIXES = (*POSED, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
 
-FOREIGN: Mapping[str, str] = {
-    **dict.fromkeys(
-        (".fbx", ".blend", ".3ds", ".usd", ".usda", ".usdc", ".usdz"), "export it as .glb, such as by Blender"
-    ),
-    **dict.fromkeys((".3mf", ".x3d", ".wrl", ".abc", ".dae"), "export it as .glb, such as by Blender"),
-    **dict.fromkeys((".max", ".mb", ".ma", ".c4d", ".lwo", ".skp"), "export it as .glb by the program that wrote it"),
-    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".fcstd", ".sldprt"), "export it as .stl by a CAD program"),
-    **dict.fromkeys(
-        (".pcd", ".las", ".laz", ".xyz", ".e57", ".splat", ".spz"), "it has points and no faces, so make a mesh of it"
-    ),
-    **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar"), "unpack it"),
-    ".xacro": "run `xacro FILE > FILE.urdf`",
+_REMEDIES = {
+    "run `assimp export FILE FILE.glb`, or use Blender": ".dae .fbx .3ds .3mf .x3d .wrl .lwo",
+    "export it as .glb, such as by Blender": ".blend .usd .usda .usdc .usdz .abc",
+    "export it as .glb by the program that wrote it": ".max .mb .ma .c4d .skp",
+    "export it as .stl by a CAD program": ".step .stp .iges .igs .fcstd .sldprt",
+    "it has points and no faces, so make a mesh of it": ".pcd .las .laz .xyz .e57 .splat .spz",
+    "unpack it": ".zip .tar .gz .tgz .bz2 .xz .7z .rar",
+    "run `xacro FILE > FILE.urdf`": ".xacro",
 }
+FOREIGN: Mapping[str, str] = {suffix: remedy for remedy, suffixes in _REMEDIES.items() for suffix in suffixes.split()}
 """Other files that may hold objects, and what to do with them."""
 
 MOST_FILES = 100_000

@@ -22,7 +22,8 @@ def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, st
     Only what belongs to some file of `everything` is a copy: a collision shape alone is all that there is of an object.
     """
     split = {path: _split(path) for path in everything}
-    originals = [path for path, (_, level) in split.items() if level is None]
+    posed = {path for path in everything if PurePosixPath(path).suffix.lower() in POSED}
+    originals = [path for path, (_, level) in split.items() if level is None or path in posed]
     levels: dict[tuple[str, str], tuple[int, str]] = {}
     for path, (stem, level) in split.items():
         if level is not None and level >= 0:
@@ -34,14 +35,14 @@ def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, st
     found = {}
     for path in paths:
         stem, level = split[path]
-        if level is None:
+        if level is None or path in posed:
             continue
         finest = levels.get((_parent(path), stem), (0, path))[1] if level >= 0 else None
         near = _near(path, by_folder) if finest in (None, path) else []
         of = next((one for one in near if _stem(one) == stem), None)
         if of is None and level < 0:
             alike = [one for one in near if stem in _stem(one) or _stem(one) in stem]
-            meshes = [one for one in near if PurePosixPath(one).suffix.lower() not in POSED] or near
+            meshes = [one for one in near if one not in posed] or near
             of = min(alike or (meshes if len(meshes) == 1 or _in_folder(path) else []), default=None)
         of = of or (finest if finest != path else None)
         if of is not None:

@@ -15,8 +15,8 @@ from workers.assets.external.urdf import POSED
 METRIC = frozenset({".glb", ".gltf", *POSED})
 """Formats whose specification says metres."""
 
-SPECIFIED_UP: Mapping[str, UpAxis] = {".glb": "y", ".gltf": "y"}
-"""Formats whose specification says which axis is up: believed, unless most of all files show that it is not."""
+SPECIFIED_UP: Mapping[str, UpAxis] = {".glb": "y", ".gltf": "y", **dict.fromkeys(POSED, "z")}
+"""Formats whose specification or use says which axis is up: believed, unless most of all files show that it is not."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def guess_ups(items: Sequence[Item]) -> list[UpRule]:
             if axis is not None and axis != whole.axis and count > (1 if specified is None else 2):
                 pattern = f"{escape(first)}/**/*{escape(suffix)}"
                 folders.append(UpRule(pattern, axis, f"{told}, unlike other {suffix} files"))
-        for item in group if specified is None else ():
+        for item in group if specified != "y" else ():  # in robots' files z is up by use alone
             held = next((rule.axis for rule in folders if matches(item.path, rule.pattern)), whole.axis)
             if item.measured.confidence == "sure" and item.measured.up not in (None, held):
                 assert item.measured.up is not None

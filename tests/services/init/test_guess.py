@@ -146,9 +146,11 @@ def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_a
         assert found == {**line, f"**/*{suffix}": "z"}, "a folder has a line"
     assert ups(item("box.glb"), item("a.gltf", up="z", confidence="likely")) == {"**/*.glb": "y", "**/*.gltf": "y"}
     assert ups(item("mug.glb", up="z")) == {"**/*.glb": "z"}, "most of all files are sure"
-    boxes = [item(f"{k}.glb") for k in range(3)]
-    (rule,) = guess_ups([*boxes, *(item(f"s{k}.glb", up="x") for k in range(3))])
-    assert rule.axis == "y" and "3 of 6 stand on x alone" in rule.why, "half of them are not most"
+    for suffix, axis in ((".glb", "y"), (".urdf", "z"), (".xml", "z")):
+        boxes = [item(f"{k}{suffix}") for k in range(3)]
+        *files, rule = guess_ups([*boxes, *(item(f"s{k}{suffix}", up="x") for k in range(3))])
+        assert rule.axis == axis and "3 of 6 stand on x alone" in rule.why, "half of them are not most"
+        assert len(files) == (0 if suffix == ".glb" else 3), "but a robot's file may lie on its side"
     assert ups(item("a.obj", up="y"), item("b.obj", up="x")) == {"a.obj": "y", "b.obj": "x", "**/*.obj": "z"}
     for confidence, axis, why in (("likely", "y", "likely: 1 of 2"), (None, "z", "not known")):
         (rule,) = guess_ups([item("a.obj", up=confidence and "y", confidence=confidence), item("b.obj")])
@@ -173,7 +175,15 @@ COPIES = {
     "jar.obj": ("jar_lod1.obj", "UCX_jar_01.obj"),
     "lamp_lod2.obj": ("lamp_lod3.obj",),
 }
-ORIGINALS = ("column.obj", "school.obj", "alone_collision.obj", "x/coll/mug.obj", "free_hull.obj", "mocha-col1.obj")
+ORIGINALS = (
+    "duck_vhacd.urdf",
+    "column.obj",
+    "school.obj",
+    "alone_collision.obj",
+    "x/coll/mug.obj",
+    "free_hull.obj",
+    "mocha-col1.obj",
+)
 
 
 def test_collision_shapes_and_coarser_levels_are_left_out_with_what_they_belong_to():
@@ -183,7 +193,9 @@ def test_collision_shapes_and_coarser_levels_are_left_out_with_what_they_belong_
         path: of for of, paths in COPIES.items() for path in paths
     }
     for path in ORIGINALS:
-        assert find_copies([path], [path, "other.obj", "more.obj"]) == {}, f"{path} is all that there is of it"
+        assert find_copies([path], [path, "duck.obj", "other.obj", "more.obj"]) == {}, (
+            f"{path} is all that there is of it"
+        )
 
 
 def solid(path, size=1.0, turned=False, faces=200, look=None, volume=0.3, **more):
