@@ -63,7 +63,7 @@ def test_a_mesh_in_the_world_is_the_glb_at_the_pose_of_objects_dat(files):
 
 def test_a_welded_mesh_is_watertight_where_the_asset_is_and_is_the_same_surface(tmp_path):
     make_dataset(
-        tmp_path, scenes=16, categories={**dict.fromkeys(CATEGORIES, 1.0)}, images={"projection": {"enabled": False}}
+        tmp_path, scenes=8, categories={**dict.fromkeys(CATEGORIES, 1.0)}, images={"projection": {"enabled": False}}
     )
     closed = {row["instance_id"]: row for row in open_dataset(tmp_path).table("assets").to_table().to_pylist()}
     split = 0
@@ -77,7 +77,7 @@ def test_a_welded_mesh_is_watertight_where_the_asset_is_and_is_the_same_surface(
                     closed[name]["volume_m3"], rel=1e-4
                 )
             split += not plain.is_watertight
-    assert split > 8, "no mesh is split at seams: the test would see nothing"
+    assert split > 4, "no mesh is split at seams: the test would see nothing"
     (pair, *_) = open_dataset(tmp_path).pairs()
     seen = pair.mesh(3, pair.input, welded=True)
     assert seen.bounds == pytest.approx(pair.mesh(3, pair.input).bounds)
