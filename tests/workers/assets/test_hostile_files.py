@@ -91,6 +91,7 @@ HOSTILE = {
     "inf.obj": ("v 0 0 inf\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not_finite", "not a finite number"),
     "far.obj": ("v 0 0 1e30\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not_finite", "over 1e+07"),
     "points.obj": (TRIANGLE, "no_faces", "has no triangles"),
+    "edges.obj": (TRIANGLE + "f 1 2\nf 3\n", "no_faces", "has no triangles"),
     "collapsed.obj": (TRIANGLE + "f 1 1 2\n", "no_faces", "only empty faces"),
     "needle.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no_faces", "only faces without area"),
     "words.obj": ("v 0 0 0\nf a b c\n", "unreadable", "that is not numbers"),

@@ -80,8 +80,8 @@ def read_obj(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
         by_material = dict.fromkeys(materials, by_material[None])  # the only material, which no line uses by name
     made = []
     for name, runs in by_material.items():
-        corners = np.concatenate([_cut(path, points, polygons) for polygons in _polygons(path, runs)])
-        made.append(_mesh(path, corners, (points, uv, normals), colors, materials.get(name or "")))
+        if cut := [_cut(path, points, polygons) for polygons in _polygons(path, runs)]:
+            made.append(_mesh(path, np.concatenate(cut), (points, uv, normals), colors, materials.get(name or "")))
     return made
 
 
