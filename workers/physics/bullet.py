@@ -128,8 +128,9 @@ NO_THRESHOLD = 1e18
 AWAY_M = 100.0
 """Between bodies that are put away, and from the world's middle."""
 
-GroundShape = float | Mesh | Array | tuple[Mesh, ...]
-"""Level ground at a height, metres, without an end; a mesh, or several; or the vertices [N, 3] of a convex body."""
+GroundShape = float | Mesh | Array | list[Array] | tuple[Mesh, ...]
+"""Level ground at a height, metres, without an end; a mesh, or several; or the vertices [N, 3] of a convex body, or of all parts
+of one."""
 
 
 def bullet_file() -> str:
@@ -278,7 +279,7 @@ def _empty_world(plain: bool) -> int:
     return client
 
 
-def _add_ground(client: int, ground: float | Mesh | Array, physics: Physics) -> int:
+def _add_ground(client: int, ground: float | Mesh | Array | list[Array], physics: Physics) -> int:
     place = {}
     if isinstance(ground, Mesh):
         shape = _shape_of_mesh(client, ground)
@@ -286,7 +287,7 @@ def _add_ground(client: int, ground: float | Mesh | Array, physics: Physics) -> 
         place = {"basePosition": [0, 0, ground - SLAB_HALF_M[2]]}
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
     else:
-        shape = _shape_of(client, [ground], {})
+        shape = _shape_of(client, ground if isinstance(ground, list) else [ground], {})
     thing: int = pybullet.createMultiBody(0, shape, useMaximalCoordinates=1, physicsClientId=client, **place)
     _set_surface(client, thing, physics)
     return thing

@@ -104,7 +104,8 @@ class Surface:
     """A welded mesh with the neighbours of its features.
 
     vertices [V, 3] metres; faces [F, 3]; side [F]: 1 where all about a face lies below its plane as it is wound, -1 where
-    all lies above, 0 where neither or both, and on a surface that is not closed, which has no inside. corners [C]:
+    all lies above, 0 where neither or both, and on a surface that is not closed, which has no inside; where it is known to be
+    wound outwards 1 in place of -1: the deepest face of a hollow is met from above alone. corners [C]:
     vertices that are not within a plane; edges [E, 2] that bend or bound, across [E, 2]: the vertices beside them (twice the
     same at one triangle); starts [V + 1] and members: the neighbours of each vertex. welded: the mesh with its faces of no area.
     """
@@ -120,8 +121,8 @@ class Surface:
     welded: Mesh
 
 
-def surface_of(mesh: Mesh, closed: bool) -> Surface:
-    """The features of a mesh, or of a part of one that is `closed`, whichever way its faces are wound."""
+def surface_of(mesh: Mesh, closed: bool, outward: bool = False) -> Surface:
+    """The features of a mesh, or of a part of one that is `closed`, whichever way its faces are wound, if not `outward`."""
     mesh = weld(mesh)
     vertices, faces = np.ascontiguousarray(mesh.vertices, dtype=np.float64), mesh.faces.astype(np.int64)
     normals = face_normals(vertices, faces)
@@ -133,6 +134,7 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     starts = np.append(0, np.cumsum(np.bincount(ends, minlength=len(vertices))))
     members = others[np.argsort(ends, kind="stable")]
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
+    side = np.abs(side) if outward else side
     edges, across = edges[bent], across[bent]
     return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members, mesh)
 

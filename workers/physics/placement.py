@@ -33,16 +33,16 @@ NO_VOLUME = 1e-15
 class Form:
     """A mesh with what its rest is found and measured by, made when first asked for.
 
-    `mesh` may be a part of a `whole`, which decides what is inside. `closed`: known to have an inside.
+    `mesh` may be a part of a `whole`, which decides what is inside. `closed`: known to have an inside; `outward`: and wound so.
     """
 
-    def __init__(self, mesh: Mesh, whole: Mesh | None = None, closed: bool = False) -> None:
-        self.mesh, self._whole, self._closed = mesh, whole or mesh, closed
+    def __init__(self, mesh: Mesh, whole: Mesh | None = None, closed: bool = False, outward: bool = False) -> None:
+        self.mesh, self._whole, self._closed, self._outward = mesh, whole or mesh, closed or outward, outward
 
     @cached_property
     def surface(self) -> Surface:
         """The features that may touch others."""
-        return surface_of(self.mesh, self._closed or is_closed(self._whole))
+        return surface_of(self.mesh, self._closed or is_closed(self._whole), self._outward)
 
     @cached_property
     def solid(self) -> manifold3d.Manifold | None:
@@ -168,7 +168,7 @@ class Support:
 
 def forms_of(starts: Sequence[ObjectStart]) -> tuple[Form, ...]:
     """The meshes of objects, each in its own frame."""
-    return tuple(Form(start.asset.shape.mesh, closed=start.asset.shape.closed) for start in starts)
+    return tuple(Form(start.asset.shape.mesh, outward=start.asset.shape.closed) for start in starts)
 
 
 def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: float) -> Placement:
@@ -192,7 +192,9 @@ def place(
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
     near = crop(table.mesh, *np.add(bounds_of(points), [[-room_m], [room_m]]))
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
-    return Placement(tuple(starts), things, (*forms, Form(near, table.mesh, table.asset.shape.closed)), friction)
+    return Placement(
+        tuple(starts), things, (*forms, Form(near, table.mesh, outward=table.asset.shape.closed)), friction
+    )
 
 
 def farthest_m(starts: Sequence[ObjectStart], poses: Sequence[Pose], others: Sequence[Pose]) -> float:

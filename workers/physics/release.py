@@ -21,8 +21,9 @@ from workers.geometry.frames import transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.contact_surface import faces_within, skin_of
 from workers.physics.contacts import contacts_within
+from workers.physics.convex_parts import parts_of
 from workers.physics.effects import is_convex
-from workers.physics.exact_rest import LEVEL, Rested, rest
+from workers.physics.exact_rest import LEVEL, MOST_STEPS, Rested, rest
 from workers.physics.fall import (
     FINEST,
     LOOK_STEPS,
@@ -39,9 +40,9 @@ from workers.physics.fall import (
     strays,
 )
 from workers.physics.placement import Placement, farthest_m
-from workers.physics.pour import NOTHING_MORE, Pouring
+from workers.physics.pour import AT_ONCE, NOTHING_MORE, Pouring
 from workers.physics.rigid_body import build_body, choose_collision_shape, make_body
-from workers.physics.support import inside_margin, split_by_side
+from workers.physics.support import SAME_LEVEL_M, inside_margin, split_by_side
 
 MANY, CROWD = 4, 25
 """Number of objects from which they fall as coarser convex parts, as time grows with the pairs of parts that are near. And that
@@ -107,7 +108,8 @@ class Drop:
     """Objects to be released over a table, with the settings and the plan of effects.
 
     room_m: how far the centre of mass of a single object may go sideways. lying, ready: the numbers of those that have fallen
-    already, and of those that were drawn again and start from where they are. clearances_m: of each over those before it.
+    already, and of those that were drawn again and start from where they are; clearances_m: of each over those before it;
+    seconds: that waves took.
     """
 
     starts: tuple[ObjectStart, ...]
@@ -119,6 +121,7 @@ class Drop:
     lying: frozenset[int] = frozenset()
     ready: frozenset[int] = frozenset()
     clearances_m: tuple[float, ...] = ()
+    seconds: float = 0.0
 
     @property
     def many(self) -> bool:
@@ -183,10 +186,21 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
     elif flat:
         levels = (np.full((len(table.top.outline), 1), z) for z in (table.top.height_m, table.top.height_m - PRISM_M))
         ground = np.concatenate([np.hstack([table.top.outline, level]) for level in levels])
+    elif not drop.single and table.asset.lofted is not None and not table.top.convex:
+        ground = _parts_of_vessel(table)
     if math.isfinite(drop.room_m):
         stops["room"] = strays((poses[0] @ bodies[0].T_obj_body)[None, :2, 3], drop.room_m)
     leaves = below if goes_on else None
     return fall(bodies, poses, ground, physics, steps, free_m, stops, drop.many, standing, leaves=leaves)
+
+
+def _parts_of_vessel(table: Table) -> list[Array]:
+    """The convex parts [N, 3], world, of a built-in tray or bin, without its legs.
+
+    Its triangles have no inside: what lies under many others sinks through a floor of them.
+    """
+    parts = [transform(table.T_world_table, part) for part in parts_of(table.asset)]
+    return [part for part in parts if part[:, 2].max() >= table.top.height_m - SAME_LEVEL_M]
 
 
 def settings_of(drop: Drop, pace: Pace) -> Physics:
@@ -220,6 +234,9 @@ they went by half a millimetre; and some creep by 0.03 mm in a second, wherever 
 MOST_HOLDS = 3
 """Times that objects are let go before they fall anew, each from where they came to rest the time before, and twice as far."""
 
+POURED_STEPS = 48
+"""Steps of exact rest of a pile of many, a tenth of a second each, after which what still slides is released where it is."""
+
 FAR_M = 2e-4
 """Motion of a centre of mass at which they are stopped at first: only faces within twice that are there to meet."""
 
@@ -243,7 +260,8 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
     held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
     for far_m in (2.0**number * FAR_M for number in range(MOST_HOLDS)):
-        rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
+        most = POURED_STEPS if drop.pouring.waves and len(poses) > AT_ONCE else MOST_STEPS
+        rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction, most)
         if not rested.still or len(poses) >= CROWD:
             return rested
         # No larger groups for what may move farther: the solver ends too early in them, and hides what slips

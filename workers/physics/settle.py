@@ -44,7 +44,7 @@ from workers.physics.pour import (
     points_of,
     renumbered,
 )
-from workers.physics.release import LEFT_M, Drop, Pace, hold, let_go, release
+from workers.physics.release import LEFT_M, PACES_MANY, PACES_TOGETHER, Drop, Pace, hold, let_go, release
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
@@ -57,8 +57,8 @@ release: correcting centimetres by a share per step gives tens of metres per sec
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
 
-MOST_RELEASES = 3
-"""Times that objects are released, each from where exact rest gave up the time before."""
+MOST_RELEASES, POURED_RELEASES = 3, 6
+"""Times that objects are released, each from where exact rest gave up the time before; and those of a pile that fell in waves."""
 
 
 class UnsupportedError(LostError):
@@ -134,6 +134,12 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
 
 
 def _settle_in_ways(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
+    poured = _pour(drop, flat=not drop.effects.runs("table_mesh"))
+    if poured is None:
+        drop = _with_mesh(drop)
+        poured = _pour(drop, flat=False)
+    assert poured is not None  # only the flat top has an edge
+    drop = poured
     *earlier, last = drop.ways
     for paces in earlier:
         with suppress(UnsupportedError):
@@ -146,11 +152,15 @@ def _settle(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace]) -> tuple[S
         ending = _come_to_rest(drop, forms, paces, flat=True)
         if ending is not None:
             return _describe(ending, _support_of(ending), drop.physics.exact_rest)
-        late = called_for_with("table_mesh", drop.starts, drop.physics)
-        drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
+        drop = _with_mesh(drop)
     ending = _come_to_rest(drop, forms, paces, flat=False)
     assert ending is not None  # only the flat top has an edge
     return _describe(ending, _support_of(ending), drop.physics.exact_rest)
+
+
+def _with_mesh(drop: Drop) -> Drop:
+    late = called_for_with("table_mesh", drop.starts, drop.physics)
+    return dataclasses.replace(drop, effects=add_effects(drop.effects, late))
 
 
 def _support_of(ending: _Ending) -> SupportedBy:
@@ -173,12 +183,9 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
     as they tip or slip, and released again where that takes them far.
     """
-    poured = _pour(drop, flat)
-    if poured is None:
-        return None
-    drop, seconds = poured
-    placement = None
-    for _ in range(MOST_RELEASES):
+    seconds, placement = drop.seconds, None
+    most = POURED_RELEASES if drop.lying else MOST_RELEASES
+    for _ in range(most):
         outcome = release(drop, flat, paces)
         if outcome.stopped_by == "room":
             raise LeftRoomError
@@ -205,7 +212,7 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
     every = range(len(drop.starts))
     raise UnsupportedError(
         "unsupported",
-        f"{'it tips or slips' if drop.single else 'something tips or slips'} on without end: released {MOST_RELEASES} times, "
+        f"{'it tips or slips' if drop.single else 'something tips or slips'} on without end: released {most} times, "
         f"for {seconds:.1f} s in all, it never came into balance: lower physics.rest.speed_mm_s, or raise physics.friction",
         [int(np.argmax(moved_m))],
         rested.poses,
@@ -213,9 +220,9 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
     )
 
 
-def _pour(drop: Drop, flat: bool) -> tuple[Drop, float] | None:
-    """The drop with all waves but the last where they lie, after so many seconds; None where one left the flat top."""
-    count, seconds = len(drop.starts), 0.0
+def _pour(drop: Drop, flat: bool) -> Drop | None:
+    """The drop with all waves but the last where they lie; None where one left the flat top."""
+    count, seconds = len(drop.starts), drop.seconds
     while drop.pouring.waves:
         wave = next_wave(count, drop.lying)
         starts = list(drop.starts)
@@ -228,7 +235,7 @@ def _pour(drop: Drop, flat: bool) -> tuple[Drop, float] | None:
         if len(part) == count:
             break
         few = dataclasses.replace(drop, starts=tuple(starts[number] for number in part))
-        outcome = release(few, flat, few.ways[0][:1])
+        outcome = release(few, flat, PACES_MANY[:1] if few.many else PACES_TOGETHER[:1])
         if outcome.stopped_by == "edge":
             return None
         seconds += outcome.seconds
@@ -238,8 +245,8 @@ def _pour(drop: Drop, flat: bool) -> tuple[Drop, float] | None:
         _require_calm(
             drop, dataclasses.replace(outcome, poses=tuple(poses), lost=tuple(part[k] for k in outcome.lost)), part
         )
-        drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part))
-    return drop, seconds
+        drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part), seconds=seconds)
+    return drop
 
 
 def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
