@@ -21,6 +21,7 @@ from tests.physics.settling import start_at
 from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
 from workers.physics import exact_rest
 from workers.physics.contact_surface import crop, faces_within, find_near, skin_of, surface_of
+from workers.physics.contacts import contacts_within
 from workers.physics.exact_rest import MANY, Motion, Rested, rest, step
 from workers.physics.placement import FARTHEST_M, Form, Support, find_gaps_m, find_overlaps_m, measure_supports, place
 from workers.physics.placement import forms_of as forms
@@ -358,3 +359,28 @@ def test_what_encloses_no_body_counts_as_its_hull_where_overlaps_are_sought():
     open_cube = Form(Mesh(CUBE.vertices, CUBE.faces[2:]))
     ((_, _, depth_m),) = find_overlaps_m([open_cube, CUBE_FORM], [EYE, translation(0, 0.098, 0)])
     assert depth_m == pytest.approx(0.002, abs=1e-9)
+
+
+def test_a_dimple_above_the_floor_of_a_tray_is_not_taken_for_what_lies_below_it():
+    """All about its corner lies lower, as about one that met the floor from below; 2 mm up, it touches nothing."""
+    cube = trimesh.creation.box((0.04, 0.04, 0.04))
+    under = np.flatnonzero((cube.vertices[cube.faces][..., 2] < 0.0).all(axis=1))
+    rim = np.flatnonzero(cube.vertices[:, 2] < 0.0)
+    order = rim[np.argsort(np.arctan2(cube.vertices[rim, 1], cube.vertices[rim, 0]))]
+    apex = len(cube.vertices)
+    fan = [(order[(k + 1) % 4], order[k], apex) for k in range(4)]
+    faces = np.concatenate([np.delete(cube.faces, under, axis=0), fan])
+    dimpled = trimesh.Trimesh(np.concatenate([cube.vertices, [(0.0, 0.0, -0.018)]]), faces, process=False)
+    assert dimpled.is_watertight and dimpled.volume > 0.0
+    hollow = trimesh.boolean.difference(
+        [
+            trimesh.creation.box((0.2, 0.2, 0.06)),
+            trimesh.creation.box((0.18, 0.18, 0.06)).apply_translation((0, 0, 0.01)),
+        ]
+    )
+    above = np.eye(4)
+    above[2, 3] = hollow.vertices[:, 2].min() + 0.01 + 0.02 + 1e-4
+    for outward, fewest in ((True, 0.0), (False, -0.003)):
+        surfaces = [surface_of(mesh_of(each), True, outward) for each in (dimpled, hollow)]
+        gaps = contacts_within(surfaces, [above, np.eye(4)], 0.003).gaps
+        assert len(gaps) and bool(gaps.min() >= 0.0) is outward and gaps.min() >= fewest
