@@ -164,6 +164,11 @@ BOUNCES_M_S = 0.1
 """Slower impacts do not bounce: the rebound is at most half a millimetre high."""
 
 
+THROWN = 3.0
+"""Ratio of a speed to that of a fall from the highest start, from which long steps threw an object: of two balls that fall as one
+a far lighter upper one leaves at three times the speed at most."""
+
+
 @dataclass(frozen=True)
 class StepSizes:
     """Adaptive time steps: `base_hz`, or more where a point would travel further than `max_travel_m` in one step.
@@ -190,7 +195,8 @@ class Outcome:
 
     speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and simulation.
     stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its bound.
-    face: of its hull that an object stands on, where that ended it. lost: the numbers of those that were put away.
+    face: of its hull that an object stands on, where that ended it. lost: the numbers of those that were put away;
+    thrown_m_s: the speed of the fastest of them, if no fall gives it.
     """
 
     poses: tuple[Pose, ...]
@@ -201,6 +207,7 @@ class Outcome:
     rise: float = 0.0
     face: Face | None = None
     lost: tuple[int, ...] = ()
+    thrown_m_s: float = 0.0
 
 
 def choose_steps(
@@ -288,7 +295,7 @@ def _simulate(
     time, rate, bounces, asked = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0, -1.0
     moving = [world.velocity(k) for k in range(len(bodies))]
     speeds, energy = _speeds(bodies, moving), EnergyRecord(bodies, [one.anchor for one in still], moving)
-    lost = list[int]()
+    lost, thrown_m_s, top_m = list[int](), 0.0, max(one.anchor[0][2] for one in still)
     while True:
         wanted = steps.rate_hz(max(speeds))
         if bounces and max(speeds) < BOUNCES_M_S:
@@ -304,6 +311,9 @@ def _simulate(
         time += SAMPLE_STEPS / rate
         for number in range(len(bodies)):
             if leaves is not None and number not in lost and leaves(number, at[number]):
+                speed = math.hypot(*moving[number][0])
+                if speed > THROWN * math.sqrt(2.0 * GRAVITY_M_S2 * max(0.0, top_m - at[number][0][2])):
+                    thrown_m_s = max(thrown_m_s, speed)
                 world.put_away(number)
                 lost.append(number)
                 at[number], moving[number] = world.pose(number), world.velocity(number)
@@ -325,7 +335,9 @@ def _simulate(
             asked, face = time, standing(at[0], moving[0])
         if face is not None or all(time - one.since >= rest.window_s for one in still):
             drift_m_s = max(one.moved_m / (time - one.since) for one in still)
-            return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True, None, energy.rise(), face, tuple(lost))
+            return Outcome(
+                tuple(map(as_pose, at)), drift_m_s, time, True, None, energy.rise(), face, tuple(lost), thrown_m_s
+            )
         if time >= end_s:
             return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, rise=energy.rise())
 

@@ -153,7 +153,7 @@ def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
         outcome = _release(drop, flat, pace, LOOK_STEPS if drop.single else SAMPLE_STEPS)
         if drop.single and pace != paces[-1] and DOUBTFUL_RISE <= outcome.rise < KNOWN_RISE:
             outcome = _release(drop, flat, pace, 1)
-        if outcome.rise < (KNOWN_RISE if drop.single else MOST_RISE):
+        if outcome.rise < (KNOWN_RISE if drop.single else MOST_RISE) and not outcome.thrown_m_s:
             break
     return outcome
 

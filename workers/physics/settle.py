@@ -284,6 +284,15 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = N
     coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
     if outcome.rested and not outcome.lost:
         return
+    if outcome.thrown_m_s:
+        raise UnsupportedError(
+            "thrown",
+            f"an object left the table at {outcome.thrown_m_s:.0f} m/s, which no fall gives: raise physics.step_hz, or take "
+            "objects of nearer masses",
+            outcome.lost,
+            outcome.poses,
+            known,
+        )
     if lost := outcome.lost or [number for number in known if _is_low(drop, coms[number][2])]:
         raise _left_table(drop, lost, outcome.poses, outcome.seconds, known)
     raise SettleError(

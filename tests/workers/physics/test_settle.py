@@ -30,6 +30,7 @@ from tests.physics.settling import (
 from workers.geometry.frames import motion_between, rotation_about, translation
 from workers.physics import release as module
 from workers.physics import settle
+from workers.physics.bullet import World
 from workers.physics.effects import called_for
 from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, fall
@@ -339,6 +340,20 @@ def test_what_leaves_the_table_is_drawn_again_above_the_others_or_removed_or_the
     for how in ({}, {"draw": draw, "most": 1}):
         with pytest.raises(SettleError, match=r"of region 4 .* off the table's top"):
             settled(**how)
+
+
+def test_what_was_thrown_off_the_table_is_told_so_and_never_counts_as_lost(monkeypatch):
+    """Whatever throws the second of two, here a push at 40 m/s as its fall begins."""
+    starts = together(TABLE, [at(CUBE, TABLE, (0.0, 0.0, 0.031)), at(CUBE, TABLE, (0.2, 0, 0.04))]).starts
+    set_velocity = World.set_velocity
+
+    def pushed(world, velocity, spin=(0.0, 0.0, 0.0), body=0):
+        set_velocity(world, (40.0, 0.0, 0.0) if body == 1 and velocity[2] else velocity, spin, body)
+
+    monkeypatch.setattr(World, "set_velocity", pushed)
+    with pytest.raises(SettleError, match=r"left the table at 4[0-9] m/s, which no fall gives") as refused:
+        settle_scene(scene_of(starts, TABLE), PHYSICS, EffectPlan(ALL, {}), Pouring(remove=True))
+    assert refused.value.reason == "thrown"
 
 
 def test_a_pile_of_more_than_eight_falls_in_waves_above_what_lies(monkeypatch):
