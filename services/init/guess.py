@@ -149,6 +149,7 @@ class _Folder:
 
     below: "dict[str, _Folder]"
     costs: list[float]
+    size: float = 0.0
 
     def finish(self) -> list[float]:
         """Sets and returns the costs, from what lies below: as its folder has it, or for `SPLIT` more as it likes best."""
@@ -158,12 +159,31 @@ class _Folder:
         return self.costs
 
     def units(self, unit: int, path: str = "") -> dict[str, int]:
-        """The number of the unit of every file below, where the folder above has `unit`."""
-        if self.costs[unit] > min(self.costs) + SPLIT:
+        """The number of the unit of every file below, where the folder above has `unit`.
+
+        Files that leave their folder's unit have one together: that which makes them as large as those that stay.
+        """
+        if self._leaves(unit):
             unit = self.costs.index(min(self.costs))
         if not self.below:
             return {path[1:]: unit}
-        return {one: k for name, below in self.below.items() for one, k in below.units(unit, f"{path}/{name}").items()}
+        files = [one for one in self.below.values() if not one.below]
+        usual = [math.log(one.size * UNITS[unit][0]) for one in files if not one._leaves(unit)] or [math.log(USUAL_M)]
+        leaving = [math.log(one.size) for one in files if one._leaves(unit)]
+        together = min(
+            range(len(UNITS)),
+            key=lambda k: sum(abs(size + math.log(UNITS[k][0]) - median(usual)) for size in leaving),
+        )
+        found = dict[str, int]()
+        for name, one in self.below.items():
+            if not one.below and one._leaves(unit):
+                found[f"{path}/{name}"[1:]] = together
+            else:
+                found |= one.units(unit, f"{path}/{name}")
+        return found
+
+    def _leaves(self, unit: int) -> bool:
+        return self.costs[unit] > min(self.costs) + SPLIT
 
 
 def _guess_units(sizes: Mapping[str, float], specified: bool) -> dict[str, int]:
@@ -176,6 +196,7 @@ def _guess_units(sizes: Mapping[str, float], specified: bool) -> dict[str, int]:
         at = root
         for name in path.split("/"):
             at = at.below.setdefault(name, _Folder({}, [0.0] * len(UNITS)))
+        at.size = size
         at.costs = [_cost(size, unit, specified) for unit in range(len(UNITS))]
     costs = root.finish()
     return root.units(costs.index(min(costs))) if sizes else {}

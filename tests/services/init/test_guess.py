@@ -112,6 +112,11 @@ UNITS = (
     ),
     ([*cubes(6.0, 22.0, 15.0, folder="hope/"), *cubes(0.2, 0.1, folder="x/")], {0.01: 3, 1.0: 2}, "centimetres, 15 cm"),
     (cubes(0.2, 0.3, 250.0), {1.0: 2, 0.001: 1}, "metres"),
+    (
+        cubes(0.06, 0.1, 0.15, 0.05, 58.8, 83.7, 40.6),
+        {1.0: 4, 0.001: 3},
+        "millimetres",
+    ),  # 58.8 alone might be centimetres
     (cubes(250.0, 90.0, 4.0), {0.001: 3}, "millimetres"),  # a screw among millimetres is small
     # A remark in the file.
     ([item("a.obj", (8.0, 8.0, 12.0), unit_m=0.0254)], {0.0254: 1}, "inches, as the files say"),
