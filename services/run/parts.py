@@ -5,10 +5,11 @@ import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from schemas.environment import cache_folder
-from schemas.errors import MeshError
+from schemas.errors import MachineError, MeshError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
 from services.run.progress import ProgressLine
@@ -27,7 +28,8 @@ USUAL_FOLDER = cache_folder("parts")
 def find_parts(job: Job, catalogue: Catalogue, folder: Path | None = USUAL_FOLDER) -> None:
     """Cuts every mesh that the job may drop onto another object, and keeps its parts in `folder`, where workers look for them.
 
-    A mesh is looked at once for ever. Single objects are left out: over a flat table few ever need parts.
+    A mesh is looked at once for ever. Single objects are left out: over a flat table few ever need parts. Raises MachineError
+    where a process is killed.
     """
     if job.captures is not None or job.physics.collision in ("box", "hull") or folder is None:
         return
@@ -36,10 +38,8 @@ def find_parts(job: Job, catalogue: Catalogue, folder: Path | None = USUAL_FOLDE
     refs = list(_meshes(job, catalogue))
     if not refs:
         return
-    from workers.assets.external.verdicts import (
-        Verdicts,
-        verdict_key,
-    )  # load what a job of built-in shapes has no use for
+    # what a job of built-in shapes has no use for
+    from workers.assets.external.verdicts import Verdicts, verdict_key
     from workers.physics.convex_parts import key_of, version_of_parts
 
     kept, keys = Verdicts(folder), {}
@@ -58,8 +58,15 @@ def find_parts(job: Job, catalogue: Catalogue, folder: Path | None = USUAL_FOLDE
         for done, cut in enumerate(as_completed(cuts), 1):
             key, root, path = keys[cuts[cut]]
             line.show(done, name=path)
+            try:
+                told = cut.result()
+            except BrokenProcessPool as error:
+                raise MachineError(
+                    "a process that cuts meshes into convex parts was killed from outside, perhaps for want of memory: "
+                    "start again, what is cut stays"
+                ) from error
             kept.put([(key, None)], root)
-            if told := cut.result():
+            if told:
                 deep.append(f"{path}: {told}")
     line.close()
     if deep:
