@@ -124,8 +124,8 @@ def exact_views_agree(shown: Outcome, gone: Outcome) -> bool:
 
 
 def dropped(*drops: Drop, **changes: Any) -> Setting:
-    """A scene of these objects, with their table, in the place of what is drawn."""
-    return Setting(changes, lambda _: facts_with(*drops).plan)
+    """A scene of these objects, with their table, in the place of what is drawn; none is drawn again where one is lost."""
+    return Setting({"start": {"if_lost": "fail"}, **changes}, lambda _: facts_with(*drops).plan)
 
 
 def switched(name: str) -> Proof:
