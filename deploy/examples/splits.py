@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Literal
 
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from services.dataset.dataset import Dataset
@@ -20,7 +21,9 @@ def pairs_of_split(dataset: Dataset, split: Split, splits: Mapping[str, str] | N
     if splits is None:
         rows = dataset.table("assets").to_table(columns=["instance_id", "split"]).to_pylist()
         splits = {row["instance_id"]: row["split"] for row in rows}
-    for pair in dataset.pairs(pc.field("instance_id").isin([name for name in splits if splits[name] == split])):
+    for pair in dataset.pairs(
+        pc.field("instance_id").isin(pa.array([name for name in splits if splits[name] == split], pa.string()))
+    ):
         if all(splits[name] == split for name in instances_of(pair)):
             yield pair
 

@@ -70,4 +70,5 @@ def speak_as_typed() -> None:
 
 
 if __name__ == "__main__":  # what the launcher sets for tools that it starts itself
-    print("\n".join(f"{name}={value}" for name, value in settings_to_change(os.environ, processor_flags()).items()))
+    for name, value in settings_to_change(os.environ, processor_flags()).items():
+        print(f"{name}={value}")

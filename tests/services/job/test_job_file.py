@@ -89,7 +89,7 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("assets: {split: {train: 0.5}}", ["assets.split", "0.7"]),
     ("images: {depth_units_per_m: 10000}", ["images", "80000", "65535"]),
     ("images: {projection: {splat: 4}}", ["images.projection.splat", "4", "even"]),
-    ("objects_per_scene: 21", ["objects_per_scene", "21", "from 1 to 20"]),
+    ("objects_per_scene: 51", ["objects_per_scene", "51", "from 1 to 50"]),
     ("objects_per_scene: [2, 1]", ["objects_per_scene", "[2, 1]", "empty"]),
     ("objects_per_scene: [1, 2.5]", ["objects_per_scene", "2.5", "[low, high]"]),
     ("verso: 2", ["verso", "2", "newer"]),

@@ -150,14 +150,14 @@ def test_every_double_is_written_as_python_writes_it(numbers):
 def test_the_card_names_every_source_with_its_licence_and_what_was_left_out_of_it_or_is_doubtful():
     objects = [
         {"source": "procedural", "weight": 2.0, "seed": 7},
-        {"source": "urdf", "folder": "meshes", "licence": "CC-BY-4.0"},
+        {"source": "files", "folder": "meshes", "licence": "CC-BY-4.0"},
     ]
     assets = Assets.model_validate({"objects": objects})
     catalogue = Catalogue(assets, (None, None), (None,), "d" * 64, {"meshes": {"too large": 2, "torn": 1}})
     lines = describe_sources(catalogue)
     assert lines[:2] == [
         "objects, weight 2: made from seed 7, licence CC0-1.0",
-        "objects, weight 1: urdf folder meshes, licence CC-BY-4.0",
+        "objects, weight 1: files folder meshes, licence CC-BY-4.0",
     ]
     assert lines[2].startswith("tables, weight 1: made from seed")
     assert lines[3:] == ["left out of meshes: 2 too large, 1 torn"]
