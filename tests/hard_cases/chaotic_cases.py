@@ -125,6 +125,7 @@ CHAOTIC = (
         on_a_face(1.0),
         lambda seed: tumbled(rod(0.0001, 0.2), seed, 0.005),
         tier="slow",
+        first="minute",
     ),
     # A disc 2 mm thick on one of 48 sides 1.6 mm wide falls beyond 4.8 degrees: within 0.1 it stays up, if it does not roll
     # onto the next side and on. Its height on its edge is 12 mm, or 1 mm flat.
@@ -144,6 +145,7 @@ CHAOTIC = (
         lambda seed: jolted(drop(rod(0.012, 0.002), level(), 0.0002, turn(X, 85)), seed),
         spin=(0.0, 0.0, 50.0),
         tier="slow",
+        first="minute",
     ),
     # A ball's bounces and faces send it some way; 1.2 m of table, and rolling friction of 0.12 m/s^2, keep it on.
     Chaotic(

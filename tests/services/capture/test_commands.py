@@ -149,6 +149,7 @@ def test_import_refuses_what_cannot_be_used_and_leaves_no_capture(run, tmp_path)
     assert not (tmp_path / "x").exists() or not list((tmp_path / "x").iterdir())
 
 
+@pytest.mark.minute
 def test_process_writes_results_by_the_estimate_that_is_asked_for(run, tmp_path):
     path = copy_of(box(), tmp_path)
     quick = ("--set", "captures.fusion.voxel_m=0.003", "--json")
@@ -162,6 +163,7 @@ def test_process_writes_results_by_the_estimate_that_is_asked_for(run, tmp_path)
     assert code != 0 and "is no folder" in err
 
 
+@pytest.mark.minute
 def test_synthesize_makes_a_view_from_a_pose_file_or_mirror_views(run, tmp_path):
     path = copy_of(processed()[0], tmp_path)
     code, _, _, answer = run("synthesize", path, "--pose", path / "board_00003.txt", "--out", tmp_path / "v", "--json")
