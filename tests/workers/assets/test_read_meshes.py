@@ -105,6 +105,12 @@ def test_files_are_listed_with_all_that_they_refer_to_and_nothing_outside_the_fo
         files = list_mesh_files(tmp_path / "m" / first, tmp_path, MeshLimits())
         assert [file.relative_to(tmp_path).as_posix() for file in files] == [f"m/{first}", *others]
     assert len(list_mesh_files(tmp_path / "m/cube.obj", tmp_path / "m", MeshLimits())) == 2
+    write_all(
+        tmp_path / "n", {"a.obj": b"mtllib gone.mtl\n", "a.mtl": b"newmtl a\nmap_Kd skin.png\n", "skin.png": picture()}
+    )
+    assert [file.name for file in list_mesh_files(tmp_path / "n/a.obj", tmp_path / "n", MeshLimits())] == [
+        *("a.obj", "a.mtl", "skin.png")
+    ], "what stands in for a missing material file is a file of the mesh"
 
 
 def test_a_texture_outside_the_root_is_not_read(tmp_path):

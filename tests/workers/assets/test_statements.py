@@ -484,6 +484,12 @@ def test_what_a_file_states_is_obeyed_or_named(tmp_path):
     assert not found, "\n".join(f"{name}: {told}" for name, told in found.items())
 
 
+PLY_OF_SIX = (
+    "ply\nformat ascii 1.0\nelement vertex 6\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+)
+
+
 def test_concave_polygons_are_cut_along_their_inside(tmp_path):
     """An L of three squares, from each of its corners, in both windings: three squares of area, and no part outside."""
     ring = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
@@ -491,10 +497,12 @@ def test_concave_polygons_are_cut_along_their_inside(tmp_path):
         for way in (1, -1):
             corners = (ring[turn:] + ring[:turn])[::way]
             text = "".join(f"v {x} 0.5 {y}\n" for x, y in corners) + "f 1 2 3 4 5 6\n"
-            shape = load_shape(write_all(tmp_path, {"a.obj": text.encode()}), MeshLimits()).shape
-            mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
-            assert mesh.area == pytest.approx(3.0) and len(shape.faces) == 4
-            assert not ((mesh.triangles_center[:, 0] > 1) & (mesh.triangles_center[:, 2] > 1)).any()
+            points = "".join(f"{x} 0.5 {y}\n" for x, y in corners)
+            for name, data in (("a.obj", text), ("a.ply", PLY_OF_SIX + points + "6 0 1 2 3 4 5\n")):
+                shape = load_shape(write_all(tmp_path, {name: data.encode()}), MeshLimits()).shape
+                mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+                assert mesh.area == pytest.approx(3.0) and len(shape.faces) == 4
+                assert not ((mesh.triangles_center[:, 0] > 1) & (mesh.triangles_center[:, 2] > 1)).any()
 
 
 def test_a_sliver_that_closes_a_body_stays_where_another_body_is_open(tmp_path):

@@ -67,11 +67,12 @@ def load_shape(path: Path, limits: MeshLimits, root: Path | None = None, budget:
     if not meshes:
         raise MeshError("no_faces", f"{path} has no triangles")
     shape, mended = clean_shape(path, [place_mesh(path, mesh) for mesh in meshes])
-    parts = tuple(_with_jpeg(part, resolver) for part in shape.parts)
+    parts = tuple(with_jpeg(part, resolver) for part in shape.parts)
     return LoadedMesh(replace(shape, parts=parts), tuple(dict.fromkeys([*resolver.notes, *mended])))
 
 
-def _with_jpeg(part: Part, resolver: FolderResolver) -> Part:
+def with_jpeg(part: Part, resolver: FolderResolver) -> Part:
+    """The part with the file of its picture, if the resolver decoded that from a JPEG."""
     jpeg = resolver.jpeg_of(part.material.texture)
     return part if jpeg is None else replace(part, material=replace(part.material, jpeg=jpeg))
 

@@ -11,7 +11,6 @@ resolver, and whatever malformed JSON raises becomes a MeshError.
 
 import base64
 import json
-import math
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,9 +25,10 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from workers.assets.external.caps import LONGEST_NAME, FolderResolver, check_counts, check_nodes, unreadable
 from workers.assets.external.gltf_materials import Materials, image_of, read_references
-from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh
+from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, cut_strip
 from workers.assets.glb import split_glb
 from workers.geometry.colour import encode_srgb
+from workers.geometry.frames import rotation_from_quaternion
 
 MALFORMED = (struct.error, ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
 """What reading a stranger's JSON may raise."""
@@ -287,16 +287,10 @@ def _pose(node: dict[str, Any]) -> Pose:
     """A node's pose [4, 4] in its parent: a matrix by columns, or translation, rotation (x, y, z, w) and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    x, y, z, w = (float(value) for value in node.get("rotation", (0.0, 0.0, 0.0, 1.0)))
-    length = math.sqrt(x * x + y * y + z * z + w * w) or 1.0
-    x, y, z, w = x / length, y / length, z / length, w / length
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    turn = np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=np.float64).reshape(4)
     result = np.eye(4)
-    result[:3, :3] = np.array(turn) * np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64).reshape(3)
+    result[:3, :3] = rotation_from_quaternion(turn) if turn.any() else np.eye(3)
+    result[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64).reshape(3)
     result[:3, 3] = np.array(node.get("translation", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3)
     return result
 
@@ -308,9 +302,7 @@ def _triangles(corners: NDArray, mode: int) -> NDArray[np.int64]:
         return corners[: len(corners) // 3 * 3].reshape(-1, 3)
     if mode == _FAN:
         return np.column_stack([np.full(max(len(corners) - 2, 0), corners[0]), corners[1:-1], corners[2:]])
-    faces = np.column_stack([corners[:-2], corners[1:-1], corners[2:]])
-    faces[1::2] = faces[1::2, [1, 0, 2]]
-    return faces
+    return cut_strip(corners)
 
 
 def _colors(values: NDArray, count: int) -> NDArray[np.uint8] | None:

@@ -1,6 +1,6 @@
 """Pure: cleans a mesh from outside, whatever its format.
 
-Merges points, winds faces, finds closed bodies, drops doubled and empty faces.
+Cuts polygons, merges points, winds faces, finds closed bodies, drops doubled and empty faces.
 
 A mesh that cannot be used raises a MeshError that says why not.
 """
@@ -8,6 +8,7 @@ A mesh that cannot be used raises a MeshError that says why not.
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -223,8 +224,7 @@ def place_mesh(path: Path, mesh: RawMesh) -> RawMesh:
     Raises MeshError `index_out_of_range` or `not_finite`.
     """
     vertices, faces, visual = mesh.vertices.astype(np.float64), mesh.faces, mesh.visual
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError("index_out_of_range", f"{path}: a face names vertex {faces.max()} of {len(vertices)}")
+    check_indices(path, faces, len(vertices))
     # Only vertices that a face names are checked: others may hold anything.
     if not (np.isfinite(vertices[faces]).all() and np.isfinite(mesh.matrix).all()):
         raise MeshError("not_finite", f"{path} has a coordinate that is not a finite number")
@@ -240,6 +240,55 @@ def place_mesh(path: Path, mesh: RawMesh) -> RawMesh:
         visual = replace(visual, colors=np.repeat(visual.face_colors, 3, axis=0), face_colors=None)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
     return RawMesh(vertices, faces, normals, visual, np.eye(4))
+
+
+def cut_polygons(points: Array) -> Indices:
+    """[F, n - 2, 3]: which corners of polygons [F, n, 3] their triangles have.
+
+    A fan where a polygon is convex, else ears (mapbox's earcut); a fan also where that finds no way, of one that meets itself.
+    """
+    count = points.shape[1]
+    fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
+    triangles = np.broadcast_to(fan, (len(points), *fan.shape)).copy()
+    if count > 3:
+        flat, convex = _flatten(points)
+        for number in np.flatnonzero(~convex):
+            ears = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat[number]), np.array([count], np.uint32))
+            if len(ears) == triangles[number].size:
+                triangles[number] = ears.reshape(-1, 3)
+    return triangles
+
+
+def _flatten(corners: Array) -> tuple[Array, Mask]:
+    """[F, n, 2] polygons [F, n, 3] seen along their normals (Newell's), counter-clockwise; and which are convex."""
+    after = np.roll(corners, -1, axis=1)
+    centre = corners.mean(axis=1, keepdims=True)
+    normal = np.cross(corners - centre, after - centre).sum(axis=1)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.where(length == 0.0, 1.0, length)
+    aside = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    x = np.cross(aside, normal)
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
+    axes = np.stack([x, np.cross(normal, x)], axis=-1)
+    flat = (corners - centre) @ axes
+    ahead = np.roll(flat, -1, axis=1) - flat
+    behind = np.roll(ahead, 1, axis=1)
+    turn = behind[..., 0] * ahead[..., 1] - behind[..., 1] * ahead[..., 0]
+    slack = 1e-9 * length
+    return flat, (turn >= -slack).all(axis=1)
+
+
+def cut_strip(corners: NDArray[np.int64]) -> Indices:
+    """[F, 3]: the triangles of a strip of corners [F + 2]; every second one is turned."""
+    faces = np.column_stack([corners[:-2], corners[1:-1], corners[2:]])
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return faces
+
+
+def check_indices(path: Path, faces: Indices, count: int) -> None:
+    """MeshError `index_out_of_range` where faces, of any shape, name a vertex beyond the first `count`."""
+    if faces.min() < 0 or faces.max() >= count:
+        raise MeshError("index_out_of_range", f"{path}: a face names vertex {faces.max()} of {count}")
 
 
 def check_coordinates(path: Path, vertices: Array) -> None:

@@ -18,7 +18,7 @@ from schemas.job.assets import MeshLimits
 from workers.assets.external.caps import FolderResolver
 from workers.assets.external.mesh import DEFAULT, MeshVisual, RawMesh
 from workers.assets.external.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled, turn
-from workers.geometry.frames import pose
+from workers.geometry.frames import half_turn, pose, rotation_about, rotation_between, rotation_from_quaternion
 
 Attributes = Mapping[str, str]
 Node = ElementTree.Element
@@ -191,8 +191,7 @@ def _pose(document: _Document, given: Attributes) -> Pose:
             R = R @ step if letter.islower() else step @ R
     elif "axisangle" in given:
         about = document.numbers(given, "axisangle", "0 0 1 0")
-        half = 0.5 * unit * about[3]
-        R = _rotation(np.array([np.cos(half), *(np.sin(half) * about[:3] / np.linalg.norm(about[:3]))]))
+        R = rotation_about(about[:3] / np.linalg.norm(about[:3]), unit * float(about[3]))
     elif "xyaxes" in given:
         x, y = document.numbers(given, "xyaxes", "1 0 0 0 1 0").reshape(2, 3)
         x = x / np.linalg.norm(x)
@@ -207,15 +206,14 @@ def _pose(document: _Document, given: Attributes) -> Pose:
 
 def _rotation(quaternion: Array) -> Array:
     """[3, 3] of a quaternion [4], w first, of any length but 0."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + 2.0 * (w * cross + cross @ cross)
+    return rotation_from_quaternion(np.roll(quaternion, -1))
 
 
 def _upright(direction: Array) -> Array:
-    """[3, 3]: the smallest turn that takes z to a direction [3] of any length."""
-    x, y, z = direction / np.linalg.norm(direction)
-    return _rotation(np.array([0.0, 1.0, 0.0, 0.0]) if z < -1.0 + 1e-12 else np.array([1.0 + z, -y, x, 0.0]))
+    """[3, 3]: the smallest turn that takes z to a direction [3] of any length; about x where that is -z."""
+    direction = direction / np.linalg.norm(direction)
+    opposite = direction[2] < -1.0 + 1e-12
+    return half_turn(np.array([1.0, 0.0, 0.0])) if opposite else rotation_between(np.array([0.0, 0.0, 1.0]), direction)
 
 
 _MSH_HEAD = struct.Struct("<4i")

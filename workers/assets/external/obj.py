@@ -12,7 +12,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +19,16 @@ from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
 from workers.assets.external.caps import FolderResolver
-from workers.assets.external.mesh import DEFAULT, WHITE, Indices, MeshVisual, RawMesh, make_material
+from workers.assets.external.mesh import (
+    DEFAULT,
+    WHITE,
+    Indices,
+    MeshVisual,
+    RawMesh,
+    check_indices,
+    cut_polygons,
+    make_material,
+)
 
 _LIBRARY = re.compile(r"^[ \t]*mtllib[ \t]+(.+?)[ \t]*$", re.MULTILINE)
 _DIGITS = str.maketrans("", "", "0123456789-+")
@@ -47,7 +55,8 @@ _NOT_DRAWN = (
 
 def named_by_obj(path: Path, data: bytes) -> list[str]:
     """Names of the material files that an OBJ file asks for, and of the one beside it that has its name."""
-    return [name for words in _LIBRARY.findall(_decode(data)) for name in _library_names(words)]
+    names = [name for words in _LIBRARY.findall(_decode(data)) for name in _library_names(words)]
+    return [*names, f"{path.stem}.mtl"] if names else []
 
 
 def named_by_mtl(data: bytes) -> list[str]:
@@ -218,47 +227,10 @@ def _polygons(path: Path, runs: list[_Run]) -> Iterator[Indices]:
 
 
 def _cut(path: Path, points: Array, faces: Indices) -> Indices:
-    """[T, 3, 4]: polygons [F, n, 4] as triangles: a fan where the polygon is convex, else ears (mapbox's earcut)."""
-    if faces[:, :, 0].min() < 0 or faces[:, :, 0].max() >= len(points):
-        raise MeshError(
-            "index_out_of_range", f"{path}: a face names vertex {faces[:, :, 0].max() + 1} of {len(points)}"
-        )
-    corners = faces.shape[1]
-    if corners == 3:
-        return faces
-    fan = np.array([[0, k, k + 1] for k in range(1, corners - 1)])
-    flat, convex = _flatten(points[faces[:, :, 0]])
-    triangles = np.broadcast_to(fan, (len(faces), *fan.shape)).copy()
-    ears = [(k, _clip_ears(flat[k])) for k in np.flatnonzero(~convex)]
-    whole = [k for k, cut in ears if len(cut) == corners - 2]
-    if whole:
-        triangles[whole] = [cut for _, cut in ears if len(cut) == corners - 2]
-    rows = np.arange(len(faces))[:, None, None]
-    return faces[rows, triangles].reshape(-1, 3, 4)
-
-
-def _flatten(corners: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """[F, n, 2] polygons [F, n, 3] seen along their normals (Newell's), counter-clockwise; and which are convex."""
-    after = np.roll(corners, -1, axis=1)
-    centre = corners.mean(axis=1, keepdims=True)
-    normal = np.cross(corners - centre, after - centre).sum(axis=1)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal /= np.where(length == 0.0, 1.0, length)
-    aside = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    x = np.cross(aside, normal)
-    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
-    axes = np.stack([x, np.cross(normal, x)], axis=-1)
-    flat = (corners - centre) @ axes
-    ahead = np.roll(flat, -1, axis=1) - flat
-    behind = np.roll(ahead, 1, axis=1)
-    turn = behind[..., 0] * ahead[..., 1] - behind[..., 1] * ahead[..., 0]
-    slack = 1e-9 * length
-    return flat, (turn >= -slack).all(axis=1)
-
-
-def _clip_ears(flat: Array) -> Indices:
-    ends = np.array([len(flat)], np.uint32)
-    return np.asarray(mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends), np.int64).reshape(-1, 3)
+    """[T, 3, 4]: polygons [F, n, 4] as triangles."""
+    check_indices(path, faces[:, :, 0], len(points))
+    triangles = cut_polygons(points[faces[:, :, 0]])
+    return faces[np.arange(len(faces))[:, None, None], triangles].reshape(-1, 3, 4)
 
 
 def _mesh(

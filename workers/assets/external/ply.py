@@ -17,7 +17,17 @@ from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
 from workers.assets.external.caps import FolderResolver, decode_names, unreadable
-from workers.assets.external.mesh import DEFAULT, WHITE, Indices, MeshVisual, RawMesh, make_material
+from workers.assets.external.mesh import (
+    DEFAULT,
+    WHITE,
+    Indices,
+    MeshVisual,
+    RawMesh,
+    check_indices,
+    cut_polygons,
+    cut_strip,
+    make_material,
+)
 from workers.assets.external.plain import read_plain
 
 _TEXTURE = re.compile(rb"^comment TextureFile[ \t]+([^\r\n]+)", re.MULTILINE)
@@ -49,7 +59,7 @@ def _head(data: bytes) -> bytes:
 
 
 def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
-    """One mesh for each picture of a PLY file. Polygons are cut as fans.
+    """One mesh for each picture of a PLY file.
 
     Raises MeshError `index_out_of_range`, `no_faces` for points and splats, or `unreadable`.
     """
@@ -65,14 +75,14 @@ def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
         vertices, faces = elements["vertex"], elements.get("face", elements.get("faces"))
         points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
         if faces is not None and len(faces):
-            corners, face = _triangles(path, faces, len(points))
+            corners, face = _triangles(path, faces, points)
         elif "tristrips" in elements:
             corners, face = _strips(elements["tristrips"]), None
         else:
             splats = set(_SPLATS) <= {prop.name for prop in vertices.properties}
             what = "Gaussian splats" if splats else "a cloud of points"
             raise MeshError("no_faces", f"{path} is {what} without triangles: make a mesh of it")
-        return _meshes(path, vertices, points, faces, corners, face, resolver)
+        return _meshes(named_by_ply(path, data), vertices, points, faces, corners, face, resolver)
     except (KeyError, ValueError, TypeError, IndexError, StopIteration) as error:
         raise unreadable(path, error) from error
 
@@ -92,52 +102,35 @@ def _parse(path: Path) -> list[PlyElement]:
         return list(PlyData.read(str(path)).elements)
 
 
-def _triangles(path: Path, faces: PlyElement, count: int) -> tuple[Indices, Indices]:
+def _triangles(path: Path, faces: PlyElement, points: Array) -> tuple[Indices, Indices]:
     """[T, 3, 2]: the triangles of all faces, each corner a vertex and a place in its face; and [T] the face of each."""
-    name = next(prop.name for prop in faces.properties if prop.name in _CORNERS)
-    lists = faces[name]
-    if lists.dtype != object:  # all are triangles
-        lists = lists.reshape(-1, 3).astype(np.int64)
-        places = np.broadcast_to(np.arange(3), lists.shape)
-        return _checked(path, np.stack([lists, places], axis=-1), count), np.arange(len(lists))
-    sizes = np.array([len(row) for row in lists])
+    lists = faces[next(prop.name for prop in faces.properties if prop.name in _CORNERS)]
+    sizes = np.full(len(lists), 3) if lists.dtype != object else np.array([len(row) for row in lists])
     made, owners = [], []
-    for size in np.unique(sizes[sizes >= 3]):
+    for size in np.unique(sizes[sizes >= 3]).tolist():
         which = np.flatnonzero(sizes == size)
-        table = np.stack(lists[which]).astype(np.int64)
-        fan = np.array([[0, k, k + 1] for k in range(1, size - 1)])
-        places = np.broadcast_to(fan, (len(which), *fan.shape))
-        made.append(np.stack([table[:, fan], places], axis=-1).reshape(-1, 3, 2))
+        table = (np.stack(lists[which]) if lists.dtype == object else lists).astype(np.int64).reshape(-1, size)
+        check_indices(path, table, len(points))
+        places = cut_polygons(points[table])
+        corners = table[np.arange(len(table))[:, None, None], places]
+        made.append(np.stack([corners, places], axis=-1).reshape(-1, 3, 2))
         owners.append(np.repeat(which, size - 2))
     if not made:
         raise MeshError("no_faces", f"{path} has no triangles")
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
-    return _checked(path, np.concatenate(made)[order], count), owner[order]
-
-
-def _checked(path: Path, corners: Indices, count: int) -> Indices:
-    worst = int(corners[..., 0].max())
-    if worst >= count or corners[..., 0].min() < 0:
-        raise MeshError("index_out_of_range", f"{path}: a face names vertex {worst} of {count}")
-    return corners
+    return np.concatenate(made)[order], owner[order]
 
 
 def _strips(strips: PlyElement) -> Indices:
-    """[T, 3, 1]: the triangles of strips, in which -1 begins another one; every second triangle is turned."""
-    made = []
-    for row in strips["vertex_indices"]:
-        ends = np.flatnonzero(np.asarray(row) < 0)
-        for strip in np.split(np.asarray(row, np.int64), ends):
-            strip = strip[strip >= 0]
-            faces = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
-            faces[1::2] = faces[1::2, [1, 0, 2]]
-            made.append(faces)
-    return np.concatenate(made)[..., None]
+    """[T, 3, 1]: the triangles of strips, in which -1 begins another one."""
+    rows = [np.asarray(row, np.int64) for row in strips["vertex_indices"]]
+    parts = [part[part >= 0] for row in rows for part in np.split(row, np.flatnonzero(row < 0))]
+    return np.concatenate([cut_strip(part) for part in parts])[..., None]
 
 
 def _meshes(
-    path: Path,
+    named: list[str],
     vertices: PlyElement,
     points: Array,
     faces: PlyElement | None,
@@ -146,7 +139,7 @@ def _meshes(
     resolver: FolderResolver,
 ) -> list[RawMesh]:
     names = {prop.name for prop in vertices.properties}
-    pictures = [_picture(name, resolver) for name in named_by_ply(path, path.read_bytes()[:65536])]
+    pictures = [_picture(name, resolver) for name in named]
     normals = np.column_stack([vertices[n] for n in ("nx", "ny", "nz")]) if {"nx", "ny", "nz"} <= names else None
     colors = _colors(vertices)
     by_face = _colors(faces) if faces is not None and colors is None else None

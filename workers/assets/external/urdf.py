@@ -22,10 +22,9 @@ from workers.assets.external.caps import (
     FolderResolver,
     check_counts,
     check_nodes,
-    decode_picture,
     find_inside,
 )
-from workers.assets.external.formats import load_shape
+from workers.assets.external.formats import load_shape, with_jpeg
 from workers.assets.external.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
 from workers.assets.external.mjcf import read_mjcf
 from workers.assets.external.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled, turned
@@ -94,37 +93,23 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
 
     @cache
     def picture(name: str) -> NDArray[np.uint8] | None:
-        return _read_picture(name, path, root, resolver)
+        try:
+            return resolver.picture(relpath(find_named(name, path, root), path.parent))
+        except MeshError:
+            resolver.note(name, "is missing")
+            return None
 
     for visual in model.visuals:
-        loaded = (
-            load(visual.mesh)
-            if visual.mesh is not None
-            else LoadedMesh(Shape((visual.body,)), ())
-            if visual.body
-            else None
-        )
-        assert loaded is not None
+        loaded = load(visual.mesh or "") if visual.body is None else LoadedMesh(Shape((visual.body,)), ())
         notes += loaded.notes
         for part in transform_shape(loaded.shape, visual.T).parts:
             check_coordinates(path, part.vertices)
-            parts.append(replace(_dressed(part, visual, picture, notes), name=f"part{len(parts)}"))
+            dressed = with_jpeg(_dressed(part, visual, picture, notes), resolver)
+            parts.append(replace(dressed, name=f"part{len(parts)}"))
             vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
         check_nodes(path, len(parts), "parts", limits)
         check_counts(path, vertices, faces, limits)
     return LoadedMesh(Shape(tuple(parts)), tuple(dict.fromkeys([*notes, *resolver.notes])))
-
-
-def _read_picture(name: str, path: Path, root: Path, resolver: FolderResolver) -> NDArray[np.uint8] | None:
-    """[h, w, 3 or 4] uint8; None with a note where it is missing or refused."""
-    try:
-        file = find_named(name, path, root)
-        return decode_picture(resolver.get(relpath(file, path.parent)), resolver.notes)
-    except MeshError:
-        resolver.note(name, "is missing")
-    except FileNotFoundError:
-        pass  # the resolver has noted it
-    return None
 
 
 def _dressed(part: Part, visual: Visual, picture: Callable[[str], NDArray[np.uint8] | None], notes: list[str]) -> Part:
