@@ -1,10 +1,13 @@
-"""The layer rules in pyproject.toml, each broken on purpose: a rule that never bites protects nothing."""
+"""The layer rules in pyproject.toml, each broken on purpose, and what a start must not load, for which somebody would wait."""
 
+import pkgutil
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from services.bench.command import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -79,3 +82,29 @@ def test_every_forbidden_import_is_found_by_its_rule(tmp_path):
 def test_what_the_rules_allow_passes(tmp_path):
     done = lint(tmp_path, ALLOWED)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+HEAVY = {"ray", "numpy", "cv2", "scipy", "pydantic", "pyarrow", "av", "OpenGL", "pybullet", "trimesh"}
+HELP = "try: services.cli.main.build_parser().parse_args(['capture', '--help'])\nexcept SystemExit: pass"
+SCHEMAS = [module.name for module in pkgutil.walk_packages([str(ROOT / "schemas")], "schemas.")]
+NO_EXTRA = f"import sys; sys.modules.update(dict.fromkeys({sorted(PACKAGES)!r}))"
+"""The message that names it is what a user sees then, and no ImportError."""
+
+STARTS = (
+    (f"import services.cli.main\n{HELP}", HEAVY),
+    (f"import {', '.join(SCHEMAS)}", {"OpenGL", "pyrender", "pyglet", "pybullet", "ray", "cv2", "trimesh", "scipy"}),
+    ("from workers.store.local import open_store; open_store('/tmp')", {"obstore", "ray"}),
+    ("import services.dataset.dataset", {"ray", "pybullet", "OpenGL", "duckdb"}),
+    ("import services.dataset.one_scene", {"ray"}),
+    ("import services.study.plots", {"matplotlib.pyplot"}),
+    (f"{NO_EXTRA}; import services.bench.command", {"ray"}),
+    (f"{NO_EXTRA}; import services.study.command", set()),
+)
+
+
+def test_a_start_loads_nothing_heavy():
+    assert len(SCHEMAS) > 15
+    for start, heavy in STARTS:
+        told = f"{start}\nimport sys; print(*sorted({{*sys.modules}} & set({sorted(heavy)!r})))"
+        done = subprocess.run([sys.executable, "-P", "-c", told], capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == "", start

@@ -1,9 +1,11 @@
-"""Every command and every Python block of every page, as a user types them: in the order of the page, in a fresh checkout.
+"""Pages: links lead somewhere, commands are commands, and every one and every Python block runs as a user types them.
 
-The checkout holds README's first dataset, which the other pages are about, and what a user brings: meshes, a recording, a scan.
+They run in the order of the page, in a fresh checkout, which holds README's first dataset, which the other pages are about, and
+what a user brings: meshes, a recording, a scan.
 """
 
 import importlib.util
+import itertools
 import re
 import shlex
 import shutil
@@ -14,9 +16,13 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from services.cli.main import build_parser
+from services.queue.queue import RESTARTS, JobState
+from services.queue.supervise import PAUSES_S
 from tests.services.init.own_meshes import cup, write_mesh
 from tests.workers.capture.recordings import recording
 
@@ -96,6 +102,42 @@ def test_every_page_with_a_block_is_run_and_steps_are_found_in_order():
     every = "\n".join(line for page in PAGES for _, line in steps((ROOT / page).read_text()))
     for pattern in (*ELSEWHERE, *SMALLER, FOR_A_WHILE):
         assert re.search(pattern, every, re.MULTILINE), f"{pattern} is not on any page any more"
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_every_link_leads_to_a_file_and_a_heading_and_every_command_is_one_that_the_command_line_takes(capsys):
+    for page in [ROOT / "CHANGELOG.md", *(ROOT / page for page in PAGES), *ROOT.glob("docs/**/*.md")]:
+        text = page.read_text()
+        for target in re.findall(r"\[[^\]]*\]\(([^)\s]+)\)", re.sub(r"(?ms)^```.*?^```$|`[^`\n]+`", "", text)):
+            path, _, anchor = target.partition("#")
+            file = (page.parent / path) if path else page
+            if not re.match(r"[a-z]+:", target):
+                assert file.exists() and (not anchor or anchor in anchors(file)), f"{page}: {target}"
+        for line in (line for language, line in steps(text) if language == "sh"):
+            words = shlex.shlex(line, posix=True, punctuation_chars="&|>")
+            words.whitespace_split = True
+            for shell, part in itertools.groupby(words, lambda word: word in ("&&", "|", ">")):
+                called, *given = part
+                if shell or called not in ("./verso", "verso") or given[:1] == ["test"] or given[-1] == "--version":
+                    continue
+                try:
+                    build_parser().parse_args(given)
+                except SystemExit as ended:
+                    if ended.code:
+                        raise AssertionError(f"{page}: {line}: {capsys.readouterr().err}") from None
+
+
+def test_the_queues_page_has_its_states_and_pauses():
+    page = (ROOT / "docs" / "queue.md").read_text()
+    table = page.partition("## States")[2].partition("##")[0]
+    assert re.findall(r"^\| (\w+) \|", table, re.MULTILINE)[1:] == list(get_args(JobState))
+    assert f"rests for {', then '.join(f'{pause:g} s' for pause in PAUSES_S)}," in page
+    assert RESTARTS == 3 and "three times at most" in page
 
 
 def checkout_at(root: Path) -> Path:

@@ -1,18 +1,8 @@
 """Digests of many encoded images, to compare between processes, processors and contents of leftover memory.
 
-    save_sources("SOURCES.npy", render(12))
-    python -m tests.kit.encoded_digests digest SOURCES.npy DIGESTS.npy --images 100000
-    python -m tests.kit.encoded_digests digest SOURCES.npy OTHER.npy --images 100000 --backward
-    python -m tests.kit.encoded_digests compare DIGESTS.npy OTHER.npy
-
-`digest` loads the encoder and nothing else of the project, so it also runs on an emulated processor:
-
-    qemu-x86_64 -cpu Nehalem,-pclmulqdq python -m tests.kit.encoded_digests digest SOURCES.npy OTHER.npy --images 4000
-
-With glibc, `MALLOC_PERTURB_=165` fills whatever is allocated or freed, which shows what leftovers in memory change.
+`python -m tests.kit.encoded_digests SOURCES.npy DIGESTS.npy IMAGES [backward]` loads the encoder and nothing else of the project.
 """
 
-import argparse
 import hashlib
 import sys
 from collections.abc import Iterator, Sequence
@@ -105,28 +95,6 @@ def _dirty_memory(rng: np.random.Generator) -> None:
     del pieces
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Runs one of the commands; 1 where digests differ."""
-    parser = argparse.ArgumentParser(description="Digests of many encoded images.")
-    parser.add_argument("command", choices=("digest", "compare"))
-    parser.add_argument("files", type=Path, nargs=2, help="sources and digests, or digests and others")
-    parser.add_argument("--images", type=int, default=1_000)
-    parser.add_argument("--backward", action="store_true", help="other images come before each")
-    options = parser.parse_args(arguments)
-    if options.command == "digest":
-        sources, out = options.files
-        numbers = list(range(options.images))
-        order = numbers[::-1] if options.backward else numbers
-        found = dict(digests(load_sources(sources), order, seed=int(options.backward)))
-        np.save(out, np.frombuffer(b"".join(found[number] for number in numbers), np.uint8).reshape(-1, DIGEST))
-        return 0
-    one, two = (np.load(path) for path in options.files)
-    common = min(len(one), len(two))
-    different = np.flatnonzero((one[:common] != two[:common]).any(axis=1))
-    print(f"{common} images, {len(different)} with other bytes: {different[:10].tolist()}")
-    return int(len(different) > 0)
-
-
 def save_sources(path: Path, images: Sequence[NDArray]) -> None:
     """Writes images of any kind into one file."""
     with open(path, "wb") as file:
@@ -144,4 +112,7 @@ def load_sources(path: Path) -> list[NDArray]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sources, out, images, *backward = sys.argv[1:]
+    numbers = list(range(int(images)))
+    found = dict(digests(load_sources(Path(sources)), numbers[::-1] if backward else numbers, seed=len(backward)))
+    np.save(out, np.frombuffer(b"".join(found[number] for number in numbers), np.uint8).reshape(-1, DIGEST))

@@ -1,4 +1,4 @@
-"""Faults on purpose: something else at a step on a disk, requests to a bucket that are cut, and a lock that another takes."""
+"""Faults on purpose: something else at a step on a disk, requests to a bucket that are cut, a lock that another takes."""
 
 import builtins
 import contextlib
@@ -202,3 +202,22 @@ def check_published(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]
         if final is None or (exact and final != entry.bytes):
             raise CorruptError(f"{entry.path} has {final} bytes in its final place, and its commit says {entry.bytes}")
     return files
+
+
+def in_threads(*works: Callable[[], object]) -> None:
+    """Runs each work in a thread of its own, all from one moment on; raises what one raised when all have ended."""
+    begin, faults = threading.Barrier(len(works)), []
+
+    def run(work: Callable[[], object]) -> None:
+        begin.wait()
+        try:
+            work()
+        except Exception as error:
+            faults.append(error)
+
+    threads = [threading.Thread(target=run, args=(work,)) for work in works]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert faults == []

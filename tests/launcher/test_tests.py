@@ -100,25 +100,17 @@ def run_suite(project, *words):
 
 
 @pytest.mark.minute
-def test_skips_are_told_by_reason_and_one_that_is_not_expected_fails_in_ci(project):
-    code, out = run_suite(project)
-    assert code == 0
-    assert "skipped, and why:\n     2 x the moon is full\n     1 x slow: runs with --all\n" in out
-    assert "known failures, and why:\n     1 x not understood\n" in out
+def test_skips_are_told_by_reason_and_figures_come_in_one_list_from_all_processes(project):
     strange = "skipped although expected_skips.txt does not expect it, and why:\n     2 x the moon is full\n"
-    assert strange in out
     code, out = run_suite(project, "--scope=ci", "-n", "2")
-    assert code == 1 and strange in out
+    assert code == 1, "a skip that nobody expected"
+    assert "skipped, and why:\n     2 x the moon is full\n     1 x slow: runs with --all\n" in out and strange in out
+    assert "known failures, and why:\n     1 x not understood\n" in out
     (project / "tests" / "expected_skips.txt").write_text("the moon is *\n")
     code, out = run_suite(project, "--scope=all")
     assert code == 0 and "although" not in out and "slow" not in out
-
-
-@pytest.mark.minute
-def test_figures_of_all_processes_come_in_one_list_and_a_failed_case_says_so(project):
     (project / "tests" / "test_failing.py").write_text(FAILING)
-    code, _ = run_suite(project, "-n", "2", "--figures", "figures.json")
-    assert code == 1
+    assert run_suite(project, "-n", "2", "--figures", "figures.json")[0] == 1
     assert json.loads((project / "figures.json").read_text()) == [
         {"name": "plane", "outcome": "made", "figure": 0.25, "bound": 1.0},
         {"name": "sphere", "outcome": "failed", "figure": 7.0, "bound": 5.0},

@@ -2,7 +2,6 @@
 
 import ast
 import os
-import pkgutil
 import re
 import subprocess
 import sys
@@ -45,15 +44,6 @@ def test_numpy_runs_without_avx512_and_does_not_complain():
     groups = ast.literal_eval(python(asks, "-W", "error", **STACK_ENVIRONMENT))
     assert set(groups) == set(STACK_ENVIRONMENT["NPY_DISABLE_CPU_FEATURES"].split(","))  # numpy knows no others
     assert not any(groups.values())
-
-
-def test_importing_schemas_loads_neither_gl_nor_physics_nor_ray():
-    heavy = {"OpenGL", "pyrender", "pyglet", "pybullet", "ray", "cv2", "trimesh", "scipy"}
-    names = [module.name for module in pkgutil.walk_packages([str(ROOT / "schemas")], "schemas.")]
-    assert len(names) > 15
-    told = "; import sys; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
-    assert heavy.isdisjoint(python(f"import {', '.join(names)}{told}").split())
-    assert "pybullet" in python(f"import workers.physics.settle{told}").split()  # it would be found
 
 
 def test_the_image_sets_the_same_environment():

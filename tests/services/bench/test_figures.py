@@ -4,8 +4,6 @@ import contextlib
 import json
 import os
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 from statistics import fmean
 from types import SimpleNamespace
@@ -43,15 +41,16 @@ from services.bench.scaling import (
 from services.bench.sides import LOOKS
 from services.cli.main import main
 from services.job.job_file import validate_job
+from tests.datasets import SMALL as ANY_SMALL
 from tests.effects.physics_scenes import facts_with
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.drops import drop, level
-from tests.services.bench.small_job import SMALL
 from tests.services.run.test_coordinator import spans
 from workers.physics.effects import PREDICATES
 from workers.scene.effects import names_of_kind
 
 ROOT = Path(__file__).resolve().parents[3]
+SMALL = {**ANY_SMALL, "run": {"range_size": 2}}
 JOB = validate_job(SMALL, "test")
 
 # ---------------------------------------------------------------------------------------------- laps
@@ -257,13 +256,3 @@ def test_without_the_extra_both_commands_end_with_one_message_before_anything_is
         told = capsys.readouterr()
         assert told.err.count("\n") == 1 and "./verso extra study" in told.err
         assert json.loads(told.out)["kind"] == "MachineError" and list(tmp_path.iterdir()) == []
-
-
-def test_both_commands_load_without_the_extra_and_bench_without_ray():
-    """So that the message is what a user sees, and no ImportError; and Ray's loading counts in no start-up."""
-    hide = f"import sys; sys.modules.update(dict.fromkeys({list(PACKAGES)!r}))"
-    code = f"{hide}; import services.bench.command; assert 'ray' not in sys.modules; import services.study.command"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")

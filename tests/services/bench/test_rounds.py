@@ -28,9 +28,10 @@ from services.bench.sides import (
 )
 from services.cli.main import main
 from services.job.job_file import validate_job
-from tests.services.bench.small_job import SMALL
+from tests.datasets import SMALL as ANY_SMALL
 from workers.store.commit import committed_files, read_record
 
+SMALL = {**ANY_SMALL, "run": {"range_size": 2}}
 JOB = validate_job(SMALL, "test")
 
 

@@ -117,18 +117,6 @@ def test_a_folder_without_a_usable_mesh_is_refused_with_what_was_found(capsys, t
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.minute
-def test_a_ray_that_does_not_answer_is_told_at_once(capsys, tmp_path):
-    code, text = told(capsys, "run", TABLETOP, "--address", "127.0.0.1:1", "--out", str(tmp_path / "out"))
-    assert code == 1 and "127.0.0.1:1" in text and "ray start" in text
-
-
-def test_a_dry_run_says_what_would_be_done_and_does_nothing(capsys, tmp_path):
-    code, text = told(capsys, "run", TABLETOP, "--dry-run", "--scenes", "5", "--out", str(tmp_path / "out"))
-    assert code == 0 and "scenes 0 to 4" in text
-    assert not (tmp_path / "out").exists()
-
-
 # ------------------------------------------------------------------------------------------------ output folders
 
 
@@ -161,17 +149,6 @@ def test_a_file_system_that_is_mounted_read_only_is_told_as_that(tmp_path):
     (line,) = done.stderr.splitlines()
     assert line == f"verso: {tmp_path} cannot be written: the file system is mounted read-only; or choose another --out"
     assert done.returncode == 2
-
-
-def test_a_folder_with_somebodys_files_is_refused_not_filled(tmp_path, capsys):
-    for name in ("thesis.tex", ".hidden", "RGB00000.png"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / name).write_text("mine")
-        code, text = told(capsys, "run", TABLETOP, "--scenes", "1", "--out", str(tmp_path / name))
-        assert code == 2 and f"{tmp_path / name} holds {name}, and no job.yaml" in text
-        assert [path.name for path in (tmp_path / name).iterdir()] == [name]
-    code, text = told(capsys, "run", TABLETOP, "--out", str(tmp_path / "thesis.tex" / "thesis.tex" / "out"))
-    assert code == 2 and "thesis.tex/out" in text
 
 
 HOLD = """
@@ -234,38 +211,6 @@ def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
     assert (found["file"], found["bytes"]) == (str(page), page.stat().st_size) and default_page(f"{made.name}/") == page
     assert (found["scenes"], len(found["shown"])) == (2, 1)
     assert str(default_page("s3://bucket/sets/small")) == "small-report.html"
-
-
-def test_verify_exits_1_where_a_file_is_gone(capsys, tmp_path):
-    store, _ = make_dataset(tmp_path, scenes=1)
-    next(tmp_path.glob("*/depth0*.png")).unlink()
-    code, lines, found = answer(capsys, "verify", store.name)
-    assert (code, found["ok"]) == (1, False)
-    assert any("is committed and missing: `verso replay" in line for line in lines)
-
-
-@pytest.mark.ray
-@pytest.mark.minute
-def test_the_first_command_of_the_readme_makes_a_dataset_and_the_others_read_it(tmp_path):
-    """From the shell, as a user would, with a small job."""
-    (tmp_path / "services").mkdir()  # a folder of the user's that has one of our generic names
-    (tmp_path / "services" / "__init__.py").write_text("raise RuntimeError('somebody else')")
-    run = ("run", TABLETOP, "--out", "out", "--scenes", "3", "--json")
-    made = verso(*run, cwd=tmp_path)
-    assert made.returncode == 0, made.stderr
-    first = json.loads(made.stdout.splitlines()[-1])
-    assert first["scenes"] == {"made": 3, "intrinsic": 0, "environmental": 0}
-    assert "pybullet build time" not in made.stdout + made.stderr
-    assert len((tmp_path / "out" / "camPoses.csv").read_text().splitlines()) == 1 + 6
-    assert "nothing off" in verso("verify", "out", cwd=tmp_path).stdout
-    assert "none differ" in verso("replay", "out", "1", cwd=tmp_path).stdout
-    assert verso("export", "out", "two", "--format", "gltf", "--scenes", "2", cwd=tmp_path).returncode == 0
-    (scene,) = (tmp_path / "two").rglob("*.glb")
-    assert scene.read_bytes()[:4] == b"glTF"
-    again = verso(*run, cwd=tmp_path)
-    assert json.loads(again.stdout.splitlines()[-1])["digest"] == first["digest"]
-    other = verso(*run, "--set", "seed=1", cwd=tmp_path)
-    assert other.returncode == 2 and "seed: 2024 there, 1 here" in other.stderr
 
 
 # ------------------------------------------------------------------------------------------------ the machine

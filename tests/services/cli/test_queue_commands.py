@@ -141,12 +141,6 @@ def test_logs_of_a_job_whose_cluster_is_gone(queue, capsys):
     assert json.loads(out.splitlines()[-1])["state"] == "done"
 
 
-def test_a_supervisor_without_a_cluster_is_told_in_one_line(queue, capsys):
-    code, _, err = told(capsys, "supervise", "--queue", queue, "--address", "http://127.0.0.1:1")
-    assert code == 1
-    assert err.startswith("verso: --address http://127.0.0.1:1: ") and err.count("\n") == 1
-
-
 def test_the_queue_may_be_named_by_the_environment(queue, capsys, monkeypatch, tmp_path):
     queue_of(Path(queue))
     queue_of(tmp_path / "other", request_of("j00000001"))

@@ -1,8 +1,6 @@
 """Meshes of a dataset's objects lie where its images and text files say; a scene made in memory is the stored one."""
 
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pyarrow.compute as pc
@@ -134,13 +132,3 @@ def test_a_scene_in_memory_is_the_stored_one(files, tmp_path):
         make_scene(path, 0, ["start.poze=placed"])
     with pytest.raises(SceneError, match="scene 0 cannot be made"):
         make_scene(overlaid(KEYS, {"cameras": {"sensor": {"fx": 90_000.0, "fy": 90_000.0}}}), 0)
-
-
-@pytest.mark.minute
-def test_neither_ray_nor_a_renderer_is_loaded_to_read():
-    code = (
-        "import sys; import services.dataset.dataset; loaded = set(sys.modules) & {'ray', 'pybullet', 'OpenGL', 'duckdb'};"
-        "import services.dataset.one_scene; print(loaded, 'ray' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["set()", "False"]

@@ -7,10 +7,8 @@ import itertools
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -90,19 +88,6 @@ def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, nam
         export_to(files, target, name, shard_mb=0)
         assert contents(target) == contents(tmp_path / "whole")
         shutil.rmtree(target)
-
-
-def test_a_process_that_is_killed_is_gone_on_with(files, tmp_path):
-    export_to(files, tmp_path / "whole", "mirror-recon")
-    command = [sys.executable, "-m", "services.cli.main", "export", files.name, str(tmp_path / "killed")]
-    command += ["--format", "mirror-recon"]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while process.poll() is None and not (tmp_path / "killed" / "_export" / "progress.json").exists():
-        time.sleep(0.001)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert main(command[3:]) == 0
-    assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("name", FORMATS)

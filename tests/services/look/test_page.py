@@ -3,7 +3,6 @@
 import io
 import re
 import zipfile
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -28,33 +27,10 @@ from services.look.report import (
 from services.look.server import Place, serving
 from tests.browser import needs_chromium, open_tab
 from tests.datasets import make_dataset
+from tests.kit.html import Reader
 from tests.services.look.conftest import address
 from tests.services.read.conftest import in_a_bucket
 from workers.store.local import LocalStore
-
-VOID = {"meta", "img", "input", "link", "br"}
-
-
-class Reader(HTMLParser):
-    """Ids, addresses and open elements of a page."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.ids: list[str] = []
-        self.addresses: list[str] = []
-
-    def handle_starttag(self, tag, attrs):
-        self.ids += [value for name, value in attrs if name == "id"]
-        self.addresses += [value for name, value in attrs if name in ("src", "href", "srcset", "action", "data")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.ids += [value for name, value in attrs if name == "id"]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag, f"</{tag}> closes another element"
 
 
 @pytest.fixture(scope="module")
@@ -65,12 +41,12 @@ def page(shown, tmp_path_factory) -> Path:
 
 
 def test_the_page_is_well_formed_names_its_job_and_holds_all_that_it_shows(page):
-    text, reader = page.read_text(), Reader()
-    reader.feed(text)
-    assert reader.open == [] and len(set(reader.ids)) == len(reader.ids) > 5
-    inner = [one for one in reader.addresses if one.startswith("#")]
+    text = page.read_text()
+    reader = Reader(text)
+    assert len(set(reader.ids)) == len(reader.ids) > 5
+    inner = [one for one in reader.links if one.startswith("#")]
     assert {one[1:] for one in inner} <= set(reader.ids)
-    assert all(one.startswith("data:image/") for one in reader.addresses if one not in inner)
+    assert all(one.startswith("data:image/") for one in reader.links if one not in inner)
     style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)[1]
     assert "url(" not in style and "@import" not in style and "default-src 'none'" in text
     assert "<title>small</title>" in text and "4 scenes asked" in text

@@ -3,9 +3,7 @@
 Real disks that are full are in tests/chaos.
 """
 
-import errno
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -15,7 +13,6 @@ import pytest
 from schemas.dataset.layout import STAGING
 from schemas.errors import MachineError
 from services.merge.merge import merge
-from tests.kit.faults import disk
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -50,24 +47,6 @@ def test_a_merge_without_room_at_any_size_of_a_file_says_so_and_can_be_done_agai
         limit = limit * 8 // 5
     assert len(told) > 12
     assert merge(store, FIRST, STOP) == merged[1]
-
-
-def test_a_step_on_the_disk_that_finds_no_room_says_so_and_can_be_done_again(merged, tmp_path):
-    def no_room():
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    store = dataset_at(tmp_path)
-    told, step = [], 0
-    while True:
-        with disk(at=step, then=no_room) as watched:
-            told.append(failed(store))
-        if watched.steps <= step:
-            break
-        (tmp_path / "_SUCCESS").unlink(missing_ok=True)
-        step += 15
-    assert sum(map(bool, told)) > len(told) // 3  # what cleans up may fail without a word
-    assert merge(store, FIRST, STOP) == merged[1]
-    assert not list(store.files(STAGING))
 
 
 MANY = """

@@ -5,7 +5,6 @@ import hashlib
 import json
 
 import numpy as np
-import pyarrow.dataset as ds
 import pytest
 from obstore.store import MemoryStore
 
@@ -14,13 +13,11 @@ from schemas.dataset.tables import TABLES
 from schemas.errors import CommitConflict, CorruptError, RunError
 from services.merge import merge as merge_module
 from services.merge.merge import merge, read_success
-from services.run.range_planner import plan_ranges
 from tests.kit.faults import disk
 from tests.kit.made_up_runs import half_merged
 from tests.kit.s3_server import Bucket, s3_server
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, small_scene, terms, with_shapes
-from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
@@ -169,18 +166,6 @@ def test_the_digest_does_not_depend_on_ranges_order_layout_or_attempts(merged, t
         [{"size": 1}, {"size": 7}, {"size": 100}, {"order": -1}, {"layout": "tar", "size": 5, "order": -1}]
     ):
         assert merge(dataset_at(tmp_path / str(number), **how), FIRST, STOP) == merged[1], how
-
-
-def test_a_dataset_extended_twice_has_the_digest_of_one_made_at_once(merged, tmp_path):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    for stop in (9, 10, STOP):
-        for start, end in plan_ranges(FIRST, stop, 4, list_commits(store).ranges):
-            attempt_at(store, start, end).commit()
-        result = merge(store, FIRST, stop)
-        assert result.complete
-    assert result == merged[1]
-    assert ds.dataset(tmp_path / "manifest/views", partitioning="hive").count_rows() == result.rows["views"]
 
 
 def test_a_dataset_whose_killed_scenes_were_retried_has_the_digest_of_one_without_kills(merged, tmp_path):

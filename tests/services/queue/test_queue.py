@@ -1,7 +1,5 @@
 """Queues in folders and buckets: a job's state after its events, what is refused, and what several writers may not do."""
 
-import threading
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,10 +7,10 @@ from hypothesis import strategies as st
 from schemas.errors import CorruptError, InputError
 from schemas.queue import MARK_FILE, JobEvent, events_folder, request_path
 from services.queue.queue import RESTARTS, JobView, Queue, apply, fold, make_queue, open_queue
+from tests.kit.faults import in_threads
 from tests.kit.queue_world import ids, queue_of, request_of
 from tests.kit.s3_server import Bucket, s3_server
 from workers.store.events import event_path
-from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
 A, B = ids(2)
@@ -27,25 +25,6 @@ def queue(request, tmp_path):
         made = Queue(ObjectStore(client, "s3://mine"))
         assert made.put_request(request_of(A))
         yield made
-
-
-def in_threads(work) -> None:
-    """Runs `work` in eight threads that start at once; raises what one raises."""
-    start, faults = threading.Barrier(8), []
-
-    def contend() -> None:
-        start.wait()
-        try:
-            work()
-        except Exception as error:
-            faults.append(error)
-
-    threads = [threading.Thread(target=contend) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert faults == []
 
 
 def test_a_job_and_its_events_are_read_as_they_were_stored_and_none_that_does_not_apply(queue):
@@ -63,7 +42,7 @@ def test_a_job_and_its_events_are_read_as_they_were_stored_and_none_that_does_no
 
 def test_of_many_writers_at_once_one_decides(queue):
     won = []
-    in_threads(lambda: won.append(Queue(queue.store).append(A, "started", 1)))
+    in_threads(*[lambda: won.append(Queue(queue.store).append(A, "started", 1))] * 8)
     assert len([view for view in won if view is not None]) == 1
     assert queue.read(A).events == 1
 
@@ -104,25 +83,12 @@ def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path):
 
 
 def test_a_new_or_an_empty_folder_becomes_a_queue_and_stays_one_also_where_many_make_it(tmp_path):
-    in_threads(lambda: make_queue(str(tmp_path / "new")))
+    in_threads(*[lambda: make_queue(str(tmp_path / "new"))] * 8)
     assert open_queue(str(tmp_path / "new")).ids() == []
     assert {path.name for path in (tmp_path / "new").iterdir()} == {MARK_FILE, "_staging"}
     mark = (tmp_path / "new" / MARK_FILE).read_bytes()
     make_queue(str(tmp_path / "new"))
     assert (tmp_path / "new" / MARK_FILE).read_bytes() == mark
-
-
-def test_a_queue_that_another_makes_between_two_looks_is_taken(tmp_path, monkeypatch):
-    make_queue(str(tmp_path / "q"))
-    asked, real = [], LocalStore.size
-
-    def absent_at_first(store, key):
-        asked.append(key)
-        return None if len(asked) == 1 else real(store, key)
-
-    monkeypatch.setattr(LocalStore, "size", absent_at_first)
-    assert make_queue(str(tmp_path / "q")).ids() == []
-    assert asked[0] == MARK_FILE
 
 
 def test_what_is_no_queue_is_refused_with_one_line(tmp_path):

@@ -5,6 +5,8 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 import trimesh
@@ -18,7 +20,7 @@ from services.read.replay import replay_scene
 from services.read.scene_geometry import posed_scene
 from services.read.status import read_status
 from tests.captures import captures_job, use_exact_captures, write_folder
-from tests.datasets import faults_of, run_here
+from tests.datasets import faults_of, make_dataset, run_here
 from workers.capture import make_capture
 from workers.capture import rows as capture_pair
 from workers.store.local import LocalStore
@@ -142,3 +144,19 @@ def test_folders_are_captures_and_one_that_cannot_be_used_is_a_row_of_failures(t
     (tmp_path / "shots/0/rgb_00000.png").write_bytes(b"")
     with pytest.raises(MachineError, match="captures in shots/0 "):
         replay_scene(store, 0)
+
+
+def test_one_query_tells_captures_from_simulations_in_both_datasets(virtual, tmp_path):
+    make_dataset(tmp_path, categories=["mug", "box"])
+    both = (tmp_path, virtual)
+    for order in (both, both[::-1]):
+        scenes = ds.dataset([ds.dataset(one / "manifest/scenes", partitioning="hive") for one in order])
+        rows = scenes.to_table(columns=["source", "category", "penetration_mm", "capture"]).to_pylist()
+        kinds = sorted((row["source"], row["capture"] is not None, row["penetration_mm"] is None) for row in rows)
+        assert kinds == [("procedural", False, False)] * 2 + [("simulated_capture", True, True)] * 2
+        measured = scenes.to_table(filter=pc.is_valid(ds.field("capture")))
+        assert measured.num_rows == 2
+
+    for table in ("views", "objects", "assets", "failures", "timings"):
+        parts = [ds.dataset(one / "manifest" / table, partitioning="hive") for one in both]
+        assert ds.dataset(parts).count_rows() == sum(part.count_rows() for part in parts), table

@@ -24,9 +24,9 @@ from services.merge.merge import encode_success, read_success
 from services.read import verdict as told_of
 from services.read import verify as whole
 from services.read.verdict import COPY, Verdict, explain_damage
-from services.read.verify import encode_fingerprint, read_stored_job, verify
+from services.read.verify import encode_fingerprint, verify
 from services.read.verify_files import Success, check_success
-from services.read.verify_range import Spans, commit_groups, read_records
+from services.read.verify_range import Spans, read_records
 from tests.damage import choose_places, damaged, files_by_kind
 from tests.datasets import faults_of, make_dataset
 from tests.kit import many_ranges
@@ -320,15 +320,6 @@ def test_every_key_of_success_counts(tiny):
         assert len(found.faults) == 1 and told in found.faults[0]
 
 
-def test_a_job_changed_where_no_image_depends_on_it_is_told(tiny, tmp_path):
-    text = tiny.read("job.yaml").decode()
-    for before, after in (("# The job", "# The joy"), ("folder: /", "folder: /x/"), ("seed: 11\n", "seed:  11\n")):
-        assert before in text
-        (tmp_path / "job.yaml").write_text(text.replace(before, after, 1))
-        found = Verdict()
-        assert not read_stored_job(LocalStore(tmp_path), found).whole and NO_SEAL in found.faults[0]
-
-
 def test_the_range_size_of_the_commits_and_their_kept_summary_are_checked(copy):
     store = LocalStore(copy)
     rows = list_commits(store).rows
@@ -377,14 +368,6 @@ def test_a_gap_of_a_billion_scenes_is_one_line_and_more_faults_than_anybody_read
         found.tell(str(number), COPY, "file")
     found.tell("_SUCCESS: is missing", COPY, "merge")
     assert (len(found.faults), found.untold) == (4, 2) and found.faults[-1].startswith("_SUCCESS")
-
-
-def test_commits_are_grouped_with_their_retries_in_order(tmp_path):
-    commits = tmp_path / "manifest/_commits"
-    commits.mkdir(parents=True)
-    for name in ("0000000016.json", "0000000000.retry-10.json", "0000000000.retry-2.json", "0000000000.json", "x"):
-        (commits / name).touch()
-    assert list(commit_groups(LocalStore(tmp_path))) == [(0, [0, 2, 10]), (16, [0])]
 
 
 def missed(store: LocalStore, count: int, seed: int) -> list[str]:

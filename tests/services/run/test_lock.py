@@ -15,7 +15,7 @@ from schemas.dataset.layout import LOCK_CLAIMS, LOCK_FILE
 from schemas.errors import MachineError, RunError
 from services.run import lock as module
 from services.run.lock import Beat, Holder, explain_lost_folder, hold_lock, read_holder
-from tests.kit.faults import STILL, taken_over
+from tests.kit.faults import STILL, in_threads, taken_over
 from workers.store.local import LocalStore
 
 FAST = Beat(period_s=0.05, patience=4)
@@ -46,24 +46,6 @@ def write(store, holder: Holder) -> None:
 
 def beat_of(store) -> int:
     return json.loads(store.read(LOCK_FILE))["beat"]
-
-
-def in_threads(*works) -> None:
-    """Runs each work in a thread of its own until all have ended; raises what one raised."""
-    faults = []
-
-    def run(work) -> None:
-        try:
-            work()
-        except Exception as error:
-            faults.append(error)
-
-    threads = [threading.Thread(target=run, args=(work,)) for work in works]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert faults == []
 
 
 def test_a_lock_is_there_while_it_is_held_and_gone_afterwards_also_after_an_error(store):
@@ -133,10 +115,8 @@ def test_a_holder_elsewhere_that_beats_is_refused_and_one_that_is_silent_replace
 def test_of_many_that_take_over_a_dead_holder_one_at_a_time_gets_it(store):
     write(store, THEIRS)
     inside, most = [], []
-    gate = threading.Barrier(6)
 
     def contend():
-        gate.wait()
         with contextlib.ExitStack() as stack:
             while True:  # as a user does
                 with contextlib.suppress(RunError):

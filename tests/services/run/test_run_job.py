@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pyarrow.dataset
 import pytest
 
@@ -15,9 +14,7 @@ from schemas.errors import OutputError, RunError
 from schemas.job.job import Job
 from services.job.job_file import load_job, validate_job
 from services.merge.merge import merge
-from services.read.dataset_reader import iter_stored
 from services.read.query import query
-from services.read.replay import replay_scene
 from services.run.ray_cluster import Slots, private_ray
 from services.run.run_job import RunRequest, run_job
 from tests.datasets import SMALL as SMALL_PAIR
@@ -25,7 +22,6 @@ from tests.datasets import faults_of, make_dataset, overlaid
 from tests.kit.killed_runs import deadly_scene, disturb_at_first_commit, interrupt
 from tests.kit.network import free_port
 from tests.services.run.scraped import scrape
-from workers.store.images import decode_png
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.ray
@@ -128,37 +124,6 @@ def test_the_finished_folder_holds_what_was_promised(made):
         assert max(row[name] for row in scenes) < 1e-6
     assert min(row["support_margin_mm"] for row in scenes) > 0
     assert not list((out / "_staging").glob("*/*"))
-
-
-def test_objects_dat_reprojects_to_its_image_coordinates(made):
-    cameras = {row["pose_id"]: row for row in table(made[0], "views") if row["role"] in ("input", "mirror")}
-    lines = [line.split() for line in (made[0] / "objects.dat").read_text().splitlines()]
-    assert len(lines) == 2 * SCENES * 2  # table and object in each pose
-    for pose, _, _, _, u, v, *T in lines:
-        camera, (x, y, z) = cameras[int(pose)], np.reshape(np.array(T, float), (4, 4))[:3, 3]
-        expected = camera["fx"] * x / z + camera["cx"], camera["fy"] * y / z + camera["cy"]
-        inside = 0 <= expected[0] < camera["width"] and 0 <= expected[1] < camera["height"]
-        assert (int(u), int(v)) == (tuple(int(np.floor(e)) for e in expected) if inside else (-1, -1))
-
-
-def test_every_pairs_images_have_their_sizes_and_types(made):
-    store = LocalStore(made[0])
-    files = [file["path"] for row in next(iter_stored(store)).rows["views"] for file in row["files"]]
-    assert len(files) > SCENES * 11
-    for path in files:
-        pixels = decode_png(store.read(path))
-        assert pixels.shape[:2] == ((24, 32) if "/patches/" in path else (120, 160))
-        assert pixels.dtype == (np.uint16 if "depth" in path else np.uint8)
-        assert pixels.ndim == (3 if "RGB" in path else 2)
-
-
-@pytest.mark.minute
-def test_a_healthy_dataset_verifies_and_replays_to_the_byte(made):
-    store = LocalStore(made[0])
-    assert faults_of(store) == []
-    replayed = replay_scene(store, 5)
-    assert (replayed.same_stack, replayed.differences) == (True, ())
-    assert replayed.compared > 15
 
 
 def test_what_does_not_belong_to_the_job_is_refused_and_left_as_it_is(made, tmp_path):

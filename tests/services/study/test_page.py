@@ -5,7 +5,6 @@ import dataclasses
 import json
 import math
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -14,6 +13,7 @@ import pytest
 from services.study.choose import answer
 from services.study.model import ERRORS, Setting, Study
 from services.study.page import page_of, wide_schema, write_page, write_tables
+from tests.kit.html import Reader
 from tests.services.study.made_up import read_study, row, stored, study
 
 # ---------------------------------------------------------------------------------------------- tables
@@ -50,38 +50,6 @@ def test_the_wide_table_has_a_row_a_setting_and_the_long_one_a_row_an_error(tmp_
 # ---------------------------------------------------------------------------------------------- the page
 
 
-class Reader(HTMLParser):
-    """Holds that every element that is opened is closed, and collects texts, links and the cells of tables."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__(convert_charrefs=True)
-        self.open: list[str] = []
-        self.texts: dict[str, list[str]] = {}
-        self.links: list[str] = []
-        self.rows: list[list[str]] = []
-        self.feed(page)
-        self.close()
-        assert self.open == [] and "script" not in self.texts and "link" not in self.texts
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.texts.setdefault(tag, [])
-        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
-        if tag not in {"meta", "img", "br"}:
-            self.open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th"):
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.texts[self.open[-1]].append(data) if self.open else None
-        if {"td", "th"} & set(self.open):
-            self.rows[-1][-1] += data
-
-
 def test_the_page_answers_first_and_needs_no_network_no_script_and_no_file(tmp_path: Path):
     picture = tmp_path / "tradeoff.png"
     picture.write_bytes(b"\x89PNG made up")
@@ -91,6 +59,7 @@ def test_the_page_answers_first_and_needs_no_network_no_script_and_no_file(tmp_p
     assert reader.texts["p"][0] == answer(stored())
     assert reader.texts["h1"] == ["What accuracy costs in time: tabletop"]
     assert len(reader.links) == 2 and all(link.startswith("data:image/png;base64,") for link in reader.links)
+    assert "script" not in reader.texts and "link" not in reader.texts
     assert base64.b64decode(reader.links[0].partition(",")[2]) == picture.read_bytes()
     assert not re.search(r"https?:|url\(|@import", page)
     assert Reader(page_of(stored(), [], {"between_mm": 1.0})).texts["p"][0] == answer(stored(), {"between_mm": 1.0})

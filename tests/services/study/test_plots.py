@@ -2,8 +2,6 @@
 
 import dataclasses
 import itertools
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -97,12 +95,6 @@ def test_the_pictures_open_and_the_same_study_gives_the_same_bytes(tmp_path: Pat
     assert [file.read_bytes() for file in written] == [file.read_bytes() for file in write_plots(made, tmp_path / "b")]
     with Image.open(written[0]) as image:
         assert image.width == 1800 and image.convert("L").getextrema() == (0, 255)
-
-
-def test_drawing_needs_no_window_and_no_state_of_pyplot():
-    code = "import sys, services.study.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
-    root = Path(__file__).resolve().parents[3]
-    assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=60, check=False).returncode == 0
 
 
 def test_points_and_front_stand_where_the_rows_say():

@@ -7,10 +7,7 @@ disk, or of the requests that it makes to a bucket. With `--ci` each row tries t
 import hashlib
 import io
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import obstore
@@ -36,7 +33,7 @@ from tests.kit.made_up_runs import (
     settings_of,
 )
 from tests.kit.stored_images import iter_records
-from tests.made_up_scenes import TERMS, attempt_at, small_scene, terms
+from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.store import ledger
 from workers.store import store as store_module
 from workers.store.attempt import sweep
@@ -305,40 +302,3 @@ def test_paused_at_a_point_while_a_newer_merge_completes_one_of_them_stands(wher
     if every:
         assert sum(finished) > len(finished) // 2
         assert sum(refused) > len(refused) // 3 or (stop == 4 and where is pause_in_bucket)  # which puts the same bytes
-
-
-RACER = """
-import sys, time
-from pathlib import Path
-from tests.made_up_scenes import attempt_at, small_scene, terms
-from workers.store.local import LocalStore
-store, me = LocalStore(sys.argv[1]), sys.argv[2]
-attempts = [attempt_at(store, start, start + 4, terms(fingerprint=me), small_scene) for start in range(0, 40, 4)]
-Path(sys.argv[1], me).touch()
-while not all(Path(sys.argv[1], name).exists() for name in "ab"):
-    pass
-for attempt in attempts:
-    result = attempt.commit()
-    print(result.won, result.conflict, result.record.terms.fingerprint)
-"""
-
-
-def test_of_two_processes_that_commit_the_same_ranges_one_wins_each_and_nothing_is_lost(tmp_path):
-    store = prepared(tmp_path)
-    racers = [
-        subprocess.Popen([sys.executable, "-c", RACER, os.fspath(tmp_path), name], stdout=subprocess.PIPE, text=True)
-        for name in "ab"
-    ]
-    told = [[line.split() for line in racer.communicate(timeout=120)[0].splitlines()] for racer in racers]
-    assert [racer.returncode for racer in racers] == [0, 0]
-    assert len(told[0]) == len(told[1]) == 10
-    for mine, theirs in zip(*told, strict=True):
-        won = [line[0] == "True" for line in (mine, theirs)]
-        assert sum(won) == 1 and mine[1] == theirs[1] == "None"
-        assert mine[2] == theirs[2] == "ab"[won.index(True)]
-    records = list(iter_records(store))
-    assert [record.span.start for record in records] == list(range(0, 40, TERMS.range_size))
-    for record in records:
-        check_published(store, record)
-    sweep(store)
-    assert not list(store.files("_staging"))

@@ -7,7 +7,6 @@ import pytest
 
 from schemas.dataset.commit import LEDGER_SCHEMA, CommitSummary, join_rows, rows_of
 from schemas.dataset.layout import LEDGER_FILE, STAGING, commit_path, range_table_path
-from schemas.dataset.tables import TABLES
 from schemas.errors import CorruptError, MachineError, RunError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms
 from workers.store import ledger as module
@@ -60,19 +59,6 @@ def test_the_rows_of_a_retry_replace_those_of_its_scenes_alone_also_where_it_fai
     for table, scenes in (("scenes", [0, 1, 2]), ("failures", [3]), ("timings", [0, 1, 2, 3])):
         assert range_rows(store, records, table).column("scene_id").to_pylist() == scenes
     assert range_rows(store, records, "failures").column("kind").to_pylist() == ["intrinsic"]
-
-
-def test_a_range_that_was_retried_has_the_rows_of_one_that_never_failed(store, tmp_path):
-    attempt_at(store, 4, 8, make=killed(4, 6)).commit()
-    attempt_at(store, 4, 8, retry=1, scenes=(4, 6)).commit()
-    (retried,) = iter_ranges(store, 4, 8)
-    other = LocalStore(tmp_path / "other")
-    other.prepare()
-    attempt_at(other, 4, 8).commit()
-    (whole,) = iter_ranges(other, 4, 8)
-    for table in TABLES:
-        if table not in ("timings", "assets"):
-            assert range_rows(store, retried, table).equals(range_rows(other, whole, table)), table
 
 
 def test_a_range_is_read_while_it_is_published_and_a_damaged_or_missing_table_is_told_by_name(store, undecided):

@@ -21,7 +21,6 @@ from workers.store.manifest import (
     decode_table,
     encode_table,
     scene_digest,
-    sorted_rows,
     table_of_rows,
 )
 
@@ -127,15 +126,6 @@ def test_rows_come_back_from_parquet_as_they_went_in_with_the_version_of_their_s
     older = table_of_rows("scenes", rows_of("scenes")).drop_columns("recheck_move_mm")
     again = decode_table("scenes", encode_table(older), "x")
     assert again.schema.equals(SCHEMAS["scenes"]) and again.column("recheck_move_mm").to_pylist() == [None]
-
-
-def test_rows_are_sorted_by_their_key_and_two_of_one_key_are_refused():
-    rows = rows_of("objects")
-    table = sorted_rows("objects", table_of_rows("objects", rows[::-1]))
-    keys = list(zip(*(table.column(name).to_pylist() for name in ("pose_id", "role", "region_id")), strict=True))
-    assert keys == sorted(keys)
-    with pytest.raises(ValueError, match="objects: two rows have the key pose_id, role, region_id"):
-        sorted_rows("objects", table_of_rows("objects", [*rows, rows[3]]))
 
 
 def test_a_flipped_bit_anywhere_is_found_or_harmless_and_a_torn_file_or_another_table_is_told_by_name():
