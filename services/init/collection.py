@@ -22,7 +22,7 @@ SUFFIXES = (*POSED, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
 
 _REMEDIES = {
-    "run `assimp export FILE FILE.glb`, or use Blender": ".dae .fbx .3ds .3mf .x3d .wrl .lwo",
+    "run `assimp export FILE FILE.glb`, or use Blender": ".fbx .3ds .3mf .x3d .wrl .lwo",
     "export it as .glb, such as by Blender": ".blend .usd .usda .usdc .usdz .abc",
     "export it as .glb by the program that wrote it": ".max .mb .ma .c4d .skp",
     "export it as .stl by a CAD program": ".step .stp .iges .igs .fcstd .sldprt",

@@ -12,7 +12,7 @@ from schemas.job.assets import UpAxis, matches
 from services.init.found import Item
 from workers.assets.external.urdf import POSED
 
-METRIC = frozenset({".glb", ".gltf", *POSED})
+METRIC = frozenset({".glb", ".gltf", ".dae", *POSED})
 """Formats whose specification says metres."""
 
 SPECIFIED_UP: Mapping[str, UpAxis] = {".glb": "y", ".gltf": "y", **dict.fromkeys(POSED, "z")}
@@ -213,7 +213,11 @@ def guess_ups(items: Sequence[Item]) -> list[UpRule]:
     files, folders, formats = list[UpRule](), list[UpRule](), list[UpRule]()
     for suffix in sorted({PurePosixPath(item.path).suffix for item in items}):
         group = [item for item in items if item.path.endswith(suffix)]
-        specified = SPECIFIED_UP.get(suffix.lower())
+        stated = Counter(item.measured.stated_up for item in group).most_common(1)[0][0]
+        specified = stated or SPECIFIED_UP.get(suffix.lower())
+        odd = [item for item in group if item.measured.stated_up != stated]
+        files += [UpRule(escape(item.path), item.measured.stated_up or "y", "as the file says") for item in odd]
+        group = [item for item in group if item not in odd]
         whole = UpRule(f"**/*{escape(suffix)}", *_decide(group, specified))
         formats.append(whole)
         for first in sorted({item.path.split("/")[0] for item in group if "/" in item.path}):
@@ -221,7 +225,7 @@ def guess_ups(items: Sequence[Item]) -> list[UpRule]:
             if axis is not None and axis != whole.axis and count > (1 if specified is None else 2):
                 pattern = f"{escape(first)}/**/*{escape(suffix)}"
                 folders.append(UpRule(pattern, axis, f"{told}, unlike other {suffix} files"))
-        for item in group if specified != "y" else ():  # in robots' files z is up by use alone
+        for item in group if not stated and specified != "y" else ():  # in robots' files z is up by use alone
             held = next((rule.axis for rule in folders if matches(item.path, rule.pattern)), whole.axis)
             if item.measured.confidence == "sure" and item.measured.up not in (None, held):
                 assert item.measured.up is not None

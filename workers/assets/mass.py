@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import MassProperties, Mesh, Shape
-from workers.assets.external.mesh import is_solid
+from workers.assets.external.mesh import find_bodies, is_solid, merge_points
 from workers.geometry.jit import compiled_for
-from workers.geometry.mesh import bounds_of, components, hold_to_one_thread, mesh_of, weld
+from workers.geometry.mesh import bounds_of, mesh_of, piece_of, solid_of
 
 MOST_UNITED = 512
 """Bodies of a file from which overlaps are not looked for: it takes as long as the pairs are many."""
@@ -25,28 +25,52 @@ def mass_properties(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> M
     Watertight means: after merging vertices at one place over all parts, every body is closed and consistently wound.
     A body wound inwards is a void and is taken away. Where closed bodies overlap, their union is weighed.
     """
+    return weigh(shape, density_kg_m3, shell_kg_m2)[0]
+
+
+def weigh(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> tuple[MassProperties, float]:
+    """As `mass_properties`; and the volume that bodies have in common, which is weighed once, m^3."""
     vertices, faces = shape.vertices, shape.faces.astype(np.int64)
-    if is_solid(vertices, faces):
-        return solid_mass(*_united(vertices, faces), density_kg_m3)
-    return shell_mass(vertices, faces, shell_kg_m2)
+    if not is_solid(vertices, faces):
+        return shell_mass(vertices, faces, shell_kg_m2), 0.0
+    united, common_m3 = _united(vertices, faces)
+    return solid_mass(*united, density_kg_m3), common_m3
 
 
-def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """The surface of the union of closed bodies; as they are where none meet another, one is a void, or there are very many."""
-    bodies = components(weld(Mesh(vertices, faces.astype(np.int32))))
-    bounds = [bounds_of(body.vertices) for body in bodies[: MOST_UNITED + 1]]
-    if len(bounds) > MOST_UNITED or not any(
-        (a[0] < b[1]).all() and (b[0] < a[1]).all() for a, b in itertools.combinations(bounds, 2)
-    ):
-        return vertices, faces
-    hold_to_one_thread()
-    solids = [manifold3d.Manifold(manifold3d.Mesh64(body.vertices, body.faces.astype(np.uint64))) for body in bodies]
-    volumes = [solid.volume() for solid in solids]
-    united = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
-    if min(volumes) <= 0.0 or united.volume() >= (1.0 - SAME) * sum(volumes):
-        return vertices, faces
+def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array, NDArray[np.int64]], float]:
+    """The surface of the union of closed bodies, voids taken from the body around them; and the volume that they share.
+
+    As they are where none meet another, a void lies in none, or there are very many.
+    """
+    as_they_are = (vertices, faces), 0.0
+    corners = merge_points(vertices)[faces]
+    found = find_bodies(vertices, faces, corners)
+    if len(found.volume) > MOST_UNITED:
+        return as_they_are
+    places = np.zeros((int(corners.max()) + 1, 3))
+    places[corners] = vertices[faces]
+    pieces = [
+        piece_of(Mesh(places, faces.astype(np.int32)), corners[found.body == k]) for k in range(len(found.volume))
+    ]
+    low, high = np.stack([bounds_of(piece.vertices) for piece in pieces], axis=1)
+    outer = np.flatnonzero(found.volume > 0.0).tolist()
+    if not any((low[a] < high[b]).all() and (low[b] < high[a]).all() for a, b in itertools.combinations(outer, 2)):
+        return as_they_are
+    solids = {k: solid for k, piece in enumerate(pieces) if (solid := solid_of(piece)) is not None}
+    for void in solids.keys() - set(outer):
+        around = [k for k in outer if (low[k] < low[void]).all() and (high[void] < high[k]).all()]
+        inmost = min(around, key=lambda k: float(found.volume[k]), default=None)
+        if inmost not in solids:
+            return as_they_are
+        solids[inmost] = solids[inmost] - solids[void]
+    if len(solids) < len(pieces):
+        return as_they_are
+    united = manifold3d.Manifold.batch_boolean([solids[k] for k in outer], manifold3d.OpType.Add)
+    common_m3 = float(found.volume.sum()) - united.volume()
+    if common_m3 <= SAME * float(found.volume.sum()):
+        return as_they_are
     mesh = mesh_of(united)
-    return np.ascontiguousarray(mesh.vertices), mesh.faces.astype(np.int64)
+    return (np.ascontiguousarray(mesh.vertices), mesh.faces.astype(np.int64)), common_m3
 
 
 def solid_mass(vertices: Array, faces: np.ndarray, density_kg_m3: float) -> MassProperties:

@@ -164,7 +164,7 @@ def components(mesh: Mesh) -> list[Mesh]:
     ]
 
 
-def piece_of(mesh: Mesh, faces: NDArray[np.int32]) -> Mesh:
+def piece_of(mesh: Mesh, faces: NDArray[np.integer]) -> Mesh:
     """These faces [F, 3] of a mesh, with the vertices that they have."""
     kept, inverse = np.unique(faces, return_inverse=True)
     return Mesh(mesh.vertices[kept], inverse.reshape(-1, 3).astype(np.int32))

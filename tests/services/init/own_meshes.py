@@ -75,7 +75,7 @@ def mixed_folder(folder: Path) -> Path:
     write_mesh(folder / "table/1.stl", trimesh.creation.cylinder(50, 90))
     write_mesh(folder / "huge.stl", trimesh.creation.box((1e6, 1e6, 1e6)))
     (folder / "broken.obj").write_text("v 0 0 0\nf 1 2 3\n")
-    (folder / "scene.dae").write_text("x")
+    (folder / "scene.fbx").write_text("x")
     (folder / "torn.gltf").write_text(
         json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": "gone.bin", "byteLength": 4}]})
     )

@@ -101,6 +101,7 @@ UNITS = (
         {1.0: 1},
         "metres, as the format says, 2.72 m (as centimetres, 0.01, it would be 2.72 cm)",
     ),
+    (cubes(5.0, 3.0, suffix=".dae"), {1.0: 2}, "metres, as the format says"),
     (cubes(5.0, 3.0, suffix=".urdf"), {1.0: 2}, "metres, as the format says"),
     (cubes(*[0.004] * 59, suffix=".gltf"), {1.0: 59}, "metres, as the format says, 4 mm"),
     (cubes(150.0, 90.0, suffix=".glb"), {0.001: 2}, "millimetres"),
@@ -156,6 +157,9 @@ def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_a
         *files, rule = guess_ups([*boxes, *(item(f"s{k}{suffix}", up="x") for k in range(3))])
         assert rule.axis == axis and "3 of 6 stand on x alone" in rule.why, "half of them are not most"
         assert len(files) == (0 if suffix == ".glb" else 3), "but a robot's file may lie on its side"
+    stated = [item(f"{k}.dae", stated_up="y") for k in range(3)]
+    assert ups(*stated, item("z.dae", stated_up="z")) == {"z.dae": "z", "**/*.dae": "y"}, "as each file says"
+    assert ups(*stated, item("s.dae", up="x", stated_up="y")) == {"**/*.dae": "y"}, "one file alone may be mistaken"
     assert ups(item("a.obj", up="y"), item("b.obj", up="x")) == {"a.obj": "y", "b.obj": "x", "**/*.obj": "z"}
     for confidence, axis, why in (("likely", "y", "likely: 1 of 2"), (None, "z", "not known")):
         (rule,) = guess_ups([item("a.obj", up=confidence and "y", confidence=confidence), item("b.obj")])

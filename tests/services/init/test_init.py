@@ -89,7 +89,7 @@ def test_a_mixed_folder_becomes_a_job_that_offers_exactly_what_was_shown(tmp_pat
         "mugs/out.glb": ("link", "leads out of the folder: copy it there"),
         "robot/collision.obj": ("part", "part of robot/model.urdf"),
         "robot/textured.obj": ("part", "part of robot/model.urdf"),
-        "scene.dae": ("format", ".dae is not read: run `assimp export FILE FILE.glb`, or use Blender"),
+        "scene.fbx": ("format", ".fbx is not read: run `assimp export FILE FILE.glb`, or use Blender"),
         "torn.gltf": ("missing", "its buffer gone.bin is missing"),
     }
     with Image.open(tmp_path / "mine.jpg") as page:

@@ -15,6 +15,7 @@ from PIL import Image
 
 from tests.mutations import mutated_bytes, mutated_tree, places
 from tests.workers.assets.oracles import CUBE, Files, glb, gltf, picture, textured_obj
+from tests.workers.assets.test_statements import SHOWN, dae
 
 Change = Callable[[random.Random, bytes], bytes]
 
@@ -71,7 +72,7 @@ def repeat(dice: random.Random, data: bytes) -> bytes:
 def nest(dice: random.Random, data: bytes) -> bytes:
     """An opening bracket or element many times."""
     opening, closing = dice.choice(
-        [(b"[", b"]"), (b'{"a":', b"}"), (b"<link>", b"</link>"), (b"<visual>", b"</visual>")]
+        [(b"[", b"]"), (b'{"a":', b"}"), *((b"<%s>" % tag, b"</%s>" % tag) for tag in (b"link", b"visual", b"node"))]
     )
     deep, at = 10 ** dice.randint(2, 5), dice.randrange(len(data) + 1)
     return data[:at] + opening * deep + data[at:] + closing * deep
@@ -114,6 +115,7 @@ CHANGES: Mapping[str, tuple[Change, ...]] = {
     "urdf": (repeat, nest, nest, number, number, number, name),
     "ply": (word, word, repeat, number, number, name),
     "stl": (word, word, word, repeat, number),
+    "dae": (repeat, nest, number, number, number, name),
     "glb": (word, tree, tree, tree, tree, nest),
     "gltf": (tree, tree, tree, tree, nest, number, name),
     "bin": (word, word),
@@ -135,7 +137,7 @@ def mutant(index: int) -> tuple[str, Files]:
         files[target] = change(dice, files[target] or b"\0")[:MOST_BYTES]
         how.append(f"{change.__name__} {target}")
     if dice.random() < 0.05:  # one format under another's name
-        other = dice.choice(["a.obj", "a.stl", "a.ply", "a.glb", "a.gltf", "a.urdf"])
+        other = dice.choice(["a.obj", "a.stl", "a.ply", "a.dae", "a.glb", "a.gltf", "a.urdf"])
         files = {other: files.pop(first), **files}
         how.append(f"as {other}")
     return f"{index} {kind}: {', '.join(how)}", files
@@ -199,6 +201,7 @@ SEEDS: Mapping[str, Files] = {
     "stl_ascii": {"a.stl": exported(BOX, "stl_ascii")},
     "glb": {"a.glb": exported(textured_scene(), "glb")},
     "gltf": {**_named_a(gltf()), **_SKIN},
+    "dae": dae(node=f"<rotate>0 0 1 30</rotate><node><scale>1 2 1</scale>{SHOWN}</node>"),
     "urdf": {"a.urdf": URDF, **{f"mesh/{name}": data for name, data in {**textured_obj(), **_SKIN}.items()}},
 }
 """Whole assets: one of every format, with what it refers to."""

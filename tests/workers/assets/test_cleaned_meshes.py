@@ -22,7 +22,7 @@ from workers.assets.external.mesh import (
     transform_shape,
 )
 from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand, place_asset
-from workers.assets.mass import mass_properties, shell_mass
+from workers.assets.mass import mass_properties, shell_mass, weigh
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 
@@ -195,6 +195,67 @@ def test_bodies_that_overlap_weigh_as_their_union_a_void_is_taken_away_and_cuts_
     cut, whole = mass_properties(shape_of(*halves), 600.0, 3.0), mass_properties(shape_of(ball), 600.0, 3.0)
     assert cut.solid and cut.mass_kg == pytest.approx(whole.mass_kg, rel=1e-12)
     assert cut.inertia == pytest.approx(whole.inertia, rel=1e-12, abs=1e-12)
+
+
+def spike(at, way, size=0.8):
+    """A square pyramid with its point at `at`, 45 degrees wide, its axis along `way`."""
+    base = size * np.array([[-0.5, -0.5, 1], [0.5, -0.5, 1], [0.5, 0.5, 1], [-0.5, 0.5, 1]])
+    R = trimesh.geometry.align_vectors([0, 0, 1], way)[:3, :3]
+    faces = [[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]]
+    return trimesh.Trimesh(np.concatenate([[[0, 0, 0]], base]) @ R.T + at, faces, process=False)
+
+
+def cube(low, high, inside_out=False):
+    made = trimesh.creation.box(bounds=(low, high))
+    if inside_out:
+        made.invert()
+    return made
+
+
+MEETING = {
+    "one point": (cube((0, 0, 0), (1, 1, 1)), spike((1, 1, 1), (-1, -1, -1))),
+    "one point, inside and outside": (cube((0, 0, 0), (1, 1, 1)), spike((1, 1, 1), (-1, 0.3, 0.2))),
+    "two points": (cube((0, 0, 0), (1, 1, 1)), spike((1, 1, 1), (-1, -1, -1)), spike((0, 0, 0), (1, 1, 1))),
+    "an edge": (cube((0, 0, 0), (1, 1, 1)), cube((0, 0, 0), (0.5, 0.5, 1))),
+    "an edge, inside and outside": (
+        cube((0, 0, 0), (1, 1, 1)),
+        trimesh.Trimesh(
+            [[0, 0, 0], [0, 0, 1], [0.9, 0.4, 0], [0.9, 0.4, 1], [0.4, -0.9, 0], [0.4, -0.9, 1]],
+            [[0, 2, 4], [1, 5, 3], [0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 0], [5, 1, 0]],
+        ),
+    ),
+    "an edge of three": (*(cube((0, 0, 0), (1, 1, 1)), cube((0, 0, 0), (0.5, 2, 1)), cube((0, 0, 0), (2, 0.5, 1))),),
+}
+
+
+def test_bodies_that_share_points_or_edges_and_overlap_weigh_as_their_union_and_say_so():
+    """Held to the union of the bodies, each a mesh of its own, and for boxes to their measures."""
+    for name, bodies in MEETING.items():
+        for body in bodies:
+            body.fix_normals()
+        shape = shape_of(*bodies)
+        mass, common = weigh(shape, 10.0, 3.0)
+        union = trimesh.boolean.union(bodies)
+        assert mass.solid and mass.mass_kg == pytest.approx(10.0 * union.volume, rel=1e-6), name  # in float32
+        assert mass.com == pytest.approx(union.center_mass, abs=1e-6), name
+        assert common == pytest.approx(sum(body.volume for body in bodies) - union.volume, rel=1e-6), name
+        one = shape_of(trimesh.util.concatenate(bodies))
+        assert weigh(one, 10.0, 3.0)[0].mass_kg == pytest.approx(mass.mass_kg, rel=1e-12), f"{name}, in one part"
+    assert weigh(shape_of(*MEETING["an edge"]), 1.0, 3.0)[0].mass_kg == pytest.approx(1.0, rel=1e-12)
+    assert weigh(shape_of(*MEETING["an edge of three"]), 1.0, 3.0)[0].mass_kg == pytest.approx(2.0, rel=1e-12)
+    # A hollow vessel with a handle that reaches into its wall, and one that reaches into the hollow.
+    hollow = cube((0, 0, 0), (1, 1, 1)), cube((0.1, 0.1, 0.1), (0.9, 0.9, 0.9), inside_out=True)
+    for reach, inside in ((0.05, 0.05), (0.3, 0.1)):
+        handle = cube((1 - reach, 0.4, 0.4), (1.5, 0.6, 0.6))
+        mass, common = weigh(shape_of(*hollow, handle), 1.0, 3.0)
+        assert mass.mass_kg == pytest.approx(1 - 0.512 + 0.04 * (0.5 + reach - inside), rel=1e-9)
+        assert common == pytest.approx(0.04 * inside, rel=1e-6)
+    for apart in (cube((1, 1, 1), (2, 2, 2)), cube((1, 1, 0), (2, 2, 1)), cube((1, 0, 0), (2, 1, 1))):
+        mass, common = weigh(shape_of(hollow[0], apart), 1.0, 3.0)
+        assert mass.mass_kg == pytest.approx(2.0, rel=1e-12) and common == 0.0
+    asset = place(trimesh.util.concatenate(MEETING["an edge"]), scale=0.1)
+    assert asset.notes == ("bodies overlap: 250 cm^3 that they share weigh once",)
+    assert asset.volume_m3 == pytest.approx(0.001, rel=1e-9) and not place(hollow[0]).notes
 
 
 def test_shells_weigh_as_their_plates_and_a_spherical_one_has_two_thirds_m_r_squared():

@@ -16,6 +16,7 @@ from schemas.job.job import Job
 from schemas.scene.shape import Asset
 from tests.workers.assets.mutants import mutant
 from tests.workers.assets.oracles import CUBE, glb, gltf, picture, textured_cube, urdf, visual, write, write_all
+from tests.workers.assets.test_statements import dae
 from workers.assets.catalogue import open_catalogue
 from workers.assets.external import urdf as urdf_file
 from workers.assets.external.formats import load_shape
@@ -45,6 +46,7 @@ end_header
 HUGE_PLY = (
     "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\nelement face 1\nend_header\n"
 )
+DAE = dae(node="<instance_node url='#n'/>")["a.dae"].decode()
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 BOX = '<box size="0.1 0.1 0.1"/>'
 MESH = '<mesh filename="cube.obj"{}/>'
@@ -83,7 +85,7 @@ def view(**change):
 HOSTILE = {
     # What no file can be
     "none.obj": (None, "missing", "No such file"),
-    "scene.dae": ("<x/>", "format", "is not one of"),
+    "scene.fbx": ("<x/>", "format", "is not one of"),
     "empty.obj": ("", "no_faces", "is empty"),
     # OBJ, PLY and STL
     "index.obj": (TRIANGLE + "f 1 2 9\n", "index_out_of_range", "a face names"),
@@ -99,6 +101,24 @@ HOSTILE = {
     "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nv 2 1e-5 0\nf 1 2 3\nf 1 3 4\n", "no_hull", "four points apart"),
     "texture.ply": (PLY, "no_hull", "four points apart"),
     "huge.ply": (HUGE_PLY, "unreadable", "promises 4000000000 elements"),
+    # COLLADA
+    "entities.dae": ("<!DOCTYPE x><COLLADA/>", "unreadable", "document type or entities"),
+    "other.dae": ("<x/>", "unreadable", "its root is <x>"),
+    "empty_scene.dae": (
+        "<COLLADA><library_visual_scenes><visual_scene/></library_visual_scenes></COLLADA>",
+        "no_faces",
+        "",
+    ),
+    "no_scene.dae": ("<COLLADA/>", "no_faces", "has no scene"),
+    "words.dae": (DAE.replace("<p>0", "<p>a"), "unreadable", "invalid literal"),
+    "index.dae": (DAE.replace("<p>0", "<p>9"), "index_out_of_range", "a face names"),
+    "input.dae": (DAE.replace('offset="1"', 'offset="2"'), "unreadable", ""),
+    "array.dae": (DAE.replace("#p-a", "#q-a"), "format", "which is not in it"),
+    "loop.dae": (
+        DAE.replace("</node></library_nodes>", "<instance_node url='#n'/></node></library_nodes>"),
+        "unreadable",
+        "",
+    ),
     # URDF
     "box.urdf": (urdf(visual('<box size="1e300 1 1"/>')), "not_finite", "over 1e+07"),
     "scale.urdf": (urdf(visual(MESH.format(' scale="1e300 1 1"'))), "not_finite", ""),

@@ -8,11 +8,15 @@ import pytest
 import trimesh
 
 from schemas.errors import MeshError
-from schemas.job.assets import MeshLimits
+from schemas.job.assets import FolderSource, MeshLimits
 from tests.workers.assets.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
+from tests.workers.assets.test_statements import dae, geometry
+from workers.assets.external.dae import find_up
 from workers.assets.external.formats import load_shape
+from workers.assets.external.placement import list_files
 from workers.assets.external.urdf import find_named, list_named, list_seen, load_posed
 
+FOLDER = FolderSource(source="files", folder=".")
 LIMITS = MeshLimits()
 
 BODY = """
@@ -222,7 +226,7 @@ def test_names_are_found_by_every_tail_of_them_in_the_folders_above_and_never_ou
             find_named(name, path, root)
 
 
-def test_mujocos_own_meshes_and_off_are_read(tmp_path):
+def test_mujocos_own_meshes_are_read(tmp_path):
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     uv = np.random.default_rng(0).random((8, 2))
     head = struct.pack("<4i", 8, 8, 8, 12)
@@ -240,5 +244,16 @@ def test_mujocos_own_meshes_and_off_are_read(tmp_path):
     assert part.uv == pytest.approx(
         np.column_stack([uv[:, 0], 1 - uv[:, 1]])[np.lexsort(box.vertices.T)], abs=1
     ) and part.uv.shape == (8, 2)
-    box.export(tmp_path / "b.off")
-    assert load_shape(tmp_path / "b.off", LIMITS).shape.closed
+
+
+def test_collada_in_a_urdf_is_in_metres_and_not_turned_up(tmp_path):
+    """As RViz has it: its unit holds, and `up_axis`, which is y here, does not. The picture is found beside the mesh."""
+    files = dae(asset='<unit meter="0.5"/><up_axis>Y_UP</up_axis>', shapes=geometry(size=2.0, stretch=(1, 2, 3)))
+    write_all(tmp_path / "meshes/visual", files)
+    path = write(tmp_path / "a.urdf", urdf(visual('<mesh filename="package://r/meshes/visual/a.dae" scale="1 1 2"/>')))
+    assert [file.name for file in list_files(FOLDER, tmp_path, path, LIMITS)] == ["a.urdf", "a.dae", "t.png"]
+    shape = load_posed(path, LIMITS, tmp_path).shape
+    assert np.ptp(shape.vertices, axis=0) == pytest.approx([0.2, 0.4, 1.2])
+    assert shape.parts[0].material.texture is not None
+    heads = {"<up_axis>Y_UP</up_axis>": "y", "<up_axis>\n Z_UP</up_axis>": "z", "<up_axis>X_UP</up_axis>": "x", "": "y"}
+    assert {head: find_up(head.encode()) for head in heads} == heads

@@ -367,7 +367,7 @@ def listed(folder, *names):
 def test_refused_candidates_are_counted_by_reason_and_others_keep_their_order(tmp_path):
     for name in ("c.obj", "d.obj", "b.obj"):
         write(tmp_path / name, CUBE)
-    candidates = {"mug": [tmp_path / name for name in ("none.obj", "d.obj", "b.obj")], "can": [tmp_path / "a.dae"]}
+    candidates = {"mug": [tmp_path / name for name in ("none.obj", "d.obj", "b.obj")], "can": [tmp_path / "a.fbx"]}
     listing = read_listing(MIT, tmp_path, candidates, MeshLimits())
     found = {name: [entry.files[0].path for entry in entries] for name, entries in listing.entries.items()}
     assert found == {"mug": ["d.obj", "b.obj"], "can": []}

@@ -87,8 +87,8 @@ def test_an_entry_has_all_that_it_needs_and_broken_ones_are_counted(tmp_path):
     write(tmp_path / "a.urdf", urdf(visual('<mesh filename="cube.obj"/>')))
     write(tmp_path / "b.urdf", urdf(visual('<mesh filename="none.obj"/>')))
     write(tmp_path / "c.urdf", "<robot")
-    write(tmp_path / "d.dae", "")
-    listing, found = listed(source(category_map={"*.urdf": "mug", "*.dae": "mug", "*.gltf": "mug"}), tmp_path)
+    write(tmp_path / "d.fbx", "")
+    listing, found = listed(source(category_map={"*.urdf": "mug", "*.fbx": "mug", "*.gltf": "mug"}), tmp_path)
     files = ["a.urdf", "cube.obj", "cube.mtl", "skin.png"], ["cube.gltf", "cube.bin", "skin.png"]
     assert found == {"mug": list(files)}
     assert listing.skipped == {"format": 1, "missing": 1, "unreadable": 1}

@@ -266,6 +266,81 @@ def stl(behind=b"", colour=b""):
     return {"a.stl": colour.ljust(80, b" ") + data[80:] + behind}
 
 
+ARRAY = (
+    '<source id="{0}"><float_array id="{0}-a" count="{2}">{1}</float_array><technique_common>'
+    '<accessor source="#{0}-a" count="{3}" stride="{4}"/></technique_common></source>'
+)
+INPUTS = '<input semantic="VERTEX" source="#v" offset="0"/><input semantic="TEXCOORD" source="#uv" offset="1"/>'
+RING = [f"{c} {k}" for side in SIDES for k, c in enumerate(side)]
+
+
+def part(kind, *orders, more=""):
+    """A primitive of the six sides, each once for every order of its corners."""
+    runs = [" ".join(RING[4 * k + i] for i in order) for k in range(6) for order in orders]
+    runs = [" ".join(runs)] if kind in ("polylist", "triangles") else runs
+    rings = "".join(f"<p>{run}</p>" for run in runs)
+    return f"<{kind} count='6' material='m'>{INPUTS}{more}{rings}</{kind}>"
+
+
+SIDE = (0, 1, 2, 3)
+FOURS = f"<vcount>{'4 ' * 6}</vcount>"
+PARTS = {
+    "polylist": part("polylist", SIDE, more=FOURS),
+    "polygons": part("polygons", SIDE),
+    "trifans": part("trifans", SIDE),
+    "tristrips": part("tristrips", (0, 1, 3, 2)),
+    "triangles": part("triangles", (0, 1, 2), (0, 2, 3)),
+}
+SKIN_PNG = image(SKIN)
+PICTURE = '<texture texture="sampler" texcoord="UVSET0"/>'
+SAMPLER = (
+    '<newparam sid="surface"><surface type="2D"><init_from>image</init_from></surface></newparam>'
+    '<newparam sid="sampler"><sampler2D><source>surface</source></sampler2D></newparam>'
+)
+SHOWN = (
+    '<instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="m" target="#skin">{}'
+    "</instance_material></technique_common></bind_material></instance_geometry>"
+)
+
+
+def array(name, values):
+    values = np.asarray(values)
+    return ARRAY.format(name, " ".join(f"{x:g}" for x in values.ravel()), values.size, len(values), values.shape[1])
+
+
+def geometry(part=PARTS["polylist"], more="", size=1.0, name="g", vertex="", stretch=(1, 1, 1)):
+    points = '<vertices id="v"><input semantic="POSITION" source="#p"/>' + vertex + "</vertices>"
+    arrays = array("p", size * CORNERS * stretch) + array("uv", UV * [1, -1] + [0, 1]) + more
+    return f'<geometry id="{name}"><mesh>{arrays}{points}{part}</mesh></geometry>'
+
+
+def dae(
+    diffuse=PICTURE,
+    surface="",
+    node=None,
+    shapes="",
+    params=SAMPLER,
+    image="t.png",
+    asset="",
+    data=None,
+    binding="",
+    more="",
+):
+    """The cube as COLLADA, which a row changes in one statement."""
+    effect = f"<technique><phong><diffuse>{diffuse}</diffuse>{surface}</phong>{more}</technique>"
+    text = (
+        '<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
+        f"<asset>{asset}</asset><library_images><image id='image'><init_from>{image}</init_from></image></library_images>"
+        f"<library_effects><effect id='e'><profile_COMMON>{params}{effect}</profile_COMMON></effect></library_effects>"
+        "<library_materials><material id='skin'><instance_effect url='#e'/></material></library_materials>"
+        f"<library_geometries>{shapes or geometry()}</library_geometries><library_nodes><node id='n'>{SHOWN}</node>"
+        "</library_nodes><library_visual_scenes><visual_scene id='s'><node>"
+        f"{SHOWN.format(binding) if node is None else node}</node></visual_scene></library_visual_scenes>"
+        "<scene><instance_visual_scene url='#s'/></scene></COLLADA>"
+    )
+    return {"a.dae": text.encode(), "t.png": data or SKIN_PNG}
+
+
 @dataclass(frozen=True)
 class Right:
     """What is right of a row: colours that are seen, in 8 bits of sRGB; None: a hole."""
@@ -418,7 +493,110 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "ply with more in a line than its head says": (ply_by_vertex("s", "t", " 7"), Right()),
     "ply strips": (ply(faces=STRIPS, rows=STRIP), Right((GREY,))),
     "ply points": (ply(faces="", rows=""), "cloud of points"),
-    # STL
+    # COLLADA
+    "dae": (dae(), Right(roughness=(2 / 3) ** 0.25)),
+    **{f"dae of {name}": (dae(shapes=geometry(part)), Right()) for name, part in PARTS.items()},
+    "dae in inches": (dae(asset='<unit meter="0.0254"/>'), Right(extents=(0.00508,) * 3, volume=0.00508**3)),
+    "dae transforms": (
+        dae(
+            node="<matrix>2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</matrix><node><rotate>0 0 1 90</rotate><scale>1 3 1</scale>"
+            f"{SHOWN}</node>"
+        ),
+        Right(extents=(1.2, 0.2, 0.2), volume=0.048),
+    ),
+    "dae instances of a node": (
+        dae(node="<instance_node url='#n'/><node><translate>0.5 0 0</translate><instance_node url='#n'/></node>"),
+        Right(extents=(0.7, 0.2, 0.2), volume=0.016),
+    ),
+    "dae ids that two shapes have": (
+        dae(shapes=geometry(size=2.0) + geometry(name="h"), node=SHOWN + SHOWN.replace("#g", "#h")),
+        Right(extents=(0.4, 0.4, 0.4), volume=0.064 + 0.008),
+    ),
+    "dae second coordinates": (
+        dae(
+            data=BANDS,
+            binding='<bind_vertex_input semantic="UVSET0" input_semantic="TEXCOORD" input_set="1"/>',
+            shapes=geometry(
+                part("polylist", SIDE, more=f'<input semantic="TEXCOORD" source="#uv2" offset="1" set="1"/>{FOURS}'),
+                array("uv2", 0.505 + 0.49 * UV),
+            ),
+        ),
+        Right((GREEN,)),
+    ),
+    "dae picture that is named at once": (dae(diffuse='<texture texture="image" texcoord="x"/>', params=""), Right()),
+    "dae of version 1.5": (
+        dae(
+            params="<newparam sid='sampler'><sampler2D><instance_image url='#image'/></sampler2D></newparam>",
+            image="<ref>t.png</ref>",
+        ),
+        Right(),
+    ),
+    "dae picture as an address": (dae(image="file:///C:/of%20me/t%2Epng"), Right()),
+    "dae picture that is missing": (dae(image="u.png"), Right((WHITE,), note="u.png is missing")),
+    "dae picture that is not defined": (dae(diffuse='<texture texture="q"/>'), Right((WHITE,), note="is not defined")),
+    "dae wrap": (
+        dae(params=SAMPLER.replace("</source>", "</source><wrap_s>CLAMP</wrap_s>")),
+        Right(note="does not repeat (CLAMP)"),
+    ),
+    "dae colour": (dae("<color>1 0 0 1</color>"), Right(((255, 0, 0),))),
+    "dae no material": (dae(node='<instance_geometry url="#g"/>'), Right((GREY,), note="#m is missing")),
+    "dae shininess": (dae(surface="<shininess><float>30</float></shininess>"), Right(roughness=0.5)),
+    "dae colours of vertices": (
+        dae(
+            "<color>0.5 0.5 0.5 1</color>",
+            shapes=geometry(
+                more=array("c", np.tile([1, 0, 0], (8, 1))), vertex='<input semantic="COLOR" source="#c"/>'
+            ),
+        ),
+        Right(((255, 0, 0),)),
+    ),
+    "dae emission alone": (
+        dae("<color>0 0 0 1</color>", "<emission><color>1 0 0 1</color></emission>"),
+        Right(((255, 0, 0),), note="emission is drawn"),
+    ),
+    "dae emission beside a colour": (
+        dae(surface="<emission><color>1 0 0 1</color></emission>"),
+        Right(note="not drawn: emission"),
+    ),
+    "dae bump": (dae(more="<extra><technique><bump/></technique></extra>"), Right(note="not drawn: bump")),
+    **{
+        f"dae transparent, {mode} of {color} times {share}": (
+            dae(
+                surface=f'<transparent opaque="{mode}"><color>{color}</color></transparent>'
+                f"<transparency><float>{share}</float></transparency>"
+            ),
+            Right((SKIN,) if seen else (None,)),
+        )
+        for mode, color, share, seen in (
+            ("A_ONE", "1 1 1 1", 1, True),
+            ("A_ONE", "1 1 1 0.25", 1, False),
+            ("A_ONE", "0 0 0 1", 0.25, False),
+            ("RGB_ZERO", "0 0 0 1", 1, True),
+            ("RGB_ZERO", "1 1 1 1", 0.75, False),
+            ("RGB_ONE", "0.2 0.2 0.2 1", 1, False),
+            ("A_ZERO", "0 0 0 0.75", 1, False),
+            ("A_ZERO", "1 1 1 0", 1, True),
+        )
+    },
+    "dae transparent as Autodesk has it": (
+        dae(surface="<transparent><color>1 1 1 1</color></transparent><transparency><float>0</float></transparency>"),
+        Right(note="an alpha of 0"),
+    ),
+    "dae alpha of a picture of colour": (dae(data=CLEAR), Right((RED, GREEN))),
+    "dae alpha of a picture that is transparent": (
+        dae(data=CLEAR, surface=f"<transparent>{PICTURE}</transparent>"),
+        Right((RED, None)),
+    ),
+    "dae skin": (dae(node='<instance_controller url="#g"/>'), "is a skin or morphs"),
+    "dae holes": (
+        dae(shapes=geometry(f"<polygons>{INPUTS}<ph><p>{' '.join(RING[:4])}</p><h>0 0</h></ph></polygons>")),
+        "polygons with holes",
+    ),
+    "dae skewed": (dae(node=f"<skew>45 0 1 0 1 0 0</skew>{SHOWN}"), "<skew>"),
+    "dae spline": (dae(shapes='<geometry id="g"><spline/></geometry>'), "no mesh"),
+    "dae in another file": (dae(node='<instance_geometry url="b.dae#g"/>'), "b.dae#g"),
+    # STL and OFF
+    "off": ({"a.off": trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="off").encode()}, Right((GREY,))),
     "stl": (stl(), Right((GREY,))),
     "stl with bytes behind": (stl(b"\0\0"), Right((GREY,))),
     "stl with a colour in its head": (stl(colour=b"COLOR=\xff\0\0\xff"), Right((GREY,))),

@@ -14,11 +14,11 @@ from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
 from workers.assets.external import plain
 from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes
+from workers.assets.external.dae import named_by_dae, read_dae
 from workers.assets.external.gltf import named_by_gltf, read_gltf
 from workers.assets.external.mesh import LoadedMesh, RawMesh, clean_shape, place_mesh
 from workers.assets.external.mjcf import count_msh, read_msh
 from workers.assets.external.obj import count_obj, named_by_mtl, named_by_obj, read_obj
-from workers.assets.external.ply import count_ply, named_by_ply, read_ply
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,9 @@ class Format:
 FORMATS: Mapping[str, Format] = {
     ".glb": Format(named_by_gltf, read_gltf),
     ".gltf": Format(named_by_gltf, read_gltf),
+    ".dae": Format(named_by_dae, read_dae),
     ".obj": Format(named_by_obj, read_obj, count_obj),
-    ".ply": Format(named_by_ply, read_ply, count_ply),
+    ".ply": Format(plain.named_by_ply, plain.read_ply, plain.count_ply),
     ".msh": Format(lambda *_: [], read_msh, count_msh),
     ".off": Format(lambda *_: [], plain.read_plain),
     ".stl": Format(lambda *_: [], plain.read_plain, plain.count_stl),

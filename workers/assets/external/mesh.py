@@ -5,6 +5,7 @@ Cuts polygons, merges points, winds faces, finds closed bodies, drops doubled an
 A mesh that cannot be used raises a MeshError that says why not.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -124,13 +125,28 @@ def find_flips(corners: Indices) -> Mask:
     return (kept[as_is] < kept[turned]) | ((kept[as_is] == kept[turned]) & (as_is > turned))
 
 
+def _label(one: Indices, other: Indices, count: int) -> Indices:
+    """[count] int64: the same number for what pairs [N], [N] join."""
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
 def find_bodies(vertices: Array, faces: Indices, corners: Indices) -> Bodies:
-    """The bodies of a mesh: faces [F, 3] into vertices [V, 3], with `corners` the same faces into merged points."""
+    """The bodies of a mesh: faces [F, 3] into vertices [V, 3], with `corners` the same faces into merged points.
+
+    Faces that share an edge are of one body. Where more than two do, surfaces that are closed there by themselves touch, and
+    stay apart; the others are joined.
+    """
     edges, count = _edges(corners), len(corners)
-    first = np.repeat(edges.face[edges.start], edges.size)
-    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, edges.face)), shape=(count, count))
-    bodies, label = connected_components(graph, directed=False)
-    body = label.astype(np.int64)
+    number = np.repeat(np.arange(len(edges.size)), edges.size)
+    pairs = edges.start[edges.size == 2]
+    surface = _label(edges.face[pairs], edges.face[pairs + 1], count)
+    met = edges.size[number] > 2
+    meeting, where = np.unique(np.stack([number[met], surface[edges.face[met]]]), axis=1, return_inverse=True)
+    ends = meeting[:, np.bincount(where.ravel(), np.where(edges.forward[met], 1, -1)) != 0]
+    same = np.flatnonzero(ends[0, 1:] == ends[0, :-1])
+    body = _label(ends[1, same], ends[1, same + 1], count)[surface]
+    bodies = int(body.max(initial=-1)) + 1
     balance = np.add.reduceat(np.where(edges.forward, 1, -1), edges.start) if count else np.zeros(0, dtype=np.int64)
     open_edges = np.bincount(body[edges.face[edges.start]], weights=balance != 0, minlength=bodies)
     centred = vertices - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
@@ -203,6 +219,28 @@ def make_material(
     red, green, blue, alpha = (float(c) for c in np.clip(np.nan_to_num(color, nan=0.7), 0.0, 1.0))
     metallic, roughness = (float(np.clip(np.nan_to_num(value, nan=0.6), 0.0, 1.0)) for value in (metallic, roughness))
     return Material((red, green, blue, alpha), metallic, roughness, texture), notes
+
+
+def roughness_of(exponent: float | None) -> float:
+    """Perceptual roughness of a Blinn-Phong exponent, None: 1.
+
+    By way of the GGX alpha (Karis, "Specular BRDF reference", 2013).
+    """
+    known = exponent if exponent is not None and np.isfinite(exponent) else 1.0
+    return float((2.0 / (max(known, 0.0) + 2.0)) ** 0.25)
+
+
+def index_corners(corners: Indices, counts: Sequence[int]) -> tuple[Indices, Indices]:
+    """(vertices [V, K], faces [T, 3] into them): one vertex for each combination that corners [T, 3, K] of triangles have.
+
+    counts [K]: how many values each of the K numbers of a corner may name.
+    """
+    flat = corners.reshape(-1, len(counts))
+    key = flat[:, 0]
+    for k in range(1, len(counts)):
+        key = np.unique(key, return_inverse=True)[1] * counts[k] + flat[:, k]
+    _, first, faces = np.unique(key, return_index=True, return_inverse=True)
+    return flat[first], faces.reshape(-1, 3)
 
 
 def transform_shape(shape: Shape, matrix: Pose) -> Shape:

@@ -27,7 +27,9 @@ from workers.assets.external.mesh import (
     RawMesh,
     check_indices,
     cut_polygons,
+    index_corners,
     make_material,
+    roughness_of,
 )
 
 _LIBRARY = re.compile(r"^[ \t]*mtllib[ \t]+(.+?)[ \t]*$", re.MULTILINE)
@@ -250,14 +252,8 @@ def _mesh(
             raise MeshError(
                 "index_out_of_range", f"{path}: a face names number {corners[..., kind].max() + 1} of {len(listed)}"
             )
-    flat = corners.reshape(-1, 3)
-    key = flat[:, 0]
-    if textured:
-        key = key * len(uv) + flat[:, 1]
-    if shaded:
-        key = np.unique(key, return_inverse=True)[1] * len(normals) + flat[:, 2]
-    _, first, faces = np.unique(key, return_index=True, return_inverse=True)
-    own = flat[first]
+    shown = [0, *([1] if textured else []), *([2] if shaded else [])]
+    own, faces = index_corners(corners[..., shown], [len(values[k]) for k in shown])
     coordinates = uv[own[:, 1]] if textured else None
     if coordinates is not None and not np.isfinite(coordinates).all():
         coordinates = None
@@ -266,7 +262,7 @@ def _mesh(
     visual = MeshVisual(material or DEFAULT, coordinates)
     if colors is not None and visual.material.texture is None:
         visual = MeshVisual(WHITE, coordinates, colors[own[:, 0]])
-    return RawMesh(points[own[:, 0]], faces.reshape(-1, 3), normals[own[:, 2]] if shaded else None, visual, np.eye(4))
+    return RawMesh(points[own[:, 0]], faces, normals[own[:, -1]] if shaded else None, visual, np.eye(4))
 
 
 # ---------------------------------------------------------------------------------------------- materials
@@ -321,9 +317,7 @@ def _material(stated: dict[str, str], resolver: FolderResolver) -> Material:
         resolver.notes.append("a colour of light (Ke) was drawn as a plain colour")
     alpha, metallic = _numbers(stated.get("d")), _numbers(stated.get("pm"))
     shine, rough = _numbers(stated.get("ns")), _numbers(stated.get("pr"))
-    # Blinn-Phong exponent to GGX alpha, and alpha to perceptual roughness (Karis, "Specular BRDF reference", 2013).
-    exponent = max(shine[0], 0.0) if shine is not None and np.isfinite(shine[0]) else 1.0
-    roughness = float(rough[0]) if rough is not None else (2.0 / (exponent + 2.0)) ** 0.25
+    roughness = float(rough[0]) if rough is not None else roughness_of(None if shine is None else float(shine[0]))
     # `Tr` is ignored, because half of the exporters write it inverted.
     color = np.append(rgb, 1.0 if alpha is None else alpha[0])
     material, notes = make_material(color, 0.0 if metallic is None else float(metallic[0]), roughness, picture)

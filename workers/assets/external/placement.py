@@ -20,11 +20,12 @@ from schemas.errors import MeshError
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset, Hull, Shape
 from workers.assets.external.caps import MOST_NOTES, one_line
+from workers.assets.external.dae import find_up
 from workers.assets.external.formats import FORMATS, list_mesh_files, load_shape
 from workers.assets.external.listing import HEAD_BYTES, Entry, check_unchanged, mesh_root, refuse_other
 from workers.assets.external.mesh import DEFAULT, LoadedMesh, transform_shape
 from workers.assets.external.urdf import POSED, list_seen, load_posed
-from workers.assets.mass import mass_properties
+from workers.assets.mass import weigh
 from workers.geometry.frames import pose
 
 UP_AXES: Mapping[str, Array] = {
@@ -92,7 +93,8 @@ def place_asset(
     _check_size(path, scale * diagonal, assets.limits)
     centre = 0.5 * (lower + upper) * scale
     shape = transform_shape(rotated, pose(scale * np.eye(3), -centre))
-    mass = mass_properties(shape, assets.density_kg_m3, assets.shell_kg_m2)
+    mass, common_m3 = weigh(shape, assets.density_kg_m3, assets.shell_kg_m2)
+    overlap = [f"bodies overlap: {1e6 * common_m3:.3g} cm^3 that they share weigh once"] if common_m3 else []
     return Asset(
         instance_id=entry.instance_id,
         category=category,
@@ -107,7 +109,7 @@ def place_asset(
         watertight=mass.solid,
         volume_m3=mass.mass_kg / assets.density_kg_m3 if mass.solid else None,
         shareable=settings.copy_assets,
-        notes=tuple(one_line(note) for note in loaded.notes[:MOST_NOTES]),
+        notes=tuple(one_line(note) for note in [*overlap, *loaded.notes][:MOST_NOTES]),
     )
 
 
@@ -260,8 +262,8 @@ class Measured:
 
     area, volume: of its surface, and between the surface and the middle of its bounding box, in the same units; thin: its
     least extent in any direction, by its diagonal; textures: how many pictures its parts have; look: their mean colour, of
-    255, None where it has none; unit_m: its unit in metres, where the file says so; up, confidence: what its shape tells
-    about the axis that is up, or None.
+    255, None where it has none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says so; up,
+    confidence: what its shape tells about the axis that is up, or None.
     """
 
     extents: tuple[float, float, float]
@@ -277,6 +279,7 @@ class Measured:
     thin: float = 1.0
     look: tuple[float, float, float] | None = None
     unit_m: float | None = None
+    stated_up: UpAxis | None = None
 
 
 def measure_asset(asset: Asset, hull: Hull | None, path: Path) -> str:
@@ -300,6 +303,7 @@ def measure_asset(asset: Asset, hull: Hull | None, path: Path) -> str:
         thin=1.0 if hull is None else measure_thinness(hull.vertices),
         look=_mean_colour(asset.shape),
         unit_m=find_unit(path),
+        stated_up=find_up(_head(path)) if path.suffix.lower() == ".dae" else None,
     )
     return json.dumps(asdict(measured))
 
@@ -337,9 +341,11 @@ _UNITS |= {"foot": 0.3048, "feet": 0.3048, "ft": 0.3048}
 
 def find_unit(path: Path) -> float | None:
     """Metres in a unit of an OBJ file that states its unit in a remark at its start; else None."""
-    if path.suffix.lower() != ".obj":
-        return None
-    with path.open("rb") as stream:
-        found = _UNIT.search(stream.read(HEAD_BYTES))
+    found = _UNIT.search(_head(path)) if path.suffix.lower() == ".obj" else None
     word = found[1].decode().lower() if found else ""
     return _UNITS.get(word, _UNITS.get(word.removesuffix("s")))
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(16 * HEAD_BYTES)

@@ -1,22 +1,208 @@
-"""Edge: reads STL files from outside by trimesh, and what trimesh made of a stored GLB."""
+"""Edge: reads PLY files from outside by the library plyfile, STL and OFF by trimesh, and what trimesh made of a stored GLB.
+
+What the elements of a PLY mean is not in the format. Read are the names that MeshLab, CloudCompare, Blender, the Stanford scans
+and BOP write: colours of vertices and faces, coordinates of pictures by vertex or by corner, several pictures, and strips of
+triangles.
+"""
 
 import io
+import re
 import struct
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
+from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver, decode_picture, unreadable
-from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, make_material
+from workers.assets.external.caps import FolderResolver, decode_names, decode_picture, unreadable
+from workers.assets.external.mesh import (
+    DEFAULT,
+    WHITE,
+    Indices,
+    MeshVisual,
+    RawMesh,
+    check_indices,
+    cut_polygons,
+    cut_strip,
+    make_material,
+    roughness_of,
+)
 from workers.geometry.colour import encode_srgb
+
+_TEXTURE = re.compile(rb"^comment TextureFile[ \t]+([^\r\n]+)", re.MULTILINE)
+_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
+_COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_CORNERS = ("vertex_indices", "vertex_index")
+_SPLATS = ("f_dc_0", "scale_0", "rot_0")
+_ROUGHNESS = 0.9
+"""Of a scan's picture or colours: nothing in the format says how they shine."""
+
+
+def named_by_ply(path: Path, data: bytes) -> list[str]:
+    """Names of the pictures that a PLY file asks for."""
+    return decode_names(_TEXTURE.findall(_head(data)))
+
+
+def count_ply(data: bytes) -> tuple[int, int]:
+    """Vertices and faces that a PLY file's header declares; MeshError `unreadable` where its bytes cannot hold them."""
+    counts = {name: int(count) for name, count in _ELEMENT.findall(_head(data)[:65536])}
+    if any(count > len(data) for count in counts.values()):
+        promised = min(max(counts.values()), 10**18)
+        raise MeshError("unreadable", f"the PLY header promises {promised} elements in {len(data)} bytes")
+    return counts.get(b"vertex", 0), counts.get(b"face", 0)
+
+
+def _head(data: bytes) -> bytes:
+    return data[: max(data.find(b"end_header"), 0)]
+
+
+def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
+    """One mesh for each picture of a PLY file.
+
+    Raises MeshError `index_out_of_range`, `no_faces` for points and splats, or `unreadable`.
+    """
+    try:
+        elements = {element.name: element for element in _parse(path)}
+    except (
+        PlyParseError,
+        UnicodeDecodeError,
+    ):  # a strict reader: trimesh takes lines that are too long, and strange heads
+        meshes = read_plain(path, data, resolver)
+        return [replace(mesh, visual=_as_it_is(mesh.visual)) for mesh in meshes]
+    try:
+        vertices, faces = elements["vertex"], elements.get("face", elements.get("faces"))
+        points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
+        if faces is not None and len(faces):
+            corners, face = _triangles(path, faces, points)
+        elif "tristrips" in elements:
+            corners, face = _strips(elements["tristrips"]), None
+        else:
+            splats = set(_SPLATS) <= {prop.name for prop in vertices.properties}
+            what = "Gaussian splats" if splats else "a cloud of points"
+            raise MeshError("no_faces", f"{path} is {what} without triangles: make a mesh of it")
+        return _meshes(named_by_ply(path, data), vertices, points, faces, corners, face, resolver)
+    except (KeyError, ValueError, TypeError, IndexError, StopIteration) as error:
+        raise unreadable(path, error) from error
+
+
+def _as_it_is(visual: MeshVisual) -> MeshVisual:
+    """The look without the colour of 0.4 by which trimesh multiplies a picture."""
+    plain = visual.material.texture is not None
+    return replace(visual, material=replace(visual.material, base_color=WHITE.base_color)) if plain else visual
+
+
+def _parse(path: Path) -> list[PlyElement]:
+    """The elements. Lists as of a file of triangles, which are read at once, or else list by list."""
+    lengths = dict.fromkeys(_CORNERS, 3) | {"texcoord": 6}
+    try:
+        return list(PlyData.read(str(path), known_list_len={"face": lengths}).elements)
+    except PlyParseError:
+        return list(PlyData.read(str(path)).elements)
+
+
+def _triangles(path: Path, faces: PlyElement, points: Array) -> tuple[Indices, Indices]:
+    """[T, 3, 2]: the triangles of all faces, each corner a vertex and a place in its face; and [T] the face of each."""
+    lists = faces[next(prop.name for prop in faces.properties if prop.name in _CORNERS)]
+    sizes = np.full(len(lists), 3) if lists.dtype != object else np.array([len(row) for row in lists])
+    made, owners = [], []
+    for size in np.unique(sizes[sizes >= 3]).tolist():
+        which = np.flatnonzero(sizes == size)
+        table = (np.stack(lists[which]) if lists.dtype == object else lists).astype(np.int64).reshape(-1, size)
+        check_indices(path, table, len(points))
+        places = cut_polygons(points[table])
+        corners = table[np.arange(len(table))[:, None, None], places]
+        made.append(np.stack([corners, places], axis=-1).reshape(-1, 3, 2))
+        owners.append(np.repeat(which, size - 2))
+    if not made:
+        raise MeshError("no_faces", f"{path} has no triangles")
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return np.concatenate(made)[order], owner[order]
+
+
+def _strips(strips: PlyElement) -> Indices:
+    """[T, 3, 1]: the triangles of strips, in which -1 begins another one."""
+    rows = [np.asarray(row, np.int64) for row in strips["vertex_indices"]]
+    parts = [part[part >= 0] for row in rows for part in np.split(row, np.flatnonzero(row < 0))]
+    return np.concatenate([cut_strip(part) for part in parts])[..., None]
+
+
+def _meshes(
+    named: list[str],
+    vertices: PlyElement,
+    points: Array,
+    faces: PlyElement | None,
+    corners: Indices,
+    face: Indices | None,
+    resolver: FolderResolver,
+) -> list[RawMesh]:
+    names = {prop.name for prop in vertices.properties}
+    pictures = [_picture(name, resolver) for name in named]
+    normals = np.column_stack([vertices[n] for n in ("nx", "ny", "nz")]) if {"nx", "ny", "nz"} <= names else None
+    colors = _colors(vertices)
+    by_face = _colors(faces) if faces is not None and colors is None else None
+    uv = next((np.column_stack([vertices[a], vertices[b]]) for a, b in _COORDINATES if {a, b} <= names), None)
+    index = corners[..., 0]
+    if faces is not None and face is not None and "texcoord" in {prop.name for prop in faces.properties} and pictures:
+        uv = _corner_coordinates(faces["texcoord"], face, corners[..., 1])
+        points, index = points[index.ravel()], np.arange(index.size).reshape(-1, 3)
+        flat = corners[..., 0].ravel()
+        normals, colors = (None if array is None else array[flat] for array in (normals, colors))
+    if uv is None or not pictures or not np.isfinite(uv).all():
+        visual = MeshVisual(WHITE if colors is not None or by_face is not None else DEFAULT, colors=colors)
+        shown = None if by_face is None or face is None else by_face[face]
+        return [RawMesh(points, index, normals, MeshVisual(visual.material, None, colors, shown), np.eye(4))]
+    which = np.zeros(len(index), np.int64)
+    if faces is not None and face is not None and "texnumber" in {prop.name for prop in faces.properties}:
+        which = np.clip(np.asarray(faces["texnumber"], np.int64)[face], 0, len(pictures) - 1)
+    return [
+        RawMesh(points, index[which == k], normals, MeshVisual(pictures[k], np.asarray(uv, np.float64)), np.eye(4))
+        for k in np.unique(which).tolist()
+    ]
+
+
+def _corner_coordinates(lists: NDArray, face: Indices, place: Indices) -> Array:
+    """[3 T, 2] of triangles [T, 3] that are corners `place` of faces: a list u, v, u, v ... a face; 0 where it is short."""
+    widest = max((len(row) for row in lists), default=0) // 2 * 2
+    table = np.zeros((len(lists), max(widest, 2)))
+    for row, values in zip(table, lists, strict=True):
+        row[: min(len(values), widest)] = values[:widest]
+    at = np.minimum(place, table.shape[1] // 2 - 1)
+    return table.reshape(len(lists), -1, 2)[face[:, None], at].reshape(-1, 2)
+
+
+def _colors(element: PlyElement) -> NDArray[np.uint8] | None:
+    """[N, 4] uint8 sRGB of an element's own colours: whole numbers up to 255, or floats in [0, 1]."""
+    names = {prop.name for prop in element.properties if not isinstance(prop, PlyListProperty)}
+    rgb = next((found for found in _COLORS if set(found) <= names), None)
+    if rgb is None:
+        return None
+    columns = [element[name] for name in (*rgb, *(["alpha"] if "alpha" in names else []))]
+    table = np.full((len(element), 4), 255, np.uint8)
+    for k, column in enumerate(columns):
+        values: NDArray[Any] = np.asarray(column)
+        if values.dtype.kind == "f":
+            values = np.nan_to_num(values) * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)
+        elif values.dtype.itemsize > 1 and values.max(initial=0) > 255:
+            values = values / np.iinfo(values.dtype).max * 255.0
+        table[:, k] = np.clip(np.round(values), 0, 255)
+    return table
+
+
+def _picture(name: str, resolver: FolderResolver) -> Material:
+    """The material of a picture: as it is, or the neutral grey where it cannot be had."""
+    picture = resolver.picture(name)
+    return DEFAULT if picture is None else make_material(np.ones(4), 0.0, _ROUGHNESS, picture)[0]
 
 
 def count_stl(data: bytes) -> tuple[int, int]:
@@ -68,7 +254,7 @@ def read_visual(mesh: trimesh.Trimesh, linear: bool = False) -> tuple[MeshVisual
     if visual.kind == "texture":
         uv = getattr(visual, "uv", None)
         usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2) and bool(np.isfinite(uv).all())
-        material, notes = _material(visual.material, textured=usable)
+        material, notes = _trimesh_material(visual.material, textured=usable)
         colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices), linear)
         return MeshVisual(material, np.asarray(uv, dtype=np.float64) if usable else None, colors), notes
     if visual.kind == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
@@ -94,7 +280,7 @@ def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArr
     return np.round(255.0 * share).astype(np.uint8)
 
 
-def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]]:
+def _trimesh_material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]]:
     """A material of trimesh's; the picture only where the mesh has coordinates for it."""
     if isinstance(source, MultiMaterial):
         source = source.materials[0] if source.materials else None
@@ -109,8 +295,7 @@ def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]
         # `Tr` is ignored, because half of the exporters write it inverted.
         with suppress(KeyError, IndexError, TypeError, ValueError):
             color[3] = float(source.kwargs["d"][0])
-        # Blinn-Phong exponent to GGX alpha, and alpha to perceptual roughness (Karis, "Specular BRDF reference", 2013).
-        metallic, roughness = 0.0, (2.0 / (max(source.glossiness, 0.0) + 2.0)) ** 0.25
+        metallic, roughness = 0.0, roughness_of(source.glossiness)
     else:
         return DEFAULT, ()
     notes: list[str] = []

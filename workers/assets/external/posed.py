@@ -18,6 +18,7 @@ from workers.assets.external.mesh import DEFAULT
 from workers.geometry.frames import pose
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
+_NAMESPACE = re.compile(rb"\sxmlns=([\"'])[^\"']*\1")
 _PREFIX = re.compile(rb"(</?|\s)([A-Za-z_][\w.-]*):(?=[A-Za-z_])")
 MAX_XML_BYTES = 10_000_000
 SEGMENTS = 48
@@ -53,25 +54,14 @@ class Model:
 
 
 def parse_xml(path: Path, limits: MeshLimits, tag: str, kind: str) -> ElementTree.Element:
-    """The root element; MeshError `missing`, `too_large` or `unreadable`. Documents with a DTD or entities are refused."""
+    """The root element of a file that poses others; MeshError `missing`, `too_large` or as `parse_tree`."""
     try:
         if path.stat().st_size > MAX_XML_BYTES:
             raise MeshError("too_large", f"{path} has {path.stat().st_size} bytes, over {MAX_XML_BYTES}")
         data = path.read_bytes()
     except OSError as error:
         raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
-    if b"<!" in data.replace(b"<!--", b"") or b"\0" in data:
-        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
-    # pybullet's own files declare XML version 0.0, which no parser accepts.
-    data = _DECLARATION.sub(b"", data, count=1)
-    if b"xmlns:" not in data:
-        data = _PREFIX.sub(rb"\1\2_", data)  # robots' own parsers know no namespaces, and let such pass undeclared
-    try:
-        root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        raise MeshError("unreadable", f"{path} is not XML: {error}") from error
-    if root.tag != tag:
-        raise MeshError("unreadable", f"{path} is not {kind}: its root is <{root.tag:.40}>")
+    root = parse_tree(path, data, tag, kind)
     for what, many in (
         ("link", "links"),
         ("joint", "joints"),
@@ -80,6 +70,23 @@ def parse_xml(path: Path, limits: MeshLimits, tag: str, kind: str) -> ElementTre
         ("geom", "geoms"),
     ):
         check_nodes(path, sum(1 for _ in root.iter(what)), many, limits)
+    return root
+
+
+def parse_tree(path: Path, data: bytes, tag: str, kind: str) -> ElementTree.Element:
+    """The root element, its default namespace left out; MeshError `unreadable`, also for a DTD or entities."""
+    if b"<!" in data.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or b"\0" in data:
+        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
+    # pybullet's own files declare XML version 0.0, which no parser accepts.
+    data = _NAMESPACE.sub(b"", _DECLARATION.sub(b"", data, count=1), count=1)
+    if b"xmlns:" not in data:
+        data = _PREFIX.sub(rb"\1\2_", data)  # robots' own parsers know no namespaces, and let such pass undeclared
+    try:
+        root = ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise MeshError("unreadable", f"{path} is not XML: {error}") from error
+    if root.tag != tag:
+        raise MeshError("unreadable", f"{path} is not {kind}: its root is <{root.tag:.40}>")
     return root
 
 
