@@ -3,6 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+import obstore
+from obstore.store import MemoryStore
+
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.dataset.shard import ShardOrder
 from schemas.job.job import Job
@@ -19,6 +22,7 @@ from workers.shard.run_shard import run_scene
 from workers.store.attempt import begin_attempt
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
+from workers.store.objects import ObjectStore
 
 SMALL: dict[str, Any] = {
     "name": "small",
@@ -75,3 +79,11 @@ def images_of(store: LocalStore) -> dict[str, bytes]:
     """Every image and patch by path."""
     paths = [path for path in Path(store.root).rglob("*.png") if "_staging" not in path.parts]
     return {str(path.relative_to(store.root)): path.read_bytes() for path in paths}
+
+
+def in_a_bucket(root: Path, kind: type[ObjectStore] = ObjectStore) -> ObjectStore:
+    """The same files in a bucket in memory."""
+    bucket = MemoryStore()
+    for path in (path for path in root.rglob("*") if path.is_file() and "_staging" not in path.parts):
+        obstore.put(bucket, path.relative_to(root).as_posix(), path)
+    return kind(bucket, "memory://bucket")

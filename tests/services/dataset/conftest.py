@@ -7,24 +7,9 @@ import pytest
 
 from schemas.dataset.tables import TABLES
 from services.dataset.dataset import Dataset, open_dataset
-from tests.datasets import make_dataset
-from tests.services.read.conftest import in_a_bucket
-from workers.store.local import LocalStore
+from tests.datasets import in_a_bucket
 
-CHANGES = {"scenes": 4, "categories": ["mug", "laptop"], "pairs_per_scene": 2, "run": {"range_size": 2}}
 FORMS = ("files", "tar", "bucket", "running files", "running tar", "running bucket")
-
-
-@pytest.fixture(scope="package")
-def files(tmp_path_factory) -> LocalStore:
-    """Four scenes of two pairs, finished."""
-    return make_dataset(tmp_path_factory.mktemp("files"), **CHANGES)[0]
-
-
-@pytest.fixture(scope="package")
-def tars(tmp_path_factory) -> LocalStore:
-    """The same in tars."""
-    return make_dataset(tmp_path_factory.mktemp("tars"), output={"layout": "tar"}, **CHANGES)[0]
 
 
 @pytest.fixture(scope="package")

@@ -75,7 +75,7 @@ def test_every_pair_has_the_facts_and_the_pixels_of_the_files(dataset, files):
 
 
 FILTERS = (
-    (pc.field("category") == "mug", lambda scene, first, asset: scene["category"] == "mug"),
+    (pc.field("category") == "can", lambda scene, first, asset: scene["category"] == "can"),
     (pc.field("input", "visible_fraction") > 0.999, lambda scene, first, asset: first["visible_fraction"] > 0.999),
     (
         pc.match_substring(pc.binary_join(pc.field("effects"), " "), "table_texture"),
@@ -106,8 +106,8 @@ def test_filters_parts_and_ids_choose_pairs_and_tables_are_whole(dataset, files)
     for name in ("scenes", "views", "objects", "failures", "timings"):
         assert dataset.table(name).count_rows() == len(plain(files.root, name))
     assert set(dataset.table("assets").to_table()["instance_id"].to_pylist()) == assets.keys()
-    mugs = dataset.table("views").to_table(filter=pc.field("category") == "mug", columns=["pose_id", "category"])
-    assert mugs.num_rows and set(mugs["category"].to_pylist()) == {"mug"}
+    cans = dataset.table("views").to_table(filter=pc.field("category") == "can", columns=["pose_id", "category"])
+    assert cans.num_rows and set(cans["category"].to_pylist()) == {"can"}
 
 
 def test_what_is_wrong_is_told_at_once_and_clearly(files, tmp_path):
@@ -148,14 +148,14 @@ def test_nothing_of_a_pair_can_be_changed_and_a_dataset_travels_to_other_process
 
 
 def test_a_missing_image_is_named(copy, tars):
-    for path in (copy / "mug").glob("depth0*.png"):
+    for path in (copy / "can").glob("depth0*.png"):
         path.unlink()
-    (pair, *_) = open_dataset(copy).pairs(pc.field("category") == "mug")
-    with pytest.raises(CorruptError, match=r"mug/depth\d+\.png is committed and missing"):
+    (pair, *_) = open_dataset(copy).pairs(pc.field("category") == "can")
+    with pytest.raises(CorruptError, match=r"can/depth\d+\.png is committed and missing"):
         pair.input.depth()
     (pair, *_) = Dataset(LocalStore(tars.root)).pairs()
-    with pytest.raises(CorruptError, match=r"mug/RGB99999\.png is committed and in no tar: `verso verify"):
-        pair._files.image(0, "mug/RGB99999.png")
+    with pytest.raises(CorruptError, match=r"can/RGB99999\.png is committed and in no tar: `verso verify"):
+        pair._files.image(0, "can/RGB99999.png")
 
 
 def test_captures_are_pairs_as_scenes_are(tmp_path, monkeypatch):

@@ -15,10 +15,10 @@ from services.dataset.one_scene import make_scene
 from services.job.job_file import validate_job
 from services.job.record import encode_job, read_job
 from tests.datasets import SMALL, make_dataset, overlaid
-from tests.services.dataset.conftest import CHANGES
+from tests.services.conftest import TWO_PAIRS
 from workers.store.local import LocalStore
 
-KEYS = overlaid(SMALL, CHANGES)
+KEYS = overlaid(SMALL, TWO_PAIRS)
 
 
 def ray_depths(meshes, view, rows, columns) -> np.ndarray:
@@ -108,7 +108,7 @@ def test_a_shape_that_is_not_stored_comes_from_the_source_and_one_that_is_gone_i
     job = type(record.job).model_validate({**record.job.model_dump(mode="json"), "assets": gone})
     LocalStore(copy).put("job.yaml", encode_job(type(record)(job, record.digest, record.catalogue, record.folder)))
     (pair, *_) = open_dataset(copy).pairs()
-    with pytest.raises(InputError, match=r"assets/mug/.*\.glb is not in the dataset.*/nowhere"):
+    with pytest.raises(InputError, match=r"assets/box/.*\.glb is not in the dataset.*/nowhere"):
         pair.mesh()
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
-from obstore.store import MemoryStore
 
 from schemas.errors import CorruptError, InputError, InUseError, OutputError
 from schemas.job.assets import SplitShares
@@ -28,11 +27,10 @@ from services.export.shapes import Shapes, color_vertices
 from services.export.source import iter_ranges, scenes_of, unchanged_sources
 from services.export.table import FORMATS
 from services.job.record import require_job
-from tests.datasets import make_dataset
+from tests.datasets import in_a_bucket, make_dataset
 from tests.services.export.exported import contents, export_to, source_rows
 from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
-from workers.store.objects import ObjectStore
 
 SPLITS = ("train", "val", "test")
 ROOT = Path(__file__).resolve().parents[3]
@@ -92,10 +90,7 @@ def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, nam
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, files, tars, tmp_path):
-    bucket = MemoryStore()
-    for path, data in contents(Path(tars.name)).items():
-        bucket.put(path, data)
-    sources = {"files": files, "tars": tars, "bucket": ObjectStore(bucket, "memory://dataset")}
+    sources = {"files": files, "tars": tars, "bucket": in_a_bucket(tars.root)}
     for place, store in sources.items():
         export_to(store, tmp_path / place, name, shard_mb=0)
     plain, tarred, far = (contents(tmp_path / place) for place in sources)

@@ -1,6 +1,7 @@
 """What the tests of the report share: a small dataset, which none changes, tables made by hand, and scenes without one."""
 
 import math
+import shutil
 
 import numpy as np
 import pyarrow as pa
@@ -9,17 +10,15 @@ import pytest
 from schemas.dataset.tables import SCHEMAS
 from services.look.collect import collect
 from services.look.pictures import Picture, ShownScene, picture_of_colour
-from tests.datasets import make_dataset
 from workers.store.local import LocalStore
 
 HOSTILE = '"><script>alert("&")</script>'
 
 
 @pytest.fixture(scope="package")
-def shown(tmp_path_factory) -> LocalStore:
-    """Four finished scenes of two categories."""
-    changes = {"scenes": 4, "categories": ["box", "mug"], "run": {"range_size": 2}}
-    return make_dataset(tmp_path_factory.mktemp("shown"), **changes)[0]
+def shown(files, tmp_path_factory) -> LocalStore:
+    """Four finished scenes of two categories, whose commits may be given other times."""
+    return LocalStore(shutil.copytree(files.root, tmp_path_factory.mktemp("shown") / "shown"))
 
 
 def scene(scene_id: int, category: str, names=("input rgb", "mirror rgb", "over")) -> ShownScene:

@@ -26,10 +26,9 @@ from services.look.report import (
 )
 from services.look.server import Place, serving
 from tests.browser import needs_chromium, open_tab
-from tests.datasets import make_dataset
+from tests.datasets import in_a_bucket, make_dataset
 from tests.kit.html import Reader
 from tests.services.look.conftest import address
-from tests.services.read.conftest import in_a_bucket
 from workers.store.local import LocalStore
 
 

@@ -82,11 +82,11 @@ def test_the_images_of_a_pair_are_those_in_its_files(shown):
     (views, _), folder = next(stored.pairs(1)), shown.root / stored.scene(1)["category"]
     images = read_pair(file_reader(shown.read, stored), views)
     assert len(images) == 8 and not any(role == "aligned" for role, _ in images)
-    for key, name in ((("input", "depth"), "depth00002"), (("mirror", "depth"), "depth00003")):
+    for key, name in ((("input", "depth"), "depth00004"), (("mirror", "depth"), "depth00005")):
         assert np.array_equal(images[key], cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED))
-    projected = cv2.imread(str(folder / "RGBprojected00002.png"))[..., ::-1]
+    projected = cv2.imread(str(folder / "RGBprojected00004.png"))[..., ::-1]
     assert np.array_equal(images["projected", "rgb"], projected)
-    with pytest.raises(CorruptError, match=r"box/RGB00002\.png is not a PNG"):
+    with pytest.raises(CorruptError, match=r"can/RGB00004\.png is not a PNG"):
         read_pair(lambda path: b"no PNG", views)
 
 

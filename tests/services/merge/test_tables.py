@@ -107,29 +107,6 @@ def test_cam_poses_has_two_rows_a_pair_that_read_back_to_the_same_doubles(merged
         assert math.copysign(1, numbers[12]) == -1  # -0.0 is kept
 
 
-def test_cameras_has_every_camera_in_order_with_both_conventions(merged):
-    with open(merged[0].root / "cameras.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    roles = ["input", "aligned", "mirror", "projected"]
-    views = sorted(plain_rows("views"), key=lambda view: (view["pose_id"], roles.index(view["role"])))
-    names = ["pose_id", "parent_id", "width", "height", "fx", "cx", "cy", "cx_opencv", "cy_opencv", "depth_units_per_m"]
-    for row, view in zip(rows, views, strict=True):
-        assert row["role"] == view["role"]
-        assert [float(row[name]) for name in names] == [view[name] for name in names]
-        assert [float(row[f"T{i}{j}"]) for i in range(4) for j in range(4)] == view["T_world_cam"]
-
-
-def test_objects_has_a_line_for_everything_in_a_pose_table_included(merged):
-    lines = (merged[0].root / "objects.dat").read_text().splitlines()
-    objects = [row for row in plain_rows("objects") if row["role"] in ("input", "mirror")]
-    keys = ("pose_id", "category", "instance_id", "region_id", "u", "v")
-    for line, row in zip(lines, objects, strict=True):
-        words = line.split(" ")
-        assert words[:6] == [str(row[key]) for key in keys]
-        assert list(map(float, words[6:])) == row["T_cam_obj"]
-    assert {line.split(" ")[1] for line in lines} >= {"table"}
-
-
 def test_a_name_with_spaces_is_one_word_and_can_be_had_back():
     for name in ("blue mug", "50%", "a\tb", "non\u00a0breaking", "line\nend", "plain-name_1.2"):
         row = {**made_scene(3).rows["objects"][0], "instance_id": name}

@@ -3,13 +3,10 @@
 import shutil
 from pathlib import Path
 
-import obstore
 import pytest
-from obstore.store import MemoryStore
 
 from tests.datasets import make_dataset
 from workers.store.local import LocalStore
-from workers.store.objects import ObjectStore
 
 TINY = {
     "scenes": 3,
@@ -18,13 +15,6 @@ TINY = {
     "cameras": {"sensor": {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}},
     "images": {"patch": {"width": 16, "height": 12}},
 }
-
-
-@pytest.fixture(scope="package")
-def three_objects(tmp_path_factory) -> LocalStore:
-    """One finished scene of three objects."""
-    changes = {"scenes": 1, "objects_per_scene": 3, "categories": ["box", "camera", "bottle"]}
-    return make_dataset(tmp_path_factory.mktemp("three"), **changes)[0]
 
 
 @pytest.fixture(scope="package")
@@ -51,11 +41,3 @@ def spoil(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 4
     path.write_bytes(data)
-
-
-def in_a_bucket(root: Path, kind: type[ObjectStore] = ObjectStore) -> ObjectStore:
-    """The same files in a bucket in memory."""
-    bucket = MemoryStore()
-    for path in (path for path in root.rglob("*") if path.is_file() and "_staging" not in path.parts):
-        obstore.put(bucket, path.relative_to(root).as_posix(), path)
-    return kind(bucket, "memory://bucket")

@@ -32,12 +32,8 @@ def exact(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def virtual(tmp_path_factory) -> Path:
-    with pytest.MonkeyPatch.context() as patch:
-        use_exact_captures(patch)
-        out = tmp_path_factory.mktemp("virtual")
-        run_here(captures_job(), out)
-    return out
+def virtual(captures) -> Path:
+    return captures.root
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from schemas.errors import CorruptError, InputError, OutputError
 from services.merge.merge import merge, read_success
 from services.read.query import Format, ask, query, write_rows
 from services.read.stored_tables import StoredTables, file_system_of, read_merged
+from tests.datasets import in_a_bucket
 from tests.made_up_scenes import attempt_at, failed_scene, fails, scene
-from tests.services.read.conftest import in_a_bucket
 from workers.store.commit import publish
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore

@@ -92,10 +92,10 @@ def materials(data: bytes) -> list[list[float]]:
     return [one["pbrMetallicRoughness"].get("baseColorFactor", [1.0] * 4) for one in tree["materials"]]
 
 
-def test_a_scene_as_glb_has_every_object_where_its_row_puts_it_in_the_colours_of_its_stored_shape(three_objects):
-    data = posed_scene(three_objects, 0).export(file_type="glb")
+def test_a_scene_as_glb_has_every_object_where_its_row_puts_it_in_the_colours_of_its_stored_shape(pile):
+    data = posed_scene(pile, 0).export(file_type="glb")
     found = trimesh.load_scene(io.BytesIO(data), file_type="glb")
-    (row,) = query(three_objects, "select bodies from scenes").to_pylist()
+    (row,) = query(pile, "select bodies from scenes").to_pylist()
     shown, compared = np.array(materials(data)), 0
     for body in row["bodies"]:
         name = f"{body['category']} {body['instance_id']} {body['region_id']}"
@@ -103,14 +103,14 @@ def test_a_scene_as_glb_has_every_object_where_its_row_puts_it_in_the_colours_of
         assert nodes
         for node in nodes:
             np.testing.assert_allclose(found.graph[node][0], np.reshape(body["T_world_obj"], (4, 4)), atol=1e-6)
-        shape = three_objects.root / "assets" / body["category"] / f"{body['instance_id']}.glb"
+        shape = pile.root / "assets" / body["category"] / f"{body['instance_id']}.glb"
         for factor in materials(shape.read_bytes()):
             assert np.abs(shown - factor).max(axis=1).min() <= 0.5 / 255 + 1e-6
             compared += 0.05 < factor[0] < 0.95
     assert compared
     assert {"floor", "table"} <= {node.split("/")[0].split(" ")[0] for node in found.graph.nodes_geometry}
     with pytest.raises(InputError, match="scene 7 is not in"):
-        posed_scene(three_objects, 7)
+        posed_scene(pile, 7)
 
 
 def test_a_part_keeps_its_corners_faces_and_colour_as_a_mesh():

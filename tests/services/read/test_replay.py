@@ -26,11 +26,11 @@ from workers.store.images import decode_png, encode_png
 from workers.store.local import LocalStore
 
 
-def test_a_scene_replays_to_the_byte_and_a_difference_is_told_by_file_table_and_column(three_objects):
-    replayed = replay_scene(three_objects, 0)
+def test_a_scene_replays_to_the_byte_and_a_difference_is_told_by_file_table_and_column(pile):
+    replayed = replay_scene(pile, 0)
     assert replayed.same_stack and replayed.differences == () and replayed.compared > 15
-    stored = find_scene(three_objects, 0)
-    output = remake.run_scene(open_context(require_job(three_objects)), 0, Stopwatch())
+    stored = find_scene(pile, 0)
+    output = remake.run_scene(open_context(require_job(pile)), 0, Stopwatch())
     assert compare_rows(stored, output) == []
     scene = {**stored.rows["scenes"][0], "settle_s": -1.0}
     other = dataclasses.replace(stored, rows={**stored.rows, "scenes": [scene], "objects": []})
@@ -51,9 +51,9 @@ def test_a_scene_replays_to_the_byte_and_a_difference_is_told_by_file_table_and_
         changed = dataclasses.replace(depth, data=encode_png(image, 1), sha256="another")
         files = (*output.files[:number], changed, *output.files[number + 1 :])
         now = dataclasses.replace(output, files=files)
-        assert len(compare_files(three_objects, stored, now, same_stack=True)) == 1
-        assert len(compare_files(three_objects, stored, now, same_stack=False)) == too_many
-        assert compare_files(three_objects, stored, dataclasses.replace(output, files=files[1:]), True)
+        assert len(compare_files(pile, stored, now, same_stack=True)) == 1
+        assert len(compare_files(pile, stored, now, same_stack=False)) == too_many
+        assert compare_files(pile, stored, dataclasses.replace(output, files=files[1:]), True)
 
 
 @pytest.fixture

@@ -28,9 +28,9 @@ from services.read.verify import encode_fingerprint, verify
 from services.read.verify_files import Success, check_success
 from services.read.verify_range import Spans, read_records
 from tests.damage import choose_places, damaged, files_by_kind
-from tests.datasets import faults_of, make_dataset
+from tests.datasets import faults_of, in_a_bucket, make_dataset
 from tests.kit import many_ranges
-from tests.services.read.conftest import in_a_bucket, spoil
+from tests.services.read.conftest import spoil
 from workers.store.attempt import reopen
 from workers.store.ledger import list_commits, save_rows
 from workers.store.local import LocalStore

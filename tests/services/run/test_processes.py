@@ -222,7 +222,10 @@ def test_a_command_that_ignores_the_interrupt_is_killed_by_a_second_one():
     assert end(run) == (1, "", "verso: interrupted; all is kept\n")
 
 
-@pytest.mark.parametrize("killed", [(0,), (1,), (0, 2), (1, 2), (2,), (0, 1, 2)])
+@pytest.mark.parametrize(
+    "killed",
+    [(0,), (1,), (2,), *(pytest.param(several, marks=pytest.mark.minute) for several in ((0, 2), (1, 2), (0, 1, 2)))],
+)
 def test_whichever_processes_are_killed_nothing_goes_on_and_the_temporary_folder_goes(tmp_path, killed):
     """0 is the process that the user started, 1 the keeper, 2 the command."""
     folder = tmp_path / "private"

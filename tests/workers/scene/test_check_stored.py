@@ -52,6 +52,17 @@ def test_a_wrong_column_of_a_scene_a_label_or_a_view_is_told(told):
         ("support_margin_mm", -1.0, "support_margin_mm is -1.0"),
     ):
         assert words in told(lambda scene, *_, column=column, value=value: scene.update({column: value}))
+    for body, column, change, words in (
+        (1, "T_world_obj", nudged, "T_cam_obj does not follow"),
+        (1, "penetration_mm", lambda mm: mm + 1.0, "penetration_mm is"),
+        (0, "instance_id", lambda _: "another", "instance_id is"),
+        (1, "region_id", lambda _: 9, "bodies have the regions"),
+    ):
+
+        def wrong_body(scene, *_, body=body, column=column, change=change):
+            scene["bodies"][body][column] = change(scene["bodies"][body][column])
+
+        assert words in told(wrong_body)
     for column, change, words in (
         ("pixels", lambda value: value + 1, "region 3: the mask has"),
         ("bbox_xywh", lambda box: [*box[:3], box[3] + 1], "region 3: the mask's box is"),

@@ -97,13 +97,25 @@ def test_rows_have_the_tables_columns_and_name_the_files_that_are_written(three)
 
 def test_a_scenes_figures_are_the_worst_of_its_objects_and_a_projected_view_has_no_object_columns(three):
     (row,), settled = three.rows["scenes"], three.scene.settled
-    assert row["hover_gap_mm"] == max(rest.hover_gap_mm for rest in settled)
+    for name in ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s"):
+        assert row[name] == max(getattr(rest, name) for rest in settled)
     assert row["support_margin_mm"] == min(rest.support_margin_mm for rest in settled)
+    first = row["bodies"][0]
+    assert all(row[name] == first[name] for name in ("category", "instance_id", "T_world_obj"))
     assert [body["region_id"] for body in row["bodies"]] == [3, 4, 5]
     projected = next(row for row in three.rows["views"] if row["role"] == "projected")
     assert projected["object_pixels"] is projected["visible_fraction"] is projected["patch_object_fraction"] is None
     assert 0 < projected["projected_filled_share"] < 1
-    assert all(row["patch_object_fraction"] is None for row in three.rows["objects"] if row["region_id"] == 2)
+    labels = {(row["role"], row["region_id"]): row for row in three.rows["objects"]}
+    assert all(row["patch_object_fraction"] is None for (_, region), row in labels.items() if region == 2)
+    for view in three.scene.pairs[0].views[:3]:
+        row = next(row for row in three.rows["views"] if row["role"] == view.role)
+        own = labels[view.role, 3]
+        assert all(row[name] == own[name] for name in ("visible_fraction", "patch_object_fraction"))
+        for region in (3, 4, 5):
+            u, v, share = (labels[view.role, region][name] for name in ("u", "v", "patch_object_fraction"))
+            assert share in (None, (view.region[v - 12 : v + 12, u - 16 : u + 16] == region).mean())
+    assert any(row["patch_object_fraction"] for row in labels.values())
 
 
 def test_a_failed_scene_is_one_row():
