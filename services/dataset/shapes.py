@@ -17,6 +17,7 @@ from schemas.job.views import Patch
 from schemas.scene.shape import REGION_TABLE, Asset
 from services.job.record import JobRecord
 from workers.assets.catalogue import Catalogue
+from workers.assets.external.plain import show_colors
 from workers.assets.glb import mesh_of_part
 from workers.store.commit import read_committed
 from workers.store.store import Store
@@ -50,7 +51,7 @@ class Shapes:
             return self._from_source(path, scene_id, region_id)
         try:
             loaded = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
-            return _join(list(loaded.geometry.values()))
+            return _join([show_colors(mesh) for mesh in loaded.geometry.values()])
         except Exception as error:  # trimesh raises errors of many kinds for a damaged file
             raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
 

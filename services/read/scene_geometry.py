@@ -15,7 +15,7 @@ from services.job.record import require_job
 from services.read.dataset_reader import StoredRange, find_scene
 from services.read.replay import open_context
 from workers.assets.catalogue import Catalogue
-from workers.assets.external.plain import read_visual
+from workers.assets.external.plain import show_colors
 from workers.assets.glb import linear_bytes, mesh_of_part
 from workers.scene.plan import SceneChance, plan_scene
 from workers.store.store import Store
@@ -43,7 +43,11 @@ def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene
     board = next(asset for asset in stored.rows["assets"] if asset["instance_id"] == row["table_id"])
     x, y, _ = (0.5 * size for size in board["extents_m"])
     rectangle = trimesh.Trimesh([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
-    placed = [(f"board {row['table_id']}", rectangle, ColorVisuals(rectangle), T_world[REGION_TABLE])]
+    rectangle.visual = ColorVisuals(
+        rectangle, vertex_colors=linear_bytes(ColorVisuals(rectangle).vertex_colors / 255.0)
+    )
+    scene = trimesh.Scene()
+    placed = [(f"board {row['table_id']}", rectangle, T_world[REGION_TABLE])]
     path = asset_path(row["category"], row["instance_id"])
     try:
         shape = trimesh.load_scene(io.BytesIO(store.read(path)), file_type="glb", process=False)
@@ -51,12 +55,9 @@ def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene
         raise CorruptError(
             f"{path} cannot be read: {error}; `verso replay {store.name} --repair` makes it again"
         ) from error
-    for mesh in shape.geometry.values():
-        colors = ColorVisuals(mesh, vertex_colors=read_visual(mesh, linear=True)[0].colors)
-        placed.append((f"{row['category']} {row['instance_id']}", mesh, colors, T_world[REGION_FIRST_OBJECT]))
-    scene = trimesh.Scene()
-    for name, mesh, colors, T_world_mesh in placed:
-        mesh.visual = ColorVisuals(mesh, vertex_colors=linear_bytes(colors.vertex_colors / 255.0))
+    thing = f"{row['category']} {row['instance_id']}"
+    placed += [(thing, show_colors(mesh), T_world[REGION_FIRST_OBJECT]) for mesh in shape.geometry.values()]
+    for name, mesh, T_world_mesh in placed:
         scene.add_geometry(mesh, geom_name=name, node_name=name, transform=T_world_mesh)
     return scene
 

@@ -167,8 +167,9 @@ def _primitive(writer: _Writer, part: Part, material: int) -> dict[str, Any]:
     if part.colors is not None:
         color = part.colors / 255.0
         color[:, :3] = decode_srgb(color[:, :3])
-        shorts = np.round(65535.0 * color).astype("<u2")
-        attributes["COLOR_0"] = writer.add_accessor(shorts, "VEC4", _USHORT, normalized=True)
+        opaque = bool((part.colors[:, 3] == 255).all())
+        floats = color[:, : 3 if opaque else 4].astype("<f4")  # trimesh cuts shorts down to their lower byte
+        attributes["COLOR_0"] = writer.add_accessor(floats, "VEC3" if opaque else "VEC4", _FLOAT)
     small = len(part.vertices) <= 65535
     index = part.faces.ravel().astype("<u2" if small else "<u4")
     indices = writer.add_accessor(index, "SCALAR", _USHORT if small else _UINT, _ELEMENT_BUFFER)

@@ -82,6 +82,26 @@ def test_a_welded_mesh_is_watertight_where_the_asset_is_and_is_the_same_surface(
     assert trimesh.proximity.closest_point(seen, seen.triangles_center[:5])[1].max() < 1e-9  # which asks rtree
 
 
+def test_colours_of_vertices_are_shown_by_a_mesh_and_by_a_stored_file_read_as_the_page_says(
+    tmp_path,
+):
+    """A ball, red below and green above; the colours of a GLB are linear: of 200 in sRGB, 0.5776 (IEC 61966-2-1)."""
+    ball = trimesh.creation.icosphere(2, 0.05)
+    ball.visual.vertex_colors = np.where(ball.vertices[:, 2:] < 0, [200, 0, 0, 255], [0, 200, 0, 255])
+    (tmp_path / "ply").mkdir()
+    ball.export(tmp_path / "ply/a.ply")
+    source = {"source": "files", "folder": str(tmp_path / "ply"), "category_map": {"*": "mug"}, "copy_assets": True}
+    folder = tmp_path / "out"
+    make_dataset(folder, scenes=1, categories={"mug": 1.0}, assets={"objects": [source]})
+    (pair,) = open_dataset(folder).pairs()
+    (path,) = (folder / "assets/mug").glob("*.glb")
+    level = round(255 * ((200 / 255 + 0.055) / 1.055) ** 2.4)
+    posed = pair.mesh().apply_transform(np.linalg.inv(pair.T_world[3]))
+    for mesh in (posed, trimesh.load_mesh(path, process=False, skip_materials=True)):
+        wanted = np.where(mesh.vertices[:, 2:] < -1e-6, [level, 0, 0, 255], [0, level, 0, 255])
+        assert np.abs(mesh.visual.vertex_colors.astype(int) - wanted).max() <= 1
+
+
 def test_each_of_several_objects_has_its_own_shape(tmp_path):
     make_dataset(tmp_path, scenes=1, objects_per_scene=3, categories=["box", "camera", "bottle"])
     (pair,) = open_dataset(tmp_path).pairs()

@@ -18,6 +18,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from trimesh.visual import ColorVisuals
 from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
 from schemas.base import Array
@@ -263,6 +264,19 @@ def read_visual(mesh: trimesh.Trimesh, linear: bool = False) -> tuple[MeshVisual
     if visual.kind == "face" and len(visual.face_colors) == len(mesh.faces):
         return MeshVisual(WHITE, face_colors=np.asarray(visual.face_colors, dtype=np.uint8)), ()
     return MeshVisual(DEFAULT), ()
+
+
+def show_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A mesh of a stored GLB that shows its vertex colours, linear as in the file.
+
+    trimesh keeps them aside where a material stands with them, and without one other viewers draw dark metal, or white.
+    """
+    visual: Any = mesh.visual
+    if visual.kind == "texture" and "color" in visual.vertex_attributes and visual.material.baseColorTexture is None:
+        mesh.visual = ColorVisuals(
+            mesh, vertex_colors=_attribute_colors(visual.vertex_attributes["color"], len(mesh.vertices), False)
+        )
+    return mesh
 
 
 def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArray[np.uint8] | None:
