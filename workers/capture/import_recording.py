@@ -18,7 +18,6 @@ from workers.capture.recording import (
     DEPTH_FORMAT,
     DEPTH_UNITS_PER_M,
     DeviceCalibration,
-    Extent,
     Recording,
     decode_color,
     decode_depth,
@@ -38,15 +37,13 @@ class Losses:
     """What is missing of a recording.
 
     dropped: colour frames missing between the first and the last that were read; without_depth: colour frames without a depth
-    frame; damaged: frames that were cut short; cut: frames missing at the end, or None where the file does not say;
-    is_cut: whether the file ends before its end.
+    frame; damaged: frames that were cut short; cut: frames missing at the end, None where nobody knows.
     """
 
     dropped: int
     without_depth: int
     damaged: int
     cut: int | None
-    is_cut: bool
 
 
 def pair_frames(color_us: Stamps, depth_us: Stamps, period_us: float, delay_us: float = 0.0) -> dict[int, int]:
@@ -67,28 +64,23 @@ def pair_frames(color_us: Stamps, depth_us: Stamps, period_us: float, delay_us: 
     return pairs
 
 
-def count_losses(
-    color_us: Stamps, pairs: int, damaged: int, period_us: float, extent: Extent, size_bytes: int
-) -> Losses:
-    """`pairs` colour frames have depth; `size_bytes` is the size of the file as it is. At least one colour frame."""
+def count_losses(color_us: Stamps, pairs: int, damaged: int, period_us: float, duration_us: float | None) -> Losses:
+    """`pairs` colour frames have depth; `duration_us` is what the file says of its length. At least one colour frame."""
     frames = round(float(color_us[-1] - color_us[0]) / period_us) + 1
     dropped = max(frames - len(color_us) - damaged, 0)
-    is_cut = extent.size_bytes is None or size_bytes < extent.size_bytes
-    cut: int | None = None
-    if extent.duration_us is not None:
-        cut = max(round((extent.duration_us - float(color_us[-1])) / period_us) - 1, 0)
-    elif extent.size_bytes is not None:
-        missing = max(extent.size_bytes - size_bytes, 0)
-        cut = round(missing * len(color_us) / size_bytes)
-    return Losses(dropped, len(color_us) - pairs, damaged, cut if is_cut else 0, is_cut)
+    cut = None if duration_us is None else max(round((duration_us - float(color_us[-1])) / period_us), 0)
+    return Losses(dropped, len(color_us) - pairs, damaged, cut)
 
 
 def describe_losses(losses: Losses) -> list[str]:
     """Sentences for the user, none where nothing is missing."""
     told = []
-    if losses.is_cut:
-        lost = "nobody knows how many frames are" if losses.cut is None else f"about {losses.cut} frames are"
-        told.append(f"the recording is cut: {lost} lost at its end")
+    if losses.cut is None:
+        told.append(
+            "the recorder was interrupted and wrote no length: nobody knows how many frames are lost at the end"
+        )
+    elif losses.cut:
+        told.append(f"the recording is cut: about {losses.cut} frames are lost at its end")
     if losses.dropped:
         told.append(f"{losses.dropped} frames are missing between the first and the last")
     if losses.damaged:
@@ -217,7 +209,7 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
             f"{path}: none of {len(color_us)} colour frames that can be read has one of {len(depth_us)} depth "
             "frames within half a frame's time: copy the file again",
         )
-    losses = count_losses(color_us, len(pairs), damaged, recording.period_us, recording.extent, path.stat().st_size)
+    losses = count_losses(color_us, len(pairs), damaged, recording.period_us, recording.duration_us)
     usable = sorted(pairs)
     chosen = [usable[i] for i in choose_frames([measures[i] for i in usable], views)]
     made = tuple(

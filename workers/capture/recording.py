@@ -2,8 +2,8 @@
 
 The layout is that of Microsoft's description ("Azure Kinect record file format") and its SDK: tracks named COLOR and DEPTH or
 marked by the tags K4A_COLOR_TRACK and K4A_DEPTH_TRACK, time stamps in microseconds of the device's clock, depth as 16-bit
-big-endian millimetres (b16g), the factory calibration as an attachment. How long a file says that it is follows from its first
-elements (RFC 8794 and RFC 9559): what a cut file has lost.
+big-endian millimetres (b16g), the factory calibration as an attachment. When it closes a file, the SDK writes the last time stamp
+into its head (record.cpp, k4a_record_flush): what a cut file has lost.
 
 What the calibration's numbers mean is taken from the SDK (calibration.c, mode_specific_calibration.c,
 intrinsic_transformation.c): principal point and focal lengths are shares of the sensor's width and height, measured from the
@@ -12,7 +12,6 @@ upper left corner of the image; Rt takes points of the rig to points of the came
 
 import json
 import re
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,64 +30,6 @@ from schemas.capture import CaptureCamera, DepthCamera
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
 from workers.geometry.frames import invert, pose
-
-HEAD_BYTES = 1 << 20
-"""As many bytes from the start hold what comes before the first frame."""
-
-_EBML, _SEGMENT, _INFO, _CLUSTER = 0x1A45DFA3, 0x18538067, 0x1549A966, 0x1F43B675
-_SCALE, _DURATION = 0x2AD7B1, 0x4489
-
-
-@dataclass(frozen=True)
-class Extent:
-    """The size of the whole file and the length of the recording, each None where the file does not say."""
-
-    size_bytes: int | None = None
-    duration_us: float | None = None
-
-
-def read_extent(head: bytes) -> Extent:
-    """Of a file that starts with `head`; all None for what is no Matroska file."""
-    elements = list(_elements(head, 0, 2))
-    if [identity for identity, _, _ in elements] != [_EBML, _SEGMENT]:
-        return Extent()
-    _, start, size = elements[1]
-    whole = start + size if size else None  # a recorder that was interrupted has left 0 or `unknown`
-    for identity, at, length in _elements(head, start):
-        if identity == _CLUSTER:
-            break
-        if identity == _INFO and length is not None:
-            return Extent(whole, _duration_us(head[: at + length], at))
-    return Extent(whole)
-
-
-def _duration_us(data: bytes, start: int) -> float | None:
-    """Of the element Info whose content begins at `start` and ends with the data."""
-    found = {identity: data[at : at + (length or 0)] for identity, at, length in _elements(data, start)}
-    scale = int.from_bytes(found.get(_SCALE, b""), "big") or 1_000_000
-    duration = found.get(_DURATION, b"")
-    if len(duration) not in (4, 8):
-        return None
-    return float(struct.unpack(">f" if len(duration) == 4 else ">d", duration)[0]) * scale / 1000.0
-
-
-def _elements(data: bytes, at: int, most: int = 10_000) -> list[tuple[int, int, int | None]]:
-    """(identity, where its content begins, its length or None for unknown) of elements side by side from `at` on."""
-    found: list[tuple[int, int, int | None]] = []
-    while at + 2 <= len(data) and len(found) < most:
-        width = 9 - data[at].bit_length()
-        after = at + width
-        if width > 4 or after >= len(data) or data[after] == 0:
-            break
-        wide = 9 - data[after].bit_length()
-        coded = int.from_bytes(data[after : after + wide], "big") & ((1 << 7 * wide) - 1)
-        length = None if coded == (1 << 7 * wide) - 1 else coded
-        found.append((int.from_bytes(data[at:after], "big"), after + wide, length))
-        if length is None:
-            break
-        at = after + wide + length
-    return found
-
 
 FORMATS = ("MJPG", "NV12", "YUY2", "BGRA")
 """Of colour frames, by their four-character code."""
@@ -160,7 +101,8 @@ class Recording:
     depth_delay_us: float
     """By how much depth frames are later than colour frames."""
     serial_number: str
-    extent: Extent
+    duration_us: float | None
+    """The last time stamp; None where the recorder was interrupted before it closed the file."""
     color_stream: int
     depth_stream: int
 
@@ -180,8 +122,6 @@ def open_recording(path: Path) -> Recording:
         raise CaptureError("missing", f"{path} is no file")
     if path.stat().st_size == 0:
         raise CaptureError("empty", f"{path} has no bytes: copy it again")
-    with path.open("rb") as file:
-        extent = read_extent(file.read(HEAD_BYTES))
     with _open(path) as container:
         color = _track(container, "COLOR")
         depth = _track(container, "DEPTH")
@@ -193,7 +133,7 @@ def open_recording(path: Path) -> Recording:
             raise CaptureError(
                 "depth", f"{path} has no depth track: record with a depth mode other than OFF and PASSIVE_IR"
             )
-        return _describe(path, container, color, depth, extent)
+        return _describe(path, container, color, depth)
 
 
 def read_frames(recording: Recording) -> Iterator[TrackFrame]:
@@ -226,9 +166,7 @@ def _track(container: InputContainer, name: str) -> VideoStream | None:
     return next(iter(tagged + named), None)
 
 
-def _describe(
-    path: Path, container: InputContainer, color: VideoStream, depth: VideoStream, extent: Extent
-) -> Recording:
+def _describe(path: Path, container: InputContainer, color: VideoStream, depth: VideoStream) -> Recording:
     tags = {**container.metadata, **color.metadata, **depth.metadata}
     codecs = (stream.codec_context for stream in (color, depth))
     color_format, depth_format = (codec.codec_tag.strip("\0 ") or codec.name for codec in codecs)
@@ -258,7 +196,7 @@ def _describe(
         1e6 / float(rate),
         int(delay) / 1000.0,
         tags.get("K4A_DEVICE_SERIAL_NUMBER", ""),
-        extent,
+        None if container.duration is None else float(container.duration),
         color.index,
         depth.index,
     )

@@ -75,10 +75,10 @@ def write_recording(
     calibration: bytes | None,
     tags: dict[str, str],
     fps: int = 30,
-    duration: bool = False,
+    closed: bool = True,
     cluster_us: int = 32_000,
 ) -> bytes:
-    """The bytes of a whole file; `duration` writes the length of the recording into its head."""
+    """The bytes of a whole file; `closed`: its length is in its head, as the last time stamp."""
     head = element(
         0x1A45DFA3,
         element(0x4286, 1) + element(0x42F7, 1) + element(0x42F2, 4) + element(0x42F3, 8)
@@ -86,8 +86,8 @@ def write_recording(
     )  # fmt: skip
     last = max((stamp for track in tracks for stamp, _ in track.frames), default=0)
     info = element(0x2AD7B1, MICROSECONDS) + element(0x4D80, "libmatroska-1.4.9") + element(0x5741, "k4arecord-1.4.1")
-    if duration:
-        info += element(0x4489, struct.pack(">d", last + 1e6 / fps))
+    if closed:
+        info += element(0x4489, struct.pack(">d", last))
     entries, all_tags, blocks = b"", b"", []
     for n, track in enumerate(tracks, start=1):
         uid = 7_000_000_000 + n

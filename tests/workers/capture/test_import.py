@@ -36,7 +36,6 @@ from workers.capture.import_recording import (
     measure_frame,
     pair_frames,
 )
-from workers.capture.recording import Extent
 
 ABOUT = CaptureFile(name="made-up", category="ball")
 COUNT = 3
@@ -147,16 +146,19 @@ def test_each_frame_gets_the_depth_less_than_half_a_period_away():
 
 
 def test_losses_are_counted_from_what_the_file_says_and_told_in_numbers():
-    whole = Extent(1000, 10 * PERIOD)
-    assert count_losses(TEN, 10, 0, PERIOD, whole, 1000) == Losses(0, 0, 0, 0, False)
-    assert count_losses(TEN[:6], 6, 0, PERIOD, whole, 600) == Losses(0, 0, 0, 4, True)
-    assert count_losses(TEN[:6], 6, 0, PERIOD, Extent(1000), 600) == Losses(0, 0, 0, 4, True)
-    assert count_losses(TEN[:6], 5, 0, PERIOD, Extent(), 600) == Losses(0, 1, 0, None, True)
-    assert count_losses(np.delete(TEN, [2, 5]), 8, 1, PERIOD, whole, 1000) == Losses(1, 0, 1, 0, False)
-    assert describe_losses(Losses(0, 0, 0, 0, False)) == []
-    told = "; ".join(describe_losses(Losses(3, 4, 5, 6, True)))
+    end = float(TEN[-1])
+    assert (
+        count_losses(TEN, 10, 0, PERIOD, end)
+        == count_losses(TEN, 10, 0, PERIOD, end + 0.4 * PERIOD)
+        == Losses(0, 0, 0, 0)
+    )
+    assert count_losses(TEN[:6], 6, 0, PERIOD, end) == Losses(0, 0, 0, 4)
+    assert count_losses(TEN[:6], 5, 0, PERIOD, None) == Losses(0, 1, 0, None)
+    assert count_losses(np.delete(TEN, [2, 5]), 8, 1, PERIOD, end) == Losses(1, 0, 1, 0)
+    assert describe_losses(Losses(0, 0, 0, 0)) == []
+    told = "; ".join(describe_losses(Losses(3, 4, 5, 6)))
     assert all(word in told for word in ("about 6 frames", "3 frames are missing", "5 frames are damaged", "4 colour"))
-    assert "nobody knows" in describe_losses(Losses(0, 0, 0, None, True))[0]
+    assert "interrupted and wrote no length: nobody knows" in describe_losses(Losses(0, 0, 0, None))[0]
 
 
 # ------------------------------------- the choice of frames: a camera that moves, stands still, comes back and blurs

@@ -9,11 +9,9 @@ import pytest
 from schemas.errors import CaptureError
 from tests.workers.capture.recordings import (
     TAGS,
-    Track,
     calibration,
     camera_entry,
     color_bytes,
-    element,
     frames,
     recording,
     renamed,
@@ -26,14 +24,12 @@ from workers.capture.recording import (
     COLOR_SIZES,
     DEPTH_MODES,
     FORMATS,
-    Extent,
     decode_color,
     decode_depth,
     decode_gray,
     is_whole,
     open_recording,
     read_calibration,
-    read_extent,
     read_frames,
 )
 from workers.geometry.frames import transform
@@ -100,18 +96,12 @@ def test_what_is_missing_is_named_with_a_remedy(tmp_path):
         open_recording(tmp_path)
 
 
-def test_what_a_file_says_of_its_own_length():
-    track = Track("COLOR", 1280, 720, b"MJPG", [(i * 33_333, bytes(100)) for i in range(10)])
-    data = write_recording([track], b"{}", {})
-    assert read_extent(data) == read_extent(data[: len(data) // 2]) == Extent(len(data), None)
-    assert read_extent(write_recording([track], b"{}", {}, duration=True)).duration_us == pytest.approx(
-        9 * 33_333 + 1e6 / 30
-    )
-    at = data.index(b"\x18\x53\x80\x67") + 4
-    for never_closed in (b"\x01" + b"\xff" * 7, b"\x01" + b"\x00" * 7):  # unknown, or not filled in
-        assert read_extent(data[:at] + never_closed + data[at + 8 :]).size_bytes is None
-    for other in (b"", b"\0" * 50, b"hello", element(0x1A45DFA3, b"x"), b"\x1a\x45\xdf\xa3"):
-        assert read_extent(other) == Extent()
+def test_a_closed_file_says_how_long_it_is_also_where_it_is_cut_and_an_interrupted_one_does_not(tmp_path):
+    last = frames(4)[1][-1][0]
+    for closed, duration_us in ((True, last), (False, None)):
+        data = recording(4, closed=closed)
+        for share in (1.0, 0.6):
+            assert open_recording(saved(tmp_path, data[: int(len(data) * share)])).duration_us == duration_us
 
 
 # ---------------------------------------------------------------------------------------------- images
