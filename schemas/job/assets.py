@@ -319,15 +319,12 @@ class MeshLimits(Frozen):
     max_memory_mb: Annotated[int, Field(ge=1024)] = 2048
     """Most memory for reading an asset, MiB."""
 
-
-FIRST_LIMITS = frozenset({"max_file_mb", "max_vertices", "max_faces", "max_texture_px"})
-"""Limits that are part of every digest; a later one only where it is not at its default, so that older digests hold."""
-
-
-def deciding_limits(limits: Mapping[str, Any]) -> dict[str, Any]:
-    """Of the limits by their names, those that digests cover."""
-    fields = MeshLimits.model_fields
-    return {name: value for name, value in limits.items() if name in FIRST_LIMITS or value != fields[name].default}
+    @model_serializer(mode="wrap")
+    def _leave_out_later(self, dump: Dump) -> dict[str, Any]:
+        """Limits are written, and digested, as they were when there were four, but for those with another value."""
+        first = ("max_file_mb", "max_vertices", "max_faces", "max_texture_px")
+        fields = type(self).model_fields.items()
+        return left_out(dump(self), **{name: field.default for name, field in fields if name not in first})
 
 
 class Assets(Frozen):

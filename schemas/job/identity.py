@@ -7,7 +7,7 @@ import hashlib
 import json
 from typing import Any
 
-from schemas.job.assets import FILES, FORMER, deciding_limits
+from schemas.job.assets import FILES, FORMER
 from schemas.job.job import Job
 
 RUN_KEYS = frozenset({"scenes", "run"})
@@ -43,7 +43,6 @@ def dataset_keys(job: Job) -> dict[str, Any]:
     for source in (*keys["assets"]["objects"], *keys["assets"]["tables"]):
         source.pop("folder", None)
         source["source"] = FORMER if source["source"] == FILES else source["source"]  # as the first datasets have it
-    keys["assets"]["limits"] = deciding_limits(keys["assets"]["limits"])
     if job.captures is not None:
         for unused in ("folders", "simulate", "board") if job.captures.folders else ("folders", "category"):
             del keys["captures"][unused]

@@ -1,18 +1,15 @@
 """Keys that a job sets and that cannot act, because another key switches off what they shape: told, never ignored in silence."""
 
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
 
+from schemas.dataset.layout import SWITCHES, is_stored
 from schemas.job.job import Job
 
 Acts = Callable[[Job], bool]
 
-_COLOUR: tuple[str, Acts] = ("render.rgb is false", lambda job: job.render.rgb)
-_MIRROR: tuple[str, Acts] = ("cameras.mirror.enabled is false", lambda job: job.cameras.mirror.enabled)
-_DEPTH: tuple[str, Acts] = ("cameras.depth.enabled is false", lambda job: job.cameras.depth.enabled)
-_PROJECTION: tuple[str, Acts] = (
-    "images.projection.enabled is false",
-    lambda job: job.images.projection.enabled,
+_COLOUR, _MIRROR, _DEPTH, _PROJECTION = (
+    (f"{SWITCHES[part]} is false", partial(is_stored, part)) for part in ("rgb", "mirror", "aligned", "projected")
 )
 _SEVERAL: tuple[str, Acts] = ("objects_per_scene is 1", lambda job: job.objects_per_scene.high > 1)
 _PILE: tuple[str, Acts] = ("start.arrange is spread", lambda job: job.start.arrange == "pile")

@@ -30,7 +30,6 @@ from schemas.job.assets import (
     ProceduralSource,
     ShapeNetSource,
     SplitShares,
-    deciding_limits,
     instance_id,
 )
 from schemas.scene.shape import Asset
@@ -273,7 +272,6 @@ def _digest(
                 files["refused"] = {category: sorted(numbers) for category, numbers in listing.refused.items()}
         record.append({"settings": plain, "generator": VERSION if listing is None else None, "files": files})
     scalars = assets.model_dump(mode="json", exclude={"objects", "tables"})
-    scalars["limits"] = deciding_limits(scalars["limits"])
     whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": scalars}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
 

@@ -17,7 +17,7 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from workers.assets.external.caps import FolderResolver
 from workers.assets.external.mesh import DEFAULT, MeshVisual, RawMesh
-from workers.assets.external.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled, turn
+from workers.assets.external.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled
 from workers.geometry.frames import half_turn, pose, rotation_about, rotation_between, rotation_from_quaternion
 
 Attributes = Mapping[str, str]
@@ -187,7 +187,7 @@ def _pose(document: _Document, given: Attributes) -> Pose:
         R = np.eye(3)
         angles = unit * document.numbers(given, "euler", "0 0 0")
         for letter, angle in zip(document.compiler.get("eulerseq", "xyz"), angles, strict=False):
-            step = turn("xyz".find(letter.lower()), float(angle))
+            step = rotation_about(np.eye(3)["xyz".find(letter.lower())], float(angle))
             R = R @ step if letter.islower() else step @ R
     elif "axisangle" in given:
         about = document.numbers(given, "axisangle", "0 0 1 0")

@@ -1,7 +1,7 @@
 """Edge: files that pose meshes and simple bodies, parsed with the standard library: their XML, and what of them is seen."""
 
-import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,7 +15,7 @@ from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
 from workers.assets.external.caps import check_nodes
 from workers.assets.external.mesh import DEFAULT
-from workers.geometry.frames import pose
+from workers.geometry.frames import pose, rotation_about
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
 _NAMESPACE = re.compile(rb"\sxmlns=([\"'])[^\"']*\1")
@@ -110,6 +110,21 @@ def make_body(path: Path, kind: str, sizes: Array) -> Part:
     return Part(kind, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
 
 
+def read_body(path: Path, element: ElementTree.Element, size_of: Callable[[str], str | None]) -> Part:
+    """The body of a <box>, <sphere> ..., whose sizes `size_of` tells by their names; MeshError `unreadable`."""
+    sizes = [numbers(path, size_of(name), count, positive=True) for name, count in _SIZES.get(element.tag, ())]
+    return make_body(path, element.tag, np.concatenate(sizes or [np.zeros(0)]))
+
+
+_SIZES = {
+    "box": (("size", 3),),
+    "ellipsoid": (("radii", 3),),
+    "sphere": (("radius", 1),),
+    **dict.fromkeys(("cylinder", "capsule"), (("radius", 1), ("length", 1))),
+}
+"""The sizes of bodies in URDF and SDF, and how many numbers each is."""
+
+
 def scaled(path: Path, scale: Array) -> Pose:
     """[4, 4] of a scale [3] of a mesh; MeshError `no_size` where it is 0."""
     if 0.0 in scale:
@@ -120,16 +135,8 @@ def scaled(path: Path, scale: Array) -> Pose:
 def turned(path: Path, xyz: str, rpy: str, unit: float = 1.0) -> Pose:
     """[4, 4] of a shift, and of roll, pitch and yaw about fixed axes, each times `unit` radians (R = Rz Ry Rx)."""
     roll, pitch, yaw = unit * numbers(path, rpy, 3)
-    return pose(turn(2, yaw) @ turn(1, pitch) @ turn(0, roll), numbers(path, xyz, 3))
-
-
-def turn(axis: int, angle: float) -> Array:
-    """[3, 3] of a turn about x, y or z (0, 1, 2), radians."""
-    a, b = ((1, 2), (2, 0), (0, 1))[axis]
-    R = np.eye(3)
-    R[a, a] = R[b, b] = math.cos(angle)
-    R[a, b], R[b, a] = -math.sin(angle), math.sin(angle)
-    return R
+    x, y, z = np.eye(3)
+    return pose(rotation_about(z, yaw) @ rotation_about(y, pitch) @ rotation_about(x, roll), numbers(path, xyz, 3))
 
 
 def numbers(path: Path, text: str | None, count: int, positive: bool = False) -> Array:

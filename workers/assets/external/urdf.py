@@ -27,7 +27,7 @@ from workers.assets.external.caps import (
 from workers.assets.external.formats import load_shape, with_jpeg
 from workers.assets.external.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
 from workers.assets.external.mjcf import read_mjcf
-from workers.assets.external.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled, turned
+from workers.assets.external.posed import MOST_ABOVE, Model, Visual, numbers, parse_xml, read_body, scaled, turned
 
 
 def find_named(name: str, path: Path, root: Path) -> Path:
@@ -177,12 +177,7 @@ def _geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual:
     for kind in visual.iterfind("geometry/*"):
         if kind.tag == "mesh":
             return Visual(T @ scaled(path, numbers(path, kind.get("scale", "1 1 1"), 3)), kind.get("filename", ""))
-        sizes = (
-            [("size", 3)] if kind.tag == "box" else [("radius", 1), ("length", 1)][: 1 if kind.tag == "sphere" else 2]
-        )
-        known = kind.tag in ("box", "sphere", "cylinder", "capsule")
-        given = [numbers(path, kind.get(name), count, positive=True) for name, count in sizes if known]
-        return Visual(T, body=make_body(path, kind.tag, np.concatenate(given or [np.zeros(0)])))
+        return Visual(T, body=read_body(path, kind, kind.get))
     raise MeshError("unreadable", f"{path} has a visual without geometry")
 
 
@@ -190,11 +185,6 @@ def _origin(path: Path, element: ElementTree.Element) -> Pose:
     """[4, 4] of an <origin>."""
     origin = element.find("origin")
     return np.eye(4) if origin is None else turned(path, origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0"))
-
-
-_SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
-_SIZES |= {"ellipsoid": ("radii",)}
-"""The sizes of SDF's bodies."""
 
 
 def read_sdf(path: Path, limits: MeshLimits) -> Model:
@@ -234,14 +224,7 @@ def _sdf_geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual | 
         if kind.tag == "mesh":
             scale = scaled(path, numbers(path, kind.findtext("scale", "1 1 1"), 3))
             return Visual(T @ scale, (kind.findtext("uri") or "").strip())
-        if kind.tag in _SIZES:
-            given = (kind.findtext(name) or "" for name in _SIZES[kind.tag])
-            sizes = np.concatenate(
-                [numbers(path, text, 3 if kind.tag in ("box", "ellipsoid") else 1, True) for text in given]
-            )
-            return Visual(T, body=make_body(path, kind.tag, sizes))
-        if kind.tag not in ("plane", "empty"):
-            raise MeshError("unreadable", f"{path}: geometry <{kind.tag:.40}> is not known")
+        return None if kind.tag in ("plane", "empty") else Visual(T, body=read_body(path, kind, kind.findtext))
     return None
 
 
