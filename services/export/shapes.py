@@ -89,7 +89,7 @@ class Shapes:
 
 
 def _part(name: str, mesh: trimesh.Trimesh) -> Part:
-    visual, _ = read_visual(mesh, linear=True)
+    visual = read_visual(mesh, [], linear=True)
     faces = np.asarray(mesh.faces, dtype=np.int32)
     normals = np.asarray(mesh.vertex_normals, dtype=np.float64)
     vertices = np.asarray(mesh.vertices, dtype=np.float64)

@@ -72,7 +72,7 @@ def test_the_reconstructed_object_stands_at_the_middle_of_its_box_and_reads_back
     scene = trimesh.load_scene(io.BytesIO(asset_glb(asset)), file_type="glb", process=False)
     (mesh,) = scene.geometry.values()
     np.testing.assert_allclose(mesh.extents, [0.1, 0.2, 0.3], atol=1e-7)
-    assert {tuple(color) for color in read_visual(mesh, linear=True)[0].colors.tolist()} == {(200, 10, 20, 255)}
+    assert {tuple(color) for color in read_visual(mesh, [], linear=True).colors.tolist()} == {(200, 10, 20, 255)}
 
 
 def test_a_board_has_its_true_size_and_a_name_that_tells_it_from_others():

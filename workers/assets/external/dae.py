@@ -232,24 +232,23 @@ class _Effect:
         """The material, and the name of its picture's coordinates."""
         notes, diffuse = self.file.resolver.notes, self.given.get("diffuse")
         emission = self.color("emission")
-        emits = emission is not None and emission[:3].max() > 0.0
+        emits = self.has_picture("emission") or (emission is not None and emission[:3].max() > 0.0)
         picture, coordinates = self.picture("diffuse")
         color = np.ones(4) if picture is not None else self.color("diffuse")
-        if picture is None and (color is None or color[:3].max() == 0.0) and (emits or self.has_picture("emission")):
+        if picture is None and (color is None or color[:3].max() == 0.0) and emits:
             picture, coordinates = self.picture("emission")
             color = np.ones(4) if picture is not None or emission is None else emission
             notes.append("emission is drawn as a plain colour")
-        elif emits or self.has_picture("emission"):
-            notes.append("not drawn: emission")
+            emits = False
         if color is None:
             color = np.ones(4) if diffuse is not None else np.array(DEFAULT.base_color)
         alpha, picture = self.opacity(picture)
         shine = self.number("shininess")
-        left_out = [name for name in ("specular", "reflective") if self.has_picture(name)]
+        left_out = ["emission"] if emits else []
+        left_out += [name for name in ("specular", "reflective") if self.has_picture(name)]
         left_out += ["bump"] if self.common.find(".//bump") is not None else []
-        material, more = make_material(np.append(color[:3], alpha), 0.0, roughness_of(shine), picture)
-        notes += [*more, *([f"not drawn: {', '.join(left_out)}"] if left_out else [])]
-        return material, coordinates
+        color = np.append(color[:3], alpha)
+        return make_material(color, 0.0, roughness_of(shine), picture, notes, left_out), coordinates
 
     def opacity(self, picture: NDArray[np.uint8] | None) -> tuple[float, NDArray[np.uint8] | None]:
         """Alpha, and the picture with what `transparent` says of it: its own alpha means nothing otherwise."""

@@ -86,11 +86,12 @@ class Materials:
         linear, picture, emits = self._emission(source, linear, picture)
         color = np.append(encode_srgb(np.clip(linear[:3], 0.0, 1.0)), linear[3])
         color[3], picture = self._alpha(source, float(color[3]), picture)
-        material, notes = make_material(color, metallic, roughness, picture)
+        notes = self._resolver.notes
+        material = make_material(color, metallic, roughness, picture, notes, _left_out(source, emits))
+        notes += ["emission is drawn as a plain colour"] * emits
         reference = (source.get("emissiveTexture") if emits else reference) or {}
         more = reference.get("extensions", {}).get(TRANSFORM, {})
         sampler = self._sampler(reference)
-        self._resolver.notes += [*notes, *_left_out(source, emits)]
         return Look(
             material,
             f"TEXCOORD_{int(more.get('texCoord', reference.get('texCoord', 0)))}",
@@ -255,10 +256,8 @@ _PLAIN_MAPS = ("normalTexture", "occlusionTexture")
 
 
 def _left_out(source: Tree, emits: bool) -> list[str]:
-    """A note on what of a material is not drawn, or none."""
+    """What of a material is not drawn."""
     found = [name for name in _PLAIN_MAPS if name in source]
     lit = max(_factor(source.get("emissiveFactor", (0.0, 0.0, 0.0)), 3)) > 0.0
     found += ["emission"] if lit and not emits else []
-    found += sorted(name for name in source.get("extensions", {}) if name not in (GLOSS, STRENGTH))
-    notes = [f"not drawn: {', '.join(found)}"] if found else []
-    return notes + (["emission is drawn as a plain colour"] if emits else [])
+    return found + sorted(name for name in source.get("extensions", {}) if name not in (GLOSS, STRENGTH))

@@ -207,18 +207,27 @@ class RawMesh:
 
 
 def make_material(
-    color: Array, metallic: float, roughness: float, texture: NDArray[np.uint8] | None
-) -> tuple[Material, tuple[str, ...]]:
-    """A material that can be drawn, from a file's colour [4] (sRGB and alpha) and numbers, which may be anything; and notes."""
-    notes: tuple[str, ...] = ()
+    color: Array,
+    metallic: float,
+    roughness: float,
+    texture: NDArray[np.uint8] | None,
+    notes: list[str],
+    left_out: Sequence[str] = (),
+) -> Material:
+    """A material that can be drawn, from a file's colour [4] (sRGB and alpha) and numbers, which may be anything.
+
+    What was changed is noted, and what is `left_out` of it.
+    """
     if color[3] < MIN_ALPHA:
         color[3] = 1.0
-        notes = ("an alpha of 0 was read as 1",)
+        notes.append("an alpha of 0 was read as 1")
+    if left_out:
+        notes.append(f"not drawn: {', '.join(left_out)}")
     if texture is not None and color[:3].max() < MIN_TINT:
         color[:3] = 1.0
     red, green, blue, alpha = (float(c) for c in np.clip(np.nan_to_num(color, nan=0.7), 0.0, 1.0))
     metallic, roughness = (float(np.clip(np.nan_to_num(value, nan=0.6), 0.0, 1.0)) for value in (metallic, roughness))
-    return Material((red, green, blue, alpha), metallic, roughness, texture), notes
+    return Material((red, green, blue, alpha), metallic, roughness, texture)
 
 
 def roughness_of(exponent: float | None) -> float:

@@ -320,10 +320,9 @@ def _material(stated: dict[str, str], resolver: FolderResolver) -> Material:
     roughness = float(rough[0]) if rough is not None else roughness_of(None if shine is None else float(shine[0]))
     # `Tr` is ignored, because half of the exporters write it inverted.
     color = np.append(rgb, 1.0 if alpha is None else alpha[0])
-    material, notes = make_material(color, 0.0 if metallic is None else float(metallic[0]), roughness, picture)
+    metal = 0.0 if metallic is None else float(metallic[0])
     left_out = [name for name in _NOT_DRAWN if name in stated]
-    resolver.notes += [*notes, *([f"not drawn: {', '.join(left_out)}"] if left_out else [])]
-    return material
+    return make_material(color, metal, roughness, picture, resolver.notes, left_out)
 
 
 def _picture(words: str | None, resolver: FolderResolver) -> NDArray[np.uint8] | None:

@@ -9,8 +9,6 @@ import io
 import re
 import struct
 import warnings
-from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from trimesh.visual import ColorVisuals
-from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from schemas.base import Array
 from schemas.errors import MeshError
@@ -35,7 +33,6 @@ from workers.assets.external.mesh import (
     cut_polygons,
     cut_strip,
     make_material,
-    roughness_of,
 )
 from workers.geometry.colour import encode_srgb
 
@@ -78,8 +75,7 @@ def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
         PlyParseError,
         UnicodeDecodeError,
     ):  # a strict reader: trimesh takes lines that are too long, and strange heads
-        meshes = read_plain(path, data, resolver)
-        return [replace(mesh, visual=_as_it_is(mesh.visual)) for mesh in meshes]
+        return read_plain(path, data, resolver)
     try:
         vertices, faces = elements["vertex"], elements.get("face", elements.get("faces"))
         points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
@@ -94,12 +90,6 @@ def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
         return _meshes(named_by_ply(path, data), vertices, points, faces, corners, face, resolver)
     except (KeyError, ValueError, TypeError, IndexError, StopIteration) as error:
         raise unreadable(path, error) from error
-
-
-def _as_it_is(visual: MeshVisual) -> MeshVisual:
-    """The look without the colour of 0.4 by which trimesh multiplies a picture."""
-    plain = visual.material.texture is not None
-    return replace(visual, material=replace(visual.material, base_color=WHITE.base_color)) if plain else visual
 
 
 def _parse(path: Path) -> list[PlyElement]:
@@ -203,7 +193,7 @@ def _colors(element: PlyElement) -> NDArray[np.uint8] | None:
 def _picture(name: str, resolver: FolderResolver) -> Material:
     """The material of a picture: as it is, or the neutral grey where it cannot be had."""
     picture = resolver.picture(name)
-    return DEFAULT if picture is None else make_material(np.ones(4), 0.0, _ROUGHNESS, picture)[0]
+    return DEFAULT if picture is None else make_material(np.ones(4), 0.0, _ROUGHNESS, picture, resolver.notes)
 
 
 def count_stl(data: bytes) -> tuple[int, int]:
@@ -240,8 +230,7 @@ def read_plain(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMes
         matrix, name = scene.graph[node]
         mesh = scene.geometry[name]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            visual, notes = read_visual(mesh)
-            resolver.notes += notes
+            visual = read_visual(mesh, resolver.notes)
             stated = "vertex_normals" in mesh._cache.cache  # trimesh would compute them
             normals = np.asarray(mesh.vertex_normals, dtype=np.float64) if stated else None
             faces = np.asarray(mesh.faces, dtype=np.int64)
@@ -249,21 +238,20 @@ def read_plain(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMes
     return meshes
 
 
-def read_visual(mesh: trimesh.Trimesh, linear: bool = False) -> tuple[MeshVisual, tuple[str, ...]]:
-    """The material and colours of one trimesh geometry, and notes. `linear`: its colours are linear, as those of a stored GLB."""
+def read_visual(mesh: trimesh.Trimesh, notes: list[str], linear: bool = False) -> MeshVisual:
+    """The material and colours of one trimesh geometry. `linear`: its colours are linear, as those of a stored GLB."""
     visual: Any = mesh.visual
     if visual.kind == "texture":
         uv = getattr(visual, "uv", None)
         usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2) and bool(np.isfinite(uv).all())
-        material, notes = _trimesh_material(visual.material, textured=usable)
+        material = _trimesh_material(visual.material, usable, notes)
         colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices), linear)
-        return MeshVisual(material, np.asarray(uv, dtype=np.float64) if usable else None, colors), notes
+        return MeshVisual(material, np.asarray(uv, dtype=np.float64) if usable else None, colors)
     if visual.kind == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
-        colors = _attribute_colors(np.asarray(visual.vertex_colors), len(mesh.vertices), linear)
-        return MeshVisual(WHITE, colors=colors), ()
+        return MeshVisual(WHITE, colors=_attribute_colors(np.asarray(visual.vertex_colors), len(mesh.vertices), linear))
     if visual.kind == "face" and len(visual.face_colors) == len(mesh.faces):
-        return MeshVisual(WHITE, face_colors=np.asarray(visual.face_colors, dtype=np.uint8)), ()
-    return MeshVisual(DEFAULT), ()
+        return MeshVisual(WHITE, face_colors=np.asarray(visual.face_colors, dtype=np.uint8))
+    return MeshVisual(DEFAULT)
 
 
 def show_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -294,25 +282,15 @@ def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArr
     return np.round(255.0 * share).astype(np.uint8)
 
 
-def _trimesh_material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]]:
+def _trimesh_material(source: object, textured: bool, notes: list[str]) -> Material:
     """A material of trimesh's; the picture only where the mesh has coordinates for it."""
-    if isinstance(source, MultiMaterial):
-        source = source.materials[0] if source.materials else None
     if isinstance(source, PBRMaterial):
-        image, factor = source.baseColorTexture, np.ones(4)
-        if source.baseColorFactor is not None:
-            factor = np.asarray(source.baseColorFactor) / 255.0
-        color = np.append(encode_srgb(factor[:3]), factor[3])
+        factor = np.ones(4) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
+        image, color = source.baseColorTexture, np.append(encode_srgb(factor[:3]), factor[3])
         metallic, roughness = (1.0 if x is None else float(x) for x in (source.metallicFactor, source.roughnessFactor))
-    elif isinstance(source, SimpleMaterial):
-        image, color = source.image, np.asarray(source.diffuse, dtype=np.float64) / 255.0
-        # `Tr` is ignored, because half of the exporters write it inverted.
-        with suppress(KeyError, IndexError, TypeError, ValueError):
-            color[3] = float(source.kwargs["d"][0])
-        metallic, roughness = 0.0, roughness_of(source.glossiness)
+    elif isinstance(source, SimpleMaterial) and source.image is not None:
+        image, color, metallic, roughness = source.image, np.ones(4), 0.0, _ROUGHNESS  # its own colour darkens by 0.4
     else:
-        return DEFAULT, ()
-    notes: list[str] = []
+        return DEFAULT
     texture = decode_picture(image, notes) if textured and image is not None else None
-    material, more = make_material(color, metallic, roughness, texture)
-    return material, (*notes, *more)
+    return make_material(color, metallic, roughness, texture, notes)
