@@ -27,11 +27,15 @@ from workers.shard.fingerprint import take_fingerprint
 
 HEALTHY = {
     "defaults": {},
-    "several": {"objects_per_scene": 3, "pairs_per_scene": 2},
+    "several": {
+        "objects_per_scene": 3,
+        "pairs_per_scene": 2,
+        "cameras": {"mirror": {"T_z_m": 1.1, "pivot_depth": "nearest"}},
+    },
     "median, tar": {"cameras": {"mirror": {"pivot_depth": "median"}}, "output": {"layout": "tar"}},
     "no mirror": {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}},
     "no colour": {"cameras": {"depth": {"enabled": False}}, "render": {"rgb": False}},
-    "noise": {"sensor": {"depth_noise": {}, "distortion": {"k1": -0.1}}},
+    "noise": {"sensor": {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}},
     "splat": {"images": {"projection": {"splat": 3}}},
 }
 

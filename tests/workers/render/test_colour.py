@@ -285,32 +285,6 @@ def test_an_effect_that_is_withdrawn_changes_colour_and_no_label(renderer, tier)
     assert changed == set(WITHDRAWN[tier])
 
 
-def scenes(count: int):
-    """Things and two views each, of 640 x 480 pixels: random shapes, and the built-in ones with their textures."""
-    for seed in range(count):
-        rng = np.random.default_rng(2_000 + seed)
-        things, height = procedural_things(rng) if seed % 2 else random_things(rng)
-        yield things, orbit_and_mirror(rng, height)
-
-
-@pytest.mark.parametrize(
-    ("tier", "count"),
-    [
-        *(("flat", 2), ("raster", 2), pytest.param("four samples", 4, marks=pytest.mark.minute)),
-        *(pytest.param(tier, 14, marks=pytest.mark.slow) for tier in ("flat", "raster")),
-    ],
-)
-def test_forcing_a_pass_changes_no_byte(renderer, tier, count):
-    """Each of the no-ops that the renderer knows of."""
-    for things, two in scenes(count):
-        for view in two:
-            plain = renderer.draw(things, APPEARANCE, view, *TIERS[tier])
-            for name in ("floor", "light_maps", "table", "textures", "transparency"):
-                again = renderer.draw(things, APPEARANCE, view, *forcing(TIERS[tier], name))
-                assert labels_of(plain) == labels_of(again), name
-                assert plain.rgb.tobytes() == again.rgb.tobytes(), name
-
-
 def counted(name: str):
     """A method of the light maps that does its work and counts its calls."""
     return mock.patch.object(LightMaps, name, autospec=True, side_effect=getattr(LightMaps, name))
@@ -318,8 +292,9 @@ def counted(name: str):
 
 def work(renderer, look: Look) -> Counter[str]:
     """What one view of a scene without textures takes: passes, maps, and draw calls by kind."""
-    things, (view, _) = next(scenes(1))
-    done = Counter[str]()
+    rng = np.random.default_rng(2_000)
+    things, height = random_things(rng)
+    view, done = orbit_and_mirror(rng, height)[0], Counter[str]()
 
     def sort(*args):
         sorted_draws = sort_draws(*args)

@@ -9,8 +9,6 @@ import pytest
 from schemas.job.views import DepthNoise, Distortion, Exposure, Images, RgbNoise, SensorEffects
 from schemas.scene.scene import EffectPlan
 from schemas.scene.view import Camera, Intrinsics, View
-from services.read.query import query
-from tests.datasets import faults_of, make_dataset
 from workers.geometry.colour import decode_codes as decode
 from workers.geometry.colour import encode_codes as encode
 from workers.scene.sensor import (
@@ -237,10 +235,3 @@ def test_an_effect_runs_because_the_plan_has_it_and_changes_what_its_number_says
     assert np.array_equal(seen.depth, exact.depth)
     assert np.abs(decode(seen.rgb) - np.minimum(2.0 * decode(exact.rgb), 1.0)).max() < 0.006
     assert sensed((), exact) is exact
-
-
-def test_a_dataset_with_every_effect_on_verifies_and_says_what_ran(tmp_path):
-    store, _ = make_dataset(tmp_path, scenes=1, sensor=EVERY)
-    assert faults_of(store) == []
-    for row in query(store, "select * from scenes").to_pylist():
-        assert set(NAMES) <= set(row["effects"])
