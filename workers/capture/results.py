@@ -8,16 +8,18 @@ A file that process.json does not name, or that has other bytes, is the user's: 
 """
 
 import hashlib
+import io
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyParseError
 
 from schemas.base import Array
 from schemas.capture import CaptureListing
@@ -29,17 +31,10 @@ from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, TRUTH
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
-_PLACE, _NORMAL, _COLOR = ("place", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)
-_CLOUD = np.dtype([_PLACE, _NORMAL, _COLOR, ("views", "<u2")])
-_VERTEX = np.dtype([_PLACE, _COLOR])
-_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-_PROPERTIES = {
-    "place": ("float x", "float y", "float z"),
-    "normal": ("float nx", "float ny", "float nz"),
-    "color": ("uchar red", "uchar green", "uchar blue"),
-    "views": ("ushort views",),
-}
-"""Of a PLY file, for each field of a vertex."""
+_PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+_CLOUD = np.dtype([*((name, "<f4") for name in _PLACE + _NORMAL), *((name, "u1") for name in _COLOR), ("views", "<u2")])
+_VERTEX = np.dtype([*((name, "<f4") for name in _PLACE), *((name, "u1") for name in _COLOR)])
+_FACE = np.dtype([("vertex_indices", "<i4", (3,))])
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
@@ -82,57 +77,53 @@ def write_results(path: Path, files: Mapping[str, bytes], record: Mapping[str, A
 
 def cloud_ply(points: Array, normals: Array, colors: NDArray[np.uint8], views: NDArray) -> bytes:
     """A binary PLY of points [N, 3] with normals, colours and numbers of views."""
-    rows = np.zeros(len(points), _CLOUD)
-    rows["place"], rows["normal"], rows["color"] = points, normals, colors
-    rows["views"] = np.minimum(views, 65_535)
-    return _head(rows) + rows.tobytes()
+    return _ply(_CLOUD, *points.T, *normals.T, *colors.T, np.minimum(views, 65_535))
 
 
 def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
     """A binary PLY of a mesh with coloured vertices."""
-    rows, triangles = np.zeros(len(vertices), _VERTEX), np.zeros(len(faces), _FACE)
-    rows["place"], rows["color"] = vertices, colors
-    triangles["count"], triangles["corners"] = 3, faces
-    return _head(rows, len(faces)) + rows.tobytes() + triangles.tobytes()
+    triangles = np.empty(len(faces), _FACE)
+    triangles["vertex_indices"] = faces
+    return _ply(_VERTEX, *vertices.T, *colors.T, faces=triangles)
+
+
+def _ply(kind: np.dtype, *columns: NDArray, faces: NDArray | None = None) -> bytes:
+    rows, stream = np.empty(len(columns[0]), kind), io.BytesIO()
+    for name, column in zip(kind.names or (), columns, strict=True):
+        rows[name] = column
+    elements = [PlyElement.describe(rows, "vertex"), *([] if faces is None else [PlyElement.describe(faces, "face")])]
+    PlyData(elements, byte_order="<", comments=["board frame, metres"]).write(stream)
+    return stream.getvalue()
 
 
 def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
     """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
-    rows, _ = _read_ply(path / CLOUD_FILE, _CLOUD)
-    places, normals = rows["place"].astype(np.float64), rows["normal"].astype(np.float64)
-    return places, normals, rows["color"].copy(), rows["views"].astype(np.int32)
+    rows = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"].data
+    places, normals = (_columns(rows, names).astype(np.float64) for names in (_PLACE, _NORMAL))
+    return places, normals, _columns(rows, _COLOR), rows["views"].astype(np.int32)
 
 
 def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
     """(vertices, faces, colours) of mesh.ply. Raises CaptureError where it is not there or another's."""
-    rows, triangles = _read_ply(path / MESH_FILE, _VERTEX)
-    return rows["place"].astype(np.float64), triangles["corners"].astype(np.int32), rows["color"].copy()
+    found = _read_ply(path / MESH_FILE, _VERTEX)
+    rows, faces = found["vertex"].data, found["face"].data["vertex_indices"]
+    return _columns(rows, _PLACE).astype(np.float64), faces.astype(np.int32), _columns(rows, _COLOR)
 
 
-def _head(rows: NDArray, faces: int | None = None) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", "comment board frame, metres", f"element vertex {len(rows)}"]
-    lines += [f"property {one}" for name in rows.dtype.names or () for one in _PROPERTIES[name]]
-    if faces is not None:
-        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
-    return "\n".join([*lines, "end_header", ""]).encode()
+def _columns(rows: NDArray, names: Sequence[str]) -> NDArray:
+    return np.stack([rows[name] for name in names], axis=1)
 
 
-def _read_ply(file: Path, vertex: np.dtype) -> tuple[NDArray, NDArray]:
-    """(vertices, triangles) of a file that `_head` begins."""
+def _read_ply(file: Path, kind: np.dtype) -> PlyData:
     try:
-        body = file.read_bytes()
+        found = PlyData.read(str(file), known_list_len={"face": {"vertex_indices": 3}})
+        if found["vertex"].data.dtype.names == kind.names:
+            return found
     except FileNotFoundError:
         raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`") from None
-    head, end, data = body.partition(b"end_header\n")
-    words = [line.split() for line in head.decode(errors="replace").splitlines()]
-    counts = {line[1]: int(line[2]) for line in words if line[:1] == ["element"] and line[2].isdigit()}
-    if not end or "vertex" not in counts:
-        raise CaptureError("unreadable", f"{file} is no PLY that `verso capture process` wrote: delete it")
-    vertices, faces = counts["vertex"], counts.get("face", 0)
-    if len(data) < vertices * vertex.itemsize + faces * _FACE.itemsize:
-        raise CaptureError("unreadable", f"{file} ends early: delete it, and process the capture again")
-    rows = np.frombuffer(data, vertex, vertices)
-    return rows, np.frombuffer(data, _FACE, faces, vertices * vertex.itemsize)
+    except (PlyParseError, UnicodeDecodeError, KeyError, ValueError):
+        pass
+    raise CaptureError("unreadable", f"{file} is not what `verso capture process` wrote, or ends early: delete it")
 
 
 def _digest_of(file: Path) -> str | None:

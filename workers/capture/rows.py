@@ -18,7 +18,6 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABL
 from schemas.scene.view import Camera, Pair, Role, View
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
-from workers.geometry.jit import compiled
 from workers.geometry.pixels import quantise_depth
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import CountPixels, derive_projected, label_things, projection_shares
@@ -33,38 +32,19 @@ def capture_regions(camera: Camera, board: Board, mask: NDArray[np.bool_]) -> ND
     The camera's pose is in the board frame, so the board is the rectangle z = 0 about the origin, at the print's true
     size. Nothing means neither board nor object: what stands beside the board may have depth there.
     """
-    k = camera.intrinsics
+    k, T = camera.intrinsics, camera.T_world_cam
     half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
-    on_board = _meets_rectangle((k.height, k.width), (k.cx, k.cy, k.fx, k.fy), camera.T_world_cam, half[0], half[1])
+    x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
+    y = ((np.arange(k.height) + 0.5 - k.cy) / k.fy)[:, None]
+    rays = [T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] for axis in range(3)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = -T[2, 3] / rays[2]
+        on_board = (T[2, 3] > 0.0) & (rays[2] < 0.0)  # from above
+        for axis in (0, 1):
+            on_board &= np.abs(T[axis, 3] + z * rays[axis]) <= half[axis]
     region = np.where(on_board, np.uint8(REGION_TABLE), np.uint8(REGION_NOTHING))
     region[mask] = REGION_FIRST_OBJECT
     return region
-
-
-@compiled
-def _meets_rectangle(
-    shape: tuple[int, int],
-    k: tuple[float, float, float, float],
-    T: NDArray[np.float64],
-    half_x: float,
-    half_y: float,
-) -> NDArray[np.bool_]:
-    """[H, W] bool: whether the ray goes from above onto the rectangle |x| <= half_x, |y| <= half_y at z = 0."""
-    meets = np.zeros(shape, np.bool_)
-    if not T[2, 3] > 0.0:
-        return meets
-    for row in range(shape[0]):
-        ray_y = (row + 0.5 - k[1]) / k[3]
-        for column in range(shape[1]):
-            ray_x = (column + 0.5 - k[0]) / k[2]
-            down = T[2, 0] * ray_x + T[2, 1] * ray_y + T[2, 2]
-            if not down < 0.0:
-                continue
-            z = -T[2, 3] / down
-            x = T[0, 3] + z * (T[0, 0] * ray_x + T[0, 1] * ray_y + T[0, 2])
-            y = T[1, 3] + z * (T[1, 0] * ray_x + T[1, 1] * ray_y + T[1, 2])
-            meets[row, column] = abs(x) <= half_x and abs(y) <= half_y
-    return meets
 
 
 Synthesize = Callable[[Camera], SynthesizedView]

@@ -243,7 +243,7 @@ def test_results_that_are_missing_or_damaged_are_refused(tmp_path):
 
     refused_cloud("verso capture process")
     (tmp_path / "cloud.ply").write_bytes(b"ply nonsense")
-    refused_cloud("no PLY that")
+    refused_cloud("is not what `verso capture process` wrote")
     (tmp_path / "cloud.ply").write_bytes(cloud_ply(POINTS, NORMALS, COLORS, VIEWS)[:-1])
     refused_cloud("ends early")
     assert read_record(tmp_path) is None
