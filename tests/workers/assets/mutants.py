@@ -15,7 +15,7 @@ from PIL import Image
 
 from tests.mutations import mutated_bytes, mutated_tree, places
 from tests.workers.assets.oracles import CUBE, Files, glb, gltf, picture, textured_obj
-from tests.workers.assets.test_statements import SHOWN, dae
+from tests.workers.assets.test_statements import SHOWN, dae, off
 
 Change = Callable[[random.Random, bytes], bytes]
 
@@ -115,6 +115,7 @@ CHANGES: Mapping[str, tuple[Change, ...]] = {
     "urdf": (repeat, nest, nest, number, number, number, name),
     "ply": (word, word, repeat, number, number, name),
     "stl": (word, word, word, repeat, number),
+    "off": (repeat, number, number),
     "dae": (repeat, nest, number, number, number, name),
     "glb": (word, tree, tree, tree, tree, nest),
     "gltf": (tree, tree, tree, tree, nest, number, name),
@@ -198,6 +199,7 @@ SEEDS: Mapping[str, Files] = {
     "ply": {"a.ply": exported(BOX, "ply", encoding="ascii").replace(b"element vertex", _NAMED, 1), **_SKIN},
     "ply_binary": {"a.ply": exported(coloured_box(), "ply")},
     "stl": {"a.stl": exported(BOX, "stl")},
+    "off": off("COFF", " 255 0 0 255"),
     "stl_ascii": {"a.stl": exported(BOX, "stl_ascii")},
     "glb": {"a.glb": exported(textured_scene(), "glb")},
     "gltf": {**_named_a(gltf()), **_SKIN},

@@ -101,6 +101,12 @@ HOSTILE = {
     "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nv 2 1e-5 0\nf 1 2 3\nf 1 3 4\n", "no_hull", "four points apart"),
     "texture.ply": (PLY, "no_hull", "four points apart"),
     "huge.ply": (HUGE_PLY, "unreadable", "promises 4000000000 elements"),
+    # OFF
+    "short.off": ("OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "unreadable", "1 of 2 faces"),
+    "index.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "index_out_of_range", "a face names"),
+    "negative.off": ("OFF\n-3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "unreadable", ""),
+    "huge.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n99999999999 0 1 2\n", "unreadable", ""),
+    "words.off": ("OFF\n3 1 0\n0 0 x\n1 0 0\n0 1 0\n3 0 1 2\n", "unreadable", ""),
     # COLLADA
     "entities.dae": ("<!DOCTYPE x><COLLADA/>", "unreadable", "document type or entities"),
     "other.dae": ("<x/>", "unreadable", "its root is <x>"),

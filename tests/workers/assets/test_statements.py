@@ -260,6 +260,13 @@ def filled_up(data):
     return data[:8] + struct.pack("<II", 20 + len(text) + len(rest), len(text)) + data[16:20] + text + rest
 
 
+def off(head="OFF", more="", behind=""):
+    """The cube as OFF, with more behind its vertices and faces."""
+    points = [f"{x:g} {y:g} {z:g}{more}" for x, y, z in CORNERS]
+    faces = [f"4 {' '.join(map(str, side))}{behind}" for side in SIDES]
+    return {"a.off": "\n".join([head, "# a remark", "8 6 12", "", *points, *faces]).encode()}
+
+
 def stl(behind=b"", colour=b""):
     cube = trimesh.creation.box((0.2, 0.2, 0.2))
     data = trimesh.exchange.stl.export_stl(cube)
@@ -596,7 +603,18 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "dae spline": (dae(shapes='<geometry id="g"><spline/></geometry>'), "no mesh"),
     "dae in another file": (dae(node='<instance_geometry url="b.dae#g"/>'), "b.dae#g"),
     # STL and OFF
-    "off": ({"a.off": trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="off").encode()}, Right((GREY,))),
+    "off": (off(), Right((GREY,))),
+    "off of trimesh": (
+        {"a.off": trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="off").encode()},
+        Right((GREY,)),
+    ),
+    "off without its word": (off(head=""), Right((GREY,))),
+    "off colours of vertices": (off("COFF", " 200 150 100 255"), Right()),
+    "off colours as shares behind normals": (off("CNOFF", " 0 0 1 1.0 0 0 1"), Right(((255, 0, 0),))),
+    "off colours of faces": (off(behind=" 200 150 100"), Right()),
+    "off colours of a map": (off(behind=" 3"), Right((GREY,), note="colours of a map")),
+    "off in four dimensions": (off("4OFF", " 1"), "three dimensions"),
+    "off in binary": (off("OFF BINARY"), "three dimensions"),
     "stl": (stl(), Right((GREY,))),
     "stl with bytes behind": (stl(b"\0\0"), Right((GREY,))),
     "stl with a colour in its head": (stl(colour=b"COLOR=\xff\0\0\xff"), Right((GREY,))),
@@ -662,6 +680,16 @@ def test_what_a_file_states_is_obeyed_or_named(tmp_path):
     assert not found, "\n".join(f"{name}: {told}" for name, told in found.items())
 
 
+def polygon(corners):
+    """A shape of COLLADA with one face."""
+    points = (
+        array("p", [(x, 0.5, y) for x, y in corners])
+        + '<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>'
+    )
+    face = '<polygons><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2 3 4 5</p></polygons>'
+    return f'<geometry id="g"><mesh>{points}{face}</mesh></geometry>'
+
+
 PLY_OF_SIX = (
     "ply\nformat ascii 1.0\nelement vertex 6\nproperty float x\nproperty float y\nproperty float z\n"
     "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -676,7 +704,13 @@ def test_concave_polygons_are_cut_along_their_inside(tmp_path):
             corners = (ring[turn:] + ring[:turn])[::way]
             text = "".join(f"v {x} 0.5 {y}\n" for x, y in corners) + "f 1 2 3 4 5 6\n"
             points = "".join(f"{x} 0.5 {y}\n" for x, y in corners)
-            for name, data in (("a.obj", text), ("a.ply", PLY_OF_SIX + points + "6 0 1 2 3 4 5\n")):
+            drawn = "6 0 1 2 3 4 5\n"
+            for name, data in (
+                ("a.obj", text),
+                ("a.ply", PLY_OF_SIX + points + drawn),
+                ("a.off", "OFF\n6 1 6\n" + points + drawn),
+                ("a.dae", dae(shapes=polygon(corners))["a.dae"].decode()),
+            ):
                 shape = load_shape(write_all(tmp_path, {name: data.encode()}), MeshLimits()).shape
                 mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
                 assert mesh.area == pytest.approx(3.0) and len(shape.faces) == 4

@@ -30,7 +30,7 @@ from workers.assets.external.mesh import (
     MeshVisual,
     RawMesh,
     check_indices,
-    cut_polygons,
+    cut_faces,
     cut_strip,
     index_corners,
     make_material,
@@ -377,15 +377,7 @@ def _corners(path: Path, primitive: Element, width: int, offset: int, points: Ar
         counts = np.array((primitive.findtext("vcount") or "").split(), dtype=np.int64)
     elif primitive.tag != "polygons":
         raise MeshError("format", f"{path} has <{primitive.tag:.40}>, which is not read: export it as triangles")
-    whole, starts = np.concatenate(runs), np.cumsum([0, *counts])[:-1]
+    whole = np.concatenate(runs)
     if counts.min(initial=0) < 0 or counts.sum() > len(whole):
         raise ValueError(f"polygons of {counts.sum()} corners among {len(whole)}")
-    made, owners = [np.zeros((0, 3, width), np.int64)], [np.zeros(0, np.int64)]
-    for size in np.unique(counts[counts > 2]).tolist():
-        which = np.flatnonzero(counts == size)
-        polygons = whole[starts[which][:, None] + np.arange(size)]
-        check_indices(path, polygons[..., offset], len(points))
-        triangles = cut_polygons(points[polygons[..., offset]])
-        made.append(polygons[np.arange(len(which))[:, None, None], triangles].reshape(-1, 3, width))
-        owners.append(np.repeat(which, size - 2))
-    return np.concatenate(made)[np.argsort(np.concatenate(owners), kind="stable")]
+    return whole[cut_faces(path, whole[:, offset], counts, points)[0]]

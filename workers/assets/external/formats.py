@@ -41,7 +41,7 @@ FORMATS: Mapping[str, Format] = {
     ".obj": Format(named_by_obj, read_obj, count_obj),
     ".ply": Format(plain.named_by_ply, plain.read_ply, plain.count_ply),
     ".msh": Format(lambda *_: [], read_msh, count_msh),
-    ".off": Format(lambda *_: [], plain.read_plain),
+    ".off": Format(lambda *_: [], plain.read_off),
     ".stl": Format(lambda *_: [], plain.read_plain, plain.count_stl),
 }
 """The formats of mesh files by suffix, the one that says most about a thing first."""

@@ -306,6 +306,25 @@ def cut_polygons(points: Array) -> Indices:
     return triangles
 
 
+def cut_faces(path: Path, corners: Indices, counts: Indices, points: Array) -> tuple[Indices, Indices]:
+    """(places in `corners` [T, 3], face [T]) of the triangles of faces with `counts` [F] corners, told one after the other.
+
+    corners [C] are numbers of points [N, 3]; MeshError `index_out_of_range` where one of a face is none.
+    """
+    starts = np.cumsum(counts) - counts
+    made, owners = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
+    for size in np.unique(counts[counts > 2]).tolist():
+        which = np.flatnonzero(counts == size)
+        places = starts[which][:, None] + np.arange(size)
+        check_indices(path, corners[places], len(points))
+        triangles = cut_polygons(points[corners[places]])
+        made.append(places[np.arange(len(which))[:, None, None], triangles].reshape(-1, 3))
+        owners.append(np.repeat(which, size - 2))
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return np.concatenate(made)[order], owner[order]
+
+
 def _flatten(corners: Array) -> tuple[Array, Mask]:
     """[F, n, 2] polygons [F, n, 3] seen along their normals (Newell's), counter-clockwise; and which are convex."""
     after = np.roll(corners, -1, axis=1)

@@ -1,4 +1,4 @@
-"""Edge: reads PLY files from outside by the library plyfile, STL and OFF by trimesh, and what trimesh made of a stored GLB.
+"""Edge: reads PLY files from outside by the library plyfile, OFF, STL by trimesh, and what trimesh made of a stored GLB.
 
 What the elements of a PLY mean is not in the format. Read are the names that MeshLab, CloudCompare, Blender, the Stanford scans
 and BOP write: colours of vertices and faces, coordinates of pictures by vertex or by corner, several pictures, and strips of
@@ -9,6 +9,7 @@ import io
 import re
 import struct
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,8 +30,7 @@ from workers.assets.external.mesh import (
     Indices,
     MeshVisual,
     RawMesh,
-    check_indices,
-    cut_polygons,
+    cut_faces,
     cut_strip,
     make_material,
 )
@@ -104,21 +104,13 @@ def _parse(path: Path) -> list[PlyElement]:
 def _triangles(path: Path, faces: PlyElement, points: Array) -> tuple[Indices, Indices]:
     """[T, 3, 2]: the triangles of all faces, each corner a vertex and a place in its face; and [T] the face of each."""
     lists = faces[next(prop.name for prop in faces.properties if prop.name in _CORNERS)]
-    sizes = np.full(len(lists), 3) if lists.dtype != object else np.array([len(row) for row in lists])
-    made, owners = [], []
-    for size in np.unique(sizes[sizes >= 3]).tolist():
-        which = np.flatnonzero(sizes == size)
-        table = (np.stack(lists[which]) if lists.dtype == object else lists).astype(np.int64).reshape(-1, size)
-        check_indices(path, table, len(points))
-        places = cut_polygons(points[table])
-        corners = table[np.arange(len(table))[:, None, None], places]
-        made.append(np.stack([corners, places], axis=-1).reshape(-1, 3, 2))
-        owners.append(np.repeat(which, size - 2))
-    if not made:
+    alike = lists.dtype != object
+    counts = np.full(len(lists), lists.shape[-1]) if alike else np.array([len(row) for row in lists])
+    corners = (lists.ravel() if alike else np.concatenate(lists)).astype(np.int64)
+    places, face = cut_faces(path, corners, counts, points)
+    if not len(face):
         raise MeshError("no_faces", f"{path} has no triangles")
-    owner = np.concatenate(owners)
-    order = np.argsort(owner, kind="stable")
-    return np.concatenate(made)[order], owner[order]
+    return np.stack([corners[places], places - (np.cumsum(counts) - counts)[face][:, None]], axis=-1), face
 
 
 def _strips(strips: PlyElement) -> Indices:
@@ -208,6 +200,52 @@ def _binary_faces(data: bytes) -> int:
     behind = len(data) - 84 - 50 * faces
     text = data[:5].lower() == b"solid" and b"facet" in data[:1024]
     return faces if behind == 0 or (0 < behind < 1024 and not text) else 0
+
+
+_OFF = re.compile(r"\s*(ST)?(C)?(N)?(4)?(n)?OFF(?!\s+BINARY)")
+
+
+def read_off(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
+    """The mesh of an OFF file as Geomview has it, with colours of vertices or of faces, whole numbers or shares.
+
+    A reader of its own: trimesh leaves out colours, and cuts polygons as fans. MeshError `format` for a binary or one of four
+    dimensions, `index_out_of_range` or `unreadable`.
+    """
+    text = re.sub("#.*", "", data.decode("utf-8", "replace"))
+    head = _OFF.match(text)
+    if (head is None and text.lstrip()[:1].isalpha()) or (head is not None and (head[4] or head[5])):
+        raise MeshError("format", f"{path} is not an OFF file of three dimensions in text: export it as .ply")
+    lines = [line.split() for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
+    try:
+        vertices, faces = int(lines[0][0]), int(lines[0][1])
+        rows = np.array(lines[1 : 1 + vertices], dtype=np.float64).reshape(vertices, -1)
+        told = lines[1 + vertices : 1 + vertices + faces]
+        counts = np.array([int(line[0]) for line in told])
+        corners = np.array([word for line in told for word in line[1 : 1 + int(line[0])]], dtype=np.int64)
+        if len(told) < faces or len(corners) != counts.sum():
+            raise ValueError(f"{len(told)} of {faces} faces")
+        places, face = cut_faces(path, corners, counts, rows[:, :3])
+        first = 6 if head is not None and head[3] else 3
+        colors = _off_colors(lines[1 : 1 + vertices], first) if head is not None and head[2] else None
+        shown = None if colors is not None else _off_colors([line[int(line[0]) :] for line in told], 1)
+        normals = rows[:, 3:6] if first == 6 else None
+        if any(len(line) == 2 + int(line[0]) for line in told):
+            resolver.notes.append("not drawn: colours of a map by their numbers")
+    except (ValueError, IndexError, OverflowError) as error:
+        raise unreadable(path, error) from error
+    visual = MeshVisual(DEFAULT if colors is None and shown is None else WHITE, None, colors)
+    visual = visual if shown is None else replace(visual, face_colors=shown[face])
+    return [RawMesh(rows[:, :3], corners[places], normals, visual, np.eye(4))]
+
+
+def _off_colors(lines: list[list[str]], first: int) -> NDArray[np.uint8] | None:
+    """[N, 4] uint8 sRGB of the three or four words behind the `first` of each line; None where a line has none."""
+    words = [line[first : first + 4] for line in lines]
+    if not words or min(map(len, words)) < 3:
+        return None
+    shares = any("." in word for line in words for word in line)
+    table = np.array([[*line, "1" if shares else "255"][:4] for line in words], dtype=np.float64)
+    return np.round(np.clip(np.nan_to_num(table) * (255.0 if shares else 1.0), 0.0, 255.0)).astype(np.uint8)
 
 
 def read_plain(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
