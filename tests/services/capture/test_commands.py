@@ -186,6 +186,7 @@ def test_evaluate_scores_a_simulated_capture_against_its_truth(run):
     assert len(answer["held_out"]) == 6
 
 
+@pytest.mark.minute
 def test_evaluate_aligns_a_given_mesh_first_and_says_so(run, tmp_path):
     path, given = copy_of(processed()[0], tmp_path), tmp_path / "given.ply"
     mesh = trimesh.load(path / "truth" / "mesh.glb", force="mesh", process=False)

@@ -50,9 +50,13 @@ class Killed(BaseException):
     """Stands for a SIGKILL: nothing of ours catches it."""
 
 
-@pytest.mark.parametrize("name", FORMATS)
 @pytest.mark.parametrize(
-    "points", [1, pytest.param(6, marks=pytest.mark.minute), pytest.param(24, marks=pytest.mark.slow)]
+    ("points", "name"),
+    [
+        *((1, name) for name in ("mirror-recon", "webdataset")),  # a file for each thing, and shards
+        *(pytest.param(6, name, marks=pytest.mark.minute) for name in FORMATS),
+        *(pytest.param(24, name, marks=pytest.mark.slow) for name in FORMATS),
+    ],
 )
 def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, name, files, tmp_path, monkeypatch):
     replace, calls = os.replace, itertools.count()

@@ -15,7 +15,7 @@ from schemas.scene.view import Intrinsics
 from workers.capture.board import marker_corners
 from workers.capture.folder import CaptureFile, write_description, write_view
 from workers.capture.poses.markers import Evidence, fit_markers, observe_view
-from workers.capture.poses.observation import Corners, Observation, Setup, no_patches
+from workers.capture.poses.observation import Corners, Observation, Setup
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import angle_between, invert, rotation_about, translation
@@ -235,15 +235,6 @@ def median_errors(estimate, truth, numbers=None):
     views = [v for v in estimate.views if v.T_board_cam is not None and (numbers is None or v.number in numbers)]
     mm, degrees = np.median([errors(v.T_board_cam, truth[v.number]) for v in views], axis=0)
     return float(mm), float(degrees)
-
-
-def without_depth(evidence: Evidence) -> Evidence:
-    """The same views, of a camera without depth."""
-    bare = []
-    for seen in evidence.observations:
-        corners = dataclasses.replace(seen.corners, depth_m=np.zeros(len(seen.corners.board)))
-        bare.append(dataclasses.replace(seen, corners=corners, board_patches=no_patches(), object_patches=no_patches()))
-    return dataclasses.replace(evidence, observations=tuple(bare))
 
 
 def draw_view(

@@ -86,15 +86,6 @@ def test_poses_of_a_drawn_capture_are_the_true_ones_and_the_same_bytes_twice(dra
     assert list(alone.by_name) == ["markers"] and set(alone.seconds) == {"read", "detect", "sample"}
 
 
-def test_a_capture_of_another_dictionary_is_refused_and_the_right_one_is_named(tmp_path):
-    write_capture(tmp_path / "c", 2, board=Board(dictionary="DICT_5X5_50"), box=False)
-    text = (tmp_path / "c" / "board.json").read_text().replace("DICT_5X5_50", "DICT_4X4_50")
-    (tmp_path / "c" / "board.json").write_text(text)
-    words = r"no marker of DICT_4X4_50 .* the image holds 3[0-9] markers of DICT_5X5_50: correct"
-    with pytest.raises(CaptureError, match=words):
-        estimate_poses(opened(tmp_path / "c"), Estimation())
-
-
 @pytest.mark.parametrize("frame", ["centre", "opencv", "opencv_old"])
 def test_poses_that_were_given_are_read_in_the_frame_that_the_flag_names(copy, drawn, frame):
     text = (copy / "capture.json").read_text().replace('"centre"', f'"{frame}"')

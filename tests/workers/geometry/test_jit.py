@@ -70,6 +70,7 @@ def test_a_compiled_loop_adds_in_the_order_that_is_written():
     assert total(values) == sum(values.tolist())
 
 
+@pytest.mark.minute
 def test_a_loop_is_compiled_also_where_nothing_can_be_kept_on_disk(tmp_path):
     project(tmp_path, loops=ONE_LOOP)
     (tmp_path / "file").write_text("")
