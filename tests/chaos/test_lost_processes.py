@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.killed_runs import EndedRun, chain_of, disturb_at_first_commit, kill_processes
+from tests.kit.killed_runs import EndedRun, chain_of, disturb_at_first_commit, interrupt, kill_processes
 
 pytestmark = [pytest.mark.ray, pytest.mark.minute]
 
@@ -56,6 +56,7 @@ LOST = "the run ended without a word (exit code 1), as it does where Ray is lost
 WAYS = {
     "an agent of Ray": (kill_processes("ray::DashboardAgent", signal.SIGKILL), LOST),
     "SIGTERM": (signal_to(signal.SIGTERM, 0), "stopped by SIGTERM"),
+    "Ctrl-C": (interrupt, "interrupted"),
     "another agent": (kill_processes("ray::RuntimeEnvAgent", signal.SIGKILL), "as it does where Ray is lost"),
     "the raylet": (kill_processes("raylet/raylet", signal.SIGKILL), "as it does where Ray is lost"),
     "the GCS": (kill_processes("gcs/gcs_server", signal.SIGKILL), "as it does where Ray is lost"),
@@ -65,11 +66,11 @@ WAYS = {
     "SIGTERM of the driver": (signal_to(signal.SIGTERM, 2), ""),
     "SIGABRT of the driver": (signal_to(signal.SIGABRT, 2), "crashed"),
 }
-"""How a run loses a process or gets a signal, and what it says then; all but the first two are slow."""
+"""How a run loses a process or gets a signal, and what it says then; all but the first three are slow."""
 
 
 @pytest.mark.parametrize(
-    "way", [*list(WAYS)[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in list(WAYS)[2:])]
+    "way", [*list(WAYS)[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in list(WAYS)[3:])]
 )
 def test_a_lost_process_or_a_signal_is_one_line_and_leaves_nothing(tmp_path, folder, way):
     disturb, words = WAYS[way]

@@ -10,15 +10,10 @@ import pytest
 
 from schemas.dataset.layout import FINGERPRINT_FILE, IMAGES, commit_path
 from schemas.errors import JobError, MachineError
-from schemas.job.identity import settings_digest
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.job.job_file import validate_job
 from tests.workers.shard import shards
-from workers.assets.catalogue import open_catalogue
-from workers.geometry.frames import invert, transform
 from workers.render.raster.gbuffer import shared_renderer
-from workers.scene.context import Stopwatch, WorkerContext
-from workers.scene.make_scene import make_scene
 from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png
 from workers.store.local import LocalStore
@@ -91,27 +86,6 @@ def test_numbers_that_no_camera_has_are_refused_by_name():
         branch, name = key.split(".")
         with pytest.raises(JobError, match=rf"cameras\.{branch}\.{name}"):
             validate_job({"name": "extreme", "cameras": {branch: {name: value}}}, "test")
-
-
-@pytest.mark.minute
-def test_a_camera_inside_an_object_sees_its_inside(tmp_path):
-    """The mirror camera 8 cm behind the front surface; labels agree with the ray caster's in every view."""
-    cameras = {"mirror": {"T_z_m": 0.08}, "orbit": {"inclination_rad": [0.1, 0.1]}}
-    job = job_of(640, 480, 525.0, cameras=cameras, categories=["box"], start=IN_THE_MIDDLE)
-    made, failed, _ = run(job, tmp_path, scenes=4)
-    assert made == 4 and not failed
-    catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
-    context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
-    surrounded = 0
-    for scene_id in range(4):
-        scene = make_scene(context, scene_id, Stopwatch())
-        mirror = scene.pairs[0].mirror
-        thing = scene.posed.things[-1]
-        low, high = (f(thing.shape.vertices, axis=0) for f in (np.min, np.max))
-        (eye,) = transform(invert(thing.T_world_shape), mirror.camera.position[None])
-        if ((low < eye) & (eye < high)).all():
-            surrounded += bool((mirror.region == REGION_FIRST_OBJECT).mean() > 0.5)
-    assert surrounded >= 2, "what faces it is nearer than 5 cm in the others, and not seen"
 
 
 @pytest.mark.slow
