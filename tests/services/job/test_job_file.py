@@ -98,6 +98,21 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("3: b", ["line 2", "3", "not a word"]),
     ("seed: 1\nseed: 2", ["line 3", "'seed'", "twice"]),
     (f"#{'x' * 400_000}", ["250000 bytes"]),
+    ("cameras: {mirror: {enabled: false}}", ["set images.projection.enabled: false too"]),
+    ("render: {rgb: false}\nsensor: {rgb_noise: {}}", ["sensor.rgb_noise"]),
+    *(
+        (f"assets: {{objects: [{{source: procedural, instances: {value}}}]}}", ["instances"])
+        for value in (0, -3, 10**13, 1.5, "few")
+    ),
+    *(
+        (f"cameras: {{{branch}: {{{name}: {value}}}}}", [f"cameras.{branch}.{name}"])
+        for branch, name, value in (
+            *(("sensor", "fx", "1.0e+300"), ("sensor", "fy", "1.0e-300"), ("sensor", "cx", "1.0e+300")),
+            *(("sensor", "cy", "-1.0e+300"), ("sensor", "width", 4097), ("sensor", "height", 0)),
+            *(("orbit", "radius_m", "1.0e+300"), ("mirror", "T_z_m", "1.0e+300")),
+            ("depth", "offset_m", "[0, 1.0e+300, 0]"),
+        )
+    ),
 )
 """What stands below `name: a`, and words of the answer."""
 

@@ -13,8 +13,7 @@ import workers.assets.catalogue
 from schemas.dataset.codec import Row
 from schemas.dataset.shard import Fingerprint
 from schemas.dataset.tables import SCHEMAS
-from schemas.errors import InputError, JobError
-from schemas.job.job import Job
+from schemas.errors import InputError
 from services.bench.command import refuse_unmatched
 from services.dataset.dataset import open_dataset
 from services.job.job_file import validate_job
@@ -262,17 +261,3 @@ def test_what_a_job_switches_off_is_not_there_and_nothing_else_changes(full, nam
     assert replay_scene(store, 1).differences == ()
     (store.root / "job.yaml").write_text((full.root / "job.yaml").read_text())
     assert faults_of(store), "its job says one thing and its rows say another"
-
-
-def test_switches_and_numbers_that_cannot_be_are_refused_with_the_remedy():
-    for changes, told in (
-        ({"cameras": {"mirror": {"enabled": False}}}, r"set images\.projection\.enabled: false too"),
-        ({"render": {"rgb": False}, "sensor": {"rgb_noise": {}}}, r"sensor\.rgb_noise"),
-        *(
-            ({"assets": {"objects": [{"source": "procedural", "instances": value}]}}, r"^[^\n]*instances[^\n]*$")
-            for value in (0, -3, 10**13, 1.5, "few")
-        ),
-    ):
-        with pytest.raises(JobError, match=told):
-            validate_job({"name": "t", **changes}, "t")
-    refuse_unmatched(Job(name="t"))
