@@ -75,18 +75,24 @@ NEEDS = {
 """What tests with these markers are about: --ci runs them where some of it differs from the base."""
 
 
+DAY_AGO = ("rev-list", "-1", "--before=1 day ago", "HEAD")
+
+
 @functools.cache
 def changed(*places: str) -> bool:
-    """Whether files differ from the commit where this branch left the main one; true where git cannot tell."""
+    """Whether files differ from the commit where this branch left the main one; on that, from a day ago, as it is tested daily.
+
+    True where git cannot tell.
+    """
 
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
-    for base in ("origin/HEAD", "origin/main", "main"):
+    for ask in (*(("merge-base", base, "HEAD") for base in ("origin/HEAD", "origin/main", "main")), DAY_AGO):
         with contextlib.suppress(OSError, subprocess.CalledProcessError):
-            left = git("merge-base", base, "HEAD")
-            if left != git("rev-parse", "HEAD"):
-                return bool(git("diff", "--name-only", left, "--", *places))
+            before = git(*ask)
+            if before not in ("", git("rev-parse", "HEAD")):
+                return bool(git("diff", "--name-only", before, "--", *places))
     return True
 
 

@@ -129,9 +129,9 @@ def test_the_list_of_this_project_expects_what_the_markers_skip():
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_a_change_is_told_from_none(tmp_path, monkeypatch):
-    def git(*words: str) -> None:
+    def git(*words: str, **environ: str) -> None:
         who = ("-c", "user.name=a", "-c", "user.email=a@b")
-        subprocess.run(["git", *who, *words], cwd=tmp_path, check=True, capture_output=True)
+        subprocess.run(["git", *who, *words], cwd=tmp_path, check=True, capture_output=True, env=os.environ | environ)
 
     monkeypatch.setattr("tests.conftest.ROOT", tmp_path)
     assert changed.__wrapped__("deploy")  # no repository: nobody can tell
@@ -145,4 +145,10 @@ def test_a_change_is_told_from_none(tmp_path, monkeypatch):
     git("checkout", "-b", "branch")
     (tmp_path / "report" / "a").write_text("b")
     git("commit", "-am", "b")
+    assert changed.__wrapped__("report") and not changed.__wrapped__("deploy")
+    git("checkout", "main")
+    git("commit", "--amend", "-m", "a", GIT_COMMITTER_DATE="2020-01-01T00:00:00Z")
+    assert changed.__wrapped__("deploy")  # as old as all there is
+    (tmp_path / "report" / "a").write_text("c")
+    git("commit", "-am", "c")  # on the main branch, today
     assert changed.__wrapped__("report") and not changed.__wrapped__("deploy")
