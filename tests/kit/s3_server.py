@@ -32,8 +32,6 @@ class Bucket:
         self.uploads: dict[str, dict[int, bytes]] = {}
         self.conditional = conditional
         """What becomes of a condition on a put: a store may not know of it, or answer that it is not implemented."""
-        self.lose_answers_of = ""
-        """The first put of a key with this in it is done, and answered with an error."""
         self.share = 0.0
         """The share of requests that meet one of `faults`."""
         self.faults: tuple[Fault, ...] = FAULTS
@@ -140,9 +138,6 @@ class _Handler(BaseHTTPRequestHandler):
                 return self._error(412, "PreconditionFailed")
             if not bucket.store(key, data):
                 return self._error(403, "QuotaExceeded")
-            if bucket.lose_answers_of and bucket.lose_answers_of in key:
-                bucket.lose_answers_of = ""
-                return self._error(503, "SlowDown")
         return self._answer(200, ETag=_tag(data))
 
     def _copy(self, source: str, key: str) -> None:

@@ -9,7 +9,10 @@ from schemas.dataset.tables import TABLES
 from services.dataset.dataset import Dataset, open_dataset
 from tests.datasets import in_a_bucket
 
-FORMS = ("files", "tar", "bucket", "running files", "running tar", "running bucket")
+FORMS = [
+    *("files", "tar", "running bucket"),
+    *(pytest.param(name, marks=pytest.mark.minute) for name in ("bucket", "running files", "running tar")),
+]
 
 
 @pytest.fixture(scope="package")

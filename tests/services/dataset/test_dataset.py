@@ -16,8 +16,7 @@ import pytest
 from schemas.errors import CorruptError, InputError, OutputError
 from services.dataset import shapes as stored_files
 from services.dataset.dataset import Dataset, open_dataset
-from tests.captures import captures_job, use_exact_captures
-from tests.datasets import make_dataset, run_here
+from tests.datasets import make_dataset
 from workers.store.local import LocalStore
 
 WORDS = {
@@ -158,10 +157,8 @@ def test_a_missing_image_is_named(copy, tars):
         pair._files.image(0, "can/RGB99999.png")
 
 
-def test_captures_are_pairs_as_scenes_are(tmp_path, monkeypatch):
-    use_exact_captures(monkeypatch)
-    run_here(captures_job(), tmp_path)
-    dataset = open_dataset(tmp_path)
+def test_captures_are_pairs_as_scenes_are(captures):
+    dataset = open_dataset(captures.root)
     pairs = list(dataset.pairs(pc.is_valid(pc.field("capture"))))
     assert len(pairs) == 4 and all(pair.aligned is None and pair.mirror.depth().any() for pair in pairs)
     assert [dataset.pair(pair.pose_id).scene["capture"] for pair in pairs] == [pair.scene["capture"] for pair in pairs]

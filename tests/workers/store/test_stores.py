@@ -22,9 +22,9 @@ from services.run.range_planner import plan_ranges
 from tests.kit.faults import check_published, in_threads
 from tests.kit.s3_server import Bucket, s3_server
 from tests.kit.stored_images import iter_records, read_images
-from tests.made_up_scenes import attempt_at, made_scene, scene, terms
+from tests.made_up_scenes import attempt_at, scene, terms
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, sweep
-from workers.store.commit import publish, read_record
+from workers.store.commit import read_record
 from workers.store.events import Events
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore, open_store
@@ -234,18 +234,13 @@ def test_a_place_that_cannot_keep_a_dataset_or_stops_answering_is_refused_by_nam
     nowhere = {"allow_http": True}
     options = {"region": "us-east-1", "skip_signature": True, "retry_config": {"max_retries": 0}}
     nobody = S3Store("bucket", endpoint="http://127.0.0.1:1", client_options=nowhere, **options)
-    with s3_server(Bucket(conditional="ignored")) as bucket:
-        for place, told in (
-            (LocalStore(tmp_path / "file" / "out"), "file/out cannot be written"),
-            (
-                ObjectStore(bucket, "s3://mine"),
-                r"s3://mine does not refuse a second put .* Use a store with conditional",
-            ),
-            (ObjectStore(HTTPStore("http://127.0.0.1:1/"), "http://web"), "http://web does not refuse a second put"),
-            (ObjectStore(nobody, "s3://nobody"), "s3://nobody cannot be written"),
-        ):
-            with pytest.raises(OutputError, match=told):
-                place.prepare()
+    for place, told in (
+        (LocalStore(tmp_path / "file" / "out"), "file/out cannot be written"),
+        (ObjectStore(HTTPStore("http://127.0.0.1:1/"), "http://web"), "http://web does not refuse a second put"),
+        (ObjectStore(nobody, "s3://nobody"), "s3://nobody cannot be written"),
+    ):
+        with pytest.raises(OutputError, match=told):
+            place.prepare()
 
     def fails(*_, **__):
         raise obstore.exceptions.GenericError("no route to host\nDebug source: ...")
@@ -314,23 +309,3 @@ def test_one_of_two_attempts_wins_and_a_swept_one_does_not_commit(place):
     assert (dead.name in sweep(place)) == kept, "a bucket keeps its files until another has committed the range"
     assert not list(place.files(STAGING))
     dead.abandon()
-
-
-def test_a_rename_that_was_ended_half_way_and_a_record_whose_answer_was_lost_are_known_as_our_own(monkeypatch):
-    halves = ObjectStore(MemoryStore(), "memory://")
-    with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda *_: None)
-        record = attempt_at(halves, 0, 4, TAR).commit().record
-    entry = record.files[-1]
-    obstore.copy(halves._bucket, f"{STAGING}/0000000000/{record.attempt}/{entry.path}", entry.path)
-    publish(halves, record)
-    check_published(halves, record)
-    assert not list(halves.files(STAGING))
-    held = Bucket()
-    with s3_server(held) as bucket:
-        mine = ObjectStore(bucket, "s3://mine")
-        attempt = attempt_at(mine, 0, 2, TAR, made_scene)
-        held.lose_answers_of = "_commits"
-        result = attempt.commit()
-        assert held.lose_answers_of == "" and result.won
-        check_published(mine, result.record)
