@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ from services.queue.queue import open_queue
 from services.run.lock import read_holder
 from tests.datasets import run_here
 from tests.kit.killed_runs import processes_with
-from tests.kit.ray_head import ROOT, VERSO, BareCluster, bare_cluster
+from tests.kit.ray_head import ROOT, RayHead, ray_head
 
 TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
 SCENES = 16
@@ -27,12 +28,18 @@ HOSTILE = "o $(touch x) `touch x`; touch x 'y' \"z\""
 PATIENCE_S = 90.0
 
 
+def verso(head: RayHead, *words: str, **changes: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-P", "-m", "services.cli.main", *words]
+    environment = {**head.environment, **changes}
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+
+
 @contextlib.contextmanager
-def supervisor(head: BareCluster, queue: str, log: Path) -> Iterator[subprocess.Popen]:
+def supervisor(head: RayHead, queue: str, log: Path) -> Iterator[subprocess.Popen]:
     """`verso supervise` as a process; killed with -9 in the end, if it lives."""
-    command = [*VERSO, "supervise", "--queue", queue, "--address", head.dashboard]
+    command = [sys.executable, "-P", "-m", "services.cli.main", "supervise", "--queue", queue, "--address", head.http]
     with log.open("ab") as words:
-        process = subprocess.Popen(command, cwd=ROOT, env=head.shell, stdout=words, stderr=words)
+        process = subprocess.Popen(command, cwd=ROOT, env=head.environment, stdout=words, stderr=words)
     try:
         wait_for("supervision", lambda: is_at_work(queue, process), log)
         yield process
@@ -54,7 +61,7 @@ def wait_for(what: str, happened: Callable[[], Any], log: Path) -> Any:
     return found
 
 
-def kill_driver(head: BareCluster, job: str) -> None:
+def kill_driver(head: RayHead, job: str) -> None:
     """Kills the innermost process of a job's `verso drive`, the one that gives work to Ray."""
     ours = [process.pid for process in processes_with(head.mark) if f" drive {job} " in process.name]
     threads = {pid: len(list(Path(f"/proc/{pid}/task").iterdir())) for pid in ours}
@@ -70,16 +77,16 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
     _, digest = run_here(load_job(TABLETOP, [f"scenes={SCENES}"]), tmp_path / "alone")
     queue, log = str(tmp_path / "queue"), tmp_path / "supervisor.log"
 
-    with bare_cluster(2, dashboard=True) as head:
+    with ray_head(2) as head:
 
         def submit(out: str, priority: int, scenes: int) -> str:
             words = ["--out", str(tmp_path / out), "--priority", str(priority), "--scenes", str(scenes), *SLOWLY]
-            done = head.verso("submit", str(TABLETOP), *words, VERSO_QUEUE=queue)
+            done = verso(head, "submit", str(TABLETOP), *words, VERSO_QUEUE=queue)
             assert "no supervisor is running" in done.stderr
             return done.stdout.strip()
 
         def rows() -> dict[str, dict[str, Any]]:
-            told = head.verso("jobs", "--queue", queue, "--json").stdout
+            told = verso(head, "jobs", "--queue", queue, "--json").stdout
             return {row["id"]: row for row in json.loads(told.splitlines()[-1])["jobs"]}
 
         waiting, cancelled, killed = submit(HOSTILE, 0, SCENES), submit("cancelled", 3, 64), submit("killed", 5, SCENES)
@@ -90,7 +97,7 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
         }
         read = open_queue(queue).read
 
-        refused = head.verso("supervise", "--queue", queue, "--address", head.dashboard, RAY_AUTH_TOKEN="b" * 64)
+        refused = verso(head, "supervise", "--queue", queue, "--address", head.http, RAY_AUTH_TOKEN="b" * 64)
         assert (refused.returncode, refused.stderr.count("\n")) == (1, 1)
         assert "RAY_AUTH_TOKEN" in refused.stderr
 
@@ -101,11 +108,11 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
                     first.kill()
                     kill_driver(head, killed)
             assert read(waiting).state == "queued"  # although it is the oldest
-        told = head.verso("cancel", cancelled, "--queue", queue)
+        told = verso(head, "cancel", cancelled, "--queue", queue)
         assert (told.returncode, told.stdout) == (0, f"{cancelled}: cancelling\n")
 
         with supervisor(head, queue, log) as second:
-            again = head.verso("supervise", "--queue", queue, "--address", head.dashboard)
+            again = verso(head, "supervise", "--queue", queue, "--address", head.http)
             assert again.returncode == 1 and "another supervisor works here" in again.stderr
             wait_for("the end", lambda: all(read(job).ended for job in (killed, cancelled, waiting)), log)
             wait_for("the last log", lambda: open_queue(queue).has_log(killed, 2), log)
@@ -123,7 +130,7 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
         assert (found[killed]["digest"], found[waiting]["digest"]) == (digest, digest)
         assert (found[killed]["scenes_done"], found[waiting]["scenes_done"]) == (SCENES, SCENES)
         assert not [one for one in processes_with(head.mark) if " drive " in one.name]
-    logs = head.verso("logs", killed, "--queue", queue, "--address", head.dashboard)  # the cluster is gone
+    logs = verso(head, "logs", killed, "--queue", queue, "--address", head.http)  # the cluster is gone
     assert logs.stdout.index("--- attempt 1 ---") < logs.stdout.index("--- attempt 2 ---")
     assert f"dataset digest {digest}" in logs.stdout
-    assert not list(tmp_path.rglob("x")) and not Path("/x").exists()
+    assert not list(tmp_path.rglob("x")) and not (ROOT / "x").exists()

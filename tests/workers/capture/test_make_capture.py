@@ -35,8 +35,7 @@ from workers.capture.make_capture import (
 )
 from workers.capture.results import open_sources
 from workers.capture.rows import CapturedObject, LeftOut, Origin, make_capture_pair, record_capture
-from workers.geometry.camera import project
-from workers.geometry.frames import invert, transform, translation
+from workers.geometry.frames import translation
 from workers.geometry.projection import Bounds, Seen, compare_covisible
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
@@ -91,18 +90,6 @@ def thing() -> CapturedObject:
 
 def pair_of(images: PosedImages, at: int = 1):
     return make_capture_pair(JOB, thing(), images, at, DONE.synthesize, shared_renderer().count_pixels).pair
-
-
-def test_a_mirror_camera_looks_at_the_object_from_the_other_side_at_the_asked_distance():
-    for number in (1, 2):
-        pair = pair_of(DONE.images(number))
-        first, mirror, k = pair.input.camera.T_world_cam, pair.mirror.camera.T_world_cam, pair.mirror.camera.intrinsics
-        pivot = first[:3, 3] + pair.d_z_m * first[:3, 2]
-        np.testing.assert_allclose(mirror[:3, 3] + 0.6 * mirror[:3, 2], pivot, atol=1e-12)
-        np.testing.assert_allclose(mirror[:2, 2], -first[:2, 2], atol=1e-12)  # half a turn about the board's normal
-        np.testing.assert_allclose(mirror[2, :3], first[2, :3], atol=1e-12)
-        u, v = project(transform(invert(mirror), pivot[None]), k)
-        assert (u[0], v[0]) == pytest.approx((k.cx, k.cy))
 
 
 def test_the_board_has_one_place_in_both_views_and_no_region_is_where_nothing_was_synthesised():
