@@ -196,10 +196,14 @@ def main(options: argparse.Namespace) -> int:
 def describe_guess(guess: Guess) -> list[str]:
     """A line for each unit and each axis that was guessed."""
     ups = [f"up: {rule.axis} in {rule.pattern}: {rule.why}" for rule in guess.ups if rule.pattern.startswith("**/")]
-    others = [f"{rule.pattern} {rule.axis}" for rule in guess.ups if not rule.pattern.startswith("**/")]
-    more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
-    told = [f"up differs: {', '.join(others[:MOST_NAMED])}{more}: stands on this axis alone"] if others else []
-    return [why for group in guess.groups for why in group.why] + ups + told
+    others: dict[str, list[str]] = {}
+    for rule in guess.ups:
+        if not rule.pattern.startswith("**/"):
+            others.setdefault(rule.why, []).append(f"{rule.pattern} {rule.axis}")
+    for why, names in others.items():
+        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        ups.append(f"up differs: {', '.join(names[:MOST_NAMED])}{more}: {why}")
+    return [why for group in guess.groups for why in group.why] + ups
 
 
 def _check_targets(out: Path, sheet: Path) -> None:

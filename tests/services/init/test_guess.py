@@ -6,10 +6,10 @@ from glob import escape
 from schemas.job.assets import FolderSource
 from services.init.categories import is_category, map_categories, name_categories
 from services.init.collection import SUFFIXES
-from services.init.command import make_guess, write_job
+from services.init.command import describe_guess, make_guess, write_job
 from services.init.copies import find_copies, find_doubles
 from services.init.found import Item, Reading
-from services.init.guess import guess_groups, guess_ups, plain_axis
+from services.init.guess import Guess, guess_groups, guess_ups, plain_axis
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import validate_job
 from workers.assets.external.placement import Measured
@@ -159,6 +159,13 @@ def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_a
         assert len(files) == (0 if suffix == ".glb" else 3), "but a robot's file may lie on its side"
     stated = [item(f"{k}.dae", stated_up="y") for k in range(3)]
     assert ups(*stated, item("z.dae", stated_up="z")) == {"z.dae": "z", "**/*.dae": "y"}, "as each file says"
+    lines = describe_guess(
+        Guess((), tuple(guess_ups([*stated, item("z.dae", stated_up="z"), *sure, item("odd.obj", up="z")])))
+    )
+    assert [line for line in lines if "differs" in line] == [
+        "up differs: z.dae z: as the file says",
+        "up differs: odd.obj z: stands on this axis alone, unlike its neighbours",
+    ]
     assert ups(*stated, item("s.dae", up="x", stated_up="y")) == {"**/*.dae": "y"}, "one file alone may be mistaken"
     assert ups(item("a.obj", up="y"), item("b.obj", up="x")) == {"a.obj": "y", "b.obj": "x", "**/*.obj": "z"}
     for confidence, axis, why in (("likely", "y", "likely: 1 of 2"), (None, "z", "not known")):
