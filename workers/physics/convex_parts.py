@@ -204,12 +204,29 @@ def _parts_of(piece: Mesh, most_m: float, most_parts: int) -> Parts:
     if (depth_m := concavity_m(piece)) <= most_m or most_parts < 2:
         return Parts((hull.vertices,), depth_m)
     coarse, moved_m = wrap(_fewer(piece)) if solid is None else (solid, 0.0)
-    step_m = SIMPLER * float(np.linalg.norm(np.ptp(piece.vertices, axis=0)))
-    while (simpler := coarse.simplify(step_m)).num_tri() > MOST_FACES:
-        step_m *= 2.0
+    simpler, step_m = _simplified(coarse, SIMPLER * float(np.linalg.norm(np.ptp(piece.vertices, axis=0))))
     parts, depth_m = halve(simpler, most_m, most_parts)
     fitted = _fit(parts, hull.vertices, hull.normals)
     return Parts(tuple(fitted) or (hull.vertices,), depth_m + step_m + moved_m)
+
+
+def _simplified(solid: manifold3d.Manifold, step_m: float) -> tuple[manifold3d.Manifold, float]:
+    """(A solid with at most `MOST_FACES`, or with as few as it can be made of; how far its surface has moved, metres).
+
+    By tolerances that double from `step_m` on. At once fewer faces go by a large one than by a smaller one before it: where
+    there is no gain, the next starts from the last. It ends, because the faces become fewer each time.
+    """
+    simpler, moved_m, start_m = solid.simplify(step_m), step_m, 0.0
+    while simpler.num_tri() > MOST_FACES:
+        step_m *= 2.0
+        further = solid.simplify(step_m)
+        if not 0 < further.num_tri() < simpler.num_tri():
+            solid, start_m = simpler, moved_m
+            further = solid.simplify(step_m)
+            if not 0 < further.num_tri() < simpler.num_tri():
+                break
+        simpler, moved_m = further, start_m + step_m
+    return simpler, moved_m
 
 
 def _fewer(sheet: Mesh) -> Mesh:

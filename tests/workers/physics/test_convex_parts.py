@@ -24,8 +24,10 @@ from tests.kit.contacts import mesh_of
 from tests.kit.shapes import box
 from workers.assets.builtin.make import make_asset
 from workers.geometry.distance import distance_to_mesh
+from workers.geometry.halving import wrap
 from workers.geometry.hull import convex_hull
 from workers.geometry.lathe_decomposition import COARSE, partition_outlines
+from workers.geometry.mesh import mesh_of as surface_of
 from workers.geometry.mesh import solid_of, weld
 from workers.physics import convex_parts as module
 from workers.physics.convex_parts import Parts, PartsCache, decompose, parts_of
@@ -146,6 +148,19 @@ def test_a_shape_whose_outlines_meet_or_cross_has_parts_all_the_same():
         for bound in (np.min, np.max):
             corners = bound(np.concatenate(parts), axis=0)
             assert corners == pytest.approx(bound(asset.shape.vertices, axis=0), abs=1e-9)
+
+
+def test_a_solid_that_large_tolerances_leave_with_more_faces_is_made_coarser_in_turn_and_it_ends(monkeypatch):
+    """What wraps an open ring: at once by ever larger tolerances it never has fewer than 1,796 faces."""
+    ring = trimesh.creation.annulus(0.06, 0.1, 0.1, sections=96)
+    solid, _ = wrap(weld(Mesh(np.ascontiguousarray(ring.vertices), ring.faces[ring.face_normals[:, 2] < 0.5])))
+    step_m, surface = 5e-4, surface_of(solid)
+    assert min(solid.simplify(step_m * 2**k).num_tri() for k in range(20)) > 1500
+    for most, ends in ((1500, 1500), (4, 1500)):
+        monkeypatch.setattr(module, "MOST_FACES", most)
+        simpler, moved_m = module._simplified(solid, step_m)
+        assert simpler.num_tri() <= ends
+        assert distance_to_mesh(surface_of(simpler).vertices, surface)[0].max() <= moved_m
 
 
 def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(monkeypatch):
