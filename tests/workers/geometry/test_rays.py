@@ -24,6 +24,7 @@ from tests.workers.geometry.made_up_kinect import (
     smaller,
     sphere_depth,
 )
+from tests.workers.render.random_scenes import facing, quad
 from workers.geometry.camera import look_at, orbit_pose, project
 from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.lens import project_points
@@ -36,14 +37,6 @@ EYE = np.eye(4)
 
 def shape_of(vertices: object, faces: object, closed: bool = False) -> Shape:
     return Shape((Part("part", frozen_array(vertices), frozen_array(faces, np.int32)),), closed)
-
-
-def quad(*corners) -> Shape:
-    return shape_of(corners, [[0, 1, 2], [0, 2, 3]])
-
-
-def square(z: float, half: float = 50.0) -> Shape:
-    return quad([-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z])
 
 
 def body(mesh: trimesh.Trimesh, closed: bool = False) -> Shape:
@@ -63,7 +56,7 @@ def cast(*things: Placed, k: Intrinsics = K, T=EYE):
 def test_depth_of_a_tilted_plane_is_exact_to_ten_picometres():
     """Embree's own float32 distance would be off by ten thousand times as much."""
     T = orbit_pose(np.array([0.1, -0.2, 0.8]), 0.75, 2.0, 2.5)
-    depth, region, cosine = cast(Placed(1, square(0.0, 30.0), EYE), T=T)
+    depth, region, cosine = cast(Placed(1, facing(0.0, 30.0), EYE), T=T)
     across = rays(K) @ T[2, :3]
     assert (region == 1).all()
     assert np.abs(depth - -T[2, 3] / across).max() < 1e-11
@@ -74,7 +67,7 @@ def test_of_coplanar_faces_the_lowest_region_id_wins_in_any_order():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         T = pose(uniform_rotation(rng), np.array([0.0, 0.0, 2.5])) @ translation(0, 0, -2.0)
-        things = [Placed(9, square(2.0, 0.3), T), Placed(4, square(2.0, 0.4), T)]
+        things = [Placed(9, facing(2.0, 0.3), T), Placed(4, facing(2.0, 0.4), T)]
         for order in (things, things[::-1]):
             region = cast(*order)[1]
             assert set(np.unique(region)) <= {0, 4} and (region == 4).any()
@@ -82,10 +75,10 @@ def test_of_coplanar_faces_the_lowest_region_id_wins_in_any_order():
 
 def test_what_lies_before_the_near_plane_is_passed_through_and_what_is_partly_behind_the_camera_is_seen_in_front():
     """A wall along the line of sight, 0.3 m to the right: its depth at column u is 0.3 fx / (u - cx)."""
-    depth, region, _ = cast(Placed(3, square(NEAR_M - 1e-3), EYE), Placed(4, square(1.0), EYE))
+    depth, region, _ = cast(Placed(3, facing(NEAR_M - 1e-3), EYE), Placed(4, facing(1.0), EYE))
     assert (region == 4).all()
     np.testing.assert_allclose(depth, 1.0, atol=1e-12)
-    wall = quad([0.3, -9, -5], [0.3, -9, 50], [0.3, 9, 50], [0.3, 9, -5])
+    wall = quad([[0.3, -9, -5], [0.3, -9, 50], [0.3, 9, 50], [0.3, 9, -5]])
     depth, region, _ = cast(Placed(3, wall, EYE))
     with np.errstate(divide="ignore"):
         z = 0.3 / rays(K)[60, :, 0]
@@ -103,7 +96,7 @@ def test_a_closed_mesh_lets_no_ray_through():
 
 def test_pixels_that_a_thing_cannot_reach_are_left_out_and_no_others():
     """Through every pixel: things within the image, over its border, one edge-on, and one that the near plane cuts."""
-    ball, every, slab = body(trimesh.creation.icosphere(2, 0.5)), rays(K).reshape(-1, 3), square(0.0, 1.0)
+    ball, every, slab = body(trimesh.creation.icosphere(2, 0.5)), rays(K).reshape(-1, 3), facing(0.0, 1.0)
     for seed in range(12):
         rng = np.random.default_rng(seed)
         places = [np.array([*rng.uniform(-1.5, 1.5, 2), z]) for z in (2.5, 4.0, 0.4)]
@@ -246,7 +239,7 @@ def test_a_centre_on_an_edge_belongs_to_what_is_on_its_right_or_below():
         ((-40.0, -30.0, 190.0, 140.0), 230 * 170),  # beyond the image
     ):
         corners = (left, top), (left, bottom), (right, bottom), (right, top)
-        shape = quad(*([(u - 80.0) / 128.0, (v - 60.0) / 128.0, 1.0] for u, v in corners))
+        shape = quad([[(u - 80.0) / 128.0, (v - 60.0) / 128.0, 1.0] for u, v in corners])
         assert count_covered(shape, EYE, EVEN) == pixels
 
 
