@@ -205,6 +205,8 @@ def _parts_of(piece: Mesh, most_m: float, most_parts: int) -> Parts:
         return Parts((hull.vertices,), depth_m)
     coarse, moved_m = wrap(_fewer(piece)) if solid is None else (solid, 0.0)
     simpler, step_m = _simplified(coarse, SIMPLER * float(np.linalg.norm(np.ptp(piece.vertices, axis=0))))
+    if simpler.is_empty():
+        return Parts((hull.vertices,), depth_m)
     parts, depth_m = halve(simpler, most_m, most_parts)
     fitted = _fit(parts, hull.vertices, hull.normals)
     return Parts(tuple(fitted) or (hull.vertices,), depth_m + step_m + moved_m)
@@ -217,6 +219,8 @@ def _simplified(solid: manifold3d.Manifold, step_m: float) -> tuple[manifold3d.M
     there is no gain, the next starts from the last. It ends, because the faces become fewer each time.
     """
     simpler, moved_m, start_m = solid.simplify(step_m), step_m, 0.0
+    if simpler.is_empty():  # it is thinner than the tolerance
+        simpler, moved_m = solid, 0.0
     while simpler.num_tri() > MOST_FACES:
         step_m *= 2.0
         further = solid.simplify(step_m)

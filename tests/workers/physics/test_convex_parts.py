@@ -264,6 +264,11 @@ def slab_with_open_pegs():
     return joined(mesh_of(box(0.2, 0.2, 0.01)), *pegs)
 
 
+def thin_angle():
+    """Two plates of 0.2 m and 0.02 mm."""
+    return of_solid(manifold3d.Manifold.cube((0.2, 0.2, 2e-5)) + manifold3d.Manifold.cube((2e-5, 0.2, 0.2)))
+
+
 def fine_torus():
     return mesh_of(trimesh.creation.torus(0.05, 0.02, major_sections=160, minor_sections=60))
 
@@ -275,11 +280,12 @@ HOLLOWS = {
     "cup aslant": (lambda: Mesh(np.ascontiguousarray(cup(48).vertices @ TURN), cup(48).faces), (6, 64)),
     "pegs": (slab_with_open_pegs, (17, 17)),
     "fine torus": (fine_torus, (6, 64)),
+    "angle thinner than the tolerance": (thin_angle, (2, 2)),
     "flat sheet": (lambda: Mesh(SQUARE, np.array([(0, 1, 2), (0, 2, 3)], np.int32)), (1, 1)),
 }
 
 
-QUICK = {"cup of 48", "pegs", "flat sheet"}
+QUICK = {"cup of 48", "pegs", "angle thinner than the tolerance", "flat sheet"}
 
 
 @pytest.mark.parametrize(
