@@ -58,7 +58,14 @@ class JammedError(Exception):
     """No small motion takes all bodies out of one another."""
 
 
-def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall: Array, gravity_m_s2: float) -> Motion:
+def step(
+    bodies: Sequence[Inertia],
+    contacts: Contacts,
+    friction: float,
+    fall: Array,
+    gravity_m_s2: float,
+    spinning_m: float = 0.0,
+) -> Motion:
     """The motion of bodies from rest in the time in which gravity alone moves them by `fall` [3], metres.
 
     The motion nearest to free fall, measured by kinetic energy, with `n . d + gap >= friction |t . d|` for the relative
@@ -71,15 +78,18 @@ def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall: A
     # The inverse of the square root of each tensor of inertia
     roots = [(axes / np.sqrt(moments)) @ axes.T for moments, axes in (np.linalg.eigh(body.tensor) for body in bodies)]
     root_masses = np.sqrt([body.mass_kg for body in bodies])
-    edges = _pyramid(contacts.normals, friction)
-    matrix = _rows(bodies, roots, contacts, edges)
+    edges, arms_m = _pyramid(contacts.normals, friction), np.zeros(CONE_EDGES)
+    if spinning_m:
+        edges = np.concatenate([edges, contacts.normals[:, None].repeat(2, axis=1)], axis=1)
+        arms_m = np.append(arms_m, [spinning_m, -spinning_m])
+    matrix = _rows(bodies, roots, contacts, edges, arms_m)
     fall_m = float(np.linalg.norm(fall))
     free = np.zeros((len(bodies), 6))
     free[:, :3] = root_masses[:, None] * fall / fall_m
     # Lengths in units of `fall_m`, so that all numbers are near 1
-    needed = -np.repeat(contacts.gaps / fall_m, CONE_EDGES) - matrix @ free.ravel()
+    needed = -np.repeat(contacts.gaps / fall_m, len(arms_m)) - matrix @ free.ravel()
     away, multipliers = _least_distance(matrix, needed)
-    forces = gravity_m_s2 * (multipliers.reshape(-1, CONE_EDGES, 1) * edges).sum(axis=1)
+    forces = gravity_m_s2 * (multipliers.reshape(*edges.shape[:2], 1) * edges).sum(axis=1)
     moved = (free + away.reshape(free.shape)) * fall_m
     turns = np.stack([root @ each for root, each in zip(roots, moved[:, 3:], strict=True)])
     return Motion(moved[:, :3] / root_masses[:, None], turns, forces)
@@ -112,15 +122,18 @@ def _interior(matrix: Array, least: Array) -> tuple[Array, Array]:
     return np.array(found.x), np.array(found.z)
 
 
-def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array) -> Array:
+def _rows(
+    bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array, arms_m: Array
+) -> Array:
     """[contacts CONE_EDGES, 6 bodies]: how motion opens contacts along each edge, in units of root of kinetic energy."""
-    rows = np.zeros((len(edges), CONE_EDGES, len(bodies), 6))
+    rows = np.zeros((*edges.shape[:2], len(bodies), 6))
+    twists = arms_m[:, None] * contacts.normals[:, None]
     for number, (body, root) in enumerate(zip(bodies, roots, strict=True)):
         own = np.flatnonzero(contacts.of(number))
         sign = np.where(contacts.upper[own] == number, 1.0, -1.0)[:, None, None]
         levers, along = contacts.points[own] - body.com, edges[own]
         rows[own, :, number, :3] = sign * along / np.sqrt(body.mass_kg)
-        rows[own, :, number, 3:] = sign * np.cross(levers[:, None], along) @ root
+        rows[own, :, number, 3:] = sign * (np.cross(levers[:, None], along) + twists[own]) @ root
     return rows.reshape(-1, 6 * len(bodies))
 
 
@@ -166,6 +179,11 @@ MOST_STEPS = 160
 """Of piles of eight most need 3 to 60 steps; what falls from a part that fills a hollow does so by half a millimetre a step."""
 
 
+MOST_SPUN = 16
+"""Further steps in which contacts have spinning friction too, for what has not come to rest. A light body that is pinched
+between a heavy one and the ground, corner over corner, can do nothing but spin."""
+
+
 @dataclass(frozen=True, eq=False)
 class Thing:
     """A body: the features of its mesh and its mass, in its own frame."""
@@ -189,7 +207,12 @@ class Rested:
 
 
 def rest(
-    things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, friction: float, most_steps: int = MOST_STEPS
+    things: Sequence[Thing],
+    poses: Sequence[Pose],
+    ground: Surface,
+    friction: float,
+    most_steps: int = MOST_STEPS,
+    spinning_m: float = 0.0,
 ) -> Rested:
     """Bodies let go at rest from `poses` (`T_world_obj`), followed without speed until nothing moves any more.
 
@@ -199,17 +222,18 @@ def rest(
     surfaces, at, near = [*(thing.surface for thing in things), ground], tuple(poses), None
     reaches = np.array([np.linalg.norm(one.surface.vertices - one.mass.com, axis=1).max() for one in things])
     fall_m, known_m, nudges = FALL_M, 0.0, 0
-    for number in range(most_steps):
+    for number in range(most_steps + (MOST_SPUN if spinning_m else 0)):
         points = [transform(T, thing.surface.vertices) for T, thing in zip(at, things, strict=True)] + [ground.vertices]
         if near is None or known_m <= 0.0:
             near, known_m = find_near_features(surfaces, points, DEEPEST_M + REACH_M), REACH_M
         contacts = find_contacts(surfaces, points, near, REACH_M, DEEPEST_M)
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
         try:
-            motion = step(inertias, contacts, friction, fall_m * DOWN, GRAVITY_M_S2)
+            spun_m = spinning_m if number >= most_steps else 0.0
+            motion = step(inertias, contacts, friction, fall_m * DOWN, GRAVITY_M_S2, spun_m)
             moved_m = _farthest(motion, reaches)
             if moved_m <= STILL * fall_m and nudges < MOST_NUDGES:
-                nudge, nudges = _nudge(inertias, contacts, friction, reaches), nudges + 1
+                nudge, nudges = _nudge(inertias, contacts, friction, reaches, spun_m), nudges + 1
                 if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
                     motion, moved_m = nudge, _farthest(nudge, reaches)
         except JammedError:
@@ -235,11 +259,13 @@ def _farthest(motion: Motion, reaches: Array) -> float:
     return float((np.linalg.norm(motion.moves, axis=1) + np.linalg.norm(motion.turns, axis=1) * reaches).max())
 
 
-def _nudge(bodies: Sequence[Inertia], contacts: Contacts, friction: float, reaches: Array) -> Motion:
+def _nudge(
+    bodies: Sequence[Inertia], contacts: Contacts, friction: float, reaches: Array, spinning_m: float
+) -> Motion:
     """The farthest motion of bodies in balance on a ground that leans by `LEVEL` to one of four sides."""
     x, y = LEVEL * math.cos(ASLANT_RAD), LEVEL * math.sin(ASLANT_RAD)
     sides = np.array([[x, y, 0.0], [-y, x, 0.0], [-x, -y, 0.0], [y, -x, 0.0]])
-    motions = [step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2) for side in sides]
+    motions = [step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2, spinning_m) for side in sides]
     return max(motions, key=lambda motion: _farthest(motion, reaches))
 
 

@@ -164,9 +164,9 @@ BOUNCES_M_S = 0.1
 """Slower impacts do not bounce: the rebound is at most half a millimetre high."""
 
 
-THROWN = 3.0
+THROWN, SLOW_M_S = 3.0, 0.5
 """Ratio of a speed to that of a fall from the highest start, from which long steps threw an object: of two balls that fall as one
-a far lighter upper one leaves at three times the speed at most."""
+a far lighter upper one leaves at three times the speed at most. And a speed at which nothing has flown off."""
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,8 @@ class Outcome:
 
     speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and simulation.
     stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its bound.
-    face: of its hull that an object stands on, where that ended it. lost: the numbers of those that were put away;
-    thrown_m_s: the speed of the fastest of them, if no fall gives it.
+    face: of its hull that an object stands on, where that ended it. lost: the numbers of those that were put away; thrown: of
+    those that were ever faster than a fall makes them, and the speed of the fastest, m/s.
     """
 
     poses: tuple[Pose, ...]
@@ -207,6 +207,7 @@ class Outcome:
     rise: float = 0.0
     face: Face | None = None
     lost: tuple[int, ...] = ()
+    thrown: frozenset[int] = frozenset()
     thrown_m_s: float = 0.0
 
 
@@ -295,7 +296,15 @@ def _simulate(
     time, rate, bounces, asked = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0, -1.0
     moving = [world.velocity(k) for k in range(len(bodies))]
     speeds, energy = _speeds(bodies, moving), EnergyRecord(bodies, [one.anchor for one in still], moving)
-    lost, thrown_m_s, top_m = list[int](), 0.0, max(one.anchor[0][2] for one in still)
+    lost, thrown, thrown_m_s = list[int](), set[int](), 0.0
+    heights = [one.anchor[0][2] for one in still]
+    low_m, top_m = min(heights), max(heights) + min(math.hypot(*v) for v, _ in moving) ** 2 / (2.0 * GRAVITY_M_S2)
+
+    def ended(speed_m_s: float, rested: bool, name: str | None = None, face: Face | None = None) -> Outcome:
+        by = tuple(lost), frozenset(thrown), thrown_m_s
+        rise = energy.rise() if name in (None, "below") else 0.0  # others begin anew, or are let go again where they stop
+        return Outcome(tuple(map(as_pose, at)), speed_m_s, time, rested, name, rise, face, *by)
+
     while True:
         wanted = steps.rate_hz(max(speeds))
         if bounces and max(speeds) < BOUNCES_M_S:
@@ -309,20 +318,20 @@ def _simulate(
             at, moving = [world.pose(k) for k in range(len(bodies))], [world.velocity(k) for k in range(len(bodies))]
             energy.add(at, moving)
         time += SAMPLE_STEPS / rate
-        for number in range(len(bodies)):
+        for number in range(len(bodies)) if len(bodies) > 1 else ():
+            speed = math.hypot(*moving[number][0])
+            fallen_m = top_m - min(low_m, at[number][0][2])
+            if speed > max(SLOW_M_S, THROWN * math.sqrt(2.0 * GRAVITY_M_S2 * fallen_m)):
+                thrown.add(number)
+                thrown_m_s = max(thrown_m_s, speed)
             if leaves is not None and number not in lost and leaves(number, at[number]):
-                speed = math.hypot(*moving[number][0])
-                if speed > THROWN * math.sqrt(2.0 * GRAVITY_M_S2 * max(0.0, top_m - at[number][0][2])):
-                    thrown_m_s = max(thrown_m_s, speed)
                 world.put_away(number)
                 lost.append(number)
                 at[number], moving[number] = world.pose(number), world.velocity(number)
         speeds = _speeds(bodies, moving)
         for name, stop in stops.items():
             if any(stop(number, one) for number, one in enumerate(at)):
-                return Outcome(
-                    tuple(map(as_pose, at)), max(speeds), time, False, name, energy.rise() if name == "below" else 0.0
-                )
+                return ended(max(speeds), False, name)
         for number, (one, now, body, speed) in enumerate(zip(still, at, bodies, speeds, strict=True)):
             turned = _angle(one.anchor[1], now[1])
             one.moved_m = math.dist(one.anchor[0], now[0]) + turned * body.reach_m
@@ -334,12 +343,9 @@ def _simulate(
         if standing is not None and asked < still[0].since <= time - STANDING_SHARE * rest.window_s:
             asked, face = time, standing(at[0], moving[0])
         if face is not None or all(time - one.since >= rest.window_s for one in still):
-            drift_m_s = max(one.moved_m / (time - one.since) for one in still)
-            return Outcome(
-                tuple(map(as_pose, at)), drift_m_s, time, True, None, energy.rise(), face, tuple(lost), thrown_m_s
-            )
+            return ended(max(one.moved_m / (time - one.since) for one in still), True, face=face)
         if time >= end_s:
-            return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, rise=energy.rise())
+            return ended(max(speeds), False)
 
 
 def _speeds(bodies: Sequence[Body], moving: Sequence[Velocity]) -> list[float]:

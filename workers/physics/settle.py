@@ -242,8 +242,9 @@ def _pour(drop: Drop, flat: bool) -> Drop | None:
         poses = [start.T_world_obj for start in starts]
         for number, T in zip(part, outcome.poses, strict=True):
             poses[number] = T
+        lost, thrown = (tuple(part[k] for k in of) for of in (outcome.lost, outcome.thrown))
         _require_calm(
-            drop, dataclasses.replace(outcome, poses=tuple(poses), lost=tuple(part[k] for k in outcome.lost)), part
+            drop, dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown)), part
         )
         drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part), seconds=seconds)
     return drop
@@ -282,17 +283,17 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = N
     """Raises SettleError where objects were lost or still move; fallen: the numbers of those that were let go, if not all."""
     known = range(len(drop.starts)) if fallen is None else list(fallen)
     coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
-    if outcome.rested and not outcome.lost:
-        return
-    if outcome.thrown_m_s:
+    if outcome.thrown:
         raise UnsupportedError(
             "thrown",
-            f"an object left the table at {outcome.thrown_m_s:.0f} m/s, which no fall gives: raise physics.step_hz, or take "
-            "objects of nearer masses",
-            outcome.lost,
+            f"an object flew off at {outcome.thrown_m_s:.0f} m/s, which no fall gives: raise physics.step_hz, or take objects "
+            "of nearer masses",
+            sorted(outcome.thrown.union(outcome.lost)),
             outcome.poses,
             known,
         )
+    if outcome.rested and not outcome.lost:
+        return
     if lost := outcome.lost or [number for number in known if _is_low(drop, coms[number][2])]:
         raise _left_table(drop, lost, outcome.poses, outcome.seconds, known)
     raise SettleError(
