@@ -122,9 +122,7 @@ def _interior(matrix: Array, least: Array) -> tuple[Array, Array]:
     return np.array(found.x), np.array(found.z)
 
 
-def _rows(
-    bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array, arms_m: Array
-) -> Array:
+def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array, arms_m: Array) -> Array:
     """[contacts CONE_EDGES, 6 bodies]: how motion opens contacts along each edge, in units of root of kinetic energy."""
     rows = np.zeros((*edges.shape[:2], len(bodies), 6))
     twists = arms_m[:, None] * contacts.normals[:, None]
@@ -259,13 +257,13 @@ def _farthest(motion: Motion, reaches: Array) -> float:
     return float((np.linalg.norm(motion.moves, axis=1) + np.linalg.norm(motion.turns, axis=1) * reaches).max())
 
 
-def _nudge(
-    bodies: Sequence[Inertia], contacts: Contacts, friction: float, reaches: Array, spinning_m: float
-) -> Motion:
+def _nudge(bodies: Sequence[Inertia], contacts: Contacts, friction: float, reaches: Array, spinning_m: float) -> Motion:
     """The farthest motion of bodies in balance on a ground that leans by `LEVEL` to one of four sides."""
     x, y = LEVEL * math.cos(ASLANT_RAD), LEVEL * math.sin(ASLANT_RAD)
     sides = np.array([[x, y, 0.0], [-y, x, 0.0], [-x, -y, 0.0], [y, -x, 0.0]])
-    motions = [step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2, spinning_m) for side in sides]
+    motions = [
+        step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2, spinning_m) for side in sides
+    ]
     return max(motions, key=lambda motion: _farthest(motion, reaches))
 
 

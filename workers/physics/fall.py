@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Array, Pose
-from schemas.job.physics import Physics
+from schemas.job.physics import Physics, Rest
 from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import invert, translation
@@ -196,7 +196,9 @@ class Outcome:
     speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and simulation.
     stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its bound.
     face: of its hull that an object stands on, where that ended it. lost: the numbers of those that were put away; thrown: of
-    those that were ever faster than a fall makes them, and the speed of the fastest, m/s.
+    those that were ever faster than a fall makes them, and the speed of the fastest, m/s. spinning: of those that do nothing but
+    spin about the vertical, as fast as at first. moves: where not all rested, of what does not rest the number, the speed, m/s,
+    and the spin, rad/s.
     """
 
     poses: tuple[Pose, ...]
@@ -209,6 +211,8 @@ class Outcome:
     lost: tuple[int, ...] = ()
     thrown: frozenset[int] = frozenset()
     thrown_m_s: float = 0.0
+    spinning: tuple[int, ...] = ()
+    moves: tuple[int, float, float] = (0, 0.0, 0.0)
 
 
 def choose_steps(
@@ -272,6 +276,28 @@ class _Stillness:
     moved_m: float = 0.0
 
 
+SPIN_KEPT = 0.8
+"""Share of a spin that is left after the last window if nothing slows it: its contact is on its axis, or without friction."""
+
+
+@dataclass(frozen=True)
+class _Late:
+    """Where a body was as the last window began, and its spin about the vertical, rad/s."""
+
+    pose: BodyPose
+    spin_rad_s: float
+
+    def spins_on(self, at: BodyPose, moving: Velocity, rest: Rest, reach_m: float) -> bool:
+        """Whether the body has done nothing since but spin: it neither drifted nor leant further, and is calm but for that."""
+        (v, (p, q, r)), window_s = moving, rest.window_s
+        leant = math.dist(as_pose(self.pose)[2, :3], as_pose(at)[2, :3])
+        stays = (
+            math.dist(self.pose[0], at[0]) <= rest.speed_mm_s / 1e3 * window_s and leant <= rest.spin_rad_s * window_s
+        )
+        calm = math.hypot(*v) + math.hypot(p, q) * reach_m <= CALM_M_S
+        return stays and calm and abs(r) >= SPIN_KEPT * abs(self.spin_rad_s)
+
+
 def _simulate(
     world: World,
     bodies: Sequence[Body],
@@ -293,6 +319,7 @@ def _simulate(
     rest = physics.rest
     drift_m, turn_rad = rest.speed_mm_s / 1e3 * rest.window_s, rest.spin_rad_s * rest.window_s
     still = [_Stillness(world.pose(k)) for k in range(len(bodies))]
+    late = list[_Late]()
     time, rate, bounces, asked = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0, -1.0
     moving = [world.velocity(k) for k in range(len(bodies))]
     speeds, energy = _speeds(bodies, moving), EnergyRecord(bodies, [one.anchor for one in still], moving)
@@ -302,7 +329,9 @@ def _simulate(
 
     def ended(speed_m_s: float, rested: bool, name: str | None = None, face: Face | None = None) -> Outcome:
         by = tuple(lost), frozenset(thrown), thrown_m_s
-        rise = energy.rise() if name in (None, "below") else 0.0  # others begin anew, or are let go again where they stop
+        rise = (
+            energy.rise() if name in (None, "below") else 0.0
+        )  # others begin anew, or are let go again where they stop
         return Outcome(tuple(map(as_pose, at)), speed_m_s, time, rested, name, rise, face, *by)
 
     while True:
@@ -345,7 +374,14 @@ def _simulate(
         if face is not None or all(time - one.since >= rest.window_s for one in still):
             return ended(max(one.moved_m / (time - one.since) for one in still), True, face=face)
         if time >= end_s:
-            return ended(max(speeds), False)
+            moves = [k for k, one in enumerate(still) if time - one.since < rest.window_s]
+            if late and all(late[k].spins_on(at[k], moving[k], rest, bodies[k].reach_m) for k in moves):
+                return dataclasses.replace(ended(max(speeds), True), spinning=tuple(moves))
+            fastest = max(moves, key=lambda k: speeds[k])
+            v, w = (math.hypot(*each) for each in moving[fastest])
+            return dataclasses.replace(ended(max(speeds), False), moves=(fastest, v, w))
+        if not late and time >= end_s - rest.window_s:
+            late = [_Late(pose, w[2]) for pose, (_, w) in zip(at, moving, strict=True)]
 
 
 def _speeds(bodies: Sequence[Body], moving: Sequence[Velocity]) -> list[float]:

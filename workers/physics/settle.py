@@ -16,7 +16,7 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, SupportedBy
 from workers.geometry.frames import motion_between, transform, translation
-from workers.physics.effects import ONLY_LATE, REMOVED, called_for_with, rooms_m
+from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
 from workers.physics.exact_rest import rest
 from workers.physics.fall import FINEST, Outcome
 from workers.physics.placement import (
@@ -54,6 +54,9 @@ PLACED_M = 1e-4
 """Height up to which an object was set down and not dropped, where it lands at 44 mm/s, and greatest overlap of objects at
 release: correcting centimetres by a share per step gives tens of metres per second."""
 
+SPINS_M = 1e-3
+"""Radius inside of which what turns spins in place, and does not roll."""
+
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
 
@@ -71,13 +74,17 @@ class LeftRoomError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class _Ending:
-    """The objects of a drop at the poses [4, 4] of their rest, after `seconds` in all, with the speed that was left."""
+    """The objects of a drop at the poses [4, 4] of their rest, after `seconds` in all, with the speed that was left.
+
+    spun: whether some spun on at the end.
+    """
 
     drop: Drop
     placement: Placement
     poses: tuple[Pose, ...]
     seconds: float = 0.0
     speed_m_s: float = 0.0
+    spun: bool = False
 
 
 def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
@@ -197,7 +204,7 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
         if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
             return standing
         placement = placement or _place(drop, outcome.poses, forms)
-        ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s)
+        ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s, bool(outcome.spinning))
         if not exact:
             return ending
         rested = hold(drop, placement, outcome.poses)
@@ -243,9 +250,7 @@ def _pour(drop: Drop, flat: bool) -> Drop | None:
         for number, T in zip(part, outcome.poses, strict=True):
             poses[number] = T
         lost, thrown = (tuple(part[k] for k in of) for of in (outcome.lost, outcome.thrown))
-        _require_calm(
-            drop, dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown)), part
-        )
+        _require_calm(drop, dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown)), part)
         drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part), seconds=seconds)
     return drop
 
@@ -276,12 +281,20 @@ def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     if T is None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), table.mesh)) @ T
-    return _Ending(drop, place_on_top(start, T, table, drop.physics.friction**2), (T,), seconds, outcome.speed_m_s)
+    return _Ending(
+        drop,
+        place_on_top(start, T, table, drop.physics.friction**2),
+        (T,),
+        seconds,
+        outcome.speed_m_s,
+        bool(outcome.spinning),
+    )
 
 
 def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = None) -> None:
     """Raises SettleError where objects were lost or still move; fallen: the numbers of those that were let go, if not all."""
     known = range(len(drop.starts)) if fallen is None else list(fallen)
+    starts = [drop.starts[number] for number in known]
     coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
     if outcome.thrown:
         raise UnsupportedError(
@@ -296,10 +309,19 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = N
         return
     if lost := outcome.lost or [number for number in known if _is_low(drop, coms[number][2])]:
         raise _left_table(drop, lost, outcome.poses, outcome.seconds, known)
-    raise SettleError(
-        "not_at_rest",
-        f"{'still moving' if drop.single else 'something still moves'} at {outcome.speed_m_s * 1e3:.2f} mm/s after "
-        f"{outcome.seconds:.1f} s: raise physics.max_settle_s or physics.rolling_friction",
+    raise SettleError("not_at_rest", _what_moves(drop.physics, starts[outcome.moves[0]], outcome))
+
+
+def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
+    _, speed_m_s, spin_rad_s = outcome.moves
+    advice = "physics.max_settle_s or physics.rolling_friction"
+    if physics.friction == 0.0:
+        advice = "physics.friction, which is 0"
+    elif physics.spinning_friction == 0.0 and speed_m_s < spin_rad_s * SPINS_M:
+        advice = "physics.spinning_friction, which is 0"
+    return (
+        f"region {start.region_id} ({start.asset.category}) still drifts at {speed_m_s * 1e3:.3g} mm/s and turns at "
+        f"{spin_rad_s:.3g} rad/s after {outcome.seconds:.1f} s: raise {advice}"
     )
 
 
@@ -349,6 +371,7 @@ def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Sett
             settle_s=ending.seconds,
             support=support,
             contacts=held.forces,
+            spun=ending.spun,
         )
         for T, held in zip(ending.poses, supports, strict=True)
     )
@@ -406,8 +429,8 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, pouring
             began, settled = settle(Drop(starts, table, physics, add_effects(effects, called), pouring=pouring))
     if any(rest.support == "mesh" for rest in settled):
         called |= dict.fromkeys(called_for_with("table_mesh", starts, physics), LEFT_TOP)
-    if len(began) < len(starts):
-        called[REMOVED] = ONLY_LATE[REMOVED]
+    late = {REMOVED: len(began) < len(starts), SPIN_LEFT: any(rest.spun for rest in settled)}
+    called |= {name: ONLY_LATE[name] for name, ran in late.items() if ran}
     return Rest(began, settled, {name: why for name, why in called.items() if not effects.runs(name)})
 
 
