@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, model_serializer
+from pydantic import BeforeValidator, Field, PlainSerializer, model_serializer, model_validator
 from pydantic import SerializerFunctionWrapHandler as Dump
 
 from schemas.base import Counts, Frozen, Interval, NonNegative, NonNegativeInt, Positive, Range, Share, left_out
@@ -61,9 +61,9 @@ Collision = Literal["planned", "box", "hull", "parts"]
 class Rest(Frozen):
     """When an object counts as resting: it drifts and turns more slowly than this for the whole window."""
 
-    speed_mm_s: Positive = 1.0
+    speed_mm_s: Annotated[float, Field(ge=0.01)] = 1.0
     """Bound on the drift of the object's farthest point."""
-    spin_rad_s: Positive = 0.01
+    spin_rad_s: Annotated[float, Field(ge=1e-4)] = 0.01
     """Bound on the rate at which it turns."""
     window_s: Positive = 0.25
     """Time for which both must hold; a fifth of it for a single object on a flat top."""
@@ -83,9 +83,9 @@ class Physics(Frozen):
     """Simulated time after which an object that still moves is a failure."""
     rest: Rest = Rest()
     """When an object counts as resting."""
-    friction: NonNegative = 0.7
+    friction: Annotated[float, Field(ge=0, le=5)] = 0.7
     """Friction of each body; contact friction is the product of the two."""
-    rolling_friction: NonNegative = 0.0005
+    rolling_friction: Annotated[float, Field(ge=0, le=0.01)] = 0.0005
     """Rolling friction of each body, metres: Bullet's torque is twice this, times `friction`, times the contact force."""
     spinning_friction: NonNegative = 0.0005
     """Spinning friction of each body, metres: the same torque about the contact's normal."""
@@ -98,3 +98,13 @@ class Physics(Frozen):
     """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2."""
     exact_rest: bool = True
     """Whether objects are brought to exact rest between the true meshes, and refused beyond the gate of docs/rest.md."""
+
+    @model_validator(mode="after")
+    def _rests_in_time(self) -> "Physics":
+        """Raises ValueError where nothing could rest before the simulation ends."""
+        if self.rest.window_s >= self.max_settle_s:
+            raise ValueError(
+                f"rest.window_s is {self.rest.window_s:g} s and max_settle_s {self.max_settle_s:g} s: nothing can have rested for "
+                "so long by then"
+            )
+        return self

@@ -4,22 +4,24 @@ A seed turns and shifts what is let go. The share is of the seeds; the gate must
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from schemas.base import frozen_array
+from schemas.scene.scene import ObjectStart
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, built_in, cube, rod
 from tests.hard_cases.case import Made
 from tests.hard_cases.drops import Drop, X, Y, drop, level, turn
-from tests.hard_cases.groups import Group, dominoes, pile, put, together, tray
+from tests.hard_cases.groups import Group, dominoes, heavy, pile, put, together, tray
 from tests.hard_cases.hollow_cases import BALL_M, at_the_bottom
 from tests.hard_cases.measures import Made as Objects
 from tests.hard_cases.measures import Measure, Rest, Z, apart, coms, on_a_face, tilt
 from tests.kit.shapes import asset_of, box
-from workers.geometry.frames import translation, uniform_rotation
+from workers.geometry.frames import transform, translation, uniform_rotation
 
 SEEDS = 20
 FIRST = 2
@@ -98,9 +100,38 @@ def ball_into_bowl(seed: int) -> Group:
     return together(table, [put(built_in("bowl"), table, 1e-4), put(ball(BALL_M, 3), table, 0.045, xy)])
 
 
+SMALL_KG = 0.005
+
+
+def uneven(ratio: float, seed: int) -> Group:
+    """Cubes of 20 and 200 mm, turned any way, one above the other: two or four, the one so many times as heavy over or under."""
+    table, rng, starts, bottom_m = level(), chance(seed), list[ObjectStart](), 0.01
+    small, large = heavy(cube(0.02), SMALL_KG), heavy(cube(0.2), ratio * SMALL_KG)
+    for number in range(4 if seed // 2 % 2 else 2):
+        asset = small if (seed + number) % 2 == 0 else large
+        starts.append(put(asset, table, bottom_m, tuple(rng.uniform(-0.03, 0.03, 2)), uniform_rotation(rng)))
+        bottom_m = 0.01 + float(
+            transform(starts[-1].T_world_obj, starts[-1].hull.vertices)[:, 2].max() - table.top.height_m
+        )
+    return together(table, starts)
+
+
 NOTHING_LESS, HARDLY_LESS = 1.0, 0.95
 
 CHAOTIC = (
+    # What falls from less than 0.6 m stays on 1.4 m of table. At 1 : 10,000 a second of letting go takes minutes.
+    *(
+        Chaotic(
+            f"cubes of 20 and 200 mm, 1 : {ratio:,}",
+            HARDLY_LESS,
+            within(0.7),
+            functools.partial(uneven, ratio),
+            again=ratio < 10_000,
+            tier="slow",
+            first=first,
+        )
+        for ratio, first in ((10, ""), (100, "minute"), (1_000, "minute"), (10_000, "slow"))
+    ),
     # Walls 150 mm high hold twenty boxes of about 105 cm^3, 2.1 l of 13.5. The pile's own bar: 95 % certified.
     Chaotic("pile of eight boxes", HARDLY_LESS, within(0.15), lambda seed: pile(8, seed), tier="slow", first="minute"),
     Chaotic("pile of twenty boxes", HARDLY_LESS, within(0.15), lambda seed: pile(20, seed), tier="slow", first="slow"),

@@ -7,6 +7,7 @@ import math
 
 import trimesh
 
+from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, built_in, cube, globe, rod
 from tests.hard_cases.case import EITHER, UNDEFINED, Case, falls, settles
 from tests.hard_cases.drops import EDGE_M, X, drop, level, slope, turn
@@ -89,6 +90,14 @@ ROLLING = (
     ),
 )
 
+
+def egg() -> Asset:
+    """A ball of 642 corners, a fifth longer than wide, lying."""
+    shape = trimesh.creation.icosphere(subdivisions=3, radius=0.025)
+    shape.apply_scale((1.2, 1.0, 1.0))
+    return asset_of(shape)
+
+
 SPINS = (
     settles(
         "cube spun at 50 rad/s on a level",
@@ -110,6 +119,21 @@ SPINS = (
             spin=(0.0, 0.0, rad_s),
         )
         for rad_s in (50.0, 200.0)
+    ),
+    # Nothing slows either: the contact has no friction, or is on the axis of the spin. Production takes the turn that it has.
+    settles(
+        "cube spun at 5 rad/s without friction",
+        both(tilt(0.1), height(0.05, 0.01)),
+        lambda: drop(cube(), level()),
+        SMOOTH,
+        spin=(0.0, 0.0, 5.0),
+    ),
+    settles(
+        "egg spun at 1 rad/s, spinning friction 0",
+        on_a_face(),
+        lambda: drop(egg(), level(), 0.0002),
+        {"spinning_friction": 0.0},
+        spin=(0.0, 0.0, 1.0),
     ),
     settles(
         "can spun lying at 50 rad/s",

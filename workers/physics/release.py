@@ -147,13 +147,14 @@ def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
     Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
-    below the top, and `room` where a single object leaves its room. Released again at the next pace where their energy rose.
+    below the top, and `room` where a single object leaves its room. Released again at the next pace where their energy rose, or several did not rest.
     """
     for pace in paces:
         outcome = _release(drop, flat, pace, LOOK_STEPS if drop.single else SAMPLE_STEPS)
         if drop.single and pace != paces[-1] and DOUBTFUL_RISE <= outcome.rise < KNOWN_RISE:
             outcome = _release(drop, flat, pace, 1)
-        if outcome.rise < (KNOWN_RISE if drop.single else MOST_RISE) and not outcome.thrown:
+        slow_enough = outcome.rise < (KNOWN_RISE if drop.single else MOST_RISE) and not outcome.thrown
+        if slow_enough and (drop.single or outcome.rested or outcome.stopped_by):
             break
     return outcome
 

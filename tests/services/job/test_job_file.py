@@ -59,6 +59,13 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("physics: 3", ["physics: 3: must hold keys with values"]),
     ("physics: {step_hz: abc}", ["physics.step_hz: 'abc': must be a whole number"]),
     ("physics: {max_settle_s: .inf}", ["physics.max_settle_s", "finite"]),
+    ("physics: {friction: 100}", ["physics.friction: 100: must be at most 5"]),
+    ("physics: {rolling_friction: 0.05}", ["physics.rolling_friction: 0.05: must be at most 0.01"]),
+    ("physics: {rest: {speed_mm_s: 0.001}}", ["physics.rest.speed_mm_s: 0.001: must be at least 0.01"]),
+    (
+        "physics: {max_settle_s: 0.2}",
+        ["physics", "rest.window_s is 0.25 s and max_settle_s 0.2 s: nothing can have rested"],
+    ),
     ("physics: {exact_rest: maybe}", ["physics.exact_rest: 'maybe': must be true or false"]),
     ("check: {raycast_share: 2}", ["check.raycast_share: 2: must be at most 1"]),
     ("check: {raycast_share: half}", ["check.raycast_share: 'half': must be a number"]),
