@@ -104,7 +104,7 @@ class Physics(Frozen):
         """Raises ValueError where nothing could rest before the simulation ends."""
         if self.rest.window_s >= self.max_settle_s:
             raise ValueError(
-                f"rest.window_s is {self.rest.window_s:g} s and max_settle_s {self.max_settle_s:g} s: nothing can have rested for "
-                "so long by then"
+                f"rest.window_s is {self.rest.window_s:g} s and max_settle_s {self.max_settle_s:g} s: nothing can have "
+                "rested for so long by then"
             )
         return self

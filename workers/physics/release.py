@@ -147,7 +147,8 @@ def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
     Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
-    below the top, and `room` where a single object leaves its room. Released again at the next pace where their energy rose, or several did not rest.
+    below the top, and `room` where a single object leaves its room. Released again at the next pace where their energy rose,
+    where one flew off, and where several did not rest.
     """
     for pace in paces:
         outcome = _release(drop, flat, pace, LOOK_STEPS if drop.single else SAMPLE_STEPS)

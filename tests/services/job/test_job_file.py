@@ -64,7 +64,7 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("physics: {rest: {speed_mm_s: 0.001}}", ["physics.rest.speed_mm_s: 0.001: must be at least 0.01"]),
     (
         "physics: {max_settle_s: 0.2}",
-        ["physics", "rest.window_s is 0.25 s and max_settle_s 0.2 s: nothing can have rested"],
+        ["physics", "rest.window_s is 0.25 s and max_settle_s 0.2 s: nothing"],
     ),
     ("physics: {exact_rest: maybe}", ["physics.exact_rest: 'maybe': must be true or false"]),
     ("check: {raycast_share: 2}", ["check.raycast_share: 2: must be at most 1"]),
