@@ -47,7 +47,7 @@ class Start(Frozen):
     max_redraws: NonNegativeInt = 20
     """Most redraws of a position that is not over the table or has no room, and of `if_lost`."""
     if_lost: Literal["redraw", "remove", "fail"] = "redraw"
-    """An object that leaves the table, or finds no balance: dropped again from a new start; removed, if it left; or a failure."""
+    """An object that leaves the table, or finds no balance: dropped again from a new start, removed, or a failure."""
 
     @model_serializer(mode="wrap")
     def _leave_out_if_lost(self, dump: Dump) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from workers.physics.effects import called_for
 from workers.physics.settle import settle_scene
 from workers.scene.context import open_worker
 from workers.scene.effects import PHYSICS_EFFECTS, Facts, plan_effects
-from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.plan import SceneChance, plan_scene, pouring_of
 
 ROUNDS = 3
 """Timed rounds, after one round that fills the caches."""
@@ -65,11 +65,12 @@ def time_settling(scenes: Sequence[Facts], rounds: int) -> tuple[dict[str, Array
         if name in EFFECTS and name not in plan_effects(facts).skipped:
             continue
         plan, scene, physics = plan_effects(facts, FORCED[name]), facts.plan, facts.job.physics
+        pouring = pouring_of(facts.job.start, SceneChance(facts.job.seed, scene.scene_id), scene)
         began = time.process_time()
         if name not in (WHOLE, EVERYTHING):
             called_for(scene.objects, scene.table, physics)
         try:
-            settle_scene(scene, physics, plan)
+            settle_scene(scene, physics, plan, pouring)
             seconds[name][lap, number] = time.process_time() - began
         except SceneError:
             failed[name] += 1

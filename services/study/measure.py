@@ -30,7 +30,7 @@ from workers.physics.rigid_body import Body
 from workers.physics.settle import Rest, moved_by, recheck_scene, settle_scene
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, plan_effects
-from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.plan import SceneChance, plan_scene, pouring_of
 from workers.shard.run_shard import run_scene
 
 RATES_HZ = (3840, 7680, 15360)
@@ -99,6 +99,9 @@ REFERENCES: tuple[Mapping[str, Any], ...] = (
 """Settings of physics finer than every measured value. The first gives the distribution of outcomes; a pose has a truth where
 both agree."""
 
+SCENE_MM = 1000.0
+"""Stands for the pose of an object that is there with one setting alone."""
+
 RELEASED: Mapping[str, Any] = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
 """Settings of physics, in steps 16 times shorter, with which objects at rest are released again."""
 
@@ -131,18 +134,18 @@ def measure_settling(
     except SceneError:
         return {}
     truths = [_settle(context.job, plan, reference) for reference in REFERENCES[: 2 if posed else 1]]
-    answers = {"reference": _describe(plan, truths[0])}
-    agreed = posed and None not in truths and _apart_mm(plan, *truths) <= AGREE_MM  # type: ignore[arg-type]
+    answers = {"reference": _describe(truths[0])}
+    agreed = posed and None not in truths and _apart_mm(*truths) <= AGREE_MM  # type: ignore[arg-type]
     answers["reference"]["agreed"] = agreed if posed else None
     again = dict[bytes, dict[str, float]]()
     for setting in settings:
         job = apply(context.job, setting.changes)
         rest = _settle(job, plan)
-        answer = answers[setting.name] = _describe(plan, rest)
+        answer = answers[setting.name] = _describe(rest)
         if rest is None:
             continue
         if agreed and truths[0] is not None:
-            answer["pose_mm"] = _apart_mm(plan, rest, truths[0])
+            answer["pose_mm"] = _apart_mm(rest, truths[0])
         if released:
             key = b"".join(one.T_world_obj.tobytes() for one in rest.settled)
             if key not in again:
@@ -152,9 +155,10 @@ def measure_settling(
 
 
 def _settle(job: Job, plan: ScenePlan, physics: Mapping[str, Any] | None = None) -> Rest | None:
-    """None where the scene does not come to rest."""
+    """None where the scene does not come to rest. What is lost is drawn again or removed as by `run`."""
+    pouring = pouring_of(job.start, SceneChance(job.seed, plan.scene_id), plan)
     try:
-        return settle_scene(plan, *_physics(job, plan, physics or {}))
+        return settle_scene(plan, *_physics(job, plan, physics or {}), pouring)
     except SceneError:
         return None
 
@@ -165,11 +169,11 @@ def _physics(job: Job, plan: ScenePlan, changes: Mapping[str, Any]) -> tuple[Phy
     return physics, plan_effects(Facts(job.model_copy(update={"physics": physics}), plan, raycast_checked=False))
 
 
-def _describe(plan: ScenePlan, rest: Rest | None) -> Answer:
+def _describe(rest: Rest | None) -> Answer:
     if rest is None:
         return {"failed": True}
     slid, rolled = [], []
-    for start, end in zip(plan.objects, rest.settled, strict=True):
+    for start, end in zip(rest.starts, rest.settled, strict=True):
         before, after = (transform(T, start.asset.mass.com[None])[0, :2] for T in (start.T_world_obj, end.T_world_obj))
         slid.append(float(np.linalg.norm(after - before)) * 1e3)
         rolled.append(math.degrees(motion_between(start.hull.vertices, start.T_world_obj, end.T_world_obj)[1]))
@@ -183,11 +187,13 @@ def _describe(plan: ScenePlan, rest: Rest | None) -> Answer:
     }
 
 
-def _apart_mm(plan: ScenePlan, one: Rest, other: Rest) -> float:
-    """The largest distance between the places of a point of an object in two rests, mm."""
+def _apart_mm(one: Rest, other: Rest) -> float:
+    """The largest distance between the places of a point of an object in two rests, mm; as long as a scene if one has fewer."""
+    if len(one.starts) != len(other.starts):
+        return SCENE_MM
     return max(
         moved_by(start, a.T_world_obj, b.T_world_obj)[0]
-        for start, a, b in zip(plan.objects, one.settled, other.settled, strict=True)
+        for start, a, b in zip(one.starts, one.settled, other.settled, strict=True)
     )
 
 
@@ -246,8 +252,9 @@ def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) 
 def _settle_s(context: WorkerContext, scene_id: int) -> float:
     """Seconds for choosing the effects and settling. Raises SceneError."""
     plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
+    pouring = pouring_of(context.job.start, SceneChance(context.job.seed, scene_id), plan)
     began = time.process_time()
-    settle_scene(plan, context.job.physics, plan_effects(Facts(context.job, plan, raycast_checked=False)))
+    settle_scene(plan, context.job.physics, plan_effects(Facts(context.job, plan, raycast_checked=False)), pouring)
     return time.process_time() - began
 
 

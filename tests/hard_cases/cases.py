@@ -8,6 +8,7 @@ import dataclasses
 from tests.hard_cases.arch_cases import ARCHES
 from tests.hard_cases.balance_cases import BALANCE
 from tests.hard_cases.case import UNDEFINED, Case
+from tests.hard_cases.file_cases import FROM_FILES
 from tests.hard_cases.groups import two_in_one_place
 from tests.hard_cases.hollow_cases import HOLLOWS
 from tests.hard_cases.leaning_cases import LEANING
@@ -56,6 +57,7 @@ SEVERAL: tuple[Case, ...] = (
     *SLOPES,
     *ARCHES,
     *HOLLOWS,
+    *FROM_FILES,
     Case("two cubes in one place", UNDEFINED, apart(200.0), two_in_one_place),
 )
 

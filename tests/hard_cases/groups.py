@@ -129,21 +129,21 @@ def in_a_bowl() -> Group:
     return together(table, [put(bowl, table, GAP_M), put(ball(0.01, 3), table, above)])
 
 
-def leaning() -> Group:
+def leaning(block: Asset | None = None, plank: Asset | None = None) -> Group:
     """A plank on the edge of a heavy cube: its foot on the table, `LEAN_DEG` from upright, both 0.1 mm away."""
     table, up = level(), math.radians(90.0 - LEAN_DEG)
-    plank = asset_of(box(PLANK_M, 0.05, PLANK_THICK_M), mass_kg=0.2)
+    plank = plank or asset_of(box(PLANK_M, 0.05, PLANK_THICK_M), mass_kg=0.2)
     along, across = np.array([math.cos(up), math.sin(up)]), np.array([-math.sin(up), math.cos(up)])
     edge = np.array([-0.05, 0.1])  # of the cube, whose middle is over the origin
     foot = edge - 0.2 * along
     centre = foot + (0.1001 - 0.1) * across + PLANK_M / 2 * along + PLANK_THICK_M / 2 * across
     start = put(plank, table, 0.0001, (float(centre[0]), 0.0), turn(Y, -math.degrees(up)))
-    return together(table, [put(heavy(cube(), 3.0), table, 0.0001), start])
+    return together(table, [put(block or heavy(cube(), 3.0), table, 0.0001), start])
 
 
-def dominoes(count: int, pushed_deg: float) -> Group:
+def dominoes(count: int, pushed_deg: float, domino: Asset | None = None) -> Group:
     """A row along x, the first of which leans towards the next by so much."""
-    table, domino = level(), asset_of(box(*DOMINO_M), mass_kg=0.015)
+    table, domino = level(), domino or asset_of(box(*DOMINO_M), mass_kg=0.015)
     starts = [put(domino, table, 0.0002, (PITCH_M * (number - count / 2), 0.0)) for number in range(count)]
     starts[0] = put(domino, table, 0.0002, (-PITCH_M * count / 2, 0.0), turn(Y, pushed_deg))
     return together(table, starts)

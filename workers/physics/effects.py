@@ -184,7 +184,7 @@ PREDICATES: dict[str, Predicate] = {
 REMOVED, SPIN_LEFT = "lost_removed", "spin_left"
 
 ONLY_LATE: dict[str, str] = {
-    REMOVED: "an object left the table's top",
+    REMOVED: "an object left the table's top or found no balance",
     SPIN_LEFT: "an object spun on where it stood, and nothing slows that: its turn is the one at physics.max_settle_s",
 }
 """Effects that are in no plan, and in the receipt only where they ran, and why each does."""

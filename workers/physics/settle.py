@@ -123,7 +123,7 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
     """
     pouring, starts = drop.pouring, list(moved_to(drop.starts, lost.poses))
     kept = [number for number in range(len(starts)) if number not in lost.numbers]
-    if pouring.remove and kept and lost.reason == "left_table":
+    if pouring.remove and kept and lost.reason != "thrown":
         lying, ready = (frozenset(kept.index(n) for n in kept if n in of) for of in (lost.fallen, drop.ready))
         clear_m = tuple(drop.clearances_m[number] for number in kept) if drop.clearances_m else ()
         fewer = renumbered([starts[number] for number in kept])
@@ -320,7 +320,7 @@ def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
     elif physics.spinning_friction == 0.0 and speed_m_s < spin_rad_s * SPINS_M:
         advice = "physics.spinning_friction, which is 0"
     return (
-        f"region {start.region_id} ({start.asset.category}) still drifts at {speed_m_s * 1e3:.3g} mm/s and turns at "
+        f"region {start.region_id} ({start.asset.category}) still drifts at {speed_m_s * 1e3:.4g} mm/s and turns at "
         f"{spin_rad_s:.3g} rad/s after {outcome.seconds:.1f} s: raise {advice}"
     )
 
@@ -437,7 +437,7 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, pouring
 def _settle_alone(
     plan: ScenePlan, physics: Physics, effects: EffectPlan, pouring: Pouring
 ) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
-    """Objects that cannot meet, one by one, without those that leave the table where these are removed."""
+    """Objects that cannot meet, one by one, without those that are lost where these are removed; the last is not."""
     began, settled, alone = list[ObjectStart](), list[Settled](), len(plan.objects) == 1
     for start, room_m in zip(plan.objects, rooms_m(plan.objects), strict=True):
         try:
@@ -447,13 +447,11 @@ def _settle_alone(
         except LostError as lost:
             if pouring.draw is not None and not alone:
                 raise LeftRoomError from None  # a new start has another room
-            if not pouring.remove or alone or lost.reason != "left_table":
+            if not pouring.remove or (start is plan.objects[-1] and not began) or lost.reason == "thrown":
                 raise
             continue
         began.append(one)
         settled.append(rest)
-    if not began:
-        raise SettleError("left_table", "every object left the table's top: narrow start.offset_m or use larger tables")
     return renumbered(began), tuple(settled)
 
 
