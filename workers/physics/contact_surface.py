@@ -104,8 +104,8 @@ class Surface:
     """A welded mesh with the neighbours of its features.
 
     vertices [V, 3] metres; faces [F, 3]; side [F]: 1 where all about a face lies below its plane as it is wound, -1 where
-    all lies above, 0 where neither or both, and on a surface that is not closed, which has no inside; where it is known to be
-    wound outwards 1 in place of -1: the deepest face of a hollow is met from above alone. corners [C]:
+    all lies above, 0 where neither or both, and on a surface that is not closed, which has no inside; 1 where it is known to be
+    wound outwards: nothing meets a face from behind. corners [C]:
     vertices that are not within a plane; edges [E, 2] that bend or bound, across [E, 2]: the vertices beside them (twice the
     same at one triangle); starts [V + 1] and members: the neighbours of each vertex. welded: the mesh with its faces of no area.
     """
@@ -128,13 +128,15 @@ def surface_of(mesh: Mesh, closed: bool, outward: bool = False) -> Surface:
     normals = face_normals(vertices, faces)
     solid = normals.any(axis=1)
     faces, normals = faces[solid], normals[solid]
-    edges, across, bent = _edges(vertices, faces, normals, *_half_edges(faces, len(vertices)))
+    edges, across, bent = _edges(vertices, faces, normals, *_half_edges(faces, len(vertices)), outward)
     # The neighbours of each vertex, one after the other, ascending as edges are
     ends, others = edges[:, ::-1].T.ravel(), edges.T.ravel()
     starts = np.append(0, np.cumsum(np.bincount(ends, minlength=len(vertices))))
     members = others[np.argsort(ends, kind="stable")]
-    side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
-    side = np.abs(side) if outward else side
+    if outward:
+        side = np.ones(len(faces), dtype=np.int64)
+    else:
+        side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
     edges, across = edges[bent], across[bent]
     return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members, mesh)
 
@@ -182,9 +184,14 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
     return side
 
 
-@compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], i8[::1]")
-def _edges(vertices: Array, faces: Index, normals: Array, keys: Index, which: Index) -> tuple[Index, Index, Index]:
-    """The edges [E, 2] of half edges, the vertices across them [E, 2], and those [B] that are not between coplanar faces."""
+@compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], i8[::1], b1")
+def _edges(
+    vertices: Array, faces: Index, normals: Array, keys: Index, which: Index, outward: bool
+) -> tuple[Index, Index, Index]:
+    """The edges [E, 2] of half edges, the vertices across them [E, 2], and those [B] that may meet another.
+
+    These are not between coplanar faces, nor, of faces that are wound outwards, the bottom of a groove.
+    """
     edges, across, bent = np.empty((len(keys), 2), np.int64), np.empty((len(keys), 2), np.int64), np.empty_like(keys)
     count = first = bends = 0
     for last in range(len(keys)):
@@ -199,7 +206,8 @@ def _edges(vertices: Array, faces: Index, normals: Array, keys: Index, which: In
         if even and v != w:
             along, p, q = vertices[j] - vertices[i], vertices[v] - vertices[i], vertices[w] - vertices[i]
             even = not dot(p, q) * dot(along, along) > dot(along, p) * dot(along, q)
-        bends += not even
+        groove = outward and last == first + 1 and dot(normals[f], vertices[w] - vertices[i]) > 0.0
+        bends += not (even or groove)
         count, first = count + 1, last + 1
     return edges[:count], across[:count], bent[:bends]
 

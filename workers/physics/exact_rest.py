@@ -161,7 +161,7 @@ REACH_M = 1e-3
 FALL_M = 1e-4
 """Free fall in the shortest step. Longer ones, by powers of two, cross slow tipping in few steps."""
 
-LONGEST_FALL_M = 0.05
+LONGEST_FALL_M = 0.4
 """Free fall in the longest step: 0.1 s."""
 
 STILL = 1e-5
@@ -175,6 +175,9 @@ MOST_NUDGES = 3
 
 MOST_STEPS = 160
 """Of piles of eight most need 3 to 60 steps; what falls from a part that fills a hollow does so by half a millimetre a step."""
+
+SLIDING_FALL_M = 6e-3
+"""Free fall in the steps of what slides or tumbles freely; what creeps gets longer ones."""
 
 
 MOST_SPUN = 16
@@ -209,25 +212,29 @@ def rest(
     poses: Sequence[Pose],
     ground: Surface,
     friction: float,
-    most_steps: int = MOST_STEPS,
+    most_sliding: int = MOST_STEPS,
     spinning_m: float = 0.0,
 ) -> Rested:
     """Bodies let go at rest from `poses` (`T_world_obj`), followed without speed until nothing moves any more.
 
     What overlaps is moved apart, what hovers falls, what is out of balance tips, also from an edge or a corner that it was
-    balanced on. friction: the coefficient of a contact. Not `still` after so many steps, or where overlapping bodies are jammed.
+    balanced on. friction: the coefficient of a contact. Not `still` after `MOST_STEPS` or so many in which something slides, or
+    where overlapping bodies are jammed.
     """
     surfaces, at, near = [*(thing.surface for thing in things), ground], tuple(poses), None
     reaches = np.array([np.linalg.norm(one.surface.vertices - one.mass.com, axis=1).max() for one in things])
-    fall_m, known_m, nudges = FALL_M, 0.0, 0
-    for number in range(most_steps + (MOST_SPUN if spinning_m else 0)):
+    fall_m, known_m, nudges, sliding = FALL_M, 0.0, 0, 0
+    for number in range(MOST_STEPS + (MOST_SPUN if spinning_m else 0)):
+        sliding += fall_m < SLIDING_FALL_M
+        if sliding > most_sliding and number < MOST_STEPS:
+            return Rested(at, False, number)
         points = [transform(T, thing.surface.vertices) for T, thing in zip(at, things, strict=True)] + [ground.vertices]
         if near is None or known_m <= 0.0:
             near, known_m = find_near_features(surfaces, points, DEEPEST_M + REACH_M), REACH_M
         contacts = find_contacts(surfaces, points, near, REACH_M, DEEPEST_M)
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
         try:
-            spun_m = spinning_m if number >= most_steps else 0.0
+            spun_m = spinning_m if number >= MOST_STEPS else 0.0
             motion = step(inertias, contacts, friction, fall_m * DOWN, GRAVITY_M_S2, spun_m)
             moved_m = _farthest(motion, reaches)
             if moved_m <= STILL * fall_m and nudges < MOST_NUDGES:
@@ -249,7 +256,7 @@ def rest(
             fall_m = max(FALL_M, fall_m / 2)
         elif moved_m < REACH_M / 4:
             fall_m = min(LONGEST_FALL_M, 2 * fall_m)
-    return Rested(at, False, most_steps)
+    return Rested(at, False, MOST_STEPS)
 
 
 def _farthest(motion: Motion, reaches: Array) -> float:

@@ -140,7 +140,11 @@ class Drop:
             return (PACES,)
         if len(self.starts) >= CROWD and not self.pouring.waves:
             return (PACES_TOGETHER[-1:],)
-        return (PACES_MANY[:1], PACES_MANY[1:]) if self.many else (PACES_TOGETHER, PACES_TOGETHER[-1:])
+        if not self.many:
+            return (PACES_TOGETHER, PACES_TOGETHER[-1:])
+        # Where what finds no balance is drawn again, that is sooner done than all at the finer pace
+        again = self.pouring.draw is not None and len(self.starts) > AT_ONCE
+        return (PACES_MANY[:1],) if again else (PACES_MANY[:1], PACES_MANY[1:])
 
 
 def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
@@ -245,7 +249,7 @@ creeps by 60 micrometres before Bullet's solver has found the forces, and by 240
 MOST_HOLDS = 3
 """Times that objects are let go before they fall anew, each from where they came to rest the time before, and twice as far."""
 
-POURED_STEPS = 48
+POURED_STEPS = 40
 """Steps of exact rest of a pile of many, a tenth of a second each, after which what still slides is released where it is."""
 
 FAR_M = 2e-4

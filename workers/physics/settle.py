@@ -64,6 +64,10 @@ MOST_RELEASES, POURED_RELEASES = 3, 6
 """Times that objects are released, each from where exact rest gave up the time before; and those of a pile that fell in waves."""
 
 
+WAVE_S = 0.7
+"""Time that a wave has before the next one falls on it, whether it has come to rest or not."""
+
+
 class UnsupportedError(LostError):
     """No balance was found, or none that holds, for these objects."""
 
@@ -241,7 +245,8 @@ def _pour(drop: Drop, flat: bool) -> Drop | None:
         part = sorted(drop.lying.union(wave))
         if len(part) == count:
             break
-        few = dataclasses.replace(drop, starts=tuple(starts[number] for number in part))
+        brief = drop.physics.model_copy(update={"max_settle_s": min(WAVE_S, drop.physics.max_settle_s)})
+        few = dataclasses.replace(drop, starts=tuple(starts[number] for number in part), physics=brief)
         outcome = release(few, flat, PACES_MANY[:1] if few.many else PACES_TOGETHER[:1])
         if outcome.stopped_by == "edge":
             return None
@@ -250,7 +255,9 @@ def _pour(drop: Drop, flat: bool) -> Drop | None:
         for number, T in zip(part, outcome.poses, strict=True):
             poses[number] = T
         lost, thrown = (tuple(part[k] for k in of) for of in (outcome.lost, outcome.thrown))
-        _require_calm(drop, dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown)), part)
+        if lost or thrown or any(_is_low(drop, _com(starts[number], poses[number])[2]) for number in part):
+            gone = dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown))
+            _require_calm(drop, gone, part)
         drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part), seconds=seconds)
     return drop
 
