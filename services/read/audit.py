@@ -32,7 +32,8 @@ from services.read.replay import compare_files, compare_rows, open_context
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px
-from workers.physics.settle import release_again, settle_scene
+from workers.physics.recheck import release_again
+from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects

@@ -26,8 +26,9 @@ from services.study.model import ERRORS, Figure, Row, Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.bullet import GRAVITY_M_S2, World, open_world
 from workers.physics.fall import FINEST
+from workers.physics.recheck import moved_by, recheck_scene
 from workers.physics.rigid_body import Body
-from workers.physics.settle import Rest, moved_by, recheck_scene, settle_scene
+from workers.physics.settle import Rest, settle_scene
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.plan import SceneChance, plan_scene, pouring_of

@@ -1,10 +1,9 @@
-"""The physics step: objects from release to rest, and a second release as a check.
+"""The physics step: objects from release to rest.
 
 Objects are simulated until calm, brought to exact rest, measured, and refused where they do not rest.
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -15,10 +14,10 @@ from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, SupportedBy
-from workers.geometry.frames import motion_between, transform, translation
+from workers.geometry.frames import transform, translation
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
 from workers.physics.exact_rest import rest
-from workers.physics.fall import FINEST, Outcome
+from workers.physics.fall import Outcome
 from workers.physics.placement import (
     TOUCHING_M,
     Form,
@@ -44,7 +43,7 @@ from workers.physics.pour import (
     points_of,
     renumbered,
 )
-from workers.physics.release import LEFT_M, PACES_MANY, PACES_TOGETHER, Drop, Pace, hold, let_go, release
+from workers.physics.release import LEFT_M, PACES_MANY, PACES_TOGETHER, Drop, Pace, hold, release
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
@@ -62,7 +61,6 @@ STAYED_M = 1e-3
 
 MOST_RELEASES, POURED_RELEASES = 3, 6
 """Times that objects are released, each from where exact rest gave up the time before; and those of a pile that fell in waves."""
-
 
 WAVE_S = 0.7
 """Time that a wave has before the next one falls on it, whether it has come to rest or not."""
@@ -400,13 +398,6 @@ def _require_support(ending: _Ending, number: int, held: Support) -> None:
     )
 
 
-RECHECK_S = 1.0
-"""Simulated time of the second release."""
-
-RECHECK_RATE = 4.0
-"""Steps a second of the second release, in the settings', of a single object on level ground: a quarter of the finest. Nothing
-slips slowly there. At rest, tilted and lifted, both rates refuse the same (docs/rest.md), this one in 0.31 of the time."""
-
 LEFT_TOP, LEFT_ROOM = "a footprint left the table's flat top", "an object left the room that it had to itself"
 
 
@@ -460,42 +451,3 @@ def _settle_alone(
         began.append(one)
         settled.append(rest)
     return renumbered(began), tuple(settled)
-
-
-def recheck_scene(
-    plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan, level_rate: float = RECHECK_RATE
-) -> Rest:
-    """The same rest, with the motion of every object after a second release of all. level_rate: as of `release_again`."""
-    effects, plan = add_effects(effects, rest.called), dataclasses.replace(plan, objects=rest.starts)
-    poses = release_again(plan, rest.settled, physics, effects, RECHECK_S, level_rate)
-    settled = []
-    for start, before, after in zip(rest.starts, rest.settled, poses, strict=True):
-        moved_mm, turned_deg = moved_by(start, before.T_world_obj, after)
-        settled.append(dataclasses.replace(before, recheck_move_mm=moved_mm, recheck_turn_deg=turned_deg))
-    return dataclasses.replace(rest, settled=tuple(settled))
-
-
-def release_again(
-    plan: ScenePlan,
-    settled: Sequence[Settled],
-    physics: Physics,
-    effects: EffectPlan,
-    seconds: float,
-    level_rate: float = FINEST,
-) -> tuple[Pose, ...]:
-    """`T_world_obj` [4, 4] of every object this long after its release from where it rests, or once one moved by `hold.FAR_M`.
-
-    With the effects of the plan, without correction. Nothing counts as resting before the end. In the finest steps, and a single
-    object on level ground in `level_rate` times as many a second as the settings say.
-    """
-    rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
-    physics = physics.model_copy(update={"max_settle_s": seconds, "rest": rest})
-    starts, poses = plan.objects, [each.T_world_obj for each in settled]
-    placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
-    return let_go(Drop(starts, plan.table, physics, effects), placement, poses, level_rate=level_rate)
-
-
-def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
-    """(mm that the farthest point of an object moves between two poses, degrees that it turns)."""
-    moved_m, turned_rad = motion_between(start.hull.vertices, before, after)
-    return moved_m * 1e3, math.degrees(turned_rad)

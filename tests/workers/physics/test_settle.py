@@ -36,6 +36,7 @@ from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, Outcome, fall
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.pour import NOTHING_MORE, Pouring, points_of
+from workers.physics.recheck import RECHECK_RATE, RECHECK_S, release_again
 from workers.physics.release import (
     DOUBTFUL_RISE,
     FAR_M,
@@ -52,7 +53,7 @@ from workers.physics.release import (
     let_go,
     release,
 )
-from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_RATE, RECHECK_S, Rest, release_again, settle_scene
+from workers.physics.settle import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
 
 TABLE = level()
 TOP = TABLE.top.height_m
