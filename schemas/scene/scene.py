@@ -117,8 +117,8 @@ class Settled:
     penetration_mm and hover_gap_mm: between the true meshes; support_margin_mm: distance of the projected centre of mass
     inside the hull of the contacts that hold it up; equilibrium_residual: share of the weight, or of weight times size, that
     contact forces cannot balance; contacts: those that carry it, whose forces are the proof of that; residual_speed_mm_s:
-    drift of the farthest point over the simulation's last window, or its speed where objects `spun` on about the vertical at the
-    end; recheck_move_mm and recheck_turn_deg: motion when released again (None where it was not).
+    drift of the farthest point over the simulation's last window, or its speed where that ended with objects in motion, as those
+    that `spun` on about the vertical; recheck_move_mm and recheck_turn_deg: motion when released again (None where it was not).
     """
 
     T_world_obj: Pose

@@ -43,7 +43,7 @@ from workers.physics.pour import (
     points_of,
     renumbered,
 )
-from workers.physics.release import LEFT_M, PACES_MANY, PACES_TOGETHER, Drop, Pace, hold, release
+from workers.physics.release import LEFT_M, Drop, Pace, hold, release
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
@@ -62,8 +62,8 @@ STAYED_M = 1e-3
 MOST_RELEASES, POURED_RELEASES = 3, 6
 """Times that objects are released, each from where exact rest gave up the time before; and those of a pile that fell in waves."""
 
-WAVE_S = 0.7
-"""Time that a wave has before the next one falls on it, whether it has come to rest or not."""
+WAVE_S, POURED_S = 0.7, 4.0
+"""Time that a wave has before the next one falls on it, and the last before exact rest, whether it has come to rest or not."""
 
 
 class UnsupportedError(LostError):
@@ -195,13 +195,14 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
     seconds, placement = drop.seconds, None
     most = POURED_RELEASES if drop.lying else MOST_RELEASES
     for _ in range(most):
-        outcome = release(drop, flat, paces)
+        brief = bool(drop.lying) and drop.physics.exact_rest
+        outcome = release(_briefly(drop, POURED_S) if brief else drop, flat, paces)
         if outcome.stopped_by == "room":
             raise LeftRoomError
         if outcome.stopped_by == "edge":
             return None
         seconds += outcome.seconds
-        _require_calm(drop, outcome)
+        _require_calm(drop, outcome, moving=brief)
         exact = drop.physics.exact_rest
         if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
             return standing
@@ -243,9 +244,8 @@ def _pour(drop: Drop, flat: bool) -> Drop | None:
         part = sorted(drop.lying.union(wave))
         if len(part) == count:
             break
-        brief = drop.physics.model_copy(update={"max_settle_s": min(WAVE_S, drop.physics.max_settle_s)})
-        few = dataclasses.replace(drop, starts=tuple(starts[number] for number in part), physics=brief)
-        outcome = release(few, flat, PACES_MANY[:1] if few.many else PACES_TOGETHER[:1])
+        few = _briefly(dataclasses.replace(drop, starts=tuple(starts[number] for number in part)), WAVE_S)
+        outcome = release(few, flat, drop.ways[0][:1])
         if outcome.stopped_by == "edge":
             return None
         seconds += outcome.seconds
@@ -253,11 +253,16 @@ def _pour(drop: Drop, flat: bool) -> Drop | None:
         for number, T in zip(part, outcome.poses, strict=True):
             poses[number] = T
         lost, thrown = (tuple(part[k] for k in of) for of in (outcome.lost, outcome.thrown))
-        if lost or thrown or any(_is_low(drop, _com(starts[number], poses[number])[2]) for number in part):
-            gone = dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown))
-            _require_calm(drop, gone, part)
+        there = dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown))
+        _require_calm(drop, there, part, moving=True)
         drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part), seconds=seconds)
     return drop
+
+
+def _briefly(drop: Drop, most_s: float) -> Drop:
+    """The drop, simulated for no longer than this."""
+    seconds = min(most_s, drop.physics.max_settle_s)
+    return dataclasses.replace(drop, physics=drop.physics.model_copy(update={"max_settle_s": seconds}))
 
 
 def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
@@ -296,8 +301,11 @@ def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     )
 
 
-def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = None) -> None:
-    """Raises SettleError where objects were lost or still move; fallen: the numbers of those that were let go, if not all."""
+def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = None, moving: bool = False) -> None:
+    """Raises SettleError where objects were lost or still move, which they may where they are `moving`.
+
+    fallen: the numbers of those that were let go, if not all.
+    """
     known = range(len(drop.starts)) if fallen is None else list(fallen)
     starts = [drop.starts[number] for number in known]
     coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
@@ -314,7 +322,8 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = N
         return
     if lost := outcome.lost or [number for number in known if _is_low(drop, coms[number][2])]:
         raise _left_table(drop, lost, outcome.poses, outcome.seconds, known)
-    raise SettleError("not_at_rest", _what_moves(drop.physics, starts[outcome.moves[0]], outcome))
+    if not moving:
+        raise SettleError("not_at_rest", _what_moves(drop.physics, starts[outcome.moves[0]], outcome))
 
 
 def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
