@@ -253,6 +253,9 @@ UNEVEN, UNEVEN_M = 100.0, 9e-5
 """Ratio of masses from which what is let go may move farther, by its root, up to this: under a thousand times its weight a cube
 creeps by 60 micrometres before Bullet's solver has found the forces, and by 240 with a thirtieth of the iterations."""
 
+POURED_HOLD_S = 0.1
+"""The same time for what fell in waves: a second of fifteen takes 32 s."""
+
 MOST_HOLDS = 3
 """Times that objects are let go before they fall anew, each from where they came to rest the time before, and twice as far."""
 
@@ -279,6 +282,8 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     forces, and bodies need not find them. What slips comes to exact rest anew, from where it went. A crowd is not let go.
     """
     still, held_m = next((still, most_m) for fewer_than, still, most_m in HELD if len(poses) < fewer_than)
+    if drop.pouring.waves and len(poses) > AT_ONCE:
+        still = still.model_copy(update={"window_s": POURED_HOLD_S})
     held_m = max(held_m, min(UNEVEN_M, held_m * math.sqrt(_unevenness(drop.starts) / UNEVEN)))
     spinning_m = 2.0 * drop.physics.friction * drop.physics.spinning_friction  # Bullet's arm
     changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
