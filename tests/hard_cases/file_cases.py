@@ -4,14 +4,14 @@ Their boxes are cut finely, with the corners of every face doubled as exporters 
 boxes that are not from files.
 """
 
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import trimesh
 
 from schemas.scene.shape import Asset
 from tests.hard_cases.case import settles
-from tests.hard_cases.groups import DOMINO_M, LEAN_DEG, PLANK_M, PLANK_THICK_M, dominoes, leaning, stack
+from tests.hard_cases.groups import DOMINO_M, LEAN_DEG, PLANK_M, PLANK_THICK_M, Group, dominoes, leaning, stack
 from tests.hard_cases.measures import apart, both, heights, tilts
 from tests.hard_cases.outside import enter
 from tests.kit.shapes import box
@@ -21,9 +21,9 @@ SIDE_M = 0.05
 
 
 @cache
-def from_file(kind: str, *sides_m: float) -> Asset:
+def from_file(kind: str, x_m: float, y_m: float, z_m: float) -> Asset:
     """A box from an OBJ or a GLB, of 192 faces that share no corner, resting on its own frame's z = 0."""
-    mesh = box(*sides_m, (0.0, 0.0, sides_m[2] / 2)).subdivide().subdivide()
+    mesh = box(x_m, y_m, z_m, (0.0, 0.0, z_m / 2)).subdivide().subdivide()
     mesh.unmerge_vertices()
 
     def made(folder: Path) -> Path:
@@ -35,6 +35,10 @@ def from_file(kind: str, *sides_m: float) -> Asset:
 def cubes(count: int, kinds: tuple[str, ...] = ("obj", "glb")) -> list[Asset]:
     """So many, from OBJ and GLB files in turn."""
     return [from_file(kinds[number % len(kinds)], SIDE_M, SIDE_M, SIDE_M) for number in range(count)]
+
+
+def _stacked(count: int) -> Group:
+    return stack(*cubes(count))
 
 
 def middles(count: int) -> tuple[float, ...]:
@@ -64,7 +68,7 @@ FROM_FILES = (
         settles(
             f"stack of {count} cubes from files",
             both(heights(*middles(count), bound_mm=0.01 * count), apart(1.0)),
-            lambda count=count: stack(*cubes(count)),
+            partial(_stacked, count),
             tier=tier,
             again="slow",
         )

@@ -44,7 +44,7 @@ def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array, NDA
     """
     as_they_are = (vertices, faces), 0.0
     corners = merge_points(vertices)[faces]
-    found = find_bodies(vertices, faces, corners)
+    found = find_bodies(vertices, faces, corners, apart=True)
     if len(found.volume) > MOST_UNITED:
         return as_they_are
     places = np.zeros((int(corners.max()) + 1, 3))

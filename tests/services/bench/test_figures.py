@@ -1,6 +1,7 @@
 """The figures of a benchmark: from times that were made up, of settling with effects forced, and of several workers."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import pickle
@@ -159,7 +160,9 @@ def test_the_share_that_the_plan_saves_is_of_the_scenes_that_come_to_rest_in_eve
 
 
 def test_what_does_not_come_to_rest_is_counted_and_refused_where_nothing_does():
-    over_nothing = facts_with(drop(cube(), level(), xy=(0.9, 0.0)))
+    facts = facts_with(drop(cube(), level(), xy=(0.9, 0.0)))
+    start = facts.job.start.model_copy(update={"if_lost": "fail"})
+    over_nothing = dataclasses.replace(facts, job=facts.job.model_copy(update={"start": start}))
     with pytest.raises(RunError, match="none of 1 scenes"):
         time_settling([over_nothing], rounds=1)
     timed = time_settling([over_nothing, facts_with(drop(cube(), level()))], rounds=1)

@@ -131,21 +131,28 @@ def _label(one: Indices, other: Indices, count: int) -> Indices:
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def find_bodies(vertices: Array, faces: Indices, corners: Indices) -> Bodies:
-    """The bodies of a mesh: faces [F, 3] into vertices [V, 3], with `corners` the same faces into merged points.
-
-    Faces that share an edge are of one body. Where more than two do, surfaces that are closed there by themselves touch, and
-    stay apart; the others are joined.
-    """
-    edges, count = _edges(corners), len(corners)
-    number = np.repeat(np.arange(len(edges.size)), edges.size)
+def _apart(edges: _Edges, number: Indices, count: int) -> Indices:
+    """[count] int64: the body of each face, where surfaces that touch stay apart; number: of the edge of each side."""
     pairs = edges.start[edges.size == 2]
     surface = _label(edges.face[pairs], edges.face[pairs + 1], count)
     met = edges.size[number] > 2
     meeting, where = np.unique(np.stack([number[met], surface[edges.face[met]]]), axis=1, return_inverse=True)
     ends = meeting[:, np.bincount(where.ravel(), np.where(edges.forward[met], 1, -1)) != 0]
     same = np.flatnonzero(ends[0, 1:] == ends[0, :-1])
-    body = _label(ends[1, same], ends[1, same + 1], count)[surface]
+    return _label(ends[1, same], ends[1, same + 1], count)[surface]
+
+
+def find_bodies(vertices: Array, faces: Indices, corners: Indices, apart: bool = False) -> Bodies:
+    """The bodies of a mesh: faces [F, 3] into vertices [V, 3], with `corners` the same faces into merged points.
+
+    Faces that share an edge are of one body. apart: where more than two do, surfaces that are closed there by themselves touch,
+    and stay apart; the others are joined.
+    """
+    edges, count = _edges(corners), len(corners)
+    number = np.repeat(np.arange(len(edges.size)), edges.size)
+    body = _label(edges.face[edges.start][number], edges.face, count)
+    if apart:
+        body = _apart(edges, number, count)
     bodies = int(body.max(initial=-1)) + 1
     balance = np.add.reduceat(np.where(edges.forward, 1, -1), edges.start) if count else np.zeros(0, dtype=np.int64)
     open_edges = np.bincount(body[edges.face[edges.start]], weights=balance != 0, minlength=bodies)
