@@ -135,7 +135,12 @@ class Drop:
     @property
     def poured(self) -> bool:
         """Whether many fall in waves, and what finds no balance is drawn again."""
-        return self.many and self.pouring.draw is not None and len(self.starts) > AT_ONCE
+        return self.many and self.in_waves and self.pouring.draw is not None
+
+    @property
+    def in_waves(self) -> bool:
+        """Whether the objects fall in more waves than one."""
+        return self.pouring.waves and len(self.starts) > AT_ONCE
 
     @property
     def single(self) -> bool:
@@ -282,14 +287,14 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     forces, and bodies need not find them. What slips comes to exact rest anew, from where it went. A crowd is not let go.
     """
     still, held_m = next((still, most_m) for fewer_than, still, most_m in HELD if len(poses) < fewer_than)
-    if drop.pouring.waves and len(poses) > AT_ONCE:
+    if drop.in_waves:
         still = still.model_copy(update={"window_s": POURED_HOLD_S})
     held_m = max(held_m, min(UNEVEN_M, held_m * math.sqrt(_unevenness(drop.starts) / UNEVEN)))
     spinning_m = 2.0 * drop.physics.friction * drop.physics.spinning_friction  # Bullet's arm
     changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
     held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
     for far_m in (2.0**number * FAR_M for number in range(MOST_HOLDS)):
-        most = POURED_STEPS if drop.pouring.waves and len(poses) > AT_ONCE else MOST_STEPS
+        most = POURED_STEPS if drop.in_waves else MOST_STEPS
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction, most, spinning_m)
         if not rested.still or len(poses) >= CROWD:
             return rested

@@ -307,7 +307,6 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = N
     fallen: the numbers of those that were let go, if not all.
     """
     known = range(len(drop.starts)) if fallen is None else list(fallen)
-    starts = [drop.starts[number] for number in known]
     coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
     if outcome.thrown:
         raise UnsupportedError(
@@ -323,7 +322,7 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = N
     if lost := outcome.lost or [number for number in known if _is_low(drop, coms[number][2])]:
         raise _left_table(drop, lost, outcome.poses, outcome.seconds, known)
     if not moving:
-        raise SettleError("not_at_rest", _what_moves(drop.physics, starts[outcome.moves[0]], outcome))
+        raise SettleError("not_at_rest", _what_moves(drop.physics, drop.starts[known[outcome.moves[0]]], outcome))
 
 
 def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:

@@ -150,9 +150,7 @@ def find_bodies(vertices: Array, faces: Indices, corners: Indices, apart: bool =
     """
     edges, count = _edges(corners), len(corners)
     number = np.repeat(np.arange(len(edges.size)), edges.size)
-    body = _label(edges.face[edges.start][number], edges.face, count)
-    if apart:
-        body = _apart(edges, number, count)
+    body = _apart(edges, number, count) if apart else _label(edges.face[edges.start][number], edges.face, count)
     bodies = int(body.max(initial=-1)) + 1
     balance = np.add.reduceat(np.where(edges.forward, 1, -1), edges.start) if count else np.zeros(0, dtype=np.int64)
     open_edges = np.bincount(body[edges.face[edges.start]], weights=balance != 0, minlength=bodies)
