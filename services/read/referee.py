@@ -12,14 +12,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.errors import plural
 from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, ScenePlan, Settled
-from workers.geometry.frames import invert, motion_between, transform
+from workers.geometry.frames import invert, motion_between, pose, transform
 from workers.physics.convex_parts import parts_of
 from workers.physics.effects import is_convex
 from workers.physics.rigid_body import body_frame
@@ -30,7 +29,7 @@ STEP_S = 5e-4
 """MuJoCo's own default is 2 ms, in which stacks sway."""
 
 WORLD = """<mujoco><size memory="1G"/>
-<option timestep="{step_s}" cone="elliptic" impratio="10" iterations="200" noslip_iterations="20"/>
+<option cone="elliptic" impratio="10" iterations="200" noslip_iterations="20"/>
 <default><geom type="mesh" condim="6" friction="{slide} {spin} {roll}" solref="0.001 1" solimp="0.99 0.999 0.001"/></default>
 <asset>{meshes}</asset><worldbody>{bodies}</worldbody></mujoco>"""
 """Twenty steps without slip: else friction yields, and what lies on a slope creeps. Contacts as stiff as the step allows."""
@@ -78,23 +77,33 @@ def hold_scene(plan: ScenePlan, settled: Sequence[Settled], physics: Physics) ->
     """Hold a scene for `HOLD_S` from where it rests; None over a table that is not convex, which would need parts."""
     if not plan.table.top.convex:
         return None
-    mujoco: Any = importlib.import_module("mujoco")
-    frames = [body_frame(start.asset.mass) for start in plan.objects]
-    poses = [rest.T_world_obj @ frame for rest, (frame, _) in zip(settled, frames, strict=True)]
-    shapes = [_convex_parts(start, physics) for start in plan.objects]
-    model = mujoco.MjModel.from_xml_string(_describe(plan, poses, [parts for parts, _ in shapes], physics))
-    data = mujoco.MjData(model)
-    for _ in range(round(HOLD_S / STEP_S)):
-        mujoco.mj_step(model, data)
-    held = Held(scenes=1, shapes=dict(Counter(what for _, what in shapes)))
-    for number, (start, T, (frame, _)) in enumerate(zip(plan.objects, poses, frames, strict=True)):
-        body = data.body(str(number))
-        after = np.eye(4)
-        after[:3, :3], after[:3, 3] = body.xmat.reshape(3, 3), body.xpos
-        points = transform(invert(frame), start.hull.vertices)
-        moved_m, turned_rad = motion_between(points, T, after)
+    poses = [one.T_world_obj for one in settled]
+    after, shapes = simulate(plan, poses, physics, HOLD_S)
+    held = Held(scenes=1, shapes=dict(Counter(shapes)))
+    for start, T, moved in zip(plan.objects, poses, after, strict=True):
+        moved_m, turned_rad = motion_between(start.hull.vertices, T, moved)
         held = held.join(Held(moved_m * 1e3, math.degrees(turned_rad)))
     return held
+
+
+def simulate(
+    plan: ScenePlan, poses: Sequence[Pose], physics: Physics, seconds: float, step_s: float = STEP_S
+) -> tuple[list[Pose], list[str]]:
+    """The objects' poses after so long, let go at `poses` over a convex table; and what stands for each of them."""
+    mujoco: Any = importlib.import_module("mujoco")
+    frames = [body_frame(start.asset.mass)[0] for start in plan.objects]
+    shapes = [_convex_parts(start, physics) for start in plan.objects]
+    placed = [T @ frame for T, frame in zip(poses, frames, strict=True)]
+    model = mujoco.MjModel.from_xml_string(_describe(plan, placed, [parts for parts, _ in shapes], physics))
+    model.opt.timestep = step_s
+    data = mujoco.MjData(model)
+    for _ in range(round(seconds / step_s)):
+        mujoco.mj_step(model, data)
+    after = []
+    for number, frame in enumerate(frames):
+        body = data.body(str(number))
+        after.append(pose(body.xmat.reshape(3, 3), body.xpos) @ invert(frame))
+    return after, [what for _, what in shapes]
 
 
 def _convex_parts(start: ObjectStart, physics: Physics) -> tuple[Sequence[Array], str]:
@@ -132,9 +141,7 @@ def _describe(plan: ScenePlan, poses: Sequence[Pose], shapes: Sequence[Sequence[
         2.0 * physics.friction * x for x in (physics.spinning_friction, physics.rolling_friction)
     ]
     slide, spin, roll = (_words([x]) for x in both)
-    return WORLD.format(
-        step_s=STEP_S, slide=slide, spin=spin, roll=roll, meshes="".join(meshes), bodies="".join(bodies)
-    )
+    return WORLD.format(slide=slide, spin=spin, roll=roll, meshes="".join(meshes), bodies="".join(bodies))
 
 
 def _mesh(name: str, points: Array) -> str:

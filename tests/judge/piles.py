@@ -25,7 +25,7 @@ from workers.scene.plan import SceneChance, plan_scene, pouring_of
 
 
 @functools.cache
-def _catalogue(job_json: str) -> Catalogue:
+def catalogue_of(job_json: str) -> Catalogue:
     """Opened once in each process."""
     job = Job.model_validate_json(job_json)
     return open_catalogue(job.assets, Path(), tuple(job.categories))
@@ -35,7 +35,7 @@ def try_pile(job: Job, asked: Asked, scene_id: int) -> Outcome:
     """A scene as its job draws it."""
     chance = SceneChance(job.seed, scene_id)
     try:
-        plan = plan_scene(job, _catalogue(job.model_dump_json()), chance)
+        plan = plan_scene(job, catalogue_of(job.model_dump_json()), chance)
     except SceneError as error:
         return Outcome(scene_id, 0, 0.0, {}, error.reason, error.detail)
     return try_scene(scene_id, plan, job.physics, asked, pouring_of(job.start, chance, plan))

@@ -11,7 +11,7 @@ from schemas.errors import SettleError
 from schemas.job.job import Job
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.groups import stack
-from tests.judge import piles, scenes
+from tests.judge import bias, piles, scenes
 from tests.judge.hollows import CONTENTS, HOLLOWS, draw_hollow
 from tests.judge.judge import Verdict
 from tests.judge.piles import try_pile
@@ -127,3 +127,20 @@ def test_the_command_prints_the_table_and_writes_every_scene(tmp_path, monkeypat
     assert "| two, 1 objects | 2 | 0 | none | 100.0% |" in capsys.readouterr().out
     written = yaml.safe_load((tmp_path / "out.json").read_text())
     assert [one["scene_id"] for one in written["scenes"]] == [0, 1] and written["summary"]["accepted"] == 1.0
+
+
+def test_the_table_of_bias_counts_classes_heights_and_what_is_lost():
+    def some(tilts, heights, lost=()):
+        return [bias.Lying(k // 2, k in lost, t, h) for k, (t, h) in enumerate(zip(tilts, heights, strict=True))]
+
+    both = bias.Both(
+        some((0, 180, 90, 10), (10, 20, 30, 40), lost=(3,)), some((0, 0, 90, 90), (5, 5, 5, 1e6), lost=(3,))
+    )
+    table = [line.split("|") for line in bias.tabulate("pile", [both, bias.Both([], [])]).splitlines()]
+    assert table[0] == ["pile: 2 scenes, 1 refused"]
+    figures = [[float(cell.split()[0]) for cell in row[2:-1]] for row in table[2:]]
+    assert figures == [
+        [3, 25, 66.7, 0, 33.3, 5],
+        [4, 25, 50, 25, 25, 25],
+        [3, 25, 33.3, 33.3, 33.3, 20],
+    ]

@@ -1,19 +1,21 @@
 """Pure: mass, centre of mass and inertia of a mesh, by exact integrals over its triangles."""
 
-import itertools
-
 import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import MassProperties, Mesh, Shape
-from workers.assets.external.mesh import find_bodies, is_solid, merge_points
+from workers.assets.external.mesh import find_bodies, find_repeated, is_solid, merge_points
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of, mesh_of, piece_of, solid_of
 
 MOST_UNITED = 512
-"""Bodies of a file from which overlaps are not looked for: it takes as long as the pairs are many."""
+"""Bodies of a file from which overlaps are not looked for."""
+
+MOST_MEETING = 4_000_000
+"""Pairs of bodies whose boxes meet, each times the root of its two counts of faces, from which overlaps are not looked for:
+1.5 s of one core where they cross one another at random (`Manifold.batch_boolean` of cylinders of 128 and 384 faces)."""
 
 SAME = 1e-9
 """Share of the volume below which an overlap is rounding."""
@@ -28,8 +30,11 @@ def mass_properties(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> M
     return weigh(shape, density_kg_m3, shell_kg_m2)[0]
 
 
-def weigh(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> tuple[MassProperties, float]:
-    """As `mass_properties`; and the volume that bodies have in common, which is weighed once, m^3."""
+def weigh(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> tuple[MassProperties, float | None]:
+    """As `mass_properties`; and the volume that bodies have in common, which is weighed once, m^3.
+
+    None where the bodies are too many to look for it: what they share, they then weigh twice.
+    """
     vertices, faces = shape.vertices, shape.faces.astype(np.int64)
     if not is_solid(vertices, faces):
         return shell_mass(vertices, faces, shell_kg_m2), 0.0
@@ -37,38 +42,46 @@ def weigh(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> tuple[MassP
     return solid_mass(*united, density_kg_m3), common_m3
 
 
-def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array, NDArray[np.int64]], float]:
+def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array, NDArray[np.int64]], float | None]:
     """The surface of the union of closed bodies, voids taken from the body around them; and the volume that they share.
 
-    As they are where none meet another, a void lies in none, or there are very many.
+    As they are where none meet another or a void lies in none; None as the volume where it would take too long.
     """
-    as_they_are = (vertices, faces), 0.0
+    as_they_are = (vertices, faces)
     corners = merge_points(vertices)[faces]
     found = find_bodies(vertices, faces, corners, apart=True)
+    all_m3, once = float(found.volume.sum()), corners
+    repeated = find_repeated(corners, oriented=True)
+    if repeated.any():  # a body that a file shows more than once
+        single = find_bodies(vertices, faces[~repeated], corners[~repeated], apart=True)
+        found, once = (single, corners[~repeated]) if single.closed.all() else (found, corners)
     if len(found.volume) > MOST_UNITED:
-        return as_they_are
+        return as_they_are, None
     places = np.zeros((int(corners.max()) + 1, 3))
     places[corners] = vertices[faces]
-    pieces = [
-        piece_of(Mesh(places, faces.astype(np.int32)), corners[found.body == k]) for k in range(len(found.volume))
-    ]
+    pieces = [piece_of(Mesh(places, faces.astype(np.int32)), once[found.body == k]) for k in range(len(found.volume))]
     low, high = np.stack([bounds_of(piece.vertices) for piece in pieces], axis=1)
-    outer = np.flatnonzero(found.volume > 0.0).tolist()
-    if not any((low[a] < high[b]).all() and (low[b] < high[a]).all() for a, b in itertools.combinations(outer, 2)):
-        return as_they_are
+    outer = np.flatnonzero(found.volume > 0.0)
+    below = (low[outer, None] < high[None, outer]).all(axis=2)
+    a, b = np.nonzero(np.triu(below & below.T, k=1))
+    if not len(a) and len(once) == len(corners):
+        return as_they_are, 0.0
+    count = np.sqrt([len(pieces[k].faces) for k in outer])
+    if float((count[a] * count[b]).sum()) > MOST_MEETING:
+        return as_they_are, None
     solids = {k: solid for k, piece in enumerate(pieces) if (solid := solid_of(piece)) is not None}
-    for void in solids.keys() - set(outer):
-        around = [k for k in outer if (low[k] < low[void]).all() and (high[void] < high[k]).all()]
+    for void in solids.keys() - set(outer.tolist()):
+        around = [k for k in outer.tolist() if (low[k] < low[void]).all() and (high[void] < high[k]).all()]
         inmost = min(around, key=lambda k: float(found.volume[k]), default=None)
         if inmost not in solids:
-            return as_they_are
+            return as_they_are, 0.0
         solids[inmost] = solids[inmost] - solids[void]
     if len(solids) < len(pieces):
-        return as_they_are
-    united = manifold3d.Manifold.batch_boolean([solids[k] for k in outer], manifold3d.OpType.Add)
-    common_m3 = float(found.volume.sum()) - united.volume()
-    if common_m3 <= SAME * float(found.volume.sum()):
-        return as_they_are
+        return as_they_are, 0.0
+    united = manifold3d.Manifold.batch_boolean([solids[k] for k in outer.tolist()], manifold3d.OpType.Add)
+    common_m3 = all_m3 - united.volume()
+    if common_m3 <= SAME * all_m3:
+        return as_they_are, 0.0
     mesh = mesh_of(united)
     return (np.ascontiguousarray(mesh.vertices), mesh.faces.astype(np.int64)), common_m3
 

@@ -258,6 +258,24 @@ def test_bodies_that_share_points_or_edges_and_overlap_weigh_as_their_union_and_
     assert asset.volume_m3 == pytest.approx(0.001, rel=1e-9) and not place(hollow[0]).notes
 
 
+def test_bodies_shown_more_than_once_weigh_once_and_very_many_that_meet_are_said():
+    """A body repeated in the same place is one; crossing bodies are joined, or the note says that they are not."""
+    one, far = cube((0, 0, 0), (1, 1, 1)), cube((0.5, 0.5, 0.5), (3, 1, 1))
+    for bodies, weight in (([one] * 2, 1.0), ([one] * 900, 1.0), ([one] * 3 + [far] * 2, 1.0 + 0.625 - 0.125)):
+        mass, common = weigh(shape_of(*bodies), 1.0, 3.0)
+        assert mass.mass_kg == pytest.approx(weight, rel=1e-9), len(bodies)
+        assert common == pytest.approx(sum(body.volume for body in bodies) - weight, rel=1e-9)
+    ball = trimesh.creation.icosphere(4, 0.5)
+    rng = np.random.default_rng(5)
+    crossing = [ball.copy().apply_translation(rng.uniform(-0.1, 0.1, 3)) for _ in range(120)]
+    mass, common = weigh(shape_of(*crossing), 1.0, 3.0)
+    assert common is None and mass.mass_kg == pytest.approx(120 * ball.volume, rel=1e-6)
+    crossing = trimesh.util.concatenate(crossing)
+    assert place(crossing, scale=0.1).notes == (
+        "bodies weigh twice what they share, if anything: they are too many to look for it",
+    )
+
+
 def test_shells_weigh_as_their_plates_and_a_spherical_one_has_two_thirds_m_r_squared():
     exact, ball = 3.0 * 4 * math.pi * 0.1**2, trimesh.creation.icosphere(5, 0.1)
     mass = shell_mass(ball.vertices, ball.faces, 3.0)

@@ -94,7 +94,6 @@ def place_asset(
     centre = 0.5 * (lower + upper) * scale
     shape = transform_shape(rotated, pose(scale * np.eye(3), -centre))
     mass, common_m3 = weigh(shape, assets.density_kg_m3, assets.shell_kg_m2)
-    overlap = [f"bodies overlap: {1e6 * common_m3:.3g} cm^3 that they share weigh once"] if common_m3 else []
     return Asset(
         instance_id=entry.instance_id,
         category=category,
@@ -109,8 +108,15 @@ def place_asset(
         watertight=mass.solid,
         volume_m3=mass.mass_kg / assets.density_kg_m3 if mass.solid else None,
         shareable=settings.copy_assets,
-        notes=tuple(one_line(note) for note in [*overlap, *loaded.notes][:MOST_NOTES]),
+        notes=tuple(one_line(note) for note in [*_note_shared(common_m3), *loaded.notes][:MOST_NOTES]),
     )
+
+
+def _note_shared(common_m3: float | None) -> list[str]:
+    """What to say of the volume that bodies share (`weigh`)."""
+    if common_m3 is None:
+        return ["bodies weigh twice what they share, if anything: they are too many to look for it"]
+    return [f"bodies overlap: {1e6 * common_m3:.3g} cm^3 that they share weigh once"] if common_m3 else []
 
 
 def find_doubt(asset: Asset, settings: ShapeNetSource | FolderSource, hull_vertices: Array) -> UpAxis | None:
