@@ -40,9 +40,9 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _python() -> Finding:
-    ok = sys.version_info[:2] == (3, 11) and platform.machine() == "x86_64"
+    ok = (3, 11) <= sys.version_info[:2] <= (3, 13) and platform.machine() == "x86_64"
     found = f"CPython {platform.python_version()} on {platform.machine()}, glibc {platform.libc_ver()[1] or 'unknown'}"
-    return Finding("python", ok, found, "use CPython 3.11 on x86-64, or docker compose")
+    return Finding("python", ok, found, "use CPython 3.11 to 3.13 on x86-64, or docker compose")
 
 
 def _cores() -> Finding:

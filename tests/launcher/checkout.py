@@ -1,27 +1,35 @@
 """A copy of the launcher with an interpreter and package tools that only log what they are asked to do."""
 
+import os
 import shutil
+import signal
 import subprocess
+import time
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 EXTRAS = ("pathtraced", "study", "audit")
 LOCKS = ("requirements.lock", *(f"requirements-{name}.lock" for name in (*EXTRAS, "dev")))
 
-# Answers the launcher's probe, makes a `.venv` that links back to itself, and logs every call of pip.
-# Files named after what should go wrong, in the folder $FAULTS, make it go wrong.
+# Answers the launcher's probe, makes a `.venv` that links back to itself, and logs every call of pip. PyBullet has no wheel.
+# Files named after what should go wrong, in the folder $FAULTS, make it go wrong; one named after a program says what it is.
 FAKE_PYTHON = r"""#!/bin/bash
 log() { echo "$*" >>"$FAULTS/log"; }
+self="$(readlink -f "$0")"
+name="${self##*/}"
 case "$*" in
-  "-V") echo "Python 3.12.9" ;;
-  "-I -") cat >/dev/null; [ -e "$FAULTS/wrong-version" ] && exit 1; readlink -f "$0" ;;
+  "-I -") cat >/dev/null; cat "$FAULTS/$name" 2>/dev/null || echo "${name#python} $self" ;;
+  "-I -c import os, sysconfig;"*) [ ! -e "$FAULTS/no-headers" ] ;;
   "-I -c import ensurepip, venv") [ ! -e "$FAULTS/no-ensurepip" ] ;;
   "-I -m venv "*) log "venv"; mkdir -p "${!#}/bin"; ln -s "$(readlink -f "$0")" "${!#}/bin/python"
      printf '#!/bin/bash\necho layers\n' >"${!#}/bin/lint-imports"; chmod +x "${!#}/bin/lint-imports"; echo "chatter" ;;
   "-I -m pip --version") ;;
   "-I -m pip "*) log "$@"; echo "chatter"
      [ -e "$FAULTS/pip-fails" ] && exit 1
-     [ -e "$FAULTS/pip-hangs" ] && { touch "$FAULTS/hanging"; sleep 60; }
+     [[ "$*" = *--only-binary*pybullet.lock && ! -e "$FAULTS/has-wheel" ]] && exit 1
+     [ -e "$FAULTS/pip-hangs" ] && [[ "$*" = *"$(cat "$FAULTS/pip-hangs")"* ]] && { touch "$FAULTS/hanging"; sleep 60; }
      [ -e "$FAULTS/pip-is-slow" ] && sleep 0.5; true ;;
   "-P -m services.cli.environment") echo "OMP_NUM_THREADS=1" ;;
   "-m pytest "*) printf '%s|' pytest "${@:3}" "path=$PYTHONPATH" "threads=$OMP_NUM_THREADS" "in=$PWD"
@@ -33,9 +41,23 @@ case "$*" in
 esac
 """
 
+# There when $FAULTS/uv is; brings the interpreter whose path that file holds, once it was told to install it.
+FAKE_UV = r"""#!/bin/bash
+case "$*" in
+  "--version") [ -e "$FAULTS/uv" ] ;;
+  "python install 3.11") echo "uv $*" >>"$FAULTS/log"; [ -s "$FAULTS/uv" ] && touch "$FAULTS/uv-installed" ;;
+  "python find --system --no-project 3.11") [ -e "$FAULTS/uv-installed" ] && cat "$FAULTS/uv" ;;
+  *) exit 99 ;;
+esac
+"""
+
 FAKES = {
     "python3.11": FAKE_PYTHON,
+    "python3.12": FAKE_PYTHON,
+    "python3.13": FAKE_PYTHON,
     "python3": FAKE_PYTHON,
+    "uv": FAKE_UV,
+    "g++": '#!/bin/bash\n[ ! -e "$FAULTS/no-compiler" ]\n',
     "dpkg-query": '#!/bin/bash\n[ -e "$FAULTS/no-$4" ] || echo "install ok installed"\n',
     "apt-get": '#!/bin/bash\necho "apt-get ${@: -3}" >>"$FAULTS/log"; [ ! -e "$FAULTS/apt-fails" ]\n',
     "id": '#!/bin/bash\n[ -e "$FAULTS/not-root" ] && echo 1000 || echo 0\n',
@@ -57,9 +79,11 @@ class Checkout:
             (self.bin / name).write_text(script)
             (self.bin / name).chmod(0o755)
         self.venv = self.root / ".venv"
+        self.environ: dict[str, str] = {}
 
     def start(self, *args: str, launcher: Path | None = None, cwd: Path | None = None) -> subprocess.Popen[str]:
         environ = {"PATH": f"{self.bin}:/usr/bin:/bin", "FAULTS": str(self.faults), "PYTHONPATH": "/opt/ros"}
+        environ |= {"HOME": str(self.faults.parent), **self.environ}
         command = [str(launcher or self.root / "verso"), *args]
         pipe = subprocess.PIPE
         return subprocess.Popen(
@@ -71,10 +95,33 @@ class Checkout:
         out, err = process.communicate(timeout=60)
         return process.returncode, out, err
 
-    def fault(self, name: str) -> Path:
+    def fault(self, name: str, text: str = "") -> Path:
         file = self.faults / name
-        file.touch()
+        file.write_text(text)
         return file
+
+    def has(self, *versions: str) -> None:
+        """Leaves these Pythons alone on the path."""
+        for name in ("3.11", "3.12", "3.13", "3"):
+            self.fault(f"python{name}", "is not Python 3" if name != "3" else "is CPython 3.10.9")
+        for version in versions:
+            (self.faults / f"python{version}").unlink()
+
+    def kill_while_pip_hangs(self, *args: str, at: str = "") -> None:
+        """Starts, and ends the launcher and its children once it is in a call of pip that has `at` in it."""
+        fault = self.fault("pip-hangs", at)
+        process = self.start(*args)
+        for _ in range(400):
+            if (self.faults / "hanging").exists():
+                break
+            time.sleep(0.05)
+        else:
+            pytest.fail("the launcher never came to pip")
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        fault.unlink()
+        (self.faults / "hanging").unlink()
+        self.calls()
 
     def calls(self) -> list[str]:
         """What was asked of pip, venv and apt-get since the last time."""

@@ -1,13 +1,10 @@
 """The launcher: it sets up once, brings up to date what changed, survives kills and faults, and starts the command."""
 
-import os
-import signal
-import time
 import tomllib
 
 import pytest
 
-from tests.launcher.checkout import LOCKS, ROOT, Checkout, locked, project
+from tests.launcher.checkout import LOCKS, ROOT, locked, project
 
 # ------------------------------------------------------------------------------------------------ its ordinary course
 
@@ -89,26 +86,10 @@ def test_an_extra_that_there_is_not_is_refused_before_anything_is_made(checkout)
 # ------------------------------------------------------------------------------------------------ faults
 
 
-def kill_while_pip_hangs(checkout: Checkout, *args: str) -> None:
-    fault = checkout.fault("pip-hangs")
-    process = checkout.start(*args)
-    for _ in range(200):
-        if (checkout.faults / "hanging").exists():
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("the launcher never came to pip")
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
-    fault.unlink()
-    (checkout.faults / "hanging").unlink()
-    checkout.calls()
-
-
 def test_a_killed_first_start_or_update_is_repaired_by_the_next(checkout):
     for lock in ("contents of requirements.lock\n", "something else\n"):
         (checkout.root / "requirements.lock").write_text(lock)
-        kill_while_pip_hangs(checkout, "--version")
+        checkout.kill_while_pip_hangs("--version")
         (checkout.venv / "half a package").touch()
         code, _, err = checkout.run("--version")
         assert code == 0 and "did not finish" in err
@@ -121,7 +102,7 @@ def test_a_killed_first_start_or_update_is_repaired_by_the_next(checkout):
 )
 def test_tools_half_installed_are_installed_over(checkout, words, lock):
     checkout.run("--version")
-    kill_while_pip_hangs(checkout, *words)
+    checkout.kill_while_pip_hangs(*words)
     assert checkout.run(*words)[0] == 0
     assert checkout.calls() == [locked(lock, checkout.root, "--force-reinstall")]
 
@@ -155,17 +136,6 @@ def test_a_moved_checkout_gets_a_new_environment_and_one_that_someone_else_made_
     code, _, err = checkout.run("--version", launcher=moved / "verso")
     assert code == 1 and "not made by this launcher" in err
     assert (moved / ".venv" / "bin" / "python").read_text() == "theirs" and checkout.calls() == []
-
-
-def test_without_python_311_it_names_both_ways_on(checkout):
-    checkout.fault("wrong-version")
-    for told in ("Python 3.12.9", "no Python 3"):
-        code, out, err = checkout.run("--version")
-        assert (code, out) == (1, "") and told in err
-        assert "apt-get install python3.11" in err and "docker compose up" in err
-        for name in ("python3.11", "python3"):
-            (checkout.bin / name).write_text("#!/bin/bash\nexit 127\n")
-    assert not checkout.venv.exists()
 
 
 def test_missing_packages_are_installed_and_named_as_root_or_else_asked_for(checkout):
