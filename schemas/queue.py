@@ -61,7 +61,7 @@ EventKind = Literal["started", "began", "busy", "ended", "died", "cancel", "stop
 - ended: that driver has come to an end, good or bad, and told it
 - died: the supervisor found that the driver of that attempt is gone without a word
 - cancel: somebody asked for the job to end
-- stopped: the supervisor found that no driver of a cancelled job is left
+- stopped: no driver of a cancelled job is left, or the supervisor ended and its drivers with it: that job waits again
 """
 
 

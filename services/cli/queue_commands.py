@@ -9,8 +9,9 @@ import urllib.parse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, RunError, plural
+from schemas.errors import InputError, MachineError, RunError, plural
 from schemas.queue import JobRequest
+from services.cli import rows
 from services.cli.commands import finish, tell_result
 from services.cli.environment import default_queue
 from services.job.job_file import load_job, name_of, read_text, refuse_folders
@@ -55,11 +56,11 @@ def jobs(options: argparse.Namespace) -> int:
     from services.queue.listing import as_tree, format_rows, list_jobs
 
     queue = open_queue(_place(options))
-    rows = list_jobs(queue)
-    print("\n".join(format_rows(rows)) if rows else f"{queue.name} has no jobs")
-    if any(row.state in ("queued", "waiting", "running", "cancelling") for row in rows):
+    listed = list_jobs(queue)
+    print("\n".join(format_rows(listed)) if listed else f"{queue.name} has no jobs")
+    if any(job.state in ("queued", "waiting", "running", "cancelling") for job in listed):
         _say(_describe_supervisor(queue))
-    return finish(options, True, queue=queue.name, jobs=[as_tree(row) for row in rows])
+    return finish(options, True, queue=queue.name, jobs=[as_tree(job) for job in listed])
 
 
 def logs(options: argparse.Namespace) -> int:
@@ -101,15 +102,21 @@ def cancel(options: argparse.Namespace) -> int:
 
 def supervise(options: argparse.Namespace) -> int:
     """`verso supervise`."""
-    from services.queue.supervise import Rules, supervise
+    from services.queue.own_ray import answers, own_ray
+    from services.queue.supervise import Rules, supervise, supervise_here
 
     queue = make_queue(_place(options))
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     rules = Rules(options.at_once, _driver_command(options))
+    on_own = options.address == rows.OWN_RAY or (options.address is None and not answers(rows.DASHBOARD))
     try:
-        supervise(queue, _drivers(options), rules, _say)
+        if on_own:
+            supervise_here(queue, own_ray(queue.name, _say), rules, _say)
+        else:
+            supervise(queue, _cluster_drivers(options), rules, _say)
     except KeyboardInterrupt:
-        _say("supervision ends; jobs that run go on, the others wait for the next `verso supervise`")
+        then = "its jobs wait" if on_own else "jobs that run go on, the others wait"
+        _say(f"supervision ends; {then} for the next `verso supervise`")
     return finish(options, True, queue=queue.name)
 
 
@@ -145,16 +152,29 @@ def _place(options: argparse.Namespace) -> str:
 
 def _drivers(options: argparse.Namespace) -> "Drivers":
     from services.queue.drivers import RayDrivers
+    from services.queue.own_ray import LogsHere
 
-    return RayDrivers(options.address)
+    return LogsHere(rows.DASHBOARD) if options.address is None else RayDrivers(options.address)
+
+
+def _cluster_drivers(options: argparse.Namespace) -> "Drivers":
+    """Those of a cluster that answers. Raises MachineError, with one more remedy where no address was asked for."""
+    drivers = _drivers(options)
+    try:
+        drivers.states()
+    except MachineError as error:
+        if options.address is not None:
+            raise
+        raise MachineError(f"{error}; or give the queue a Ray of its own on this machine: --address own") from error
+    return drivers
 
 
 def _driver_command(options: argparse.Namespace) -> list[str]:
     """The words that start Verso on the cluster's head."""
     if options.driver is not None:
         return [str(options.driver)]
-    host = urllib.parse.urlsplit(options.address).hostname
-    if host in ("127.0.0.1", "localhost", "::1"):
+    host = urllib.parse.urlsplit(options.address or rows.DASHBOARD).hostname
+    if options.address == rows.OWN_RAY or host in ("127.0.0.1", "localhost", "::1"):
         return [sys.executable, "-P", "-m", "services.cli.main"]
     return ["verso"]
 

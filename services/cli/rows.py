@@ -169,7 +169,17 @@ DASHBOARD: Final = "http://127.0.0.1:8265"
 QUEUE_HELP = "the queue: a folder that all hosts see, or a bucket (default: $VERSO_QUEUE)"
 QUEUE = option("--queue", "URL", QUEUE_HELP, read.read_place)
 ADDRESS_HELP = f"Ray's job API (default: {DASHBOARD}); a token is taken from RAY_AUTH_MODE and RAY_AUTH_TOKEN"
-ADDRESS = option("--address", "HTTP", ADDRESS_HELP, read.read_http, default=DASHBOARD)
+ADDRESS = option("--address", "HTTP", ADDRESS_HELP, read.read_http)
+
+OWN_RAY: Final = "own"
+"""The address that means a private Ray, which ends with the supervisor."""
+
+SUPERVISED_HELP = (
+    f"{ADDRESS_HELP}; `{OWN_RAY}`, or where nothing answers there: a private Ray, which ends with this command"
+)
+SUPERVISED = option(
+    "--address", "HTTP", SUPERVISED_HELP, lambda text: text if text == OWN_RAY else read.read_http(text)
+)
 ID = option("id", "ID", kind=read.read_job_id)
 
 QUEUE_COMMANDS: Final[dict[str, Command]] = {
@@ -204,10 +214,10 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
         handler="services.cli.queue_commands:cancel",
     ),
     "supervise": command(
-        "start the queue's jobs on a Ray cluster, and start them again where they died",
+        "start the queue's jobs on a cluster or here, and again where they died",
         "--queue /shared/queue --at-once 2",
         QUEUE,
-        ADDRESS,
+        SUPERVISED,
         number("--at-once", "jobs that run at once, and share the cluster evenly (default: 2)", 2),
         path(
             "--driver",
@@ -215,6 +225,9 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
             "the program `verso` on the cluster's head (default: this one where HTTP is on this machine, else verso)",
         ),
         handler="services.cli.queue_commands:supervise",
+        starts_ray=lambda options: options.address in (None, OWN_RAY),
+        kept="what is committed is kept, the next `verso supervise` starts the jobs again",
+        quiet=True,
     ),
     "drive": command(
         "one attempt at a job of the queue, as `supervise` has it started on the cluster's head",

@@ -99,7 +99,7 @@ def apply(view: JobView, event: JobEvent) -> JobView:
         case "cancel":
             after["state"] = "cancelling" if view.held else "cancelled"
         case "stopped":
-            after = {"state": "cancelled"}
+            after = {"state": "cancelled" if cancelling else "queued"}
         case "busy":
             after |= {"state": "cancelled" if cancelling else "waiting", "busy": view.busy + 1}
         case "died":  # to be taken up again, unless it was cancelled or that happened too often
@@ -123,9 +123,7 @@ def applies(view: JobView, event: JobEvent) -> bool:
         return False
     if event.kind == "began":
         return not view.began and view.state == "running"
-    if event.kind == "stopped":
-        return view.state == "cancelling"
-    return event.kind == "died" or view.began
+    return event.kind in ("died", "stopped") or view.began
 
 
 Model = TypeVar("Model", bound=Frozen)

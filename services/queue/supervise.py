@@ -39,6 +39,13 @@ class Drivers(Protocol):
         """What a driver and its commands wrote so far; None where it is not known."""
 
 
+class EndingDrivers(Drivers, Protocol):
+    """Drivers that end with their supervisor."""
+
+    def end(self) -> None:
+        """Stops all of them and waits for their ends."""
+
+
 PAUSES_S: Final = (10.0, 60.0, 300.0)
 """Before a job is taken up again after its first, second and third death."""
 
@@ -195,6 +202,14 @@ class Supervisor:
         self._do_all(choose_starts(self._queue.read_all(left)[0], self._rules.at_once, self._is_due))
         self._tell_share(left)
 
+    def note_ends(self) -> None:
+        """Notes that all drivers were stopped: their jobs wait for the next supervisor, and no death is counted."""
+        views, _ = self._queue.read_all(self._queue.ids())
+        for view in views:
+            if view.held:
+                self._keep_log(view.request.id, view.attempt)
+                self._queue.append(view.request.id, "stopped", view.attempt)
+
     def _do_all(self, actions: Sequence[Action]) -> None:
         """Does one thing after another; what fails is told, and done by the next look."""
         for action in actions:
@@ -282,10 +297,26 @@ def supervise(queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str],
     """Looks after a queue until it is interrupted. Raises RunError where another supervisor does, or took over."""
     drivers.states()  # an address where nothing answers is told at once
     with hold_queue(queue) as lock:
+        _look_on(Supervisor(queue, drivers, rules, say, time.monotonic), lock)
+
+
+def supervise_here(
+    queue: Queue, own: contextlib.AbstractContextManager[EndingDrivers], rules: Rules, say: Callable[[str], None]
+) -> None:
+    """The same with drivers that end with this process: `own` is entered once the queue is held."""
+    with hold_queue(queue) as lock, own as drivers:
         supervisor = Supervisor(queue, drivers, rules, say, time.monotonic)
-        while True:
-            supervisor.look(lock.require_held)
-            time.sleep(EVERY_S)
+        try:
+            _look_on(supervisor, lock)
+        finally:
+            drivers.end()
+            supervisor.note_ends()
+
+
+def _look_on(supervisor: Supervisor, lock: Lock) -> None:
+    while True:
+        supervisor.look(lock.require_held)
+        time.sleep(EVERY_S)
 
 
 @contextlib.contextmanager

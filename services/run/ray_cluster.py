@@ -144,6 +144,18 @@ def private_folder() -> Iterator[Path]:
         os.close(owner)
 
 
+def living_folders() -> list[Path]:
+    """This user's private folders on this machine, those of processes that are gone removed first."""
+    found = []
+    for place in _places():
+        remove_dead(place)
+        for folder in place.glob(f"{PREFIX}*"):
+            with contextlib.suppress(OSError):
+                if folder.lstat().st_uid == os.geteuid() and (folder / OWNER).exists():
+                    found.append(folder / INNER)
+    return found
+
+
 def remove_dead(place: Path) -> None:
     """Removes this user's folders below `place` whose owner does not live."""
     for folder in place.glob(f"{PREFIX}*"):
@@ -216,7 +228,14 @@ def private_ray(workers: int) -> Iterator[Slots]:
     a folder that no other user can enter, and answer those that show its token, which no file and no log holds. Raises
     MachineError where Ray does not start.
     """
-    with private_folder() as folder, kept_private():
+    with private_folder() as folder, ray_in(folder, workers) as slots:
+        yield slots
+
+
+@contextlib.contextmanager
+def ray_in(folder: Path, workers: int) -> Iterator[Slots]:
+    """A private Ray as above, in a private folder."""
+    with kept_private():
         tell(folder=str(folder.parent))  # the supervisor removes it where this process cannot
         settings = {
             "num_cpus": workers,
@@ -292,6 +311,11 @@ def _read_authentication_again() -> None:
     """Ray's core keeps the mode from its import, and the token from its first use."""
     Config.initialize("")
     AuthenticationTokenLoader.instance().reset_cache()
+
+
+def address_here() -> str:
+    """HOST:PORT of the Ray that this process is connected to."""
+    return str(ray.get_runtime_context().gcs_address)
 
 
 def _object_store_folder(temporary: str) -> str:

@@ -107,12 +107,21 @@ def supervise(command: Callable[[], int], kept: str, quiet: bool = True, answers
     watched = {number for number in (*STOPS, signal.SIGTSTP, signal.SIGCONT) if _is_wanted(number)}
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, watched | {signal.SIGCHLD})
-    mark = uuid.uuid4().hex
-    os.environ[MARK] = mark  # noqa: TID251 - what the command starts inherits it, and is known by it
     last = os.pipe()
-    keeper = _Layer(frozenset(watched), kept, words, answers, signal.SIGKILL, innermost=True, last=last)
+    keeper = _Layer(
+        frozenset(watched), kept, words, answers, signal.SIGKILL, innermost=True, last=last, mark=_set_mark()
+    )
     front = replace(keeper, dies_with_parent=signal.SIGTERM, innermost=False)
     return front.tend(lambda: keeper.tend(lambda: _drive(command, words, mask)))
+
+
+def _set_mark() -> str:
+    """The line in the environments of all that the command starts. It leaves the mark of a run that started this one."""
+    environ, name = os.environ, MARK  # noqa: TID251 - what the command starts inherits it, and is known by it
+    while name in environ:
+        name += "_"
+    environ[name] = uuid.uuid4().hex
+    return f"{name}={environ[name]}"
 
 
 def tell(**facts: int | str | None) -> None:
@@ -143,6 +152,7 @@ class _Layer:
     innermost: bool
     last: tuple[int, int]
     """The pipe whose end, when nobody can write to it any more, wakes the last process."""
+    mark: str
 
     def tend(self, work: Callable[[], int]) -> int:
         """Runs `work` in a child; its exit code, in both processes."""
@@ -160,7 +170,7 @@ class _Layer:
             return work()
         os.close(mouth)
         if self.innermost:
-            _start_last(self.last)
+            _start_last(self.last, self.mark)
         status, stopped_by = self._wait(child)
         end_descendants()
         facts = _read(ear)
@@ -217,7 +227,7 @@ class _Layer:
             os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def _start_last(pipe: tuple[int, int]) -> None:
+def _start_last(pipe: tuple[int, int], mark: str) -> None:
     """Starts the process that outlives a kill of all others, and then ends what carries the run's mark."""
     if os.fork():
         return
@@ -229,8 +239,7 @@ def _start_last(pipe: tuple[int, int]) -> None:
     for writer in {pipe[1], *_listeners}:
         os.close(writer)
     facts = _read(pipe[0], to_its_end=True)
-    line = f"{MARK}={os.environ[MARK]}"  # noqa: TID251 - set by `supervise`
-    end_all(lambda: marked(line))
+    end_all(lambda: marked(mark))
     if facts.folder is not None:
         _remove(facts.folder)
     os._exit(0)

@@ -140,6 +140,7 @@ STATES = {
     "started:1 began:1 busy:1 started:2 began:2": "running",
     "started:1 cancel": "cancelling",
     "started:1 began:1 cancel stopped:1": "cancelled",
+    "started:1 began:1 stopped:1": "queued",
     "started:1 began:1 cancel died:1": "cancelled",
     "started:1 began:1 cancel busy:1": "cancelled",
     "started:1 began:1 cancel ended:1:1": "cancelled",
@@ -149,11 +150,11 @@ STATES = {
 LATE = [
     ("cancel", "started:1"),
     ("started:1", "started:1 ended:1:0"),
-    ("started:1 began:1", "started:2 began:1 stopped:1"),
+    ("started:1 began:1", "started:2 began:1"),
     ("started:1 cancel", "began:1"),
     ("started:1 died:1 started:2", "began:1"),
     ("started:1 began:1 died:1 started:2", "ended:1:0"),
-    ("started:1 began:1 died:1", "died:1"),
+    ("started:1 began:1 died:1", "died:1 stopped:1"),
     ("started:1 began:1 ended:1:0", "died:1 cancel"),
     ("started:1 began:1 cancel", "cancel"),
 ]

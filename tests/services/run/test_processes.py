@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from services.run.machine import descendants, marked, read_process, send, usable_cores
-from services.run.supervisor import LAST_WORDS, Facts, judge
+from services.run.supervisor import LAST_WORDS, MARK, Facts, judge
 from tests.kit.killed_runs import chain_of
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -202,6 +202,17 @@ def test_a_signal_ends_the_command_and_all_that_it_started(number):
     run.send_signal(number)
     assert end(run) == (1, "", f"verso: {STOPPED[number]}; all is kept\n")
     assert not any(Path(f"/proc/{process.pid}").exists() for process in below)
+
+
+def test_what_a_run_starts_below_another_run_has_the_marks_of_both(monkeypatch):
+    """The outer one is killed with all of the inner one's supervisors: its last process ends what that started, too."""
+    monkeypatch.setenv(MARK, "outer")
+    run = begun()
+    started = descendants(run.pid)[-1]
+    assert started.name == "sleep" and started.pid in {process.pid for process in marked(f"{MARK}=outer")}
+    kill_each(chain_of(run.pid), (0, 1, 2))
+    end(run)
+    wait_until_gone(Path(f"/proc/{started.pid}"))
 
 
 def test_a_program_that_waits_for_json_gets_it_from_a_command_that_dies():

@@ -1,0 +1,208 @@
+"""A queue of one machine: drivers that are children of the supervisor, its own Ray, and every end of both."""
+
+import http.server
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.errors import MachineError, RunError
+from services.cli import rows
+from services.cli.main import main
+from services.job.job_file import load_job
+from services.queue import own_ray as module
+from services.queue.own_ray import LogsHere, OwnDrivers, answers, own_ray
+from services.queue.queue import open_queue
+from services.queue.supervise import Driver, Rules, supervise_here
+from services.run.ray_cluster import private_folder
+from tests.datasets import run_here
+from tests.kit.killed_runs import chain_of, processes_with
+from tests.kit.network import free_port, listeners_of
+from tests.kit.queue_world import ids, queue_of, request_of
+
+ROOT = Path(__file__).resolve().parents[3]
+TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
+PATIENCE_S = 180.0
+
+
+def wait_for(happened: Callable[[], Any], told: Callable[[], str] = str) -> Any:
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := happened()):
+        assert time.monotonic() < deadline, told()
+        time.sleep(0.05)
+    return found
+
+
+def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found_while_they_run(tmp_path):
+    with private_folder() as folder:
+        logs = folder / module.FOLDER
+        logs.mkdir()
+        drivers = OwnDrivers(logs, {**os.environ, "GIVEN": "to drivers"})
+        stubborn = "trap 'echo told' TERM; echo $GIVEN; while :; do sleep 0.05; done"
+        for name, script in {"stubborn": stubborn, "plain": "exit 3", "killed": "kill -9 $$"}.items():
+            for _ in range(2):  # a driver that is known is not started again
+                drivers.hand_over(name, shlex.join(["bash", "-c", script]), {})
+        wait_for(lambda: [one.state for one in drivers.states().values()].count("over") == 2)
+        assert drivers.states() == {
+            "stubborn": Driver("running"),
+            "plain": Driver("over", "exit code 3"),
+            "killed": Driver("over", "killed by SIGKILL"),
+        }
+        reader = LogsHere("http://127.0.0.1:1")
+        wait_for(lambda: reader.log("stubborn") == "to drivers\n")
+        for _ in range(3):
+            drivers.stop("stubborn")
+            time.sleep(0.2)
+        assert drivers.log("stubborn") == "to drivers\ntold\n" and reader.log("plain") == ""
+        with pytest.raises(MachineError, match=r"--driver /no/verso: it cannot be started \(No such file"):
+            drivers.hand_over("other", "/no/verso drive", {})
+        module.STOP_S, patient = 0.2, module.STOP_S
+        try:
+            drivers.end()
+        finally:
+            module.STOP_S = patient
+        assert drivers.states()["stubborn"] == Driver("over", "killed by SIGKILL")
+    with pytest.raises(MachineError, match=r"--address http://127\.0\.0\.1:1"):
+        reader.log("stubborn")
+
+
+def test_an_orderly_end_is_no_death_of_a_job_and_of_a_cancelled_one_the_end(tmp_path, monkeypatch):
+    (job, cancelled), said = ids(2), []
+    queue = queue_of(tmp_path / "q", request_of(job), request_of(cancelled))
+
+    def interrupt(seconds: float) -> None:
+        monkeypatch.undo()
+        queue.append(job, "began", 1)
+        queue.append(cancelled, "cancel")
+        raise KeyboardInterrupt
+
+    class Slow(OwnDrivers):
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            assert set(self.states().values()) == {Driver("over", "killed by SIGTERM")}
+
+    monkeypatch.setattr("services.queue.supervise.time.sleep", interrupt)
+    rules = Rules(2, [sys.executable, "-c", "import time; time.sleep(600)"])
+    with pytest.raises(KeyboardInterrupt):
+        supervise_here(queue, Slow(tmp_path, os.environ), rules, said.append)
+    view = queue.read(job)
+    assert (view.state, view.deaths, view.attempt) == ("queued", 0, 1)
+    assert queue.read(cancelled).state == "cancelled"
+    assert queue.has_log(job, 1)
+
+
+def test_a_second_one_and_a_machine_without_memory_are_told_in_one_line(tmp_path, monkeypatch):
+    def no_memory(**_: Any) -> None:
+        raise ValueError("only 0.01 GB is left for tasks\nThe rest of the words")
+
+    monkeypatch.setattr("ray.init", no_memory)
+    told = r"Ray did not start on this machine \(only 0.01 GB is left for tasks\)"
+    with pytest.raises(MachineError, match=told), own_ray("/first", print):
+        pass
+    with private_folder() as other:
+        (other / module.FOLDER).mkdir()
+        (other / module.FOLDER / module.NOTE).write_text(json.dumps({"queue": "/first", "pid": 7}))
+        told = "process 7 works here with a Ray of its own, for the queue /first: submit"
+        with pytest.raises(RunError, match=told), own_ray("/second", print):
+            pass
+
+
+def test_a_port_that_something_else_uses_is_told_with_the_way_round_it(tmp_path, monkeypatch, capsys):
+    handler = type("Other", (http.server.BaseHTTPRequestHandler,), {"log_message": lambda *_: None})
+    with http.server.HTTPServer(("127.0.0.1", 0), handler) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        monkeypatch.setattr(rows, "DASHBOARD", f"http://127.0.0.1:{other.server_port}")
+        code = main(["supervise", "--queue", str(tmp_path / "q")])
+        other.shutdown()
+    told = capsys.readouterr().err
+    assert code == 1 and told.count("\n") == 1
+    assert told.startswith(f"verso: --address {rows.DASHBOARD}: Ray's job API")
+    assert told.endswith("or give the queue a Ray of its own on this machine: --address own\n")
+    assert not answers(rows.DASHBOARD)
+
+
+# ------------------------------------------------------------------------------------------------ with a real Ray
+
+
+class Machine:
+    """One on which nothing answers at the default address; `mark` is in the environment of all that is started here."""
+
+    def __init__(self, folder: Path) -> None:
+        self.queue, self.log = str(folder / "queue"), folder / "log"
+        self.mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
+        self._environment = {**os.environ, **dict([self.mark.split("=")]), "VERSO_QUEUE": self.queue, "TMPDIR": "/tmp"}
+        start = f"import sys; from services.cli import main, rows; rows.DASHBOARD = 'http://127.0.0.1:{free_port()}'; "
+        self._command = [sys.executable, "-c", f"{start}sys.exit(main.main())"]
+
+    def verso(self, *words: str) -> "subprocess.CompletedProcess[str]":
+        command = [*self._command, *words]
+        return subprocess.run(command, cwd=ROOT, env=self._environment, capture_output=True, text=True, check=False)
+
+    def supervisor(self) -> subprocess.Popen:
+        with self.log.open("ab") as words:
+            command = [*self._command, "supervise", "--at-once", "1"]
+            return subprocess.Popen(command, cwd=ROOT, env=self._environment, stdout=words, stderr=words)
+
+    def submit(self, out: Path, scenes: int) -> str:
+        slowly = [*("--set", "run.range_size=1"), *("--set", "run.shard_size=1")]
+        done = self.verso("submit", str(TABLETOP), "--out", str(out), "--scenes", str(scenes), *slowly)
+        return done.stdout.strip()
+
+    def left(self) -> list[str]:
+        return [process.name for process in processes_with(self.mark)]
+
+
+def folders() -> set[Path]:
+    return set(Path("/tmp").glob("vr-*"))
+
+
+@pytest.mark.ray
+@pytest.mark.minute
+@pytest.mark.timeout(600)
+def test_submit_and_supervise_are_the_whole_queue_of_one_machine_and_every_end_leaves_nothing(tmp_path):
+    _, digest = run_here(load_job(TABLETOP, ["scenes=16"]), tmp_path / "alone")
+    machine, before = Machine(tmp_path), folders()
+    short, long = machine.submit(tmp_path / "short", 16), machine.submit(tmp_path / "long", 4000)
+    read, log = open_queue(machine.queue).read, machine.log
+    supervisor = machine.supervisor()
+    try:
+        wait_for(lambda: read(short).state == "done", log.read_text)
+        assert read(short).digest == digest
+        wait_for(lambda: list((tmp_path / "long").glob("manifest/_commits/*")), log.read_text)
+        assert "4000 scenes" in machine.verso("logs", long).stdout, "of a driver that runs"
+        assert {one.address for one in listeners_of(supervisor.pid) if one.protocol.startswith("tcp")} <= {"127.0.0.1"}
+        told = machine.verso("supervise", "--queue", str(tmp_path / "other")).stderr
+        assert f"for the queue {machine.queue}: submit jobs there" in told and told.count("\n") == 1
+        assert "another supervisor works here" in machine.verso("supervise").stderr
+        deaths = 0
+        for ends in ([signal.SIGINT], [signal.SIGHUP], [signal.SIGKILL] * 3):
+            for pid, number in zip(chain_of(supervisor.pid), ends, strict=False):
+                os.kill(pid, number)
+            code = supervisor.wait(60)
+            wait_for(lambda: not machine.left(), lambda: str(machine.left()))
+            assert folders() <= before
+            orderly = ends[0] != signal.SIGKILL
+            assert (code == 0) == orderly
+            assert read(long).state == ("queued" if orderly else "running"), log.read_text()
+            supervisor = machine.supervisor()
+            attempt, deaths = read(long).attempt, deaths + (not orderly)
+            wait_for(lambda n=attempt: read(long).began and read(long).attempt > n, log.read_text)
+            assert read(long).deaths == deaths
+        machine.verso("cancel", long)
+        wait_for(lambda: read(long).state == "cancelled", log.read_text)
+    finally:
+        supervisor.terminate()
+        supervisor.wait()
+    assert "a Ray of its own" not in log.read_text() and log.read_text().count("no Ray answers on this machine") == 4
