@@ -3,13 +3,16 @@
 import hashlib
 import io
 import os
+import re
 import shutil
+import subprocess
 import sys
 import tarfile
+from pathlib import Path
 
 import pytest
 
-from tests.launcher.checkout import Checkout, locked, project
+from tests.launcher.checkout import ROOT, Checkout, locked, project
 
 LOCK = """\
 numpy==2 \\
@@ -257,3 +260,37 @@ def test_a_compiled_pybullet_is_kept_by_its_sources_hash_and_half_of_one_never(c
     start(expect="verso -ffast-math|")
     pin(add_source(checkout, "another"))
     start(expect="pybullet |verso -ffast-math|")
+
+
+# ------------------------------------------------------------------------------------------------ the same bytes
+
+
+def installed(minor: int) -> str:
+    """A CPython 3.`minor` of this machine for which PyBullet is compiled, or has a wheel; else the test is skipped."""
+    name, home = f"python3.{minor}", Path.home()
+    managed = (*home.glob(f".pyenv/versions/3.{minor}.*"), *home.glob(f".local/share/uv/python/cpython-3.{minor}.*"))
+    ready = minor == 11 or any((home / ".cache/verso/pybullet").rglob(f"pybullet-*-cp3{minor}-*.whl"))
+    for path in (shutil.which(name), *(folder / "bin" / name for folder in managed)):
+        if ready and path and subprocess.run([path, "-V"], capture_output=True, check=False).returncode == 0:
+            return str(path)
+    pytest.skip(f"no CPython 3.{minor} with a compiled PyBullet is here")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("minor", [minor for minor in (11, 12, 13) if minor != sys.version_info.minor])
+def test_another_python_makes_the_same_dataset_and_verifies_it(tmp_path, minor):
+    def digest(*command: str, **environ: str) -> str:
+        words = (*command, "run", "deploy/jobs/tabletop.yaml", "--scenes", "16", "--out", f"{tmp_path}/{len(environ)}")
+        out = subprocess.run(
+            words, cwd=ROOT, check=True, capture_output=True, text=True, env=os.environ | environ
+        ).stdout
+        return re.findall("dataset digest (.*)", out)[0]
+
+    python = installed(minor)
+    left_out = shutil.ignore_patterns(".*", "data", "docs", "tests", "__pycache__", "*.egg-info")
+    shutil.copytree(ROOT, tmp_path / "checkout", ignore=left_out)
+    launcher = str(tmp_path / "checkout" / "verso")
+    ours = digest(sys.executable, "-P", "-m", "services.cli.main", PYTHONPATH=str(ROOT))
+    assert digest(launcher, VERSO_PYTHON=python, PYTHONPATH="") == ours
+    subprocess.run([launcher, "verify", str(tmp_path / "2")], check=True, capture_output=True)

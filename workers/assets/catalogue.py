@@ -34,6 +34,7 @@ from schemas.job.assets import (
 )
 from schemas.scene.shape import Asset
 from workers.assets.external.listing import Listing, Watch, find_files, find_models, ignore
+from workers.geometry.frames import add_up
 
 if TYPE_CHECKING:
     from workers.assets.external.verdicts import Verdicts
@@ -293,7 +294,7 @@ def choose_object(catalogue: Catalogue, category: str, rng: np.random.Generator)
     offers = catalogue.offers(category)
     if not offers:
         raise AssetSourceError(f"no source offers {category!r}")
-    share = rng.random() * sum(settings.weight for _, settings, _ in offers)
+    share = rng.random() * add_up(settings.weight for _, settings, _ in offers)
     chosen = offers[-1]
     for offer in offers:
         share -= offer[1].weight

@@ -1,6 +1,9 @@
 """Rigid transforms and rotations. World: z up, metres, floor at z = 0. Optical frame: x right, y down, z forward."""
 
+import functools
 import math
+import operator
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -79,7 +82,7 @@ def cross(a: Array, b: Array) -> Array:
 
 def rotation_from_quaternion(xyzw: Array) -> Array:
     """[3, 3] float64 from a quaternion (x, y, z, w) of any length but zero."""
-    x, y, z, w = np.asarray(xyzw, dtype=np.float64) / math.sqrt(sum(float(c) ** 2 for c in xyzw))
+    x, y, z, w = np.asarray(xyzw, dtype=np.float64) / math.sqrt(add_up(float(c) ** 2 for c in xyzw))
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -142,3 +145,8 @@ def quaternion_from_rotation(R: Array) -> Array:
 def dot(one: Array, other: Array) -> float:
     """The scalar product of two vectors [3]; x and z are added first, as einsum adds three products."""
     return (one[0] * other[0] + one[2] * other[2]) + one[1] * other[1]
+
+
+def add_up(numbers: Iterable[float]) -> float:
+    """The sum of numbers, rounded at every term as by Python 3.11; since 3.12 `sum` carries what a term of floats loses."""
+    return functools.reduce(operator.add, numbers, 0.0)

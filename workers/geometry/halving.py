@@ -13,6 +13,7 @@ from manifold3d import Manifold
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.distance import distance_to_mesh
+from workers.geometry.frames import add_up
 from workers.geometry.mesh import concavity_m, face_areas, face_normals, hold_to_one_thread, mesh_of
 
 WAYS = np.array(
@@ -131,7 +132,7 @@ def _cut(piece: Manifold, size_m: float) -> list[Manifold]:
     By volume alone a ring would be cut into ever thinner rings.
     """
     cuts = [parts for way, at in _planes(_surface(piece), size_m) if len(parts := _split(piece, way, at, size_m)) > 1]
-    return min(cuts, key=lambda parts: sum(map(_filled, parts)), default=[])
+    return min(cuts, key=lambda parts: add_up(map(_filled, parts)), default=[])
 
 
 def _filled(piece: Manifold) -> float:

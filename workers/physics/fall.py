@@ -14,7 +14,7 @@ from schemas.base import Array, Pose
 from schemas.job.physics import Physics, Rest
 from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Mesh
-from workers.geometry.frames import invert, translation
+from workers.geometry.frames import add_up, invert, translation
 from workers.geometry.hull import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
 from workers.physics.rigid_body import Body, BodyPose, as_pose
@@ -43,7 +43,7 @@ class EnergyRecord:
     """The energy of bodies from time to time, over their weight, metres: the first, the least and the last of it."""
 
     def __init__(self, bodies: Sequence[Body], at: Sequence[BodyPose], moving: Sequence[Velocity]) -> None:
-        mass_kg = sum(body.mass_kg for body in bodies)
+        mass_kg = add_up(body.mass_kg for body in bodies)
         self._shares = [body.mass_kg / mass_kg for body in bodies]
         self._radii2 = [[float(moment) / body.mass_kg for moment in body.moments] for body in bodies]
         self._first = self._least = self._last = self._height_m(at, moving)

@@ -28,6 +28,7 @@ from workers.capture.poses.terms import (
     normal_equations,
     prior_sigma,
 )
+from workers.geometry.frames import add_up
 
 REACH_M = 0.012
 """Patches of one surface lie at most so far apart: about their own width."""
@@ -218,7 +219,7 @@ def _linearise(problem: Problem, poses: Array, shared: Shared) -> tuple[Array, A
     gradient[first:] += deviation / sigma**2
     held = np.concatenate([np.repeat(problem.fixed, POSE), ~free])
     matrix[held], matrix[:, held], gradient[held] = 0.0, 0.0, 0.0
-    return matrix, gradient, sum(r.cost for r in rows) + float(((deviation / sigma)[free] ** 2).sum())
+    return matrix, gradient, add_up(r.cost for r in rows) + float(((deviation / sigma)[free] ** 2).sum())
 
 
 ROUNDS = 4
