@@ -138,3 +138,5 @@ class ShardReport(Frozen):
     fingerprint: Fingerprint
     host: str
     pid: int
+    note: str = ""
+    """What a worker has to say about its device, if anything."""

@@ -42,21 +42,23 @@ class Run(Frozen):
     """Workers, shards, ranges and limits. None of these keys changes a byte of the dataset."""
 
     workers: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    """None: the cores that this container may use, or the cluster's."""
+    """None: this container's cores, or the cluster's."""
     shard_size: PositiveInt | None = None
-    """Scenes in a Ray task; rounded up to whole ranges. None: at most 64, and fewer towards the end."""
+    """Scenes in a Ray task, in whole ranges. None: at most 64, fewer towards the end."""
     range_size: RangeSize | None = None
-    """Scenes in a commit; recorded at the first run. None: at most 16, and fewer where scenes are few or slow."""
+    """Scenes in a commit; recorded at the first run. None: at most 16, fewer where scenes are few or slow."""
     max_failure_share: Share = 0.01
     """Above this share of failed scenes the run exits 1."""
     max_attempts: PositiveInt = 3
-    """Tries of a range whose worker dies, before its scene is an environmental failure."""
+    """Tries of a range whose worker dies, before its scene fails as environmental."""
     scene_timeout_s: Positive = 120.0
     """A worker that takes longer over one scene is killed."""
     device: Literal["any", "gpu"] = "any"
-    """Allowed renderers: `gpu` refuses workers where OpenGL runs in software, on the CPU."""
+    """`gpu` refuses workers that draw in software."""
+    workers_per_gpu: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """Workers that share a GPU. None: as few as leave no core idle."""
     fingerprint: Literal["strict", "record"] = "strict"
-    """`strict` refuses workers whose stack makes other bytes; `record` allows them and stores which made what."""
+    """`strict` refuses workers whose stack makes other bytes; `record` stores which made what."""
 
 
 MOST = 16
@@ -153,7 +155,7 @@ class Job(Frozen):
     output: Output = Output()
     """How files are laid out."""
     run: Run = Run()
-    """How the work is driven: changes no byte of the dataset."""
+    """How the work is driven: changes no byte."""
 
     @model_validator(mode="before")
     @classmethod

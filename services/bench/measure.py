@@ -88,7 +88,7 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
     store.prepare()
     compile_planned()
     context = open_worker(job, catalogue)
-    require_device(context.renderer.name, job.run.device)
+    require_device(context.renderer.name, job.run.device, context.renderer.choice)
     return Workbench(context, store, ShardOrder.of(str(out), job, "bench"), job.first_scene)
 
 

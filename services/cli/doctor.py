@@ -27,7 +27,9 @@ class Finding:
 
 def main(options: argparse.Namespace) -> int:
     """Examine everything and print it; returns 1 where something is missing."""
-    findings = [examine() for examine in (_python, _cores, _memory, _disk, _shared_memory, _ray, _renderer, _stack)]
+    findings = [
+        examine() for examine in (_python, _cores, _memory, _disk, _shared_memory, _ray, _gpus, _renderer, _stack)
+    ]
     width = max(len(finding.what) for finding in findings)
     for finding in findings:
         print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.what:{width}}  {finding.found}")
@@ -73,6 +75,25 @@ def _ray() -> Finding:
         return Finding("ray", True, f"{version('ray')}, temporary files in {tempfile.gettempdir()}")
     except PackageNotFoundError:
         return Finding("ray", False, "not installed", "run ./verso once: it installs what the lock file names")
+
+
+def _gpus() -> Finding:
+    """EGL's devices, and which of them this process takes."""
+    try:
+        from workers.render.raster.context import choose
+        from workers.render.raster.devices import describe, list_devices, visible_gpus
+
+        devices, choice = list_devices(), choose()
+    except MachineError as error:
+        return Finding("GPUs", False, "none that may be drawn on", str(error))
+    except (ImportError, AttributeError, TypeError):  # what a missing library shows as
+        devices = ()
+    if not devices:
+        return Finding("GPUs", True, "EGL lists none")
+    visible = visible_gpus()
+    why = choice.reason or ("the first" if visible is None else f"CUDA_VISIBLE_DEVICES is {visible!r}")
+    listed = "; ".join(describe(device) for device in devices)
+    return Finding("GPUs", True, f"{listed}: drawn on device {choice.index} ({why})")
 
 
 def _renderer() -> Finding:

@@ -134,19 +134,25 @@ MOST_LOOKED_AT = 32
 
 @dataclass(frozen=True)
 class Limits:
-    """The shards given to Ray at once, at most `attempts` at a range, and at most `failures` failed scenes."""
+    """The shards given to Ray at once, at most `attempts` at a range, and at most `failures` failed scenes.
+
+    `num_gpus` is the part of a GPU that each shard asks Ray for; 0: none.
+    """
 
     slots: Slots
     attempts: int
     failures: int
+    num_gpus: float = 0.0
 
 
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
-def _shard_task(enter: EnterShard, env_vars: dict[str, str]) -> Any:
+def _shard_task(enter: EnterShard, env_vars: dict[str, str], num_gpus: float) -> Any:
     """The task that makes a shard, as Ray's remote function; a new one asks for workers of its own."""
-    task = ray.remote(num_cpus=1, max_retries=0)(enter)
+    # Ray would end a process after each task with a GPU, unless max_calls is given
+    on_gpu: dict[str, Any] = {"num_gpus": num_gpus, "max_calls": 0} if num_gpus else {}
+    task = ray.remote(num_cpus=1, max_retries=0, **on_gpu)(enter)
     return task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
 
 
@@ -159,13 +165,15 @@ class Coordinator:
         self._terms = pattern.terms
         self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
         self._enter, self._env_vars = pattern.enter, dict(pattern.env_vars)
-        self._task = _shard_task(self._enter, self._env_vars)
+        self._task = _shard_task(self._enter, self._env_vars, limits.num_gpus)
         self._limits = limits
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()
         self._running: dict[ray.ObjectRef, tuple[Span, ...]] = {}
         self._stalled: set[ray.ObjectRef] = set()
         """Shards whose workers the watchdog ended."""
+        self._notes: set[str] = set()
+        """What workers said of their devices."""
         self._deaths = Deaths(limits.attempts)
         self._lost_nodes = LostNodes(lambda: {host for _, host in _alive_nodes()})
 
@@ -234,6 +242,9 @@ class Coordinator:
         finally:
             self._stalled.discard(ref)
         self._tally.add(report)
+        if report.note and report.note not in self._notes:
+            self._notes.add(report.note)
+            say(report.note)
         for span in report.spans:
             log_event("range committed", range=span.start, **span.model_dump(include={"stop", "won", "made", "failed"}))
             for bug in span.bugs:
@@ -256,7 +267,7 @@ class Coordinator:
         log_event("nodes lost", logging.WARNING, hosts=sorted(hosts))
         say(f"lost {', '.join(sorted(hosts))}: what was in progress there is made again elsewhere")
         # A task shares its requests for workers, and some of these wait for lost hosts.
-        self._task = _shard_task(self._enter, self._env_vars)
+        self._task = _shard_task(self._enter, self._env_vars, self._limits.num_gpus)
         for ref, spans in list(self._running.items()):
             had = hosts_of(self._store, self._order.label, spans)
             if had and not had <= hosts:

@@ -26,6 +26,7 @@ from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-d
 from ray.exceptions import RayError
 
 from schemas.errors import MachineError
+from schemas.job.job import Run
 from services.run.machine import usable_cores
 from services.run.supervisor import core_stderr, tell
 
@@ -82,6 +83,31 @@ def share_slots(whole: Slots, jobs: Callable[[], int]) -> Slots:
         return now if sharing <= 1 else Slots(share, share)
 
     return replace(whole, look=look)
+
+
+RAY_PARTS = 10_000
+"""Ray counts parts of a resource in so many steps. Rounded down, all parts of a GPU fit."""
+
+
+def share_gpus(nodes: Sequence[tuple[int, int]], running: int, run: Run) -> float:
+    """The part of a GPU that a shard asks for: by (cores, GPUs) of each node, shards that run at once, and the job.
+
+    By default as few workers have a GPU together as leave no shard waiting: Ray fills one GPU before it takes the next.
+    0 where no node has one, and where some have none and the job takes any device: those would stand idle.
+    """
+    working = [(cores, gpus) for cores, gpus in nodes if cores > 0]
+    with_gpu = [(cores, gpus) for cores, gpus in working if gpus > 0]
+    if not with_gpu or (run.device == "any" and len(with_gpu) < len(working)):
+        return 0.0
+    wanted = min(running, sum(cores for cores, _ in with_gpu))
+    fewest = next(k for k in range(1, wanted + 1) if sum(min(cores, k * gpus) for cores, gpus in with_gpu) >= wanted)
+    return RAY_PARTS // (run.workers_per_gpu or fewest) / RAY_PARTS
+
+
+def nodes_here() -> list[tuple[int, int]]:
+    """(cores, GPUs) of each node of the Ray that this process is connected to."""
+    found = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    return [(int(one.get("CPU", 0)), int(one.get("GPU", 0))) for one in found]
 
 
 def private_environment() -> dict[str, str]:

@@ -24,7 +24,7 @@ from services.run.metrics import Meter, Tally, serve
 from services.run.parts import find_parts
 from services.run.progress import ProgressLine, event_log, log_event, show_counts
 from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_shards, plan_spans
-from services.run.ray_cluster import Slots, open_ray, share_slots
+from services.run.ray_cluster import Slots, nodes_here, open_ray, share_gpus, share_slots
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
 from workers.geometry.loops import are_kept
@@ -200,7 +200,8 @@ def _coordinate(run: Run, pattern: Pattern, slots: Slots) -> int:
     job, plan = run.record.job, run.plan
     tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
-    limits = Limits(slots, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
+    num_gpus = share_gpus(nodes_here(), slots.running, job.run)
+    limits = Limits(slots, job.run.max_attempts, int(job.run.max_failure_share * job.scenes), num_gpus)
     if job.run.shard_size is not None:
         shards = group_shards(plan, job.run.shard_size)
     else:

@@ -60,7 +60,7 @@ def main(options: argparse.Namespace) -> int:
     require_tier(plan.job.render)
     catalogue = open_catalogue(plan.job.assets, plan.job_folder, tuple(plan.job.categories))
     context = open_worker(plan.job, catalogue)
-    require_device(context.renderer.name, plan.job.run.device)
+    require_device(context.renderer.name, plan.job.run.device, context.renderer.choice)
     header = header_of(plan, context.settings_digest, code_digest())
     with Journal(options.out, header) as journal, closing(ProgressLine(0, "tradeoff", unit="measurement")) as progress:
         if plan.job.captures is not None:

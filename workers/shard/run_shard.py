@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache, partial
+from functools import lru_cache, partial
 from itertools import takewhile
 from pathlib import PurePath
 from typing import IO
@@ -32,7 +32,7 @@ from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
 from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
-from workers.render.raster.gbuffer import shared_renderer
+from workers.render.raster.gbuffer import Renderer
 from workers.render.tiers import require_tier
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.make_scene import make_scene
@@ -99,8 +99,8 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
     require_tier(order.job.drawn)
     compile_planned()
     context = open_worker(order.job, catalogue)
-    require_device(context.renderer.name, order.job.run.device)
-    fingerprint = _fingerprint(order.job.drawn.tier)
+    note = require_device(context.renderer.name, order.job.run.device, context.renderer.choice)
+    fingerprint = _fingerprint(context.renderer, order.job.drawn.tier)
     store = open_store(order.out)
     _join_stack(store, fingerprint, order)
     order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})
@@ -114,6 +114,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
         fingerprint=fingerprint,
         host=socket.gethostname(),
         pid=os.getpid(),
+        note=note,
     )
 
 
@@ -236,9 +237,9 @@ def _category(context: WorkerContext, scene_id: int) -> str:
     return choose_category(context.job, SceneChance(context.job.seed, scene_id))
 
 
-@cache
-def _fingerprint(tier: Tier) -> Fingerprint:
-    return take_fingerprint(shared_renderer(), tier)
+@lru_cache(maxsize=1)  # a process has one job and, at a time, one renderer
+def _fingerprint(renderer: Renderer, tier: Tier) -> Fingerprint:
+    return take_fingerprint(renderer, tier)
 
 
 def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:

@@ -22,6 +22,8 @@ from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job
 from services.run.lock import read_holder
 from tests.datasets import make_dataset
+from workers.render.raster import context, devices
+from workers.render.raster.devices import GraphicsDevice
 from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 
@@ -225,14 +227,36 @@ def test_a_machine_without_gl_is_told_what_to_install():
 
 
 def test_a_missing_part_is_told_with_its_remedy_and_exits_1(monkeypatch, capsys):
-    for name in ("_python", "_cores", "_memory", "_disk", "_shared_memory", "_ray", "_stack"):
+    for name in ("_python", "_cores", "_memory", "_disk", "_shared_memory", "_ray", "_gpus", "_stack"):
         monkeypatch.setattr(doctor, name, lambda name=name: Finding(name, True, "there"))
     for suffices, code in ((True, 0), (False, 1)):
         monkeypatch.setattr(doctor, "_renderer", lambda ok=suffices: Finding("GL", ok, "found", "install it"))
         assert doctor.main(argparse.Namespace(json=True)) == code
         *lines, last = capsys.readouterr().out.splitlines()
         assert any("install it" in line for line in lines) is not suffices
-        assert json.loads(last)["ok"] is suffices and len(json.loads(last)["findings"]) == 8
+        assert json.loads(last)["ok"] is suffices and len(json.loads(last)["findings"]) == 9
+
+
+def test_every_gpu_is_listed_with_its_device_and_the_one_that_would_be_drawn_on(monkeypatch):
+    gpus = tuple(GraphicsDevice(1 - number, f"card{number}", True, number) for number in range(2))
+    software = GraphicsDevice(2, "Mesa's software")
+    for listed, visible, told in (
+        ((*gpus, software), None, "drawn on device 0 (the first)"),
+        ((*gpus, software), "0", "drawn on device 1 (CUDA_VISIBLE_DEVICES is '0')"),
+        ((*gpus, software), "9", "drawn on device 2 (CUDA_VISIBLE_DEVICES is '9', and EGL has"),
+        (gpus, "9", "none that may be drawn on"),
+        ((), "0", "EGL lists none"),
+    ):
+        for module in (devices, context):
+            monkeypatch.setattr(module, "list_devices", lambda listed=listed: listed)
+        monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
+        monkeypatch.setattr(devices, "visible_gpus", lambda visible=visible: visible)
+        finding = doctor._gpus()
+        assert told in finding.found and finding.ok == (told != "none that may be drawn on"), finding
+        if software in listed:
+            assert "EGL device 1 (card0, CUDA 0); EGL device 0 (card1, CUDA 1); EGL device 2 (Mesa's" in finding.found
+        if not finding.ok:
+            assert "NVIDIA_DRIVER_CAPABILITIES=all" in finding.remedy
 
 
 PRINT_ENVIRONMENT = """

@@ -93,7 +93,7 @@ def handed_out(monkeypatch, tmp_path):
             return name
 
     monkeypatch.setattr(module.ray, "put", lambda value: "catalogue")
-    monkeypatch.setattr(module, "_shard_task", lambda enter, env_vars: Task)
+    monkeypatch.setattr(module, "_shard_task", lambda enter, env_vars, num_gpus: Task)
     order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
     pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
     slots = [1]
@@ -114,6 +114,15 @@ def test_what_a_node_that_is_to_end_gives_back_is_handed_out_again_without_count
     assert list(shards.values()) == [spans(0, 2, 4), *[spans(2, 4)] * 4]
     assert (coordinator._tally.made, coordinator._deaths._counts) == (6, Counter())
     assert coordinator._fill_slots(waiting) and list(shards.values())[-1] == spans(6)
+
+
+def test_what_workers_say_of_their_devices_is_told_once_for_each_host(handed_out, monkeypatch, capsys):
+    coordinator, _, _ = handed_out
+    for note in ("h1 draws in software", "", "h2 draws in software", "h1 draws in software"):
+        answer = report(span(0, 2, {})).model_copy(update={"note": note})
+        monkeypatch.setattr(module.ray, "get", lambda ref, answer=answer: answer)
+        coordinator._collect("shard", spans(0))
+    assert capsys.readouterr().err.split("verso: ")[1:] == ["h1 draws in software\n", "h2 draws in software\n"]
 
 
 def test_shards_are_handed_out_as_the_cluster_grows_and_held_back_as_it_shrinks(handed_out):

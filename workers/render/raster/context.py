@@ -9,9 +9,7 @@ function that PyOpenGL checks: the read-back of the image at the latest.
 """
 
 import importlib
-import importlib.util
 import socket
-import sys
 from collections.abc import Callable, Mapping
 from ctypes import CFUNCTYPE, c_float, c_int, c_ssize_t, c_ubyte, c_uint, c_void_p
 from types import ModuleType
@@ -24,6 +22,7 @@ from schemas.errors import MachineError
 from schemas.scene.shape import Appearance
 from schemas.scene.view import Intrinsics
 from workers.geometry.colour import encode_srgb
+from workers.render.raster.devices import NO_GPU, Choice, choose_device, list_devices, load_egl, visible_gpus
 from workers.render.raster.draw_calls import Program
 from workers.render.raster.lit_shaders import MASK_FRAGMENT, MASK_VERTEX
 
@@ -132,49 +131,51 @@ REMEDY = (
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swr ", "swiftshader", "lavapipe", "basic render")
 """Words of GL_RENDERER, in lower case, where OpenGL runs on the CPU."""
 
-NO_GPU = (
-    "install the GPU's driver with its EGL library (NVIDIA: libnvidia-gl; in a container run with --gpus all and "
-    "NVIDIA_DRIVER_CAPABILITIES=all) and see that `verso doctor` names the GPU, or set run.device: any"
-)
-
 
 def is_software(name: str) -> bool:
     """Whether a GL_RENDERER is one that draws on the CPU."""
     return any(word in f"{name.lower()} " for word in SOFTWARE)
 
 
-def require_device(name: str, device: Literal["any", "gpu"]) -> None:
-    """Raises MachineError where a GPU is asked for and the GL_RENDERER called `name` is software."""
-    if device == "gpu" and is_software(name):
-        raise MachineError(
-            f"run.device is gpu, and OpenGL fell back to software on {socket.gethostname()} ({name}): {NO_GPU}"
-        )
+def require_device(name: str, device: Literal["any", "gpu"], choice: Choice) -> str:
+    """What there is to say about the GL_RENDERER called `name`, which was chosen so: nothing where that is as asked.
+
+    Raises MachineError where a GPU is asked for and that is software.
+    """
+    if not is_software(name):
+        return ""
+    why, remedy = f": {choice.reason}" if choice.reason else "", choice.remedy or NO_GPU
+    if device == "gpu":
+        told = f"run.device is gpu, and OpenGL fell back to software on {socket.gethostname()} ({name}){why}"
+        raise MachineError(f"{told}: {remedy}, or set run.device: any")
+    return f"{socket.gethostname()} draws in software{why}: {remedy}" if why else ""
 
 
-def _pyrenders_egl() -> ModuleType:
-    """The module `pyrender.platforms.egl`, without the package, which imports pyglet, trimesh and more: 0.5 s a process."""
-    package = importlib.util.find_spec("pyrender")
-    if package is None or "pyrender" in sys.modules:
-        return importlib.import_module("pyrender.platforms.egl")
-    sys.modules["pyrender"] = importlib.util.module_from_spec(package)  # stands for the package, which is not run
+def choose() -> Choice:
+    """The device for this process at this moment. Raises MachineError where EGL has none that it may take."""
+    if (visible := visible_gpus()) is None:
+        return Choice(0)
     try:
-        return importlib.import_module("pyrender.platforms.egl")
-    finally:
-        del sys.modules["pyrender"]
+        return choose_device(list_devices(), visible)
+    except LookupError as error:
+        raise MachineError(f"no OpenGL context could be opened ({error})") from error
 
 
-def open_context() -> tuple[ModuleType, Any]:
+def open_context(device: int = 0) -> tuple[ModuleType, Any]:
     """(the functions of OpenGL.GL, pyrender's `EGLPlatform`); a core context of OpenGL 4.1 or later is current afterwards.
+
+    `device`: the place in EGL's list of devices.
 
     Raises MachineError, with the packages to install, where this machine has no EGL, no OpenGL or too old a one.
     """
     try:
-        platform = _pyrenders_egl().EGLPlatform(1, 1)
+        egl = load_egl()
+        platform = egl.EGLPlatform(1, 1, egl.get_device_by_index(device) if device else None)
         platform.init_context()
         gl = importlib.import_module("OpenGL.GL")
         gl.glGetString(gl.GL_RENDERER).decode()
     except Exception as error:  # a missing library shows as ImportError, AttributeError, TypeError, EGLError or assert
-        # pyrender takes the first of EGL's devices.
+        # pyrender takes the first of EGL's devices where none is named.
         found = "EGL has no device" if isinstance(error, IndexError) else f"{type(error).__name__}: {error}"
         raise MachineError(f"no OpenGL context could be opened ({found}): {REMEDY}") from error
     return DirectCalls(gl), platform

@@ -24,7 +24,6 @@ its antialiasing and its cut-out texels change colour alone: labels treat every 
 import ctypes
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from types import ModuleType
 
 import cv2
@@ -39,7 +38,8 @@ from workers.geometry.frames import invert
 from workers.geometry.pixels import fill_plane_depth, fourth_channel
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
-from workers.render.raster.context import ColourTarget, Framebuffer, is_software, open_context
+from workers.render.raster.context import ColourTarget, Framebuffer, choose, is_software, open_context
+from workers.render.raster.devices import Choice
 from workers.render.raster.draw_calls import (
     DEPTH_BIAS,
     FLOOR_BIAS,
@@ -111,13 +111,22 @@ FLAT_EFFECTS = EffectPlan(("rgb", "floor", "table", "textures"), {})
 """Everything that tier flat draws of any scene."""
 
 
-@cache
-def shared_renderer() -> "Renderer":
-    """This process's renderer, made at the first call: a process has one OpenGL context.
+_shared: dict[int, "Renderer"] = {}
+"""This process's renderer, by the place of its device in EGL's list."""
 
-    Raises MachineError, with the packages to install, where there is no EGL or no OpenGL.
+
+def shared_renderer() -> "Renderer":
+    """This process's renderer, made at the first call: a process has one OpenGL context at a time.
+
+    Where Ray gives the process another GPU, it is closed and made anew there. Raises MachineError, with the packages to
+    install, where there is no EGL or no OpenGL.
     """
-    return Renderer()
+    choice = choose()
+    if choice.index not in _shared:
+        while _shared:
+            _shared.popitem()[1].close()
+        _shared[choice.index] = Renderer(choice)
+    return _shared[choice.index]
 
 
 class Renderer:
@@ -126,8 +135,9 @@ class Renderer:
     Make one a process, through `shared_renderer`, and use it from the thread that made it.
     """
 
-    def __init__(self) -> None:
-        self._gl, self._platform = open_context()
+    def __init__(self, choice: Choice) -> None:
+        self._gl, self._platform = open_context(choice.index)
+        self.choice = choice
         gl = self._gl
         self.name: str = gl.glGetString(gl.GL_RENDERER).decode()
         """OpenGL's name of the device: tells a GPU from software."""
@@ -147,6 +157,10 @@ class Renderer:
         gl.glDepthFunc(gl.GL_GREATER)
         gl.glProvokingVertex(gl.GL_LAST_VERTEX_CONVENTION)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
+
+    def close(self) -> None:
+        """Ends the context; nothing can be drawn any more."""
+        self._platform.delete_context()
 
     def draw(
         self,
