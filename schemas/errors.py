@@ -24,7 +24,8 @@ because an exception that crosses processes is rebuilt from them.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Literal
 
 FailureKind = Literal["intrinsic", "environmental"]
@@ -147,6 +148,18 @@ def _printable(character: str) -> str:
     return character if character.isprintable() else character.encode("unicode_escape").decode()
 
 
+@contextmanager
+def needs_making(what: str) -> Iterator[None]:
+    """Around imports of what makes data, in what reads it. Raises MachineError where only the half that reads is installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MachineError(
+            f"{what} needs what makes data, and {error.name} is not installed: "
+            "install verso-data in place of verso-read (Linux on x86-64)"
+        ) from error
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A question with the nearest of the known words and a space behind it; empty where none is near."""
     near = difflib.get_close_matches(word, known, n=1)
@@ -167,3 +180,25 @@ def describe_seconds(seconds: float) -> str:
 def plural(count: int, one: str, many: str | None = None) -> str:
     """A number with its noun: "1 scene", "1,200 scenes"."""
     return f"{count:,} {one if count == 1 else many or f'{one}s'}"
+
+
+def number(value: float) -> str:
+    """Three digits: "0", "0.00012", "13.4", "1,250"; below a ten-thousandth and from a million on "3.5e-5"."""
+    if value != 0.0 and not 1e-4 <= abs(value) < 1e6:
+        digits, _, exponent = f"{value:.3g}".partition("e")
+        return f"{digits}e{int(exponent)}" if exponent else digits
+    return f"{float(f'{value:.3g}'):,.8f}".rstrip("0").rstrip(".")
+
+
+def milliseconds(ms: float) -> str:
+    """The time of a scene: "118 ms", "11.2 s"."""
+    return f"{number(ms)} ms" if ms < 9999.5 else f"{number(ms / 1e3)} s"
+
+
+_SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1e9, "TB"))
+
+
+def size(kilobytes: float) -> str:
+    """The size of a job's files: "15 MB"."""
+    value, name = next((kilobytes / one, name) for most, one, name in _SIZES if kilobytes < most)
+    return f"{number(float(f'{value:.2g}') if value < 100.0 else round(value))} {name}"

@@ -42,8 +42,8 @@ from workers.capture.make_capture import board_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch
-from workers.scene.plan import SceneChance
 
 SMALL_CAPTURES: dict[str, Any] = {
     "name": "captures",

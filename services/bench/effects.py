@@ -17,9 +17,10 @@ from services.bench.figures import Spread, describe_head, describe_machine, form
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.settle import settle_scene
+from workers.scene.chance import SceneChance
 from workers.scene.context import open_worker
 from workers.scene.effects import PHYSICS_EFFECTS, Facts, plan_effects
-from workers.scene.plan import SceneChance, plan_scene, pouring_of
+from workers.scene.plan import plan_scene, pouring_of
 
 ROUNDS = 3
 """Timed rounds, after one round that fills the caches."""

@@ -1,98 +1,46 @@
 """Shapes of a dataset's objects as meshes in the object frame, and the files of its pairs, from single files or from tars."""
 
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import trimesh
 from cachetools import LRUCache
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import asset_path, tar_path
-from schemas.errors import CorruptError, InputError, MachineError
-from schemas.job.assets import TABLE
+from schemas.dataset.layout import tar_path
+from schemas.errors import CorruptError
 from schemas.job.views import Patch
-from schemas.scene.shape import REGION_TABLE, Asset
 from services.job.record import JobRecord
-from workers.assets.catalogue import Catalogue
-from workers.assets.external.plain import show_colors
-from workers.assets.glb import mesh_of_part
+from services.read.scene_geometry import ReadShape, Sources, read_meshes, region_names
 from workers.store.commit import read_committed
 from workers.store.store import Store
 from workers.store.tars import read_tar
 
-ReadShape = Callable[[str], bytes]
-"""Returns the bytes of a stored shape by its path. Raises FileNotFoundError."""
+if TYPE_CHECKING:
+    import trimesh
 
 
 class Shapes:
     """Reads shapes of one job."""
 
     def __init__(self, read: ReadShape, record: JobRecord) -> None:
-        self._read = read
-        self._record = record
-        self._catalogue: Catalogue | None = None
-        self._parts = lru_cache(16)(self._load)
+        self._read, self._sources = read, Sources(record)
+        self._kept = lru_cache(16)(self._load)
 
-    def mesh(self, scene: Mapping[str, Any], region_id: int) -> trimesh.Trimesh:
+    def mesh(self, scene: Mapping[str, Any], region_id: int) -> "trimesh.Trimesh":
         """The shape of the table or of an object of a scene, own frame, metres; a copy that the caller may change.
 
         Raises InputError where it is neither stored nor to be had from the job's sources, CorruptError where it is damaged.
         """
-        return self._parts(*_name_of(scene, region_id), scene["scene_id"], region_id).copy()
+        return self._kept(region_names(scene)[region_id], scene["scene_id"]).copy()
 
-    def _load(self, category: str, instance_id: str, scene_id: int, region_id: int) -> trimesh.Trimesh:
-        path = asset_path(category, instance_id)
-        try:
-            data = self._read(path)
-        except FileNotFoundError:
-            return self._from_source(path, scene_id, region_id)
-        try:
-            loaded = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
-            return _join([show_colors(mesh) for mesh in loaded.geometry.values()])
-        except Exception as error:  # trimesh raises errors of many kinds for a damaged file
-            raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
+    def _load(self, name: tuple[str, str], scene_id: int) -> "trimesh.Trimesh":
+        import trimesh
 
-    def _from_source(self, path: str, scene_id: int, region_id: int) -> trimesh.Trimesh:
-        """The shape of a source whose licence keeps it out of the dataset."""
-        if self._record.job.captures is not None:
-            raise CorruptError(f"{path} is missing: restore it from a copy")
-        from workers.scene.plan import SceneChance, plan_scene  # loads the physics
-
-        plan = plan_scene(self._record.job, self._sources(path), SceneChance(self._record.job.seed, scene_id))
-        assets: dict[int, Asset] = {start.region_id: start.asset for start in plan.objects}
-        asset = {**assets, REGION_TABLE: plan.table.asset}[region_id]
-        return _join([mesh_of_part(part) for part in asset.shape.parts])
-
-    def _sources(self, path: str) -> Catalogue:
-        from workers.capture.results import open_sources
-
-        if self._catalogue is None:
-            told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off)"
-            try:
-                self._catalogue = open_sources(self._record.job, Path(self._record.folder))
-            except InputError as error:
-                raise InputError(f"{told}, and its source cannot be read here: {error}") from error
-        if self._catalogue.digest != self._record.catalogue:
-            raise MachineError("the files of the asset folders do not hold what they held when this job was run")
-        return self._catalogue
-
-
-def _name_of(scene: Mapping[str, Any], region_id: int) -> tuple[str, str]:
-    """(category, instance id) of a region of a row of `scenes`."""
-    if region_id == REGION_TABLE:
-        return TABLE, scene["table_id"]
-    bodies = {body["region_id"]: (body["category"], body["instance_id"]) for body in scene["bodies"] or ()}
-    return bodies.get(region_id, (scene["category"], scene["instance_id"]))
-
-
-def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of all parts."""
-    joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
-    assert isinstance(joined, trimesh.Trimesh)
-    return joined
+        meshes = read_meshes(self._read, self._sources, scene_id, name)
+        joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
+        assert isinstance(joined, trimesh.Trimesh)
+        return joined
 
 
 TAR_BYTES = 256 << 20

@@ -54,7 +54,7 @@ class Bop(Writer):
 
     def begin(self, request: ExportRequest, fresh: bool) -> None:
         """Opens the list of objects."""
-        self._shapes = Shapes(self.store, self.record)
+        self._shapes = Shapes(self.record)
         self._models = BopModels(self.folder, self.kept["models"])
 
     def add(self, scene: ExportScene) -> Added:

@@ -10,12 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from schemas.dataset.codec import Row, read_matrix
-from schemas.errors import SceneError
+from schemas.errors import CorruptError, SceneError, VersoError
 from schemas.scene.view import DRAWN_ROLES
 from services.export.formats import Added, Writer
-from services.export.source import ExportScene, unchanged_sources
-from services.read.scene_geometry import captured_scene, planned_scene
-from workers.assets.catalogue import Catalogue
+from services.export.source import ExportScene
+from services.read.scene_geometry import Sources, pose_shapes
 from workers.assets.glb import join_glb, split_glb
 
 NO_SOURCES = "the sources of the shapes are not here, or have changed"
@@ -34,15 +33,14 @@ class Gltf(Writer):
 
     def add(self, scene: ExportScene) -> Added:
         """Writes the scene's file."""
-        if self.record.job.captures is not None:
-            posed = captured_scene(self.store, scene.stored, scene.row)
-        elif self._catalogue is None:
+        try:
+            posed = pose_shapes(self.store, scene.stored, scene.row, self.record, self._sources)
+        except CorruptError:
+            raise
+        except SceneError as error:
+            return _left_out(scene, f"its shapes cannot be made again: {error.reason}")
+        except (VersoError, OSError):
             return _left_out(scene, NO_SOURCES)
-        else:
-            try:
-                posed = planned_scene(self.record.job, self._catalogue, scene.scene_id, scene.row)
-            except SceneError as error:
-                return _left_out(scene, f"its shapes cannot be made again: {error.reason}")
         data: bytes = posed.export(file_type="glb")
         seen = with_cameras(
             data, [pair.views[role] for pair in scene.pairs for role in DRAWN_ROLES if role in pair.views]
@@ -52,8 +50,8 @@ class Gltf(Writer):
         return Added(len(scene.pairs))
 
     @cached_property
-    def _catalogue(self) -> Catalogue | None:
-        return unchanged_sources(self.record)
+    def _sources(self) -> Sources:
+        return Sources(self.record)
 
     def describe(self) -> dict[str, Any]:
         """Files by category, and the frame."""

@@ -1,30 +1,24 @@
 """Shapes of a dataset's instances, and silhouettes of objects: what is seen, what others hide, what is outside the image."""
 
-import io
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-import trimesh
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_matrix
 from schemas.dataset.layout import asset_path
-from schemas.errors import CorruptError, SceneError
+from schemas.errors import CorruptError, VersoError, needs_making
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Camera
-from services.export.source import ExportScene, unchanged_sources
+from services.export.source import ExportScene
 from services.job.record import JobRecord
-from workers.assets.catalogue import Catalogue, load_asset
-from workers.assets.external.plain import read_visual
-from workers.geometry.camera import project_bounds
+from services.read.scene_geometry import Sources, load_glb
+from workers.assets.glb import part_of_mesh
+from workers.geometry.camera import NEAR_M, project_bounds
 from workers.geometry.frames import transform
-from workers.geometry.raycast import NEAR_M, cast_view
-from workers.scene.plan import SceneChance, choose_assets
-from workers.store.store import Store
 
 _KEPT = 32
 """Shapes that are kept: those of a few scenes."""
@@ -41,9 +35,8 @@ class ColoredShape:
 class Shapes:
     """Loads shapes by instance; keeps those that were asked for last."""
 
-    def __init__(self, store: Store, record: JobRecord) -> None:
-        self._store = store
-        self._record = record
+    def __init__(self, record: JobRecord) -> None:
+        self._sources = Sources(record)
         self._kept: LRUCache[str, ColoredShape | None] = LRUCache(_KEPT)
 
     def load(self, scene: ExportScene, instance_id: str) -> ColoredShape | None:
@@ -52,48 +45,21 @@ class Shapes:
         Raises CorruptError where a stored shape is damaged.
         """
         if instance_id not in self._kept:
-            row = scene.assets[instance_id]
-            path = asset_path(row["category"], instance_id)
-            try:
-                data = scene.read(path)
-            except CorruptError:  # it is not stored: only shapes that may be passed on are
-                shape = self._from_sources(scene, row)
-            else:
-                shape = self._decode(path, data)
+            shape = self._find(scene, scene.assets[instance_id])
             self._kept[instance_id] = None if shape is None else color_vertices(shape)
         return self._kept[instance_id]
 
-    def _decode(self, path: str, data: bytes) -> Shape:
+    def _find(self, scene: ExportScene, row: Row) -> Shape | None:
+        path = asset_path(row["category"], row["instance_id"])
         try:
-            scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
-            return Shape(tuple(_part(name, mesh) for name, mesh in scene.geometry.items()))
-        except Exception as error:  # trimesh raises errors of many kinds for a damaged file
-            told = f"{path} cannot be read: {error}; `verso replay {self._store.name} --repair` makes it again"
-            raise CorruptError(told) from error
-
-    def _from_sources(self, scene: ExportScene, row: Row) -> Shape | None:
-        if self._catalogue is None:
-            return None
-        chance = SceneChance(self._record.job.seed, scene.scene_id)
-        objects, _ = choose_assets(self._record.job, self._catalogue, chance)
-        ref = next((ref for ref in objects if ref.instance_id == row["instance_id"]), None)
-        try:
-            asset = None if ref is None else load_asset(self._catalogue, ref)
-        except SceneError:
-            return None
-        return asset.shape if asset is not None and asset.sha256 == row["sha256"] else None
-
-    @cached_property
-    def _catalogue(self) -> Catalogue | None:
-        return unchanged_sources(self._record)
-
-
-def _part(name: str, mesh: trimesh.Trimesh) -> Part:
-    visual = read_visual(mesh, [], linear=True)
-    faces = np.asarray(mesh.faces, dtype=np.int32)
-    normals = np.asarray(mesh.vertex_normals, dtype=np.float64)
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    return Part(name, vertices, faces, visual.material, normals, visual.uv, visual.colors)
+            data = scene.read(path)
+        except CorruptError:  # it is not stored: only shapes that may be passed on are
+            try:
+                asset = self._sources.asset(scene.scene_id, row["category"], row["instance_id"])
+            except (VersoError, OSError):
+                return None
+            return asset.shape if asset.sha256 == row["sha256"] else None
+        return Shape(tuple(part_of_mesh(name, mesh) for name, mesh in load_glb(data, path).items()))
 
 
 def color_vertices(shape: Shape) -> ColoredShape:
@@ -145,6 +111,8 @@ def whole_silhouette(label: Row, view: Row, visible: NDArray[np.bool_], shape: S
         return Silhouette(visible, int(visible.sum()), box_of(visible))
     if shape is None:
         return None
+    with needs_making("the silhouette of an object that others hide in part"):
+        from workers.geometry.raycast import cast_view
     camera, T_cam_obj = read_camera(view), read_matrix(label["T_cam_obj"])
     left, top, right, bottom = _window(shape, T_cam_obj, camera)
     k = camera.intrinsics

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,29 +13,16 @@ from numpy.typing import NDArray
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import PixelKind, patch_index
-from schemas.errors import CorruptError, InputError, VersoError
+from schemas.errors import CorruptError, InputError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
 from services.dataset.splits import Splits, collect_ids, split_by_category
-from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
 from services.read.stored_tables import patch_paths, view_paths
-from workers.assets.catalogue import Catalogue
-from workers.capture.results import open_sources
 from workers.store.commit import read_committed, split_code
 from workers.store.ledger import range_rows, read_range
 from workers.store.store import Store
-
-
-def unchanged_sources(record: JobRecord) -> Catalogue | None:
-    """The catalogue of a job; None where its folders are not here, or hold something else than when the job was run."""
-    try:
-        catalogue = open_sources(record.job, Path(record.folder))
-    except (VersoError, OSError):
-        return None
-    return catalogue if catalogue.digest == record.catalogue else None
-
 
 _STRICTNESS = ("train", "val", "test")
 

@@ -7,7 +7,7 @@ from html import escape
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.study.model import number
+from schemas.errors import number
 
 FINE = 960
 """Number of equal steps that are counted: a multiple of every number of bars that a chart may have."""

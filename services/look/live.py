@@ -10,7 +10,7 @@ from typing import Literal
 from cachetools import LRUCache
 
 from schemas.dataset.layout import commit_path
-from schemas.errors import OutputError, VersoError, describe_seconds, plural
+from schemas.errors import OutputError, VersoError, describe_seconds, number, plural
 from services.job.record import read_job
 from services.look.charts import Histogram
 from services.look.pictures import DEPTH_M, Picture, ShownScene, show_scene
@@ -20,7 +20,6 @@ from services.read.dataset_reader import file_reader, read_stored
 from services.read.status import Status, read_status
 from services.read.verdict import explain_damage
 from services.run.lock import shows_life
-from services.study.model import number
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import read_range
 from workers.store.store import Store

@@ -7,13 +7,12 @@ from html import escape
 import cv2
 import numpy as np
 
-from schemas.errors import describe_seconds, plural
+from schemas.errors import describe_seconds, milliseconds, number, plural, size
 from schemas.job.job import Job
 from services.look.charts import Chart, Histogram, amount, chart_html, length_of_decade
 from services.look.clouds import Space
 from services.look.collect import Cost, Failure, Figures
 from services.look.pictures import FIXED_REGIONS, OBJECT_REGIONS, Picture, Sample, ShownScene
-from services.study.model import milliseconds, number, size
 
 Side = tuple[str, Figures, Sample]
 """Name, figures and shown scenes of one dataset."""

@@ -29,9 +29,9 @@ from services.read.independent.derive import StoredPair, check_forces
 from services.read.independent.poses import check_merged, check_pair, list_underived
 from services.read.referee import Held, describe_held, hold_scene, is_installed
 from services.read.replay import compare_files, compare_rows, open_context
-from workers.geometry.camera import project
+from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
-from workers.geometry.raycast import NEAR_M, edge_distance_px
+from workers.geometry.raycast import edge_distance_px
 from workers.physics.recheck import release_again
 from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer

@@ -1,6 +1,10 @@
-"""The posed geometry of one stored scene or capture."""
+"""The shapes of a dataset's objects, stored or from the job's sources, and the posed geometry of a stored scene or capture."""
 
 import io
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
@@ -8,74 +12,138 @@ from trimesh.visual import ColorVisuals
 
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import asset_path
-from schemas.errors import CorruptError, InputError
-from schemas.job.job import Job
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
-from services.job.record import require_job
+from schemas.errors import CorruptError, InputError, MachineError, needs_making
+from schemas.job.assets import TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Asset
+from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, find_scene
-from services.read.replay import open_context
-from workers.assets.catalogue import Catalogue
-from workers.assets.external.plain import show_colors
-from workers.assets.glb import linear_bytes, mesh_of_part
-from workers.scene.plan import SceneChance, plan_scene
+from workers.assets.appearance import draw_appearance
+from workers.assets.glb import linear_bytes, mesh_of_part, show_colors
+from workers.scene.chance import SceneChance, Stream
 from workers.store.store import Store
+
+if TYPE_CHECKING:
+    from workers.assets.catalogue import Catalogue
+
+ReadShape = Callable[[str], bytes]
+"""Returns the bytes of a stored shape by its path. Raises FileNotFoundError."""
+
+
+class Sources:
+    """Makes or reads again the shapes that are not in the dataset. Needs what makes data."""
+
+    def __init__(self, record: JobRecord) -> None:
+        self._record = record
+
+    def asset(self, scene_id: int, category: str, instance_id: str) -> Asset:
+        """An object, or the table, of a scene of the job.
+
+        Raises CorruptError for a capture, which has no other source; InputError where the sources cannot be read here,
+        MachineError where they have changed or what makes data is not installed, SceneError where the mesh is refused.
+        """
+        path = asset_path(category, instance_id)
+        if self._record.job.captures is not None:
+            raise CorruptError(f"{path} is missing: `verso replay OUT --repair` makes it again")
+        told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off), and"
+        with needs_making(told):
+            from workers.assets.catalogue import load_asset
+            from workers.scene.plan import choose_assets
+        try:
+            catalogue = self._catalogue
+        except InputError as error:
+            raise InputError(f"{told} its source cannot be read here: {error}") from error
+        objects, table = choose_assets(self._record.job, catalogue, SceneChance(self._record.job.seed, scene_id))
+        ref = next(
+            (one for one in (*objects, table) if (one.category, one.instance_id) == (category, instance_id)), None
+        )
+        if ref is None:
+            raise CorruptError(
+                f"scene {scene_id} of the job has no {category} {instance_id}: restore job.yaml from a copy"
+            )
+        return load_asset(catalogue, ref)
+
+    @cached_property
+    def _catalogue(self) -> "Catalogue":
+        from workers.capture.results import open_sources
+
+        catalogue = open_sources(self._record.job, Path(self._record.folder))
+        if catalogue.digest != self._record.catalogue:
+            raise MachineError("the files of the asset folders do not hold what they held when this job was run")
+        return catalogue
+
+
+def load_glb(data: bytes, path: str) -> Mapping[str, trimesh.Trimesh]:
+    """The parts of a stored shape by name, object frame, metres. Raises CorruptError where it is damaged."""
+    try:
+        meshes: Mapping[str, trimesh.Trimesh] = trimesh.load_scene(
+            io.BytesIO(data), file_type="glb", process=False
+        ).geometry
+        if not meshes:
+            raise ValueError("it has no mesh")
+        return meshes
+    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
+        raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
+
+
+def region_names(scene: Mapping[str, Any]) -> dict[int, tuple[str, str]]:
+    """(category, instance id) of the table and of every object, by region id, of a row of `scenes`."""
+    bodies = scene["bodies"] or [{**scene, "region_id": REGION_FIRST_OBJECT}]
+    objects = {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
+    return {REGION_TABLE: (TABLE, scene["table_id"]), **objects}
+
+
+def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[str, str]) -> list[trimesh.Trimesh]:
+    """The parts of the shape called (category, instance id), object frame, metres; colours are linear, as glTF has them.
+
+    Raises CorruptError where the stored shape is damaged, and as `Sources.asset` where none is stored.
+    """
+    path = asset_path(*name)
+    try:
+        data = read(path)
+    except FileNotFoundError:
+        return [mesh_of_part(part) for part in sources.asset(scene_id, *name).shape.parts]
+    return [show_colors(mesh) for mesh in load_glb(data, path).values()]
 
 
 def posed_scene(store: Store, scene_id: int) -> trimesh.Scene:
-    """Floor, table and objects where the stored rows put them: world frame, z up, metres.
-
-    Shapes come from the job's sources; poses from the manifest. Raises InputError where the scene was not made.
-    """
+    """Floor, table or board, and objects where the stored rows put them. Raises InputError where the scene was not made."""
     record, stored = require_job(store), find_scene(store, scene_id)
     row = stored.scene(scene_id)
     if row is None:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
+    return pose_shapes(store, stored, row, record, Sources(record))
+
+
+def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, sources: Sources) -> trimesh.Scene:
+    """The same for a row of `scenes`: world frame, z up, metres. Raises as `read_meshes`.
+
+    The floor is drawn again: its look is in no file.
+    """
+    T_world, names, scene = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}, region_names(row), trimesh.Scene()
+    placed: list[tuple[str, int, list[trimesh.Trimesh]]] = []
     if record.job.captures is not None:
-        return captured_scene(store, stored, row)
-    context = open_context(record)
-    return planned_scene(context.job, context.catalogue, scene_id, row)
+        placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [_board(stored, row)]))
+    else:
+        chance = SceneChance(record.job.seed, row["scene_id"])
+        floor, _ = draw_appearance(chance.stream(Stream.APPEARANCE), record.job.render.tier)
+        placed.append(("floor", REGION_FLOOR, [mesh_of_part(part) for part in floor.parts]))
+    for region_id, name in names.items():
+        # Two objects may be of one instance: only the region id tells them apart.
+        region = f" {region_id}" if len(names) > 2 and region_id >= REGION_FIRST_OBJECT else ""
+        placed.append((f"{' '.join(name)}{region}", region_id, read_meshes(store.read, sources, row["scene_id"], name)))
+    for label, region_id, meshes in placed:
+        for number, mesh in enumerate(meshes):
+            part = f"{label}/{number}"
+            scene.add_geometry(mesh, geom_name=part, node_name=part, transform=T_world[region_id])
+    return scene
 
 
-def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene:
-    """Board and object of a capture, from its stored shape. Raises CorruptError where that cannot be read."""
-    T_world = read_world_poses(row)
+def _board(stored: StoredRange, row: Row) -> trimesh.Trimesh:
+    """The rectangle of a capture's board, its frame, metres."""
     board = next(asset for asset in stored.rows["assets"] if asset["instance_id"] == row["table_id"])
     x, y, _ = (0.5 * size for size in board["extents_m"])
-    rectangle = trimesh.Trimesh([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
-    rectangle.visual = ColorVisuals(
-        rectangle, vertex_colors=linear_bytes(ColorVisuals(rectangle).vertex_colors / 255.0)
-    )
-    scene = trimesh.Scene()
-    placed = [(f"board {row['table_id']}", rectangle, T_world[REGION_TABLE])]
-    path = asset_path(row["category"], row["instance_id"])
-    try:
-        shape = trimesh.load_scene(io.BytesIO(store.read(path)), file_type="glb", process=False)
-    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
-        raise CorruptError(
-            f"{path} cannot be read: {error}; `verso replay {store.name} --repair` makes it again"
-        ) from error
-    thing = f"{row['category']} {row['instance_id']}"
-    placed += [(thing, show_colors(mesh), T_world[REGION_FIRST_OBJECT]) for mesh in shape.geometry.values()]
-    for name, mesh, T_world_mesh in placed:
-        scene.add_geometry(mesh, geom_name=name, node_name=name, transform=T_world_mesh)
-    return scene
-
-
-def planned_scene(job: Job, catalogue: Catalogue, scene_id: int, row: Row) -> trimesh.Scene:
-    """Floor, table and objects of a scene, from the job's sources. Raises SceneError where a shape cannot be made again."""
-    plan = plan_scene(job, catalogue, SceneChance(job.seed, scene_id))
-    T_world = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}
-    table = plan.table.asset
-    placed = [("floor", REGION_FLOOR, plan.floor), (f"table {table.instance_id}", REGION_TABLE, table.shape)]
-    for start in plan.objects:
-        # Two objects may be of one instance: only the region id tells them apart.
-        region = f" {start.region_id}" if len(plan.objects) > 1 else ""
-        name = f"{start.asset.category} {start.asset.instance_id}{region}"
-        placed.append((name, start.region_id, start.asset.shape))
-    scene = trimesh.Scene()
-    for name, region_id, shape in placed:
-        for number, part in enumerate(shape.parts):
-            label = f"{name}/{number}-{part.name}"
-            scene.add_geometry(mesh_of_part(part), geom_name=label, node_name=label, transform=T_world[region_id])
-    return scene
+    corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    mesh.visual = ColorVisuals(mesh, vertex_colors=linear_bytes(ColorVisuals(mesh).vertex_colors / 255.0))
+    return mesh

@@ -5,8 +5,8 @@ import math
 from collections.abc import Mapping, Sequence
 from decimal import ROUND_CEILING, Context
 
-from schemas.errors import InputError, RunError, describe_seconds, did_you_mean
-from services.study.model import ERRORS, Figure, Row, Study, amount, listed, milliseconds, short, size, times, unit
+from schemas.errors import InputError, RunError, describe_seconds, did_you_mean, milliseconds, size
+from services.study.model import ERRORS, Figure, Row, Study, amount, listed, short, times, unit
 
 Targets = Mapping[str, float]
 """The greatest allowed value of each error, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""

@@ -23,10 +23,10 @@ from services.study.rays import Box, cast_patch
 from workers.assets.appearance import draw_appearance
 from workers.render.pathtraced import draw_view
 from workers.render.tiers import require_tier
+from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Scene
-from workers.scene.plan import SceneChance, Stream
 
 
 def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:

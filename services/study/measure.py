@@ -29,9 +29,10 @@ from workers.physics.fall import FINEST
 from workers.physics.recheck import moved_by, recheck_scene
 from workers.physics.rigid_body import Body
 from workers.physics.settle import Rest, settle_scene
+from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, plan_effects
-from workers.scene.plan import SceneChance, plan_scene, pouring_of
+from workers.scene.plan import plan_scene, pouring_of
 from workers.shard.run_shard import run_scene
 
 RATES_HZ = (3840, 7680, 15360)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from schemas.errors import number
 from schemas.job.job import Job
 
 Group = Literal["physics", "labels", "mirror", "colour", "capture"]
@@ -227,8 +228,6 @@ ERRORS = {kind.name: kind for kind in (
 
 # ---------------------------------------------------------------------------------------------- in words
 
-_SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1e9, "TB"))
-
 
 def short(name: str) -> str:
     """An error's name in a few words."""
@@ -250,14 +249,6 @@ def amount(name: str, value: float) -> str:
     return f"{number(shown(name, value))} {unit(name)}".strip()
 
 
-def number(value: float) -> str:
-    """Three digits: "0", "0.00012", "13.4", "1,250"; below a ten-thousandth and from a million on "3.5e-5"."""
-    if value != 0.0 and not 1e-4 <= abs(value) < 1e6:
-        digits, _, exponent = f"{value:.3g}".partition("e")
-        return f"{digits}e{int(exponent)}" if exponent else digits
-    return f"{float(f'{value:.3g}'):,.8f}".rstrip("0").rstrip(".")
-
-
 def as_often(ratio: float) -> str:
     """A ratio of times in two digits: "1" within the noise of 5 %, "0.62", "1.6", "47"."""
     return "1" if abs(ratio - 1.0) < 0.05 else number(float(f"{ratio:.2g}"))
@@ -272,17 +263,6 @@ def cost(ratio: float) -> str:
 def times(ratio: float) -> str:
     """A ratio of times with its word, and a third digit near 1: "1.07 times"."""
     return f"{number(round(ratio, 2)) if 0.9 <= ratio < 1.1 else as_often(ratio)} times"
-
-
-def milliseconds(ms: float) -> str:
-    """The time of a scene: "118 ms", "11.2 s"."""
-    return f"{number(ms)} ms" if ms < 9999.5 else f"{number(ms / 1e3)} s"
-
-
-def size(kilobytes: float) -> str:
-    """The size of a job's files: "15 MB"."""
-    value, name = next((kilobytes / one, name) for most, one, name in _SIZES if kilobytes < most)
-    return f"{number(float(f'{value:.2g}') if value < 100.0 else round(value))} {name}"
 
 
 def listed(words: list[str]) -> str:

@@ -13,9 +13,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.errors import describe_seconds
+from schemas.errors import describe_seconds, milliseconds, number, size
 from services.study.choose import Targets, answer, as_cheap, front, own_row
-from services.study.model import ERRORS, Row, Study, milliseconds, number, short, shown, size, times, unit
+from services.study.model import ERRORS, Row, Study, short, shown, times, unit
 
 STUDY_FILE = "study.json"
 WIDE_FILE = "tradeoff.parquet"

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 from matplotlib.transforms import Bbox
 
+from schemas.errors import milliseconds, number
 from services.study.choose import front, own_row
-from services.study.model import Row, Study, as_often, cost, milliseconds, number, short, shown, unit
+from services.study.model import Row, Study, as_often, cost, short, shown, unit
 
 _PHYSICS = "pose_mm moved_mm outcome_mm penetration_mm gap_mm unbalanced_share turned_deg outcome_deg"
 

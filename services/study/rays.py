@@ -13,9 +13,9 @@ from schemas.base import Array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Camera
-from workers.geometry.camera import project, project_bounds, unproject
+from workers.geometry.camera import NEAR_M, project, project_bounds, unproject
 from workers.geometry.frames import invert, transform
-from workers.geometry.raycast import NEAR_M, first_hit
+from workers.geometry.raycast import first_hit
 
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""

@@ -17,10 +17,11 @@ from schemas.scene.shape import Part, Shape
 from services.job.job_file import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene
 from workers.scene.make_scene import Scene, make_scene
-from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.plan import plan_scene
 from workers.scene.rows import record_scene
 
 SMALL: dict[str, Any] = {

@@ -27,8 +27,9 @@ from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.physics.fall import FINEST
 from workers.physics.recheck import RECHECK_RATE, RECHECK_S, moved_by, release_again
 from workers.physics.settle import settle_scene
+from workers.scene.chance import SceneChance
 from workers.scene.effects import Facts, plan_effects
-from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.plan import plan_scene
 
 TILTS_DEG = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 0.005, 0.02)
 LIFTS_MM = (0.005, 0.05, 0.09, 0.15)

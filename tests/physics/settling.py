@@ -17,7 +17,8 @@ from workers.physics.effects import called_for, called_for_with
 from workers.physics.fall import FINEST
 from workers.physics.recheck import RECHECK_S, moved_by, release_again
 from workers.physics.settle import settle_scene
-from workers.scene.plan import SceneChance, draw_scene
+from workers.scene.chance import SceneChance
+from workers.scene.plan import draw_scene
 
 PHYSICS = Job(name="t").physics
 

@@ -22,7 +22,8 @@ from tests.physics.settling import settle_group, settle_single
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.physics.support import place_table
-from workers.scene.plan import SceneChance, draw_start
+from workers.scene.chance import SceneChance
+from workers.scene.plan import draw_start
 
 TABLE = place_table(table())
 SEEDS = 20

@@ -1,4 +1,4 @@
-"""Pure: an asset as one binary glTF 2.0 file, the same bytes for the same asset.
+"""Pure: an asset as one binary glTF 2.0 file, the same bytes for the same asset; and what trimesh makes of one, read back.
 
 Coordinates are written as they are, in the object frame: metres, **z up**, where glTF viewers expect y up. The file
 says so in `asset.extras`. Written by hand because it is short, and because other exporters do not promise the
@@ -19,9 +19,8 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Array
-from schemas.scene.shape import Asset, Part
-from workers.geometry.colour import decode_srgb
-from workers.geometry.mesh import bounds_of
+from schemas.scene.shape import Asset, Material, Part
+from workers.geometry.colour import decode_srgb, encode_srgb
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
@@ -155,8 +154,7 @@ def _material(writer: _Writer, part: Part, rgb: list[float], watertight: bool) -
 
 def _primitive(writer: _Writer, part: Part, material: int) -> dict[str, Any]:
     positions = part.vertices.astype("<f4")
-    low, high = bounds_of(part.vertices).astype("<f4").tolist()  # rounding keeps the order, so these are their bounds
-    bounds = {"min": low, "max": high}
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     attributes = {"POSITION": writer.add_accessor(positions, "VEC3", _FLOAT, **bounds)}
     if part.normals is not None:
         attributes["NORMAL"] = writer.add_accessor(part.normals.astype("<f4"), "VEC3", _FLOAT)
@@ -197,3 +195,59 @@ def _visual(part: Part) -> TextureVisuals | ColorVisuals:
 def linear_bytes(srgb: Array) -> NDArray[np.uint8]:
     """[..., 4] colours and vertex colours as glTF has them: linear, where textures and ours are sRGB; alpha as it is."""
     return np.rint(255.0 * np.concatenate([decode_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)
+
+
+def show_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A mesh of a stored GLB that shows its vertex colours, linear as in the file.
+
+    trimesh keeps them aside where a material stands with them, and without one other viewers draw dark metal, or white.
+    """
+    visual: Any = mesh.visual
+    if visual.kind == "texture" and "color" in visual.vertex_attributes and visual.material.baseColorTexture is None:
+        colors = attribute_colors(visual.vertex_attributes["color"], len(mesh.vertices))
+        mesh.visual = ColorVisuals(mesh, vertex_colors=colors)
+    return mesh
+
+
+def attribute_colors(values: NDArray | None, count: int, linear: bool = False) -> NDArray[np.uint8] | None:
+    """Vertex colours, floats in [0, 1] or integers that use the whole range of their type, as [V, 4] uint8 sRGB.
+
+    `linear`: they are linear, as those of a stored GLB. None where they cannot be used.
+    """
+    if values is None or np.shape(values) not in ((count, 3), (count, 4)):
+        return None
+    whole = np.issubdtype(values.dtype, np.integer)
+    share = np.ones((count, 4))
+    share[:, : values.shape[1]] = values / np.iinfo(values.dtype).max if whole else values
+    if not np.isfinite(share).all():
+        return None
+    share = np.clip(share, 0.0, 1.0)
+    if linear:
+        share[:, :3] = encode_srgb(share[:, :3])
+    return np.round(255.0 * share).astype(np.uint8)
+
+
+def part_of_mesh(name: str, mesh: trimesh.Trimesh) -> Part:
+    """A mesh of a stored GLB, as trimesh loads it, in our terms: colours are sRGB again."""
+    visual: Any = mesh.visual
+    material, uv, colors = Material((1.0, 1.0, 1.0, 1.0)), None, None
+    if visual.kind == "texture":
+        uv, source = visual.uv, visual.material
+        factor = np.ones(4) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
+        red, green, blue = encode_srgb(factor[:3]).tolist()
+        image = source.baseColorTexture
+        texture = None if image is None else np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
+        metallic, roughness = (1.0 if x is None else float(x) for x in (source.metallicFactor, source.roughnessFactor))
+        material = Material((red, green, blue, float(factor[3])), metallic, roughness, texture)
+        colors = visual.vertex_attributes.get("color")
+    elif visual.kind == "vertex":
+        colors = np.asarray(visual.vertex_colors)
+    return Part(
+        name,
+        np.asarray(mesh.vertices, dtype=np.float64),
+        np.asarray(mesh.faces, dtype=np.int32),
+        material,
+        np.asarray(mesh.vertex_normals, dtype=np.float64),
+        None if uv is None else np.asarray(uv, dtype=np.float64),
+        attribute_colors(colors, len(mesh.vertices), linear=True),
+    )

@@ -27,8 +27,8 @@ from workers.capture.simulate.simulate import load_object, simulate_capture
 from workers.capture.views import CaptureViews
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import translation
+from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
-from workers.scene.plan import SceneChance
 from workers.store.file_system import temporary_folder
 
 BOARD = "board"

@@ -13,6 +13,9 @@ from workers.geometry.frames import UP, cross, invert, pose, transform
 MARGIN_PX = 2.0
 """Width by which the image is extended on each side: what lies outside of that touches no sample of a pixel."""
 
+NEAR_M = 0.05
+"""Surfaces nearer than this, along the optical axis, are not seen: the near plane of the fast renderer."""
+
 
 def look_at(position: Array, target: Array, up: Array = UP) -> Pose:
     """Camera to world, [4, 4] float64, optical frame, zero roll: the image's x axis is level.

@@ -9,6 +9,12 @@ from workers.geometry.jit import compiled, compiled_for
 
 
 @compiled
+def dot(one: Array, other: Array) -> float:
+    """The scalar product of two vectors [3]; x and z are added first, as einsum adds three products."""
+    return (one[0] * other[0] + one[2] * other[2]) + one[1] * other[1]
+
+
+@compiled
 def nearest_on_triangle(p: Array, corners: Array, nearest: Array) -> None:
     """Writes into `nearest` [3] the point of the triangle `corners` [3, 3] that is nearest to p [3].
 

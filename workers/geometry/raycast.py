@@ -20,8 +20,9 @@ from schemas.base import Array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.geometry.camera import project
-from workers.geometry.frames import dot, invert, transform
+from workers.geometry.camera import NEAR_M, project
+from workers.geometry.distance import dot
+from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import face_planes
 
@@ -127,9 +128,6 @@ def keep_nearer(
         if distance[n] + apart_m / slant < best[0][rays[n]]:
             best[0][rays[n]], best[1][rays[n]], best[2][rays[n]] = distance[n], region_id, cosine[n]
 
-
-NEAR_M = 0.05
-"""Surfaces nearer than this, along the optical axis, are not seen: the near plane of the fast renderer."""
 
 COPLANAR_M = 1e-6
 """Surfaces nearer than this along the normal count as one: ten times what float32 coordinates of a scene

@@ -10,8 +10,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.distance import nearest_on_segments, nearest_on_triangle
-from workers.geometry.frames import dot
+from workers.geometry.distance import dot, nearest_on_segments, nearest_on_triangle
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of, edge_keys, face_normals, has_rim, numbers_in, weld
 

@@ -22,8 +22,8 @@ from schemas.scene.view import VIEW_ROLES, Camera, Role
 from workers.geometry.camera import is_outside_views
 from workers.geometry.colour import has_holes
 from workers.physics.effects import ONLY_LATE, PREDICATES
+from workers.scene.chance import SceneChance, Stream
 from workers.scene.pairs import place_beside, place_mirror_camera
-from workers.scene.plan import SceneChance, Stream
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,11 @@ from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Pair
 from workers.physics.recheck import recheck_scene
 from workers.physics.settle import settle_scene
+from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene, plan_effects
 from workers.scene.pairs import SettledScene, make_pair
-from workers.scene.plan import SceneChance, plan_scene, pouring_of
+from workers.scene.plan import plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
 
 

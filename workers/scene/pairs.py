@@ -18,9 +18,9 @@ from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
 from workers.geometry.frames import UP, half_turn, pose, translation
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.render.pathtraced import draw_view
+from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
-from workers.scene.plan import SceneChance, Stream
 from workers.scene.ray_check import check_against_rays
 from workers.scene.sensor import SensorChance, sense_view
 

@@ -5,8 +5,7 @@ Each step has a named stream of random numbers. Several objects begin each on a 
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from enum import IntEnum
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,49 +24,7 @@ from workers.geometry.frames import UP, pose, rotation_about, transform, transla
 from workers.geometry.hull import hull_of
 from workers.physics.pour import Pouring, points_of
 from workers.physics.support import place_table, sample_elevation, support_height, support_margin
-
-
-class Stream(IntEnum):
-    """Every use of chance in a scene. A new one gets the next number; a number is never used for anything else."""
-
-    CATEGORY = 0
-    OBJECT = 1
-    TABLE = 2
-    START = 3
-    REDRAW = 4
-    CAMERA = 5
-    APPEARANCE = 6
-    RAYCAST_CHECK = 7
-    SENSOR_DEPTH = 8
-    SENSOR_RGB = 9
-    SENSOR_EXPOSURE = 10
-    PATHS = 11
-    COUNT = 12
-    HIDDEN_MARKERS = 13
-    MOTION = 14
-    HELD_OUT = 15
-    LOST = 16
-
-
-@dataclass(frozen=True)
-class SceneChance:
-    """The random numbers of one scene: a function of the dataset's seed and the scene's id alone."""
-
-    seed: int
-    scene_id: int
-
-    def stream(self, name: Stream, *within: int) -> np.random.Generator:
-        """The generator of one step.
-
-        `within` names a part of a step that must not depend on how many parts there are: (pair, role) for a view's noise.
-        """
-        key = (self.scene_id, int(name), *within)
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
-
-    def object_stream(self, name: Stream, number: int) -> np.random.Generator:
-        """The generator of one step for an object by its number: the first object's is that of a scene with only one."""
-        return self.stream(name, *([number] if number else []))
-
+from workers.scene.chance import SceneChance, Stream
 
 APART_M = 0.001
 """Columns nearer to each other than this count as touching."""

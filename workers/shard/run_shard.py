@@ -34,9 +34,10 @@ from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import Renderer
 from workers.render.tiers import require_tier
+from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.make_scene import make_scene
-from workers.scene.plan import SceneChance, choose_assets, choose_category
+from workers.scene.plan import choose_assets, choose_category
 from workers.scene.rows import failed_scene, record_scene, timing_row
 from workers.shard.fingerprint import take_fingerprint
 from workers.store.attempt import TIMED_OUT, Attempt, begin_attempt

@@ -89,7 +89,7 @@ def test_cameras_stand_where_the_views_were_taken_from(pile, exported):
     assert perspective["aspectRatio"] == pytest.approx(160 / 120)
 
 
-def test_captures_have_their_board_and_scenes_whose_sources_are_gone_are_left_out(captures, pile, tmp_path):
+def test_captures_have_their_board_and_scenes_with_neither_shapes_nor_sources_are_left_out(captures, pile, tmp_path):
     export_to(captures, tmp_path / "new", "gltf")
     paths = sorted((tmp_path / "new" / "mug").glob("*.glb"))
     assert [path.name for path in paths] == ["000000.glb", "000001.glb"]
@@ -98,5 +98,7 @@ def test_captures_have_their_board_and_scenes_whose_sources_are_gone_are_left_ou
     shutil.copytree(pile.name, tmp_path / "copy")
     job, catalogue = tmp_path / "copy" / "job.yaml", require_job(pile).catalogue
     job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
+    assert export_to(LocalStore(tmp_path / "copy"), tmp_path / "stored", "gltf").manifest["pairs"] == 1
+    shutil.rmtree(tmp_path / "copy" / "assets")
     manifest = export_to(LocalStore(tmp_path / "copy"), tmp_path / "none", "gltf").manifest
     assert (manifest["pairs"], manifest["left_out"]) == (0, {NO_SOURCES: 1})

@@ -24,9 +24,10 @@ from services.dataset import splits
 from services.dataset.splits import Splits, collect_ids, split_by_category
 from services.export.folder import ExportFolder, Rounds
 from services.export.shapes import Shapes, color_vertices
-from services.export.source import iter_ranges, scenes_of, unchanged_sources
+from services.export.source import iter_ranges, scenes_of
 from services.export.table import FORMATS
 from services.job.record import require_job
+from services.read.scene_geometry import Sources
 from tests.datasets import in_a_bucket, make_dataset
 from tests.services.export.exported import contents, export_to, source_rows
 from workers.store.commit import list_codes, read_record
@@ -316,7 +317,7 @@ def test_each_split_has_its_share_of_every_category_and_what_is_held_out_is_test
 def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_path):
     def load(store):
         scene = first_scene(store)
-        return Shapes(store, require_job(store)).load(scene, scene.row["instance_id"])
+        return Shapes(require_job(store)).load(scene, scene.row["instance_id"])
 
     for path in (tmp_path / "copy" / "assets").rglob("*.glb"):
         path.write_bytes(b"glTF")
@@ -333,7 +334,9 @@ def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_p
     record = require_job(copy)
     gone = {"objects": [{"source": "urdf", "folder": "gone", "category_map": {"*.obj": "mug"}}]}
     job = Job.model_validate({"name": "t", "assets": gone})
-    assert unchanged_sources(dataclasses.replace(record, job=job, folder=str(tmp_path))) is None
+    sources = Sources(dataclasses.replace(record, job=job, folder=str(tmp_path)))
+    with pytest.raises(InputError, match="gone"):
+        sources.asset(0, "mug", "x")
 
 
 def test_a_vertex_has_the_colour_of_its_texel_times_the_base_colour():

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
+from schemas.errors import InputError, milliseconds, number, size
 from services.study.choose import (
     AS_CHEAP,
     TargetError,
@@ -22,7 +22,7 @@ from services.study.choose import (
     parse_targets,
     recommend,
 )
-from services.study.model import Row, amount, as_often, listed, milliseconds, number, size, times
+from services.study.model import Row, amount, as_often, listed, times
 from tests.services.study.made_up import row, stored, study
 
 OWN = row(depth_mm=0.1, penetration_mm=0.01, mirror_mm=1.0)

@@ -15,7 +15,8 @@ from workers.assets.appearance import (
     draw_floor_material,
     make_pattern,
 )
-from workers.scene.plan import SceneChance, Stream, draw_scene
+from workers.scene.chance import SceneChance, Stream
+from workers.scene.plan import draw_scene
 
 BOX, TABLE = asset_of(box(0.1, 0.08, 0.2)), table()
 JOBS = {tier: Job.model_validate({"name": "t", "seed": 5, "render": {"tier": tier}}) for tier in ("flat", "raster")}

@@ -24,8 +24,9 @@ from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.reader import Request, Task, ask_all, unpack_asset
 from workers.assets.external.urdf import load_posed
 from workers.assets.external.verdicts import Verdicts
+from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, open_worker
-from workers.scene.plan import SceneChance, draw_scene
+from workers.scene.plan import draw_scene
 from workers.shard.run_shard import run_scene
 
 PLY = """ply

@@ -32,8 +32,8 @@ from workers.capture.process import ProcessedFolder, process_folder
 from workers.capture.simulate.photograph import build_studio, photograph, place_object
 from workers.capture.simulate.simulate import plan_path, simulate_capture
 from workers.geometry.lens import opencv_lens
+from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
-from workers.scene.plan import SceneChance, Stream
 
 KEPT = tempfile.TemporaryDirectory(prefix="verso-captures-")
 VIEWS = 10

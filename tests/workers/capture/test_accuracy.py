@@ -23,8 +23,8 @@ from workers.capture.reconstruct import ProcessorClock
 from workers.capture.score import compare_poses
 from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth, place_object
 from workers.capture.simulate.simulate import simulate_capture
+from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
-from workers.scene.plan import SceneChance, Stream
 from workers.store.images import encode_png
 
 NOISE = Simulate(views=40, depth_noise=KinectDepthNoise(), rgb_noise=RgbNoise())

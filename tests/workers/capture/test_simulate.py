@@ -53,8 +53,8 @@ from workers.geometry.colour import SRGB_STEPS, decode_codes, decode_srgb
 from workers.geometry.frames import angle_between, invert, pose, transform, uniform_rotation
 from workers.geometry.lens import opencv_lens, opencv_matrix
 from workers.geometry.raycast import cast_view
+from workers.scene.chance import SceneChance
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
-from workers.scene.plan import SceneChance
 from workers.scene.sensor import sense_depth
 
 SMALL = {"views": 2, "image_scale": 0.25}

@@ -18,8 +18,9 @@ from tests.physics.settling import settle_single
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px
+from workers.scene.chance import SceneChance
 from workers.scene.make_scene import pose_scene
-from workers.scene.plan import SceneChance, draw_scene
+from workers.scene.plan import draw_scene
 from workers.scene.ray_check import STEEPEST_COS, check_against_rays, check_pair
 
 STORED = Range(0.2, 8.0)

@@ -17,6 +17,7 @@ from workers.geometry.camera import inclination, look_at, orbit_pose
 from workers.geometry.frames import half_turn, pose, rotation_about, translation
 from workers.geometry.lens import distort
 from workers.geometry.pixels import Extent
+from workers.scene.chance import SceneChance
 from workers.scene.labels import (
     carry_depth,
     compare_views,
@@ -30,7 +31,7 @@ from workers.scene.labels import (
     projection_shares,
 )
 from workers.scene.pairs import front_distance, mirror_pose, object_distance, place_beside, place_mirror_camera
-from workers.scene.plan import SceneChance, draw_scene
+from workers.scene.plan import draw_scene
 
 JOB = Job(name="t")
 CAMERA = Camera(Intrinsics.of(JOB.cameras.sensor), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5))

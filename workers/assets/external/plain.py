@@ -17,7 +17,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
-from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from schemas.base import Array
@@ -34,6 +33,7 @@ from workers.assets.external.mesh import (
     cut_strip,
     make_material,
 )
+from workers.assets.glb import attribute_colors
 from workers.geometry.colour import encode_srgb
 
 _TEXTURE = re.compile(rb"^comment TextureFile[ \t]+([^\r\n]+)", re.MULTILINE)
@@ -276,48 +276,20 @@ def read_plain(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMes
     return meshes
 
 
-def read_visual(mesh: trimesh.Trimesh, notes: list[str], linear: bool = False) -> MeshVisual:
-    """The material and colours of one trimesh geometry. `linear`: its colours are linear, as those of a stored GLB."""
+def read_visual(mesh: trimesh.Trimesh, notes: list[str]) -> MeshVisual:
+    """The material and colours of one trimesh geometry."""
     visual: Any = mesh.visual
     if visual.kind == "texture":
         uv = getattr(visual, "uv", None)
         usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2) and bool(np.isfinite(uv).all())
         material = _trimesh_material(visual.material, usable, notes)
-        colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices), linear)
+        colors = attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices))
         return MeshVisual(material, np.asarray(uv, dtype=np.float64) if usable else None, colors)
     if visual.kind == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
-        return MeshVisual(WHITE, colors=_attribute_colors(np.asarray(visual.vertex_colors), len(mesh.vertices), linear))
+        return MeshVisual(WHITE, colors=attribute_colors(np.asarray(visual.vertex_colors), len(mesh.vertices)))
     if visual.kind == "face" and len(visual.face_colors) == len(mesh.faces):
         return MeshVisual(WHITE, face_colors=np.asarray(visual.face_colors, dtype=np.uint8))
     return MeshVisual(DEFAULT)
-
-
-def show_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A mesh of a stored GLB that shows its vertex colours, linear as in the file.
-
-    trimesh keeps them aside where a material stands with them, and without one other viewers draw dark metal, or white.
-    """
-    visual: Any = mesh.visual
-    if visual.kind == "texture" and "color" in visual.vertex_attributes and visual.material.baseColorTexture is None:
-        mesh.visual = ColorVisuals(
-            mesh, vertex_colors=_attribute_colors(visual.vertex_attributes["color"], len(mesh.vertices), False)
-        )
-    return mesh
-
-
-def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArray[np.uint8] | None:
-    """Vertex colours, floats in [0, 1] or integers that use the whole range of their type, as [V, 4] uint8 sRGB."""
-    if values is None or np.shape(values) not in ((count, 3), (count, 4)):
-        return None
-    whole = np.issubdtype(values.dtype, np.integer)
-    share = np.ones((count, 4))
-    share[:, : values.shape[1]] = values / np.iinfo(values.dtype).max if whole else values
-    if not np.isfinite(share).all():
-        return None
-    share = np.clip(share, 0.0, 1.0)
-    if linear:
-        share[:, :3] = encode_srgb(share[:, :3])
-    return np.round(255.0 * share).astype(np.uint8)
 
 
 def _trimesh_material(source: object, textured: bool, notes: list[str]) -> Material:

@@ -44,7 +44,7 @@ from workers.geometry.lens import opencv_lens
 from workers.geometry.zbuffer import register_depth
 from workers.render.pathtraced import draw_view
 from workers.render.raster.gbuffer import shared_renderer
-from workers.scene.plan import SceneChance, Stream
+from workers.scene.chance import SceneChance, Stream
 from workers.scene.sensor import add_noise, expose, sense_depth
 
 

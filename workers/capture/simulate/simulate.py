@@ -43,8 +43,9 @@ from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_codes
 from workers.geometry.frames import pose, rotation_about
 from workers.geometry.lens import opencv_lens
+from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
-from workers.scene.plan import SceneChance, Stream, choose_assets
+from workers.scene.plan import choose_assets
 
 
 def planned_settings(simulate: Simulate, plan: EffectPlan) -> Simulate:
