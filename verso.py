@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import CorruptError, InputError, OutputError, SceneError, VersoError
+from schemas.errors import CorruptError, InputError, OutputError, SceneError, VersoError, needs_making
 from schemas.job.job import Job
 from services.dataset.dataset import Dataset
 from services.dataset.dataset import open_dataset as open
@@ -37,6 +37,7 @@ def make_scene(
     `job` is a job file, its keys, or a parsed job; `changes` are `KEY=VALUE` as in `--set`. Raises SceneError where the scene
     cannot be made, and InputError where the job is wrong.
     """
-    from services.dataset import one_scene
+    with needs_making("verso.make_scene"):
+        from services.dataset.one_scene import make_scene as make
 
-    return one_scene.make_scene(job, scene_id, changes)
+    return make(job, scene_id, changes)

@@ -150,12 +150,14 @@ def _printable(character: str) -> str:
 
 @contextmanager
 def needs_making(what: str) -> Iterator[None]:
-    """Around imports of what makes data, in what reads it. Raises MachineError where only the half that reads is installed."""
+    """Around imports of what makes data, in what reads it. Raises MachineError where verso-read alone is installed."""
     try:
         yield
     except ModuleNotFoundError as error:
+        if not {"schemas", "services", "workers"} & set((error.name or "").split(".")[:2]):
+            raise
         raise MachineError(
-            f"{what} needs what makes data, and {error.name} is not installed: "
+            f"{what} needs what makes data, which this installation does not have: "
             "install verso-data in place of verso-read (Linux on x86-64)"
         ) from error
 

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.dataset.layout import COMMITS
-from schemas.errors import InputError, RunError, VersoError, plural
+from schemas.errors import InputError, RunError, VersoError, needs_making, plural
 from schemas.job.job import Job
 from services.cli.environment import host_place
 from services.job.job_file import load_job, pack_job
@@ -42,6 +43,14 @@ def test(options: argparse.Namespace) -> int:
 def lock(options: argparse.Namespace) -> int:
     """`verso lock`. Raises InputError: only the launcher of a checkout can do it."""
     raise InputError("lock makes a checkout's lock files: type ./verso lock there")
+
+
+def wheels(options: argparse.Namespace) -> int:
+    """`verso wheels`. Raises InputError where this is no checkout."""
+    script = Path(__file__).parents[2] / "deploy/wheels.py"
+    if not script.exists():
+        raise InputError("wheels builds those of a checkout: type ./verso wheels DIR there")
+    return subprocess.run([sys.executable, "-P", str(script), str(options.dir)]).returncode
 
 
 Found = TypeVar("Found")
@@ -135,7 +144,6 @@ def status(options: argparse.Namespace) -> int:
 
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
-    from services.read.audit import audit, describe_audit, describe_independent, verify_independently
     from services.read.verify import verify as read_back
 
     store = _committed(options.out)
@@ -143,12 +151,10 @@ def verify(options: argparse.Namespace) -> int:
     off = _tell_faults(verdict)
     read = f"{plural(verdict.files, 'file')} ({verdict.bytes / 1e6:.1f} MB), {plural(verdict.scenes, 'scene')}"
     print(f"{options.out}: {read}, labels of {plural(verdict.pairs, 'pair')} derived again: {off or 'nothing'} off")
+    if verdict.not_derived:
+        print(f"files and tables alone were checked: {verdict.not_derived}")
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
-    checks: tuple[tuple[str, Callable, Callable], ...] = (
-        ("independent", verify_independently, describe_independent),
-        ("audit", audit, describe_audit),
-    )
-    for name, check, describe in checks:
+    for name, check, describe in _deep_checks() if options.independent or options.audit else ():
         if count := getattr(options, name):
             try:
                 with explain_damage(store):
@@ -162,6 +168,16 @@ def verify(options: argparse.Namespace) -> int:
             faults += found.faults
             answer[name] = dataclasses.asdict(found)
     return finish(options, not faults, **answer)
+
+
+def _deep_checks() -> tuple[tuple[str, Callable, Callable], ...]:
+    """(option, what it does, how that is told)."""
+    with needs_making("verify --independent or --audit"):
+        from services.read.audit import audit, describe_audit, describe_independent, verify_independently
+    return (
+        ("independent", verify_independently, describe_independent),
+        ("audit", audit, describe_audit),
+    )
 
 
 def _tell_faults(verdict: Verdict) -> int:

@@ -5,11 +5,12 @@ import importlib
 import json
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from schemas.errors import VersoError
+from schemas.errors import VersoError, needs_making
 from services.cli.arguments import Command, Parser
 from services.cli.environment import enter_stack_environment, speak_as_typed, typed_program
 from services.cli.rows import COMMANDS, JSON, KEPT
@@ -44,7 +45,8 @@ def _run(options: argparse.Namespace) -> int:
     speak_as_typed()  # once more: a child of the supervisor has another standard error
     try:
         module, _, function = options.handler.partition(":")
-        return int(getattr(importlib.import_module(module), function)(options) or 0)
+        with needs_making(f"`{options.command}`"):
+            return int(getattr(importlib.import_module(f"..{module}", __package__), function)(options) or 0)
     except VersoError as error:
         print(f"verso: {error}", file=sys.stderr)
         if getattr(options, "json", False):
@@ -64,9 +66,9 @@ def _run(options: argparse.Namespace) -> int:
 def build_parser(program: str = "verso") -> argparse.ArgumentParser:
     """Every command and option of the program, which is called so in usages and examples.
 
-    `options.handler` names the function of a command as `module:function`; `options.starts_ray(options)` tells whether
-    it starts Ray, `options.kept` what remains of its work where it dies, and `options.quiet` whether the terminal is
-    spared what C++ code says.
+    `options.handler` names the function of a command as `module:function` below `services`, `options.command` is how it is typed;
+    `options.starts_ray(options)` tells whether it starts Ray, `options.kept` what remains of its work where it dies, and
+    `options.quiet` whether the terminal is spared what C++ code says.
     """
     parser = Parser(
         prog=program,
@@ -98,15 +100,21 @@ def _add_commands(parsers: "Commands", commands: Mapping[str, Command], above: s
             group = command.add_mutually_exclusive_group(required=True)
             for names, settings in entry.one_of:
                 group.add_argument(*names, **settings)
-        handler = entry.handler or f"services.cli.commands:{name}"
-        command.set_defaults(handler=handler, starts_ray=entry.starts_ray, kept=entry.kept, quiet=entry.quiet)
+        handler = entry.handler or f"cli.commands:{name}"
+        command.set_defaults(
+            command=words,
+            handler=handler,
+            starts_ray=entry.starts_ray,
+            kept=entry.kept,
+            quiet=entry.quiet,
+        )
 
 
 def _version() -> str:
-    try:
-        return f"verso {version('verso-data')}"
-    except PackageNotFoundError:
-        return "verso (a checkout that is not installed)"
+    for name in ("verso-data", "verso-read"):
+        with suppress(PackageNotFoundError):
+            return f"verso {version(name)}"
+    return "verso (a checkout that is not installed)"
 
 
 if __name__ == "__main__":

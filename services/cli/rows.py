@@ -30,7 +30,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         choice("--tiles", ("a4",), "several sheets to glue together instead of one large one"),
         BOARD,
         number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
-        handler="services.capture:board",
+        handler="capture:board",
     ),
     "simulate": command(
         "make a virtual capture with known truth",
@@ -40,7 +40,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         option("--seed", "N", "seed of all that is random (default: 0)", read.read_index, default=0),
         option("--category", "NAME", "what is captured (default: mug)", default="mug"),
         SET,
-        handler="services.capture:simulate",
+        handler="capture:simulate",
     ),
     "import": command(
         "make a capture from an Azure Kinect recording, without its SDK",
@@ -51,7 +51,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         BOARD,
         option("--name", "NAME", "of the object (default: the name of DIR)"),
         option("--category", "NAME", "folder that the capture has in a dataset (default: object)", default="object"),
-        handler="services.capture:import_recording",
+        handler="capture:import_recording",
     ),
     "process": command(
         "estimate the camera poses of a capture, and merge its views into a cloud and a mesh",
@@ -63,13 +63,13 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             "what the cloud is made with (default: captures.estimation.estimate, joint); all three are reported",
         ),
         SET,
-        handler="services.capture:process",
+        handler="capture:process",
     ),
     "synthesize": command(
         "make RGB, depth and mask of a processed capture from other poses",
         "data/mug --pose data/mug/board_00000.txt --out data/mug/views",
         *(FOLDER, path("--out", "DIR", "where the views go (default: DIR/views)")),
-        handler="services.capture:synthesize",
+        handler="capture:synthesize",
         one_of=(
             path("--pose", "FILE", "T_board_cam, 4 lines of 4 numbers"),
             flag("--mirror", "the mirror view of every captured view"),
@@ -79,7 +79,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         "score a processed capture against its truth or a given mesh",
         "data/mug --json",
         *(FOLDER, path("--mesh", "FILE", "the object's mesh, metres, in its own frame")),
-        handler="services.capture:evaluate",
+        handler="capture:evaluate",
     ),
 }
 
@@ -139,7 +139,7 @@ STUDY_COMMANDS: Final[dict[str, Command]] = {
             "--effects",
             "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
         ),
-        handler="services.bench.command:main",
+        handler="bench.command:main",
         starts_ray=lambda options: options.workers is not None or options.nodes is not None,
         kept="no figures are kept",
     ),
@@ -159,7 +159,7 @@ STUDY_COMMANDS: Final[dict[str, Command]] = {
         number("--laps", "rounds of timing (default: 3)", 3),
         number("--workers", "default: the cores this container may use"),
         SET,
-        handler="services.study.command:main",
+        handler="study.command:main",
     ),
 }
 
@@ -193,25 +193,25 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
         MORE_SCENES,
         SET,
         RETRY,
-        handler="services.cli.queue_commands:submit",
+        handler="cli.queue_commands:submit",
     ),
     "jobs": command(
         "the jobs of the queue, and how far they are",
         "--queue /shared/queue --json",
         QUEUE,
-        handler="services.cli.queue_commands:jobs",
+        handler="cli.queue_commands:jobs",
     ),
     "logs": command(
         "what a job wrote, also after the cluster is gone",
         "j0a1b2c3d --queue /shared/queue --follow",
         *(ID, QUEUE, ADDRESS, flag("--follow", "go on until the job has ended")),
-        handler="services.cli.queue_commands:logs",
+        handler="cli.queue_commands:logs",
     ),
     "cancel": command(
         "end a job of the queue; what it committed is kept",
         "j0a1b2c3d --queue /shared/queue",
         *(ID, QUEUE),
-        handler="services.cli.queue_commands:cancel",
+        handler="cli.queue_commands:cancel",
     ),
     "supervise": command(
         "start the queue's jobs on a cluster or here, and again where they died",
@@ -224,7 +224,7 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
             "PROGRAM",
             "the program `verso` on the cluster's head (default: this one where HTTP is on this machine, else verso)",
         ),
-        handler="services.cli.queue_commands:supervise",
+        handler="cli.queue_commands:supervise",
         starts_ray=lambda options: options.address in (None, OWN_RAY),
         kept="what is committed is kept, the next `verso supervise` starts the jobs again",
         quiet=True,
@@ -233,7 +233,7 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
         "one attempt at a job of the queue, as `supervise` has it started on the cluster's head",
         "j0a1b2c3d 1 --queue /shared/queue",
         *(ID, option("attempt", "ATTEMPT", kind=read.read_count), QUEUE),
-        handler="services.cli.queue_commands:drive",
+        handler="cli.queue_commands:drive",
         starts_ray=lambda options: True,
         kept="what is committed is kept, the queue's supervisor starts the job again",
         quiet=True,
@@ -253,7 +253,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "name categories after the first folder that not all share, the folder that a file lies in, or the file without "
             "its number, or call all NAME (default: the folder that holds one object or several of a kind)",
         ),
-        handler="services.init.command:main",
+        handler="init.command:main",
     ),
     "run": command(
         "make a dataset, or go on where it stopped",
@@ -342,7 +342,7 @@ COMMANDS: Final[dict[str, Command]] = {
         option("--held-out", "CATEGORY", "put all its objects into test; may be repeated", action="append", default=[]),
         number("--shard-mb", "size of a file of webdataset and huggingface, 10^6 bytes (default: 256)", 256),
         number("--points", "also draw N points on each shape, of webdataset and huggingface"),
-        handler="services.export.export:main",
+        handler="export.export:main",
     ),
     "capture": command(
         "real photographs of an object on a marker board: print a board, simulate, import, process, make views, score",
@@ -360,12 +360,12 @@ COMMANDS: Final[dict[str, Command]] = {
         option("-k", "EXPR", "only tests whose name matches, as in pytest"),
     ),
     **STUDY_COMMANDS,
-    "doctor": command("what this machine has, and what is missing", "", handler="services.cli.doctor:main"),
+    "doctor": command("what this machine has, and what is missing", "", handler="cli.doctor:main"),
     "completion": command(
         'print what completes commands and options in a shell: eval "$(verso completion bash)"',
         "bash",
         choice("shell", ("bash", "zsh", "tcsh")),
-        handler="services.cli.reference:main",
+        handler="cli.reference:main",
     ),
     "extra": command(
         "install what only some commands need: Mitsuba, MuJoCo as a referee, or the plots of studies",
@@ -373,5 +373,10 @@ COMMANDS: Final[dict[str, Command]] = {
         choice("name", ("pathtraced", "audit", "study")),
     ),
     "lock": command("make the lock files of a checkout anew, with the newest versions that pyproject.toml allows", ""),
+    "wheels": command(
+        "build a checkout's two wheels: verso-data, which is all of it, and verso-read, which reads what was made",
+        "dist",
+        path("dir", "DIR", "where they go"),
+    ),
 }
 """In the order of `verso --help`."""

@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
@@ -20,6 +19,9 @@ from schemas.scene.view import ROLES, Camera, ObjectLabel, Role, crop_box
 from services.read.stored_tables import patch_paths, view_paths
 from workers.store.images import decode_png
 
+if TYPE_CHECKING:
+    import trimesh
+
 
 class Files(Protocol):
     """Where the files of a pair come from."""
@@ -30,7 +32,7 @@ class Files(Protocol):
     def image(self, scene_id: int, path: str) -> bytes:
         """The bytes of an image. Raises CorruptError where it is missing."""
 
-    def mesh(self, scene: Row, region_id: int) -> trimesh.Trimesh:
+    def mesh(self, scene: Row, region_id: int) -> "trimesh.Trimesh":
         """The shape of a region (2 the table, 3 and up the objects) in its own frame, metres."""
 
 
@@ -174,7 +176,7 @@ class Pair:
 
     def mesh(
         self, region_id: int = REGION_FIRST_OBJECT, view: View | None = None, *, welded: bool = False
-    ) -> trimesh.Trimesh:
+    ) -> "trimesh.Trimesh":
         """An object's shape (or the table's, 2) where it rests: in the world, or in the frame of a view's camera, metres.
 
         welded: one vertex at each place and no look, for what needs a closed surface. Stored shapes have several at the seams
@@ -191,8 +193,10 @@ class Pair:
         return mesh
 
 
-def weld(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def weld(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
     """The surface with one vertex at each place, without triangles of two corners and without colours."""
+    import trimesh  # takes as long to load as all the rest
+
     places, at = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = at.reshape(-1)[mesh.faces]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)

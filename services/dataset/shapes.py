@@ -1,7 +1,7 @@
 """Shapes of a dataset's objects as meshes in the object frame, and the files of its pairs, from single files or from tars."""
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 from cachetools import LRUCache
@@ -11,7 +11,6 @@ from schemas.dataset.layout import tar_path
 from schemas.errors import CorruptError
 from schemas.job.views import Patch
 from services.job.record import JobRecord
-from services.read.scene_geometry import ReadShape, Sources, read_meshes, region_names
 from workers.store.commit import read_committed
 from workers.store.store import Store
 from workers.store.tars import read_tar
@@ -19,12 +18,14 @@ from workers.store.tars import read_tar
 if TYPE_CHECKING:
     import trimesh
 
+    from services.read.scene_geometry import ReadShape, Sources
+
 
 class Shapes:
-    """Reads shapes of one job."""
+    """Reads shapes of one job; loads what reads them, trimesh above all, with the first."""
 
-    def __init__(self, read: ReadShape, record: JobRecord) -> None:
-        self._read, self._sources = read, Sources(record)
+    def __init__(self, read: "ReadShape", record: JobRecord) -> None:
+        self._read, self._record = read, record
         self._kept = lru_cache(16)(self._load)
 
     def mesh(self, scene: Mapping[str, Any], region_id: int) -> "trimesh.Trimesh":
@@ -32,10 +33,20 @@ class Shapes:
 
         Raises InputError where it is neither stored nor to be had from the job's sources, CorruptError where it is damaged.
         """
+        from services.read.scene_geometry import region_names
+
         return self._kept(region_names(scene)[region_id], scene["scene_id"]).copy()
+
+    @cached_property
+    def _sources(self) -> "Sources":
+        from services.read.scene_geometry import Sources
+
+        return Sources(self._record)
 
     def _load(self, name: tuple[str, str], scene_id: int) -> "trimesh.Trimesh":
         import trimesh
+
+        from services.read.scene_geometry import read_meshes
 
         meshes = read_meshes(self._read, self._sources, scene_id, name)
         joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
 
 from schemas.base import Array
@@ -29,7 +30,6 @@ from services.export.formats import Added, ExportRequest, Writer
 from services.export.shapes import ColoredShape, Shapes, Silhouette, box_of, whole_silhouette
 from services.export.source import ExportPair, ExportScene
 from workers.geometry.frames import invert
-from workers.geometry.hull import convex_hull
 from workers.store.images import decode_png, encode_mask
 
 NO_SHAPE: Final = "an object is hidden in part, and its shape is neither stored nor here"
@@ -267,7 +267,7 @@ def model_info(vertices_mm: Array) -> dict[str, float]:
     low, high = vertices_mm.min(axis=0), vertices_mm.max(axis=0)
     sizes = dict(zip(("min_x", "min_y", "min_z"), low.tolist(), strict=True))
     sizes |= dict(zip(("size_x", "size_y", "size_z"), (high - low).tolist(), strict=True))
-    corners = convex_hull(vertices_mm).vertices
+    corners = vertices_mm[ConvexHull(vertices_mm, qhull_options="Qt QJ").vertices]
     blocks = (corners[first : first + _AT_ONCE] for first in range(0, len(corners), _AT_ONCE))
     return {"diameter": float(max(cdist(block, corners).max() for block in blocks)), **sizes}
 

@@ -20,13 +20,13 @@ class Format:
 
     def load(self) -> Any:
         """The class of the writer."""
-        return getattr(importlib.import_module(self.module), self.writer)
+        return getattr(importlib.import_module(f"{__package__}.{self.module}"), self.writer)
 
 
 FORMATS = {
-    "mirror-recon": Format("services.export.mirror_recon", "MirrorRecon"),
-    "bop": Format("services.export.bop", "Bop"),
-    "webdataset": Format("services.export.webdataset", "WebDataset", sharded=True),
-    "huggingface": Format("services.export.huggingface", "HuggingFace", sharded=True),
-    "gltf": Format("services.export.gltf", "Gltf"),
+    "mirror-recon": Format("mirror_recon", "MirrorRecon"),
+    "bop": Format("bop", "Bop"),
+    "webdataset": Format("webdataset", "WebDataset", sharded=True),
+    "huggingface": Format("huggingface", "HuggingFace", sharded=True),
+    "gltf": Format("gltf", "Gltf"),
 }

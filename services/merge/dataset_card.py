@@ -1,5 +1,7 @@
 """OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
+from typing import TYPE_CHECKING
+
 from schemas.base import Counts
 from schemas.dataset.layout import ARTICLE, FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
 from schemas.dataset.shard import Fingerprint
@@ -7,9 +9,11 @@ from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
 from services.job.record import JobRecord
 from services.merge.merge import MergeResult
-from workers.assets.catalogue import Catalogue
 from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
+
+if TYPE_CHECKING:
+    from workers.assets.catalogue import Catalogue
 
 SHAPES_OF_CAPTURES = (
     "- reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing\n"
@@ -25,13 +29,13 @@ def is_card_sealed(data: bytes) -> bool:
     return is_sealed(data, *SEAL)
 
 
-def write_card(store: Store, record: JobRecord, catalogue: Catalogue, merged: MergeResult) -> None:
+def write_card(store: Store, record: JobRecord, catalogue: "Catalogue", merged: MergeResult) -> None:
     """Writes DATASET.md."""
     fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     store.put(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
 
 
-def describe_dataset(record: JobRecord, catalogue: Catalogue, merged: MergeResult, fingerprint: Fingerprint) -> str:
+def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: MergeResult, fingerprint: Fingerprint) -> str:
     """The text of DATASET.md."""
     job = record.job
     libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))
@@ -79,7 +83,7 @@ y down, z forward), metres.
 """
 
 
-def _describe_captures(captures: Captures, catalogue: Catalogue) -> str:
+def _describe_captures(captures: Captures, catalogue: "Catalogue") -> str:
     """The section on where photographs come from and what was done to them."""
     board = captures.board
     origin = f"{len(catalogue.captures)} folders of photographs with registered depth, each with the board in its board.json."
@@ -105,7 +109,7 @@ def _count(count: Counts) -> str:
     return str(count.low) if count.low == count.high else f"{count.low} to {count.high}"
 
 
-def describe_sources(catalogue: Catalogue) -> list[str]:
+def describe_sources(catalogue: "Catalogue") -> list[str]:
     """One line for each source of objects and of tables with its licence, and those of `Catalogue.describe_left_out`."""
     lines = []
     for what, sources in (("objects", catalogue.assets.objects), ("tables", catalogue.assets.tables)):

@@ -20,7 +20,6 @@ above `objects.CONDITIONAL_BYTES` are asked for and then put, not in one step.
 """
 
 import contextlib
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -40,6 +39,7 @@ from services.merge.tables import MergedTable, PoseFiles
 from workers.store.attempt import sweep
 from workers.store.canonical import dataset_digest
 from workers.store.commit import commits_digest
+from workers.store.file_system import sha256_of
 from workers.store.manifest import PARQUET_OPTIONS
 from workers.store.store import Entry, Store, map_ahead, stat_all
 
@@ -106,7 +106,7 @@ AT_ONCE = 4
 def file_entry(path: Path) -> dict[str, object]:
     """Size and SHA-256 of a file, as `_SUCCESS` has them."""
     with open(path, "rb") as file:
-        return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+        return {"bytes": path.stat().st_size, "sha256": sha256_of(file)}
 
 
 class Installation:

@@ -17,9 +17,7 @@ from schemas.job.assets import TABLE
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Asset
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, find_scene
-from workers.assets.appearance import draw_appearance
 from workers.assets.glb import linear_bytes, mesh_of_part, show_colors
-from workers.scene.chance import SceneChance, Stream
 from workers.store.store import Store
 
 if TYPE_CHECKING:
@@ -47,6 +45,7 @@ class Sources:
         told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off), and"
         with needs_making(told):
             from workers.assets.catalogue import load_asset
+            from workers.scene.chance import SceneChance
             from workers.scene.plan import choose_assets
         try:
             catalogue = self._catalogue
@@ -64,8 +63,8 @@ class Sources:
 
     @cached_property
     def _catalogue(self) -> "Catalogue":
-        from workers.capture.results import open_sources
-
+        with needs_making("a shape that is not stored"):
+            from workers.capture.results import open_sources
         catalogue = open_sources(self._record.job, Path(self._record.folder))
         if catalogue.digest != self._record.catalogue:
             raise MachineError("the files of the asset folders do not hold what they held when this job was run")
@@ -118,16 +117,14 @@ def posed_scene(store: Store, scene_id: int) -> trimesh.Scene:
 def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, sources: Sources) -> trimesh.Scene:
     """The same for a row of `scenes`: world frame, z up, metres. Raises as `read_meshes`.
 
-    The floor is drawn again: its look is in no file.
+    The floor is drawn again, its look being in no file; where what makes data is not installed there is none.
     """
     T_world, names, scene = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}, region_names(row), trimesh.Scene()
     placed: list[tuple[str, int, list[trimesh.Trimesh]]] = []
     if record.job.captures is not None:
         placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [_board(stored, row)]))
     else:
-        chance = SceneChance(record.job.seed, row["scene_id"])
-        floor, _ = draw_appearance(chance.stream(Stream.APPEARANCE), record.job.render.tier)
-        placed.append(("floor", REGION_FLOOR, [mesh_of_part(part) for part in floor.parts]))
+        placed.append(("floor", REGION_FLOOR, _floor(record, row["scene_id"])))
     for region_id, name in names.items():
         # Two objects may be of one instance: only the region id tells them apart.
         region = f" {region_id}" if len(names) > 2 and region_id >= REGION_FIRST_OBJECT else ""
@@ -137,6 +134,18 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
             part = f"{label}/{number}"
             scene.add_geometry(mesh, geom_name=part, node_name=part, transform=T_world[region_id])
     return scene
+
+
+def _floor(record: JobRecord, scene_id: int) -> list[trimesh.Trimesh]:
+    try:
+        with needs_making("the floor"):
+            from workers.assets.appearance import draw_appearance
+            from workers.scene.chance import SceneChance, Stream
+    except MachineError:
+        return []
+    chance = SceneChance(record.job.seed, scene_id)
+    floor, _ = draw_appearance(chance.stream(Stream.APPEARANCE), record.job.render.tier)
+    return [mesh_of_part(part) for part in floor.parts]
 
 
 def _board(stored: StoredRange, row: Row) -> trimesh.Trimesh:

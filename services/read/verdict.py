@@ -32,6 +32,9 @@ class Verdict:
     bytes: int = 0
     scenes: int = 0
     pairs: int = 0
+    """Pairs whose labels were derived again."""
+    not_derived: str = ""
+    """Why none were, where what makes data is not installed."""
     faults: list[str] = field(default_factory=list)
     untold: int = 0
     """Faults beyond `MOST_FAULTS`."""

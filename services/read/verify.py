@@ -45,7 +45,6 @@ from services.read.verify_files import (
     tell_strays,
 )
 from services.read.verify_range import RangeCheck, ReadRange, Spans, commit_groups, read_records
-from workers.scene.context import keep_freed_memory
 from workers.store.commit import commits_digest
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
@@ -222,7 +221,6 @@ class Ranges:
 
 def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     """Reads everything back. Raises OutputError where a newer version wrote it, MachineError where TMPDIR is full."""
-    keep_freed_memory()
     verdict = Verdict(store.name)
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)

@@ -1,6 +1,5 @@
 """A whole folder against its commits: merged files, `_SUCCESS`, DATASET.md, and everything that is no part of the dataset."""
 
-import hashlib
 import json
 import os
 import re
@@ -33,6 +32,7 @@ from schemas.dataset.layout import (
 from services.merge.dataset_card import is_card_sealed
 from services.merge.merge import encode_success, file_entry
 from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable
+from workers.store.file_system import sha256_of
 from workers.store.store import Store
 
 FREE = frozenset({LOCK_FILE, LOG_FOLDER, STAGING})
@@ -241,7 +241,7 @@ def _hash_file(store: Store, path: str, verdict: Verdict) -> dict[str, object] |
     """{bytes, sha256} of a stored file, or why it cannot be read; on a disk in constant memory."""
     try:
         with store.open(path) as file:
-            digest, size = hashlib.file_digest(file, "sha256").hexdigest(), file.seek(0, os.SEEK_END)
+            digest, size = sha256_of(file), file.seek(0, os.SEEK_END)
     except FileNotFoundError:
         return "is merged and missing"
     except OSError as error:

@@ -2,7 +2,7 @@
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, groupby
@@ -13,12 +13,11 @@ import pyarrow as pa
 from schemas.dataset.commit import CommitRecord, FileEntry
 from schemas.dataset.layout import COMMITS, RANGES, commit_path, is_shape, parse_commit_name, stored_roles
 from schemas.dataset.tables import DETERMINISTIC_TABLES, TABLES
-from schemas.errors import CorruptError
+from schemas.errors import CorruptError, MachineError, needs_making
 from schemas.job.job import Job
 from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image
 from services.read.verdict import COPY, MOST_FAULTS, PathIndex, Verdict, describe_os_error
-from workers.scene.check_stored import check_stored_pair, check_stored_scene
 from workers.store.commit import committed_files, read_committed, read_record
 from workers.store.ledger import range_rows
 from workers.store.store import Store
@@ -153,6 +152,11 @@ class RangeCheck:
         """Of the keys of job.yaml as they are: labels of commits of another job cannot be derived."""
         self.index = index
         self.verdict = verdict
+        self._checks: list[CheckScene] = []
+        try:
+            self._checks = [_label_check()]
+        except MachineError as error:
+            verdict.not_derived = str(error)
 
     def check(self, records: tuple[CommitRecord, ...]) -> ReadRange:
         """Reads one range with its retries."""
@@ -268,8 +272,8 @@ class RangeCheck:
             read = file_reader(read_file, stored)
         except (CorruptError, OSError):
             return []  # the archive is told by its digest
-        for scene_id, scene in made.items():
-            faults += [(scene_id, fault) for fault in _check_scene(job, stored, scene, read)]
+        for scene_id, scene in made.items() if self._checks else ():
+            faults += [(scene_id, fault) for check in self._checks for fault in check(job, stored, scene, read)]
             self.verdict.pairs += len({row["parent_id"] for row in rows["views"] if row["scene_id"] == scene_id})
         return faults
 
@@ -294,18 +298,30 @@ def is_table(entry: FileEntry) -> bool:
     return entry.path.startswith(f"{RANGES}/")
 
 
-def _check_scene(job: Job, stored: StoredRange, scene: dict, read: ReadFile) -> list[str]:
-    """Labels of one scene that do not follow from its images, rows and job, a sentence each."""
-    faults, roles = check_stored_scene(scene), stored_roles(job)
-    for views, objects in stored.pairs(scene["scene_id"]):
-        if set(views) != set(roles):
-            faults.append(f"scene {scene['scene_id']}: has views {sorted(views)}, and must have {sorted(roles)}")
-            continue
-        try:
-            faults += check_stored_pair(job, views, objects, scene, partial(read_image, read))
-        except (CorruptError, ValueError, OSError) as error:
-            faults.append(f"scene {scene['scene_id']}: {error}")
-    return faults
+CheckScene = Callable[[Job, StoredRange, dict, ReadFile], list[str]]
+"""Labels of one scene that do not follow from its images, rows and job, a sentence each."""
+
+
+def _label_check() -> CheckScene:
+    """Derives labels by the producer's functions. Raises MachineError where these are not installed."""
+    with needs_making("deriving labels again"):
+        from workers.scene.check_stored import check_stored_pair, check_stored_scene
+        from workers.scene.context import keep_freed_memory
+    keep_freed_memory()
+
+    def check_scene(job: Job, stored: StoredRange, scene: dict, read: ReadFile) -> list[str]:
+        faults, roles = check_stored_scene(scene), stored_roles(job)
+        for views, objects in stored.pairs(scene["scene_id"]):
+            if set(views) != set(roles):
+                faults.append(f"scene {scene['scene_id']}: has views {sorted(views)}, and must have {sorted(roles)}")
+                continue
+            try:
+                faults += check_stored_pair(job, views, objects, scene, partial(read_image, read))
+            except (CorruptError, ValueError, OSError) as error:
+                faults.append(f"scene {scene['scene_id']}: {error}")
+        return faults
+
+    return check_scene
 
 
 def _without_remedy(error: Exception) -> str:

@@ -93,18 +93,6 @@ def gather_colours(rgb: NDArray[np.uint8], source: NDArray[np.integer]) -> NDArr
     return gathered
 
 
-@compiled_for("u2[:,::1]")
-def split_samples(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """[H, 1 + 2 W] uint8: each row of pixels [H, W] as pairs of bytes, the high one first, after a byte that is 0."""
-    rows = np.empty((pixels.shape[0], 1 + 2 * pixels.shape[1]), np.uint8)
-    for row in range(pixels.shape[0]):
-        rows[row, 0] = 0
-        for column in range(pixels.shape[1]):
-            rows[row, 1 + 2 * column] = pixels[row, column] >> 8
-            rows[row, 2 + 2 * column] = np.uint8(pixels[row, column])
-    return rows
-
-
 def measure_regions(region: NDArray[np.uint8]) -> list[Extent]:
     """The extent of each of the 256 region ids in a mask [H, W]."""
     counts, boxes = np.zeros(256, np.int64), np.zeros((256, 4), np.int64)

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import errno
 import fcntl
+import hashlib
 import os
 import pwd
 import re
@@ -14,6 +15,7 @@ import uuid
 import weakref
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from io import BufferedIOBase
 from pathlib import Path
 from typing import IO
 
@@ -145,9 +147,20 @@ def sync_path(path: str | Path) -> None:
 
 def _syncfs(descriptor: int) -> None:
     """Writes back the whole file system of `descriptor`. Raises OSError where writing failed since it was opened."""
-    if ctypes.CDLL(None, use_errno=True).syncfs(descriptor) != 0:
+    syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
+    if syncfs is None:  # macOS has none
+        os.sync()
+    elif syncfs(descriptor) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
+
+
+def sha256_of(file: IO[bytes] | BufferedIOBase) -> str:
+    """The digest of a file from where it stands; Python 3.10 has no `hashlib.file_digest`."""
+    digest = hashlib.sha256()
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
 
 
 @contextlib.contextmanager

@@ -63,13 +63,10 @@ def _deflated(pixels: NDArray, sub: bool, level: int) -> bytes:
 
 def _unfiltered_rows(pixels: NDArray) -> NDArray[np.uint8]:
     """[H, 1 + row bytes]: each row after the number of its PNG filter, `none`, with the high byte of a sample first."""
-    if pixels.dtype == np.uint16:
-        from workers.geometry.pixels import split_samples  # numba loads only where something is encoded
-
-        return split_samples(pixels)
     rows = np.empty((len(pixels), 1 + pixels[0].nbytes), np.uint8)
     rows[:, 0] = 0
-    rows[:, 1:] = pixels.reshape(len(pixels), -1)
+    samples = pixels.astype(">u2").view(np.uint8) if pixels.dtype == np.uint16 else pixels
+    rows[:, 1:] = samples.reshape(len(pixels), -1)
     return rows
 
 

@@ -40,7 +40,7 @@ def refusal(capsys, words: list[str]) -> str:
 def test_every_example_is_accepted_its_handler_exists_and_its_help_shows_it(capsys):
     for words, command in commands():
         options = parse(*words, *shlex.split(command.example))
-        module, _, function = options.handler.partition(":")
+        module, _, function = f"services.{options.handler}".partition(":")
         assert callable(getattr(importlib.import_module(module), function)), words
         with pytest.raises(SystemExit) as caught:
             parse(*words, "--help")

@@ -1,0 +1,145 @@
+"""The wheel that only reads: what it holds, that it is enough to read with, and that both wheels are the same each time."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from deploy import wheels
+from tests.datasets import make_dataset
+
+ROOT = Path(__file__).parents[2]
+IMPORTED_AS = {
+    "annotated-types": "annotated_types",
+    "opencv-contrib-python-headless": "cv2",
+    "pillow": "PIL",
+    "pyyaml": "yaml",
+    "zlib-ng": "zlib_ng",
+}
+
+GUARD = """
+import importlib.abc, sys
+class Guard(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {forbidden!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Guard())
+from verso.services.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    out = tmp_path_factory.mktemp("wheels")
+    subprocess.run([sys.executable, "-P", "deploy/wheels.py", str(out)], cwd=ROOT, check=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("made") / "out", scenes=2)[0].root
+
+
+def test_reading_loads_what_the_wheel_names_and_nothing_that_makes_data():
+    modules, others = wheels.reading_modules()
+    named = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]["reading"]
+    names = {one.split(">")[0] for one in named}
+    assert others == {IMPORTED_AS.get(name, name) for name in names}
+    rooms = {".".join(name.split(".")[:2]) for name in modules}
+    assert not rooms & {"workers.physics", "workers.render", "workers.capture", "workers.shard", "services.queue"}
+    assert len(modules) < 100
+
+
+def read(place: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """A command of the unpacked wheel, where nothing else of ours and nothing that it does not name can be imported."""
+    _, others = wheels.reading_modules()
+    locked = (ROOT / "requirements.lock").read_text()
+    heavy = ["ray", "pybullet", "OpenGL", "pyrender", "numba", "manifold3d", "embreex", "av", "skimage", "shapely"]
+    heavy += ["plyfile", "mapbox_earcut", "clarabel", "daqp", "reportlab", "prometheus_client", "networkx", "pyglet"]
+    assert "pybullet" in locked and not set(heavy) & others
+    code = GUARD.format(forbidden=(*heavy, "schemas", "services", "workers"))
+    command = [sys.executable, "-P", "-c", code, *words]
+    return subprocess.run(command, env={**os.environ, "PYTHONPATH": str(place)}, capture_output=True, text=True)
+
+
+def test_every_command_of_reading_works_from_the_wheel_and_the_others_say_what_to_install(built, dataset, tmp_path):
+    (wheel,) = built.glob("verso_read-*.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        assert {name.split("/")[0] for name in packed.namelist()} == {"verso", "verso_read-0.1.0.dist-info"}
+        packed.extractall(tmp_path / "site")
+    out, place = str(dataset), tmp_path / "site"
+    commands = [["status", out], ["columns"], ["query", out, "select count(*) from scenes"], ["verify", out]]
+    commands += [["export", out, str(tmp_path / name), "--format", name] for name in ("bop", "gltf", "huggingface")]
+    commands += [["export", out, str(tmp_path / name), "--format", name] for name in ("mirror-recon", "webdataset")]
+    commands += [["report", out, "--out", str(tmp_path / "page.html")]]
+    for words in commands:
+        ended = read(place, *words)
+        assert ended.returncode == 0, (words, ended.stdout, ended.stderr)
+    told = read(place, "verify", out, "--json").stdout
+    assert json.loads(told.splitlines()[-1])["pairs"] == 0 and "deriving labels again needs what makes data" in told
+    for words in (
+        ["run", str(ROOT / "deploy/jobs/tabletop.yaml")],
+        ["replay", out, "0"],
+        ["doctor"],
+        ["verify", out, "--audit", "1"],
+    ):
+        ended = read(place, *words)
+        assert ended.returncode == 1 and "install verso-data" in ended.stderr, (words, ended.stderr)
+
+
+@pytest.mark.minute
+def test_both_wheels_are_the_same_bytes_from_the_same_source(built, tmp_path):
+    subprocess.run([sys.executable, "-P", "deploy/wheels.py", str(tmp_path)], cwd=ROOT, check=True)
+    first, second = (
+        {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("*.whl")}
+        for folder in (built, tmp_path)
+    )
+    assert len(first) == 2 and first == second
+
+
+PYTHON = """
+import json, sys, time
+began = time.process_time()
+import verso
+pair = next(iter(verso.open(sys.argv[1]).pairs()))
+made = {"shape": pair.input.rgb().shape, "watertight": pair.mesh(welded=True).is_watertight}
+try:
+    verso.make_scene({}, 0)
+except verso.VersoError as error:
+    made["told"] = str(error)
+print(json.dumps(made))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("version", ["3.10", "3.12", "3.13"])
+def test_the_wheel_installs_and_reads_on(version, built, dataset, tmp_path):
+    python = find_python(version)
+    if python is None:
+        pytest.skip(f"no Python {version} is installed")
+    subprocess.run([python, "-m", "venv", str(tmp_path / "env")], check=True)
+    own, (wheel,) = tmp_path / "env/bin", built.glob("verso_read-*.whl")
+    subprocess.run([str(own / "pip"), "install", "-q", str(wheel)], check=True)
+    for words in (["verify", str(dataset)], ["export", str(dataset), str(tmp_path / "bop"), "--format", "bop"]):
+        subprocess.run([str(own / "verso"), *words], check=True, cwd=tmp_path)
+    ended = subprocess.run(
+        [str(own / "python"), "-c", PYTHON, str(dataset)], capture_output=True, text=True, cwd=tmp_path
+    )
+    found = json.loads(ended.stdout)
+    assert found["watertight"] and len(found["shape"]) == 3 and "verso-data" in found["told"], ended.stderr
+
+
+def find_python(version: str) -> str | None:
+    """An interpreter of this version on the path, or among pyenv's."""
+    asks = f"import sys; sys.exit('{version}' != '%d.%d' % sys.version_info[:2])"
+    places = [shutil.which(f"python{version}"), *sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))]
+    found = (str(one) for one in places if one)
+    return next((one for one in found if subprocess.run([one, "-c", asks], capture_output=True).returncode == 0), None)
