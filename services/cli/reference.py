@@ -46,8 +46,8 @@ EXIT_CODES = (
 
 HEAD = """# Commands
 
-`./verso COMMAND --help` explains every option (installed: `verso`). `--json` makes the last line of standard output one JSON
-object. Messages go to standard error.
+`./verso COMMAND --help` explains every option (installed: `verso`). `--json` ends standard output with one JSON object.
+Messages go to standard error. `VERSO_PYTHON` names `.venv`'s Python.
 
 | exit code | meaning |
 |---|---|"""
