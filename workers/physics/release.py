@@ -254,9 +254,10 @@ HELD = (9, Rest(speed_mm_s=0.05, window_s=0.05), 1.5e-5), (math.inf, Rest(speed_
 make up their margins by up to 10 micrometres. Slips in heaps take longer to begin: of twenty boxes three stood for 0.6 s before
 they went by half a millimetre; and some creep by 0.03 mm in a second, wherever they are."""
 
-UNEVEN, UNEVEN_M = 100.0, 9e-5
-"""Ratio of masses from which what is let go may move farther, by its root, up to this: under a thousand times its weight a cube
-creeps by 60 micrometres before Bullet's solver has found the forces, and by 240 with a thirtieth of the iterations."""
+UNEVEN, UNEVEN_M = 8.0, 9e-5
+"""Ratio of masses from which what is let go may move farther, by its fourth root, up to this: before Bullet's solver has found the
+forces, a cube creeps by 24 micrometres under a hundred times its weight, by 60 under a thousand times, and by 240 there with a
+thirtieth of the iterations."""
 
 POURED_HOLD_S = 0.1
 """The same time for what fell in waves: a second of fifteen takes 32 s."""
@@ -289,7 +290,7 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     still, held_m = next((still, most_m) for fewer_than, still, most_m in HELD if len(poses) < fewer_than)
     if drop.in_waves:
         still = still.model_copy(update={"window_s": POURED_HOLD_S})
-    held_m = max(held_m, min(UNEVEN_M, held_m * math.sqrt(_unevenness(drop.starts) / UNEVEN)))
+    held_m = max(held_m, min(UNEVEN_M, held_m * (_unevenness(drop.starts) / UNEVEN) ** 0.25))
     spinning_m = 2.0 * drop.physics.friction * drop.physics.spinning_friction  # Bullet's arm
     changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
     held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
