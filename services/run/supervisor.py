@@ -84,6 +84,9 @@ def _name(number: int) -> str:
 STOP_S = 30.0
 """Time that the command gets to end after the first signal that stops it; a second one ends it at once."""
 
+EXIT_S = 10
+"""Time that the command's interpreter gets to end once its exit code is told."""
+
 LAST_WORDS = "driver.txt"
 """The file in OUT/_logs with what Ray said in the command's process, where that is anything."""
 
@@ -264,6 +267,9 @@ def _drive(command: Callable[[], int], words: int | None, mask: Collection[int])
         code = 1
         traceback.print_exc()
     tell(code=code)
+    # gRPC's destructors hang where a Ray did not start; the default of SIGALRM is to end the process
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(EXIT_S)
     return code
 
 

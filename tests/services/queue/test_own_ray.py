@@ -43,12 +43,12 @@ def wait_for(happened: Callable[[], Any], told: Callable[[], str] = str) -> Any:
     return found
 
 
-def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found_while_they_run(tmp_path):
+def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found_while_they_run(monkeypatch):
     with private_folder() as folder:
         logs = folder / module.FOLDER
         logs.mkdir()
         drivers = OwnDrivers(logs, {**os.environ, "GIVEN": "to drivers"})
-        stubborn = "trap 'echo told' TERM; echo $GIVEN; while :; do sleep 0.05; done"
+        stubborn = "trap 'echo told' TERM; echo $GIVEN; for ((i = 0; i < 600; i++)); do sleep 0.05; done"
         for name, script in {"stubborn": stubborn, "plain": "exit 3", "killed": "kill -9 $$"}.items():
             for _ in range(2):  # a driver that is known is not started again
                 drivers.hand_over(name, shlex.join(["bash", "-c", script]), {})
@@ -66,11 +66,8 @@ def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found
         assert drivers.log("stubborn") == "to drivers\ntold\n" and reader.log("plain") == ""
         with pytest.raises(MachineError, match=r"--driver /no/verso: it cannot be started \(No such file"):
             drivers.hand_over("other", "/no/verso drive", {})
-        module.STOP_S, patient = 0.2, module.STOP_S
-        try:
-            drivers.end()
-        finally:
-            module.STOP_S = patient
+        monkeypatch.setattr(module, "STOP_S", 0.2)
+        drivers.end()
         assert drivers.states()["stubborn"] == Driver("over", "killed by SIGKILL")
     with pytest.raises(MachineError, match=r"--address http://127\.0\.0\.1:1"):
         reader.log("stubborn")

@@ -225,6 +225,11 @@ def test_a_program_that_waits_for_json_gets_it_from_a_command_that_dies():
     assert code == 1 and answer["ok"] is False and wrong == f"verso: {answer['error']}\n"
 
 
+def test_a_command_whose_interpreter_does_not_end_is_ended_with_its_exit_code():
+    patience = "import atexit, services.run.supervisor as module; module.EXIT_S = 1"
+    assert end(start(f"{patience}; atexit.register(time.sleep, 600); print('said'); return 3")) == (3, "said\n", "")
+
+
 def test_a_command_that_ignores_the_interrupt_is_killed_by_a_second_one():
     run = begun("signal.signal(signal.SIGINT, signal.SIG_IGN); " + FOREVER)
     for _ in range(2):
