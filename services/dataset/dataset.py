@@ -23,8 +23,7 @@ from schemas.scene.view import ROLES
 from services.dataset.pair import Files, Pair, read_pair
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.dataset.splits import Splits, collect_ids, split_by_category
-from services.job.record import require_job
-from services.merge.merge import read_success
+from services.job.record import read_success, require_job
 from services.read.dataset_reader import find_records
 from services.read.stored_tables import StoredTables
 from workers.store.ledger import iter_committed, range_rows

@@ -21,8 +21,7 @@ from services.export.folder import ExportFolder
 from services.export.formats import Added, Choice, Chooser, ExportRequest, Writer
 from services.export.source import iter_ranges, scenes_of, splits_of
 from services.export.table import FORMATS
-from services.job.record import JobRecord, require_dataset, require_job
-from services.merge.merge import read_success
+from services.job.record import JobRecord, read_success, require_dataset, require_job
 from services.read.verdict import explain_damage
 from services.run.progress import ProgressLine
 from workers.store.commit import list_codes

@@ -1,5 +1,6 @@
-"""OUT/job.yaml: the job that an output folder belongs to. Another job is refused, naming the keys."""
+"""OUT/job.yaml: the job that an output folder belongs to. Another job is refused, naming the keys. And OUT/_SUCCESS."""
 
+import json
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING
+from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING, SUCCESS_FILE, is_merged_path
 from schemas.errors import CorruptError, JobError, OutputError
 from schemas.job.identity import compare_jobs, job_digest
 from schemas.job.job import Job
@@ -151,3 +152,22 @@ def refuse_foreign(store: Store) -> None:
             f"{store.name} holds {', '.join(foreign[:3])}{' and more' if len(foreign) > 3 else ''}, and no {JOB_FILE}: "
             "choose an empty or a new folder for --out"
         )
+
+
+def read_success(store: Store) -> dict | None:
+    """The contents of `_SUCCESS`, None where there is none or it is not whole."""
+    try:
+        success = json.loads(store.read(SUCCESS_FILE))
+    except (FileNotFoundError, ValueError):
+        return None
+    return success if _is_whole(success) else None
+
+
+def _is_whole(success: object) -> bool:
+    """Whether the keys that readers of `_SUCCESS` use are of their types, and its files those that a merge writes."""
+    kinds = {"schema_version": int, "digest": str, "files": dict, "scenes": dict, "rows": dict}
+    if not isinstance(success, dict) or any(not isinstance(success.get(key), kind) for key, kind in kinds.items()):
+        return False
+    files = success["files"].items()
+    named = all(is_merged_path(path) and isinstance(file, dict) and "bytes" in file for path, file in files)
+    return named and "environmental" in success["scenes"]

@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import MANIFEST
 from schemas.dataset.tables import SCHEMAS
+from services.job.record import read_success
 from services.look.charts import Histogram
-from services.merge.merge import read_success
 from services.read.stored_tables import category_of
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import range_rows, read_range

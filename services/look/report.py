@@ -13,7 +13,7 @@ import trimesh
 
 from schemas.errors import MachineError, OutputError, plural
 from schemas.job.job import Job
-from services.job.record import JobRecord, require_job
+from services.job.record import JobRecord, read_success, require_job
 from services.look.clouds import Space, pack_spaces, read_spaces
 from services.look.collect import Figures, collect, open_tables
 from services.look.pictures import Sample, choose_scenes, show_scenes
@@ -30,7 +30,6 @@ from services.look.sections import (
     sheets_html,
     space_html,
 )
-from services.merge.merge import read_success
 from workers.store.store import Store
 
 WEB = Path(__file__).with_name("web")

@@ -30,9 +30,10 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from schemas.dataset.layout import CAM_POSES, CAMERAS, MANIFEST, OBJECTS, SUCCESS_FILE, is_merged_path, is_shape
+from schemas.dataset.layout import CAM_POSES, CAMERAS, MANIFEST, OBJECTS, SUCCESS_FILE, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.errors import RunError, VersoError
+from services.job.record import read_success
 from services.merge.reading import Block, PublishedFiles, read_blocks
 from services.merge.shared import SharedRows, merge_folder
 from services.merge.tables import MergedTable, PoseFiles
@@ -245,25 +246,6 @@ def merge(
 def encode_success(success: Mapping[str, object]) -> bytes:
     """The bytes of `_SUCCESS`."""
     return json.dumps(success, sort_keys=True, indent=1).encode() + b"\n"
-
-
-def read_success(store: Store) -> dict | None:
-    """The contents of `_SUCCESS`, None where there is none or it is not whole."""
-    try:
-        success = json.loads(store.read(SUCCESS_FILE))
-    except (FileNotFoundError, ValueError):
-        return None
-    return success if _is_whole(success) else None
-
-
-def _is_whole(success: object) -> bool:
-    """Whether the keys that readers of `_SUCCESS` use are of their types, and its files those that a merge writes."""
-    kinds = {"schema_version": int, "digest": str, "files": dict, "scenes": dict, "rows": dict}
-    if not isinstance(success, dict) or any(not isinstance(success.get(key), kind) for key, kind in kinds.items()):
-        return False
-    files = success["files"].items()
-    named = all(is_merged_path(path) and isinstance(file, dict) and "bytes" in file for path, file in files)
-    return named and "environmental" in success["scenes"]
 
 
 def _merged_already(store: Store, asked: Mapping[str, object]) -> dict | None:

@@ -22,8 +22,7 @@ from schemas.errors import CorruptError, InputError, SceneError, plural
 from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import Camera, View
-from services.job.record import require_job
-from services.merge.merge import read_success
+from services.job.record import read_success, require_job
 from services.read.dataset_reader import StoredRange, choose_scenes, file_reader, find_scene
 from services.read.independent.derive import StoredPair, check_forces
 from services.read.independent.poses import check_merged, check_pair, list_underived

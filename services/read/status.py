@@ -8,7 +8,7 @@ import pyarrow.compute as pc
 from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import COMMITS, STAGING, commit_path
 from schemas.errors import OutputError
-from services.merge.merge import read_success
+from services.job.record import read_success
 from services.run.lock import Holder, read_holder
 from services.run.range_planner import find_lost
 from workers.store.attempt import blamed_scene, retry_of_attempt, staged_attempts

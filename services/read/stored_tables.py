@@ -27,7 +27,7 @@ from schemas.dataset.layout import (
 )
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, OutputError
-from services.merge.merge import read_success
+from services.job.record import read_success
 from workers.store.commit import commit_names, read_record
 from workers.store.ledger import range_rows
 from workers.store.manifest import join_rows

@@ -15,7 +15,7 @@ from schemas.dataset.commit import Ledger, Span
 from schemas.dataset.layout import commit_path
 from schemas.errors import OutputError
 from schemas.job.job import Job
-from services.merge.merge import read_success
+from services.job.record import read_success
 from workers.store.commit import commits_digest
 from workers.store.ledger import list_commits
 from workers.store.store import Store

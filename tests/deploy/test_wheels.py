@@ -24,28 +24,6 @@ IMPORTED_AS = {
 }
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    out = tmp_path_factory.mktemp("wheels")
-    subprocess.run([sys.executable, "-P", "deploy/wheels.py", str(out)], cwd=ROOT, check=True)
-    return out
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("made") / "out", scenes=2)[0].root
-
-
-def test_reading_loads_what_the_wheel_names_and_nothing_that_makes_data():
-    modules, others = wheels.reading_modules()
-    named = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]["reading"]
-    names = {one.split(">")[0] for one in named}
-    assert others == {IMPORTED_AS.get(name, name) for name in names}
-    rooms = {".".join(name.split(".")[:2]) for name in modules}
-    assert not rooms & {"workers.physics", "workers.render", "workers.capture", "workers.shard", "services.queue"}
-    assert len(modules) < 100
-
-
 HEAVY = {
     "ray",
     "pybullet",
@@ -70,6 +48,35 @@ HEAVY |= {
     "networkx",
     "pyglet",
 }
+"""What only making needs."""
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    out = tmp_path_factory.mktemp("wheels")
+    subprocess.run([sys.executable, "-P", "deploy/wheels.py", str(out)], cwd=ROOT, check=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("made") / "out", scenes=2)[0].root
+
+
+def test_reading_loads_what_the_wheel_names_and_nothing_that_makes_data():
+    modules, others = wheels.reading_modules()
+    named = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]["reading"]
+    names = {one.split(">")[0] for one in named}
+    assert others == {IMPORTED_AS.get(name, name) for name in names}
+    rooms = {".".join(name.split(".")[:2]) for name in modules}
+    assert not rooms & {"workers.physics", "workers.render", "workers.capture", "workers.shard", "services.queue"}
+    assert len(modules) < 100
+    code = "import sys, verso; print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    ours = {name for name in loaded if name.split(".")[0] in wheels.OURS and wheels.file_of(name).name != "__init__.py"}
+    assert ours <= modules.keys() and not {*HEAVY, "trimesh", "scipy", "cv2", "duckdb", "obstore"} & set(loaded)
 
 
 ALONE = f"""

@@ -255,9 +255,9 @@ make up their margins by up to 10 micrometres. Slips in heaps take longer to beg
 they went by half a millimetre; and some creep by 0.03 mm in a second, wherever they are."""
 
 UNEVEN, UNEVEN_M = 8.0, 9e-5
-"""Ratio of masses from which what is let go may move farther, by its fourth root, up to this: before Bullet's solver has found the
-forces, a cube creeps by 24 micrometres under a hundred times its weight, by 60 under a thousand times, and by 240 there with a
-thirtieth of the iterations."""
+"""Ratio of masses from which what is let go may move farther, by its fourth root, up to this: before Bullet's solver has found
+the forces, a cube creeps by 24 micrometres under a hundred times its weight and by 60 under a thousand times; there by 240 with
+a thirtieth of the iterations."""
 
 POURED_HOLD_S = 0.1
 """The same time for what fell in waves: a second of fifteen takes 32 s."""

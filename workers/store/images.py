@@ -3,8 +3,6 @@
 import struct
 from typing import cast
 
-import cv2
-import fpng
 import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
@@ -40,6 +38,8 @@ def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     whole: NDArray = np.ascontiguousarray(pixels)
     shaded = pixels.ndim == 3 and not _has_holes(pixels)
     if level == 1 and shaded and max(pixels.shape) <= _FPNG_SIDE:
+        import fpng  # brings Pillow and OpenCV
+
         data: bytes = fpng.from_ndarray(whole)
         if not data.endswith(_END):  # it has stopped early, which it says in no other way
             raise ValueError(f"fpng made a PNG of {len(data)} bytes that does not end")
@@ -91,6 +91,8 @@ def decode_png(data: bytes, name: str = "an image") -> Pixels:
     Raises CorruptError naming a file that is torn, altered or no PNG.
     """
     _check_chunks(data, name)
+    import cv2  # loads what decodes with the first image
+
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise CorruptError(f"{name} is a PNG file that cannot be decoded")

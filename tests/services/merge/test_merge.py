@@ -11,8 +11,9 @@ from obstore.store import MemoryStore
 from schemas.dataset.layout import STAGING, SUCCESS_FILE
 from schemas.dataset.tables import TABLES
 from schemas.errors import CommitConflict, CorruptError, RunError
+from services.job.record import read_success
 from services.merge import merge as merge_module
-from services.merge.merge import merge, read_success
+from services.merge.merge import merge
 from tests.kit.faults import disk
 from tests.kit.made_up_runs import half_merged
 from tests.kit.s3_server import Bucket, s3_server

@@ -16,7 +16,8 @@ import pytest
 from schemas.dataset.layout import STAGING
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError
-from services.merge.merge import merge, read_success
+from services.job.record import read_success
+from services.merge.merge import merge
 from services.read.query import Format, ask, query, write_rows
 from services.read.stored_tables import StoredTables, file_system_of, read_merged
 from tests.datasets import in_a_bucket

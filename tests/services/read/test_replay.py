@@ -10,8 +10,7 @@ import pytest
 from schemas.errors import CorruptError
 from schemas.scene.scene import encoded_file
 from services.cli.main import main
-from services.job.record import require_job
-from services.merge.merge import read_success
+from services.job.record import read_success, require_job
 from services.read import replay as remake
 from services.read.dataset_reader import find_scene
 from services.read.repair import Repair, repair

@@ -19,8 +19,8 @@ from schemas.dataset.commit import LEDGER_SCHEMA, join_rows
 from schemas.dataset.shard import Fingerprint
 from schemas.errors import VersoError
 from services.cli.main import main
-from services.job.record import encode_job, require_job
-from services.merge.merge import encode_success, read_success
+from services.job.record import encode_job, read_success, require_job
+from services.merge.merge import encode_success
 from services.read import verdict as told_of
 from services.read import verify as whole
 from services.read.verdict import COPY, Verdict, explain_damage

@@ -17,9 +17,9 @@ from schemas.errors import InputError
 from services.bench.command import refuse_unmatched
 from services.dataset.dataset import open_dataset
 from services.job.job_file import validate_job
-from services.job.record import require_job
+from services.job.record import read_success, require_job
 from services.merge.dataset_card import describe_dataset
-from services.merge.merge import MergeResult, read_success
+from services.merge.merge import MergeResult
 from services.read.query import query
 from services.read.replay import open_context, replay_scene
 from services.read.scene_geometry import posed_scene

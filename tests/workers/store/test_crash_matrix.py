@@ -17,9 +17,10 @@ import pytest
 from obstore.store import MemoryStore
 
 from schemas.errors import RunError
+from services.job.record import read_success
 from services.merge import merge as merge_module
 from services.merge import reading
-from services.merge.merge import merge, read_success
+from services.merge.merge import merge
 from tests.kit.crash_states import Disk, losses, recorded, write_tree
 from tests.kit.faults import REQUESTS, check_published, disk, requests
 from tests.kit.made_up_runs import (

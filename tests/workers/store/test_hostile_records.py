@@ -12,7 +12,8 @@ import pytest
 
 from schemas.dataset.layout import STAGING, SUCCESS_FILE, commit_path
 from schemas.errors import CommitConflict, CorruptError, OutputError, RunError
-from services.merge.merge import merge, read_success
+from services.job.record import read_success
+from services.merge.merge import merge
 from tests.made_up_scenes import attempt_at, small_scene
 from tests.mutations import mutated_bytes, mutated_tree
 from workers.store.attempt import sweep

@@ -14,7 +14,8 @@ from obstore.store import LocalStore as FolderStore
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import STAGING, TEMPORARY
 from schemas.errors import CorruptError, MachineError, OutputError, RunError
-from services.merge.merge import merge, read_success
+from services.job.record import read_success
+from services.merge.merge import merge
 from services.read.query import query
 from services.read.status import read_status
 from services.run.lock import Beat, hold_lock, read_holder
