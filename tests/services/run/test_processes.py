@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from dataclasses import replace
 from pathlib import Path
 
@@ -206,10 +207,11 @@ def test_a_signal_ends_the_command_and_all_that_it_started(number):
 
 def test_what_a_run_starts_below_another_run_has_the_marks_of_both(monkeypatch):
     """The outer one is killed with all of the inner one's supervisors: its last process ends what that started, too."""
-    monkeypatch.setenv(MARK, "outer")
+    outer = uuid.uuid4().hex
+    monkeypatch.setenv(MARK, outer)
     run = begun()
     deadline = time.monotonic() + 15  # a program that was just started has no environment for a moment
-    while not (started := [process.pid for process in marked(f"{MARK}=outer") if process.name == "sleep"]):
+    while not (started := [process.pid for process in marked(f"{MARK}={outer}") if process.name == "sleep"]):
         assert time.monotonic() < deadline or run.kill()
     kill_each(chain_of(run.pid), (0, 1, 2))
     end(run)
