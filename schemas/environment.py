@@ -77,13 +77,3 @@ def cache_folder(name: str) -> Path | None:
         return Path.home() / ".cache" / "verso" / name
     except RuntimeError:
         return None
-
-
-def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
-    """Feature flags of this machine's first core, from Linux; empty where it does not list them."""
-    try:
-        with cpuinfo.open() as lines:
-            first = next((line for line in lines if line.startswith("flags")), "")
-    except OSError:
-        return frozenset()
-    return frozenset(first.partition(":")[2].split())

@@ -7,8 +7,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from schemas.environment import processor_flags, settings_to_change
+from schemas.environment import settings_to_change
 from services.cli.rows import COMMANDS
+from services.run.worker_entry import processor_flags
 
 
 def enter_stack_environment() -> None:

@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3, processor_flags
+from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3
 from schemas.errors import FingerprintError, MachineError, OutputError, VersoError
 
 if TYPE_CHECKING:
@@ -43,6 +43,16 @@ class Sight:
     """Why it cannot."""
     folder: str = ""
     """What is wrong with the output folder there; empty where nothing is."""
+
+
+def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
+    """Feature flags of this machine's first core, from Linux; empty where it does not list them."""
+    try:
+        with cpuinfo.open() as lines:
+            first = next((line for line in lines if line.startswith("flags")), "")
+    except OSError:
+        return frozenset()
+    return frozenset(first.partition(":")[2].split())
 
 
 def start_environment(names: Iterable[str], environ: Path = Path("/proc/self/environ")) -> dict[str, str]:

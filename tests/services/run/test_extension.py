@@ -16,6 +16,7 @@ from services.job.record import record_job, require_job
 from services.run.run_job import RunRequest, order_pattern, run_job
 from tests.datasets import SMALL, make_dataset
 from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.render.raster.gbuffer import shared_renderer
 from workers.shard import run_shard as module
 from workers.shard.run_shard import run_shard
 from workers.store.ledger import list_commits
@@ -94,7 +95,7 @@ def test_an_older_order_does_not_make_a_later_job_smaller(finished):
 
 
 def test_another_stack_is_refused_by_what_the_commits_say_and_a_mix_of_them_ends_a_strict_job(finished, monkeypatch):
-    mine = module._fingerprint("raster")
+    mine = module._fingerprint(shared_renderer(), "raster")
     whole = json.loads(finished.read(FINGERPRINT_FILE))
     for damaged in (None, b"{", b"[]"):  # of the file: the same stack writes it again
         finished.remove(FINGERPRINT_FILE)
@@ -103,7 +104,7 @@ def test_another_stack_is_refused_by_what_the_commits_say_and_a_mix_of_them_ends
         module._join_stack(finished, mine, order_of(finished)[0])
         assert json.loads(finished.read(FINGERPRINT_FILE)) == whole
     other = mine.model_copy(update={"simd": "other"})
-    monkeypatch.setattr(module, "_fingerprint", lambda tier: other)
+    monkeypatch.setattr(module, "_fingerprint", lambda renderer, tier: other)
     for file in (None, other.model_dump_json().encode()):
         finished.remove(FINGERPRINT_FILE)
         if file is not None:

@@ -135,3 +135,5 @@ def test_a_context_is_opened_on_the_device_that_was_chosen_and_anew_where_that_c
         assert now is not before and now.choice == Choice(place)
         assert before._platform._egl_context is None and now._platform._egl_context is not None
     gbuffer.shared_renderer().close()
+    monkeypatch.undo()
+    gbuffer.shared_renderer()._platform.make_current()  # what other tests draw with

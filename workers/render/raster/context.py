@@ -181,6 +181,14 @@ def open_context(device: int = 0) -> tuple[ModuleType, Any]:
     return DirectCalls(gl), platform
 
 
+def close_context(platform: Any) -> None:
+    """Ends a context, and not its display, which other contexts of the process may share: pyrender's own end takes both."""
+    egl = importlib.import_module("OpenGL.EGL")
+    egl.eglMakeCurrent(platform._egl_display, egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)
+    egl.eglDestroyContext(platform._egl_display, platform._egl_context)
+    platform._egl_context = platform._egl_display = None  # what it would end when it is collected
+
+
 class Framebuffer:
     """Renderbuffers of the size that was bound last: views of one job have the same size."""
 
