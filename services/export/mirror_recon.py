@@ -8,9 +8,9 @@ world, object poses object to camera, both in the optical frame.
 
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
@@ -131,7 +131,7 @@ def _distance_patch(pair: ExportPair, region_id: int, patch: bytes) -> NDArray[n
     assert region is not None
     height, width = decode_png(patch).shape[:2]
     (label,) = (row for row in pair.labels("input") if row["region_id"] == region_id)
-    distance = cv2.distanceTransform((region != region_id).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = distance_transform_edt(region != region_id)
     top, left = label["v"] - height // 2, label["u"] - width // 2
     return np.rint(distance[top : top + height, left : left + width]).astype(np.uint16)
 

@@ -5,12 +5,13 @@ import hashlib
 import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from trimesh.visual.color import interpolate
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import patch_index
@@ -66,12 +67,18 @@ def picture_of_colour(rgb: NDArray[np.uint8], words: str) -> Picture:
     return _jpeg(Image.fromarray(rgb), words)
 
 
+@cache
+def viridis() -> NDArray[np.uint8]:
+    """[256, 3] RGB, from dark violet to yellow."""
+    return np.asarray(interpolate(np.arange(256), "viridis", dtype=np.uint8)[:, :3])
+
+
 def picture_of_depth(depth_m: NDArray, span_m: tuple[float, float], words: str) -> Picture:
     """Depth in viridis, near is yellow; pixels without depth (0) are black. `span_m`: depth of first and last colour."""
     low, high = span_m
     share = np.clip((depth_m - low) / max(high - low, 1e-6), 0.0, 1.0)
-    bgr = cv2.applyColorMap((255 * (1.0 - share)).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-    return _jpeg(Image.fromarray(np.where(depth_m[..., None] > 0, bgr[..., ::-1], np.uint8(0))), words)
+    rgb = viridis()[(255 * (1.0 - share)).astype(np.uint8)]
+    return _jpeg(Image.fromarray(np.where(depth_m[..., None] > 0, rgb, np.uint8(0))), words)
 
 
 def depth_span(depth_m: NDArray, regions: NDArray | None = None) -> tuple[float, float]:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
 
-import cv2
 import numpy as np
 
 from schemas.errors import describe_seconds, milliseconds, number, plural, size
@@ -12,7 +11,7 @@ from schemas.job.job import Job
 from services.look.charts import Chart, Histogram, amount, chart_html, length_of_decade
 from services.look.clouds import Space
 from services.look.collect import Cost, Failure, Figures
-from services.look.pictures import FIXED_REGIONS, OBJECT_REGIONS, Picture, Sample, ShownScene
+from services.look.pictures import FIXED_REGIONS, OBJECT_REGIONS, Picture, Sample, ShownScene, viridis
 
 Side = tuple[str, Figures, Sample]
 """Name, figures and shown scenes of one dataset."""
@@ -128,7 +127,7 @@ def _facts(scene: ShownScene) -> str:
 
 def _legend() -> str:
     """Colours of depth and of regions."""
-    steps = cv2.applyColorMap(np.linspace(255, 0, 9).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+    steps = viridis()[np.linspace(255, 0, 9).astype(np.uint8)]
     width = 100 / len(steps)
     ramp = "".join(
         f'<rect x="{i * width:.2f}" width="{width + 0.5:.2f}" height="8" fill="{_hex(color)}"/>'
