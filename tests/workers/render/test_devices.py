@@ -26,6 +26,7 @@ def test_a_gpu_is_found_by_number_and_by_uuid_wherever_egl_lists_it():
         (GPUS, None, 0),
         ([ALONE], None, 0),
         ([], None, 0),
+        (GPUS, "", 0),
         (GPUS, "0", 2),
         (GPUS, "1", 0),
         (GPUS, " 1,0", 0),
@@ -40,7 +41,6 @@ def test_a_gpu_is_found_by_number_and_by_uuid_wherever_egl_lists_it():
 
 
 REFUSED = [
-    (GPUS, "", "which hides every GPU", "unset it"),
     (GPUS, "-1", "which hides every GPU", "unset it"),
     (GPUS, "3", f"'3', and EGL has EGL device 0 (H100, CUDA 1, {SECOND})", "NVIDIA_DRIVER_CAPABILITIES=all"),
     (GPUS, "GPU-3", "and EGL has EGL device 0", "--gpus all"),

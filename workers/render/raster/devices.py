@@ -51,12 +51,12 @@ class Choice:
 
 
 def choose_device(devices: Sequence[GraphicsDevice], visible: str | None) -> Choice:
-    """The device that CUDA_VISIBLE_DEVICES names first; EGL's first one where it is not set.
+    """The device that CUDA_VISIBLE_DEVICES names first; EGL's first one where it names none.
 
-    Where EGL lacks that, the first one that is no NVIDIA GPU, since others may have those. Raises LookupError where there is
-    none.
+    Ray empties it for a task that asks for no part of a GPU, which hides nothing from OpenGL. Where EGL lacks what is named, the
+    first one that is no NVIDIA GPU, since others may have those. Raises LookupError where there is none.
     """
-    if visible is None:
+    if not visible:
         return Choice(0)
     gpus = [device for device in devices if device.is_nvidia]
     named = visible.split(",")[0].strip()
@@ -67,7 +67,7 @@ def choose_device(devices: Sequence[GraphicsDevice], visible: str | None) -> Cho
     if named.upper().startswith("MIG-"):
         reason = f"{told}, a part of a GPU in MIG mode, in which OpenGL does not draw"
         remedy = "give the run whole GPUs (`nvidia-smi -mig 0`)"
-    elif named in ("", "-1"):
+    elif named == "-1":
         reason, remedy = (f"{told}, which hides every GPU", "unset it") if gpus else ("", "")
     else:
         has = ", ".join(describe(device) for device in gpus) or "no NVIDIA GPU"
