@@ -1,5 +1,6 @@
 """Shapes of a dataset's instances, and silhouettes of objects: what is seen, what others hide, what is outside the image."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,9 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_matrix
 from schemas.dataset.layout import asset_path
-from schemas.errors import CorruptError, VersoError, needs_making
-from schemas.scene.scene import Placed
+from schemas.errors import CorruptError, VersoError
 from schemas.scene.shape import Material, Part, Shape
-from schemas.scene.view import Camera
+from schemas.scene.view import Camera, Intrinsics
 from services.export.source import ExportScene
 from services.job.record import JobRecord
 from services.read.scene_geometry import Sources, load_glb
@@ -111,19 +111,64 @@ def whole_silhouette(label: Row, view: Row, visible: NDArray[np.bool_], shape: S
         return Silhouette(visible, int(visible.sum()), box_of(visible))
     if shape is None:
         return None
-    with needs_making("the silhouette of an object that others hide in part"):
-        from workers.geometry.raycast import cast_view
     camera, T_cam_obj = read_camera(view), read_matrix(label["T_cam_obj"])
     left, top, right, bottom = _window(shape, T_cam_obj, camera)
     k = camera.intrinsics
     seen_by = k.model_copy(update={"width": right - left, "height": bottom - top, "cx": k.cx - left, "cy": k.cy - top})
-    _, region, _ = cast_view([Placed(1, shape, T_cam_obj)], Camera(seen_by, np.eye(4)))
-    whole = region > 0
+    whole = covered(transform(T_cam_obj, shape.vertices), shape.faces, seen_by)
     inside = np.s_[-top : k.height - top, -left : k.width - left]
     whole[inside] |= visible  # at an edge, rays and the renderer may differ by a pixel
     x, y, width, height = box_of(whole)
     box = (x + left, y + top, width, height) if width >= 0 else (x, y, width, height)
     return Silhouette(whole[inside], int(whole.sum()), box)
+
+
+_AT_ONCE = 4_000_000
+"""Pairs of a triangle and a pixel that are looked at together."""
+
+
+def covered(points_cam: Array, faces: NDArray[np.int32], k: Intrinsics) -> NDArray[np.bool_]:
+    """[H, W]: through which pixels' centres a ray meets a triangle beyond `NEAR_M`; points [V, 3], camera frame, faces [F, 3].
+
+    A ray t d meets the triangle a, b, c where the products d . (b x c), d . (c x a) and d . (a x b) have one sign; their sum
+    is a . (b x c) / t.
+    """
+    mask = np.zeros((k.height, k.width), np.bool_)
+    corners = points_cam[faces]
+    corners = corners[(corners[:, :, 2] > NEAR_M).any(axis=1)]
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    sides = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    volume = np.einsum("fi,fi->f", a, sides[:, 0])
+    z = np.where(corners[:, :, 2] > NEAR_M, corners[:, :, 2], np.nan)  # what passes the near plane may be anywhere
+    low, high = [], []
+    for axis, focal, centre, size in ((0, k.fx, k.cx, k.width), (1, k.fy, k.cy, k.height)):
+        at = focal * corners[:, :, axis] / z + centre - 0.5
+        low.append(np.nan_to_num(np.ceil(at.min(axis=1)), nan=0.0).clip(0, size).astype(np.int64))
+        high.append(np.nan_to_num(np.floor(at.max(axis=1)), nan=size - 1.0).clip(-1, size - 1).astype(np.int64))
+    wide, tall = (np.maximum(high[axis] - low[axis] + 1, 0) for axis in (0, 1))
+    ends = np.cumsum(wide * tall)
+    for first, stop in _blocks(ends):
+        count = (wide * tall)[first:stop]
+        of = np.repeat(np.arange(first, stop), count)
+        place = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        column, row = low[0][of] + place % wide[of], low[1][of] + place // wide[of]
+        ray = np.stack([(column + 0.5 - k.cx) / k.fx, (row + 0.5 - k.cy) / k.fy, np.ones(len(of))], axis=1)
+        products = np.einsum("nsi,ni->ns", sides[of], ray)
+        total = products.sum(axis=1)
+        met = ((products >= 0.0).all(axis=1) | (products <= 0.0).all(axis=1)) & (total != 0.0)
+        met[met] = volume[of][met] / total[met] > NEAR_M
+        mask[row[met], column[met]] = True
+    return mask
+
+
+def _blocks(ends: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """(first, stop) of runs of triangles with about `_AT_ONCE` pixels; ends: the running sum of their pixels."""
+    first = 0
+    while first < len(ends):
+        before = int(ends[first - 1]) if first else 0
+        stop = max(first + 1, int(np.searchsorted(ends, before + _AT_ONCE, side="right")))
+        yield first, stop
+        first = stop
 
 
 def box_of(mask: NDArray[np.bool_]) -> Box:

@@ -60,7 +60,7 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("made") / "out", scenes=2)[0].root
+    return make_dataset(tmp_path_factory.mktemp("made") / "out", scenes=2, objects_per_scene=3)[0].root
 
 
 def test_reading_loads_what_the_wheel_names_and_nothing_that_makes_data():

@@ -14,22 +14,29 @@ from pathlib import Path
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
+import trimesh
 
 from schemas.errors import CorruptError, InputError, InUseError, OutputError
 from schemas.job.assets import SplitShares
 from schemas.job.job import Job
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from services.cli.main import main
 from services.dataset import splits
 from services.dataset.splits import Splits, collect_ids, split_by_category
 from services.export.folder import ExportFolder, Rounds
-from services.export.shapes import Shapes, color_vertices
+from services.export.shapes import Shapes, color_vertices, covered
 from services.export.source import iter_ranges, scenes_of
 from services.export.table import FORMATS
 from services.job.record import require_job
 from services.read.scene_geometry import Sources
 from tests.datasets import in_a_bucket, make_dataset
+from tests.kit.shapes import shape_of
 from tests.services.export.exported import contents, export_to, source_rows
+from workers.geometry.camera import NEAR_M
+from workers.geometry.frames import pose, transform, uniform_rotation
+from workers.geometry.raycast import cast_view
 from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
 
@@ -337,6 +344,23 @@ def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_p
     sources = Sources(dataclasses.replace(record, job=job, folder=str(tmp_path)))
     with pytest.raises(InputError, match="gone"):
         sources.asset(0, "mug", "x")
+
+
+def test_a_silhouette_is_where_rays_of_embree_meet_the_mesh_also_across_the_near_plane():
+    rng, k = np.random.default_rng(3), Intrinsics(width=160, height=120, fx=150.0, fy=155.0, cx=75.3, cy=61.7)
+    meshes = [
+        trimesh.creation.torus(0.1, 0.03),
+        trimesh.creation.box((0.2, 0.1, 0.05)),
+        trimesh.creation.annulus(0.05, 0.1, 0.1),
+    ]
+    crossing = 0
+    for shape in map(shape_of, meshes * 8):
+        T = pose(uniform_rotation(rng), np.array([*rng.uniform(-0.15, 0.15, 2), rng.uniform(0.04, 0.4)]))
+        points = transform(T, shape.vertices)
+        _, region, _ = cast_view([Placed(1, shape, T)], Camera(k, np.eye(4)))
+        assert np.array_equal(covered(points, shape.faces, k), region > 0)
+        crossing += bool((points[:, 2] < NEAR_M).any() and (region > 0).any())
+    assert crossing > 2
 
 
 def test_a_vertex_has_the_colour_of_its_texel_times_the_base_colour():
