@@ -48,7 +48,7 @@ class Shapes:
 
         from services.read.scene_geometry import read_meshes
 
-        meshes = read_meshes(self._read, self._sources, scene_id, name)
+        meshes = [mesh for _, mesh in read_meshes(self._read, self._sources, scene_id, name)]
         joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
         assert isinstance(joined, trimesh.Trimesh)
         return joined

@@ -12,7 +12,7 @@ from trimesh.visual import ColorVisuals
 
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import asset_path
-from schemas.errors import CorruptError, InputError, MachineError, needs_making
+from schemas.errors import CorruptError, InputError, MachineError, VersoError, needs_making
 from schemas.job.assets import TABLE
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Asset
 from services.job.record import JobRecord, require_job
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 ReadShape = Callable[[str], bytes]
 """Returns the bytes of a stored shape by its path. Raises FileNotFoundError."""
+
+
+Named = tuple[str, trimesh.Trimesh]
+"""A part's name and its mesh."""
 
 
 class Sources:
@@ -47,10 +51,11 @@ class Sources:
             from workers.assets.catalogue import load_asset
             from workers.scene.chance import SceneChance
             from workers.scene.plan import choose_assets
-        try:
-            catalogue = self._catalogue
-        except InputError as error:
-            raise InputError(f"{told} its source cannot be read here: {error}") from error
+        catalogue = self._opened
+        if isinstance(catalogue, InputError):
+            raise InputError(f"{told} its source cannot be read here: {catalogue}") from catalogue
+        if isinstance(catalogue, Exception):
+            raise catalogue
         objects, table = choose_assets(self._record.job, catalogue, SceneChance(self._record.job.seed, scene_id))
         ref = next(
             (one for one in (*objects, table) if (one.category, one.instance_id) == (category, instance_id)), None
@@ -62,12 +67,16 @@ class Sources:
         return load_asset(catalogue, ref)
 
     @cached_property
-    def _catalogue(self) -> "Catalogue":
-        with needs_making("a shape that is not stored"):
-            from workers.capture.results import open_sources
-        catalogue = open_sources(self._record.job, Path(self._record.folder))
+    def _opened(self) -> "Catalogue | VersoError | OSError":
+        """The job's catalogue, or why it cannot be used: found once, because every file of the sources is read for it."""
+        from workers.capture.results import open_sources
+
+        try:
+            catalogue = open_sources(self._record.job, Path(self._record.folder))
+        except (VersoError, OSError) as error:
+            return error
         if catalogue.digest != self._record.catalogue:
-            raise MachineError("the files of the asset folders do not hold what they held when this job was run")
+            return MachineError("the files of the asset folders do not hold what they held when this job was run")
         return catalogue
 
 
@@ -91,7 +100,7 @@ def region_names(scene: Mapping[str, Any]) -> dict[int, tuple[str, str]]:
     return {REGION_TABLE: (TABLE, scene["table_id"]), **objects}
 
 
-def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[str, str]) -> list[trimesh.Trimesh]:
+def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[str, str]) -> list[Named]:
     """The parts of the shape called (category, instance id), object frame, metres; colours are linear, as glTF has them.
 
     Raises CorruptError where the stored shape is damaged, and as `Sources.asset` where none is stored.
@@ -100,8 +109,13 @@ def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[st
     try:
         data = read(path)
     except FileNotFoundError:
-        return [mesh_of_part(part) for part in sources.asset(scene_id, *name).shape.parts]
-    return [show_colors(mesh) for mesh in load_glb(data, path).values()]
+        return [(part.name, mesh_of_part(part)) for part in sources.asset(scene_id, *name).shape.parts]
+    # A part gives its name to its material; trimesh names a mesh by the object.
+    named = [
+        (getattr(getattr(mesh.visual, "material", None), "name", None) or key, mesh)
+        for key, mesh in load_glb(data, path).items()
+    ]
+    return [(part, show_colors(mesh)) for part, mesh in named]
 
 
 def posed_scene(store: Store, scene_id: int) -> trimesh.Scene:
@@ -120,23 +134,23 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
     The floor is drawn again, its look being in no file; where what makes data is not installed there is none.
     """
     T_world, names, scene = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}, region_names(row), trimesh.Scene()
-    placed: list[tuple[str, int, list[trimesh.Trimesh]]] = []
+    placed: list[tuple[str, int, list[Named]]] = []
     if record.job.captures is not None:
-        placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [_board(stored, row)]))
+        placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [("board", _board(stored, row))]))
     else:
         placed.append(("floor", REGION_FLOOR, _floor(record, row["scene_id"])))
-    for region_id, name in names.items():
+    for region_id, of in names.items():
         # Two objects may be of one instance: only the region id tells them apart.
         region = f" {region_id}" if len(names) > 2 and region_id >= REGION_FIRST_OBJECT else ""
-        placed.append((f"{' '.join(name)}{region}", region_id, read_meshes(store.read, sources, row["scene_id"], name)))
+        placed.append((f"{' '.join(of)}{region}", region_id, read_meshes(store.read, sources, row["scene_id"], of)))
     for label, region_id, meshes in placed:
-        for number, mesh in enumerate(meshes):
-            part = f"{label}/{number}"
+        for number, (name, mesh) in enumerate(meshes):
+            part = f"{label}/{number}-{name}"
             scene.add_geometry(mesh, geom_name=part, node_name=part, transform=T_world[region_id])
     return scene
 
 
-def _floor(record: JobRecord, scene_id: int) -> list[trimesh.Trimesh]:
+def _floor(record: JobRecord, scene_id: int) -> list[Named]:
     try:
         with needs_making("the floor"):
             from workers.assets.appearance import draw_appearance
@@ -145,7 +159,7 @@ def _floor(record: JobRecord, scene_id: int) -> list[trimesh.Trimesh]:
         return []
     chance = SceneChance(record.job.seed, scene_id)
     floor, _ = draw_appearance(chance.stream(Stream.APPEARANCE), record.job.render.tier)
-    return [mesh_of_part(part) for part in floor.parts]
+    return [(part.name, mesh_of_part(part)) for part in floor.parts]
 
 
 def _board(stored: StoredRange, row: Row) -> trimesh.Trimesh:

@@ -59,7 +59,8 @@ def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array, NDA
         return as_they_are, None
     places = np.zeros((int(corners.max()) + 1, 3))
     places[corners] = vertices[faces]
-    pieces = [piece_of(Mesh(places, faces.astype(np.int32)), once[found.body == k]) for k in range(len(found.volume))]
+    whole = Mesh(places, once.astype(np.int32))
+    pieces = [piece_of(whole, once[found.body == k]) for k in range(len(found.volume))]
     low, high = np.stack([bounds_of(piece.vertices) for piece in pieces], axis=1)
     outer = np.flatnonzero(found.volume > 0.0)
     below = (low[outer, None] < high[None, outer]).all(axis=2)
