@@ -7,6 +7,7 @@ pixel centres on integers, as OpenCV has them. A scene's folder appears whole.
 import csv
 import io
 import json
+import math
 import shutil
 import sqlite3
 from collections.abc import Iterator
@@ -17,8 +18,6 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
-from scipy.spatial.distance import cdist
 
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
@@ -267,9 +266,26 @@ def model_info(vertices_mm: Array) -> dict[str, float]:
     low, high = vertices_mm.min(axis=0), vertices_mm.max(axis=0)
     sizes = dict(zip(("min_x", "min_y", "min_z"), low.tolist(), strict=True))
     sizes |= dict(zip(("size_x", "size_y", "size_z"), (high - low).tolist(), strict=True))
-    corners = vertices_mm[ConvexHull(vertices_mm, qhull_options="Qt QJ").vertices]
-    blocks = (corners[first : first + _AT_ONCE] for first in range(0, len(corners), _AT_ONCE))
-    return {"diameter": float(max(cdist(block, corners).max() for block in blocks)), **sizes}
+    return {"diameter": _diameter(np.unique(vertices_mm, axis=0) - (low + high) / 2.0), **sizes}
+
+
+def _diameter(points: Array) -> float:
+    """The largest distance between two of `points` [N, 3], by all pairs that can be as far apart as the largest found so far.
+
+    Two points are at most the sum of their distances from the origin apart, so the points go from far to near.
+    """
+    squared = np.einsum("ij,ij->i", points, points)
+    order = np.argsort(-squared)
+    points, squared = points[order], squared[order]
+    reach, largest = np.sqrt(squared), 0.0
+    for first in range(0, len(points), _AT_ONCE):
+        end = int(np.searchsorted(-reach, reach[first] - largest, side="right"))
+        if end <= first:
+            break
+        block = slice(first, first + _AT_ONCE)
+        apart = squared[block, None] - 2.0 * points[block] @ points[first:end].T + squared[first:end]
+        largest = max(largest, math.sqrt(max(float(apart.max()), 0.0)))
+    return largest
 
 
 def ply_lines(colored: ColoredShape) -> Iterator[bytes]:
@@ -291,4 +307,6 @@ def _normals(part: Part) -> Array:
     """[V, 3]: those of the part, else the mean of the faces about each vertex, weighed by their angles."""
     if part.normals is not None:
         return part.normals
-    return np.asarray(trimesh.Trimesh(part.vertices, part.faces, process=False).vertex_normals)
+    mesh, total = trimesh.Trimesh(part.vertices, part.faces, process=False), np.zeros(part.vertices.shape)
+    np.add.at(total, mesh.faces, mesh.face_angles[..., None] * mesh.face_normals[:, None])
+    return np.asarray(trimesh.unitize(total))

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
@@ -131,9 +130,24 @@ def _distance_patch(pair: ExportPair, region_id: int, patch: bytes) -> NDArray[n
     assert region is not None
     height, width = decode_png(patch).shape[:2]
     (label,) = (row for row in pair.labels("input") if row["region_id"] == region_id)
-    distance = distance_transform_edt(region != region_id)
     top, left = label["v"] - height // 2, label["u"] - width // 2
-    return np.rint(distance[top : top + height, left : left + width]).astype(np.uint16)
+    distance = distance_to(region == region_id, slice(top, top + height), slice(left, left + width))
+    return np.rint(distance).astype(np.uint16)
+
+
+def distance_to(mask: NDArray[np.bool_], rows: slice, columns: slice) -> NDArray[np.float64]:
+    """[h, w] distance in pixels from each pixel in `rows` and `columns` to the nearest one of `mask` [H, W], which has one.
+
+    First to the nearest above or below in each column, then over columns (Felzenszwalb and Huttenlocher 2012, section 2).
+    """
+    row = np.arange(len(mask))[:, None]
+    far = 2.0 * sum(mask.shape)
+    above = np.maximum.accumulate(np.where(mask, row, -far))
+    below = np.minimum.accumulate(np.where(mask, row, far)[::-1])[::-1]
+    used = np.flatnonzero(mask.any(axis=0))
+    along = np.minimum(row - above, below - row)[rows, used] ** 2
+    across = (np.arange(mask.shape[1])[columns, None] - used) ** 2
+    return np.sqrt(np.array([(line + across).min(axis=1) for line in along]))
 
 
 def _pose_line(even: int, more: int, view: Row) -> str:

@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.distance import pdist
 
 from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
@@ -200,10 +201,15 @@ def test_a_shape_without_normals_gets_those_of_its_faces_and_a_flat_one_has_a_di
     box = trimesh.creation.box((0.1, 0.2, 0.2))
     assert model_info(1000.0 * box.vertices)["diameter"] == pytest.approx(300.0)
     assert model_info(np.array([[0.0, 0, 0], [30, 0, 0], [30, 40, 0], [0, 40, 0]]))["diameter"] == pytest.approx(50.0)
+    for seed, sizes in enumerate(((1, 1, 1), (50, 1, 1), (1, 1, 0), (1, 0, 0))):  # of 2,000 points: several blocks
+        cloud = np.random.default_rng(seed).normal(size=(2000, 3)) * sizes + 100.0
+        assert model_info(cloud)["diameter"] == pytest.approx(pdist(cloud).max(), rel=1e-12)
+    ball = trimesh.creation.icosphere(4, 30.0)
+    assert model_info(ball.vertices)["diameter"] == pytest.approx(pdist(ball.vertices).max(), rel=1e-12)
     (tmp_path / "box.ply").write_bytes(b"".join(ply_lines(color_vertices(plain_shape(box)))))
     model = load_model(tmp_path / "box.ply")
     np.testing.assert_allclose(model.vertices, 1000.0 * box.vertices, atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(model.normals, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(model.normals, box.vertex_normals, atol=1e-5)
     assert ((model.normals * model.vertices).sum(axis=1) > 0).all()
     np.testing.assert_allclose(trimesh.load(tmp_path / "box.ply", process=False).vertices, model.vertices, atol=1e-4)
 
