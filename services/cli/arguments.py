@@ -50,6 +50,14 @@ def read_counts(text: str) -> list[int]:
     return [read_count(one) for one in text.split(",")]
 
 
+def read_duration(text: str) -> float:
+    """Seconds, of a number with s, m or h behind it. Raises argparse.ArgumentTypeError."""
+    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)(s|m|h)", text, re.ASCII)
+    if found is None or not float(found[1]):
+        raise refusal(text, " is not a time such as 90s, 15m or 2h")
+    return float(found[1]) * {"s": 1, "m": 60, "h": 3600}[found[2]]
+
+
 def read_span(text: str) -> tuple[int, int]:
     """Two ids, FIRST-LAST, both included; one id means itself alone. Raises argparse.ArgumentTypeError."""
     first, dash, last = text.partition("-")

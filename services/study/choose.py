@@ -1,11 +1,12 @@
 """The cheapest setting that meets the targets, the front of settings worth their time, and the answer in words. Pure."""
 
-import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from decimal import ROUND_CEILING, Context
 
 from schemas.errors import InputError, RunError, describe_seconds, did_you_mean, milliseconds, size
+from schemas.job.job import Job
+from services.study.knobs import OTHER_WORLD
 from services.study.model import ERRORS, Figure, Row, Study, amount, listed, short, times, unit
 
 Targets = Mapping[str, float]
@@ -16,9 +17,6 @@ AS_CHEAP = 1.05
 
 MORE_FAILED = 0.01
 """A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
-
-NOISE = 0.02
-"""Relative noise of a ratio: the difference of interleaved medians on one core from run to run."""
 
 DEFAULT_TARGETS: Targets = {
     "penetration_mm": 0.1,
@@ -79,22 +77,26 @@ def as_cheap(row: Row, other: Row) -> bool:
 
 
 def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None) -> Row:
-    """The cheapest setting all of whose errors meet the targets (`value <= target`). Raises InputError, TargetError.
+    """The cheapest setting all of whose errors meet the targets. Raises InputError, TargetError.
+
+    What a user asks for, without `bounds`, is met with the upper ends of the intervals; where no setting does, and for
+    default targets, with the values (`value <= target`).
 
     An error that a setting did not measure is the job's own (`error_of`). Unless failed scenes are a target themselves, a
     setting that fails `MORE_FAILED` more of them than the job is left out. `bounds` are further targets that the message
     does not name.
 
     The choice should be repeatable. Errors are, to the bit, because scenes are a pure function of job and seed; times are
-    not. So every cost up to `AS_CHEAP` times the least counts as the least, and facts without noise decide among those: the
-    job itself first, because a change for 5 % is not worth making; then the least sum of errors relative to the job's own;
-    then the fewest changes; then the name.
+    not. So every cost up to `AS_CHEAP` times the least upper end of an interval counts as the least, and facts without noise
+    decide among those: the job itself first, because a change for 5 % is not worth making; then the least sum of errors
+    relative to the job's own; then the fewest changes; then the name.
     """
     check_targets(rows, targets)
-    meeting = [row for row in candidates(rows, targets) if meets(row, {**(bounds or {}), **targets}, rows)]
-    if not meeting:
+    able = [row for row in candidates(rows, targets) if meets(row, {**(bounds or {}), **targets}, rows)]
+    if not able:
         raise TargetError(describe_miss(rows, targets))
-    return cheapest(meeting, rows)
+    sure = [row for row in able if meets(row, targets, rows, upper=True)] if bounds is None else []
+    return cheapest(sure or able, rows)
 
 
 def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
@@ -104,7 +106,7 @@ def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
         parts = row.setting.parts
         return bool(parts), round(relative_error(row, rows), 6), len(parts), row.setting.name
 
-    least = min(row.ratio for row in some)
+    least = min(max(row.ratio, row.ratio_most) for row in some)
     return min((row for row in some if row.ratio <= least * AS_CHEAP), key=order)
 
 
@@ -119,15 +121,19 @@ def relative_error(row: Row, rows: Sequence[Row]) -> float:
 
 
 def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
-    """The settings that may be chosen: those that do not fail too many scenes."""
+    """The settings that may be chosen: those that do not fail too many scenes, and make the same world (`OTHER_WORLD`)."""
     most = own_row(rows).failed_share + MORE_FAILED
-    return [row for row in rows if "failed_share" in targets or row.failed_share <= most]
+    same = [row for row in rows if not OTHER_WORLD & set(dict(row.setting.parts))]
+    return [row for row in same if "failed_share" in targets or row.failed_share <= most]
 
 
-def meets(row: Row, targets: Targets, rows: Sequence[Row]) -> bool:
-    """Whether all errors are at most their targets; an error that was never measured meets none."""
+def meets(row: Row, targets: Targets, rows: Sequence[Row], upper: bool = False) -> bool:
+    """Whether all errors, or the upper ends of their intervals, are at most their targets; what was never measured is not."""
     found = {name: error_of(row, name, rows) for name in targets}
-    return all(figure is not None and figure.value <= targets[name] for name, figure in found.items())
+    return all(
+        figure is not None and (max(figure.value, figure.high) if upper else figure.value) <= targets[name]
+        for name, figure in found.items()
+    )
 
 
 def check_targets(rows: Sequence[Row], targets: Targets) -> None:
@@ -145,26 +151,6 @@ def check_targets(rows: Sequence[Row], targets: Targets) -> None:
 
 def _unknown(name: str) -> str:
     return f"--target {name}: there is no such error; {did_you_mean(name, ERRORS)}Known: {', '.join(ERRORS)}"
-
-
-def close_calls(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None) -> list[Row]:
-    """The settings whose time decides the choice: were one of them off by `NOISE`, another setting would be chosen.
-
-    They are to be timed for some more rounds; an empty list means that the choice holds. No rule makes it always hold: in
-    made-up studies with 5 to 45 settings and ratios off by 1 %, two runs agree on the cheapest setting in 93 of 100, and on
-    the result of `choose` in 96. Raises what `choose` raises.
-    """
-    chosen = choose(rows, targets, bounds)
-
-    def chosen_if(row: Row, off: float) -> Row:
-        noisy = dataclasses.replace(row, ratio=row.ratio * off)
-        return choose([noisy if one is row else one for one in rows], targets, bounds)
-
-    # The job's own ratio is 1 whatever the noise.
-    turned = [row for row in candidates(rows, targets) if row.setting.parts]
-    meeting = [row for row in turned if meets(row, {**(bounds or {}), **targets}, rows)]
-    noises = (1.0 - NOISE, 1.0 + NOISE)
-    return [row for row in meeting if any(chosen_if(row, off).setting != chosen.setting for off in noises)]
 
 
 # ---------------------------------------------------------------------------------------------- no setting meets them
@@ -224,6 +210,7 @@ def parse_targets(text: str) -> dict[str, float]:
     targets: dict[str, float] = {}
     for part in text.split(","):
         name, equals, value = (piece.strip() for piece in part.partition("="))
+        name, value = _as_lost(name, value)
         if not equals or not name:
             raise InputError(f"--target {part.strip() or text!r}: write it as penetration_mm=0.1,depth_mm=0.5")
         if name not in ERRORS:
@@ -240,6 +227,46 @@ def parse_targets(text: str) -> dict[str, float]:
     return targets
 
 
+KEPT = "kept_share"
+"""How a user may ask for a share of objects that are kept: `lost_share` is 1 minus it."""
+
+
+def _as_lost(name: str, value: str) -> tuple[str, str]:
+    if name != KEPT:
+        return name, value
+    try:
+        return "lost_share", f"{round(1.0 - float(value), 12)}"
+    except ValueError:
+        return "lost_share", value
+
+
+_NOT_MEASURED: tuple[tuple[Callable[[Job], bool], str, str], ...] = (
+    (lambda job: job.captures is None, "capture", "the job has no captures"),
+    (lambda job: job.captures is not None, "physics labels mirror colour", "the job is one of captures"),
+    (lambda job: not job.cameras.mirror.enabled, "mirror", "cameras.mirror.enabled is false"),
+    (lambda job: not job.render.rgb, "colour", "render.rgb is false"),
+    (
+        lambda job: job.start.pose == "tumbled" or job.objects_per_scene.high > 1,
+        "pose_mm",
+        "where things end is random when they tumble or meet, so no pose is the true one; ask for outcome_mm",
+    ),
+)
+"""Jobs in which an error, or the errors of some groups, cannot be measured, and why."""
+
+
+def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
+    """Raises InputError for a target that no setting of the job can have, before anything is measured.
+
+    `missing` says why this machine has no truth of colour.
+    """
+    for name in targets:
+        for is_so, what, why in _NOT_MEASURED:
+            if is_so(job) and (name in what.split() or ERRORS[name].group in what.split()):
+                raise InputError(f"--target {name}: it cannot be measured here: {why}")
+        if name == "flip" and missing is not None:
+            raise InputError(f"--target flip: {missing}")
+
+
 def answer(study: Study, targets: Targets | None = None) -> str:
     """One sentence: which setting to use for the targets, what it costs, and what the next better one costs.
 
@@ -249,7 +276,7 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     asked, bounds = (targets, {}) if targets is not None else default_targets(study.rows)
     wish = describe_targets(asked)
     try:
-        chosen = recommend(study, targets)
+        chosen = recommend(study.rows, targets)
     except TargetError as error:
         return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {error}."
     own = own_row(study.rows)
@@ -273,16 +300,21 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}."
 
 
-def recommend(study: Study, targets: Targets | None = None) -> Row:
+def recommend(rows: Sequence[Row], targets: Targets | None = None) -> Row:
     """The setting that the sentence names. Raises TargetError, InputError."""
     if targets is not None:
-        return choose(study.rows, targets)
-    asked, bounds = default_targets(study.rows)
-    seeing = [row for row in study.rows if not set(dict(row.setting.parts)) & blind_knobs(study.rows)]
+        return choose(rows, targets)
+    asked, bounds = default_targets(rows)
+    seeing = [row for row in rows if not set(dict(row.setting.parts)) & blind_knobs(rows)]
     try:
         return choose(seeing, asked, bounds)
     except TargetError:
         raise TargetError(describe_miss(seeing, asked, default=True)) from None
+
+
+def targets_of(rows: Sequence[Row], targets: Targets | None) -> Targets:
+    """The targets that were asked for, or the default ones that were measured."""
+    return default_targets(rows)[0] if targets is None else targets
 
 
 def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:

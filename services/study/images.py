@@ -6,6 +6,7 @@ the size of pixels, through places that do not depend on it. Views of all pairs 
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -27,12 +28,13 @@ from services.study.colour import (
     flip_error,
 )
 from services.study.knobs import size_value
-from services.study.measure import context_for
+from services.study.measure import Answer, Meter, answer_for, context_for, laid_for
 from services.study.model import Setting
 from services.study.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
 from workers.geometry.pixels import dequantise_depth
 from workers.scene.context import Stopwatch, WorkerContext
-from workers.scene.make_scene import Scene, make_scene
+from workers.scene.make_scene import Scene, render_scene
+from workers.scene.rows import record_scene
 
 KEPT = 12
 """Casts kept of a scene, some 0.3 MB each: the last ones used. Every setting uses the input camera's; the mirror camera moves
@@ -214,48 +216,66 @@ FINE_WIDTH = 2560
 """Pixels: 4 times the width that colours are compared at."""
 
 
-def measure_scene_images(
-    context: WorkerContext, settings: Sequence[Setting], scene_id: int
-) -> dict[str, dict[str, float]]:
-    """Errors of depth, masks, mirror pose and projection by the settings' names, where the scene can be made."""
-    truth, answers = None, {}
-    for setting in settings:
-        with suppress(SceneError):
-            worker = context_for(context, setting)
-            scene = make_scene(worker, scene_id, Stopwatch())
-            truth = truth_of(scene, truth)
-            answers[setting.name] = measure_images(worker, scene, truth)
-    return answers
+def measure_drawn(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
+    """Errors of depth, masks, mirror pose and projection by the settings' names, at the job's own rest.
+
+    `s` is the time from rest to the encoded files, whose `bytes` are those of all files and of no rows.
+    """
+    kept: list[Truth] = []
+    order = np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))
+
+    def measure(worker: WorkerContext, meter: Meter) -> Answer:
+        laid = laid_for(context, worker, scene_id)
+        with meter:
+            scene = render_scene(worker, laid, Stopwatch())
+            output = record_scene(worker, scene, Stopwatch())
+        truth = truth_of(scene, kept[-1] if kept else None)
+        kept[:] = [truth]
+        sizes = sum(len(file.data) for file in output.files)
+        return {"errors": measure_images(worker, scene, truth), "bytes": sizes}
+
+    workers = {settings[k].name: context_for(context, settings[k]) for k in order}
+    return {name: answer_for(partial(measure, worker)) for name, worker in workers.items()}
 
 
-def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, dict[str, float]]:
-    """FLIP of the input RGB by the settings' names: `flip` and `edge_flip`; nothing where no object is visible.
+def measure_colour(
+    context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int
+) -> dict[str, Answer]:
+    """FLIP of the input RGB by the settings' names: `flip` and `edge_flip`; no errors where no object is visible.
 
     `flip` is against a path-traced image, where that tier is installed. `edge_flip`, of tier raster, is against the same
     tier's own light at 64 samples a pixel, because FLIP against other light tells little of edges.
     """
-    found: dict[str, tuple[WorkerContext, Scene]] = {}
-    for setting in settings:
-        with suppress(SceneError):
-            found[setting.name] = _input_alone(context, setting, scene_id)
-    first = next(iter(found.values()), None)
-    crop = None if first is None else crop_of(first[1])
-    if first is None or crop is None:
-        return {}
-    traced = None if colour_truth_missing() else converged_colour(*first, CONVERGED_PATHS)
-    smooth = _smooth(context, scene_id, crop)
-    answers = {}
-    for name, (worker, scene) in found.items():
+    with Meter() as truths_made:
+        traced, smooth = colour_truths(context, scene_id)
+
+    def measure(setting: Setting, meter: Meter) -> Answer:
+        worker, scene = _input_alone(context, setting, scene_id)
         truths = {"flip": traced, "edge_flip": smooth if worker.job.render.tier == "raster" else None}
-        if (rgb := scene.pairs[0].input.rgb) is not None:
-            answers[name] = {error: flip_error(truth, rgb) for error, truth in truths.items() if truth is not None}
-    return answers
+        rgb = scene.pairs[0].input.rgb
+        found = {} if rgb is None else {name: flip_error(truth, rgb) for name, truth in truths.items() if truth}
+        return {"errors": found}
+
+    answers = {setting.name: answer_for(partial(measure, setting)) for setting in settings}
+    shared_s = truths_made.took / len(settings)
+    return {name: {**one, "took": one["took"] + shared_s} for name, one in answers.items()}
+
+
+@lru_cache(maxsize=2)
+def colour_truths(context: WorkerContext, scene_id: int) -> tuple[ColourTruth | None, ColourTruth | None]:
+    """The scene's truths of colour and of edges; None where there is none, or no object is visible."""
+    with suppress(SceneError):
+        first = _input_alone(context, Setting(), scene_id)
+        if (crop := crop_of(first[1])) is not None:
+            traced = None if colour_truth_missing() else converged_colour(*first, CONVERGED_PATHS)
+            return traced, _smooth(context, scene_id, crop)
+    return None, None
 
 
 def _input_alone(context: WorkerContext, setting: Setting, scene_id: int) -> tuple[WorkerContext, Scene]:
     """The setting's job without the views whose colour is not compared, and its scene. Raises SceneError."""
     worker = context_for(context, Setting(setting.parts, {**setting.changes, **INPUT_ALONE}))
-    return worker, make_scene(worker, scene_id, Stopwatch())
+    return worker, render_scene(worker, laid_for(context, worker, scene_id), Stopwatch())
 
 
 def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | None:

@@ -14,13 +14,49 @@ from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job
 from schemas.job.keys import set_key
 from services.job.job_file import describe_fault
-from services.study.model import Changes, Group, Knob, Setting, Value
+from services.study.model import Changes, Knob, Setting, Value
+
+OTHER_WORLD = frozenset({"friction", "density", "if_lost", "depth_noise", "rgb_noise", "distortion", "exposure"})
+"""Knobs whose cost is shown and which are never recommended: they make another world or another camera, not a better one."""
+
+FREE: Mapping[str, str] = {
+    "verso name seed scenes first_scene preset": "says which scenes",
+    "run output check": "costs no setting of a scene anything, or is not measured",
+    "pairs_per_scene objects_per_scene categories": "what is in a scene: twice as much takes about twice as long",
+    "assets.objects assets.tables assets.split assets.limits assets.shell_kg_m2": "which shapes",
+    "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m start.max_redraws": "where things begin",
+    "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
+    "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
+    "cameras.orbit cameras.depth cameras.mirror.enabled cameras.mirror.T_z_m": "where cameras stand",
+    "images.depth_range_m images.patch images.projection.enabled": "which files",
+    "render.rgb render.path_bounces": "a whole image, or of the path-traced tier alone",
+    "captures.source captures.folders captures.category captures.board captures.most_views": "what is captured",
+    "captures.simulate.distance_m captures.simulate.inclination_rad captures.simulate.roll_deg": "where views are",
+    "captures.simulate.tier captures.simulate.depth_noise captures.simulate.rgb_noise captures.simulate.motion_blur "
+    "captures.simulate.exposure captures.simulate.distortion captures.simulate.hidden_markers captures.simulate.print_scale "
+    "captures.simulate.registration_error": "the simulated camera, which a real one has anyway",
+    "captures.estimation.compare captures.estimation.min_markers captures.estimation.max_reprojection_px "
+    "captures.estimation.corner_px captures.estimation.depth_sigma_m captures.estimation.trust": "no time",
+    "captures.fusion.max_edge_deg captures.fusion.board_clearance_m captures.fusion.min_views "
+    "captures.synthesis.fill_px": "no time",
+}
+"""Keys of a job, or branches of keys, that no knob turns, and why. Every other key that costs time is a row of `knobs_of`."""
 
 VIEWS = (4, 6, 10, 20, 40)
 """Numbers of views, as far as the job's captures have as many."""
 
 SPIN_PER_SPEED = 0.01
 """rad/s of `physics.rest.spin_rad_s` for each mm/s of `physics.rest.speed_mm_s`: their defaults' ratio."""
+
+_FINE = {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400}
+_FINEST = {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400}
+
+REFERENCES: tuple[Setting, ...] = (
+    Setting((("reference", "fine"),), {f"physics.{key}": value for key, value in _FINE.items()}),
+    Setting((("reference", "finest"),), {f"physics.{key}": value for key, value in _FINEST.items()}),
+)
+"""Settings of physics finer than every measured value. The first gives the distribution of outcomes; a pose has a truth where
+both agree."""
 
 WIDTHS = (160, 320, 640, 1280)
 """Pixels; the other lengths of the pinhole camera scale with them."""
@@ -36,6 +72,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
             "iterations": _values("captures.estimation.max_iterations", (1, 2, 5, 20)),
             "voxel": _values("captures.fusion.voxel_m", (0.006, 0.004, 0.002, 0.0015)),
             "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
+            "image_scale": _values("captures.simulate.image_scale", (0.25, 0.5, 1.0)),
         }
         return tuple(Knob(name, "capture", tuple(values)) for name, values in simulated.items())
     speed, spin = "physics.rest.speed_mm_s", "physics.rest.spin_rad_s"
@@ -45,10 +82,20 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
         "rest": [Value(f"{v:g}", {speed: v, spin: SPIN_PER_SPEED * v}) for v in (30.0, 10.0, 3.0, 1.0, 0.3)],
         "collision": _collisions(job),
+        "concavity": _values("physics.concavity", (0.2, 0.1, 0.05, 0.02)),
+        "friction": _values("physics.friction", (0.3, 0.5, 0.7, 1.0)),
+        "density": _values("assets.density_kg_m3", (200.0, 600.0, 2000.0)),
+        "if_lost": [Value(name, {"start.if_lost": name}) for name in ("fail", "remove", "redraw")],
         "exact_rest": [Value("off", {"physics.exact_rest": False}), Value("on", {"physics.exact_rest": True})],
     }
     units = [n for n in (1000, 2000, 5000, 8000) if n * job.images.depth_range_m.high <= 65_535]
-    sensors = (Value("exact", {"sensor.depth_noise": None}), Value("azure-kinect", {"sensor.depth_noise": {}}))
+    sensors = {
+        "depth_noise": (Value("off", {"sensor.depth_noise": None}), Value("azure-kinect", {"sensor.depth_noise": {}})),
+        **{
+            name: (Value("off", {f"sensor.{name}": None}), Value("on", {f"sensor.{name}": {}}))
+            for name in ("rgb_noise", "distortion", "exposure")
+        },
+    }
     key, removal = "images.projection.splat", "images.projection.hidden_point_removal"
     splats = [
         Value(f"{size}{' without backs' if removed else ''}", {key: size, removal: removed})
@@ -60,7 +107,8 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
         Knob("pivot_depth", "mirror", _pivot_depths()),
         Knob("splat", "mirror", tuple(splats)),
-        Knob("sensor", "labels", sensors),
+        *(Knob(name, "labels", values) for name, values in sensors.items()),
+        Knob("png_level", "labels", tuple(_values("images.png_level", (0, 1, 2, 6, 9)))),
         Knob("colour", "colour", _tiers()),
     )
 
@@ -166,10 +214,3 @@ def job_tree_with(changes: Changes, tree: Mapping[str, Any] | None = None) -> di
     for path, value in changes.items():
         set_key(made, path, to_jsonable_python(value))
     return made
-
-
-def groups_of(setting: Setting, knobs: Mapping[str, Knob]) -> frozenset[Group]:
-    """Which parts of a scene a setting changes; every part for the job itself and for presets, which are no knob's."""
-    if not setting.parts or any(name not in knobs for name, _ in setting.parts):
-        return frozenset(("physics", "labels", "mirror", "colour", "capture"))
-    return frozenset(knobs[name].group for name, _ in setting.parts)

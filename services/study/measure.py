@@ -1,39 +1,226 @@
-"""Measures a scene with each setting: how it comes to rest, and its time; and a setting's errors with their intervals.
+"""Measures one scene with settings, each in turn: how it comes to rest, what is drawn of it, and the processor's time of both.
 
-Rest is held against finer steps than any that is measured. Times are of processor on one core, settings in turn.
+What no code foresaw in a setting is a counted answer, `broken`, and never the end of a study. At the end of the file: how
+errors fall with the step where the truth is a formula.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from statistics import fmean, median
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import wasserstein_distance
 
+from schemas.base import Array
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.job.physics import Physics
-from schemas.scene.scene import EffectPlan, ScenePlan
-from services.bench.figures import Spread
+from schemas.scene.scene import ObjectStart, Settled
 from services.study.knobs import apply
-from services.study.model import ERRORS, Figure, Row, Setting
+from services.study.model import Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.bullet import GRAVITY_M_S2, World, open_world
 from workers.physics.fall import FINEST
-from workers.physics.recheck import moved_by, recheck_scene
+from workers.physics.recheck import recheck_scene
 from workers.physics.rigid_body import Body
-from workers.physics.settle import Rest, settle_scene
-from workers.scene.chance import SceneChance
+from workers.physics.settle import Rest
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, plan_effects
-from workers.scene.plan import plan_scene, pouring_of
-from workers.shard.run_shard import run_scene
+from workers.scene.make_scene import Laid, lay_scene, plan_with_effects
+from workers.shard.run_shard import describe, run_scene
+
+RELEASED = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
+"""Settings of physics, in steps 16 times shorter, with which objects at rest are released again."""
+
+POSED = 48
+"""Scenes of which poses are kept, the first ones."""
+
+QUICK_S = 2.0
+"""A scene that comes to rest in less is settled once untimed first, which builds its shapes; of slower ones these cost little."""
+
+SLEPT_S = 1.0
+"""Times of what the machine slept in for longer are thrown away."""
+
+Answer = dict[str, Any]
+
+_seen: set[int] = set()
+"""Scenes whose shapes this process has built."""
+
+
+class Meter:
+    """Within `with`, measures: `s` seconds of processor, None where the machine slept in between; `took` seconds by the clock."""
+
+    s: float | None
+    took: float
+
+    def __enter__(self) -> "Meter":
+        self._began = time.process_time(), time.monotonic(), time.clock_gettime(time.CLOCK_BOOTTIME)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        cpu, clock, wall = self._began
+        self.took = time.monotonic() - clock
+        slept = time.clock_gettime(time.CLOCK_BOOTTIME) - wall - self.took > SLEPT_S
+        self.s = None if slept else time.process_time() - cpu
+
+
+def answer_for(measure: Callable[[Meter], Answer]) -> Answer:
+    """What `measure` found, with its times: it gets a meter for what counts as the setting's time, the clock runs for all.
+
+    A scene that cannot be made is `failed` with its reason; anything else that it raises is also `broken`.
+    """
+    meter = Meter()
+    meter.s = None
+    with Meter() as whole:
+        try:
+            answer = measure(meter)
+        except SceneError as error:
+            answer = {"failed": error.reason}
+        except Exception as error:  # one scene that breaks a measure must not end the study
+            answer = {"failed": "broken", "broken": describe(error)}
+    return {**answer, "s": meter.s, "took": whole.took}
+
+
+def context_for(context: WorkerContext, setting: Setting) -> WorkerContext:
+    """The same worker with the setting's job. The settings' digest stays: nothing is stored under it."""
+    return dataclasses.replace(context, job=apply(context.job, setting.changes))
+
+
+def measure_rest(
+    context: WorkerContext,
+    settings: Sequence[Setting],
+    scene_id: int,
+    number: int,
+) -> dict[str, Answer]:
+    """How the scene comes to rest, by the settings' names. `number`: its place among the measured scenes.
+
+    `s` is the time to rest, without the plan. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm and rolled_deg
+    (sideways travel of the centre of mass, and turn, since the object was released; the largest of several objects). Beside
+    them `lost`, `planned` and `redrawn` objects, and `corners`, mm, of each object's box in the world. The job itself also
+    has `plan_s`, the time of its plan and new shapes.
+    """
+    new_s: float | None = None
+    if scene_id not in _seen:
+        _seen.add(scene_id)
+        with Meter() as planning:
+            _attempt(lambda: plan_with_effects(context, scene_id, Stopwatch()))
+        new_s = planning.s
+        with Meter() as cold:
+            _attempt(lambda: lay_scene(context, scene_id, Stopwatch()))
+        again = {"cold": cold.s} if cold.took < QUICK_S else {}
+    else:
+        again = {}
+    order = np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))
+    answers = {}
+    for setting in [settings[k] for k in order]:
+        worker = context_for(context, setting)
+        answers[setting.name] = answer_for(partial(_rest, worker, scene_id, number))
+    own = answers.get(Setting().name)
+    if own is not None and new_s is not None:
+        built = max(0.0, (again.get("cold") or 0.0) - new_s - own["s"]) if again and own["s"] else 0.0
+        own["plan_s"] = new_s + built
+    return answers
+
+
+def _attempt(work: Callable[[], object]) -> None:
+    """Runs what only warms up; whatever is wrong with it is told by what is measured."""
+    with contextlib.suppress(Exception):
+        work()
+
+
+def _rest(worker: WorkerContext, scene_id: int, number: int, meter: Meter) -> Answer:
+    with Meter() as planning:
+        plan, _ = plan_with_effects(worker, scene_id, Stopwatch())
+    planned, before = len(plan.objects), sum(start.redraws for start in plan.objects)
+    try:
+        with meter:
+            laid = lay_scene(worker, scene_id, Stopwatch())
+    except SceneError as error:
+        return {"failed": error.reason, "lost": planned, "planned": planned, "redrawn": 0}
+    finally:
+        if meter.s is not None and planning.s is not None:
+            meter.s -= planning.s
+    rest = laid.rest
+    answer: Answer = {
+        "errors": _errors_of(rest),
+        "lost": planned - len(rest.settled),
+        "planned": planned,
+        "redrawn": max(0, sum(start.redraws for start in rest.starts) - before),
+    }
+    if number < POSED:
+        answer["corners"] = [
+            _corners_mm(start, end).tolist() for start, end in zip(rest.starts, rest.settled, strict=True)
+        ]
+    return answer
+
+
+def _errors_of(rest: Rest) -> dict[str, float]:
+    slid, rolled = [], []
+    for start, end in zip(rest.starts, rest.settled, strict=True):
+        before, after = (transform(T, start.asset.mass.com[None])[0, :2] for T in (start.T_world_obj, end.T_world_obj))
+        slid.append(float(np.linalg.norm(after - before)) * 1e3)
+        rolled.append(math.degrees(motion_between(start.hull.vertices, start.T_world_obj, end.T_world_obj)[1]))
+    return {
+        "penetration_mm": max(one.penetration_mm for one in rest.settled),
+        "gap_mm": max(one.hover_gap_mm for one in rest.settled),
+        "unbalanced_share": max(one.equilibrium_residual for one in rest.settled),
+        "slid_mm": max(slid),
+        "rolled_deg": max(rolled),
+    }
+
+
+def _corners_mm(start: ObjectStart, end: Settled) -> Array:
+    """[8, 3] the corners of the object's own box in the world, mm, to a nanometre."""
+    low, high = start.hull.vertices.min(axis=0), start.hull.vertices.max(axis=0)
+    return np.round(
+        1e3 * transform(end.T_world_obj, np.array(list(itertools.product(*zip(low, high, strict=True))))), 6
+    )
+
+
+def measure_again(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
+    """How far objects at rest move when they are let go again in the finest steps: moved_mm and turned_deg."""
+    return {one.name: answer_for(partial(_again, context_for(context, one), scene_id)) for one in settings}
+
+
+def _again(worker: WorkerContext, scene_id: int, meter: Meter) -> Answer:
+    laid = lay_scene(worker, scene_id, Stopwatch())
+    physics = worker.job.physics.model_copy(update=RELEASED)
+    effects = plan_effects(Facts(worker.job.model_copy(update={"physics": physics}), laid.plan, raycast_checked=False))
+    again = recheck_scene(laid.plan, laid.rest, physics, effects, FINEST).settled
+    moved, turned = ([getattr(one, name) or 0.0 for one in again] for name in ("recheck_move_mm", "recheck_turn_deg"))
+    return {"errors": {"moved_mm": max(moved), "turned_deg": max(turned)}}
+
+
+@lru_cache(maxsize=2)
+def own_rest(context: WorkerContext, scene_id: int) -> Rest:
+    """How the job's own scene rests, kept for what is drawn of it. Raises SceneError."""
+    return lay_scene(context, scene_id, Stopwatch()).rest
+
+
+def laid_for(context: WorkerContext, worker: WorkerContext, scene_id: int) -> Laid:
+    """The scene at the job's own rest, as a setting that changes no physics would draw it. Raises SceneError."""
+    rest = own_rest(context, scene_id)
+    plan, effects = plan_with_effects(worker, scene_id, Stopwatch())
+    return Laid(replace(plan, objects=rest.starts), effects, rest)
+
+
+WARM_SCENES, WARM_SCENE = 2, 2_000_000
+"""How many scenes warm a process up, and the id of the first, which no study measures."""
+
+
+def warm_up(context: WorkerContext) -> None:
+    """Makes scenes of one object, untimed: the first run compiles code and shaders."""
+    few = dataclasses.replace(context, job=apply(context.job, {"objects_per_scene": 1}))
+    for number in range(WARM_SCENES):
+        run_scene(few, WARM_SCENE + number, Stopwatch())
+
+
+# ---------------------------------------------------------------------------------------------- where the truth is a formula
 
 RATES_HZ = (3840, 7680, 15360)
 """An order shows in the limit: in longer steps a sliding block loses contacts for single steps, and stops a little later."""
@@ -89,276 +276,3 @@ def _slide_error_m(rate_hz: int) -> float:
 def _advance(world: World, steps: int) -> None:
     for _ in range(steps):
         world.advance()
-
-
-AGREE_MM = 0.05
-"""Two references agree where their poses are nearer than this; only then is there a true pose."""
-
-REFERENCES: tuple[Mapping[str, Any], ...] = (
-    {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400},
-    {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400},
-)
-"""Settings of physics finer than every measured value. The first gives the distribution of outcomes; a pose has a truth where
-both agree."""
-
-SCENE_MM = 1000.0
-"""Stands for the pose of an object that is there with one setting alone."""
-
-RELEASED: Mapping[str, Any] = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
-"""Settings of physics, in steps 16 times shorter, with which objects at rest are released again."""
-
-WARM_SCENES = 4
-
-PERCENTILE = 95.0
-"""The percentile of the scenes' figures that is a setting's error."""
-
-RESAMPLES = 200
-"""Bootstrap samples of the scenes for an interval."""
-
-INTERVAL = (2.5, 97.5)
-
-Answer = dict[str, Any]
-Laps = Sequence[Mapping[int, Mapping[str, Any]]]
-"""What `time_scene` told, by round and scene."""
-
-
-def measure_settling(
-    context: WorkerContext, settings: Sequence[Setting], scene_id: int, posed: bool, released: bool
-) -> dict[str, Answer]:
-    """Figures of one scene by the settings' names, and of the reference under "reference".
-
-    Each has `failed`, or else penetration_mm, gap_mm and unbalanced_share, slid_mm and rolled_deg (sideways travel of the
-    centre of mass, and turn, since the object was released; the largest of several objects). With `posed` also pose_mm,
-    where there is a truth; with `released` moved_mm and turned_deg. A scene that cannot be drawn has no answers.
-    """
-    try:
-        plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
-    except SceneError:
-        return {}
-    truths = [_settle(context.job, plan, reference) for reference in REFERENCES[: 2 if posed else 1]]
-    answers = {"reference": _describe(truths[0])}
-    agreed = posed and None not in truths and _apart_mm(*truths) <= AGREE_MM  # type: ignore[arg-type]
-    answers["reference"]["agreed"] = agreed if posed else None
-    again = dict[bytes, dict[str, float]]()
-    for setting in settings:
-        job = apply(context.job, setting.changes)
-        rest = _settle(job, plan)
-        answer = answers[setting.name] = _describe(rest)
-        if rest is None:
-            continue
-        if agreed and truths[0] is not None:
-            answer["pose_mm"] = _apart_mm(rest, truths[0])
-        if released:
-            key = b"".join(one.T_world_obj.tobytes() for one in rest.settled)
-            if key not in again:
-                again[key] = _release(context.job, plan, rest)
-            answer.update(again[key])
-    return answers
-
-
-def _settle(job: Job, plan: ScenePlan, physics: Mapping[str, Any] | None = None) -> Rest | None:
-    """None where the scene does not come to rest. What is lost is drawn again or removed as by `run`."""
-    pouring = pouring_of(job.start, SceneChance(job.seed, plan.scene_id), plan)
-    try:
-        return settle_scene(plan, *_physics(job, plan, physics or {}), pouring)
-    except SceneError:
-        return None
-
-
-def _physics(job: Job, plan: ScenePlan, changes: Mapping[str, Any]) -> tuple[Physics, EffectPlan]:
-    """The job's physics with these changes, and the plan of effects with them."""
-    physics = job.physics.model_copy(update=dict(changes))
-    return physics, plan_effects(Facts(job.model_copy(update={"physics": physics}), plan, raycast_checked=False))
-
-
-def _describe(rest: Rest | None) -> Answer:
-    if rest is None:
-        return {"failed": True}
-    slid, rolled = [], []
-    for start, end in zip(rest.starts, rest.settled, strict=True):
-        before, after = (transform(T, start.asset.mass.com[None])[0, :2] for T in (start.T_world_obj, end.T_world_obj))
-        slid.append(float(np.linalg.norm(after - before)) * 1e3)
-        rolled.append(math.degrees(motion_between(start.hull.vertices, start.T_world_obj, end.T_world_obj)[1]))
-    return {
-        "failed": False,
-        "penetration_mm": max(one.penetration_mm for one in rest.settled),
-        "gap_mm": max(one.hover_gap_mm for one in rest.settled),
-        "unbalanced_share": max(one.equilibrium_residual for one in rest.settled),
-        "slid_mm": max(slid),
-        "rolled_deg": max(rolled),
-    }
-
-
-def _apart_mm(one: Rest, other: Rest) -> float:
-    """The largest distance between the places of a point of an object in two rests, mm; as long as a scene if one has fewer."""
-    if len(one.starts) != len(other.starts):
-        return SCENE_MM
-    return max(
-        moved_by(start, a.T_world_obj, b.T_world_obj)[0]
-        for start, a, b in zip(one.starts, one.settled, other.settled, strict=True)
-    )
-
-
-def _release(job: Job, plan: ScenePlan, rest: Rest) -> dict[str, float]:
-    again = recheck_scene(plan, rest, *_physics(job, plan, RELEASED), FINEST).settled
-    return {
-        "moved_mm": max(one.recheck_move_mm or 0.0 for one in again),
-        "turned_deg": max(one.recheck_turn_deg or 0.0 for one in again),
-    }
-
-
-def context_for(context: WorkerContext, setting: Setting) -> WorkerContext:
-    """The same worker with the setting's job. The settings' digest stays: nothing is stored under it."""
-    return dataclasses.replace(context, job=apply(context.job, setting.changes))
-
-
-# ---------------------------------------------------------------------------------------------- time
-
-
-def time_scene(
-    context: WorkerContext, whole: Sequence[Setting], settling: Sequence[Setting], scene_id: int, lap: int
-) -> Answer:
-    """Seconds of processor by setting: of the whole scene up to its encoded files, or of `settling` alone.
-
-    The first run, of the job itself, builds the scene's shapes, as a job does in every scene; all others find them in caches,
-    so that the cost of new shapes is known (`cold`). The others run in a new order in each scene and `lap`, so that no
-    setting always follows the same one. Bytes are those of all files and of no rows.
-    """
-    began = time.process_time()
-    run_scene(context, scene_id, Stopwatch())
-    cold = time.process_time() - began
-    answer: Answer = {"whole": {}, "settling": {}, "bytes": {}, "cold": cold}
-    order = np.random.default_rng([scene_id, lap])
-    for setting in [whole[k] for k in order.permutation(len(whole))]:
-        worker = context_for(context, setting)
-        began = time.process_time()
-        output = run_scene(worker, scene_id, Stopwatch())
-        took = time.process_time() - began
-        if output.files:
-            answer["whole"][setting.name] = took
-            answer["bytes"][setting.name] = sum(len(file.data) for file in output.files)
-    for setting in [settling[k] for k in order.permutation(len(settling))]:
-        with suppress(SceneError):  # where the scene does not come to rest
-            answer["settling"][setting.name] = _settle_s(context_for(context, setting), scene_id)
-    return answer
-
-
-def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> None:
-    """Make untimed scenes with every setting: the first run compiles code and shaders."""
-    for number in range(WARM_SCENES):
-        run_scene(context, scene_id + number, Stopwatch())
-    for setting in settings:
-        run_scene(context_for(context, setting), scene_id, Stopwatch())
-
-
-def _settle_s(context: WorkerContext, scene_id: int) -> float:
-    """Seconds for choosing the effects and settling. Raises SceneError."""
-    plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
-    pouring = pouring_of(context.job.start, SceneChance(context.job.seed, scene_id), plan)
-    began = time.process_time()
-    settle_scene(plan, context.job.physics, plan_effects(Facts(context.job, plan, raycast_checked=False)), pouring)
-    return time.process_time() - began
-
-
-def job_cost(laps: Laps, own: str) -> tuple[float, float]:
-    """(milliseconds of processor, kilobytes) a scene of the job itself: medians over rounds, shapes new."""
-    made = [[_own_s(lap, laps[0], scene, own) for scene, one in lap.items() if own in one["whole"]] for lap in laps]
-    sizes = [answer["bytes"][own] for answer in laps[0].values() if own in answer["bytes"]]
-    return median(fmean(times) for times in made if times) * 1e3, fmean(sizes) / 1e3
-
-
-def _own_s(lap: Mapping[int, Mapping[str, Any]], first: Mapping[int, Mapping[str, Any]], scene: int, own: str) -> float:
-    """Seconds of the job's own scene in this round, plus the cost of new shapes, which is measured once."""
-    new = max(0.0, first[scene]["cold"] - first[scene]["whole"].get(own, first[scene]["cold"]))
-    return float(lap[scene]["whole"][own]) + new
-
-
-def timed_rows(settings: Sequence[Setting], laps: Laps) -> Iterator[tuple[Row, int]]:
-    """(row without errors, scenes timed) of each setting that has a time; the first setting is the job itself.
-
-    Over the scenes that a setting and the job made in a round. A setting that only settles is compared by settling: its
-    difference to the job's own is added to the whole.
-    """
-    own = settings[0].name
-    own_ms, own_kb = job_cost(laps, own)
-    for setting in settings:
-        name = setting.name
-        ratios, scenes = [], set[int]()
-        for lap in laps:
-            more, base = 0.0, 0.0
-            for scene, answer in lap.items():
-                times = answer["whole" if name in answer["whole"] else "settling"]
-                if name in times and own in times and own in answer["whole"]:
-                    more += times[name] - times[own]
-                    base += _own_s(lap, laps[0], scene, own)
-                    scenes.add(scene)
-            if base:
-                ratios.append((base + more) / base)
-        if ratios:
-            ratio, sizes = Spread.of(ratios), [one["bytes"][name] for one in laps[0].values() if name in one["bytes"]]
-            kilobytes = fmean(sizes) / 1e3 if sizes else own_kb
-            yield (
-                Row(setting, own_ms * ratio.median, ratio.median, ratio.least, ratio.most, kilobytes, {}, 0.0),
-                len(scenes),
-            )
-
-
-# ---------------------------------------------------------------------------------------------- a setting over scenes
-
-
-def figure_over_scenes(figures: Sequence[float]) -> Figure:
-    """The 95th percentile of one figure a scene, of at least one."""
-    values = np.asarray(figures, float)
-    return _figure(len(values), lambda rows: float(np.percentile(values[rows], PERCENTILE)), float(np.median(values)))
-
-
-def share(flags: Sequence[bool]) -> Figure:
-    """The share of true flags."""
-    values = np.asarray(flags, float)
-    return _figure(len(values), lambda rows: float(values[rows].mean()))
-
-
-def apart(own: Sequence[float], truth: Sequence[float]) -> Figure:
-    """The first Wasserstein distance of two distributions, given by samples [N] of the same scenes in the same order.
-
-    It is the area between the cumulative distributions, in the samples' unit (Villani 2009, Optimal Transport, 6.2; Ramdas,
-    Garcia and Cuturi 2017 for one dimension). The end of a tumbling object is random, so that only distributions can be
-    compared. The interval is a paired bootstrap's; the median repeats the value.
-    """
-    mine, other = np.asarray(own, float), np.asarray(truth, float)
-    return _figure(len(mine), lambda rows: float(wasserstein_distance(mine[rows], other[rows])))
-
-
-def _figure(count: int, measure: Callable[[NDArray[np.int64]], float], median: float | None = None) -> Figure:
-    """The value over all scenes, with a bootstrap's interval; without a median the value is it."""
-    rng = np.random.default_rng(0)
-    samples = [measure(rng.integers(0, count, count, dtype=np.int64)) for _ in range(RESAMPLES)]
-    low, high = np.percentile(samples, INTERVAL)
-    value = measure(np.arange(count, dtype=np.int64))
-    return Figure(value, float(low), float(high), value if median is None else median, count)
-
-
-def settling_figures(name: str, scenes: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
-    """A setting's errors of physics, from the answers of `measure_settling`, each of which has all settings."""
-    mine = [scene[name] for scene in scenes if name in scene]
-    if not mine:
-        return {}
-    found = {"failed_share": share([one["failed"] for one in mine])}
-    for error in ("penetration_mm", "gap_mm", "unbalanced_share", "pose_mm", "moved_mm", "turned_deg"):
-        if figures := [one[error] for one in mine if error in one]:
-            found[error] = figure_over_scenes(figures)
-    both = [
-        (scene[name], scene["reference"])
-        for scene in scenes
-        if name in scene and not scene[name]["failed"] and not scene["reference"]["failed"]
-    ]
-    if len(both) > 1:
-        found["outcome_mm"] = apart([a["slid_mm"] for a, _ in both], [b["slid_mm"] for _, b in both])
-        found["outcome_deg"] = apart([a["rolled_deg"] for a, _ in both], [b["rolled_deg"] for _, b in both])
-    return found
-
-
-def image_figures(scenes: Sequence[Mapping[str, float]]) -> dict[str, Figure]:
-    """A setting's errors of images, from one mapping a scene, in the order of `ERRORS`."""
-    names = [name for name in ERRORS if any(name in scene for scene in scenes)]
-    return {name: figure_over_scenes([scene[name] for scene in scenes if name in scene]) for name in names}

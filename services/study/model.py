@@ -77,8 +77,8 @@ class Figure:
 class Row:
     """A setting as measured.
 
-    `ratio` of its time to the job's own in the same rounds: median, least and most; `ms`: that ratio times the job's own
-    median milliseconds of processor a scene; `kilobytes` a scene on disk; `errors`: the measured figures by name of
+    `ratio` of its time to the job's own in the same scenes, and its 95 % interval, least to most; `ms`: that ratio times the
+    job's own milliseconds of processor a scene; `kilobytes` a scene on disk; `errors`: the measured figures by name of
     `ERRORS`; `notes`: what is missing, and why.
     """
 
@@ -94,53 +94,56 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Proof:
+    """A recommended setting on fresh scenes, all its parts at once: its figure of each target, and whether all hold."""
+
+    setting: str
+    scenes: int
+    targets: Mapping[str, float]
+    measured: Mapping[str, Figure]
+    promised: Mapping[str, Figure]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every measured figure is at or below its target."""
+        return all(name in self.measured and self.measured[name].value <= most for name, most in self.targets.items())
+
+
+@dataclass(frozen=True)
 class Study:
     """The content of a report: the machine, the command, the table, and the slopes of smooth cases.
 
-    `scenes` were made with each setting and `physics_scenes` dropped; `job_scenes` is the size of the whole job, 0 where its
-    cost is not told; `notes` hold for the whole study, such as what was not measured, and why.
+    `scenes` is the most that a setting was measured in; `job_scenes` is the size of the whole job, 0 where its cost is not
+    told; `seconds` were spent of a budget of `budget_s`; `answer` is the answer in words and `chosen` the name of the
+    setting in it, empty where nothing is recommended; `doubts` are what is not decided, and how long that would take;
+    `notes` hold for the whole study, such as what was not measured, and why.
     """
 
     job: str
     command: str
     machine: Mapping[str, Any]
     scenes: int
-    physics_scenes: int
     rows: tuple[Row, ...]
     slopes: Mapping[str, float] = field(default_factory=dict)
     preset: str = "balanced"
     job_scenes: int = 0
     notes: tuple[str, ...] = ()
+    budget_s: float = 0.0
+    seconds: float = 0.0
+    answer: str = ""
+    chosen: str = ""
+    doubts: tuple[str, ...] = ()
+    proofs: tuple[Proof, ...] = ()
 
     @property
     def sample(self) -> str:
-        """What was measured with each setting, in words: a study of captures drops nothing."""
-        if not self.physics_scenes:
-            return f"{self.scenes} captures processed"
-        return f"{self.scenes} scenes made and {self.physics_scenes} dropped"
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much is measured, in scenes.
-
-    `scenes` have their images measured. `settled` only come to rest; the first `released` of them are released again, and
-    the first `posed` have their poses compared with the truth. `timed` are timed in each of `laps` rounds; `coloured` are
-    drawn with very many paths.
-    """
-
-    scenes: int = 48
-    settled: int = 500
-    released: int = 16
-    posed: int = 48
-    timed: int = 12
-    laps: int = 3
-    coloured: int = 4
+        """What was measured, in words."""
+        return f"up to {self.scenes} scenes with each of {len(self.rows)} settings"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The job that is timed, its knobs and settings, the presets, the targets, and the sizes."""
+    """The job that is measured, its knobs and settings, the presets, the targets, the seconds to spend, and processes."""
 
     job: Job
     job_folder: Path
@@ -148,7 +151,8 @@ class Plan:
     settings: tuple[Setting, ...]
     presets: tuple[Setting, ...]
     targets: Mapping[str, float] | None
-    sizes: Sizes = field(default_factory=Sizes)
+    budget_s: float = 900.0
+    processes: int = 2
 
 
 _RAYS = "a ray caster in float64 at the same pixel centres"
@@ -193,6 +197,9 @@ ERRORS = {kind.name: kind for kind in (
     ErrorKind("outcome_deg", "deg", "how they lie, on the whole",
               "how far things turn: two distributions apart", _REFERENCE, "physics", True),
     ErrorKind("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", True),
+    ErrorKind("lost_share", "", "objects that are lost", "objects of the plan that no scene has", "counted", "physics", True),
+    ErrorKind("redrawn_share", "", "objects dropped again",
+              "objects that left the table and were drawn again, an object", "counted", "physics", True),
     ErrorKind("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
     ErrorKind("table_depth_mm", "mm", "depth of the table",
               "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from schemas.errors import describe_seconds, milliseconds, number, size
-from services.study.choose import Targets, answer, as_cheap, front, own_row
-from services.study.model import ERRORS, Row, Study, short, shown, times, unit
+from services.study.choose import as_cheap, front, own_row
+from services.study.model import ERRORS, Proof, Row, Study, amount, short, shown, times, unit
 
 STUDY_FILE = "study.json"
 WIDE_FILE = "tradeoff.parquet"
@@ -101,13 +101,13 @@ GROUPS = {
 }
 
 
-def write_page(study: Study, plots: Sequence[Path], file: Path, targets: Targets | None = None) -> None:
+def write_page(study: Study, plots: Sequence[Path], file: Path) -> None:
     """Write the page with the pictures in it: the first of `plots` on top, the others at the end, one for each knob."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(page_of(study, plots, targets), encoding="utf-8")
+    file.write_text(page_of(study, plots), encoding="utf-8")
 
 
-def page_of(study: Study, plots: Sequence[Path], targets: Targets | None = None) -> str:
+def page_of(study: Study, plots: Sequence[Path]) -> str:
     """The whole page."""
     tables = {name: table for group, name in GROUPS.items() if (table := _group_table(study, group))}
     knobs = [_picture(plot, f"Errors over time along the knob {plot.stem.removeprefix('knob_')}") for plot in plots[1:]]
@@ -115,7 +115,9 @@ def page_of(study: Study, plots: Sequence[Path], targets: Targets | None = None)
     slopes = _table([(name, number(order)) for name, order in study.slopes.items()], ("case", "order in the step"))
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
         job=escape(study.job),
-        answer=escape(answer(study, targets)),
+        answer=escape(study.answer),
+        proof=_proofs(study),
+        doubts="".join(f'<p class="doubt">Not decided: {escape(line)}.</p>' for line in study.doubts),
         tradeoff="".join(_picture(plot, "Errors over processor time, a point for each setting") for plot in plots[:1]),
         groups="\n".join(f"<h2>{name}</h2>{table}" for name, table in tables.items()),
         errors=_errors(study),
@@ -143,6 +145,29 @@ def _cells(kind: str, words: Iterable[str]) -> str:
     return "".join(f"<{kind}>{escape(word)}</{kind}>" for word in words)
 
 
+def describe_proof(proof: Proof) -> str:
+    """One line: what was promised and measured, and whether it holds."""
+    words = [
+        f"{short(name)} {amount(name, proof.measured[name].value)}"
+        + (f", promised {amount(name, proof.promised[name].value)}" if name in proof.promised else "")
+        + f" (at most {amount(name, most)})"
+        for name, most in proof.targets.items()
+    ]
+    end = "holds" if proof.holds else "does not hold: withdrawn"
+    return f"{proof.setting} on {proof.scenes} fresh scenes: {'; '.join(words)}: {end}"
+
+
+def _proofs(study: Study) -> str:
+    rows = [
+        (proof.setting, str(proof.scenes), short(name), amount(name, most),
+         amount(name, proof.promised[name].value) if name in proof.promised else "as the job",
+         amount(name, proof.measured[name].value), "yes" if proof.measured[name].value <= most else "no: withdrawn")
+        for proof in study.proofs for name, most in proof.targets.items()
+    ]  # fmt: skip
+    head = ("setting", "fresh scenes", "error", "at most", "promised", "measured", "holds")
+    return f"<h2>Promised, and measured on fresh scenes</h2>{_table(rows, head)}" if rows else ""
+
+
 def _errors(study: Study) -> str:
     measured = {name for row in study.rows for name in row.errors}
     rows = [
@@ -166,7 +191,8 @@ def _machine(study: Study) -> str:
     own = own_row(study.rows)
     rows = [
         ("command", study.command),
-        ("scenes", f"{study.sample} with each of {len(study.rows)} settings"),
+        ("scenes", study.sample),
+        ("time spent", f"{describe_seconds(study.seconds)} of a budget of {describe_seconds(study.budget_s)}"),
         ("preset of the job", study.preset),
         ("a scene as the job is", f"{milliseconds(own.ms)} of processor, {size(own.kilobytes)}"),
     ]

@@ -141,7 +141,7 @@ def draw_tradeoff(study: Study) -> Picture:
     """A panel for each part of a scene: its main error over processor time, both logarithmic."""
     panels = panels_of(study.rows)
     core = cut(str(study.machine.get("cpu", "an unknown processor")), 60)
-    sample = f"{cut(study.job, 40)}: {study.sample} with each of {len(study.rows)} settings; one core of {core}"
+    sample = f"{cut(study.job, 40)}: {study.sample}; one core of {core}"
     draws = [partial(_draw_panel, study, panel) for panel in panels]
     return _draw_panels(f"{headline(study, panels)}\n{sample}", draws, min(2, len(panels)), (12.0, 4.6))
 

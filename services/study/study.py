@@ -1,94 +1,53 @@
-"""The whole study: its journal, every knob by itself, then promising combinations, and the table of both.
-
-The journal is a file of answers, with which the same command goes on where it stopped. A round is settings that are
-measured side by side, in units of one scene.
-"""
+"""The whole study within a budget: a pilot, rounds of a race between settings, the choice, and its proof on fresh scenes."""
 
 import hashlib
 import itertools
-import json
-import multiprocessing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, replace
-from functools import cache
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from schemas.errors import OutputError
-from schemas.job.job import Job
-from services.bench.figures import describe_machine, pinned
+from schemas.errors import RunError, describe_seconds, plural
+from services.bench.figures import describe_machine
 from services.run.progress import ProgressLine
-from services.study.choose import DEFAULT_TARGETS, TargetError, close_calls, default_targets
-from services.study.images import measure_colour, measure_scene_images
-from services.study.knobs import apply, groups_of, joined
-from services.study.measure import (
-    image_figures,
-    measure_settling,
-    settling_figures,
-    slopes,
-    time_scene,
-    timed_rows,
-    warm_up,
-)
-from services.study.model import ERRORS, Figure, Group, Plan, Row, Setting, Study
-from workers.assets.catalogue import open_catalogue
-from workers.scene.context import WorkerContext, open_worker
+from services.study.choose import DEFAULT_TARGETS, TargetError, answer, own_row, recommend, targets_of
+from services.study.knobs import REFERENCES, joined
+from services.study.lanes import Journal, Lanes, Unit
+from services.study.measure import slopes
+from services.study.model import ERRORS, Figure, Plan, Proof, Row, Setting, Study
+from services.study.race import MOST, SHARES, Race, Wanted
+from services.study.table import AGAIN, OWN, UNTIMED, Part, Parts, Table, figures_of, part_of
 
-JOURNAL_FILE = "journal.jsonl"
+PILOT_SHARE, RACE_SHARE, PROOF_SHARE = 0.3, 0.9, 1.0
+"""By these shares of the budget the pilot, the race and the proof end."""
 
+LATE_SHARE = 0.03
+"""What is under way then may take this share more, because a process that is ended takes seconds to come back."""
 
-class Journal(dict[str, Any], AbstractContextManager):
-    """Answers by the unit's name, one JSON line each; the first line identifies the study.
+PAGE_S = 6.0
+"""Seconds of the budget that are kept for the tables, the plots and the page."""
 
-    A line that the end of a process cut off is dropped, and its unit measured again.
-    """
+FRESH_SCENE = 1_000_000
+"""How far from the job's first scene those begin that prove a recommendation: no study measures them before."""
 
-    def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
-        """Raises OutputError where the folder cannot be written, or holds another study."""
-        self._path = folder / JOURNAL_FILE
-        super().__init__()
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = self._path.open("a+b")
-        except OSError as error:
-            raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
-        try:
-            self._read(header)
-        except BaseException:
-            self._file.close()
-            raise
+PROVED, LEAST_PROVED = 200, 4
+"""The most scenes of a proof, and the fewest."""
 
-    def _read(self, header: Mapping[str, Any]) -> None:
-        self._file.seek(0)
-        written = self._file.read()
-        whole = written[: written.rfind(b"\n") + 1]
-        self._file.truncate(len(whole))
-        if not whole:
-            self._write(header)
-            return
-        first, *entries = map(json.loads, whole.splitlines())
-        wanted = json.loads(json.dumps(header))
-        if other := sorted(key for key in {*first, *wanted} if first.get(key) != wanted.get(key)):
-            raise OutputError(
-                f"{self._path.parent} holds the measurements of another study (other {', '.join(other)}): choose another "
-                f"--out, or delete {self._path.name} there"
-            )
-        self.update((entry["unit"], entry["answer"]) for entry in entries)
+SPENT = "spent"
+"""The journal's entry of the seconds that were spent before."""
 
-    def add(self, unit: str, answer: Any) -> None:
-        """Keep an answer, on disk too."""
-        self[unit] = answer
-        self._write({"unit": unit, "answer": answer})
+SURE_SCENES = 59
+"""Scenes without one above a target that make a 95th percentile sure (1 - 0.95^59 > 0.95)."""
 
-    def _write(self, entry: Mapping[str, Any]) -> None:
-        self._file.write(json.dumps(entry, sort_keys=True).encode() + b"\n")
-        self._file.flush()
+LEVEL_OF_CHOICE = 8
+"""Scenes from which combinations are chosen, and from which a part may be decided."""
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+RELEASED_SCENES = 4
+"""Scenes whose objects are let go again, unless a target asks for more."""
 
+UNIT_SHARE = 0.04
+"""A unit of several settings takes about this share of the budget at most."""
 
 SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
 """A value saves time at this share of the job's own, keeps an error that grows to this share, and shrinks one below this."""
@@ -147,233 +106,333 @@ def _least_share(row: Row, own: Row) -> float | None:
     return min((value / mine for value, mine, negligible in pairs if mine > negligible), default=1.0)
 
 
-@dataclass(frozen=True)
-class Unit:
-    """One scene to measure with these settings; its answer is kept by its name.
-
-    `kind`: time, settling, images or colour. Of time: its `lap`. Of settling: whether poses are held against the truth
-    (`posed`) and objects released again (`released`).
-    """
-
-    name: str
-    kind: str
-    settings: tuple[Setting, ...]
-    scene_id: int
-    lap: int = 0
-    posed: bool = False
-    released: bool = False
-
-
-@dataclass(frozen=True)
-class Round:
-    """Settings that are measured side by side; the first is the job itself."""
+@dataclass
+class Measurement:
+    """What a study is measured with: its plan, parts, journal, processes and clock."""
 
     plan: Plan
-    name: str
-    settings: tuple[Setting, ...]
-    times_only: bool = False
+    parts: Parts
+    journal: Journal
+    lanes: Lanes
+    progress: ProgressLine
+    began: float
+    before_s: float
 
-    def of(self, *groups: Group) -> tuple[Setting, ...]:
-        """The job's own setting, and those that change any of these parts of a scene."""
-        knobs = {knob.name: knob for knob in self.plan.knobs}
-        return (self.settings[0], *(one for one in self.settings[1:] if groups_of(one, knobs) & set(groups)))
+    @property
+    def spent_s(self) -> float:
+        """Seconds spent of the budget, those of earlier starts with it."""
+        return self.before_s + time.monotonic() - self.began
 
-    def timings(self) -> list[Unit]:
-        """The units of time, in the order in which they are taken: lap by lap."""
-        first, sizes = self.plan.job.first_scene, self.plan.sizes
-        return [
-            Unit(f"{self.name}/time/{lap}/{scene}", "time", self.settings, scene, lap)
-            for lap, scene in itertools.product(range(sizes.laps), range(first, first + sizes.timed))
-        ]
+    def deadline(self, share: float) -> float:
+        """The moment of the monotonic clock at which a share of the budget is spent, but for what the page takes."""
+        return self.began + share * (self.plan.budget_s - PAGE_S) - self.before_s
 
-    def errors(self) -> list[Unit]:
-        """The units of errors."""
-        first, sizes = self.plan.job.first_scene, self.plan.sizes
-        kinds = (
-            ("colour", self.of("colour"), sizes.coloured),
-            ("images", self.of("labels", "mirror"), sizes.scenes),
-            ("settling", self.of("physics"), sizes.settled),
-        )
-        units = []
-        for kind, settings, count in kinds:
-            for number in range(count if len(settings) > 1 and not self.times_only else 0):
-                name, part = f"{self.name}/{kind}/{first + number}", (number < sizes.posed, number < sizes.released)
-                units.append(Unit(name, kind, settings, first + number, 0, *part))
-        return units
+    def left_s(self, share: float) -> float:
+        """Seconds until then."""
+        return self.deadline(share) - time.monotonic()
 
-    def rows(self, journal: Journal) -> tuple[Row, ...]:
-        """The round's table, from the answers in the journal; settings without a time are left out."""
-        laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(self.plan.sizes.laps)]
-        for unit in self.timings():
-            laps[unit.lap][unit.scene_id] = journal[unit.name]
-        units = self.errors()
-        answers = {
-            kind: [journal[unit.name] for unit in units if unit.kind == kind]
-            for kind in ("settling", "images", "colour")
-        }
-        rows = []
-        for row, scenes in timed_rows(self.settings, laps):
-            errors = self._errors(answers, row.setting.name)
-            failed = errors["failed_share"].value if "failed_share" in errors else 0.0
-            notes = () if scenes >= self.plan.sizes.timed else (f"timed in {scenes} scenes",)
-            rows.append(replace(row, errors=errors, failed_share=failed, notes=notes))
-        return tuple(rows)
+    def table(self) -> Table:
+        """The table so far."""
+        return Table(self.parts, self.journal)
 
-    @staticmethod
-    def _errors(answers: Mapping[str, Sequence[Mapping[str, Any]]], name: str) -> dict[str, Figure]:
-        """A setting's errors, `failed_share` last and the others in the order of `ERRORS`."""
-        found = settling_figures(name, answers["settling"])
-        for kind in ("images", "colour"):
-            found |= image_figures([one[name] for one in answers[kind] if name in one])
-        order = [error for error in ERRORS if error != "failed_share"]
-        return {error: found[error] for error in (*order, "failed_share") if error in found}
+    def run(self, wanted: Sequence[Wanted], share: float) -> None:
+        """Measures, in order, until a share of the budget is spent, and keeps the answers."""
+        first = self.plan.job.first_scene
+        groups = grouped(wanted, UNIT_SHARE * self.plan.budget_s)
+        units = [Unit(part, scene, scene - first, settings) for part, scene, settings in groups]
+        for unit, answers in self.lanes.run(units, self.deadline(share), self.deadline(share + LATE_SHARE)):
+            for name, found in answers.items():
+                self.journal.add(f"{unit.part}/{unit.scene_id}/{name}", found)
+            self.progress.show(round(self.spent_s))
+
+    def keep_clock(self) -> None:
+        """Writes down what was spent, for the next start."""
+        self.journal.add(SPENT, self.spent_s)
 
 
-LAPS_OF_CLOSE_CALLS = 3
-"""Factor on the rounds of timing for settings whose time decides the choice."""
+def grouped(wanted: Sequence[Wanted], most_s: float) -> list[tuple[Part, int, tuple[Setting, ...]]]:
+    """Settings of one part and scene side by side, in units of at most about so many seconds."""
+    units: list[tuple[Part, int, tuple[Setting, ...]]] = []
+    order = dict.fromkeys((one.part, one.scene_id) for one in wanted)
+    for part, scene in order:
+        some, cost = list[Setting](), 0.0
+        for one in (one for one in wanted if (one.part, one.scene_id) == (part, scene)):
+            if some and cost + one.cost_s > most_s:
+                units.append((part, scene, tuple(some)))
+                some, cost = [], 0.0
+            some.append(one.setting)
+            cost += one.cost_s
+        if some:
+            units.append((part, scene, tuple(some)))
+    return units
 
 
 def run_study(
-    plan: Plan, journal: Journal, context: WorkerContext, processes: int, progress: ProgressLine
-) -> tuple[Row, ...]:
-    """Measure what is not in the journal yet, and make the table; its first row is the job itself.
+    plan: Plan,
+    journal: Journal,
+    renderer: str,
+    command: str,
+    left_out: Sequence[str],
+    progress: ProgressLine,
+    began: float,
+) -> Study:
+    """Measures until the answer is sure or the budget is spent, proves the answer, and tells it.
 
-    First every knob by itself; then promising combinations; then the settings whose time decides the choice are timed for
-    longer.
+    `began` is when the command did, by the monotonic clock. The same journal goes on: a longer budget refines. Raises
+    RunError where no scene of the job can be made, or none within the budget.
     """
-    bench = _Bench(journal, context, processes, progress)
-    rows = bench.measure(Round(plan, "alone", plan.settings))
-    chosen = (Setting(), *plan.presets, *promising(rows, plan.targets or DEFAULT_TARGETS))
-    combined = bench.measure(Round(plan, f"together-{_digest(chosen)}", chosen))
-    rows = (*rows, *(with_time_of(row, row, rows[0].ms) for row in combined[1:]))
-    asked, bounds = (plan.targets, {}) if plan.targets else default_targets(rows)
-    try:
-        close = close_calls(rows, asked, bounds)
-    except TargetError:  # no setting meets the targets, however long it is timed
-        close = []
-    if not close:
-        return rows
-    again = (Setting(), *(row.setting for row in close))
-    longer = replace(plan, sizes=replace(plan.sizes, laps=LAPS_OF_CLOSE_CALLS * plan.sizes.laps))
-    timed = bench.measure(Round(longer, f"close-{_digest(again)}", again, times_only=True))
-    longest = {row.setting.name: row for row in timed[1:]}
-    return tuple(with_time_of(row, longest.get(row.setting.name, row), rows[0].ms) for row in rows)
-
-
-def with_time_of(row: Row, timed: Row, own_ms: float) -> Row:
-    """The row with the time of another measurement of its setting; `own_ms` is the job's own time."""
-    ratios = {name: getattr(timed, name) for name in ("ratio", "ratio_least", "ratio_most")}
-    return replace(row, ms=own_ms * timed.ratio, **ratios)
-
-
-def _digest(settings: Sequence[Setting]) -> str:
-    """Eight hexadecimal digits of the settings' names: which settings are promising depends on the targets."""
-    return hashlib.sha256("; ".join(setting.name for setting in settings).encode()).hexdigest()[:8]
-
-
-@dataclass
-class _Bench:
-    """Measures rounds, keeps the answers in the journal and shows the progress."""
-
-    journal: Journal
-    context: WorkerContext
-    processes: int
-    progress: ProgressLine
-    asked: int = 0
-    done: int = 0
-
-    def measure(self, part: Round) -> tuple[Row, ...]:
-        """The round's table. Missing times are taken first and with no other load, then errors side by side."""
-        timings, errors = part.timings(), part.errors()
-        missing = [unit for unit in errors if unit.name not in self.journal]
-        untimed = [unit for unit in timings if unit.name not in self.journal]
-        self.asked += len(timings) + len(errors)
-        self.done = self.asked - len(untimed) - len(missing)
-        self.progress.expect(self.asked)
-        if untimed:
-            with pinned():
-                quick = [setting for setting in part.settings if not _is_slow(self.context.job, setting)]
-                warm_up(self.context, quick, part.plan.job.first_scene + part.plan.sizes.timed)
-                for unit in untimed:
-                    self._keep(unit.name, _time(part, self.context, unit))
-        for name, answer in measure_in_pool(self.context.job, part.plan.job_folder, self.processes, missing):
-            self._keep(name, answer)
-        return part.rows(self.journal)
-
-    def _keep(self, name: str, answer: Any) -> None:
-        self.journal.add(name, answer)
-        self.done += 1
-        self.progress.show(self.done)
-
-
-def _time(part: Round, context: WorkerContext, unit: Unit) -> dict[str, Any]:
-    """Settings of physics are timed by settling alone; path-traced ones only in the first scene of the first lap."""
-    drawn = part.of("labels", "mirror", "colour")
-    first = unit.name == part.timings()[0].name
-    whole = [one for one in drawn if first or not _is_slow(context.job, one)]
-    own, settles = part.settings[0], [one for one in part.settings if one not in drawn]
-    return time_scene(context, whole, [own, *settles], unit.scene_id, unit.lap)
-
-
-def _is_slow(job: Job, setting: Setting) -> bool:
-    return job.render.tier != "pathtraced" and apply(job, setting.changes).render.tier == "pathtraced"
-
-
-def measure_in_pool(job: Job, job_folder: Path, processes: int, units: Sequence[Unit]) -> Iterator[tuple[str, Any]]:
-    """Answers by the units' names, as they are ready, from a pool of processes.
-
-    What a unit raises is raised here, and the others are dropped.
-    """
-    if not units:
-        return
-    fresh = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=fresh) as pool:
-        told = job.model_dump_json(), str(job_folder)
-        running = {pool.submit(_measure, *told, unit): unit.name for unit in units}
+    parts = split_of(plan)
+    with (
+        tempfile.TemporaryDirectory(prefix="verso-study-") as scratch,
+        Lanes(plan.job, plan.job_folder, plan.processes, Path(scratch)) as lanes,
+    ):
+        bench = Measurement(plan, parts, journal, lanes, progress, began, float(journal.get(SPENT, 0.0)))
         try:
-            for done in as_completed(running):
-                yield running[done], done.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+            race = Race(plan.targets or DEFAULT_TARGETS, plan.job.first_scene, {})
+            run_pilot(bench, race)
+            bench = run_race(bench, race)
+            rows, proofs = choose_and_prove(bench)
+        finally:
+            bench.keep_clock()
+        return told(bench, race, rows, proofs, renderer, command, left_out)
 
 
-@cache
-def _context(job: str, folder: str) -> WorkerContext:
-    parsed = Job.model_validate_json(job)
-    return open_worker(parsed, open_catalogue(parsed.assets, Path(folder), tuple(parsed.categories)))
+def split_of(plan: Plan) -> Parts:
+    """What is measured of a plan's settings."""
+    captured = plan.job.captures is not None
+    return Parts.split((*plan.settings, *plan.presets), captured, again=bool(AGAIN.keys() & set(plan.targets or ())))
 
 
-def _measure(job: str, folder: str, unit: Unit) -> Any:
-    context = _context(job, folder)
-    if unit.kind == "settling":
-        return measure_settling(context, unit.settings, unit.scene_id, unit.posed, unit.released)
-    measure = measure_scene_images if unit.kind == "images" else measure_colour
-    return measure(context, unit.settings, unit.scene_id)
+def run_pilot(bench: Measurement, race: Race) -> None:
+    """One scene of the job itself, then one of every setting, for costs. Raises RunError."""
+    table = bench.table()
+    wanted = [one for part in bench.parts.measured for one in race.missing(table, part, 1)]
+    own = sorted((one for one in wanted if one.setting == OWN), key=lambda one: one.part in UNTIMED)
+    bench.run(own, PILOT_SHARE)
+    table = bench.table()
+    missing = [part for part in bench.parts.measured if part not in UNTIMED and not table.answers(part, OWN)]
+    if missing:
+        raise RunError(
+            f"one scene of the job took more than {describe_seconds(max(0.0, PILOT_SHARE * bench.plan.budget_s))}, a third of "
+            f"--budget {describe_seconds(bench.plan.budget_s)}: give more, such as --budget 2h"
+        )
+    first = next(iter(bench.parts.measured))
+    if all("failed" in one for one in table.answers(first, OWN).values()):
+        few = [Wanted(first, bench.plan.job.first_scene + n, OWN, 0.0) for n in range(1, 4)]
+        bench.run([one for one in few if one.scene_id not in table.answers(first, OWN)], PILOT_SHARE)
+        failed = bench.table().answers(first, OWN)
+        if all("failed" in one for one in failed.values()):
+            reasons = sorted({str(one.get("broken", one["failed"])) for one in failed.values()})
+            raise RunError(
+                f"none of the job's first {plural(len(failed), 'scene')} can be made ({'; '.join(reasons)}): "
+                "a study needs scenes; `verso run` with --scenes 4 tells more of each"
+            )
+    table = bench.table()
+    bench.run(in_turn([one for part in bench.parts.measured for one in race.missing(table, part, 1)]), PILOT_SHARE)
 
 
-def study_of(plan: Plan, rows: Sequence[Row], renderer: str, command: str, left_out: Sequence[str]) -> Study:
-    """The content of the report."""
-    return Study(
+def in_turn(wanted: Sequence[Wanted]) -> list[Wanted]:
+    """The knobs in turn, the first value of each, then the second, so that a pilot that is cut off knows something of all."""
+    place: dict[tuple[str, str], int] = {}
+    order = []
+    for one in wanted:
+        key = one.part, one.setting.knob
+        place[key] = place.get(key, 0) + 1
+        order.append((one.part == "again", one.setting in REFERENCES, place[key]))
+    return [wanted[k] for k in sorted(range(len(wanted)), key=lambda k: order[k])]
+
+
+def run_race(bench: Measurement, race: Race) -> Measurement:
+    """Rounds of twice as many scenes, until every part is decided or the budget's share is spent."""
+    levels = dict.fromkeys(bench.parts.measured, 2)
+    most = {**MOST, **({} if AGAIN.keys() & set(race.targets) else {"again": RELEASED_SCENES})}
+    combined = False
+    while levels and bench.left_s(RACE_SHARE) > 0.0:
+        table = bench.table()
+        race.judge(table)
+        weights = sum(SHARES[part] for part in levels)
+        allowed_s = bench.left_s(RACE_SHARE) * bench.plan.processes / weights
+        wanted: list[Wanted] = []
+        for part, level in list(levels.items()):
+            some, whole = race.next_round(table, part, level, allowed_s * SHARES[part])
+            wanted += some
+            if not whole or level >= most[part] or (level > LEVEL_OF_CHOICE and race.is_decided(table, part)):
+                del levels[part]
+            else:
+                levels[part] = 2 * level
+        # Scene by scene, so that what the end of the budget cuts off leaves the same scenes of all.
+        bench.run(sorted(wanted, key=lambda one: one.scene_id), RACE_SHARE)
+        if not combined and max(levels.values(), default=LEVEL_OF_CHOICE) >= LEVEL_OF_CHOICE:
+            bench, combined = with_combinations(bench, race), True
+    race.judge(bench.table())
+    return bench
+
+
+def with_combinations(bench: Measurement, race: Race) -> Measurement:
+    """The race with promising combinations of knobs of one part; those across parts are put together from their parts."""
+    table, plan = bench.table(), bench.plan
+    found: list[Setting] = []
+    for part in bench.parts.measured:
+        if part in UNTIMED:
+            continue
+        singles = [one for one in plan.settings if one != OWN and bench.parts.of[one.name].get(part, OWN) != OWN]
+        rows = [row for one in (OWN, *singles) if (row := table.row(one)) is not None]
+        if rows and rows[0].setting == OWN:
+            found += promising(rows, race.targets)
+    known = {one.name for one in plan.settings}
+    plan = replace(plan, settings=(*plan.settings, *(one for one in found if one.name not in known)))
+    return replace(bench, plan=plan, parts=split_of(plan))
+
+
+# ---------------------------------------------------------------------------------------------- the choice and its proof
+
+
+def all_rows(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Row, ...]]:
+    """The measured settings' rows, the job's own first; and those of every setting of rest with every one of drawing."""
+    table = bench.table()
+    settings = (*bench.plan.settings, *bench.plan.presets)
+    rows = tuple(row for one in settings if (row := table.row(one)) is not None)
+    by_part: dict[Part, list[Setting]] = {part: [] for part in bench.parts.measured}
+    for row in rows[1:]:
+        changed = [part for part, one in bench.parts.of[row.setting.name].items() if one != OWN and part not in UNTIMED]
+        if len(changed) == 1 and row.setting.kind != "preset":
+            by_part[changed[0]].append(row.setting)
+    crossed = []
+    for pair in itertools.product(by_part.get("rest", ()), by_part.get("draw", ())):
+        both = joined(pair)
+        parts = {**bench.parts.of[pair[1].name], "rest": bench.parts.of[pair[0].name]["rest"]}
+        if (row := table.row_of(both, parts)) is not None:
+            crossed.append(row)
+    return rows, tuple(crossed)
+
+
+def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Proof, ...]]:
+    """The rows of the table, with every setting that was proved, and the proofs; the last proof is that of the answer."""
+    rows, crossed = all_rows(bench)
+    proofs: list[Proof] = []
+    known = {row.setting.name: row for row in crossed}
+    while True:
+        withdrawn = {one.setting for one in proofs}
+        able = [row for row in (*rows, *crossed) if row.setting.name not in withdrawn]
+        if not any(row.setting == OWN for row in able):
+            able = [own_row(rows), *able]
+        try:
+            chosen = recommend(able, bench.plan.targets)
+        except TargetError:
+            break
+        if (
+            chosen.setting.name in withdrawn
+            or (proof := prove(bench, chosen, targets_of(able, bench.plan.targets))) is None
+        ):
+            break
+        proofs.append(proof)
+        if chosen.setting.name in known and chosen not in rows:
+            rows = (*rows, chosen)
+        if proof.holds or bench.left_s(PROOF_SHARE) <= 0.0:
+            break
+    return rows, tuple(proofs)
+
+
+def prove(bench: Measurement, chosen: Row, targets: Mapping[str, float]) -> Proof | None:
+    """The chosen setting on fresh scenes, all its parts at once; None where there is no time for a few.
+
+    Its answers are kept in the journal, so that the same command proves the same.
+    """
+    parts = sorted({part_of(name) for name in targets}, key=list(bench.parts.measured).index)
+    if not parts:
+        return None
+    digest = hashlib.sha256(repr(sorted(chosen.setting.changes.items())).encode()).hexdigest()[:8]
+    first, most = bench.plan.job.first_scene + FRESH_SCENE, {part: min(PROVED, MOST[part]) for part in parts}
+    most = {part: PROVED if part in ("rest", "draw") else count for part, count in most.items()}
+    units = [
+        Unit(part, first + n, n, (OWN,), chosen.setting)
+        for n in range(PROVED)
+        for part in parts
+        if n < most[part] and f"proof-{digest}/{part}/{first + n}" not in bench.journal
+    ]
+    for unit, answers in bench.lanes.run(units, bench.deadline(PROOF_SHARE)):
+        bench.journal.add(f"proof-{digest}/{unit.part}/{unit.scene_id}", answers[OWN.name])
+        bench.progress.show(round(bench.spent_s))
+    measured: dict[str, Figure] = {}
+    counts = []
+    for part in parts:
+        place = f"proof-{digest}/{part}/"
+        found = {int(name[len(place) :]): one for name, one in bench.journal.items() if name.startswith(place)}
+        measured |= figures_of(found)
+        counts.append(len(found))
+    if min(counts) < LEAST_PROVED:
+        return None
+    asked = {name: most for name, most in targets.items() if name in measured}
+    promised = {name: figure for name in asked if (figure := chosen.errors.get(name)) is not None}
+    return Proof(chosen.setting.name, min(counts), asked, {name: measured[name] for name in asked}, promised)
+
+
+def told(
+    bench: Measurement,
+    race: Race,
+    rows: tuple[Row, ...],
+    proofs: tuple[Proof, ...],
+    renderer: str,
+    command: str,
+    left_out: Sequence[str],
+) -> Study:
+    """The study in words and figures."""
+    plan, table = bench.plan, bench.table()
+    missing = [one.name for one in (*plan.settings, *plan.presets) if table.row(one) is None]
+    notes = [*left_out, *([f"not reached within the budget: {', '.join(missing)}"] if missing else [])]
+    held = bool(proofs) and proofs[-1].holds
+    withdrawn = {one.setting for one in proofs if not one.holds}
+    able = tuple(row for row in rows if row.setting == OWN or row.setting.name not in withdrawn)
+    scenes = max(len(table.answers(part, OWN)) for part in bench.parts.measured)
+    study = Study(
         job=plan.job.name,
         command=command,
         machine=describe_machine(renderer),
-        scenes=plan.sizes.scenes,
-        physics_scenes=plan.sizes.settled,
-        job_scenes=plan.job.scenes,
-        rows=tuple(rows),
+        scenes=scenes,
+        rows=rows,
         slopes={} if plan.job.captures is not None else slopes(),
         preset=plan.job.preset,
-        notes=tuple(left_out),
+        job_scenes=plan.job.scenes,
+        notes=tuple(notes),
+        budget_s=plan.budget_s,
+        seconds=bench.spent_s,
+        doubts=doubts_of(bench, race, table),
+        proofs=proofs,
     )
+    try:
+        chosen = recommend(able, plan.targets).setting.name
+    except TargetError:
+        chosen = ""
+    if chosen in withdrawn or (proofs and not held):
+        chosen = ""
+    words = answer(replace(study, rows=able), plan.targets)
+    if proofs and not held:
+        words = (
+            f"Nothing is recommended: {', '.join(sorted(withdrawn))} did not keep the targets on fresh scenes. A longer "
+            "--budget tells more."
+        )
+    return replace(study, answer=words, chosen=chosen)
 
 
-def header_of(plan: Plan, settings_digest: str, code: str) -> dict[str, Any]:
-    """The journal's first line: what must be the same for measurements to go on."""
-    return {
-        "job": settings_digest,
-        "code": code,
-        "sizes": asdict(plan.sizes),
-        "knobs": [knob.name for knob in plan.knobs],
-        "settings": [setting.name for setting in plan.settings],
-    }
+def doubts_of(bench: Measurement, race: Race, table: Table) -> tuple[str, ...]:
+    """What is not decided with 95 % confidence, and how long that would take."""
+    found = []
+    for part in bench.parts.measured:
+        rivals = race.open_rivals(table, part)
+        if not rivals:
+            continue
+        scenes = {one.name: len(table.answers(part, one)) for one in rivals}
+        need = min(SURE_SCENES, MOST[part])
+        wanted_s = (
+            sum(max(0, need - scenes[one.name]) * race.cost_s(table, part, one) for one in rivals)
+            / bench.plan.processes
+        )
+        names = [f"{one.name} ({plural(scenes[one.name], 'scene')})" for one in rivals]
+        words = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        longer = (
+            f"about {describe_seconds(wanted_s)} more would tell"
+            if wanted_s > 0
+            else "they lie too near to a target to tell"
+        )
+        found.append(f"whether these keep the targets is not sure to 95 %: {words}; {longer}")
+    return tuple(found)

@@ -49,7 +49,7 @@ SMALLER = {
     r"^\./verso test$": "./verso test tests/test_layers.py",
     r"tests/hard_cases": "tests/test_layers.py",
     r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
-    r"(\./verso tradeoff .*)": r"\1 --scenes 6 --physics-scenes 6 --laps 1 --knobs step",
+    r"(\./verso tradeoff .*)": r"\1 --budget 60s --knobs step",
     r"(run deploy/jobs/captures.yaml)": r"\1 --scenes 1 --set captures.simulate.views=8 " + TINY,
     r"--views 40 --category mug": f"--views 10 --category mug {TINY}",
     r"~/my_meshes": "meshes",

@@ -10,7 +10,7 @@ from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settl
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Pair
 from workers.physics.recheck import recheck_scene
-from workers.physics.settle import settle_scene
+from workers.physics.settle import Rest, settle_scene
 from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene, plan_effects
@@ -37,20 +37,48 @@ class Scene:
         return self.effects.runs("raycast_check")
 
 
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """A scene whose objects rest, before anything is drawn: the plan with the starts that led there, the effects, the rest."""
+
+    plan: ScenePlan
+    effects: EffectPlan
+    rest: Rest
+
+
 def make_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> Scene:
     """Plan, settle, render, derive, check. Raises SceneError where this scene cannot be made."""
+    return render_scene(context, lay_scene(context, scene_id, stopwatch), stopwatch)
+
+
+def plan_with_effects(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> tuple[ScenePlan, EffectPlan]:
+    """What chance decides, and the effects that it calls for. Raises SceneError."""
     job, chance = context.job, SceneChance(context.job.seed, scene_id)
     with stopwatch.stage("assets"):
         plan = plan_scene(job, context.catalogue, chance)
     with stopwatch.stage("plan"):
         facts = Facts(job, plan, is_raycast_scene(job.check, chance))
-        effects = plan_effects(facts, context.forced).without(*context.withdrawn)
+        return plan, plan_effects(facts, context.forced).without(*context.withdrawn)
+
+
+def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> Laid:
+    """Plan and settle: all before the renderer. Raises SceneError."""
+    job = context.job
+    plan, effects = plan_with_effects(context, scene_id, stopwatch)
     with stopwatch.stage("physics", "dynamics" if effects.runs("dynamics") else None):
-        rest = settle_scene(plan, job.physics, effects, pouring_of(job.start, chance, plan))
+        pouring = pouring_of(job.start, SceneChance(job.seed, scene_id), plan)
+        rest = settle_scene(plan, job.physics, effects, pouring)
     plan = replace(plan, objects=rest.starts)
     if effects.runs("release_again"):
         with stopwatch.stage("recheck", "release_again"):
             rest = recheck_scene(plan, rest, job.physics, effects)
+    return Laid(plan, effects, rest)
+
+
+def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Scene:
+    """Render, derive, check: all after physics. Raises SceneError."""
+    job, chance = context.job, SceneChance(context.job.seed, laid.plan.scene_id)
+    plan, effects, rest = laid.plan, laid.effects, laid.rest
     posed = pose_scene(plan, rest.settled)
     scene = SettledScene(context, chance, plan, posed, effects, stopwatch)
     with stopwatch.stage("render", "light_maps" if effects.runs("light_maps") else None):

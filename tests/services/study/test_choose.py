@@ -14,7 +14,6 @@ from services.study.choose import (
     TargetError,
     answer,
     choose,
-    close_calls,
     error_of,
     front,
     next_better,
@@ -74,7 +73,9 @@ def test_the_cheapest_that_meets_all_targets_is_chosen():
 
 def test_of_settings_about_as_cheap_facts_without_noise_decide():
     """The job itself first, then the least errors relative to the job's, then the fewest changes and the name."""
-    just, well = (row("step=1", 1 / AS_CHEAP + off, depth_mm=0.01) for off in (1e-6, -1e-6))
+    just, well = (row("step=1", 1 / AS_CHEAP + off, noise=0.0, depth_mm=0.01) for off in (1e-6, -1e-6))
+    unsure = dataclasses.replace(well, ratio_most=1.1)  # its interval holds the job's own time
+    assert choose([OWN, unsure], {"depth_mm": 1.0}) is OWN
     assert choose([OWN, just], {"depth_mm": 1.0}) is OWN and choose([OWN, well], {"depth_mm": 1.0}) is well
     a = row("step=a", 0.50, depth_mm=0.09, penetration_mm=0.03)  # 0.9 + 3 + 1 times the job's
     b = row("step=b", 0.52, depth_mm=0.3)  # 3 + 1 + 1
@@ -100,10 +101,15 @@ def test_the_choice_stays_when_measured_times_come_back_a_little_off():
     assert chosen == {"size=1280, pivot_depth=nearest"}
 
 
-def test_settings_whose_time_decides_are_told():
-    near = [OWN, row("step=1", 0.5, depth_mm=0.3), row("step=2", 0.53, depth_mm=0.05)]
-    assert names(close_calls(near, {"mirror_mm": 1.0})) == ["step=1", "step=2"]
-    assert close_calls([*near[:2], row("step=2", 0.6, depth_mm=0.05)], {"mirror_mm": 1.0}) == []
+def test_the_upper_ends_of_intervals_decide_where_one_meets_the_targets():
+    near, sure = row("step=60", 0.4, depth_mm=0.098), row("step=120", 0.7, depth_mm=0.05)  # to 0.1078 and to 0.055
+    assert choose([OWN, near, sure], {"depth_mm": 0.1}) is sure
+    assert choose([OWN, near], {"depth_mm": 0.1}) is near  # nothing is surely below, this one is
+
+
+def test_another_world_is_never_recommended():
+    rows = [OWN, row("friction=0.3", 0.2), row("if_lost=fail", 0.2), row("step=60", 0.5)]
+    assert choose(rows, {"depth_mm": 0.1}).setting.name == "step=60"
 
 
 # ---------------------------------------------------------------------------------------------- nobody meets them
@@ -167,14 +173,14 @@ def test_default_targets_that_nobody_meets_are_told_with_the_option_that_sets_ot
     ):
         made = study(row(**own))
         with pytest.raises(TargetError) as caught:
-            recommend(made)
+            recommend(made.rows)
         told = str(caught.value)
         assert told.startswith("no setting meets the default targets. The nearest is the job,") and "\n" not in told
         assert f"it misses {missed}" in told and f"Set others with --target {option}" in told
-        assert recommend(made, parse_targets(told.rpartition("--target ")[2])) is made.rows[0]
+        assert recommend(made.rows, parse_targets(told.rpartition("--target ")[2])) is made.rows[0]
     worse = study(row(depth_mm=0.5, flip=0.1), row("tier=flat", 0.5, depth_mm=0.05, flip=0.9))
     with pytest.raises(TargetError, match=r"tier=flat.* it misses none of them, and is worse than the job"):
-        recommend(worse)
+        recommend(worse.rows)
 
 
 # ---------------------------------------------------------------------------------------------- what a user types
@@ -238,11 +244,11 @@ def test_the_sentence_names_the_setting_its_cost_and_the_next_better():
 
 def test_whoever_asks_for_nothing_keeps_the_images_that_they_have():
     flat, small = row("tier=flat", 0.5, flip=0.3), row("size=small", 0.4, flip=0.11)  # the job's interval ends at 0.11
-    assert recommend(study(COLOURED, flat, small)) is small
-    assert recommend(study(COLOURED, flat)) is COLOURED
+    assert recommend([COLOURED, flat, small]) is small
+    assert recommend([COLOURED, flat]) is COLOURED
     blind = study(row(penetration_mm=0.01), row("tier=flat", 0.5), row("step=1, tier=flat", 0.4, penetration_mm=0.01))
-    assert recommend(blind).setting.name == "the job"  # nothing is known of what a tier costs
-    assert recommend(blind, {"penetration_mm": 0.1}).setting.name == "step=1, tier=flat"
+    assert recommend(blind.rows).setting.name == "the job"  # nothing is known of what a tier costs
+    assert recommend(blind.rows, {"penetration_mm": 0.1}).setting.name == "step=1, tier=flat"
 
 
 def test_better_is_better_by_more_than_both_intervals_and_worse_in_nothing():

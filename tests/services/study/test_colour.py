@@ -132,7 +132,8 @@ def test_four_samples_are_nearer_to_smooth_edges_than_one_and_flat_light_has_no_
     context = context_of(validate_job({"name": "t", "seed": 2024, "check": {"raycast_share": 0.0}}, "a test"))
     settings, _ = settings_of(context.job, [knob for knob in knobs_of(context.job) if knob.name == "colour"])
     for scene_id in (0, 2):
-        found = measure_colour(context, [one for one in settings if "path" not in one.name], scene_id)
+        answers = measure_colour(context, [one for one in settings if "path" not in one.name], scene_id, 0)
+        found = {name: one["errors"] for name, one in answers.items()}
         assert found["colour=raster-4"]["edge_flip"] < 0.8 * found["the job"]["edge_flip"] < 0.1
         assert found["colour=flat"] == {}
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from services.study.choose import answer
 from services.study.model import ERRORS, Setting, Study
 from services.study.page import page_of, wide_schema, write_page, write_tables
 from tests.kit.html import Reader
@@ -56,20 +55,26 @@ def test_the_page_answers_first_and_needs_no_network_no_script_and_no_file(tmp_p
     write_page(stored(), [picture, picture], tmp_path / "new" / "index.html")
     page = (tmp_path / "new" / "index.html").read_text(encoding="utf-8")
     reader = Reader(page)
-    assert reader.texts["p"][0] == answer(stored())
+    assert reader.texts["p"][0] == stored().answer
     assert reader.texts["h1"] == ["What accuracy costs in time: tabletop"]
     assert len(reader.links) == 2 and all(link.startswith("data:image/png;base64,") for link in reader.links)
     assert "script" not in reader.texts and "link" not in reader.texts
     assert base64.b64decode(reader.links[0].partition(",")[2]) == picture.read_bytes()
     assert not re.search(r"https?:|url\(|@import", page)
-    assert Reader(page_of(stored(), [], {"between_mm": 1.0})).texts["p"][0] == answer(stored(), {"between_mm": 1.0})
+    assert Reader(page_of(study(row()), [])).texts["p"][:2] == [
+        "Use step=60.",
+        "Not decided: whether step=30 (4 scenes).",
+    ]
 
 
 def test_what_comes_from_outside_is_escaped():
     evil = '<script>alert("x")</script>&'
     rows = [row(depth_mm=0.1), row(f"{evil}={evil}", 0.5, depth_mm=0.2), row(f"a=1, {evil}={evil}", 0.4, depth_mm=0.3)]
     noted = tuple(dataclasses.replace(one, notes=(evil,)) for one in rows)
-    page = page_of(Study(evil, evil, {evil: {evil: [evil]}}, 1, 2, noted, {evil: 1.0}, evil, 64, (evil,)), [])
+    made = Study(
+        evil, evil, {evil: {evil: [evil]}}, 1, noted, {evil: 1.0}, evil, 64, (evil,), answer=evil, doubts=(evil,)
+    )
+    page = page_of(made, [])
     assert "<script" not in page and evil in " ".join(Reader(page).texts["li"])
 
 

@@ -1,10 +1,10 @@
 """What is measured: knobs, presets, rounds of settings, promising combinations, and the journal of what is done."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
+from typing import get_args
 
 import pytest
+from pydantic import BaseModel
 
 from schemas.errors import InputError, OutputError
 from schemas.job.captures import ESTIMATES
@@ -12,27 +12,14 @@ from schemas.job.identity import settings_digest
 from schemas.job.job import PRESETS, Job
 from services.study import knobs as study_knobs
 from services.study.choose import error_of, own_row
-from services.study.knobs import apply, choose_knobs, groups_of, joined, knobs_of, settings_of
-from services.study.measure import REFERENCES, measure_settling
-from services.study.model import ERRORS, Plan, Row, Setting, Sizes
-from services.study.study import (
-    JOURNAL_FILE,
-    NEGLIGIBLE,
-    Journal,
-    Round,
-    Unit,
-    header_of,
-    measure_in_pool,
-    promising,
-    with_time_of,
-)
+from services.study.knobs import FREE, REFERENCES, apply, choose_knobs, joined, knobs_of, settings_of
+from services.study.lanes import JOURNAL_FILE, Journal
+from services.study.model import ERRORS, Row, Setting
+from services.study.study import NEGLIGIBLE, promising
 from tests.services.study.made_up import row, stored
-from workers.assets.catalogue import open_catalogue
-from workers.scene.context import open_worker
 
 JOB = Job(name="t", seed=2024, first_scene=100)
 CAPTURES = Job.model_validate({"name": "t", "scenes": 2, "captures": {"simulate": {"views": 12}}})
-SIZES = Sizes(scenes=3, settled=5, released=1, posed=2, timed=2, laps=2, coloured=1)
 
 
 def labels(job: Job, name: str) -> list[str]:
@@ -68,10 +55,11 @@ def test_a_knob_has_the_values_that_mean_something_for_the_job(tmp_path):
 
 def test_the_reference_is_finer_than_anything_that_a_knob_can_be():
     values = [value.changes for knob in knobs_of(JOB) if knob.group == "physics" for value in knob.values]
-    for reference in REFERENCES:
-        assert all(v.get("physics.step_hz", 0) < reference["step_hz"] for v in values)
-        assert all(v.get("physics.max_step_travel_mm", 1.0) >= reference["max_step_travel_mm"] for v in values)
-        assert all(v.get("physics.solver_iterations", 0) < reference["solver_iterations"] for v in values)
+    for finer in (reference.changes for reference in REFERENCES):
+        assert all(v.get("physics.step_hz", 0) < finer["physics.step_hz"] for v in values)
+        travel = "physics.max_step_travel_mm"
+        assert all(v.get(travel, 1.0) >= finer[travel] for v in values)
+        assert all(v.get("physics.solver_iterations", 0) < finer["physics.solver_iterations"] for v in values)
 
 
 def test_what_cannot_be_turned_is_told(monkeypatch):
@@ -92,10 +80,33 @@ def test_settings_are_named_by_their_parts_and_have_all_their_keys():
     assert both.name == "a=1, b=2" and dict(both.changes) == {"x.y": 1, "x.z": 2}
     kinds = [Setting(parts).kind for parts in ((), (("preset", "fast"),), (("step", "240"),), both.parts)]
     assert kinds == ["own", "preset", "single", "several"]
-    known = {knob.name: knob for knob in knobs_of(JOB)}
-    assert groups_of(Setting((("step", "60"), ("colour", "flat"))), known) == {"physics", "colour"}
-    everything = {"physics", "labels", "mirror", "colour", "capture"}
-    assert groups_of(Setting(), known) == groups_of(Setting((("preset", "fast"),)), known) == everything
+
+
+def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """The dotted keys of a job."""
+    for name, field in model.model_fields.items():
+        inner = [one for one in (field.annotation, *get_args(field.annotation)) if isinstance(one, type)]
+        branch = next((one for one in inner if issubclass(one, BaseModel)), None)
+        if branch is None or prefix.startswith("sensor."):
+            yield f"{prefix}{name}"
+        else:
+            yield from leaves(branch, f"{prefix}{name}.")
+
+
+def test_every_key_of_a_job_is_turned_by_a_knob_or_listed_as_free():
+    turned = {
+        key for job in (JOB, CAPTURES) for knob in knobs_of(job) for value in knob.values for key in value.changes
+    }
+    free = " ".join(FREE).split()
+    keys = set(leaves(Job))
+    assert len(keys) > 90
+
+    def is_known(key: str, places: Iterable[str]) -> bool:
+        return any(key == place or key.startswith(f"{place}.") for place in places)
+
+    assert [key for key in sorted(keys) if not is_known(key, (*turned, *free))] == []
+    assert [key for key in free if key in turned or not any(is_known(one, [key]) for one in keys)] == []
+    assert [key for key in turned if not any(is_known(one, [key]) for one in keys)] == []
 
 
 # ---------------------------------------------------------------------------------------------- presets
@@ -148,43 +159,7 @@ def test_a_preset_makes_the_same_dataset_as_its_keys_and_all_choose_the_same_key
     assert digest(Job(name="t", preset="exact")) != digest(Job(name="t")) == digest(Job(name="t", preset="balanced"))
 
 
-# ---------------------------------------------------------------------------------------------- rounds
-
-
-def round_of(*names: str, times_only: bool = False) -> Round:
-    chosen = choose_knobs(knobs_of(JOB), names)
-    settings, _ = settings_of(JOB, chosen)
-    return Round(Plan(JOB, Path(), chosen, settings, (), None, SIZES), "alone", settings, times_only)
-
-
-def test_times_are_taken_lap_by_lap_and_a_scene_is_measured_only_of_the_parts_that_a_setting_changes():
-    part = round_of("step", "units")
-    assert [unit.name for unit in part.timings()] == [f"alone/time/{lap}/{n}" for lap in (0, 1) for n in (100, 101)]
-    assert all(unit.settings == part.settings for unit in part.timings())
-    kinds = [(unit.kind, unit.scene_id) for unit in part.errors()]
-    assert kinds == [*(("images", n) for n in range(100, 103)), *(("settling", n) for n in range(100, 105))]
-    for unit in part.errors():
-        assert unit.settings[0].name == "the job" and len(unit.settings) > 1
-        assert {setting.knob for setting in unit.settings[1:]} == {{"images": "units", "settling": "step"}[unit.kind]}
-    settling = [unit for unit in part.errors() if unit.kind == "settling"]
-    assert [unit.posed for unit in settling] == [True, True, False, False, False]
-    assert [unit.released for unit in settling] == [True, False, False, False, False]
-    assert round_of("step", times_only=True).errors() == []
-
-
-@pytest.mark.minute
-def test_a_pool_gives_the_answers_of_one_process_by_the_units_names():
-    unit = Unit("alone/settling/0", "settling", (Setting(),), 0)
-    context = open_worker(JOB, open_catalogue(JOB.assets, Path(), tuple(JOB.categories)))
-    expected = measure_settling(context, unit.settings, 0, posed=False, released=False)
-    assert dict(measure_in_pool(JOB, Path(), 1, [unit])) == {unit.name: expected}
-
-
-def test_a_longer_measurement_gives_the_time_and_nothing_else():
-    found = with_time_of(row("step=1", 2.0, depth_mm=0.1), row("step=1", 1.5), 100.0)
-    assert (found.ms, found.ratio, found.ratio_least) == (150.0, 1.5, 1.5 * 0.98)
-    assert found.errors["depth_mm"].value == 0.1
-
+# ---------------------------------------------------------------------------------------------- combinations
 
 OWN = row(depth_mm=0.1, mask_share=0.01)
 
@@ -247,8 +222,3 @@ def test_a_journal_of_another_study_and_a_folder_that_cannot_be_written_are_refu
     assert (tmp_path / JOURNAL_FILE).read_bytes() == before
     with pytest.raises(OutputError, match="choose another --out"):
         Journal(tmp_path / JOURNAL_FILE / "study", HEADER)
-    plan = Plan(JOB, Path(), (), (Setting(),), (), None, SIZES)
-    header = header_of(plan, "digest", "code")
-    assert header == header_of(replace(plan, targets={"depth_mm": 0.1}), "digest", "code")
-    assert header != header_of(replace(plan, sizes=Sizes(scenes=5)), "digest", "code")
-    assert header != header_of(plan, "digest", "other") and header != header_of(plan, "other", "code")

@@ -1,0 +1,92 @@
+"""Measures a simulated capture with settings: the time of its processing, and the errors that its truth tells."""
+
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from schemas.capture import CaptureScore
+from schemas.errors import InputError
+from schemas.job.job import Job
+from services.study.measure import Answer, Meter, answer_for, context_for
+from services.study.model import Setting
+from workers.capture.folder import CaptureFolder, open_folder
+from workers.capture.make_capture import process_capture, require_captures, simulate_one
+from workers.capture.reconstruct import ProcessorClock
+from workers.geometry.camera import spread_evenly
+from workers.scene.context import WorkerContext
+
+POINT_BYTES, VERTEX_BYTES, FACE_BYTES = 3 * 4 + 3 * 4 + 3, 3 * 4 + 3, 3 * 4
+"""As a cloud and a mesh are written: float32 coordinates and normals, 8-bit colours, 32-bit indices."""
+
+ERRORS_OF_SCORE = {
+    "camera_mm": "pose_mm",
+    "camera_deg": "pose_deg",
+    "cloud_mm": "cloud_median_mm",
+    "cloud_p95_mm": "cloud_p95_mm",
+    "view_depth_mm": "depth_median_mm",
+}
+"""Names of the study's errors, and of the score's figures."""
+
+_warm: list[bool] = []
+
+
+def measure_capture(
+    context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int, scratch: Path
+) -> dict[str, Answer]:
+    """Time, bytes and errors by setting of a simulated capture, which is kept in `scratch` for all settings.
+
+    Time is that of detection, estimates, cloud and mesh. A process works untimed first: that compiles its loops.
+    """
+    if not _warm:
+        _warm.append(True)
+        answer_for(partial(_process, context, scene_id, scratch, Setting()))
+    order = np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))
+    return {settings[k].name: answer_for(partial(_process, context, scene_id, scratch, settings[k])) for k in order}
+
+
+def _simulated(context: WorkerContext, worker: WorkerContext, scene_id: int, scratch: Path) -> CaptureFolder:
+    """The capture with the job's own number of views, and the setting's scale of images; made once."""
+    scale = require_captures(worker.job).simulate.image_scale
+    place = scratch / f"capture-{scene_id}-{scale:g}"
+    if not place.exists():
+        made = scratch / f"{place.name}-{os.getpid()}"
+        scaled = Setting((), {"captures.simulate.image_scale": scale})
+        simulate_one(context_for(context, scaled), scene_id, made)
+        with suppress(OSError):  # another process was faster, with the same bytes
+            made.rename(place)
+    return open_folder(place)
+
+
+def _process(context: WorkerContext, scene_id: int, scratch: Path, setting: Setting, meter: Meter) -> Answer:
+    worker, watch = context_for(context, setting), ProcessorClock()
+    captures, whole = require_captures(worker.job), _simulated(context, worker, scene_id, scratch)
+    done = process_capture(fewer_views(whole, captures.simulate.views), captures, watch)
+    meter.s = sum(s for stage, s in watch.seconds.items() if stage != "score")
+    points, vertices, faces = map(len, (done.surface.points, done.surface.vertices, done.surface.faces))
+    size = points * POINT_BYTES + vertices * VERTEX_BYTES + faces * FACE_BYTES
+    return {"errors": errors_of(done.score or CaptureScore()), "bytes": size}
+
+
+def fewer_views(folder: CaptureFolder, views: int) -> CaptureFolder:
+    """The same capture with some of its views only, evenly over the path."""
+    return replace(folder, numbers=tuple(folder.numbers[place] for place in spread_evenly(len(folder.numbers), views)))
+
+
+def errors_of(score: CaptureScore) -> dict[str, float]:
+    """The study's errors from a score; what was not measured is left out."""
+    found = {name: getattr(score, figure) for name, figure in ERRORS_OF_SCORE.items()}
+    found["missing_share"] = None if score.completeness is None else 1.0 - score.completeness
+    return {name: float(value) for name, value in found.items() if value is not None}
+
+
+def check_captures(job: Job) -> None:
+    """Raises InputError where a job's captures cannot be studied."""
+    if job.captures is None or job.captures.source != "simulate":
+        raise InputError(
+            "captures.source is folders: a study needs truth, which simulated captures alone have; use captures.source: simulate"
+        )

@@ -1,0 +1,170 @@
+"""Which settings are measured in which scenes next, within what is left of the budget. Pure.
+
+Successive halving (Jamieson and Talwalkar 2016) with paired scenes: in each round every setting that may still be the answer
+is measured in twice as many scenes, the same ones for all. A setting is out of the race once it surely misses a target, or
+surely takes longer than one that surely meets all (`Table.verdict`, 95 %). Parts of a scene race apart, each with a share of
+what is left of the budget.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from statistics import median
+
+from services.study.choose import AS_CHEAP
+from services.study.knobs import REFERENCES
+from services.study.model import Setting
+from services.study.table import OWN, Part, Table
+
+MOST: Mapping[Part, int] = {"rest": 512, "again": 64, "draw": 64, "colour": 8, "capture": 32}
+"""The most scenes of each part."""
+
+LEAST = 8
+"""Nothing is out of the race before it was measured in so many scenes."""
+
+REFERENCE_TIMES = 8.0
+"""A guess at how many times the job's own time a reference takes, before one was measured."""
+
+REFERENCE_SHARE = 0.3
+"""References may take this share of a round; where they would take more they wait, and errors against them have fewer scenes."""
+
+SHARES: Mapping[Part, float] = {"rest": 3.0, "again": 1.0, "draw": 2.0, "colour": 1.0, "capture": 1.0}
+"""How what is left of the budget is shared among the parts that are not decided."""
+
+MOST_PROMISING = 4
+"""Where a round does not fit, so many settings are measured in as many scenes as fit."""
+
+DEAR = 4.0
+"""Settings that take this many times the usual one's seconds wait for the others."""
+
+KEPT = frozenset({OWN.name, *(one.name for one in REFERENCES)})
+"""What no rule puts out of the race."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """One scene that is to be measured with a setting, and a guess at its seconds."""
+
+    part: Part
+    scene_id: int
+    setting: Setting
+    cost_s: float
+
+
+@dataclass
+class Race:
+    """The state of the race: which settings are out, and why."""
+
+    targets: Mapping[str, float]
+    first_scene: int
+    out: dict[tuple[Part, str], str]
+
+    def alive(self, table: Table, part: Part) -> list[Setting]:
+        """The settings of a part that are still in the race."""
+        return [one for one in table.parts.measured[part] if (part, one.name) not in self.out]
+
+    def judge(self, table: Table) -> None:
+        """Puts out what surely misses, and what surely costs more than a setting that surely meets."""
+        for part, settings in table.parts.measured.items():
+            verdicts = {one.name: table.verdict(part, one, self.targets) for one in settings}
+            sure = [
+                one for one in settings if verdicts[one.name] == "meets" and self._scenes(table, part, one) >= LEAST
+            ]
+            costs = {one.name: table.ratio(_timed(part), one) for one in settings}
+            cheapest = min((cost.high for one in sure if (cost := costs[one.name])), default=float("inf"))
+            for one in settings:
+                cost = costs[one.name]
+                if one.name in KEPT or self._scenes(table, part, one) < min(LEAST, MOST[part]):
+                    continue
+                if verdicts[one.name] == "misses":
+                    self.out.setdefault((part, one.name), "misses a target")
+                elif cost and cost.low > cheapest * AS_CHEAP:
+                    self.out.setdefault((part, one.name), "costs more than one that meets the targets")
+
+    def open_rivals(self, table: Table, part: Part) -> list[Setting]:
+        """Settings that may turn out cheaper than the cheapest that surely meets the targets, or than the job."""
+        alive = self.alive(table, part)
+        ratios = {one.name: table.ratio(_timed(part), one) for one in alive}
+        sure = [one for one in alive if table.verdict(part, one, self.targets) == "meets" and ratios[one.name]]
+        best = min((ratios[one.name].value for one in sure), default=float("inf"))  # type: ignore[union-attr]
+        return [
+            one
+            for one in alive
+            if one not in REFERENCES
+            and table.verdict(part, one, self.targets) == "open"
+            and (ratios[one.name] is None or ratios[one.name].low * AS_CHEAP < best)  # type: ignore[union-attr]
+        ]
+
+    def is_decided(self, table: Table, part: Part) -> bool:
+        """Whether more scenes of this part would not change the choice."""
+        return not self.open_rivals(table, part) or all(
+            self._scenes(table, part, one) >= MOST[part] for one in self.open_rivals(table, part)
+        )
+
+    def next_round(self, table: Table, part: Part, level: int, allowed_s: float) -> tuple[list[Wanted], bool]:
+        """What is missing of a part up to `level` scenes of every setting in the race, and whether all of it fits.
+
+        Where it would take more than the seconds allowed, the settings that promise least wait, and then the last scenes.
+        """
+        wanted = self.missing(table, part, level)
+        if sum(one.cost_s for one in wanted) <= allowed_s:
+            return wanted, True
+        by_setting: dict[str, list[Wanted]] = {}
+        for one in wanted:
+            by_setting.setdefault(one.setting.name, []).append(one)
+        order = [one.name for one in self._by_promise(table, part) if one.name in by_setting]
+        least = order[:MOST_PROMISING]
+        needed_s = sum(one.cost_s for name in least for one in by_setting[name])
+        share = min(1.0, allowed_s / needed_s) if needed_s else 1.0
+        chosen, left_s = list[Wanted](), allowed_s
+        for name in order:
+            scenes = int(len(by_setting[name]) * share)
+            cost_s = scenes * by_setting[name][0].cost_s
+            if cost_s <= left_s:
+                chosen += by_setting[name][:scenes]
+                left_s -= cost_s
+        return chosen, False
+
+    def missing(self, table: Table, part: Part, level: int) -> list[Wanted]:
+        """What has no answer up to `level` scenes of a part's settings; references only as far as they take their share."""
+        settings = self.alive(table, part)
+        scenes = range(self.first_scene, self.first_scene + min(level, MOST[part]))
+        costs = {one.name: self.cost_s(table, part, one) for one in settings}
+        total = sum(costs[one.name] for one in settings if one not in REFERENCES)
+        wanted = []
+        for one in settings:
+            if one in REFERENCES and level > 1 and costs[one.name] > REFERENCE_SHARE * total:
+                continue
+            done = table.answers(part, one)
+            wanted += [Wanted(part, scene, one, costs[one.name]) for scene in scenes if scene not in done]
+        return wanted
+
+    def _by_promise(self, table: Table, part: Part) -> list[Setting]:
+        """The job itself, then those that meet the targets so far, the cheapest first; dear ones and references last."""
+        alive = self.alive(table, part)
+        costs = {one.name: self.cost_s(table, part, one) for one in alive}
+        usual = median(costs.values())
+
+        def key(one: Setting) -> tuple[bool, bool, bool, float]:
+            figures, ratio = table.figures(part, one), table.ratio(_timed(part), one)
+            missed = any(name in figures and figures[name].value > most for name, most in self.targets.items())
+            dear = costs[one.name] > DEAR * usual or one in REFERENCES
+            return one != OWN, dear, missed, ratio.value if ratio else 1.0
+
+        return sorted(alive, key=key)
+
+    def cost_s(self, table: Table, part: Part, setting: Setting) -> float:
+        """Seconds by the clock of one scene: the mean so far, or the job's own."""
+        took = [one["took"] for one in table.answers(part, setting).values()]
+        if took:
+            return sum(took) / len(took)
+        own = [one["took"] for one in table.answers(part, OWN).values()]
+        return (REFERENCE_TIMES if setting in REFERENCES else 1.0) * (sum(own) / len(own) if own else 1.0)
+
+    @staticmethod
+    def _scenes(table: Table, part: Part, setting: Setting) -> int:
+        return len(table.answers(part, setting))
+
+
+def _timed(part: Part) -> Part:
+    """The part that has the time of a part's settings."""
+    return {"colour": "draw", "again": "rest"}.get(part, part)

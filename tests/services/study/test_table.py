@@ -1,0 +1,199 @@
+"""From answers of single scenes to figures, verdicts and rows whose values are known; and which scenes a race asks for next."""
+
+import math
+
+import numpy as np
+import pytest
+
+from services.study.knobs import REFERENCES
+from services.study.model import Setting
+from services.study.race import LEAST, MOST, Race
+from services.study.study import grouped, in_turn
+from services.study.table import OWN, Parts, Table, apart, figure_over_scenes, figures_of, share, unit_name, verdict
+
+STEP = Setting((("step", "60"),), {"physics.step_hz": 60})
+FLAT = Setting((("colour", "flat"),), {"render.tier": "flat"})
+FAST = Setting((("preset", "fast"),), {"physics.step_hz": 60, "render.tier": "flat"})
+UNITS = Setting((("units", "1000"),), {"images.depth_units_per_m": 1000})
+PARTS = Parts.split((OWN, STEP, FLAT, UNITS, FAST), captured=False)
+
+# ---------------------------------------------------------------------------------------------- over scenes
+
+
+def test_an_error_is_the_95th_percentile_of_the_scenes_and_lies_in_its_interval():
+    figure = figure_over_scenes([float(k) for k in range(101)])
+    assert (figure.value, figure.median, figure.scenes) == (95.0, 50.0, 101)
+    assert 85.0 < figure.low < 95.0 < figure.high <= 100.0
+
+
+def test_the_distance_of_two_distributions_is_their_shift():
+    """Of samples that are shifted the first Wasserstein distance is the shift, and their order does not matter."""
+    rng = np.random.default_rng(1)
+    sample = rng.normal(size=300)
+    found = apart(sample + 0.7, sample)
+    assert found.value == pytest.approx(0.7, abs=1e-12)
+    assert found.low <= 0.7 + 1e-12 and found.high >= 0.7 - 1e-12
+    assert apart(sample, rng.permutation(sample)).value == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_interval_of_a_share_covers_the_truth_about_as_often_as_it_says():
+    rng = np.random.default_rng(2)
+    figures = [share(list(rng.random(200) < 0.3)) for _ in range(100)]
+    assert 88 <= sum(figure.low <= 0.3 <= figure.high for figure in figures) <= 100
+
+
+@pytest.mark.parametrize(
+    ("above", "count", "expected"),
+    [
+        (0, 58, "open"),
+        (0, 59, "meets"),
+        (1, 59, "open"),
+        (1, 93, "meets"),
+        (2, 4, "misses"),
+        (1, 4, "open"),
+        (30, 200, "misses"),
+    ],
+)
+def test_a_percentile_is_sure_by_the_count_of_scenes_above_the_target(above, count, expected):
+    """0.95^59 < 0.05 <= 0.95^58; with one above, 93 scenes (Clopper and Pearson)."""
+    values = [2.0] * above + [0.0] * (count - above)
+    assert verdict(values, figure_over_scenes(values), 1.0) == expected
+
+
+def test_verdicts_are_wrong_no_more_often_than_they_say():
+    """Of scenes of which 6 % are above the target, its 95th percentile misses; of 4 %, it meets."""
+    rng = np.random.default_rng(3)
+    for true_share, wrong in ((0.06, "meets"), (0.04, "misses")):
+        found = [verdict(list(rng.random(100) < true_share), None, 0.5) for _ in range(400)]
+        assert found.count(wrong) <= 0.05 * 400 + 3 * math.sqrt(400 * 0.05 * 0.95)
+
+
+def rest(s: float, slid: float = 1.0, corner: float = 0.0, **more: object) -> dict:
+    errors = {"penetration_mm": 0.1, "slid_mm": slid, "rolled_deg": 1.0}
+    return {
+        "s": s,
+        "took": s,
+        "errors": errors,
+        "corners": [[[corner, 0, 0]]],
+        "lost": 0,
+        "planned": 2,
+        "redrawn": 1,
+        **more,
+    }
+
+
+def lost(s: float, reason: str = "left_table") -> dict:
+    return {"s": s, "took": s, "failed": reason, "lost": 2, "planned": 2, "redrawn": 0}
+
+
+def test_rest_is_held_against_the_references_of_the_same_scenes():
+    fine, finest = (
+        {0: rest(1, 1.0), 1: rest(1, 2.0), 3: rest(1, 5.0)},
+        {0: rest(1, corner=0.01), 1: rest(1, corner=9.0)},
+    )
+    own = {0: rest(1, 3.0, corner=2.0), 1: rest(1, 4.0), 2: rest(1, 100.0), 3: lost(1)}
+    found = figures_of(own, [fine, finest])
+    assert found["outcome_mm"].value == pytest.approx(2.0) and found["outcome_mm"].scenes == 2
+    assert found["outcome_deg"].value == 0.0
+    assert (found["pose_mm"].value, found["pose_mm"].scenes) == (2.0, 1)  # of the scene in which the references agree
+    assert found["failed_share"].value == 0.25 and found["lost_share"].value == 0.25
+    assert found["redrawn_share"].value == 3 / 8 and "moved_mm" not in found
+    assert figures_of({}, [fine]) == {}
+
+
+def journal(scenes: int = 4, step_s: float = 0.5, flat_s: float = 0.5) -> dict[str, dict]:
+    """The job takes 1 s to rest, 1 s to draw and 2 s for its plan."""
+    found = {}
+    for n in range(scenes):
+        found[unit_name("rest", n, OWN)] = rest(1.0, plan_s=2.0)
+        found[unit_name("rest", n, STEP)] = rest(step_s)
+        for one, s, size in ((OWN, 1.0, 1000), (FLAT, flat_s, 400), (UNITS, 1.0, 900)):
+            drawn = {"depth_mm": 0.5 if one == UNITS else 0.1}
+            found[unit_name("draw", n, one)] = {"s": s, "took": s, "bytes": size, "errors": drawn}
+        found[unit_name("colour", n, FLAT)] = {"s": None, "took": 1.0, "errors": {"flip": 0.5}}
+        found[unit_name("colour", n, OWN)] = {"s": None, "took": 1.0, "errors": {"flip": 0.1}}
+    return found
+
+
+def test_times_of_parts_add_up_and_a_preset_is_put_together_of_parts_that_were_measured_once():
+    table = Table(PARTS, journal())
+    own, step, flat, fast = (table.row(one) for one in (OWN, STEP, FLAT, FAST))
+    assert (own.ms, own.ratio, own.kilobytes) == (4000.0, 1.0, 1.0)
+    assert set(own.errors) >= {"penetration_mm", "depth_mm", "flip", "failed_share"}
+    assert (step.ratio, step.ms, step.kilobytes) == (pytest.approx(3.5 / 4), pytest.approx(3500.0), 1.0)
+    assert "depth_mm" not in step.errors and "penetration_mm" not in flat.errors
+    assert (flat.ratio, flat.kilobytes, flat.errors["flip"].value) == (pytest.approx(3.5 / 4), 0.4, 0.5)
+    assert fast.ratio == pytest.approx(3.0 / 4) and {"penetration_mm", "depth_mm", "flip"} <= set(fast.errors)
+    assert PARTS.of[FAST.name]["rest"] == STEP and len(PARTS.measured["rest"]) == 2 + len(REFERENCES)
+
+
+def test_a_scene_that_fails_counts_and_a_setting_without_a_time_has_no_row():
+    some = journal() | {
+        unit_name("rest", 1, STEP): lost(0.1),
+        unit_name("rest", 2, STEP): {**lost(0.1, "broken"), "broken": "flat"},
+    }
+    row = Table(PARTS, some).row(STEP)
+    assert row.failed_share == 0.5 and row.notes == ("flat: 1 scene", "left_table: 1 scene")
+    assert row.errors["lost_share"].value == 0.5
+    del some[unit_name("draw", 0, FLAT)]
+    assert Table(PARTS, some).row(FLAT).ratio == pytest.approx(3.5 / 4)
+    assert Table(PARTS, {k: v for k, v in some.items() if not k.endswith(FLAT.name)}).row(FLAT) is None
+    slept = {**rest(0.0), "s": None}
+    assert Table(PARTS, some | {unit_name("rest", n, STEP): slept for n in range(4)}).row(STEP) is None
+
+
+# ---------------------------------------------------------------------------------------------- the race
+
+
+def racing(**targets: float) -> Race:
+    return Race(targets, 0, {})
+
+
+def asked(race: Race, table: Table, part: str, level: int, allowed_s: float) -> set[tuple[str, int]]:
+    return {(one.setting.name, one.scene_id) for one in race.next_round(table, part, level, allowed_s)[0]}
+
+
+def test_every_round_asks_for_the_same_scenes_of_all_that_are_in_the_race():
+    race, table = racing(depth_mm=0.2), Table(PARTS, journal(2))
+    assert asked(race, table, "draw", 4, 1e9) == {(one.name, n) for one in (OWN, FLAT, UNITS) for n in (2, 3)}
+    assert asked(race, table, "draw", 2, 1e9) == set()
+    assert asked(race, table, "draw", 2000, 1e9) == {
+        (one.name, n) for one in (OWN, FLAT, UNITS) for n in range(2, MOST["draw"])
+    }
+
+
+def test_what_surely_misses_or_surely_costs_more_is_out_and_nothing_before_it_was_measured_enough():
+    race = racing(depth_mm=0.2)
+    race.judge(Table(PARTS, journal(LEAST - 1)))
+    assert race.out == {}
+    race.judge(Table(PARTS, journal(LEAST)))
+    assert race.out == {("draw", UNITS.name): "misses a target"}
+    slow = racing(depth_mm=0.2)
+    table = Table(PARTS, journal(64, flat_s=3.0))
+    slow.judge(table)
+    assert slow.out["draw", FLAT.name].startswith("costs more") and slow.is_decided(table, "draw")
+    assert ("draw", OWN.name) not in slow.out
+    unsure = Table(PARTS, journal(16))
+    assert not racing(depth_mm=0.2).is_decided(unsure, "draw") and OWN in racing(depth_mm=0.2).open_rivals(
+        unsure, "draw"
+    )
+
+
+def test_a_round_that_does_not_fit_keeps_the_promising_and_never_takes_more_than_allowed():
+    race, table = racing(depth_mm=0.2), Table(PARTS, journal(2, flat_s=0.5))
+    for allowed_s in (0.0, 1.0, 3.0, 10.0, 100.0):
+        wanted, whole = race.next_round(table, "draw", 64, allowed_s)
+        assert sum(one.cost_s for one in wanted) <= allowed_s and whole == (allowed_s == 1e9)
+    names = [one.setting.name for one in race.next_round(table, "draw", 64, 30.0)[0]]
+    assert names.count(OWN.name) == names.count(FLAT.name) > 5
+
+
+def test_units_are_of_one_scene_and_no_longer_than_asked_and_a_pilot_takes_the_knobs_in_turn():
+    wanted = racing().missing(Table(PARTS, journal(1)), "draw", 3)
+    units = grouped(wanted, 1.9)  # 1 + 0.5 + 1 s in each of two scenes
+    assert [(scene, len(settings)) for _, scene, settings in units] == [(1, 2), (1, 1), (2, 2), (2, 1)]
+    assert grouped(wanted, 1e9) == [("draw", n, (OWN, FLAT, UNITS)) for n in (1, 2)]
+    values = [Setting(((knob, str(n)),), {f"physics.{knob}": n}) for knob in ("a", "b") for n in (1, 2)]
+    pilot = racing().missing(Table(Parts.split((OWN, *values), captured=False), {}), "rest", 1)
+    names = [one.setting.name for one in in_turn(pilot)]
+    assert names == ["the job", "a=1", "b=1", "a=2", "b=2", *(one.name for one in REFERENCES)]
