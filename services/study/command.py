@@ -24,7 +24,7 @@ from services.study.knobs import apply, choose_knobs, job_tree_with, knobs_of, p
 from services.study.lanes import Journal
 from services.study.model import Plan, Row
 from services.study.page import describe_proof, write_page, write_tables
-from services.study.study import run_study
+from services.study.study import LOOKS, run_study
 from workers.assets.catalogue import open_catalogue
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier
@@ -54,7 +54,8 @@ def main(options: argparse.Namespace) -> int:
     with Journal(options.out, header) as journal, closing(ProgressLine(budget, "tradeoff", unit="second")) as progress:
         study = run_study(plan, journal, context.renderer.name, command, left_out, progress, began)
     write_tables(study, options.out)
-    write_page(study, write_plots(study, options.out), options.out / "index.html")
+    looks = {name.split("/", 2)[2]: one for name, one in journal.items() if name.startswith(f"{LOOKS}/")}
+    write_page(study, write_plots(study, options.out), options.out / "index.html", looks)
     for name, order in study.slopes.items():
         print(f"convergence  {name}: error goes with the step to the power {order:.3f}")
     for note in study.notes:

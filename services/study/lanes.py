@@ -135,10 +135,16 @@ def _measure(context: WorkerContext, unit: Unit, scratch: Path) -> Mapping[str, 
         from services.study.captures import measure_capture
 
         return measure_capture(context, unit.settings, unit.scene_id, unit.number, scratch)
-    from services.study.images import measure_colour, measure_drawn
+    from services.study.images import measure_colour, measure_drawn, measure_look
     from services.study.measure import measure_again, measure_rest
 
-    parts = {"rest": measure_rest, "again": measure_again, "draw": measure_drawn, "colour": measure_colour}
+    parts = {
+        "rest": measure_rest,
+        "again": measure_again,
+        "draw": measure_drawn,
+        "colour": measure_colour,
+        "look": measure_look,
+    }
     return parts[unit.part](context, unit.settings, unit.scene_id, unit.number)
 
 

@@ -19,8 +19,8 @@ from services.study.model import ERRORS, Figure, Plan, Proof, Row, Setting, Stud
 from services.study.race import MOST, SHARES, Race, Wanted
 from services.study.table import AGAIN, OWN, UNTIMED, Part, Parts, Table, figures_of, part_of
 
-PILOT_SHARE, RACE_SHARE, PROOF_SHARE = 0.3, 0.9, 1.0
-"""By these shares of the budget the pilot, the race and the proof end."""
+PILOT_SHARE, RACE_SHARE, LOOK_SHARE, PROOF_SHARE = 0.3, 0.87, 0.9, 1.0
+"""By these shares of the budget the pilot, the race, the pictures and the proof end."""
 
 LATE_SHARE = 0.03
 """What is under way then may take this share more, because a process that is ended takes seconds to come back."""
@@ -191,6 +191,7 @@ def run_study(
             race = Race(plan.targets or DEFAULT_TARGETS, plan.job.first_scene, {})
             run_pilot(bench, race)
             bench = run_race(bench, race)
+            look_at_errors(bench)
             rows, proofs = choose_and_prove(bench)
         finally:
             bench.keep_clock()
@@ -304,6 +305,38 @@ def all_rows(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Row, ...]]:
         if (row := table.row_of(both, parts)) is not None:
             crossed.append(row)
     return rows, tuple(crossed)
+
+
+LOOKS = "look"
+"""The part, in the journal, of pictures."""
+
+
+def look_at_errors(bench: Measurement) -> None:
+    """Pictures of the job's first scene with the settings that have the largest and the least error of each group."""
+    if bench.plan.job.captures is not None or not bench.plan.job.render.rgb:
+        return
+    table, scene = bench.table(), bench.plan.job.first_scene
+    single = [one for one in bench.plan.settings if one.kind in ("own", "single")]
+    rows = [row for one in single if (row := table.row(one)) is not None]
+    known = {name.split("/", 2)[2] for name in bench.journal if name.startswith(f"{LOOKS}/")}
+    settings = [one for one in dict.fromkeys([OWN.name, *telling(rows)]) if one not in known]
+    by_name = {row.setting.name: row.setting for row in rows}
+    units = [Unit(LOOKS, scene, 0, (by_name[name],)) for name in settings]
+    for unit, answers in bench.lanes.run(units, bench.deadline(LOOK_SHARE), bench.deadline(LOOK_SHARE + LATE_SHARE)):
+        for name, found in answers.items():
+            bench.journal.add(f"{LOOKS}/{unit.scene_id}/{name}", found)
+
+
+def telling(rows: Sequence[Row]) -> list[str]:
+    """Names of the settings with the largest and the least of each group's first error that settings move."""
+    found: dict[str, None] = {}
+    for group in ("physics", "labels", "colour"):  # the mirror camera's errors are not in the input view
+        for name in (kind.name for kind in ERRORS.values() if kind.group == group and not kind.pooled):
+            some = sorted((row.errors[name].value, row.setting.name) for row in rows if name in row.errors)
+            if len(some) > 1 and some[-1][0] > 1.05 * some[0][0]:
+                found |= {some[-1][1]: None, some[0][1]: None}
+                break
+    return list(found)
 
 
 def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Proof, ...]]:

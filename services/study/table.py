@@ -197,7 +197,8 @@ def part_of(error: str) -> Part:
     return AGAIN.get(error) or _PART_OF[ERRORS[error].group]
 
 
-_AT_REST = ("physics.", "start.", "assets.")
+AT_REST = ("physics.", "start.", "assets.")
+"""Keys that change how objects rest; every other one changes what is drawn."""
 _COLOUR = ("render.",)
 
 
@@ -237,7 +238,7 @@ class Parts:
 def _changes_by_part(changes: Mapping[str, Any], captured: bool, again: bool) -> dict[Part, dict[str, Any]]:
     if captured:
         return {"capture": dict(changes)}
-    rest = {key: value for key, value in changes.items() if key.startswith(_AT_REST)}
+    rest = {key: value for key, value in changes.items() if key.startswith(AT_REST)}
     colour = {key: value for key, value in changes.items() if key.startswith(_COLOUR)}
     drawn = {key: value for key, value in changes.items() if key not in rest}
     return {"rest": rest, **({"again": rest} if again else {}), "draw": drawn, "colour": colour}
