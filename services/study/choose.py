@@ -7,7 +7,7 @@ from decimal import ROUND_CEILING, Context
 from schemas.errors import InputError, RunError, describe_seconds, did_you_mean, milliseconds, size
 from schemas.job.job import Job
 from services.study.knobs import OTHER_WORLD
-from services.study.model import ERRORS, Figure, Row, Study, amount, listed, short, times, unit
+from services.study.model import ERRORS, NEGLIGIBLE, Figure, Row, Study, amount, listed, short, times, unit
 
 Targets = Mapping[str, float]
 """The greatest allowed value of each error, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""
@@ -360,6 +360,6 @@ def worse_than(row: Row, own: Row, rows: Sequence[Row]) -> list[str]:
     worse = []
     for name, ours in own.errors.items():
         theirs = error_of(row, name, rows)
-        if theirs is not None and theirs.low > ours.high:
+        if theirs is not None and theirs.low > ours.high and theirs.value > NEGLIGIBLE[ERRORS[name].unit]:
             worse.append(f"{short(name)} ({amount(name, theirs.value)} instead of {amount(name, ours.value)})")
     return worse

@@ -233,6 +233,9 @@ ERRORS = {kind.name: kind for kind in (
 # fmt: on
 """By name."""
 
+NEGLIGIBLE: Mapping[str, float] = {"mm": 0.02, "deg": 0.02, "": 0.001}
+"""By unit: errors below this are as good as none, however they compare."""
+
 # ---------------------------------------------------------------------------------------------- in words
 
 

@@ -15,8 +15,8 @@ from services.study.choose import DEFAULT_TARGETS, TargetError, answer, own_row,
 from services.study.knobs import REFERENCES, joined
 from services.study.lanes import Journal, Lanes, Unit
 from services.study.measure import slopes
-from services.study.model import ERRORS, Figure, Plan, Proof, Row, Setting, Study
-from services.study.race import MOST, SHARES, Race, Wanted
+from services.study.model import ERRORS, NEGLIGIBLE, Figure, Plan, Proof, Row, Setting, Study
+from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted
 from services.study.table import AGAIN, OWN, UNTIMED, Part, Parts, Table, figures_of, part_of
 
 PILOT_SHARE, RACE_SHARE, LOOK_SHARE, PROOF_SHARE = 0.3, 0.87, 0.9, 1.0
@@ -37,9 +37,6 @@ PROVED, LEAST_PROVED = 200, 4
 SPENT = "spent"
 """The journal's entry of the seconds that were spent before."""
 
-SURE_SCENES = 59
-"""Scenes without one above a target that make a 95th percentile sure (1 - 0.95^59 > 0.95)."""
-
 LEVEL_OF_CHOICE = 8
 """Scenes from which combinations are chosen, and from which a part may be decided."""
 
@@ -51,9 +48,6 @@ UNIT_SHARE = 0.04
 
 SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
 """A value saves time at this share of the job's own, keeps an error that grows to this share, and shrinks one below this."""
-
-NEGLIGIBLE: Mapping[str, float] = {"mm": 0.02, "deg": 0.02, "": 0.001}
-"""By unit: errors below this are as good as none, however they compare."""
 
 DEAREST = 5.0
 """A value that takes at least this many times the job's time is measured by itself only."""
@@ -245,7 +239,7 @@ def in_turn(wanted: Sequence[Wanted]) -> list[Wanted]:
 
 def run_race(bench: Measurement, race: Race) -> Measurement:
     """Rounds of twice as many scenes, until every part is decided or the budget's share is spent."""
-    levels = dict.fromkeys(bench.parts.measured, 2)
+    levels = dict.fromkeys(bench.parts.measured, FIRST_LEVEL)
     most = {**MOST, **({} if AGAIN.keys() & set(race.targets) else {"again": RELEASED_SCENES})}
     combined = False
     while levels and bench.left_s(RACE_SHARE) > 0.0:
@@ -411,7 +405,8 @@ def told(
 ) -> Study:
     """The study in words and figures."""
     plan, table = bench.plan, bench.table()
-    missing = [one.name for one in (*plan.settings, *plan.presets) if table.row(one) is None]
+    asked = [one for one in (*plan.settings, *plan.presets) if one.kind in ("single", "preset")]
+    missing = [one.name for one in asked if table.row(one) is None]
     notes = [*left_out, *([f"not reached within the budget: {', '.join(missing)}"] if missing else [])]
     held = bool(proofs) and proofs[-1].holds
     withdrawn = {one.setting for one in proofs if not one.holds}

@@ -14,8 +14,8 @@ from services.study import knobs as study_knobs
 from services.study.choose import error_of, own_row
 from services.study.knobs import FREE, REFERENCES, apply, choose_knobs, joined, knobs_of, settings_of
 from services.study.lanes import JOURNAL_FILE, Journal
-from services.study.model import ERRORS, Row, Setting
-from services.study.study import NEGLIGIBLE, promising
+from services.study.model import ERRORS, NEGLIGIBLE, Row, Setting
+from services.study.study import promising
 from tests.services.study.made_up import row, stored
 
 JOB = Job(name="t", seed=2024, first_scene=100)

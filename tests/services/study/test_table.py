@@ -1,5 +1,6 @@
 """From answers of single scenes to figures, verdicts and rows whose values are known; and which scenes a race asks for next."""
 
+import itertools
 import math
 
 import numpy as np
@@ -197,3 +198,26 @@ def test_units_are_of_one_scene_and_no_longer_than_asked_and_a_pilot_takes_the_k
     pilot = racing().missing(Table(Parts.split((OWN, *values), captured=False), {}), "rest", 1)
     names = [one.setting.name for one in in_turn(pilot)]
     assert names == ["the job", "a=1", "b=1", "a=2", "b=2", *(one.name for one in REFERENCES)]
+
+
+def test_where_not_all_can_be_measured_until_they_are_sure_each_round_keeps_the_promising_half():
+    """Eight settings of 1 s, of which those with a lower number are cheaper; all 59 scenes of all would take 531 s."""
+    some = [Setting((("step", str(n)),), {"physics.step_hz": 100 + n}) for n in range(8)]
+    parts = Parts.split((OWN, *some), captured=False)
+
+    def at(scenes: int) -> Table:
+        answers = {unit_name("rest", n, one): rest(1.0) for n in range(scenes) for one in (OWN, *some)}
+        for n, (place, one) in itertools.product(range(scenes), enumerate(some)):
+            answers[unit_name("rest", n, one)] |= {"s": 0.5 + 0.05 * place}
+        drawn = {unit_name("draw", n, OWN): {"s": 1.0, "took": 1.0, "bytes": 1, "errors": {}} for n in range(scenes)}
+        return Table(parts, answers | drawn)
+
+    def kept(level: int, allowed_s: float) -> set[str]:
+        wanted, whole = racing(penetration_mm=1.0).next_round(at(level // 2), "rest", level, allowed_s)
+        assert whole
+        return {one.setting.name for one in wanted if one.setting not in REFERENCES}
+
+    assert len(kept(2, 200.0)) == 9
+    assert kept(4, 200.0) == {"the job", "step=0", "step=1", "step=2", "step=3"}
+    assert kept(8, 200.0) == {"the job", "step=0", "step=1", "step=2"}
+    assert len(kept(4, 1000.0)) == 9  # all can be sure
