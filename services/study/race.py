@@ -58,11 +58,12 @@ class Wanted:
 
 @dataclass
 class Race:
-    """The state of the race: which settings are out, and why."""
+    """The state of the race: which settings are out, and why; and parts that this job and budget leave out."""
 
     targets: Mapping[str, float]
     first_scene: int
     out: dict[tuple[Part, str], str]
+    left_out: list[Part]
 
     def alive(self, table: Table, part: Part) -> list[Setting]:
         """The settings of a part that are still in the race."""

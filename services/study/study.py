@@ -43,6 +43,9 @@ LEVEL_OF_CHOICE = 8
 RELEASED_SCENES = 4
 """Scenes whose objects are let go again, unless a target asks for more."""
 
+AGAIN_SHARE = 0.002
+"""Objects that take longer than this share of the budget to come to rest are not let go again: that takes 15 times as long."""
+
 UNIT_SHARE = 0.04
 """A unit of several settings takes about this share of the budget at most."""
 
@@ -182,7 +185,7 @@ def run_study(
     ):
         bench = Measurement(plan, parts, journal, lanes, progress, began, float(journal.get(SPENT, 0.0)))
         try:
-            race = Race(plan.targets or DEFAULT_TARGETS, plan.job.first_scene, {})
+            race = Race(plan.targets or DEFAULT_TARGETS, plan.job.first_scene, {}, [])
             run_pilot(bench, race)
             bench = run_race(bench, race)
             look_at_errors(bench)
@@ -202,7 +205,7 @@ def run_pilot(bench: Measurement, race: Race) -> None:
     """One scene of the job itself, then one of every setting, for costs. Raises RunError."""
     table = bench.table()
     wanted = [one for part in bench.parts.measured for one in race.missing(table, part, 1)]
-    own = sorted((one for one in wanted if one.setting == OWN), key=lambda one: one.part in UNTIMED)
+    own = [one for one in wanted if one.setting == OWN and one.part not in UNTIMED]
     bench.run(own, PILOT_SHARE)
     table = bench.table()
     missing = [part for part in bench.parts.measured if part not in UNTIMED and not table.answers(part, OWN)]
@@ -223,7 +226,15 @@ def run_pilot(bench: Measurement, race: Race) -> None:
                 "a study needs scenes; `verso run` with --scenes 4 tells more of each"
             )
     table = bench.table()
-    bench.run(in_turn([one for part in bench.parts.measured for one in race.missing(table, part, 1)]), PILOT_SHARE)
+    rest_s = [one["took"] for one in table.answers("rest", OWN).values()]
+    if rest_s and min(rest_s) > AGAIN_SHARE * bench.plan.budget_s and not AGAIN.keys() & set(race.targets):
+        race.left_out.append("again")
+    bench.run(in_turn([one for part in parts_in(bench, race) for one in race.missing(table, part, 1)]), PILOT_SHARE)
+
+
+def parts_in(bench: Measurement, race: Race) -> list[Part]:
+    """The parts that are measured in this job and budget."""
+    return [part for part in bench.parts.measured if part not in race.left_out]
 
 
 def in_turn(wanted: Sequence[Wanted]) -> list[Wanted]:
@@ -239,7 +250,7 @@ def in_turn(wanted: Sequence[Wanted]) -> list[Wanted]:
 
 def run_race(bench: Measurement, race: Race) -> Measurement:
     """Rounds of twice as many scenes, until every part is decided or the budget's share is spent."""
-    levels = dict.fromkeys(bench.parts.measured, FIRST_LEVEL)
+    levels = dict.fromkeys(parts_in(bench, race), FIRST_LEVEL)
     most = {**MOST, **({} if AGAIN.keys() & set(race.targets) else {"again": RELEASED_SCENES})}
     combined = False
     while levels and bench.left_s(RACE_SHARE) > 0.0:
@@ -407,6 +418,11 @@ def told(
     plan, table = bench.plan, bench.table()
     asked = [one for one in (*plan.settings, *plan.presets) if one.kind in ("single", "preset")]
     missing = [one.name for one in asked if table.row(one) is None]
+    if race.left_out:
+        left_out = [
+            *left_out,
+            "objects are not let go again: it would take too much of the budget; --target moved_mm=... asks for it",
+        ]
     notes = [*left_out, *([f"not reached within the budget: {', '.join(missing)}"] if missing else [])]
     held = bool(proofs) and proofs[-1].holds
     withdrawn = {one.setting for one in proofs if not one.holds}

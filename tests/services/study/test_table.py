@@ -147,7 +147,7 @@ def test_a_scene_that_fails_counts_and_a_setting_without_a_time_has_no_row():
 
 
 def racing(**targets: float) -> Race:
-    return Race(targets, 0, {})
+    return Race(targets, 0, {}, [])
 
 
 def asked(race: Race, table: Table, part: str, level: int, allowed_s: float) -> set[tuple[str, int]]:
