@@ -4,6 +4,7 @@ A row is a pair. Its columns come from the manifest's schemas: what a view has i
 the columns `<role>_rgb`, `<role>_depth` and `<role>_region`, PNG files as they are stored.
 """
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -63,7 +64,9 @@ class HuggingFace(ShardedWriter):
     def finish(self) -> None:
         """Ends the last files, and writes the card."""
         super().finish()
-        text = card_text(self.record.job.name, self._schema, self.kept["rows"], self.kept["licences"])
+        rows, told = self.kept["rows"], json.dumps([self.folder.plan, self.kept["rows"]], sort_keys=True)
+        export = hashlib.sha256(told.encode()).hexdigest()[:16]
+        text = card_text(self.record.job.name, export, self._schema, rows, self.kept["licences"])
         self.folder.put("README.md", text.encode())
 
     def describe(self) -> dict[str, Any]:
@@ -146,8 +149,11 @@ def _feature(kind: pa.DataType) -> dict[str, Any]:
     return {"dtype": names[kind], "_type": "Value"}
 
 
-def card_text(name: str, schema: pa.Schema, rows: Mapping[str, int], licences: Sequence[str]) -> str:
-    """README.md: the head that Hugging Face reads, and what a person wants to know."""
+def card_text(name: str, export: str, schema: pa.Schema, rows: Mapping[str, int], licences: Sequence[str]) -> str:
+    """README.md: the head that Hugging Face reads, and what a person wants to know.
+
+    `datasets` keeps what it loaded by the folder's last name and this head alone, so that each export needs a head of its own.
+    """
     files = "".join(f"\n  - split: {split}\n    path: data/{split}-*.parquet" for split in sorted(rows)) or " []"
     counts = "".join(f"- {split}: {plural(count, 'pair')}\n" for split, count in sorted(rows.items()))
     columns = "".join(f"- `{field.name}`: {_describe(field)}\n" for field in schema)
@@ -159,6 +165,7 @@ task_categories:
 - image-to-3d
 configs:
 - config_name: default
+  description: export {export}
   data_files:{files}
 ---
 

@@ -174,7 +174,7 @@ def test_the_card_names_the_files_the_licence_and_every_column(exported):
     assert all(SCHEMAS["views"].field(name).type.equals(kind) for name, kind in views.items())
     assert {"T_world_cam", "cx_opencv", "depth_units_per_m"} <= views.keys()
     for licences, licence in ((["CC0-1.0", "ShapeNet"], "other"), ([], "cc0-1.0")):
-        text = card_text("a: b", schema, {}, licences)
+        text = card_text("a: b", "", schema, {}, licences)
         head = yaml.safe_load(text.split("---\n")[1])
         assert (head["license"], head["pretty_name"], head["configs"][0]["data_files"]) == (licence, "a: b", [])
         assert ", ".join(licences) in text and ARTICLE in text
@@ -190,3 +190,7 @@ def test_the_datasets_package_reads_every_image(files, exported, tmp_path):
         for row in rows:
             images = {name: np.asarray(cell) for name, cell in row.items() if name.partition("_")[0] in WORDS}
             check_pixels(files, row["category"], row["pose_id"], lambda *names, of=images: of["_".join(names)])
+    other = tmp_path / folder.name
+    export_to(files, other, "huggingface", last_scene=0)
+    loaded = datasets.load_dataset(str(other), cache_dir=str(tmp_path / "cache"))
+    assert sum(len(rows) for rows in loaded.values()) == 2, "not what is kept of another folder of that name"
