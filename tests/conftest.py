@@ -69,7 +69,11 @@ def docker_answers() -> bool:
 
 
 NEEDS = {
-    "docker": ("deploy", "docker-compose.yml", ".dockerignore", "pyproject.toml", "requirements.lock", "tests/deploy"),
+    "docker": (
+        *("deploy/Dockerfile", "deploy/compile_loops.py", "deploy/entrypoint", "deploy/stack_environment.py"),
+        *(".dockerignore", "docker-compose.yml", "requirements.lock", "requirements-study.lock"),
+        *("requirements-reading.lock", "tests/deploy/test_image.py", "tests/kit/containers.py"),
+    ),
     "browser": ("services/look", "tests/services/look"),
 }
 """What tests with these markers are about: --ci runs them where some of it differs from the base."""

@@ -94,7 +94,7 @@ def project(tmp_path):
 
 def run_suite(project, *words):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
-    environ = {**os.environ, "PYTHONPATH": str(project)}
+    environ = {**os.environ, "PYTHONPATH": str(project), "PYTEST_ADDOPTS": ""}
     done = subprocess.run(command, cwd=project, capture_output=True, text=True, check=False, env=environ)
     return done.returncode, done.stdout
 
