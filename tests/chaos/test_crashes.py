@@ -29,8 +29,8 @@ from workers.store.objects import ObjectStore
 from workers.store.store import Store
 
 MIXTURES = 3
-POINTS = {"default": 4, "ci": 60}
-REQUEST_POINTS = {"default": 3, "ci": 30}
+POINTS = {"default": 4, "ci": 30}
+REQUEST_POINTS = {"default": 3, "ci": 15}
 """Points of each program (and fault) in each scope; with --all, all."""
 
 

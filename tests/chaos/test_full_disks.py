@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
 ]
 
-POINTS = {"ci": 12, "all": 120}
+POINTS = {"ci": 6, "all": 120}
 BLOCK = 4096
 
 

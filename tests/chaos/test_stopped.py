@@ -18,7 +18,7 @@ from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 from workers.store.store import Store
 
-POINTS = {"default": 3, "ci": 25}
+POINTS = {"default": 3, "ci": 12}
 """Steps of each case in each scope; with --all, all."""
 
 

@@ -68,6 +68,7 @@ def test_a_job_is_made_on_the_cluster_and_its_exit_code_comes_back(head):
     assert code == 2 and "fewer scenes than committed" in out + err, "the job's own exit code and words"
 
 
+@pytest.mark.slow
 def test_words_with_shell_characters_are_text(head):
     """In the name of the job, the output folder and a setting: nothing of it is run, and the dataset says it as written."""
     pack = [sys.executable, "-P", "-m", "services.cli.main", "pack"]

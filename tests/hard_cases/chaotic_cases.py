@@ -130,7 +130,7 @@ CHAOTIC = (
             tier="slow",
             first=first,
         )
-        for ratio, first in ((10, ""), (100, "minute"), (1_000, "minute"), (10_000, "slow"))
+        for ratio, first in ((10, ""), (100, "minute"), (1_000, "slow"), (10_000, "slow"))
     ),
     # Walls 150 mm high hold twenty boxes of about 105 cm^3, 2.1 l of 13.5. The pile's own bar: 95 % certified.
     Chaotic("pile of eight boxes", HARDLY_LESS, within(0.15), lambda seed: pile(8, seed), tier="slow", first="minute"),
@@ -146,7 +146,7 @@ CHAOTIC = (
         tier="slow",
         first="slow",
     ),
-    Chaotic("eight balls poured into a tray", HARDLY_LESS, within(0.1), poured, tier="slow", first="minute"),
+    Chaotic("eight balls poured into a tray", HARDLY_LESS, within(0.1), poured, tier="slow", first="slow"),
     # It lies on its side, or stands; it has no other face. Upright it keeps its base's share of the solid angle at most.
     Chaotic("mug tumbled from 1 m", HARDLY_LESS, on_a_face(), lambda seed: tumbled(built_in("mug"), seed, 1.0)),
     Chaotic("cube of 2 mm tumbled from 1 m", NOTHING_LESS, on_a_face(), lambda seed: tumbled(cube(0.002), seed, 1.0)),
@@ -232,6 +232,6 @@ CHAOTIC = (
         first="minute",
     ),
     Chaotic(
-        "ball let go anywhere into a bowl", NOTHING_LESS, at_the_bottom(), ball_into_bowl, tier="slow", first="minute"
+        "ball let go anywhere into a bowl", NOTHING_LESS, at_the_bottom(), ball_into_bowl, tier="slow", first="slow"
     ),
 )

@@ -72,6 +72,6 @@ FROM_FILES = (
             tier=tier,
             again="slow",
         )
-        for count, tier in ((10, ""), (20, "minute"))
+        for count, tier in ((10, ""), (20, "slow"))
     ),
 )

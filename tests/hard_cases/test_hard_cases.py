@@ -95,10 +95,10 @@ def judge(case: Case, made: Made | None, end: End) -> tuple[str, float | None, f
 
 
 def rows(cases: Sequence[Case], again: bool) -> list[Any]:
-    """The cases, with the markers of their time; made again, all but every eighth take their time in --ci."""
+    """The cases, with the markers of their time; made again, all but every eighth run with --all."""
     found = []
     for number, case in enumerate(cases):
-        tiers = {case.tier or ("minute" if number % 8 else ""), case.again} if again else {case.tier}
+        tiers = {case.tier, case.again, "slow" if number % 8 else ""} if again else {case.tier}
         marks = [getattr(pytest.mark, name) for name in sorted(tiers - {""})]
         found.append(pytest.param(case, id=case.name, marks=marks))
     return found

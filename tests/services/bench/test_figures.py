@@ -227,7 +227,7 @@ def command_of(pid: str) -> bytes:
         return b""
 
 
-@pytest.mark.minute
+@pytest.mark.slow
 @pytest.mark.ray
 def test_simulated_nodes_take_the_time_of_their_shards_and_leave_no_process_and_no_address(tmp_path):
     """Ray notes the address of a cluster where every later `ray.init()` of the machine looks, and fails without that folder."""

@@ -44,6 +44,7 @@ def private(job, cluster) -> str:
     return digest_of(cluster.verso("run", str(job), "--out", str(job.parent / "private")))
 
 
+@pytest.mark.slow
 def test_a_cluster_started_in_a_bare_shell_makes_the_same_bytes(cluster, job, private):
     out = job.parent / "cluster"
     assert digest_of(cluster.verso("run", str(job), "--out", str(out), "--address", cluster.address)) == private
