@@ -57,7 +57,7 @@ def test_the_first_pattern_that_fits_gives_the_category_and_links_out_of_the_fol
         write(tmp_path / "in" / name, CUBE)
     write(tmp_path / "out.obj", CUBE)
     (tmp_path / "in/mugs/link.obj").symlink_to(tmp_path / "out.obj")
-    settings = source(category_map={"mugs/box_*.obj": "box", "mugs/*.obj": "mug", "deep/**/*.obj": "can"})
+    settings = source(category_map={"**": "box", "mugs/box_*.obj": "box", "mugs/*.obj": "mug", "deep/**/*.obj": "can"})
     _, found = listed(settings, tmp_path / "in", "mug", "box", "can")
     assert found == {"mug": [["mugs/a.obj"]], "box": [["mugs/box_b.obj"]], "can": [["deep/er/d.obj"]]}
 

@@ -229,7 +229,9 @@ def _match_files(category_map: Mapping[str, str], folder: Path) -> dict[Path, st
     found: dict[Path, str] = {}
     for pattern, category in category_map.items():
         try:
-            paths = [path.resolve() for path in folder.glob(pattern) if path.is_file()]
+            # From Python 3.13 on, `**` at the end finds files too.
+            named = [path for path in folder.glob(pattern) if matches(path.relative_to(folder).as_posix(), pattern)]
+            paths = [path.resolve() for path in named if path.is_file()]
         except (ValueError, NotImplementedError) as error:
             raise AssetSourceError(f"category_map: {pattern!r} is not a pattern below the folder: {error}") from error
         found |= {path: found.get(path, category) for path in paths if path.is_relative_to(folder)}
