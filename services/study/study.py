@@ -17,7 +17,7 @@ from services.study.lanes import Journal, Lanes, Unit
 from services.study.measure import slopes
 from services.study.model import ERRORS, NEGLIGIBLE, Figure, Plan, Proof, Row, Setting, Study
 from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted
-from services.study.table import AGAIN, OWN, UNTIMED, Part, Parts, Table, figures_of, part_of
+from services.study.table import AGAIN, OWN, UNTIMED, Part, Parts, Table, figures_of, part_of, unit_name
 
 PILOT_SHARE, RACE_SHARE, LOOK_SHARE, PROOF_SHARE = 0.3, 0.87, 0.9, 1.0
 """By these shares of the budget the pilot, the race, the pictures and the proof end."""
@@ -138,8 +138,8 @@ class Measurement:
         groups = grouped(wanted, UNIT_SHARE * self.plan.budget_s)
         units = [Unit(part, scene, scene - first, settings) for part, scene, settings in groups]
         for unit, answers in self.lanes.run(units, self.deadline(share), self.deadline(share + LATE_SHARE)):
-            for name, found in answers.items():
-                self.journal.add(f"{unit.part}/{unit.scene_id}/{name}", found)
+            for one in unit.settings:
+                self.journal.add(unit_name(unit.part, unit.scene_id, one), answers[one.name])
             self.progress.show(round(self.spent_s))
 
     def keep_clock(self) -> None:
@@ -328,8 +328,8 @@ def look_at_errors(bench: Measurement) -> None:
     by_name = {row.setting.name: row.setting for row in rows}
     units = [Unit(LOOKS, scene, 0, (by_name[name],)) for name in settings]
     for unit, answers in bench.lanes.run(units, bench.deadline(LOOK_SHARE), bench.deadline(LOOK_SHARE + LATE_SHARE)):
-        for name, found in answers.items():
-            bench.journal.add(f"{LOOKS}/{unit.scene_id}/{name}", found)
+        for one in unit.settings:
+            bench.journal.add(unit_name(LOOKS, unit.scene_id, one), answers[one.name])
 
 
 def telling(rows: Sequence[Row]) -> list[str]:
