@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import shlex
 import sys
 import time
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import yaml
 
-from schemas.errors import RunError, describe_seconds
+from schemas.errors import RunError, describe_seconds, plural
 from schemas.job.job import Job
 from services.bench.command import require_extra
 from services.job.job_file import load_job, read_tree
@@ -31,6 +32,9 @@ from workers.render.tiers import require_tier
 from workers.scene.context import open_worker
 from workers.shard.code import code_digest
 
+BUSY = 0.5
+"""A machine with more load than this a core before a study begins is told to be busy."""
+
 UNMEASURED = {"check.raycast_share": 0.0, "output.layout": "files"}
 """What no setting is measured with: checks of labels, and tar archives."""
 
@@ -49,6 +53,9 @@ def main(options: argparse.Namespace) -> int:
     context = open_worker(plan.job, catalogue)
     require_device(context.renderer.name, plan.job.run.device, context.renderer.choice)
     header = {"job": context.settings_digest, "code": code_digest()}
+    if (load := os.getloadavg()[0]) > BUSY * usable_cores():
+        told = f"the machine was busy when this began (load {load:.1f} on {plural(usable_cores(), 'core')}): times are noisy"
+        left_out = [*left_out, told]
     budget, command = round(plan.budget_s), shlex.join(["verso", *sys.argv[1:]])
     print(f"measures for at most {describe_seconds(plan.budget_s)} (--budget), {plan.processes} scenes at a time")
     with Journal(options.out, header) as journal, closing(ProgressLine(budget, "tradeoff", unit="second")) as progress:
