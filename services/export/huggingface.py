@@ -64,8 +64,10 @@ class HuggingFace(ShardedWriter):
     def finish(self) -> None:
         """Ends the last files, and writes the card."""
         super().finish()
-        rows, told = self.kept["rows"], json.dumps([self.folder.plan, self.kept["rows"]], sort_keys=True)
-        export = hashlib.sha256(told.encode()).hexdigest()[:16]
+        rows, plan = self.kept["rows"], dict(self.folder.plan)
+        if plan["dataset_digest"] is not None:
+            del plan["job_digest"]  # which differs where the same dataset is stored otherwise
+        export = hashlib.sha256(json.dumps([plan, rows], sort_keys=True).encode()).hexdigest()[:16]
         text = card_text(self.record.job.name, export, self._schema, rows, self.kept["licences"])
         self.folder.put("README.md", text.encode())
 
