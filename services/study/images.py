@@ -32,7 +32,7 @@ from services.study.colour import (
     flip_error,
 )
 from services.study.knobs import size_value
-from services.study.measure import Answer, Meter, answer_for, context_for, laid_for
+from services.study.measure import Answer, Meter, answer_for, context_for, laid_for, warm_answer_for
 from services.study.model import Setting
 from services.study.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
 from services.study.table import AT_REST
@@ -240,8 +240,8 @@ def measure_drawn(context: WorkerContext, settings: Sequence[Setting], scene_id:
         sizes = sum(len(file.data) for file in output.files)
         return {"errors": measure_images(worker, scene, truth), "bytes": sizes}
 
-    workers = {settings[k].name: context_for(context, settings[k]) for k in order}
-    return {name: answer_for(partial(measure, worker)) for name, worker in workers.items()}
+    workers = [(settings[k], context_for(context, settings[k])) for k in order]
+    return {one.name: warm_answer_for("draw", one, partial(measure, worker)) for one, worker in workers}
 
 
 def measure_colour(

@@ -86,6 +86,20 @@ def answer_for(measure: Callable[[Meter], Answer]) -> Answer:
     return {**answer, "s": meter.s, "took": whole.took}
 
 
+_ran: set[tuple[str, str]] = set()
+"""Parts and settings that this process has run."""
+
+
+def warm_answer_for(part: str, setting: Setting, measure: Callable[[Meter], Answer]) -> Answer:
+    """`answer_for`, twice where it is this process's first of the setting and quick: the first run compiles code and shaders."""
+    answer = answer_for(measure)
+    if (part, setting.name) not in _ran:
+        _ran.add((part, setting.name))
+        if answer["took"] < QUICK_S:
+            return answer_for(measure)
+    return answer
+
+
 def context_for(context: WorkerContext, setting: Setting) -> WorkerContext:
     """The same worker with the setting's job. The settings' digest stays: nothing is stored under it."""
     return dataclasses.replace(context, job=apply(context.job, setting.changes))
@@ -119,7 +133,7 @@ def measure_rest(
     answers = {}
     for setting in [settings[k] for k in order]:
         worker = context_for(context, setting)
-        answers[setting.name] = answer_for(partial(_rest, worker, scene_id, number))
+        answers[setting.name] = warm_answer_for("rest", setting, partial(_rest, worker, scene_id, number))
     own = answers.get(Setting().name)
     if own is not None and new_s is not None:
         built = max(0.0, (again.get("cold") or 0.0) - new_s - own["s"]) if again and own["s"] else 0.0

@@ -39,8 +39,8 @@ MOST_PROMISING = 4
 SURE_SCENES = 59
 """Scenes without one above a target that make a 95th percentile sure (1 - 0.95^59 > 0.95)."""
 
-DEAR = 4.0
-"""Settings that take this many times the usual one's seconds wait for the others."""
+DEAR, DEAR_LEVEL = 6.0, 4
+"""Settings that take this many times the usual one's seconds are measured in so many scenes and no more."""
 
 KEPT = frozenset({OWN.name, *(one.name for one in REFERENCES)})
 """What no rule puts out of the race."""
@@ -97,6 +97,7 @@ class Race:
             one
             for one in alive
             if one not in REFERENCES
+            and (one.kind != "several" or ratios[one.name] is not None)  # a combination that was not promising enough
             and table.verdict(part, one, self.targets) == "open"
             and (ratios[one.name] is None or ratios[one.name].low * AS_CHEAP < best)  # type: ignore[union-attr]
         ]
@@ -113,12 +114,16 @@ class Race:
         Where not all settings can be measured until they are sure, each round keeps half of those of the round before, the
         most promising. Where even these would take more than the seconds allowed, the last ones wait, and the last scenes.
         """
-        wanted = self.missing(table, part, level)
+        dear = {one.name for one in self._dear(table, part)}
+        wanted = [
+            one for one in self.missing(table, part, level) if level <= DEAR_LEVEL or one.setting.name not in dear
+        ]
         by_setting: dict[str, list[Wanted]] = {}
         for one in wanted:
             by_setting.setdefault(one.setting.name, []).append(one)
         order = [one.name for one in self._by_promise(table, part) if one.name in by_setting]
-        sure, alive = min(SURE_SCENES, MOST[part]), [one for one in self.alive(table, part) if one not in REFERENCES]
+        alive = [one for one in self.alive(table, part) if one not in REFERENCES and one.name not in dear]
+        sure = min(SURE_SCENES, MOST[part])
         whole_s = sum(self.cost_s(table, part, one) * max(0, sure - self._scenes(table, part, one)) for one in alive)
         if level > FIRST_LEVEL and whole_s > allowed_s:
             order = order[: max(MOST_PROMISING, -(-len(alive) * FIRST_LEVEL // level))]
@@ -151,17 +156,20 @@ class Race:
 
     def _by_promise(self, table: Table, part: Part) -> list[Setting]:
         """The job itself, then those that meet the targets so far, the cheapest first; dear ones and references last."""
-        alive = self.alive(table, part)
-        costs = {one.name: self.cost_s(table, part, one) for one in alive}
-        usual = median(costs.values())
+        dear = self._dear(table, part)
 
         def key(one: Setting) -> tuple[bool, bool, bool, float]:
             figures, ratio = table.figures(part, one), table.ratio(_timed(part), one)
             missed = any(name in figures and figures[name].value > most for name, most in self.targets.items())
-            dear = costs[one.name] > DEAR * usual or one in REFERENCES
-            return one != OWN, dear, missed, ratio.value if ratio else 1.0
+            return one != OWN, one in dear or one in REFERENCES, missed, ratio.value if ratio else 1.0
 
-        return sorted(alive, key=key)
+        return sorted(self.alive(table, part), key=key)
+
+    def _dear(self, table: Table, part: Part) -> list[Setting]:
+        """Settings that take many times the usual one's seconds a scene."""
+        settings = [one for one in table.parts.measured[part] if one not in REFERENCES]
+        usual_s = median(self.cost_s(table, part, one) for one in settings)
+        return [one for one in settings if one != OWN and self.cost_s(table, part, one) > DEAR * usual_s]
 
     def cost_s(self, table: Table, part: Part, setting: Setting) -> float:
         """Seconds by the clock of one scene: the mean so far, or the job's own."""
