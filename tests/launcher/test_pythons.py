@@ -138,9 +138,7 @@ def test_without_a_python_it_takes_one_of_uv_or_else_names_three_ways_on(checkou
 
 def from_source(checkout: Checkout) -> str:
     how = "--no-build-isolation --use-pep517 --require-hashes"
-    return (
-        f"pip {how} --cache-dir {checkout.faults.parent}/.cache/verso/pybullet -r {checkout.venv}/verso-pybullet.lock"
-    )
+    return f"pip {how} --cache-dir {checkout.faults.parent}/.cache/verso/pybullet-o3 -r {checkout.venv}/verso-pybullet.lock"
 
 
 def test_pybullet_alone_is_compiled_where_it_has_no_wheel_and_after_all_else(checkout):
@@ -270,7 +268,7 @@ def installed(minor: int) -> str:
     """A CPython 3.`minor` of this machine for which PyBullet is compiled, or has a wheel; else the test is skipped."""
     name, home = f"python3.{minor}", Path.home()
     managed = (*home.glob(f".pyenv/versions/3.{minor}.*"), *home.glob(f".local/share/uv/python/cpython-3.{minor}.*"))
-    ready = minor == 11 or any((home / ".cache/verso/pybullet").rglob(f"pybullet-*-cp3{minor}-*.whl"))
+    ready = minor == 11 or any((home / ".cache/verso/pybullet-o3").rglob(f"pybullet-*-cp3{minor}-*.whl"))
     for path in (shutil.which(name), *(folder / "bin" / name for folder in managed)):
         if ready and path and subprocess.run([path, "-V"], capture_output=True, check=False).returncode == 0:
             return str(path)
