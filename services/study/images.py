@@ -32,7 +32,7 @@ from services.study.colour import (
     flip_error,
 )
 from services.study.knobs import size_value
-from services.study.measure import Answer, Meter, answer_for, context_for, laid_for, warm_answer_for
+from services.study.measure import Answer, Meter, answer_for, context_for, laid_for, own_rest, warm_answer_for
 from services.study.model import Setting
 from services.study.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
 from services.study.table import AT_REST
@@ -240,8 +240,11 @@ def measure_drawn(context: WorkerContext, settings: Sequence[Setting], scene_id:
         sizes = sum(len(file.data) for file in output.files)
         return {"errors": measure_images(worker, scene, truth), "bytes": sizes}
 
+    with Meter() as rested, suppress(Exception):  # told by what is measured
+        own_rest(context, scene_id)
     workers = [(settings[k], context_for(context, settings[k])) for k in order]
-    return {one.name: warm_answer_for("draw", one, partial(measure, worker)) for one, worker in workers}
+    answers = {one.name: warm_answer_for("draw", one, partial(measure, worker)) for one, worker in workers}
+    return {name: {**one, "took": one["took"] + rested.took / len(settings)} for name, one in answers.items()}
 
 
 def measure_colour(

@@ -4,6 +4,7 @@ With the journal, a file of answers, the same command goes on where it stopped.
 """
 
 import json
+import math
 import multiprocessing
 import signal
 import time
@@ -38,6 +39,8 @@ class Unit:
     number: int
     settings: tuple[Setting, ...]
     base: Setting = OWN
+    limit_s: float = math.inf
+    """Seconds of processor that one setting may take."""
 
 
 class Lanes:
@@ -131,6 +134,9 @@ def _serve(pipe: Connection, job: str, folder: str, scratch: str) -> None:
 
 def _measure(context: WorkerContext, unit: Unit, scratch: Path) -> Mapping[str, Any]:
     """The parts are imported where they run: captures load what scenes have no use for."""
+    from services.study.measure import LIMIT
+
+    LIMIT["s"] = unit.limit_s
     if unit.part == "capture":
         from services.study.captures import measure_capture
 

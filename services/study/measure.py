@@ -8,12 +8,13 @@ import contextlib
 import dataclasses
 import itertools
 import math
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -69,20 +70,40 @@ class Meter:
         self.s = None if slept else time.process_time() - cpu
 
 
+class TimeOut(SceneError):
+    """A scene that took many times as long as the job's own."""
+
+    stage = "study"
+
+
+LIMIT = {"s": math.inf}
+"""The seconds of processor that one answer of this process may take."""
+
+
+def _out_of_time(*_: object) -> NoReturn:
+    raise TimeOut("time_out", f"took more than {LIMIT['s']:.0f} s of processor")
+
+
 def answer_for(measure: Callable[[Meter], Answer]) -> Answer:
     """What `measure` found, with its times: it gets a meter for what counts as the setting's time, the clock runs for all.
 
-    A scene that cannot be made is `failed` with its reason; anything else that it raises is also `broken`.
+    A scene that cannot be made, or takes longer than the limit, is `failed` with its reason; anything else that it raises is
+    also `broken`.
     """
     meter = Meter()
     meter.s = None
     with Meter() as whole:
         try:
+            if LIMIT["s"] < math.inf:
+                signal.signal(signal.SIGPROF, _out_of_time)
+                signal.setitimer(signal.ITIMER_PROF, LIMIT["s"])
             answer = measure(meter)
         except SceneError as error:
             answer = {"failed": error.reason}
         except Exception as error:  # one scene that breaks a measure must not end the study
             answer = {"failed": "broken", "broken": describe(error)}
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
     return {**answer, "s": meter.s, "took": whole.took}
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import math
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -46,8 +47,11 @@ RELEASED_SCENES = 4
 AGAIN_SHARE = 0.002
 """Objects that take longer than this share of the budget to come to rest are not let go again: that takes 15 times as long."""
 
-UNIT_SHARE = 0.04
+UNIT_SHARE = 0.01
 """A unit of several settings takes about this share of the budget at most."""
+
+SLOW, LEAST_LIMIT_S = 5.0, 30.0
+"""A scene that takes this many times the longest of the job's own, and so many seconds of processor at least, is a time out."""
 
 SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
 """A value saves time at this share of the job's own, keeps an error that grows to this share, and shrinks one below this."""
@@ -136,7 +140,9 @@ class Measurement:
         """Measures, in order, until a share of the budget is spent, and keeps the answers."""
         first = self.plan.job.first_scene
         groups = grouped(wanted, UNIT_SHARE * self.plan.budget_s)
-        units = [Unit(part, scene, scene - first, settings) for part, scene, settings in groups]
+        own_s = [one["took"] for part in self.parts.measured for one in self.table().answers(part, OWN).values()]
+        most_s = max(LEAST_LIMIT_S, SLOW * max(own_s)) if own_s else math.inf
+        units = [Unit(part, scene, scene - first, settings, OWN, most_s) for part, scene, settings in groups]
         for unit, answers in self.lanes.run(units, self.deadline(share), self.deadline(share + LATE_SHARE)):
             for one in unit.settings:
                 self.journal.add(unit_name(unit.part, unit.scene_id, one), answers[one.name])

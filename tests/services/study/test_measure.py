@@ -78,6 +78,14 @@ def test_what_breaks_a_measure_is_a_counted_answer_and_a_machine_that_sleeps_has
     def lost(meter: Meter) -> dict:
         raise SettleError("left_table", "it is gone")
 
+    def endless(meter: Meter) -> dict:
+        while True:
+            pass
+
+    monkeypatch.setitem(measure.LIMIT, "s", 0.05)
+    found = answer_for(endless)
+    assert found["failed"] == "time_out" and 0.03 < found["took"] < 20.0
+    monkeypatch.setitem(measure.LIMIT, "s", float("inf"))
     assert answer_for(flat)["failed"] == "broken" and "initial simplex is flat" in answer_for(flat)["broken"]
     assert answer_for(lost)["failed"] == "left_table" and "broken" not in answer_for(lost)
     clock = iter((0.0, 3600.0))
