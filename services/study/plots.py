@@ -19,7 +19,7 @@ from schemas.errors import milliseconds, number
 from services.study.choose import front, own_row
 from services.study.model import Row, Study, as_often, cost, short, shown, unit
 
-_PHYSICS = "pose_mm moved_mm outcome_mm penetration_mm gap_mm unbalanced_share turned_deg outcome_deg"
+_PHYSICS = "pose_mm outcome_mm penetration_mm gap_mm moved_mm unbalanced_share turned_deg outcome_deg"
 
 PARTS = (
     ("at rest", "How objects rest", _PHYSICS),

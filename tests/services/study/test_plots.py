@@ -131,13 +131,13 @@ def test_titles_say_what_less_error_takes():
 
 
 def test_a_panel_shows_the_first_error_of_a_part_that_settings_move_and_the_knobs_that_move_it():
-    rows = [row(moved_mm=0.0, outcome_mm=0.1, depth_mm=0.1), row("step=1", 1.5, moved_mm=0.0, outcome_mm=0.05)]
+    rows = [row(pose_mm=0.0, outcome_mm=0.1, depth_mm=0.1), row("step=1", 1.5, pose_mm=0.0, outcome_mm=0.05)]
     assert [panel.error for panel in panels_of([*rows, row("units=1", 0.9, depth_mm=0.2)])] == [
         "outcome_mm",
         "depth_mm",
     ]
     assert [panel.error for panel in panels_of(rows)] == ["outcome_mm"]
-    assert [panel.error for panel in panels_of(rows[:1])] == ["moved_mm", "depth_mm"]
+    assert [panel.error for panel in panels_of(rows[:1])] == ["pose_mm", "depth_mm"]
     rows = [row(moved_mm=0.1), row("step=1", 1.5, moved_mm=0.2), row("step=2", 2.0, moved_mm=0.1)]
     others = [row("way=1", 1.1, moved_mm=0.104), row("way=1, rest=1", 1.1, moved_mm=0.2)]
     kept = [row("preset=fast", 0.5, moved_mm=0.1), row("step=1, way=1", 1.6, moved_mm=0.2)]
