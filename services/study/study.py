@@ -50,7 +50,7 @@ AGAIN_SHARE = 0.002
 UNIT_SHARE = 0.01
 """A unit of several settings takes about this share of the budget at most."""
 
-SLOW, LEAST_LIMIT_S = 5.0, 30.0
+SLOW, LEAST_LIMIT_S = 3.0, 40.0
 """A scene that takes this many times the longest of the job's own, and so many seconds of processor at least, is a time out."""
 
 SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
@@ -140,9 +140,9 @@ class Measurement:
         """Measures, in order, until a share of the budget is spent, and keeps the answers."""
         first = self.plan.job.first_scene
         groups = grouped(wanted, UNIT_SHARE * self.plan.budget_s)
-        own_s = [one["took"] for part in self.parts.measured for one in self.table().answers(part, OWN).values()]
-        most_s = max(LEAST_LIMIT_S, SLOW * max(own_s)) if own_s else math.inf
-        units = [Unit(part, scene, scene - first, settings, OWN, most_s) for part, scene, settings in groups]
+        own = {part: [one["took"] for one in self.table().answers(part, OWN).values()] for part in self.parts.measured}
+        limits = {part: max(LEAST_LIMIT_S, SLOW * max(took)) if took else math.inf for part, took in own.items()}
+        units = [Unit(part, scene, scene - first, settings, OWN, limits[part]) for part, scene, settings in groups]
         for unit, answers in self.lanes.run(units, self.deadline(share), self.deadline(share + LATE_SHARE)):
             for one in unit.settings:
                 self.journal.add(unit_name(unit.part, unit.scene_id, one), answers[one.name])
