@@ -111,13 +111,13 @@ def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
 
 
 def relative_error(row: Row, rows: Sequence[Row]) -> float:
-    """The sum of a setting's errors, each as a share of the job's own.
-
-    Where the job's own is 0, any error counts as a share of 2.
-    """
+    """The sum of a setting's errors, each as a share of the job's own; what is negligible counts as the bound of that."""
     own = own_row(rows).errors
-    pairs = [((error_of(row, name, rows) or figure).value, figure.value) for name, figure in own.items()]
-    return sum(value / mine if mine > 0 else 2.0 if value > 0 else 1.0 for value, mine in pairs)
+    shares = []
+    for name, figure in own.items():
+        least = NEGLIGIBLE[ERRORS[name].unit]
+        shares.append(max((error_of(row, name, rows) or figure).value, least) / max(figure.value, least))
+    return sum(shares)
 
 
 def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
