@@ -322,8 +322,15 @@ class Table:
             for k, v in self.figures(part, one).items()
         }
         failed, notes = self._failed(mine)
+        counts = {part: len(self.answers(part, one)) for part, one in changed.items()}
+        fewer = [count for part, count in counts.items() if count < len(self.answers(part, OWN))]
         if known and min(one.scenes for one in known) == 1:
             notes = (*notes, "measured in one scene: no interval")
+        elif fewer:
+            notes = (
+                *notes,
+                f"measured in {min(fewer)} scenes and the job in more, so that its percentiles may flatter it",
+            )
         sizes = [
             one["bytes"]
             for part in ("draw", "capture")

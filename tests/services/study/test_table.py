@@ -135,6 +135,8 @@ def test_a_scene_that_fails_counts_and_a_setting_without_a_time_has_no_row():
     }
     row = Table(PARTS, some).row(STEP)
     assert row.failed_share == 0.5 and row.notes == ("flat: 1 scene", "left_table: 1 scene")
+    short = {name: one for name, one in journal().items() if not name.endswith(f"3/{STEP.name}")}
+    assert "measured in 3 scenes and the job in more" in Table(PARTS, short).row(STEP).notes[0]
     assert row.errors["lost_share"].value == 0.5
     del some[unit_name("draw", 0, FLAT)]
     assert Table(PARTS, some).row(FLAT).ratio == pytest.approx(3.5 / 4)
