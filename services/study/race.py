@@ -6,9 +6,9 @@ surely takes longer than one that surely meets all (`Table.verdict`, 95 %). Part
 what is left of the budget.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from statistics import median
+from statistics import fmean, median
 
 from services.study.choose import AS_CHEAP
 from services.study.knobs import REFERENCES
@@ -172,12 +172,16 @@ class Race:
         return [one for one in settings if one != OWN and self.cost_s(table, part, one) > DEAR * usual_s]
 
     def cost_s(self, table: Table, part: Part, setting: Setting) -> float:
-        """Seconds by the clock of one scene: the mean so far, or the job's own."""
-        took = [one["took"] for one in table.answers(part, setting).values()]
-        if took:
-            return sum(took) / len(took)
-        own = [one["took"] for one in table.answers(part, OWN).values()]
-        return (REFERENCE_TIMES if setting in REFERENCES else 1.0) * (sum(own) / len(own) if own else 1.0)
+        """Seconds by the clock of one scene: the mean so far, or the usual one of the part's settings."""
+
+        def means(settings: Iterable[Setting]) -> list[float]:
+            took = [[one["took"] for one in table.answers(part, some).values()] for some in settings]
+            return [fmean(some) for some in took if some]
+
+        if own := means([setting]):
+            return own[0]
+        usual = means(table.parts.measured[part])
+        return (REFERENCE_TIMES if setting in REFERENCES else 1.0) * (median(usual) if usual else 1.0)
 
     @staticmethod
     def _scenes(table: Table, part: Part, setting: Setting) -> int:
