@@ -93,8 +93,9 @@ class Lanes:
 class _Lane:
     def __init__(self, job: str, folder: str, scratch: str) -> None:
         self.pipe, theirs = multiprocessing.Pipe()
+        # No daemon: files from outside are read by processes of its own.
         fresh = multiprocessing.get_context("spawn")
-        self.process = fresh.Process(target=_serve, args=(theirs, job, folder, scratch), daemon=True)
+        self.process = fresh.Process(target=_serve, args=(theirs, job, folder, scratch))
         self.process.start()
         theirs.close()
         self.unit: Unit | None = None

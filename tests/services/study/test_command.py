@@ -12,6 +12,7 @@ from schemas.capture import CaptureScore
 from schemas.errors import InputError, MachineError
 from schemas.job.job import Job
 from services.cli.main import main
+from services.job.job_file import load_job
 from services.study import command
 from services.study.captures import check_captures, errors_of, fewer_views, measure_capture
 from services.study.choose import refuse_unmeasured
@@ -149,6 +150,15 @@ def test_a_process_that_dies_is_a_broken_answer_and_what_is_under_way_at_the_end
         found = {unit.part: answers["the job"] for unit, answers in lanes.run(units, float("inf"))}
         assert found["no such part"]["broken"] == DIED and found["rest"]["errors"]["penetration_mm"] < 1e-6
         assert list(lanes.run(units[1:], 0.0)) == []
+
+
+@pytest.mark.minute
+def test_files_from_outside_are_read_by_processes_of_their_own_also_in_a_study(tmp_path):
+    job = load_job(Path(TABLETOP).with_name("real_meshes.yaml"), [])
+    with Lanes(job, Path(TABLETOP).parent, 1, tmp_path) as lanes:
+        units = [Unit("rest", scene, scene, (Setting(),)) for scene in range(4)]
+        found = [answers["the job"] for _, answers in lanes.run(units, float("inf"))]
+    assert not [one["broken"] for one in found if "broken" in one] and any("errors" in one for one in found)
 
 
 # ---------------------------------------------------------------------------------------------- captures
