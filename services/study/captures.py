@@ -13,7 +13,7 @@ from schemas.capture import CaptureScore
 from schemas.errors import InputError
 from schemas.job.job import Job
 from services.study.measure import Answer, Meter, answer_for, context_for
-from services.study.model import Setting
+from services.study.model import OWN, Setting
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.make_capture import process_capture, require_captures, simulate_one
 from workers.capture.reconstruct import ProcessorClock
@@ -44,7 +44,7 @@ def measure_capture(
     """
     if not _warm:
         _warm.append(True)
-        answer_for(partial(_process, context, scene_id, scratch, Setting()))
+        answer_for(partial(_process, context, scene_id, scratch, OWN))
     order = np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))
     return {settings[k].name: answer_for(partial(_process, context, scene_id, scratch, settings[k])) for k in order}
 

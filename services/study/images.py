@@ -33,7 +33,7 @@ from services.study.colour import (
 )
 from services.study.knobs import size_value
 from services.study.measure import Answer, Meter, answer_for, context_for, laid_for, own_rest, warm_answer_for
-from services.study.model import Setting
+from services.study.model import OWN, Setting
 from services.study.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
 from services.study.table import AT_REST
 from workers.geometry.pixels import dequantise_depth
@@ -274,7 +274,7 @@ def measure_colour(
 def colour_truths(context: WorkerContext, scene_id: int) -> tuple[ColourTruth | None, ColourTruth | None]:
     """The scene's truths of colour and of edges; None where there is none, or no object is visible."""
     with suppress(SceneError):
-        first = _input_alone(context, Setting(), scene_id)
+        first = _input_alone(context, OWN, scene_id)
         if (crop := crop_of(first[1])) is not None:
             traced = None if colour_truth_missing() else converged_colour(*first, CONVERGED_PATHS)
             return traced, _smooth(context, scene_id, crop)

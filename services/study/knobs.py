@@ -14,7 +14,7 @@ from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job
 from schemas.job.keys import set_key
 from services.job.job_file import describe_fault
-from services.study.model import Changes, Knob, Setting, Value
+from services.study.model import OWN, Changes, Knob, Setting, Value
 
 OTHER_WORLD = frozenset({"friction", "density", "if_lost", "depth_noise", "rgb_noise", "distortion", "exposure"})
 """Knobs whose cost is shown and which are never recommended: they make another world or another camera, not a better one."""
@@ -166,7 +166,7 @@ def choose_knobs(knobs: Sequence[Knob], names: Sequence[str] | None) -> tuple[Kn
 
 def settings_of(job: Job, knobs: Sequence[Knob]) -> tuple[tuple[Setting, ...], tuple[str, ...]]:
     """The job itself, then each value of each knob that it does not have itself; and what is left out, and why."""
-    settings, left_out = [Setting()], []
+    settings, left_out = [OWN], []
     for knob in knobs:
         missing = [value for value in knob.values if value.package and not find_spec(value.package)]
         if missing:

@@ -19,11 +19,10 @@ from typing import Any
 from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.study.knobs import apply
-from services.study.model import Setting
+from services.study.model import OWN, Setting
 from workers.assets.catalogue import open_catalogue
 from workers.scene.context import WorkerContext, open_worker
 
-OWN = Setting()
 DIED = "the process that measured it died"
 
 

@@ -23,7 +23,7 @@ from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Settled
 from services.study.knobs import apply
-from services.study.model import Setting
+from services.study.model import OWN, Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.bullet import GRAVITY_M_S2, World, open_world
 from workers.physics.fall import FINEST
@@ -155,7 +155,7 @@ def measure_rest(
     for setting in [settings[k] for k in order]:
         worker = context_for(context, setting)
         answers[setting.name] = warm_answer_for("rest", setting, partial(_rest, worker, scene_id, number))
-    own = answers.get(Setting().name)
+    own = answers.get(OWN.name)
     if own is not None and new_s is not None:
         built = max(0.0, (again.get("cold") or 0.0) - new_s - own["s"]) if again and own["s"] else 0.0
         own["plan_s"] = new_s + built

@@ -62,6 +62,10 @@ class Setting:
         return "preset" if self.parts[0][0] == "preset" else "single" if len(self.parts) == 1 else "several"
 
 
+OWN = Setting()
+"""The job as it is."""
+
+
 @dataclass(frozen=True)
 class Figure:
     """An error of a setting: its value, its 95 % confidence interval by bootstrap over scenes, and their number."""

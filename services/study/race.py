@@ -12,8 +12,8 @@ from statistics import fmean, median
 
 from services.study.choose import AS_CHEAP
 from services.study.knobs import REFERENCES
-from services.study.model import Setting
-from services.study.table import OWN, Part, Table
+from services.study.model import OWN, Setting
+from services.study.table import Part, Table
 
 MOST: Mapping[Part, int] = {"rest": 512, "again": 64, "draw": 64, "colour": 8, "capture": 32}
 """The most scenes of each part."""
@@ -104,9 +104,7 @@ class Race:
 
     def is_decided(self, table: Table, part: Part) -> bool:
         """Whether more scenes of this part would not change the choice."""
-        return not self.open_rivals(table, part) or all(
-            self._scenes(table, part, one) >= MOST[part] for one in self.open_rivals(table, part)
-        )
+        return all(self._scenes(table, part, one) >= MOST[part] for one in self.open_rivals(table, part))
 
     def next_round(self, table: Table, part: Part, level: int, allowed_s: float) -> tuple[list[Wanted], bool]:
         """What is missing of a part up to `level` scenes of the settings in this round, and whether all of it fits.

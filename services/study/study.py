@@ -12,13 +12,13 @@ from pathlib import Path
 from schemas.errors import RunError, describe_seconds, plural
 from services.bench.figures import describe_machine
 from services.run.progress import ProgressLine
-from services.study.choose import DEFAULT_TARGETS, TargetError, answer, own_row, recommend, targets_of
+from services.study.choose import DEFAULT_TARGETS, TargetError, answer, recommend, targets_of
 from services.study.knobs import REFERENCES, joined
 from services.study.lanes import Journal, Lanes, Unit
 from services.study.measure import slopes
-from services.study.model import ERRORS, NEGLIGIBLE, Figure, Plan, Proof, Row, Setting, Study
+from services.study.model import ERRORS, NEGLIGIBLE, OWN, Figure, Plan, Proof, Row, Setting, Study
 from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted
-from services.study.table import AGAIN, OWN, UNTIMED, Part, Parts, Table, figures_of, part_of, unit_name
+from services.study.table import AGAIN, UNTIMED, Part, Parts, Table, figures_of, part_of, unit_name
 
 PILOT_SHARE, RACE_SHARE, LOOK_SHARE, PROOF_SHARE = 0.3, 0.87, 0.9, 1.0
 """By these shares of the budget the pilot, the race, the pictures and the proof end."""
@@ -143,6 +143,10 @@ class Measurement:
         own = {part: [one["took"] for one in self.table().answers(part, OWN).values()] for part in self.parts.measured}
         limits = {part: max(LEAST_LIMIT_S, SLOW * max(took)) if took else math.inf for part, took in own.items()}
         units = [Unit(part, scene, scene - first, settings, OWN, limits[part]) for part, scene, settings in groups]
+        self.keep(units, share)
+
+    def keep(self, units: Sequence[Unit], share: float) -> None:
+        """Measures these units until a share of the budget is spent, and keeps the answers."""
         for unit, answers in self.lanes.run(units, self.deadline(share), self.deadline(share + LATE_SHARE)):
             for one in unit.settings:
                 self.journal.add(unit_name(unit.part, unit.scene_id, one), answers[one.name])
@@ -332,10 +336,7 @@ def look_at_errors(bench: Measurement) -> None:
     known = {name.split("/", 2)[2] for name in bench.journal if name.startswith(f"{LOOKS}/")}
     settings = [one for one in dict.fromkeys([OWN.name, *telling(rows)]) if one not in known]
     by_name = {row.setting.name: row.setting for row in rows}
-    units = [Unit(LOOKS, scene, 0, (by_name[name],)) for name in settings]
-    for unit, answers in bench.lanes.run(units, bench.deadline(LOOK_SHARE), bench.deadline(LOOK_SHARE + LATE_SHARE)):
-        for one in unit.settings:
-            bench.journal.add(unit_name(LOOKS, unit.scene_id, one), answers[one.name])
+    bench.keep([Unit(LOOKS, scene, 0, (by_name[name],)) for name in settings], LOOK_SHARE)
 
 
 def telling(rows: Sequence[Row]) -> list[str]:
@@ -354,12 +355,9 @@ def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Proof, 
     """The rows of the table, with every setting that was proved, and the proofs; the last proof is that of the answer."""
     rows, crossed = all_rows(bench)
     proofs: list[Proof] = []
-    known = {row.setting.name: row for row in crossed}
     while True:
         withdrawn = {one.setting for one in proofs}
-        able = [row for row in (*rows, *crossed) if row.setting.name not in withdrawn]
-        if not any(row.setting == OWN for row in able):
-            able = [own_row(rows), *able]
+        able = without((*rows, *crossed), withdrawn)
         try:
             chosen = recommend(able, bench.plan.targets)
         except TargetError:
@@ -370,11 +368,16 @@ def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Proof, 
         ):
             break
         proofs.append(proof)
-        if chosen.setting.name in known and chosen not in rows:
+        if chosen not in rows:
             rows = (*rows, chosen)
         if proof.holds or bench.left_s(PROOF_SHARE) <= 0.0:
             break
     return rows, tuple(proofs)
+
+
+def without(rows: Sequence[Row], withdrawn: set[str]) -> tuple[Row, ...]:
+    """The rows that are not withdrawn, and the job's own, which all others are held against."""
+    return tuple(row for row in rows if row.setting == OWN or row.setting.name not in withdrawn)
 
 
 def prove(bench: Measurement, chosen: Row, targets: Mapping[str, float]) -> Proof | None:
@@ -386,8 +389,8 @@ def prove(bench: Measurement, chosen: Row, targets: Mapping[str, float]) -> Proo
     if not parts:
         return None
     digest = hashlib.sha256(repr(sorted(chosen.setting.changes.items())).encode()).hexdigest()[:8]
-    first, most = bench.plan.job.first_scene + FRESH_SCENE, {part: min(PROVED, MOST[part]) for part in parts}
-    most = {part: PROVED if part in ("rest", "draw") else count for part, count in most.items()}
+    first = bench.plan.job.first_scene + FRESH_SCENE
+    most = {part: PROVED if part in ("rest", "draw") else MOST[part] for part in parts}
     units = [
         Unit(part, first + n, n, (OWN,), chosen.setting)
         for n in range(PROVED)
@@ -432,7 +435,7 @@ def told(
     notes = [*left_out, *([f"not reached within the budget: {', '.join(missing)}"] if missing else [])]
     held = bool(proofs) and proofs[-1].holds
     withdrawn = {one.setting for one in proofs if not one.holds}
-    able = tuple(row for row in rows if row.setting == OWN or row.setting.name not in withdrawn)
+    able = without(rows, withdrawn)
     scenes = max(len(table.answers(part, OWN)) for part in bench.parts.measured)
     study = Study(
         job=plan.job.name,

@@ -17,7 +17,7 @@ from scipy.stats import beta
 
 from schemas.base import Array
 from services.study.knobs import REFERENCES
-from services.study.model import ERRORS, Figure, Group, Row, Setting
+from services.study.model import ERRORS, OWN, Figure, Group, Row, Setting
 
 Answer = Mapping[str, Any]
 """What one scene told of one setting: `s` seconds of processor (None where the machine slept), `took` seconds by the clock,
@@ -188,8 +188,6 @@ AGAIN: Mapping[str, Part] = {"moved_mm": "again", "turned_deg": "again"}
 
 UNTIMED = frozenset({"colour", "again"})
 """Parts that measure errors and no time."""
-
-OWN = Setting()
 
 
 def part_of(error: str) -> Part:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from services.study.knobs import REFERENCES
-from services.study.model import Setting
+from services.study.model import OWN, Setting
 from services.study.race import LEAST, MOST, Race
 from services.study.study import grouped, in_turn
-from services.study.table import OWN, Parts, Table, apart, figure_over_scenes, figures_of, share, unit_name, verdict
+from services.study.table import Parts, Table, apart, figure_over_scenes, figures_of, share, unit_name, verdict
 
 STEP = Setting((("step", "60"),), {"physics.step_hz": 60})
 FLAT = Setting((("colour", "flat"),), {"render.tier": "flat"})
