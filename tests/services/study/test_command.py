@@ -26,15 +26,20 @@ from workers.capture.folder import open_folder
 from workers.scene.context import open_worker
 
 SMALL = [
-    *("--budget", "36s", "--workers", "1", "--knobs", "exact_rest,units", "--target", "depth_mm=0.11"),
+    *("--budget", "60s", "--workers", "1", "--knobs", "exact_rest,units", "--target", "depth_mm=0.11"),
     *("--set", "cameras.sensor={width: 160, height: 120, fx: 131.25, fy: 131.25, cx: 80, cy: 60}"),
 ]
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory) -> Path:
-    """A small study, stopped after two answers and gone on with."""
+    """A small study, stopped after two answers and gone on with.
+
+    One scene comes first: the first on a machine compiles for longer than the small study may take.
+    """
     out = tmp_path_factory.mktemp("study")
+    with Lanes(load_job(Path(TABLETOP), SMALL[-1:]), Path(TABLETOP).parent, 1, out) as lanes:
+        assert len(list(lanes.run([Unit(part, 0, 0, (Setting(),)) for part in ("rest", "draw")], float("inf")))) == 2
     real, calls = Journal.add, []
 
     def stopped(journal, *entry):
@@ -64,7 +69,7 @@ def test_a_study_has_every_setting_with_its_errors_its_plots_its_proof_and_its_p
         assert rows[name]["depth_mm"] == pytest.approx(off_mm, rel=0.05)
     study = read_study(measured)
     assert study.chosen in rows and study.proofs[-1].setting == study.chosen and study.proofs[-1].holds
-    assert study.proofs[-1].scenes >= 4 and study.seconds < 1.1 * study.budget_s == pytest.approx(39.6)
+    assert study.proofs[-1].scenes >= 4 and study.seconds < 1.1 * study.budget_s == pytest.approx(66.0)
     page = (measured / "index.html").read_text()
     assert "<html" in page and "units" in page and "1000" in page and "fresh scenes" in page
     for name in ("tradeoff.png", "knob_units.png"):
@@ -81,7 +86,7 @@ def test_the_same_command_measures_nothing_twice_and_a_longer_budget_goes_on(mea
     code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--target", "depth_mm=0.01")
     assert code == 1 and "units=8000" in text and "depth_mm" in text and "0.06" in text
     assert (len(set(before)) == len(before) and "not decided" in text) or "convergence" in text
-    code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--budget", "46s")
+    code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--budget", "70s")
     assert code == 0 and units()[: len(before)] == before and len(set(units())) == len(units())
     code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--set", "seed=5")
     assert code == 2 and "another study" in text and "--out" in text
@@ -89,7 +94,7 @@ def test_the_same_command_measures_nothing_twice_and_a_longer_budget_goes_on(mea
 
 @pytest.mark.minute
 def test_a_target_writes_the_job_with_the_cheapest_setting_that_meets_it(measured, capsys):
-    words = ["--target", "depth_mm=0.3,kept_share=0.9", "--budget", "60s", "--json"]
+    words = ["--target", "depth_mm=0.3,kept_share=0.9", "--budget", "90s", "--json"]
     assert main(["tradeoff", TABLETOP, "--out", str(measured), *SMALL, *words]) == 0
     answer = json.loads(capsys.readouterr().out.splitlines()[-1])
     tree = yaml.safe_load((measured / "job.yaml").read_text())
