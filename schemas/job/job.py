@@ -79,23 +79,68 @@ PATH_S = 1.0
 
 
 PresetName = Literal["fast", "balanced", "exact"]
+JobKind = Literal["singles", "piles", "meshes", "captures"]
+Keys = Mapping[str, Any]
+"""Values by dotted key of a job."""
 
-PRESETS: dict[PresetName, dict[str, Any]] = {
-    "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
-    "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
-    "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
+PRESETS: Mapping[JobKind, Mapping[PresetName, Keys]] = {
+    "singles": {
+        "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
+        "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
+        "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
+    },
+    "piles": {
+        "fast": {"physics.step_hz": 120, "render.tier": "raster", "render.samples": 1},
+        "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
+        "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
+    },
+    "meshes": {
+        "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
+        "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
+        "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
+    },
+    "captures": {
+        "fast": {
+            "captures.estimation.max_iterations": 2,
+            "captures.fusion.voxel_m": 0.004,
+            "captures.synthesis.views": 3,
+        },
+        "balanced": {
+            "captures.estimation.max_iterations": 100,
+            "captures.fusion.voxel_m": 0.002,
+            "captures.synthesis.views": 6,
+        },
+        "exact": {
+            "captures.estimation.max_iterations": 100,
+            "captures.fusion.voxel_m": 0.0015,
+            "captures.synthesis.views": 12,
+        },
+    },
 }
-"""Values by preset and dotted key; all presets set the same keys. They set effort, and never what is stored (image size,
-units, how d_z is read). `balanced` equals the keys' own defaults."""
+"""Values by kind of job, preset and dotted key, from the studies in docs/tradeoff; all presets of a kind set the same keys.
+They set effort, and never what an image holds (size, units, how d_z is read). `balanced` equals the keys' own defaults."""
 
 
-def with_preset(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a job's keys, with those of its preset where the job does not give them.
+def kind_of(tree: Keys) -> JobKind:
+    """Which of the four kinds a job is, by its keys, of which any may be missing or wrong."""
+    if isinstance(tree.get("captures"), Mapping):
+        return "captures"
+    count = tree.get("objects_per_scene", 1)
+    if (count[-1:] if isinstance(count, list | tuple) else [count]) not in ([1], (1,)):
+        return "piles"
+    assets = tree.get("assets")
+    sources = assets.get("objects") if isinstance(assets, Mapping) else None
+    kinds = [one.get("source") for one in sources if isinstance(one, Mapping)] if isinstance(sources, list) else []
+    return "singles" if all(kind == "procedural" for kind in kinds) else "meshes"
+
+
+def with_preset(tree: Keys) -> dict[str, Any]:
+    """A copy of a job's keys, with those of its preset and kind where the job does not give them.
 
     An unknown preset is left to validation; a branch that is no mapping is left as it is.
     """
     preset = tree.get("preset", "balanced")
-    return with_defaults(tree, next((keys for name, keys in PRESETS.items() if name == preset), {}))
+    return with_defaults(tree, next((keys for name, keys in PRESETS[kind_of(tree)].items() if name == preset), {}))
 
 
 MOST_SCENE_IDS = 10**10
@@ -121,7 +166,7 @@ class Job(Frozen):
     name: Annotated[str, Field(max_length=1000), AfterValidator(_usable)]
     """Names the dataset; the default output folder is data/<name>."""
     preset: PresetName = "balanced"
-    """Defaults of keys that are not given; docs/measured.md has what they cost."""
+    """Defaults of keys that are not given, by kind of job; docs/measured.md has what they cost."""
     seed: Seed = 0
     """Seed of all that is random in a scene."""
     scenes: PositiveInt = 64

@@ -95,7 +95,7 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, flo
     job = apply(asked, {"captures.estimation.compare": False} if captured else UNMEASURED)
     knobs = choose_knobs(knobs_of(job), options.knobs.split(",") if options.knobs else None)
     settings, left_out = settings_of(job, knobs)
-    presets = () if captured else preset_settings(job)  # presets have no keys of captures
+    presets = preset_settings(job)
     processes = options.workers or usable_cores()
     plan = Plan(job, options.job.parent, knobs, settings, presets, targets, options.budget, processes)
     return plan, [*left_out, *([missing] if missing and not captured else [])]

@@ -11,7 +11,7 @@ from pydantic_core import to_jsonable_python
 
 from schemas.errors import InputError, did_you_mean
 from schemas.job.captures import ESTIMATES
-from schemas.job.job import PRESETS, Job
+from schemas.job.job import PRESETS, Job, kind_of
 from schemas.job.keys import set_key
 from services.job.job_file import describe_fault
 from services.study.model import OWN, Changes, Knob, Setting, Value
@@ -186,8 +186,9 @@ def settings_of(job: Job, knobs: Sequence[Knob]) -> tuple[tuple[Setting, ...], t
 
 
 def preset_settings(job: Job) -> tuple[Setting, ...]:
-    """One setting for each preset that makes another job."""
-    settings = [Setting((("preset", name),), changes) for name, changes in PRESETS.items()]
+    """One setting for each preset of the job's kind that makes another job."""
+    presets = PRESETS[kind_of(job.model_dump(mode="json"))]
+    settings = [Setting((("preset", name),), changes) for name, changes in presets.items()]
     return tuple(setting for setting in settings if apply(job, setting.changes) != job)
 
 

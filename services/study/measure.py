@@ -136,10 +136,11 @@ def measure_rest(
 
     `s` is the time to rest, without the plan. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm and rolled_deg
     (sideways travel of the centre of mass, and turn, since the object was released; the largest of several objects). Beside
-    them `lost`, `planned` and `redrawn` objects, and `corners`, mm, of each object's box in the world. The job itself also
-    has `plan_s`, the time of its plan and new shapes.
+    them `lost`, `planned` and `redrawn` objects, `corners`, mm, of each object's box in the world, and `planned_s`, the time
+    of a plan whose shapes are there. The job itself also has `plan_s`, that of its plan with new shapes.
     """
     new_s: float | None = None
+    cold_s: float | None = None
     if scene_id not in _seen:
         _seen.add(scene_id)
         with Meter() as planning:
@@ -147,9 +148,7 @@ def measure_rest(
         new_s = planning.s
         with Meter() as cold:
             _attempt(lambda: lay_scene(context, scene_id, Stopwatch()))
-        again = {"cold": cold.s} if cold.took < QUICK_S else {}
-    else:
-        again = {}
+        cold_s = cold.s if cold.took < QUICK_S else None
     order = np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))
     answers = {}
     for setting in [settings[k] for k in order]:
@@ -157,8 +156,7 @@ def measure_rest(
         answers[setting.name] = warm_answer_for("rest", setting, partial(_rest, worker, scene_id, number))
     own = answers.get(OWN.name)
     if own is not None and new_s is not None:
-        built = max(0.0, (again.get("cold") or 0.0) - new_s - own["s"]) if again and own["s"] else 0.0
-        own["plan_s"] = new_s + built
+        own["plan_s"] = new_s + max(0.0, (cold_s or 0.0) - (own.get("planned_s") or 0.0) - (own["s"] or 0.0))
     return answers
 
 
@@ -182,6 +180,7 @@ def _rest(worker: WorkerContext, scene_id: int, number: int, meter: Meter) -> An
             meter.s -= planning.s
     rest = laid.rest
     answer: Answer = {
+        "planned_s": planning.s,
         "errors": _errors_of(rest),
         "lost": planned - len(rest.settled),
         "planned": planned,

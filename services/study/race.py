@@ -69,6 +69,11 @@ class Race:
         """The settings of a part that are still in the race."""
         return [one for one in table.parts.measured[part] if (part, one.name) not in self.out]
 
+    def reasons(self, mine: Mapping[Part, Setting]) -> tuple[str, ...]:
+        """Why a setting with these parts is out of the race, in words; none where it is not."""
+        found = [self.out.get((part, one.name)) for part, one in mine.items() if one != OWN]
+        return tuple(f"out of the race: {reason}" for reason in dict.fromkeys(found) if reason)
+
     def judge(self, table: Table) -> None:
         """Puts out what surely misses, and what surely costs more than a setting that surely meets."""
         for part, settings in table.parts.measured.items():

@@ -437,6 +437,9 @@ def told(
     notes = [*left_out, *([f"not reached within the budget: {', '.join(missing)}"] if missing else [])]
     held = bool(proofs) and proofs[-1].holds
     withdrawn = {one.setting for one in proofs if not one.holds}
+    rows = tuple(
+        replace(row, notes=(*row.notes, *race.reasons(bench.parts.of.get(row.setting.name, {})))) for row in rows
+    )
     able = without(rows, withdrawn)
     scenes = max(len(table.answers(part, OWN)) for part in bench.parts.measured)
     study = Study(

@@ -116,7 +116,7 @@ def test_a_preset_fills_the_keys_that_the_job_does_not_give():
     given = {"preset": "exact", "render": {"samples": 1}}
     filled = with_preset(given)
     assert filled["render"] == {"samples": 1, "tier": "raster"}
-    assert filled["physics"] == {"step_hz": PRESETS["exact"]["physics.step_hz"]}
+    assert filled["physics"] == {"step_hz": PRESETS["singles"]["exact"]["physics.step_hz"]}
     assert given == {"preset": "exact", "render": {"samples": 1}}
     for name in ("unknown", 3, None, ["fast"]):
         assert with_preset({"preset": name}) == {"preset": name}

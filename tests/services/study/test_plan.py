@@ -1,7 +1,7 @@
 """What is measured: knobs, presets, rounds of settings, promising combinations, and the journal of what is done."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from pydantic import BaseModel
@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from schemas.errors import InputError, OutputError
 from schemas.job.captures import ESTIMATES
 from schemas.job.identity import settings_digest
-from schemas.job.job import PRESETS, Job
+from schemas.job.job import PRESETS, Job, JobKind, kind_of
 from services.study import knobs as study_knobs
 from services.study.choose import error_of, own_row
 from services.study.knobs import FREE, REFERENCES, apply, choose_knobs, joined, knobs_of, settings_of
@@ -114,8 +114,9 @@ def test_every_key_of_a_job_is_turned_by_a_knob_or_listed_as_free():
 SLACK = 0.1
 """A preset may take a tenth more time than a setting that is as good, and have errors a tenth larger than one as cheap."""
 
-BY_EFFORT = {*PRESETS["balanced"], "physics.max_step_travel_mm", "physics.solver_iterations", "physics.collision"} | {
-    *("physics.rest.speed_mm_s", "physics.rest.spin_rad_s", "physics.exact_rest", "render.path_samples")
+BY_EFFORT = {key for kind in PRESETS.values() for key in kind["balanced"]} | {
+    *("physics.max_step_travel_mm", "physics.solver_iterations", "physics.collision"),
+    *("physics.rest.speed_mm_s", "physics.rest.spin_rad_s", "physics.exact_rest", "render.path_samples"),
 }
 """The keys that presets choose or could. Settings that change other keys store other things, and are no rivals."""
 
@@ -141,21 +142,31 @@ def better_than(preset: Row, rows: Sequence[Row]) -> list[str]:
 def test_no_measured_setting_is_better_than_a_preset_by_more_than_the_slack():
     rows = stored().rows
     assert sum(set(one.setting.changes) <= BY_EFFORT for one in rows) > 8
-    for name, changes in PRESETS.items():
+    for name, changes in PRESETS["singles"].items():
         preset = next((one for one in rows if one.setting.parts == (("preset", name),)), own_row(rows))
         assert preset.setting.parts or name == "balanced"
         assert dict(preset.setting.changes) in ({}, changes), "measure docs/tradeoff again: its preset has other keys"
         assert better_than(preset, rows) == []
 
 
+OF_KIND: dict[JobKind, dict[str, Any]] = {
+    "singles": {"objects_per_scene": [1, 1], "assets": {"objects": [{"source": "procedural"}]}, "captures": None},
+    "piles": {"objects_per_scene": [1, 3], "assets": {"objects": [{"source": "files", "folder": "x"}]}},
+    "meshes": {"assets": {"objects": [{"source": "procedural"}, {"source": "urdf", "folder": "x"}]}},
+    "captures": {"captures": {}},
+}
+
+
 def test_a_preset_makes_the_same_dataset_as_its_keys_and_all_choose_the_same_keys():
     def digest(job: Job) -> str:
         return settings_digest(job, "x")
 
-    for name, changes in PRESETS.items():
-        job = Job.model_validate({"name": "t", "preset": name})
-        assert digest(job) == digest(apply(Job(name="t"), changes)) and changes.keys() == PRESETS["balanced"].keys()
-        assert Job.model_validate_json(job.model_dump_json()) == job
+    for kind, keys in OF_KIND.items():
+        for name, changes in PRESETS[kind].items():
+            plain, job = (Job.model_validate({"name": "t", **keys, **some}) for some in ({}, {"preset": name}))
+            assert kind_of(keys) == kind_of(job.model_dump(mode="json")) == kind
+            assert digest(job) == digest(apply(plain, changes)) and changes.keys() == PRESETS[kind]["balanced"].keys()
+            assert Job.model_validate_json(job.model_dump_json()) == job
     assert digest(Job(name="t", preset="exact")) != digest(Job(name="t")) == digest(Job(name="t", preset="balanced"))
 
 

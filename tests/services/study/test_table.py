@@ -175,7 +175,9 @@ def test_what_surely_misses_or_surely_costs_more_is_out_and_nothing_before_it_wa
     table = Table(PARTS, journal(64, flat_s=3.0))
     slow.judge(table)
     assert slow.out["draw", FLAT.name].startswith("costs more") and slow.is_decided(table, "draw")
-    assert ("draw", OWN.name) not in slow.out
+    assert ("draw", OWN.name) not in slow.out and slow.reasons({"rest": OWN, "draw": OWN}) == ()
+    (reason,) = slow.reasons({"rest": OWN, "draw": FLAT})
+    assert reason.startswith("out of the race: costs more")
     unsure = Table(PARTS, journal(16))
     assert not racing(depth_mm=0.2).is_decided(unsure, "draw") and OWN in racing(depth_mm=0.2).open_rivals(
         unsure, "draw"
