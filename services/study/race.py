@@ -6,7 +6,7 @@ surely takes longer than one that surely meets all (`Table.verdict`, 95 %). Part
 what is left of the budget.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
 
@@ -54,6 +54,23 @@ class Wanted:
     scene_id: int
     setting: Setting
     cost_s: float
+
+
+def grouped(wanted: Sequence[Wanted], most_s: float) -> list[tuple[Part, int, tuple[Setting, ...]]]:
+    """Settings of one part and scene side by side, in units of at most about so many seconds."""
+    units: list[tuple[Part, int, tuple[Setting, ...]]] = []
+    order = dict.fromkeys((one.part, one.scene_id) for one in wanted)
+    for part, scene in order:
+        some, cost = list[Setting](), 0.0
+        for one in (one for one in wanted if (one.part, one.scene_id) == (part, scene)):
+            if some and cost + one.cost_s > most_s:
+                units.append((part, scene, tuple(some)))
+                some, cost = [], 0.0
+            some.append(one.setting)
+            cost += one.cost_s
+        if some:
+            units.append((part, scene, tuple(some)))
+    return units
 
 
 @dataclass

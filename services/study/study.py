@@ -17,7 +17,7 @@ from services.study.knobs import REFERENCES, joined
 from services.study.lanes import Journal, Lanes, Unit
 from services.study.measure import slopes
 from services.study.model import ERRORS, NEGLIGIBLE, OWN, Figure, Plan, Proof, Row, Setting, Study
-from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted
+from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted, grouped
 from services.study.table import AGAIN, UNTIMED, Part, Parts, Table, figures_of, part_of, unit_name
 
 FIRST_SHARE, PILOT_SHARE, RACE_SHARE, LOOK_SHARE, PROOF_SHARE = 0.5, 0.3, 0.87, 0.9, 1.0
@@ -35,6 +35,9 @@ FRESH_SCENE = 1_000_000
 
 PROVED, LEAST_PROVED = 200, 4
 """The most scenes of a proof, and the fewest."""
+
+MOST_PROOF_SHARE = 0.3
+"""Where the fewest scenes of a proof need more than the share that is left for it, they have up to this, and the race less."""
 
 SPENT = "spent"
 """The journal's entry of the seconds that were spent before."""
@@ -119,6 +122,7 @@ class Measurement:
     progress: ProgressLine
     began: float
     before_s: float
+    race_share: float = RACE_SHARE
 
     @property
     def spent_s(self) -> float:
@@ -156,23 +160,6 @@ class Measurement:
     def keep_clock(self) -> None:
         """Writes down what was spent, for the next start."""
         self.journal.add(SPENT, self.spent_s)
-
-
-def grouped(wanted: Sequence[Wanted], most_s: float) -> list[tuple[Part, int, tuple[Setting, ...]]]:
-    """Settings of one part and scene side by side, in units of at most about so many seconds."""
-    units: list[tuple[Part, int, tuple[Setting, ...]]] = []
-    order = dict.fromkeys((one.part, one.scene_id) for one in wanted)
-    for part, scene in order:
-        some, cost = list[Setting](), 0.0
-        for one in (one for one in wanted if (one.part, one.scene_id) == (part, scene)):
-            if some and cost + one.cost_s > most_s:
-                units.append((part, scene, tuple(some)))
-                some, cost = [], 0.0
-            some.append(one.setting)
-            cost += one.cost_s
-        if some:
-            units.append((part, scene, tuple(some)))
-    return units
 
 
 def run_study(
@@ -260,16 +247,25 @@ def in_turn(wanted: Sequence[Wanted]) -> list[Wanted]:
     return [wanted[k] for k in sorted(range(len(wanted)), key=lambda k: order[k])]
 
 
+def race_share(table: Table, processes: int, budget_s: float) -> float:
+    """The share of the budget at which the race ends, so that the pictures and the fewest scenes of a proof still fit."""
+    answers = [table.answers(part, OWN).values() for part in table.parts.measured if part not in UNTIMED]
+    scene_s = sum(max((one["took"] for one in some), default=0.0) for some in answers)
+    share = -(-LEAST_PROVED // processes) * scene_s / max(1.0, budget_s - PAGE_S)
+    return min(RACE_SHARE, 1.0 - (LOOK_SHARE - RACE_SHARE) - LATE_SHARE - min(MOST_PROOF_SHARE, share))
+
+
 def run_race(bench: Measurement, race: Race) -> Measurement:
     """Rounds of twice as many scenes, until every part is decided or the budget's share is spent."""
     levels = dict.fromkeys(parts_in(bench, race), FIRST_LEVEL)
     most = {**MOST, **({} if AGAIN.keys() & set(race.targets) else {"again": RELEASED_SCENES})}
-    combined = False
-    while levels and bench.left_s(RACE_SHARE) > 0.0:
+    combined, end = False, race_share(bench.table(), bench.plan.processes, bench.plan.budget_s)
+    bench = replace(bench, race_share=end)
+    while levels and bench.left_s(end) > 0.0:
         table = bench.table()
         race.judge(table)
         weights = sum(SHARES[part] for part in levels)
-        allowed_s = bench.left_s(RACE_SHARE) * bench.plan.processes / weights
+        allowed_s = bench.left_s(end) * bench.plan.processes / weights
         wanted: list[Wanted] = []
         for part, level in list(levels.items()):
             some, whole = race.next_round(table, part, level, allowed_s * SHARES[part])
@@ -279,7 +275,7 @@ def run_race(bench: Measurement, race: Race) -> Measurement:
             else:
                 levels[part] = 2 * level
         # Scene by scene, so that what the end of the budget cuts off leaves the same scenes of all.
-        bench.run(sorted(wanted, key=lambda one: one.scene_id), RACE_SHARE)
+        bench.run(sorted(wanted, key=lambda one: one.scene_id), end)
         if not combined and max(levels.values(), default=LEVEL_OF_CHOICE) >= LEVEL_OF_CHOICE:
             bench, combined = with_combinations(bench, race), True
     race.judge(bench.table())
@@ -338,7 +334,9 @@ def look_at_errors(bench: Measurement) -> None:
     known = {name.split("/", 2)[2] for name in bench.journal if name.startswith(f"{LOOKS}/")}
     settings = [one for one in dict.fromkeys([OWN.name, *telling(rows)]) if one not in known]
     by_name = {row.setting.name: row.setting for row in rows}
-    bench.keep([Unit(LOOKS, scene, 0, (by_name[name],)) for name in settings], LOOK_SHARE)
+    bench.keep(
+        [Unit(LOOKS, scene, 0, (by_name[name],)) for name in settings], bench.race_share + LOOK_SHARE - RACE_SHARE
+    )
 
 
 def telling(rows: Sequence[Row]) -> list[str]:

@@ -57,11 +57,14 @@ class CaptureCase:
     first: bool = False
 
 
-def run(case: CaptureCase, path: Path) -> tuple[float | None, str, str]:
-    """(worst error in mm, how it ended, the reason of view 0). Raises CaptureError; asserts that nothing is nan."""
+def run(case: CaptureCase, path: Path, seed: int = 0) -> tuple[float | None, str, str]:
+    """(worst error in mm, how it ended, the reason of view 0), with the seed of the noise.
+
+    Raises CaptureError; asserts that nothing is nan.
+    """
     write_description(path, CaptureFile(name="case"), CaptureCamera(HALF, np.zeros(8)), BOARD)
     for number, T in enumerate(case.poses):
-        view = replace(drawn(T.tobytes()), number=number)
+        view = replace(drawn(T.tobytes(), seed), number=number)
         write_view(path, view if case.change is None else case.change(view, T))
     if case.spoil is not None:
         case.spoil(path)
@@ -85,10 +88,10 @@ def assert_finite(estimate: CaptureEstimate) -> None:
 
 
 @functools.cache
-def drawn(pose_bytes: bytes) -> CapturedView:
+def drawn(pose_bytes: bytes, seed: int) -> CapturedView:
     """The view from a pose, drawn once."""
     T = np.frombuffer(pose_bytes).reshape(4, 4)
-    return draw_view(0, T, np.random.default_rng(1), picture=_print())
+    return draw_view(0, T, np.random.default_rng(1 + seed), picture=_print())
 
 
 @functools.cache

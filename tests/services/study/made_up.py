@@ -1,10 +1,11 @@
-"""Studies of accuracy against time: rows that were made up, and the study that is kept in docs/tradeoff."""
+"""Studies of accuracy against time: rows that were made up, and the studies that are kept in docs/tradeoff."""
 
 import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from schemas.job.job import JobKind
 from services.study.model import Figure, Proof, Row, Setting, Study
 from services.study.page import STUDY_FILE, STUDY_VERSION
 
@@ -52,6 +53,6 @@ def _row(tree: dict) -> Row:
 
 
 @cache
-def stored() -> Study:
-    """The study of docs/tradeoff: 51 settings as measured."""
-    return read_study(EVIDENCE)
+def stored(kind: JobKind = "singles") -> Study:
+    """The study of docs/tradeoff of this kind of job, as measured."""
+    return read_study(EVIDENCE / kind)

@@ -8,8 +8,8 @@ import pytest
 
 from services.study.knobs import REFERENCES
 from services.study.model import OWN, Setting
-from services.study.race import LEAST, MOST, Race
-from services.study.study import grouped, in_turn
+from services.study.race import LEAST, MOST, Race, grouped
+from services.study.study import RACE_SHARE, in_turn, race_share
 from services.study.table import Parts, Table, apart, figure_over_scenes, figures_of, share, unit_name, verdict
 
 STEP = Setting((("step", "60"),), {"physics.step_hz": 60})
@@ -202,6 +202,15 @@ def test_units_are_of_one_scene_and_no_longer_than_asked_and_a_pilot_takes_the_k
     pilot = racing().missing(Table(Parts.split((OWN, *values), captured=False), {}), "rest", 1)
     names = [one.setting.name for one in in_turn(pilot)]
     assert names == ["the job", "a=1", "b=1", "a=2", "b=2", *(one.name for one in REFERENCES)]
+
+
+def test_the_race_ends_earlier_where_four_scenes_of_a_proof_take_longer_than_what_is_left():
+    """A scene takes 1 s to rest and 1 s to draw: of two processes each proves two scenes, in 4 s of the 40 beside the page."""
+    table = Table(PARTS, journal())
+    assert race_share(table, 2, 10_000.0) == RACE_SHARE
+    assert race_share(table, 2, 46.0) == pytest.approx(0.94 - 4.0 / 40.0)
+    assert race_share(table, 1, 46.0) == pytest.approx(0.94 - 8.0 / 40.0)
+    assert race_share(table, 2, 7.0) == pytest.approx(0.94 - 0.3)
 
 
 def test_where_not_all_can_be_measured_until_they_are_sure_each_round_keeps_the_promising_half():
