@@ -132,7 +132,8 @@ class Race:
         """What is missing of a part up to `level` scenes of the settings in this round, and whether all of it fits.
 
         Where not all settings can be measured until they are sure, each round keeps half of those of the round before, the
-        most promising. Where even these would take more than the seconds allowed, the last ones wait, and the last scenes.
+        most promising, and the references, which errors of all are held against. Where even these would take more than the
+        seconds allowed, the last ones wait, and the last scenes.
         """
         dear = {one.name for one in self._dear(table, part)}
         wanted = [
@@ -146,7 +147,9 @@ class Race:
         sure = min(SURE_SCENES, MOST[part])
         whole_s = sum(self.cost_s(table, part, one) * max(0, sure - self._scenes(table, part, one)) for one in alive)
         if level > FIRST_LEVEL and whole_s > allowed_s:
-            order = order[: max(MOST_PROMISING, -(-len(alive) * FIRST_LEVEL // level))]
+            references = [one.name for one in REFERENCES if one.name in by_setting]
+            others = [name for name in order if name not in references]
+            order = others[: max(MOST_PROMISING, -(-len(alive) * FIRST_LEVEL // level))] + references
         if sum(one.cost_s for name in order for one in by_setting[name]) <= allowed_s:
             return [one for one in wanted if one.setting.name in order], True
         needed_s = sum(one.cost_s for name in order[:MOST_PROMISING] for one in by_setting[name])

@@ -270,9 +270,10 @@ def run_race(bench: Measurement, race: Race) -> Measurement:
         for part, level in list(levels.items()):
             some, whole = race.next_round(table, part, level, allowed_s * SHARES[part])
             wanted += some
-            if not whole or level >= most[part] or (level > LEVEL_OF_CHOICE and race.is_decided(table, part)):
+            decided = level >= most[part] or (level > LEVEL_OF_CHOICE and race.is_decided(table, part))
+            if decided if whole else not some:
                 del levels[part]
-            else:
+            elif whole:  # otherwise what is left of this level waits for what other parts leave of the budget
                 levels[part] = 2 * level
         # Scene by scene, so that what the end of the budget cuts off leaves the same scenes of all.
         bench.run(sorted(wanted, key=lambda one: one.scene_id), end)

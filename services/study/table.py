@@ -40,6 +40,9 @@ SURE = 0.95
 AGREE_MM = 0.05
 """Two references agree where their poses are nearer than this; only then is there a true pose."""
 
+LEAST_OUTCOMES = 8
+"""Scenes without which two distributions of outcomes are not compared: of two scenes their distance is chance alone."""
+
 SCENE_MM = 1000.0
 """Stands for the pose of an object that is there with one setting alone."""
 
@@ -116,7 +119,7 @@ def figures_of(answers: Answers, references: Sequence[Answers] = ()) -> dict[str
             if "errors" in references[0].get(n, {})
         ]
         for error, told in (("outcome_mm", "slid_mm"), ("outcome_deg", "rolled_deg")):
-            if len(both) > 1:
+            if len(both) >= LEAST_OUTCOMES:
                 found[error] = apart([a[told] for a, _ in both], [b[told] for _, b in both])
         poses = [
             pose

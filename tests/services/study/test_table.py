@@ -10,7 +10,17 @@ from services.study.knobs import REFERENCES
 from services.study.model import OWN, Setting
 from services.study.race import LEAST, MOST, Race, grouped
 from services.study.study import RACE_SHARE, in_turn, race_share
-from services.study.table import Parts, Table, apart, figure_over_scenes, figures_of, share, unit_name, verdict
+from services.study.table import (
+    LEAST_OUTCOMES,
+    Parts,
+    Table,
+    apart,
+    figure_over_scenes,
+    figures_of,
+    share,
+    unit_name,
+    verdict,
+)
 
 STEP = Setting((("step", "60"),), {"physics.step_hz": 60})
 FLAT = Setting((("colour", "flat"),), {"render.tier": "flat"})
@@ -93,12 +103,15 @@ def test_rest_is_held_against_the_references_of_the_same_scenes():
         {0: rest(1, corner=0.01), 1: rest(1, corner=9.0)},
     )
     own = {0: rest(1, 3.0, corner=2.0), 1: rest(1, 4.0), 2: rest(1, 100.0), 3: lost(1)}
+    assert "outcome_mm" not in figures_of(own, [fine, finest])  # two scenes tell nothing of a distribution
+    more = range(4, 2 + LEAST_OUTCOMES)
+    fine, own = fine | {n: rest(1, 2.0) for n in more}, own | {n: rest(1, 4.0) for n in more}
     found = figures_of(own, [fine, finest])
-    assert found["outcome_mm"].value == pytest.approx(2.0) and found["outcome_mm"].scenes == 2
+    assert found["outcome_mm"].value == pytest.approx(2.0) and found["outcome_mm"].scenes == LEAST_OUTCOMES
     assert found["outcome_deg"].value == 0.0
     assert (found["pose_mm"].value, found["pose_mm"].scenes) == (2.0, 1)  # of the scene in which the references agree
-    assert found["failed_share"].value == 0.25 and found["lost_share"].value == 0.25
-    assert found["redrawn_share"].value == 3 / 8 and "moved_mm" not in found
+    assert found["failed_share"].value == 1 / len(own) and found["lost_share"].value == 1 / len(own)
+    assert found["redrawn_share"].value == (len(own) - 1) / (2 * len(own)) and "moved_mm" not in found
     assert figures_of({}, [fine]) == {}
 
 
