@@ -1,22 +1,27 @@
 """Measures a simulated capture with settings: the time of its processing, and the errors that its truth tells."""
 
 import os
+import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 
-from schemas.capture import CaptureScore
+from schemas.capture import CaptureScore, SynthesizedView
 from schemas.errors import InputError
 from schemas.job.job import Job
+from schemas.scene.view import Camera
 from services.study.measure import Answer, Meter, answer_for, context_for
 from services.study.model import OWN, Setting
 from workers.capture.folder import CaptureFolder, open_folder
-from workers.capture.make_capture import process_capture, require_captures, simulate_one
-from workers.capture.reconstruct import ProcessorClock
+from workers.capture.make_capture import require_captures, simulate_one
+from workers.capture.reconstruct import ProcessorClock, estimate_surface, given_files
+from workers.capture.score import read_whole_truth, score_capture
+from workers.capture.views import CaptureViews
 from workers.geometry.camera import spread_evenly
 from workers.scene.context import WorkerContext
 
@@ -32,6 +37,9 @@ ERRORS_OF_SCORE = {
 }
 """Names of the study's errors, and of the score's figures."""
 
+HELD_OUT = 3
+"""Views that are made of the others, for their depth and their time."""
+
 _warm: list[bool] = []
 
 
@@ -40,7 +48,8 @@ def measure_capture(
 ) -> dict[str, Answer]:
     """Time, bytes and errors by setting of a simulated capture, which is kept in `scratch` for all settings.
 
-    Time is that of detection, estimates, cloud and mesh. A process works untimed first: that compiles its loops.
+    Time is that of detection, estimates, cloud, mesh and as many synthesised views as there are photographs. A process works
+    untimed first: that compiles its loops.
     """
     if not _warm:
         _warm.append(True)
@@ -62,14 +71,35 @@ def _simulated(context: WorkerContext, worker: WorkerContext, scene_id: int, scr
     return open_folder(place)
 
 
+@dataclass(eq=False)
+class TimedViews(CaptureViews):
+    """Views that keep the seconds of processor that each synthesised one took."""
+
+    seconds: list[float] = field(default_factory=list)
+
+    def synthesize(self, camera: Camera, without: int | None = None) -> SynthesizedView:
+        """As `CaptureViews.synthesize`."""
+        began = time.process_time()
+        made = super().synthesize(camera, without)
+        self.seconds.append(time.process_time() - began)
+        return made
+
+
 def _process(context: WorkerContext, scene_id: int, scratch: Path, setting: Setting, meter: Meter) -> Answer:
     worker, watch = context_for(context, setting), ProcessorClock()
     captures, whole = require_captures(worker.job), _simulated(context, worker, scene_id, scratch)
-    done = process_capture(fewer_views(whole, captures.simulate.views), captures, watch)
-    meter.s = sum(s for stage, s in watch.seconds.items() if stage != "score")
-    points, vertices, faces = map(len, (done.surface.points, done.surface.vertices, done.surface.faces))
+    folder = fewer_views(whole, captures.simulate.views)
+    with watch.stage("read"):
+        given = given_files(folder)
+    estimates, merged = estimate_surface(given, captures, watch)
+    views = TimedViews(given, estimates.estimate, captures, merged.body)
+    truth, surface = read_whole_truth(folder), merged.surface
+    score = None if truth is None else score_capture(estimates.estimate, surface, views, truth, HELD_OUT).summary
+    mirrors_s = fmean(views.seconds) * len(estimates.estimate.used) if views.seconds else 0.0
+    meter.s = sum(watch.seconds.values()) + mirrors_s
+    points, vertices, faces = map(len, (surface.points, surface.vertices, surface.faces))
     size = points * POINT_BYTES + vertices * VERTEX_BYTES + faces * FACE_BYTES
-    return {"errors": errors_of(done.score or CaptureScore()), "bytes": size}
+    return {"errors": errors_of(score or CaptureScore()), "bytes": size}
 
 
 def fewer_views(folder: CaptureFolder, views: int) -> CaptureFolder:
