@@ -61,7 +61,7 @@ COLUMNS = ("case", "declared", "ended", "measured", "figure", "bound", "spread",
 
 @dataclass(frozen=True)
 class Ending:
-    """How one seed of a case ended: in a word, what was measured, and the seconds that it took."""
+    """How one seed of a case ended: in a word, what was measured, and the seconds of processor that it took."""
 
     ended: str
     what: str = ""
@@ -218,12 +218,12 @@ def line_of(series: Series, ends: Sequence[Ending], other: Ending) -> dict[str, 
 
 def _timed(task: tuple[int, int]) -> tuple[tuple[int, int], Ending]:
     place, seed = task
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         end = all_series()[place].end(seed)
     except Exception as error:  # one line of the table, and not the end of an hour's work
         end = Ending(f"broken: {type(error).__name__}: {error}")
-    return task, dataclasses.replace(end, seconds=time.perf_counter() - began)
+    return task, dataclasses.replace(end, seconds=time.process_time() - began)
 
 
 def measured(tasks: Iterable[tuple[int, int]], processes: int) -> Iterator[tuple[tuple[int, int], Ending]]:
