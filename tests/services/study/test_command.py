@@ -169,6 +169,7 @@ def test_files_from_outside_are_read_by_processes_of_their_own_also_in_a_study(t
 # ---------------------------------------------------------------------------------------------- captures
 
 OWN, COARSE = Setting(), Setting((("voxel", "0.008"),), {"captures.fusion.voxel_m": 0.008})
+MERGED = Setting((("merged_views", "1"),), {"captures.synthesis.views": 1})
 HOPELESS = Setting((("views", "1"),), {"captures.simulate.views": 1})
 
 SMALL_CAPTURE = {
@@ -186,8 +187,9 @@ def job_of(captures: dict) -> Job:
 def test_a_setting_has_its_time_its_bytes_and_its_errors_or_a_reason(tmp_path):
     job = job_of(SMALL_CAPTURE)
     context = open_worker(job, open_catalogue(job.assets, Path(), tuple(job.categories)))
-    found = measure_capture(context, (OWN, COARSE, HOPELESS), 0, 0, tmp_path)
+    found = measure_capture(context, (OWN, COARSE, MERGED, HOPELESS), 0, 0, tmp_path)
     assert all(found[one.name]["s"] > 0 for one in (OWN, COARSE)) and "failed" in found[HOPELESS.name]
+    assert found[MERGED.name]["s"] < 0.9 * found[OWN.name]["s"]  # every photograph has a view from the other side
     assert found[COARSE.name]["bytes"] < found[OWN.name]["bytes"] / 3
     assert found[OWN.name]["errors"]["cloud_mm"] < found[COARSE.name]["errors"]["cloud_mm"]
     (place,) = tmp_path.iterdir()
