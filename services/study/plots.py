@@ -129,11 +129,12 @@ def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
 
 
 def half_row(rows: Sequence[Row], error: str) -> Row | None:
-    """The cheapest setting that measured at most half of the job's own error."""
+    """The cheapest setting that measured at most half of the job's own error, and less than that with its whole interval."""
     own = own_row(rows).errors.get(error)
     if own is None or own.value <= 0.0:
         return None
-    return next((row for row in front(rows, error) if row.errors[error].value <= own.value / 2), None)
+    halves = [row for row in front(rows, error) if row.errors[error].value <= own.value / 2]
+    return next((row for row in halves if row.errors[error].high <= own.value), None)
 
 
 @style.context(["default", PLAIN])

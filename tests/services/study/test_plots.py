@@ -122,7 +122,10 @@ def test_titles_say_what_less_error_takes():
         (study(OWN), "no setting that was measured halves an error"),
     ):
         assert headline(made, panels_of(made.rows)) == f"A scene takes 118 ms; {told}"
+    half = row("a=1", 1.5, flip=0.05)
+    unsure = {"flip": dataclasses.replace(half.errors["flip"], high=0.2)}  # it may as well be larger than the job's
     for turned, told in (
+        ((dataclasses.replace(half, errors=unsure), row("b=1", 2.0, flip=0.04)), "half the error takes 2 × the time"),
         ((row("a=1", 2.0, flip=0.05), row("a=2", 3.0, flip=0.01)), "half the error takes 2 × the time"),
         ((row("a=1", 1.5, flip=0.06),), "40 % less error takes 1.5 × the time"),
         ((row("a=1", 0.5, flip=0.2),), "nothing better was measured"),
