@@ -10,7 +10,7 @@ from schemas.errors import SettleError
 from schemas.job.job import Job
 from services.study import measure
 from services.study.knobs import REFERENCES
-from services.study.measure import Meter, answer_for, measure_again, measure_rest, slopes
+from services.study.measure import QUICK_S, Meter, answer_for, measure_again, measure_rest, slopes, warm_answer_for
 from services.study.model import Setting
 from services.study.table import pose_error
 from workers.assets.catalogue import open_catalogue
@@ -99,3 +99,17 @@ def test_errors_of_smooth_cases_fall_with_the_step_in_the_order_of_the_integrato
     found = slopes()
     assert found["free fall"] == pytest.approx(1.0, abs=1e-3)
     assert found["sliding to rest"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_process_measures_its_first_answer_of_a_setting_again_unless_that_takes_long(monkeypatch):
+    calls: list[str] = []
+
+    def first_compiles(meter: Meter) -> dict[str, int]:
+        calls.append("")
+        with meter:
+            time.sleep(0.2 if len(calls) == 1 else 0.0)
+        return {"call": len(calls)}
+
+    assert [warm_answer_for("draw", COARSE, first_compiles)["call"] for _ in range(2)] == [2, 3]
+    monkeypatch.setitem(QUICK_S, "draw", 0.0)
+    assert warm_answer_for("draw", BOX, first_compiles)["call"] == 4
