@@ -1,6 +1,6 @@
 """How far each hard case is from its bound, and whether another setting of the processor changes how it ends.
 
-    python -m tests.hard_cases.margins docs/hard_cases.csv [--slow] [--seeds 20]
+    python -m tests.hard_cases.margins docs/hard_cases.csv [--all] [--seeds 20]
 
 A margin is the distance of the mean figure from its bound in standard deviations over seeds. A seed moves every object at
 release by up to 10 micrometres and 0.002 degrees, which changes no declared outcome; a chaotic case has seeds of its own,
@@ -236,27 +236,29 @@ def main() -> int:
     """0 where every case ended as declared with every seed and on the other processor, with a margin that is not weak."""
     ask = argparse.ArgumentParser(description=__doc__)
     ask.add_argument("file", type=Path, help="the table, CSV")
-    ask.add_argument("--slow", action="store_true", help="cases too that take minutes a seed")
+    ask.add_argument("--all", action="store_true", help="cases too that take a minute or more a seed")
     ask.add_argument("--seeds", type=int, default=SEEDS)
     ask.add_argument("--processes", type=int, default=2)
     given = ask.parse_args()
-    places = [place for place, one in enumerate(all_series()) if given.slow or one.tier != "slow"]
-    tasks = [(place, seed) for place in places for seed in range(given.seeds if all_series()[place].seeded else 1)]
-    ends = list(measured(tasks, given.processes))
+    places = [place for place, one in enumerate(all_series()) if given.all or not one.tier]
+    usual = {name: os.environ[name] for name in OTHER_PROCESSOR if name in os.environ}
     os.environ |= OTHER_PROCESSOR
     others = dict(measured([(place, 0) for place in places], given.processes))
-    lines = [
-        line_of(all_series()[place], [end for _, end in some], others[place, 0])
-        for place, some in groupby(ends, lambda one: one[0][0])
-    ]
-    with given.file.open("w", newline="", encoding="utf-8") as file:
+    for name in OTHER_PROCESSOR:
+        del os.environ[name]
+    os.environ |= usual
+    tasks = [(place, seed) for place in places for seed in range(given.seeds if all_series()[place].seeded else 1)]
+    bad = 0
+    with given.file.open("w", newline="", encoding="utf-8", buffering=1) as file:
         table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         table.writeheader()
-        table.writerows(lines)
-    bad = [line for line in lines if what_is_weak(line)]
-    for line in bad:
-        print(f"{line['case']}: {what_is_weak(line)}")
-    print(f"{len(lines)} cases, {len(bad)} weak or wrong")
+        for place, some in groupby(measured(tasks, given.processes), lambda one: one[0][0]):
+            line = line_of(all_series()[place], [end for _, end in some], others[place, 0])
+            table.writerow(line)
+            if said := what_is_weak(line):
+                bad += 1
+                print(f"{line['case']}: {said}", flush=True)
+    print(f"{len(places)} cases, {bad} weak or wrong")
     return int(bool(bad))
 
 
