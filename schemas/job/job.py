@@ -100,21 +100,9 @@ PRESETS: Mapping[JobKind, Mapping[PresetName, Keys]] = {
         "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
     },
     "captures": {
-        "fast": {
-            "captures.estimation.max_iterations": 2,
-            "captures.fusion.voxel_m": 0.004,
-            "captures.synthesis.views": 3,
-        },
-        "balanced": {
-            "captures.estimation.max_iterations": 100,
-            "captures.fusion.voxel_m": 0.002,
-            "captures.synthesis.views": 6,
-        },
-        "exact": {
-            "captures.estimation.max_iterations": 100,
-            "captures.fusion.voxel_m": 0.0015,
-            "captures.synthesis.views": 12,
-        },
+        "fast": {"captures.fusion.voxel_m": 0.002, "captures.synthesis.views": 1},
+        "balanced": {"captures.fusion.voxel_m": 0.002, "captures.synthesis.views": 6},
+        "exact": {"captures.fusion.voxel_m": 0.0015, "captures.synthesis.views": 6},
     },
 }
 """Values by kind of job, preset and dotted key, from the studies in docs/tradeoff; all presets of a kind set the same keys.
