@@ -187,10 +187,10 @@ def run_study(
             run_pilot(bench, race)
             bench = run_race(bench, race)
             look_at_errors(bench)
-            rows, proofs = choose_and_prove(bench)
+            rows, among, proofs = choose_and_prove(bench)
         finally:
             bench.keep_clock()
-        return told(bench, race, rows, proofs, renderer, command, left_out)
+        return told(bench, race, rows, among, proofs, renderer, command, left_out)
 
 
 def split_of(plan: Plan) -> Parts:
@@ -352,8 +352,8 @@ def telling(rows: Sequence[Row]) -> list[str]:
     return list(found)
 
 
-def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Proof, ...]]:
-    """The rows of the table, with every setting that was proved, and the proofs; the last proof is that of the answer."""
+def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Row, ...], tuple[Proof, ...]]:
+    """The rows of the table, with every setting that was proved; all that was chosen among; the proofs, the answer's last."""
     rows, crossed = all_rows(bench)
     proofs: list[Proof] = []
     while True:
@@ -363,17 +363,15 @@ def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Proof, 
             chosen = recommend(able, bench.plan.targets)
         except TargetError:
             break
-        if (
-            chosen.setting.name in withdrawn
-            or (proof := prove(bench, chosen, targets_of(able, bench.plan.targets))) is None
-        ):
-            break
-        proofs.append(proof)
         if chosen not in rows:
             rows = (*rows, chosen)
+        asked = targets_of(able, bench.plan.targets)
+        if chosen.setting.name in withdrawn or (proof := prove(bench, chosen, asked)) is None:
+            break
+        proofs.append(proof)
         if proof.holds or bench.left_s(PROOF_SHARE) <= 0.0:
             break
-    return rows, tuple(proofs)
+    return rows, (*rows, *(row for row in crossed if row not in rows)), tuple(proofs)
 
 
 def without(rows: Sequence[Row], withdrawn: set[str]) -> tuple[Row, ...]:
@@ -419,12 +417,13 @@ def told(
     bench: Measurement,
     race: Race,
     rows: tuple[Row, ...],
+    among: tuple[Row, ...],
     proofs: tuple[Proof, ...],
     renderer: str,
     command: str,
     left_out: Sequence[str],
 ) -> Study:
-    """The study in words and figures."""
+    """The study in words and figures: `rows` are shown, and the answer is chosen `among` these and combinations across parts."""
     plan, table = bench.plan, bench.table()
     asked = [one for one in (*plan.settings, *plan.presets) if one.kind in ("single", "preset")]
     missing = [one.name for one in asked if table.row(one) is None]
@@ -439,7 +438,7 @@ def told(
     rows = tuple(
         replace(row, notes=(*row.notes, *race.reasons(bench.parts.of.get(row.setting.name, {})))) for row in rows
     )
-    able = without(rows, withdrawn)
+    able = without(among, withdrawn)
     scenes = max(len(table.answers(part, OWN)) for part in bench.parts.measured)
     study = Study(
         job=plan.job.name,

@@ -17,7 +17,7 @@ from scipy.stats import beta
 
 from schemas.base import Array
 from services.study.knobs import REFERENCES
-from services.study.model import ERRORS, OWN, Figure, Group, Row, Setting
+from services.study.model import ERRORS, NEGLIGIBLE, OWN, Figure, Group, Row, Setting
 
 Answer = Mapping[str, Any]
 """What one scene told of one setting: `s` seconds of processor (None where the machine slept), `took` seconds by the clock,
@@ -150,6 +150,10 @@ def _apart_mm(one: Answer, other: Answer) -> float:
     return float(np.linalg.norm(mine - theirs, axis=-1).max())
 
 
+def _scaled(figure: Figure, times: float) -> Figure:
+    return Figure(figure.value * times, figure.low * times, figure.high * times, figure.median * times, figure.scenes)
+
+
 def values_of(answers: Answers, error: str) -> list[float]:
     """One figure a scene, of an error that is a percentile of such."""
     return [one["errors"][error] for one in answers.values() if error in one.get("errors", {})]
@@ -276,15 +280,30 @@ class Table:
         return self._own_s.keys() == self.parts.measured.keys() - UNTIMED
 
     def figures(self, part: Part, setting: Setting) -> dict[str, Figure]:
-        """The errors of a part's setting; shares of failed scenes of rest alone."""
+        """The errors of a part's setting; shares of failed scenes of rest alone.
+
+        Percentiles over fewer scenes than the job's are the job's own times their ratio in the scenes of both (the ratio
+        estimator, Cochran 1977, 6.3), where the job's are not negligible: of the easy scenes alone they would flatter.
+        """
         key = part, setting.name
         if key not in self._figures:
-            references = [self.answers("rest", one) for one in REFERENCES] if part == "rest" else []
-            found = figures_of(self.answers(part, setting), references)
-            if part != "rest":
-                found.pop("failed_share", None)
+            found = self._figures_of(part, self.answers(part, setting))
+            own = self.answers(part, OWN)
+            same = {scene: own[scene] for scene in self.answers(part, setting) if scene in own}
+            if setting != OWN and 0 < len(same) < len(own):
+                here, whole = self._figures_of(part, same), self.figures(part, OWN)
+                for name in found.keys() & here.keys():
+                    if not ERRORS[name].pooled and here[name].value > NEGLIGIBLE[ERRORS[name].unit]:
+                        found[name] = _scaled(found[name], whole[name].value / here[name].value)
             self._figures[key] = found
         return self._figures[key]
+
+    def _figures_of(self, part: Part, answers: Answers) -> dict[str, Figure]:
+        references = [self.answers("rest", one) for one in REFERENCES] if part == "rest" else []
+        found = figures_of(answers, references)
+        if part != "rest":
+            found.pop("failed_share", None)
+        return found
 
     def ratio(self, part: Part, setting: Setting) -> Figure | None:
         """The ratio of a whole scene's time to the job's own, with this part alone changed; None where it has no time."""
@@ -330,7 +349,7 @@ class Table:
         elif fewer:
             notes = (
                 *notes,
-                f"measured in {min(fewer)} scenes and the job in more, so that its percentiles may flatter it",
+                f"measured in {min(fewer)} scenes and the job in more: percentiles are the job's, times the ratio in the same",
             )
         sizes = [
             one["bytes"]

@@ -141,6 +141,21 @@ def test_times_of_parts_add_up_and_a_preset_is_put_together_of_parts_that_were_m
     assert PARTS.of[FAST.name]["rest"] == STEP and len(PARTS.measured["rest"]) == 2 + len(REFERENCES)
 
 
+def test_percentiles_of_fewer_scenes_are_as_many_times_the_jobs_as_in_the_same_scenes():
+    """The job's error is 1 mm in two scenes and 3 mm in two more, in which only it was measured; the setting's is half."""
+
+    def drawn(depth_mm: float) -> dict:
+        return {"s": 1.0, "took": 1.0, "errors": {"depth_mm": depth_mm, "mirror_mm": 1e-9 * depth_mm}}
+
+    answers = {unit_name("draw", n, OWN): drawn(1.0 if n < 2 else 3.0) for n in range(4)}
+    answers |= {unit_name("draw", n, UNITS): drawn(0.5) for n in range(2)}
+    table = Table(PARTS, answers)
+    own, units = (table.figures("draw", one) for one in (OWN, UNITS))
+    assert own["depth_mm"].value == pytest.approx(3.0)
+    assert (units["depth_mm"].value, units["depth_mm"].scenes) == (pytest.approx(1.5), 2)
+    assert units["mirror_mm"].value == pytest.approx(0.5e-9)  # of what is negligible a ratio is noise
+
+
 def test_a_scene_that_fails_counts_and_a_setting_without_a_time_has_no_row():
     some = journal() | {
         unit_name("rest", 1, STEP): lost(0.1),
