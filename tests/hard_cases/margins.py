@@ -56,18 +56,33 @@ OTHER_PROCESSOR = {
     "NUMBA_CPU_FEATURES": "+sse4.2",
 }
 
-COLUMNS = ("case", "declared", "ended", "measured", "figure", "bound", "spread", "margin", "seconds", "other_processor")
+COLUMNS = (
+    *(
+        "case",
+        "declared",
+        "ended",
+        "wrong",
+        "measured",
+        "figure",
+        "bound",
+        "spread",
+        "margin",
+        "seconds",
+        "other_processor",
+    ),
+)
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How one seed of a case ended: in a word, what was measured, and the seconds of processor that it took."""
+    """How one seed of a case ended: in a word, what was measured, its seconds of processor, and what is wrong with it."""
 
     ended: str
     what: str = ""
     figure: float | None = None
     bound: float | None = None
     seconds: float = 0.0
+    wrong: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,7 +126,7 @@ def _at_rest(case: Case, seed: int) -> Ending:
         end = error
     what, figure, bound, wrong = test_hard_cases.judge(case, made, end)
     ended = end.reason if isinstance(end, SceneError) else "settled"
-    return Ending(f"wrong: {wrong}" if wrong else ended, what, figure, bound)
+    return Ending("wrong" if wrong else ended, what, figure, bound, wrong=wrong)
 
 
 FLAGGED = capture_cases.FLAG
@@ -135,7 +150,7 @@ def _held(outcome: str, what: str, bound: float, figure: Callable[[int], float |
     except (SceneError, CaptureError) as error:
         value, ended = None, refuse(error.reason)
     if ended != outcome or (value is not None and value > bound):
-        return Ending(f"wrong: {ended}", what, value, bound)
+        return Ending("wrong", what, value, bound, wrong=ended)
     return Ending(ENDED.get(ended, ended.removeprefix(refuse(""))), what, value, bound if value is not None else None)
 
 
@@ -204,6 +219,7 @@ def line_of(series: Series, ends: Sequence[Ending], other: Ending) -> dict[str, 
         "case": series.name,
         "declared": series.declared,
         "ended": ", ".join(f"{word} {count}" for word, count in counts.items()),
+        "wrong": next((one.wrong.rstrip("; ") for one in ends if one.wrong), ""),
         "seconds": f"{statistics.median(one.seconds for one in ends):.2g}",
         "other_processor": "the same" if other.ended == ends[0].ended else other.ended,
     }
@@ -222,7 +238,7 @@ def _timed(task: tuple[int, int]) -> tuple[tuple[int, int], Ending]:
     try:
         end = all_series()[place].end(seed)
     except Exception as error:  # one line of the table, and not the end of an hour's work
-        end = Ending(f"broken: {type(error).__name__}: {error}")
+        end = Ending("wrong", wrong=f"{type(error).__name__}: {error}")
     return task, dataclasses.replace(end, seconds=time.process_time() - began)
 
 
@@ -265,7 +281,7 @@ def main() -> int:
 def what_is_weak(line: dict[str, str]) -> str:
     """What a line of the table must not have; empty where there is nothing."""
     said = [
-        line["ended"] if "wrong" in line["ended"] or "broken" in line["ended"] else "",
+        f"{line['ended']}: {line['wrong']}" if line["wrong"] else "",
         f"a margin of {line['margin']} spreads" if line["margin"] and float(line["margin"]) < WEAK else "",
         f"on another processor {line['other_processor']}" if line["other_processor"] != "the same" else "",
     ]
