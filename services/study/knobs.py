@@ -186,10 +186,10 @@ def settings_of(job: Job, knobs: Sequence[Knob]) -> tuple[tuple[Setting, ...], t
 
 
 def preset_settings(job: Job) -> tuple[Setting, ...]:
-    """One setting for each preset of the job's kind that makes another job."""
+    """One setting for each preset of the job's kind that makes another job, with the keys that the job has otherwise."""
     presets = PRESETS[kind_of(job.model_dump(mode="json"))]
-    settings = [Setting((("preset", name),), changes) for name, changes in presets.items()]
-    return tuple(setting for setting in settings if apply(job, setting.changes) != job)
+    changed = {name: {k: v for k, v in keys.items() if apply(job, {k: v}) != job} for name, keys in presets.items()}
+    return tuple(Setting((("preset", name),), changes) for name, changes in changed.items() if changes)
 
 
 def joined(settings: Sequence[Setting]) -> Setting:

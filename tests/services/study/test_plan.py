@@ -142,11 +142,12 @@ def better_than(preset: Row, rows: Sequence[Row]) -> list[str]:
 @pytest.mark.parametrize("kind", get_args(JobKind))
 def test_no_measured_setting_is_better_than_a_preset_by_more_than_the_slack(kind):
     rows = stored(kind).rows
-    assert sum(set(one.setting.changes) <= BY_EFFORT for one in rows) > 8
+    assert sum(set(one.setting.changes) <= BY_EFFORT for one in rows) >= 8
     for name, changes in PRESETS[kind].items():
         preset = next((one for one in rows if one.setting.parts == (("preset", name),)), own_row(rows))
         assert preset.setting.parts or name == "balanced"
-        assert dict(preset.setting.changes) in ({}, changes), "measure docs/tradeoff again: its preset has other keys"
+        stale = "measure docs/tradeoff again: its preset has other keys"
+        assert preset.setting.changes.items() <= changes.items(), stale
         assert better_than(preset, rows) == [], name
 
 
