@@ -28,7 +28,7 @@ WEAK_CASES = {
     "cube of 1 m": "rocks, and slides by half a millimetre where a tenth is its bound",
     "cube over the edge by 49 %": "falls by 5 mm first, which is a thousand times the energy that tips it",
     "mug hung by its handle on a peg at the edge": "is refused, with a thousandth of its weight out of balance",
-    "cube on a wedge of 27.5 degrees, turned by 30 degrees": "slides down to heights that differ by as much as they are under the bound",
+    "cube on a wedge of 27.5 degrees, turned by 30 degrees": "slides down to heights that differ",
     "can spun upright at 200 rad/s": "lands on its rim, and rolls on that",
 }
 """Cases whose declared outcome holds as they are made, and not with every seed."""
