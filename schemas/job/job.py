@@ -83,22 +83,17 @@ JobKind = Literal["singles", "piles", "meshes", "captures"]
 Keys = Mapping[str, Any]
 """Values by dotted key of a job."""
 
+_SCENES: Mapping[PresetName, Keys] = {
+    "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
+    "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
+    "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
+}
+
 PRESETS: Mapping[JobKind, Mapping[PresetName, Keys]] = {
-    "singles": {
-        "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
-        "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
-        "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
-    },
-    "piles": {
-        "fast": {"physics.step_hz": 120, "render.tier": "raster", "render.samples": 1},
-        "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
-        "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
-    },
-    "meshes": {
-        "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
-        "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
-        "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
-    },
+    "singles": _SCENES,
+    # `flat` would save a hundredth of a pile's time.
+    "piles": {**_SCENES, "fast": {"physics.step_hz": 120, "render.tier": "raster", "render.samples": 1}},
+    "meshes": _SCENES,
     "captures": {
         "fast": {"captures.fusion.voxel_m": 0.002, "captures.synthesis.views": 1},
         "balanced": {"captures.fusion.voxel_m": 0.002, "captures.synthesis.views": 6},

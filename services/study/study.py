@@ -259,13 +259,13 @@ def run_race(bench: Measurement, race: Race) -> Measurement:
     """Rounds of twice as many scenes, until every part is decided or the budget's share is spent."""
     levels = dict.fromkeys(parts_in(bench, race), FIRST_LEVEL)
     most = {**MOST, **({} if AGAIN.keys() & set(race.targets) else {"again": RELEASED_SCENES})}
-    combined, end = False, race_share(bench.table(), bench.plan.processes, bench.plan.budget_s)
-    bench = replace(bench, race_share=end)
-    while levels and bench.left_s(end) > 0.0:
+    combined = False
+    bench = replace(bench, race_share=race_share(bench.table(), bench.plan.processes, bench.plan.budget_s))
+    while levels and bench.left_s(bench.race_share) > 0.0:
         table = bench.table()
         race.judge(table)
         weights = sum(SHARES[part] for part in levels)
-        allowed_s = bench.left_s(end) * bench.plan.processes / weights
+        allowed_s = bench.left_s(bench.race_share) * bench.plan.processes / weights
         wanted: list[Wanted] = []
         for part, level in list(levels.items()):
             some, whole = race.next_round(table, part, level, allowed_s * SHARES[part])
@@ -276,7 +276,7 @@ def run_race(bench: Measurement, race: Race) -> Measurement:
             elif whole:  # otherwise what is left of this level waits for what other parts leave of the budget
                 levels[part] = 2 * level
         # Scene by scene, so that what the end of the budget cuts off leaves the same scenes of all.
-        bench.run(sorted(wanted, key=lambda one: one.scene_id), end)
+        bench.run(sorted(wanted, key=lambda one: one.scene_id), bench.race_share)
         if not combined and max(levels.values(), default=LEVEL_OF_CHOICE) >= LEVEL_OF_CHOICE:
             bench, combined = with_combinations(bench, race), True
     race.judge(bench.table())

@@ -78,6 +78,11 @@ def momenta(flight: Flight, R: Array, w: Array) -> Array:
     return np.einsum("nij,j,nkj,nk->ni", R, flight.body.moments, R, w)
 
 
+def turned_otherwise_deg(R: Array, wanted: Array) -> float:
+    """The angle between the last of two series of rotations [N, 3, 3], by the chord between them, which small angles need."""
+    return math.degrees(2.0 * math.asin(min(1.0, float(np.linalg.norm(R[-1] - wanted[-1])) / math.sqrt(8.0))))
+
+
 def energies(flight: Flight, R: Array, w: Array) -> Array:
     """[N] kinetic energy, J."""
     return np.einsum("ni,ni->n", momenta(flight, R, w), w) / 2.0

@@ -28,20 +28,24 @@ from schemas.base import frozen_array
 from schemas.environment import KEEP
 from schemas.errors import CaptureError, SceneError
 from schemas.scene.scene import ObjectStart
-from tests.hard_cases import capture_cases, flight_cases, recording_cases, surface_cases, test_hard_cases
+from tests.hard_cases import (
+    capture_cases,
+    flight_cases,
+    recording_cases,
+    surface_cases,
+    test_chaotic_cases,
+    test_hard_cases,
+)
 from tests.hard_cases.camera_cases import CAMERAS, HOLD, CameraCase
 from tests.hard_cases.case import Case, Made, refuse
 from tests.hard_cases.cases import CASES
-from tests.hard_cases.chaotic_cases import CHAOTIC, Chaotic
+from tests.hard_cases.chaotic_cases import CHAOTIC, SEEDS, Chaotic
 from tests.hard_cases.drops import Drop, X, Y, turn
 from tests.hard_cases.groups import Group
 from tests.hard_cases.measures import Z
-from tests.hard_cases.spin import spinning
-from tests.physics.settling import settle_group
 from workers.geometry.frames import translation
 from workers.render.raster.gbuffer import shared_renderer
 
-SEEDS = 20
 WEAK = 2.0
 """Spreads: a case whose margin is smaller is weak."""
 
@@ -57,19 +61,8 @@ OTHER_PROCESSOR = {
 }
 
 COLUMNS = (
-    *(
-        "case",
-        "declared",
-        "ended",
-        "wrong",
-        "measured",
-        "figure",
-        "bound",
-        "spread",
-        "margin",
-        "seconds",
-        "other_processor",
-    ),
+    *("case", "declared", "ended", "wrong", "measured", "figure"),
+    *("bound", "spread", "margin", "seconds", "other_processor"),
 )
 
 
@@ -116,14 +109,7 @@ def _moved(start: ObjectStart, rng: np.random.Generator) -> ObjectStart:
 
 
 def _at_rest(case: Case, seed: int) -> Ending:
-    made: Made | None = None
-    end: test_hard_cases.End
-    try:
-        made = jolted(case.make(), seed)
-        with spinning(case.spin):
-            end = settle_group(made.starts, made.table, test_hard_cases.physics_of(case))
-    except SceneError as error:
-        end = error
+    made, end = test_hard_cases.ending(case, partial(jolted, seed=seed))
     what, figure, bound, wrong = test_hard_cases.judge(case, made, end)
     ended = end.reason if isinstance(end, SceneError) else "settled"
     return Ending("wrong" if wrong else ended, what, figure, bound, wrong=wrong)
@@ -134,12 +120,9 @@ ENDED = {HOLD: "holds", FLAGGED: "flagged"}
 
 
 def _chaotic(case: Chaotic, seed: int) -> Ending:
-    made = case.make(seed)
-    try:
-        with spinning(case.spin):
-            end = settle_group(made.starts, made.table, test_hard_cases.PHYSICS.model_copy(update=case.physics))
-    except SceneError as error:
-        return Ending(error.reason)
+    made, end = test_chaotic_cases.ending(case, seed)
+    if isinstance(end, SceneError):
+        return Ending(end.reason)
     return Ending("settled", case.measure.what, float(case.measure.of(made, end)), case.measure.bound)
 
 
@@ -169,8 +152,7 @@ def _recorded(case: recording_cases.RecordingCase, _: int) -> float:
 
 
 def _flown_deg(flight: flight_cases.Flight, _: int) -> float:
-    R, wanted = flight_cases.flown(flight)[0], flight_cases.exact(flight)[0]
-    return float(np.degrees(2.0 * np.arcsin(min(1.0, float(np.linalg.norm(R[-1] - wanted[-1])) / 8.0**0.5))))
+    return flight_cases.turned_otherwise_deg(flight_cases.flown(flight)[0], flight_cases.exact(flight)[0])
 
 
 @cache

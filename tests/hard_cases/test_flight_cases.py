@@ -16,6 +16,7 @@ from tests.hard_cases.flight_cases import (
     lean_of_top,
     momenta,
     sleeping_rad_s,
+    turned_otherwise_deg,
 )
 
 ROWS = [pytest.param(one, id=one.name) for one in FLIGHTS]
@@ -28,7 +29,7 @@ def test_what_flies_keeps_its_momentum_and_energy_and_turns_as_euler_has_it(flig
     momentum, energy = momenta(flight, R, w), energies(flight, R, w)
     drift = float(np.linalg.norm(momentum - momentum[0], axis=1).max() / np.linalg.norm(momentum[0]))
     rises, falls = float(energy.max() / energy[0] - 1.0), float(1.0 - energy.min() / energy[0])
-    off = math.degrees(2.0 * math.asin(min(1.0, float(np.linalg.norm(R[-1] - wanted[-1])) / math.sqrt(8.0))))
+    off = turned_otherwise_deg(R, wanted)
     record_figure(f"{flight.name}: change of its angular momentum", "must hold", drift, flight.kept)
     record_figure(f"{flight.name}: rise of its energy", "must hold", rises, RISES)
     record_figure(f"{flight.name}: fall of its energy", "must hold", falls, flight.kept)

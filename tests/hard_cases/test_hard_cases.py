@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,11 +34,11 @@ def physics_of(case: Case) -> Physics:
     return PHYSICS.model_copy(update=case.physics)
 
 
-def ending(case: Case) -> tuple[Made | None, End]:
-    """What a case comes to: the objects and their rest poses, or why there are none."""
+def ending(case: Case, move: Callable[[Made], Made] = lambda made: made) -> tuple[Made | None, End]:
+    """What a case comes to: the objects, as moved before they are let go, and their rest poses, or why there are none."""
     made = None
     try:
-        made = case.make()
+        made = move(case.make())
         with spinning(case.spin):
             return made, settle_group(made.starts, made.table, physics_of(case))
     except SceneError as error:

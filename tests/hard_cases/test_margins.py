@@ -1,4 +1,4 @@
-"""The kept table of margins has every hard case, few of them weak; and what its figures are made of."""
+"""The kept table of margins has the quick cases of one object, few of them weak; and what its figures are made of."""
 
 import csv
 import math
