@@ -3,16 +3,18 @@
 import argparse
 import json
 import os
+import resource
 import shlex
 import sys
 import time
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
 
-from schemas.errors import RunError, describe_seconds, plural
+from schemas.errors import RunError, describe_seconds
 from schemas.job.job import Job
 from services.bench.command import require_extra
 from services.job.job_file import load_job, read_tree
@@ -32,8 +34,11 @@ from workers.render.tiers import require_tier
 from workers.scene.context import open_worker
 from workers.shard.code import code_digest
 
-BUSY = 0.5
-"""A machine with more load than this a core before a study begins is told to be busy."""
+BUSY = 0.05
+"""A study says so where other processes took more than this share of the machine's processor time while it measured."""
+
+OTHERS = "others"
+"""The journal's entry of the processor seconds that other processes took."""
 
 UNMEASURED = {"check.raycast_share": 0.0, "output.layout": "files"}
 """What no setting is measured with: checks of labels, and tar archives."""
@@ -53,13 +58,18 @@ def main(options: argparse.Namespace) -> int:
     context = open_worker(plan.job, catalogue)
     require_device(context.renderer.name, plan.job.run.device, context.renderer.choice)
     header = {"job": context.settings_digest, "code": code_digest()}
-    if (load := os.getloadavg()[0]) > BUSY * usable_cores():
-        told = f"the machine was busy when this began (load {load:.1f} on {plural(usable_cores(), 'core')}): times are noisy"
-        left_out = [*left_out, told]
     budget, command = round(plan.budget_s), shlex.join(["verso", *sys.argv[1:]])
     print(f"measures for at most {describe_seconds(plan.budget_s)} (--budget), {plan.processes} scenes at a time")
     with Journal(options.out, header) as journal, closing(ProgressLine(budget, "tradeoff", unit="second")) as progress:
-        study = run_study(plan, journal, context.renderer.name, command, left_out, progress, began)
+        others_s = float(journal.get(OTHERS, 0.0)) - others_seconds()
+        try:
+            study = run_study(plan, journal, context.renderer.name, command, left_out, progress, began)
+        finally:
+            others_s += others_seconds()
+            journal.add(OTHERS, others_s)
+    if (share := others_s / (study.seconds * (os.cpu_count() or 1))) > BUSY:
+        told = f"other processes took {share:.0%} of this machine while it was measured: times are noisy"
+        study = replace(study, notes=(*study.notes, told))
     write_tables(study, options.out)
     looks = {name.split("/", 2)[2]: one for name, one in journal.items() if name.startswith(f"{LOOKS}/")}
     write_page(study, write_plots(study, options.out), options.out / "index.html", looks)
@@ -84,6 +94,14 @@ def main(options: argparse.Namespace) -> int:
         summary |= {"ok": True, "out": str(options.out), "ms": chosen.ms, "ratio": chosen.ratio}
         print(json.dumps(summary))
     return 0
+
+
+def others_seconds() -> float:
+    """Processor seconds that all processes took since the machine started, less those of this one and its ended children."""
+    # user, nice, system, idle, iowait, irq, softirq, steal: proc_stat(5). What waits takes no processor.
+    ticks = [int(word) for word in Path("/proc/stat").read_text().split(maxsplit=9)[1:9]]
+    own = sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return (sum(ticks) - ticks[3] - ticks[4]) / os.sysconf("SC_CLK_TCK") - own
 
 
 def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, float] | None) -> tuple[Plan, list[str]]:

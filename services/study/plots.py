@@ -8,6 +8,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, Literal
 
+import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.cbook import pts_to_poststep
@@ -180,9 +181,9 @@ def _message(rows: Sequence[Row], panel: Panel) -> str:
     if panel.half is not None:
         return f"half the error takes {cost(panel.half.ratio)}"
     own = own_row(rows).errors.get(panel.error)
-    if own is None or own.value <= best.errors[panel.error].value:
+    less = 0.0 if own is None or own.value <= 0.0 else 1.0 - best.errors[panel.error].value / own.value
+    if less <= MOVED:
         return "nothing better was measured"
-    less = 1.0 - best.errors[panel.error].value / own.value
     return f"{100 * less:.2g} % less error takes {cost(best.ratio)}"
 
 
@@ -264,17 +265,26 @@ def _label(row: Row, error: str) -> Label:
 
 def _write_labels(axes: Axes, labels: Sequence[Label]) -> None:
     """Labels beside their points, but for those that would cover an earlier one or leave the axes."""
+    # No label lies on the star or the square of another setting.
+    large = [line for line in axes.get_lines() if line.get_markersize() >= PRESET["ms"]]
+    points = [(line.get_markersize() * DOTS / 72, at) for line in large for at in np.array(line.get_xydata(), float)]
+    marks = [(tuple(at), _square(axes.transData.transform(at), size)) for size, at in points]
     taken: list[Bbox] = []
     for text, at in labels:
+        covered = [box for place, box in marks if place != at]
         # Above on the right the front never runs.
         for sign, side, end in ((1, "left", "bottom"), (-1, "right", "top")):
             place = (6.0 * sign, 3.0 * sign)
             note = axes.annotate(text, at, place, textcoords="offset points", ha=side, va=end, zorder=6)
             box, frame = note.get_window_extent(), axes.get_window_extent()
-            if frame.x0 <= box.x0 and box.x1 <= frame.x1 and not box.count_overlaps(taken):
+            if frame.x0 <= box.x0 and box.x1 <= frame.x1 and not box.count_overlaps([*taken, *covered]):
                 taken.append(box)
                 break
             note.remove()
+
+
+def _square(centre: np.ndarray, size: float) -> Bbox:
+    return Bbox([centre - size / 2, centre + size / 2])
 
 
 def _draw_rows(axes: Axes, rows: Sequence[Row], error: str, title: str, mark: Mark) -> None:
