@@ -78,7 +78,7 @@ _IMAGE = re.compile(
     rf"{_CATEGORY.pattern}/(?:patches/)?(?:{'|'.join(sorted({image.content for image in IMAGES}))})([0-9]{{5,19}})"
     r"(?:obj[0-9]{1,4})?\.png"
 )
-_SHAPE = re.compile(rf"{ASSETS}/{_CATEGORY.pattern}/[^/]+\.glb")
+_SHAPE = re.compile(rf"{ASSETS}/{_CATEGORY.pattern}/[^/]+\.(?:glb|npz)")
 _MERGED = re.compile(rf"{MANIFEST}/[a-z]+/category=[^/]+/part-[0-9]{{5,}}\.parquet")
 
 
@@ -91,6 +91,8 @@ SWITCHES: dict[Role | PixelKind, str] = {
 
 def is_stored(part: Role | PixelKind, job: Job) -> bool:
     """Whether the job asks for a view, or for a kind of image of every view."""
+    if part in MODALITIES and (target := MODALITIES[part].target) is not None:
+        return target in job.targets.views and MODALITIES[part].layer <= job.targets.layers
     return part not in SWITCHES or attrgetter(SWITCHES[part])(job)
 
 
@@ -119,20 +121,26 @@ def file_pose_id(role: Role, parent_id: int) -> int:
     return parent_id + 1 if role == "mirror" else parent_id
 
 
-def image_path(category: str, content: Content, pose_id: int) -> str:
-    """`mug/RGB00000.png`."""
-    return f"{category}/{content}{pose_id:05d}.png"
+def image_path(category: str, content: Content, pose_id: int, object_index: int | None = None) -> str:
+    """`mug/RGB00000.png`; of an object's own image, with several objects, `mug/amodal00000obj1.png`."""
+    suffix = "" if object_index is None else f"obj{object_index}"
+    return f"{category}/{content}{pose_id:05d}{suffix}.png"
 
 
 def patch_path(category: str, content: Content, pose_id: int, object_index: int | None = None) -> str:
     """`mug/patches/RGB00000.png`, with several objects `mug/patches/RGB00000obj1.png`."""
-    suffix = "" if object_index is None else f"obj{object_index}"
-    return f"{category}/patches/{content}{pose_id:05d}{suffix}.png"
+    folder, name = image_path(category, content, pose_id, object_index).split("/")
+    return f"{folder}/patches/{name}"
 
 
 def asset_path(category: str, instance_id: str) -> str:
     """`assets/mug/<instance>.glb`."""
     return f"{ASSETS}/{category}/{instance_id}.glb"
+
+
+def samples_path(category: str, instance_id: str) -> str:
+    """`assets/mug/<instance>.npz`: points of the shape's surface and volume (`targets.shape`)."""
+    return f"{ASSETS}/{category}/{instance_id}.npz"
 
 
 def is_shape(path: str) -> bool:

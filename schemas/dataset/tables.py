@@ -44,7 +44,7 @@ FRAMES = {
     "source": "the frame of the file that the shape came from",
 }
 
-Of = Literal["both", "scenes", "captures"]
+Of = Literal["both", "scenes", "captures", "targets"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Column:
     null: bool = False
     """Whether the value may be missing where the column applies."""
     of: Of = "both"
-    """The kind of dataset that has it; it is null in the other."""
+    """The kind of dataset that has it, null in others; a table without any value `targets` has the digest of one without them."""
 
     @property
     def nullable(self) -> bool:
@@ -231,6 +231,11 @@ bbox_xywh | int64[4] | px | image | Bounding box of its pixels: left, top, width
 pixels | int64 | count | - | Pixels of it that are seen.
 visible_fraction | double | 1 | - | Share that is seen of its own pixels, {share_seen}.
 patch_object_fraction | double? | 1 | - | {patch}
+amodal_bbox_xywh | int64[4]?, targets | px | image | Bounding box of its image `amodal`; null without the target.
+amodal_pixels | int64?, targets | count | - | Pixels of its image `amodal`: in the image, hidden ones too.
+coordinates_scale_m | double?, targets | m | - | Its `coordinates`: scale * value / 65535 + offset is a point of it.
+coordinates_offset_m | double[3]?, targets | m | object | That offset.
+targets_share | double?, targets | 1 | - | Of captures: share of its pixels that have `normals` and `coordinates`.
 """,
     "assets": """
 instance_id | string | - | - | {instance}
@@ -326,6 +331,11 @@ NOT_OF_CAPTURES = tuple(column.path for column in COLUMNS["scenes"] if column.of
 
 ALWAYS_OF_SCENES = tuple(column.path for column in COLUMNS["scenes"] if column.of == "scenes" and not column.null)
 """Those of them that every simulated scene has."""
+
+NOT_IN_DIGEST = {
+    table: frozenset(column.path for column in columns if column.of == "targets") for table, columns in COLUMNS.items()
+}
+"""Columns that are left out of a table's digest where no row has a value: so a job without targets has the digest of before."""
 
 SHAPE_FILE_COLUMNS = (pa.field("file_bytes", pa.int64()), pa.field("file_sha256", pa.string()))
 """More columns of `assets` in a range's own file: the size and the SHA-256 of the asset's shape, null where none is

@@ -16,6 +16,7 @@ from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknow
 from schemas.job.captures import Captures, with_capture_keys
 from schemas.job.keys import with_defaults
 from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
+from schemas.job.targets import Targets
 from schemas.job.views import Cameras, Images, Render, SensorEffects
 
 RangeSize = Annotated[int, Field(ge=1, le=100_000)]
@@ -176,6 +177,8 @@ class Job(Frozen):
     """How RGB is made."""
     sensor: SensorEffects = SensorEffects()
     """Effects of real sensors on exact images; none by default."""
+    targets: Targets = Targets()
+    """What networks are trained on beside the article's images; none by default."""
     check: Check = Check()
     """What is checked before a scene is committed."""
     captures: Captures | None = None
@@ -229,11 +232,12 @@ class Job(Frozen):
         return self
 
     @model_serializer(mode="wrap")
-    def _leave_out_absent_captures(self, dump: Dump) -> dict[str, Any]:
-        """A job of scenes is written, and digested, as it was before there were captures."""
+    def _leave_out_absent_branches(self, dump: Dump) -> dict[str, Any]:
+        """A job without captures, or without targets, is written, and digested, as it was before there were any."""
         keys: dict[str, Any] = dump(self)
-        if self.captures is None:
-            keys.pop("captures", None)
+        for name, absent in (("captures", self.captures is None), ("targets", self.targets == Targets())):
+            if absent:
+                keys.pop(name, None)
         return keys
 
     @property
@@ -276,4 +280,7 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
         return "objects_per_scene must be 1: a capture is of one object"
     if job.sensor != SensorEffects():
         return "sensor has effects: leave them out, those of a virtual capture are keys of captures.simulate"
+    if unfit := [name for name in job.targets.views if name in ("albedo", "amodal")] + list(job.targets.shape):
+        told = "a capture has no shape but what its photographs saw; left are normals, coordinates and layers"
+        return f"targets asks for {', '.join(unfit)}: {told}"
     return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Frozen, Pose
+from schemas.job.targets import MOST_LAYERS, ViewTarget
 from schemas.job.views import Patch, Sensor
 
 Role = str
@@ -50,6 +51,9 @@ DRAWN_ROLES: tuple[Role, ...] = tuple(role.name for role in VIEW_ROLES.values() 
 PixelKind = str
 """The name of a modality."""
 
+LAYERS = range(1, MOST_LAYERS + 1)
+"""Numbers of the surfaces along a pixel's ray, from the front."""
+
 
 @dataclass(frozen=True)
 class Modality:
@@ -64,6 +68,12 @@ class Modality:
     """The key of the job that switches it on and off in every view; None where it is always stored."""
     projected: bool = False
     """Whether a view that is projected and not drawn has such an image too."""
+    target: ViewTarget | None = None
+    """The item of the job's `targets.views` that it belongs to."""
+    layer: int = 0
+    """It is stored where the job's `targets.layers` is at least this."""
+    each: bool = False
+    """One image for each object, in the order of their regions; as an array [objects, H, W]."""
 
     def word_of(self, role: ViewRole) -> str | None:
         """The word in the file's name (`RGB`, `RGBaligned`, `depthAligned`); None where such a view has no such image."""
@@ -83,6 +93,14 @@ MODALITIES: dict[PixelKind, Modality] = {
         Modality("rgb", "RGB", "uint8", 3, "render.rgb", projected=True),
         Modality("depth", "depth", "uint16", projected=True),
         Modality("region", "segment", "uint8"),
+        Modality("normals", "normals", "uint16", 3, target="normals"),
+        Modality("coordinates", "coordinates", "uint16", 3, target="coordinates"),
+        Modality("albedo", "albedo", "uint8", 3, target="albedo"),
+        Modality("amodal", "amodal", "uint8", target="amodal", each=True),
+        *(Modality(f"layer{n}", f"layer{n}_", "uint16", target="layers", layer=n) for n in LAYERS),
+        *(Modality(f"layer{n}_region", f"layerSegment{n}_", "uint8", target="layers", layer=n) for n in LAYERS),
+        Modality("back", "back", "uint16", target="layers"),
+        Modality("back_region", "backSegment", "uint8", target="layers"),
     )
 }
 """Every modality there is. Files, `verify`, the Python door and the exports take from here which images there are."""

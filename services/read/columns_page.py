@@ -18,7 +18,8 @@ prints the same.
 A column name ends in its unit where it has one: `_m` metres, `_mm` millimetres, `_rad` radians, `_deg` degrees, `_s` seconds.
 Below, `1` is a pure number, `id` and `count` are whole numbers. `T_a_b` takes coordinates in frame b to coordinates in frame a:
 16 doubles, row by row; its frames stand after the unit. `name[]` stands for the items of a list.
-Columns marked "captures" are null in datasets of scenes, those marked "scenes" in datasets of captures.
+Columns marked "captures" are null in datasets of scenes, those marked "scenes" in datasets of captures,
+those marked "targets" where the job does not ask for the target.
 
 Frames:
 

@@ -1,7 +1,8 @@
 """The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket."""
 
+import itertools
 import urllib.parse
-from collections.abc import Callable, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from itertools import groupby
 from types import MappingProxyType
@@ -19,6 +20,7 @@ from schemas.dataset.layout import (
     MANIFEST,
     STAGING,
     SUCCESS_FILE,
+    Content,
     PixelKind,
     image_path,
     patch_path,
@@ -27,6 +29,7 @@ from schemas.dataset.layout import (
 )
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, OutputError
+from schemas.scene.view import MODALITIES
 from services.job.record import read_success
 from workers.store.commit import commit_names, read_record
 from workers.store.ledger import range_rows
@@ -35,18 +38,29 @@ from workers.store.store import Store
 
 
 def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:
-    """The paths of a view's images that are stored, by kind."""
-    return _stored(row, lambda content: image_path(row["category"], content, row["pose_id"]))
+    """The paths of a view's images that are stored, by kind; `amodal0`, `amodal1` of one that each of several objects has."""
+    listed = {file["path"] for file in row["files"]}
+    named = {kind: image_path(row["category"], content, row["pose_id"]) for kind, content in _contents(row)}
+    for kind, content in _contents(row):
+        for n in itertools.count() if MODALITIES[kind].each else ():
+            if (path := image_path(row["category"], content, row["pose_id"], n)) not in listed:
+                break
+            named[f"{kind}{n}"] = path
+    return _those(named, listed)
 
 
 def patch_paths(row: Mapping[str, Any], index: int | None) -> Mapping[PixelKind, str]:
     """The paths of the patches of a view's object that are stored, by kind."""
-    return _stored(row, lambda content: patch_path(row["category"], content, row["pose_id"], index))
+    named = {kind: patch_path(row["category"], content, row["pose_id"], index) for kind, content in _contents(row)}
+    return _those(named, {file["path"] for file in row["files"]})
 
 
-def _stored(row: Mapping[str, Any], path_of: Callable[[str], str]) -> Mapping[PixelKind, str]:
-    listed = {file["path"] for file in row["files"]}
-    named = {image.pixels: path_of(image.content) for image in IMAGES if image.role == row["role"]}
+def _contents(row: Mapping[str, Any]) -> Iterator[tuple[PixelKind, Content]]:
+    """Kinds of images that a view may have, with the word in their names."""
+    return ((image.pixels, image.content) for image in IMAGES if image.role == row["role"])
+
+
+def _those(named: Mapping[PixelKind, str], listed: Collection[str]) -> Mapping[PixelKind, str]:
     return MappingProxyType({kind: path for kind, path in named.items() if path in listed})
 
 

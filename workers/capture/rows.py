@@ -171,7 +171,7 @@ def record_capture(
                 files += own
                 row = view_row(scene_id, one.pair, view, own, job)
                 views.append(row | {"capture": view_columns(done, one, view.role)})
-                objects += object_rows(scene_id, view, job)
+                objects += object_rows(scene_id, view, job, ())
     with watch.stage("encode"):
         path = asset_path(thing.asset.category, thing.asset.instance_id)
         files.append(encoded_file(path, asset_glb(thing.asset, encode_png)))

@@ -201,7 +201,7 @@ def _count_covered(
     width, height = int(np.ceil(right)) - x0, int(np.ceil(bottom)) - y0
     if width > LARGEST_PX or height > LARGEST_PX:
         return UNKNOWN
-    corners = _to_grid(vertices, T.astype(np.float32), (k[0], k[1], k[2] - x0, k[3] - y0), width, height)
+    corners = to_grid(vertices, T.astype(np.float32), (k[0], k[1], k[2] - x0, k[3] - y0), width, height)
     covered = np.zeros((height, width), np.uint8)
     for face in range(len(faces)):
         a, b, c = (
@@ -223,7 +223,7 @@ def _count_covered(
 
 
 @compiled
-def _to_grid(
+def to_grid(
     vertices: Array, T: NDArray[np.float32], k: tuple[float, float, float, float], width: int, height: int
 ) -> NDArray[np.int64]:
     """[V, 2]: where vertices fall in a window of this size, in 1/256 pixel from the centre of its first pixel."""
@@ -262,15 +262,15 @@ def _cover(covered: NDArray[np.uint8], a: Corner, b: Corner, c: Corner) -> None:
     if first > last:
         return
     for row in range(upper, lower + 1):
-        left, right = _cut(a, b, row, first, last)
-        left, right = _cut(b, c, row, left, right)
-        left, right = _cut(c, a, row, left, right)
+        left, right = cut_row(a, b, row, first, last)
+        left, right = cut_row(b, c, row, left, right)
+        left, right = cut_row(c, a, row, left, right)
         if left <= right:
             covered[row, left : right + 1] = 1  # in one go: as a loop, each index is tested for counting from the end
 
 
 @compiled
-def _cut(start: Corner, end: Corner, row: int, left: int, right: int) -> tuple[int, int]:
+def cut_row(start: Corner, end: Corner, row: int, left: int, right: int) -> tuple[int, int]:
     """The pixels of a row, from `left` to `right`, whose centres lie within an edge; on the left and on top also those on it."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     # Within is where `inside` - 256 column dy > 0.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.dataset.codec import Row, columns_of_bodies, read_camera, read_label, read_world_poses
-from schemas.dataset.layout import file_pose_id, image_path, stored_images
+from schemas.dataset.layout import file_pose_id, image_path, patch_index, stored_images
 from schemas.dataset.tables import ALWAYS_OF_SCENES
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan
@@ -17,7 +17,7 @@ from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
 from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
 from workers.scene.pairs import object_distance, place_beside, place_mirror_camera
-from workers.scene.rows import image_boxes
+from workers.scene.rows import amodal_columns, image_boxes
 
 ROUNDING = 1e-12
 """Largest difference of poses and distances that are computed again from the same doubles."""
@@ -60,6 +60,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
         if role != "projected":
             faults += _check_labels(job, view, objects, scene)
             faults += _check_images(view, scene)
+            faults += _check_amodal(view, objects)
         faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
     faults += _check_cameras(job, stored, views)
     if "mirror" in stored and not _is_captured(scene):
@@ -72,21 +73,37 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
 def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faults: list[str]) -> View:
     """A stored view; images of a wrong size or type are added to the faults."""
     role: Role = row["role"]
+    own = [one for one in objects if (one["pose_id"], one["role"]) == (row["pose_id"], role)]
+    count = sum(one["region_id"] >= REGION_FIRST_OBJECT for one in own)
     images: dict[str, NDArray] = {}
     for image in stored_images(role, job):
-        path = image_path(row["category"], image.content, file_pose_id(role, row["parent_id"]))
-        pixels = read(path)
-        modality = MODALITIES[image.pixels]
+        modality, pose_id = MODALITIES[image.pixels], file_pose_id(role, row["parent_id"])
+        numbers = [patch_index(REGION_FIRST_OBJECT + n, count) for n in range(count)] if modality.each else [None]
+        paths = [image_path(row["category"], image.content, pose_id, number) for number in numbers]
+        planes = [read(path) for path in paths]
         shape = modality.shape(row["height"], row["width"])
-        if pixels.shape != shape or pixels.dtype != modality.dtype:
-            faults.append(f"{path}: is {pixels.dtype} {pixels.shape}, and must be {modality.dtype} {shape}")
-        images[image.pixels] = pixels
-    own = [one for one in objects if (one["pose_id"], one["role"]) == (row["pose_id"], role)]
+        wrong = [n for n, pixels in enumerate(planes) if pixels.shape != shape or pixels.dtype != modality.dtype]
+        for n in wrong:
+            told = f"is {planes[n].dtype} {planes[n].shape}, and must be {modality.dtype} {shape}"
+            faults.append(f"{paths[n]}: {told}")
+        images[image.pixels] = np.stack(planes) if modality.each and not wrong else planes[0]
     labels = tuple(read_label(one) for one in sorted(own, key=lambda one: one["region_id"]))
     camera, ids = read_camera(row), (row["pose_id"], row["parent_id"])
     rgb, depth, region = (images.pop(name, None) for name in ("rgb", "depth", "region"))
     assert depth is not None
     return View(role, *ids, camera, rgb, depth, region, labels, images)
+
+
+def _check_amodal(view: View, objects: Sequence[Row]) -> list[str]:
+    """Extents of silhouettes that are not those of their images; each holds the pixels that the mask shows of its object."""
+    faults, masks = [], view.further.get("amodal", ())
+    rows = {row["region_id"]: row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)}
+    for region_id, mask in enumerate(masks, start=REGION_FIRST_OBJECT):
+        expected = amodal_columns(mask)
+        told = {name: rows[region_id][name] for name in expected}
+        if told != expected:
+            faults.append(f"{_named(view)}, region {region_id}: its image amodal gives {expected}, objects says {told}")
+    return faults
 
 
 def _differs(a: ArrayLike, b: ArrayLike) -> bool:
@@ -160,7 +177,7 @@ def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: R
     for path, kind, box in image_boxes(view, objects, row["category"], job.images.patch):
         expected.add(path)
         full = view.images.get(kind)
-        if box is not None and path in listed and full is not None and not np.array_equal(read(path), full[box]):
+        if box and path in listed and full is not None and not np.array_equal(read(path), full[box]):
             faults.append(f"{path}: is not the crop of its image")
     if expected != listed:
         wrong = sorted(expected ^ listed)

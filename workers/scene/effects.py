@@ -8,6 +8,7 @@ give it its two scenes (tests/effects/cases.py) and its proof (tests/effects/pro
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from schemas.base import Array
 from schemas.dataset.layout import SWITCHES, PixelKind, is_stored
 from schemas.job.captures import Simulate
 from schemas.job.job import Check, Job
+from schemas.job.targets import ViewTarget
 from schemas.job.views import SensorEffects, Tier
 from schemas.scene.scene import EffectKind, EffectPlan, ScenePlan
 from schemas.scene.shape import Part
@@ -61,7 +63,10 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
         raise ValueError(f"no effects of these names: {', '.join(sorted(unknown))}")
     if asked := forced & names_of_kind("asked"):
         raise ValueError(f"switches of the job, which cannot be forced: {', '.join(sorted(asked))}")
-    return _plan({effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}, forced)
+    reasons = {effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}
+    # Not in the receipt of a job without them, which is then as it was before there were any.
+    unasked = set(get_args(ViewTarget)) if not facts.job.targets.views else set()
+    return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
 
 
 def plan_capture(simulate: Simulate) -> EffectPlan:
@@ -116,6 +121,11 @@ def _stored(part: Role | PixelKind) -> Reason:
 def _sensor(name: str) -> Reason:
     """A sensor effect, which runs in every scene where the job asks for it."""
     return _where(lambda facts: getattr(facts.job.sensor, name) is not None, f"sensor.{name} is off")
+
+
+def _target(name: str) -> Reason:
+    """An image target, which runs in every scene where the job asks for it."""
+    return _where(lambda facts: name in facts.job.targets.views, f"targets.views has no {name}")
 
 
 def _tier(*tiers: Tier) -> Reason:
@@ -237,6 +247,7 @@ TABLE: tuple[Effect, ...] = (
     Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "render"),
     Effect("global_illumination", "asked", _tier("pathtraced"), "render", _of_tier("pathtraced")),
     Effect("glass", "asked", _first_of(_tier("pathtraced"), _GLASS), "render", _of_tier("pathtraced")),
+    *(Effect(name, "asked", _target(name), "targets") for name in get_args(ViewTarget)),
     *(Effect(f"sensor_{name}", "asked", _sensor(name), "sensor") for name in SensorEffects.model_fields),
     Effect("raycast_check", "asked", _RAYCAST, "raycast"),
     Effect("release_again", "asked", _RAYCAST, "recheck"),

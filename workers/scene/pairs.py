@@ -23,6 +23,7 @@ from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
 from workers.scene.ray_check import check_against_rays
 from workers.scene.sensor import SensorChance, sense_view
+from workers.scene.targets import draw_targets
 
 
 def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
@@ -140,7 +141,8 @@ def render_view(scene: SettledScene, role: Role, number: int, camera: Camera) ->
         count = partial(count_unoccluded, count_drawn=renderer.count_pixels)
         labels = label_regions(scene.plan, scene.posed, camera, buffer.region, count)
         depth = quantise_depth(buffer.depth_m, job.images)
-    return View(role, pose_id, parent_id, camera, buffer.rgb, depth, buffer.region, labels)
+    further = draw_targets(scene.posed.things, camera, buffer.region, job, scene.effects, stopwatch)
+    return View(role, pose_id, parent_id, camera, buffer.rgb, depth, buffer.region, labels, further)
 
 
 def sense(scene: SettledScene, exact: View, number: int) -> View:

@@ -1,26 +1,32 @@
 """The output of a scene: the images that its views leave, and its rows in each manifest table. Pure."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
 from schemas.dataset.layout import IMAGES, asset_path, image_path, patch_index, patch_path
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.views import Images, Patch
-from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
-from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
-from schemas.scene.view import ObjectLabel, Pair, PixelKind, View, crop_box
+from schemas.scene.scene import EncodedFile, Placed, SceneOutput, encoded_file
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Shape
+from schemas.scene.view import MODALITIES, ObjectLabel, Pair, PixelKind, View, crop_box
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.geometry.camera import inclination, yaw
+from workers.geometry.pixels import measure_regions
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import write_receipt
 from workers.scene.labels import patch_object_fraction
 from workers.scene.make_scene import Scene
+from workers.scene.targets import coordinate_scale
 from workers.store.images import encode_png
 
-Box = tuple[slice, slice]
+Box = tuple[int | slice, ...]
+"""Which part of an image: rows and columns, or all; of one that each object has, the object's number first."""
 
 
 def encode_view(view: View, pair: Pair, images: Images) -> tuple[EncodedFile, ...]:
@@ -28,26 +34,29 @@ def encode_view(view: View, pair: Pair, images: Images) -> tuple[EncodedFile, ..
     files = []
     objects = object_labels(view, pair)
     for path, kind, box in image_boxes(view, objects, objects[0].category, images.patch):
-        pixels = view.images[kind]
-        files.append(encoded_file(path, encode_png(pixels if box is None else pixels[box], images.png_level)))
+        files.append(encoded_file(path, encode_png(view.images[kind][box], images.png_level)))
     return tuple(files)
 
 
 def image_boxes(
     view: View, objects: Sequence[ObjectLabel], category: str, patch: Patch
-) -> Iterator[tuple[str, PixelKind, Box | None]]:
-    """Path, kind of pixels and crop (rows, columns; None for all) of each image that the view holds and of its patches.
+) -> Iterator[tuple[str, PixelKind, Box]]:
+    """Path, kind of pixels and part of each image that the view holds and of its patches.
 
     objects: the labels that have patches. `category` is the scene's.
     """
     boxes = [(patch_index(label.region_id, len(objects)), crop_box(label, view.camera, patch)) for label in objects]
+    there = view.images
     for image in IMAGES:
-        if image.role != view.role or image.pixels not in view.images:
+        if image.role != view.role or image.pixels not in there:
             continue
-        yield image_path(category, image.content, view.pose_id), image.pixels, None
-        for index, box in boxes:
+        each = MODALITIES[image.pixels].each
+        for n, (index, _) in enumerate(boxes if each else [(None, None)]):
+            yield image_path(category, image.content, view.pose_id, index), image.pixels, (n,) if each else ()
+        for n, (index, box) in enumerate(boxes):
             if box is not None:
-                yield patch_path(category, image.content, view.pose_id, index), image.pixels, box
+                path = patch_path(category, image.content, view.pose_id, index)
+                yield path, image.pixels, (n, *box) if each else box
 
 
 def object_labels(view: View, pair: Pair) -> list[ObjectLabel]:
@@ -81,7 +90,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
             row
             for pair in scene.pairs
             for view in pair.views
-            for row in object_rows(scene.plan.scene_id, view, context.job)
+            for row in object_rows(scene.plan.scene_id, view, context.job, scene.posed.things)
         ],
         "assets": [asset_row(asset, context.job) for asset in assets],
         "failures": [],
@@ -149,8 +158,9 @@ def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile]
     }
 
 
-def object_rows(scene_id: int, view: View, job: Job) -> list[Row]:
-    """The rows of `objects`, key (pose_id, role, region_id); the table has one too."""
+def object_rows(scene_id: int, view: View, job: Job, things: Sequence[Placed]) -> list[Row]:
+    """The rows of `objects`, key (pose_id, role, region_id); the table has one too. `things` are those that can be seen."""
+    shapes = {thing.region_id: thing.shape for thing in things}
     return [
         {
             "pose_id": view.pose_id,
@@ -160,9 +170,30 @@ def object_rows(scene_id: int, view: View, job: Job) -> list[Row]:
             "patch_object_fraction": None
             if label.region_id < REGION_FIRST_OBJECT
             else patch_object_fraction(view, label, job.images.patch),
+            **target_columns(view.further, label.region_id, shapes.get(label.region_id)),
         }
         for label in view.labels
     ]
+
+
+def target_columns(images: Mapping[PixelKind, NDArray], region_id: int, shape: Shape | None) -> Row:
+    """Columns of `objects` of the image targets that there are; of the table, and without any, all are null."""
+    columns: Row = dict.fromkeys(TARGET_COLUMNS)
+    if region_id >= REGION_FIRST_OBJECT and "amodal" in images:
+        columns |= amodal_columns(images["amodal"][region_id - REGION_FIRST_OBJECT])
+    if region_id >= REGION_FIRST_OBJECT and "coordinates" in images and shape is not None:
+        scale, offset = coordinate_scale(shape)
+        columns |= {"coordinates_scale_m": scale, "coordinates_offset_m": offset.tolist()}
+    return columns
+
+
+TARGET_COLUMNS = ("amodal_bbox_xywh", "amodal_pixels", "coordinates_scale_m", "coordinates_offset_m", "targets_share")
+
+
+def amodal_columns(mask: NDArray[np.uint8]) -> Row:
+    """The extent of a silhouette [H, W] of 255."""
+    whole = measure_regions(mask)[255]
+    return {"amodal_bbox_xywh": list(whole.bbox_xywh), "amodal_pixels": whole.pixels}
 
 
 def asset_row(asset: Asset, job: Job) -> Row:

@@ -118,10 +118,10 @@ def label_differences(stored: Any, derived: Any, path: str = "") -> Iterator[str
 
 
 _PATH = re.compile(
-    r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"
+    r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+(?:\d+_[A-Za-z]*)?)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"
 )
 _MEMBER = re.compile(
-    r"(?P<pose>\d{5}|[1-9]\d{5,})\.(?P<content>[A-Za-z]+)(?P<patch>\.patch)?(?:\.obj(?P<object>0|[1-9]\d*))?\.png"
+    r"(?P<pose>\d{5}|[1-9]\d{5,})\.(?P<content>[A-Za-z]+(?:\d+_[A-Za-z]*)?)(?P<patch>\.patch)?(?:\.obj(?P<object>0|[1-9]\d*))?\.png"
 )
 _LABEL = re.compile(r"(?P<pose>\d{5}|[1-9]\d{5,})\.json", re.ASCII)
 _CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
@@ -139,7 +139,7 @@ def path_of(category: str, member: str) -> str:
     found = _match(_MEMBER, member)
     index = None if found["object"] is None else int(found["object"])
     name, pose_id = cast(Content, found["content"]), int(found["pose"])
-    return patch_path(category, name, pose_id, index) if found["patch"] else image_path(category, name, pose_id)
+    return (patch_path if found["patch"] else image_path)(category, name, pose_id, index)
 
 
 def member_order(path: str) -> tuple[int, int, bool, int]:

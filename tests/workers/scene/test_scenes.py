@@ -149,7 +149,7 @@ def test_patches_are_of_each_object_that_they_do_not_leave_and_a_projected_views
     projected = dataclasses.replace(view, role="projected", region=None, labels=())
     box = (slice(20, 28), slice(12, 28))
     assert boxes_of(projected, Pair(1.0, view, mirror=mirror, projected=projected)) == {
-        f"mug/{folder}{name}00006.png": box if folder else None
+        f"mug/{folder}{name}00006.png": box if folder else ()
         for name in ("RGBprojected", "depthProjected")
         for folder in ("", "patches/")
     }

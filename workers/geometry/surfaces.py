@@ -1,0 +1,345 @@
+"""All surfaces along the rays through pixel centres, without a GPU: the nearest of each region, and every one from front to back.
+
+Pixels are covered by the rule of the label pass (zbuffer.py), in exact integers: so a surface that bounds a body is met an even
+number of times, and what is found agrees with the stored mask. Distances and points are of the faces' planes, in float64.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.scene.scene import Placed
+from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera, Intrinsics
+from workers.geometry.camera import NEAR_M
+from workers.geometry.frames import invert, transform
+from workers.geometry.jit import compiled, compiled_for
+from workers.geometry.mesh import face_planes
+from workers.geometry.zbuffer import Corner, cut_row, to_grid
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """The faces of some things before the camera, in its frame and on its pixel grid.
+
+    mesh: vertices [V, 3] in the camera's frame, metres, and faces [F, 3], of which what lies before the near plane is left;
+    corners [V, 2] int64: vertices in 1/256 pixel from the centre of the first; planes: normals [F, 3] and offsets [F];
+    region [F] uint8; closed [F] bool: whether the other side of the face is never seen; face [F]: its number in the shape that
+    it is of.
+    """
+
+    mesh: Mesh
+    corners: NDArray[np.int64]
+    planes: tuple[Array, Array]
+    region: NDArray[np.uint8]
+    closed: NDArray[np.bool_]
+    face: NDArray[np.int64]
+    intrinsics: Intrinsics
+
+    @property
+    def k(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy."""
+        k = self.intrinsics
+        return k.fx, k.fy, k.cx, k.cy
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.intrinsics.width, self.intrinsics.height
+
+
+def triangles_of(things: Sequence[Placed], camera: Camera) -> Triangles:
+    """The faces of things, one or more, as this camera has them."""
+    k, T_cam_world = camera.intrinsics, invert(camera.T_world_cam)
+    window, meshes, corners, owners = (k.fx, k.fy, k.cx, k.cy), [], [], []
+    for thing in things:
+        T = T_cam_world @ thing.T_world_shape
+        points = transform(T, thing.shape.vertices)
+        mesh, owner = Mesh(points, thing.shape.faces), np.arange(len(thing.shape.faces))
+        place, source = T.astype(np.float32), thing.shape.vertices
+        if (points[:, 2] <= NEAR_M).any():
+            mesh, owner = _cut_near(mesh)
+            place, source = np.eye(4, dtype=np.float32), np.maximum(mesh.vertices, [-np.inf, -np.inf, NEAR_M])
+        corners.append(to_grid(np.ascontiguousarray(source), place, window, k.width, k.height))
+        meshes.append(mesh)
+        owners.append(owner)
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + np.int32(start) for mesh, start in zip(meshes, starts, strict=False)]
+    whole = Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces, dtype=np.int32))
+    counts = [len(mesh.faces) for mesh in meshes]
+    region = np.repeat(np.array([thing.region_id for thing in things], np.uint8), counts)
+    closed = np.repeat(np.array([thing.shape.closed for thing in things]), counts)
+    return Triangles(whole, np.concatenate(corners), face_planes(whole), region, closed, np.concatenate(owners), k)
+
+
+def _cut_near(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
+    """(what of a mesh lies beyond the near plane, the number of the face that each of its faces is a piece of)."""
+    beyond = mesh.vertices[:, 2] > NEAR_M
+    count = beyond[mesh.faces].sum(axis=1)
+    whole = np.flatnonzero(count == 3)
+    vertices, faces, owners = [mesh.vertices], [mesh.faces[whole]], [whole]
+    free = len(mesh.vertices)
+    for face in np.flatnonzero((count == 1) | (count == 2)):
+        ring = mesh.vertices[mesh.faces[face]]
+        piece = []
+        for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            if a[2] > NEAR_M:
+                piece.append(a)
+            if (a[2] > NEAR_M) != (b[2] > NEAR_M):
+                met = a + (b - a) * (NEAR_M - a[2]) / (b[2] - a[2])
+                met[2] = NEAR_M
+                piece.append(met)
+        fan = [(free, free + n, free + n + 1) for n in range(1, len(piece) - 1)]
+        vertices.append(np.array(piece))
+        faces.append(np.array(fan, np.int32))
+        owners.append(np.full(len(fan), face))
+        free += len(piece)
+    return Mesh(np.concatenate(vertices), np.concatenate(faces, dtype=np.int32)), np.concatenate(owners)
+
+
+def nearest_faces(triangles: Triangles, region: NDArray[np.uint8]) -> tuple[NDArray[np.int32], Array]:
+    """(face [H, W] int32, z [H, W] float64, metres): the nearest face of each pixel's own region [H, W], -1 and 0 without one.
+
+    A pixel whose centre no face of its region covers, by a rounding of the renderer, has the face and the plane of a neighbour.
+    """
+    t = triangles
+    return _nearest_faces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, (t.region, t.closed), region, t.k)
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Every surface along each pixel's ray, from front to back.
+
+    start [H * W + 1]: where the pixel's surfaces begin and end in z [N] float64, metres, and face [N] int32.
+    """
+
+    start: NDArray[np.int64]
+    z: Array
+    face: NDArray[np.int32]
+
+
+def all_surfaces(triangles: Triangles) -> Surfaces:
+    """Every face that a pixel's ray meets, either side up."""
+    t = triangles
+    return Surfaces(*_all_surfaces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, t.k, t.size))
+
+
+@compiled
+def _oriented(corners: NDArray[np.int64], faces: NDArray[np.int32], face: int) -> tuple[int, Corner, Corner, Corner]:
+    """(twice the area, positive where the face shows its back; its corners, clockwise)."""
+    a, b, c = (
+        (corners[faces[face, 0], 0], corners[faces[face, 0], 1]),
+        (corners[faces[face, 1], 0], corners[faces[face, 1], 1]),
+        (corners[faces[face, 2], 0], corners[faces[face, 2], 1]),
+    )
+    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    return (area, a, b, c) if area > 0 else (area, a, c, b)
+
+
+@compiled
+def _box(a: Corner, b: Corner, c: Corner, width: int, height: int) -> tuple[int, int, int, int]:
+    """(first, last column, upper, lower row) of the pixel centres in the triangle's box and in the image."""
+    first, last = max((min(a[0], b[0], c[0]) + 255) >> 8, 0), min(max(a[0], b[0], c[0]) >> 8, width - 1)
+    upper, lower = max((min(a[1], b[1], c[1]) + 255) >> 8, 0), min(max(a[1], b[1], c[1]) >> 8, height - 1)
+    return first, last, upper, lower
+
+
+@compiled
+def _columns(a: Corner, b: Corner, c: Corner, row: int, first: int, last: int) -> tuple[int, int]:
+    """The columns of a row whose centres a triangle covers."""
+    left, right = cut_row(a, b, row, first, last)
+    left, right = cut_row(b, c, row, left, right)
+    return cut_row(c, a, row, left, right)
+
+
+@compiled
+def _depth(
+    face: int,
+    column: int,
+    row: int,
+    k: tuple[float, float, float, float],
+    planes: tuple[Array, Array],
+    span: tuple[float, float],
+) -> float:
+    """z at which a pixel's ray meets a face's plane; within `span`, that of the face, also where it is seen edge-on."""
+    normal = planes[0][face]
+    along = normal[0] * ((column + 0.5 - k[2]) / k[0]) + normal[1] * ((row + 0.5 - k[3]) / k[1]) + normal[2]
+    z = planes[1][face] / along if along != 0.0 else span[0]
+    return min(max(z, span[0]), span[1])
+
+
+@compiled
+def _span(points: Array, faces: NDArray[np.int32], face: int) -> tuple[float, float]:
+    """The least and the greatest z of a face's corners."""
+    a, b, c = points[faces[face, 0], 2], points[faces[face, 1], 2], points[faces[face, 2], 2]
+    return min(a, b, c), max(a, b, c)
+
+
+@compiled_for(
+    "i8[:,::1], i4[:,::1], f8[:,::1], Tuple((f8[:,::1], f8[::1])), Tuple((u1[::1], b1[::1])), const(u1[:,::1]), UniTuple(f8, 4)"
+)
+def _nearest_faces(
+    corners: NDArray[np.int64],
+    faces: NDArray[np.int32],
+    points: Array,
+    planes: tuple[Array, Array],
+    kinds: tuple[NDArray[np.uint8], NDArray[np.bool_]],
+    region: NDArray[np.uint8],
+    k: tuple[float, float, float, float],
+) -> tuple[NDArray[np.int32], Array]:
+    height, width = region.shape
+    best, depth = np.full((height, width), -1, np.int32), np.zeros((height, width))
+    for face in range(len(faces)):
+        area, a, b, c = _oriented(corners, faces, face)
+        if area == 0 or (area > 0 and kinds[1][face]):
+            continue
+        own, span = kinds[0][face], _span(points, faces, face)
+        first, last, upper, lower = _box(a, b, c, width, height)
+        for row in range(upper, lower + 1):
+            left, right = _columns(a, b, c, row, first, last)
+            for column in range(left, right + 1):
+                if region[row, column] != own:
+                    continue
+                z = _depth(face, column, row, k, planes, span)
+                if best[row, column] < 0 or z < depth[row, column]:
+                    best[row, column], depth[row, column] = face, z
+    _fill_missed(best, depth, kinds[0], region, points, faces, planes, k)
+    return best, depth
+
+
+@compiled
+def _fill_missed(
+    best: NDArray[np.int32],
+    depth: Array,
+    regions: NDArray[np.uint8],
+    region: NDArray[np.uint8],
+    points: Array,
+    faces: NDArray[np.int32],
+    planes: tuple[Array, Array],
+    k: tuple[float, float, float, float],
+) -> None:
+    """Gives a pixel of a region that none of its faces covers the face of a pixel beside it that one does."""
+    height, width = region.shape
+    found = best.copy()
+    for row in range(height):
+        for column in range(width):
+            if best[row, column] >= 0 or region[row, column] == 0:
+                continue
+            for n in range(9):
+                y, x = row + n // 3 - 1, column + n % 3 - 1
+                if not (0 <= y < height and 0 <= x < width) or region[y, x] != region[row, column]:
+                    continue
+                face = found[y, x]
+                if face >= 0 and regions[face] == region[row, column]:
+                    span = _span(points, faces, face)
+                    best[row, column], depth[row, column] = face, _depth(face, column, row, k, planes, span)
+                    break
+
+
+@compiled_for("i8[:,::1], i4[:,::1], f8[:,::1], Tuple((f8[:,::1], f8[::1])), UniTuple(f8, 4), UniTuple(i8, 2)")
+def _all_surfaces(
+    corners: NDArray[np.int64],
+    faces: NDArray[np.int32],
+    points: Array,
+    planes: tuple[Array, Array],
+    k: tuple[float, float, float, float],
+    size: tuple[int, int],
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int32]]:
+    width, height = size
+    start = np.zeros(width * height + 1, np.int64)
+    for face in range(len(faces)):
+        area, a, b, c = _oriented(corners, faces, face)
+        if area != 0:
+            first, last, upper, lower = _box(a, b, c, width, height)
+            for row in range(upper, lower + 1):
+                left, right = _columns(a, b, c, row, first, last)
+                for column in range(left, right + 1):
+                    start[row * width + column + 1] += 1
+    for pixel in range(width * height):
+        start[pixel + 1] += start[pixel]
+    z, owner, filled = np.empty(start[-1]), np.empty(start[-1], np.int32), np.zeros(width * height, np.int32)
+    for face in range(len(faces)):
+        area, a, b, c = _oriented(corners, faces, face)
+        if area == 0:
+            continue
+        span = _span(points, faces, face)
+        first, last, upper, lower = _box(a, b, c, width, height)
+        for row in range(upper, lower + 1):
+            left, right = _columns(a, b, c, row, first, last)
+            for column in range(left, right + 1):
+                pixel = row * width + column
+                own, place = _depth(face, column, row, k, planes, span), start[pixel] + filled[pixel]
+                filled[pixel] += 1
+                while place > start[pixel] and z[place - 1] > own:
+                    z[place], owner[place] = z[place - 1], owner[place - 1]
+                    place -= 1
+                z[place], owner[place] = own, face
+    return start, z, owner
+
+
+def corner_weights(points: Array, mesh: Mesh, face: NDArray[np.int64]) -> tuple[NDArray[np.int32], Array]:
+    """(corners [N, 3] of the faces [N], weights [N, 3]) with which vertices of a mesh add up to points [N, 3] on these faces."""
+    corners = np.ascontiguousarray(mesh.faces[face])
+    return corners, _weights(np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), corners)
+
+
+@compiled_for("f8[:,::1], f8[:,::1], i4[:,::1]", "f8[:,::1], const(f8[:,::1]), i4[:,::1]")
+def _weights(points: Array, vertices: Array, corners: NDArray[np.int32]) -> Array:
+    """Barycentric coordinates (Ericson, Real-Time Collision Detection 2005, 3.4), cut to 0 to 1; of no area, the first corner."""
+    weights = np.zeros((len(points), 3))
+    for n in range(len(points)):
+        a, b, c = corners[n, 0], corners[n, 1], corners[n, 2]
+        d00 = d01 = d11 = d20 = d21 = 0.0
+        for axis in range(3):
+            u, v = vertices[b, axis] - vertices[a, axis], vertices[c, axis] - vertices[a, axis]
+            w = points[n, axis] - vertices[a, axis]
+            d00 += u * u
+            d01 += u * v
+            d11 += v * v
+            d20 += w * u
+            d21 += w * v
+        area = d00 * d11 - d01 * d01
+        if area > 0.0:
+            second = min(max((d11 * d20 - d01 * d21) / area, 0.0), 1.0)
+            third = min(max((d00 * d21 - d01 * d20) / area, 0.0), 1.0 - second)
+            weights[n, 1], weights[n, 2] = second, third
+        weights[n, 0] = 1.0 - weights[n, 1] - weights[n, 2]
+    return weights
+
+
+def mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:
+    """[N, C]: values [V, C] of vertices, interpolated with weights [N, 3] of corners [N, 3]."""
+    return _mix(np.ascontiguousarray(values, dtype=np.float64), corners, weights)
+
+
+@compiled_for("f8[:,::1], i4[:,::1], f8[:,::1]", "const(f8[:,::1]), i4[:,::1], f8[:,::1]")
+def _mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:
+    mixed = np.zeros((len(corners), values.shape[1]))
+    for n in range(len(corners)):
+        for corner in range(3):
+            for channel in range(values.shape[1]):
+                mixed[n, channel] += weights[n, corner] * values[corners[n, corner], channel]
+    return mixed
+
+
+@compiled_for("const(u1[:,:,::1]), f8[:,::1], f8[::1]", "u1[:,:,::1], f8[:,::1], f8[::1]")
+def sample_texture(texture: NDArray[np.uint8], uv: Array, light: Array) -> Array:
+    """[N, 3]: linear light of a texture [h, w, 3 or 4] at uv [N, 2], bilinear among four texels, repeated beyond its edges.
+
+    uv (0, 0) is the lower left corner; light [256]: of each code.
+    """
+    height, width = texture.shape[:2]
+    sampled = np.zeros((len(uv), 3))
+    for n in range(len(uv)):
+        x, y = uv[n, 0] * width - 0.5, (1.0 - uv[n, 1]) * height - 0.5
+        left, top = np.floor(x), np.floor(y)
+        for corner in range(4):
+            right, down = corner % 2, corner // 2
+            share = (x - left if right else 1.0 - x + left) * (y - top if down else 1.0 - y + top)
+            texel = texture[(int(top) + down) % height, (int(left) + right) % width]
+            for channel in range(3):
+                sampled[n, channel] += share * light[texel[channel]]
+    return sampled

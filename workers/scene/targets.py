@@ -1,0 +1,198 @@
+"""Image targets of a drawn view: what networks are trained on, from the faces that the pixels' rays meet. Pure.
+
+A target says of each pixel what is at its centre, of the same faces as the stored mask, without light, lens or noise. Whatever
+there is not is 0. Coordinates and normals are 16-bit: `value / 65535` is the stored number, from 0 to 1.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.job.job import Job
+from schemas.job.targets import Targets
+from schemas.job.views import Images
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
+from schemas.scene.view import LAYERS, Camera, PixelKind
+from workers.geometry.colour import SRGB_STEPS, decode_srgb, encode_codes
+from workers.geometry.frames import invert, transform
+from workers.geometry.pixels import quantise_depth
+from workers.geometry.surfaces import (
+    Surfaces,
+    Triangles,
+    all_surfaces,
+    corner_weights,
+    mix,
+    nearest_faces,
+    sample_texture,
+    triangles_of,
+)
+from workers.scene.context import Stopwatch
+
+FULL = 65_535
+"""The code of 1 in an image of 16 bits."""
+
+OF_NEAREST, OF_ALL = ("normals", "coordinates", "albedo"), ("layers", "amodal")
+"""Targets of what is seen, and of everything along a pixel's ray."""
+
+
+def draw_targets(
+    things: Sequence[Placed], camera: Camera, region: NDArray[np.uint8], job: Job, effects: EffectPlan, watch: Stopwatch
+) -> dict[PixelKind, NDArray]:
+    """The image targets that the plan has of a view with the mask `region` [H, W], by modality."""
+    drawn: dict[PixelKind, NDArray] = {}
+    objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
+    if any(effects.runs(name) for name in OF_NEAREST):
+        with watch.stage("targets"):
+            seen = Seen(things if effects.runs("normals") or effects.runs("albedo") else objects, camera, region)
+        for name in filter(effects.runs, OF_NEAREST):
+            with watch.stage("targets", name):
+                drawn[name] = _OF_SEEN[name](seen, job.targets)
+    if any(effects.runs(name) for name in OF_ALL):
+        with watch.stage("targets"):
+            triangles = triangles_of(objects, camera)
+            surfaces = all_surfaces(triangles)
+        if effects.runs("amodal"):
+            with watch.stage("targets", "amodal"):
+                drawn["amodal"] = whole_silhouettes(triangles, surfaces, [thing.region_id for thing in objects])
+        if effects.runs("layers"):
+            with watch.stage("targets", "layers"):
+                drawn |= peel_layers(triangles, surfaces, job.targets.layers, job.images)
+    return drawn
+
+
+class Seen:
+    """What is seen at each pixel of a mask [H, W]: face [H, W] int32 of `triangles`, -1 for none, and z [H, W], metres."""
+
+    def __init__(self, things: Sequence[Placed], camera: Camera, region: NDArray[np.uint8]) -> None:
+        self.things, self.camera = things, camera
+        self.triangles = triangles_of(things, camera)
+        self.face, self.z = nearest_faces(self.triangles, region)
+
+    def points_at(self, pixels: NDArray[np.int64]) -> Array:
+        """[N, 3]: the points, in the camera's frame, that are seen at pixels (flat numbers)."""
+        k = self.triangles.intrinsics
+        rows, columns = np.divmod(pixels, k.width)
+        z = self.z.reshape(-1)[pixels]
+        return np.stack([(columns + 0.5 - k.cx) / k.fx * z, (rows + 0.5 - k.cy) / k.fy * z, z], axis=1)
+
+    def by_thing(self) -> Iterator[tuple[Placed, NDArray[np.int64]]]:
+        """Each thing with the pixels (flat numbers) that show it."""
+        regions = np.append(self.triangles.region, np.uint8(0))[self.face]
+        for thing in self.things:
+            yield thing, np.flatnonzero(regions == thing.region_id)
+
+
+def draw_normals(seen: Seen, targets: Targets) -> NDArray[np.uint16]:
+    """[H, W, 3]: unit normals n in the camera's frame, towards the camera, as (n + 1) / 2; of shading with `targets.smooth`."""
+    normals, offsets = seen.triangles.planes
+    towards = np.where(offsets[:, None] > 0.0, -normals, normals)
+    codes = np.concatenate([_sixteen_bits((towards + 1.0) / 2.0), np.zeros((1, 3), np.uint16)])
+    image = codes[seen.face]
+    if targets.smooth:
+        flat = image.reshape(-1, 3)
+        for thing, pixels in seen.by_thing():
+            turn = invert(seen.camera.T_world_cam)[:3, :3] @ thing.T_world_shape[:3, :3]
+            for part, some, corners, weights in _parts_of(seen, thing, pixels):
+                if part.normals is not None:
+                    smooth = mix(part.normals, corners, weights) @ turn.T
+                    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+                    # To the side that the face shows: at an outline a shading normal may look away a little.
+                    own = towards[seen.face.reshape(-1)[some]]
+                    smooth *= np.where((smooth * own).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+                    flat[some] = _sixteen_bits((smooth + 1.0) / 2.0)
+    return image
+
+
+def draw_coordinates(seen: Seen, targets: Targets) -> NDArray[np.uint16]:
+    """[H, W, 3]: where on its object each pixel is: the middle of the object's box at 0.5, the box's diagonal as 1 (NOCS)."""
+    image = np.zeros((*seen.face.shape, 3), np.uint16)
+    flat = image.reshape(-1, 3)
+    for thing, pixels in seen.by_thing():
+        if thing.region_id >= REGION_FIRST_OBJECT:
+            scale, offset = coordinate_scale(thing.shape)
+            points = transform(invert(thing.T_world_shape) @ seen.camera.T_world_cam, seen.points_at(pixels))
+            flat[pixels] = _sixteen_bits((points - offset) / scale)
+    return image
+
+
+def coordinate_scale(shape: Shape) -> tuple[float, Array]:
+    """(scale, offset [3]), metres: an object's point is scale * value / 65535 + offset, in its own frame."""
+    lower, upper = shape.bounds
+    scale = float(np.linalg.norm(upper - lower))
+    return scale, (lower + upper) / 2.0 - scale / 2.0
+
+
+def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
+    """[H, W, 3] sRGB: base colours, of textures bilinear among four texels in linear light, without light and shadow."""
+    image = np.zeros((*seen.face.shape, 3), np.uint8)
+    flat = image.reshape(-1, 3)
+    for thing, pixels in seen.by_thing():
+        for part, some, corners, weights in _parts_of(seen, thing, pixels):
+            base = decode_srgb(np.array(part.material.base_color[:3]))
+            if part.material.texture is None and part.colors is None:
+                flat[some] = encode_codes(base)
+                continue
+            light = np.broadcast_to(base, (len(some), 3))
+            if part.colors is not None:
+                light = light * mix(SRGB_STEPS[part.colors[:, :3]], corners, weights)
+            if part.material.texture is not None and part.uv is not None:
+                light = light * sample_texture(part.material.texture, mix(part.uv, corners, weights), SRGB_STEPS)
+            flat[some] = encode_codes(light)
+    return image
+
+
+def whole_silhouettes(triangles: Triangles, surfaces: Surfaces, regions: Sequence[int]) -> NDArray[np.uint8]:
+    """[objects, H, W]: 255 where an object would be seen if nothing stood in front of it."""
+    width, height = triangles.size
+    place = np.full(256, -1, np.int64)
+    place[list(regions)] = np.arange(len(regions))
+    masks = np.zeros((len(regions), height, width), np.uint8)
+    pixel = np.repeat(np.arange(width * height), np.diff(surfaces.start))
+    masks.reshape(len(regions), -1)[place[triangles.region[surfaces.face]], pixel] = 255
+    return masks
+
+
+def peel_layers(
+    triangles: Triangles, surfaces: Surfaces, count: int, images: Images
+) -> dict[PixelKind, NDArray[np.uint16] | NDArray[np.uint8]]:
+    """Depth and region [H, W] of the first `count` surfaces of objects along each pixel's ray, and of the last one."""
+    width, height = triangles.size
+    start, stop = surfaces.start[:-1], surfaces.start[1:]
+    drawn: dict[PixelKind, NDArray] = {}
+    for name, surface in (*((f"layer{n}", start + n - 1) for n in LAYERS[:count]), ("back", stop - 1)):
+        pixels = np.flatnonzero((surface < stop) & (surface >= start))
+        z, region = np.zeros((height, width)), np.zeros((height, width), np.uint8)
+        z.reshape(-1)[pixels] = surfaces.z[surface[pixels]]
+        region.reshape(-1)[pixels] = triangles.region[surfaces.face[surface[pixels]]]
+        drawn |= {name: quantise_depth(z, images), f"{name}_region": region}
+    return drawn
+
+
+def _parts_of(
+    seen: Seen, thing: Placed, pixels: NDArray[np.int64]
+) -> Iterator[tuple[Part, NDArray[np.int64], NDArray[np.int32], Array]]:
+    """Each part that is seen: the pixels (flat numbers) that show it, and the corners and weights [N, 3] of what they show."""
+    face = seen.triangles.face[seen.face.reshape(-1)[pixels]]
+    T_shape_cam, start = invert(thing.T_world_shape) @ seen.camera.T_world_cam, 0
+    for part in thing.shape.parts:
+        inside = np.flatnonzero((face >= start) & (face < start + len(part.faces)))
+        if len(inside):
+            points = transform(T_shape_cam, seen.points_at(pixels[inside]))
+            own = corner_weights(points, Mesh(part.vertices, part.faces), face[inside] - start)
+            yield part, pixels[inside], *own
+        start += len(part.faces)
+
+
+_OF_SEEN: Mapping[str, Callable[[Seen, Targets], NDArray]] = {
+    "normals": draw_normals,
+    "coordinates": draw_coordinates,
+    "albedo": draw_albedo,
+}
+
+
+def _sixteen_bits(share: Array) -> NDArray[np.uint16]:
+    """Numbers from 0 to 1 as codes, to the nearest."""
+    return np.rint(np.clip(share, 0.0, 1.0) * FULL).astype(np.uint16)
