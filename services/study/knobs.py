@@ -27,6 +27,7 @@ FREE: Mapping[str, str] = {
     "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m start.max_redraws": "where things begin",
     "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
     "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
+    "targets": "which files; their time is in the table of timings",
     "cameras.orbit cameras.depth cameras.mirror.enabled cameras.mirror.T_z_m": "where cameras stand",
     "images.depth_range_m images.patch images.projection.enabled": "which files",
     "render.rgb render.path_bounces": "a whole image, or of the path-traced tier alone",

@@ -5,9 +5,13 @@ Effects of physics have theirs in physics_cases.py.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
+from schemas.job.targets import ViewTarget
 from tests.effects.scenes import ABOVE_THE_HORIZON, Setting, with_holes, without_textures
+
+
+TARGETS: tuple[str, ...] = get_args(ViewTarget)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +29,13 @@ def _asked(on: Mapping[str, Any], off: Mapping[str, Any], why: str) -> Case:
 
 def _sensor(name: str, **branch: Any) -> Case:
     return _asked({"sensor": {name: branch}}, {}, f"sensor.{name} is off")
+
+
+def _target(name: str) -> Case:
+    """Asked for beside another target, and that target alone: a job without any has none in its receipt."""
+    other = next(one for one in TARGETS if one != name)
+    views = {"views": [other, name]}, {"views": [other]}
+    return _asked({"targets": views[0]}, {"targets": views[1]}, f"targets.views has no {name}")
 
 
 NOISY = {
@@ -58,6 +69,7 @@ ASKED: dict[str, Case] = {
     "sensor_exposure": _sensor("exposure", stops=[1.0, 1.0]),
     "raycast_check": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
     "release_again": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
+    **{name: _target(name) for name in TARGETS},
 }
 
 NO_OPS: dict[str, Case] = {

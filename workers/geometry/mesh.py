@@ -253,3 +253,68 @@ def mesh_of(solid: manifold3d.Manifold) -> Mesh:
     """The surface of a solid."""
     mesh = solid.to_mesh64()
     return Mesh(np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int32))
+
+
+def corner_weights(points: Array, mesh: Mesh, face: NDArray[np.int64]) -> tuple[NDArray[np.int32], Array]:
+    """(corners [N, 3] of the faces [N], weights [N, 3]) with which vertices of a mesh add up to points [N, 3] on these faces."""
+    corners = np.ascontiguousarray(mesh.faces[face])
+    return corners, _weights(np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), corners)
+
+
+@compiled_for("f8[:,::1], f8[:,::1], i4[:,::1]", "f8[:,::1], const(f8[:,::1]), i4[:,::1]")
+def _weights(points: Array, vertices: Array, corners: NDArray[np.int32]) -> Array:
+    """Barycentric coordinates (Ericson, Real-Time Collision Detection 2005, 3.4), cut to 0 to 1; of no area, the first corner."""
+    weights = np.zeros((len(points), 3))
+    for n in range(len(points)):
+        a, b, c = corners[n, 0], corners[n, 1], corners[n, 2]
+        d00 = d01 = d11 = d20 = d21 = 0.0
+        for axis in range(3):
+            u, v = vertices[b, axis] - vertices[a, axis], vertices[c, axis] - vertices[a, axis]
+            w = points[n, axis] - vertices[a, axis]
+            d00 += u * u
+            d01 += u * v
+            d11 += v * v
+            d20 += w * u
+            d21 += w * v
+        area = d00 * d11 - d01 * d01
+        if area > 0.0:
+            second = min(max((d11 * d20 - d01 * d21) / area, 0.0), 1.0)
+            third = min(max((d00 * d21 - d01 * d20) / area, 0.0), 1.0 - second)
+            weights[n, 1], weights[n, 2] = second, third
+        weights[n, 0] = 1.0 - weights[n, 1] - weights[n, 2]
+    return weights
+
+
+def mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:
+    """[N, C]: values [V, C] of vertices, interpolated with weights [N, 3] of corners [N, 3]."""
+    return _mix(np.ascontiguousarray(values, dtype=np.float64), corners, weights)
+
+
+@compiled_for("f8[:,::1], i4[:,::1], f8[:,::1]", "const(f8[:,::1]), i4[:,::1], f8[:,::1]")
+def _mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:
+    mixed = np.zeros((len(corners), values.shape[1]))
+    for n in range(len(corners)):
+        for corner in range(3):
+            for channel in range(values.shape[1]):
+                mixed[n, channel] += weights[n, corner] * values[corners[n, corner], channel]
+    return mixed
+
+
+@compiled_for("const(u1[:,:,::1]), f8[:,::1], f8[::1]", "u1[:,:,::1], f8[:,::1], f8[::1]")
+def sample_texture(texture: NDArray[np.uint8], uv: Array, light: Array) -> Array:
+    """[N, 3]: linear light of a texture [h, w, 3 or 4] at uv [N, 2], bilinear among four texels, repeated beyond its edges.
+
+    uv (0, 0) is the lower left corner; light [256]: of each code.
+    """
+    height, width = texture.shape[:2]
+    sampled = np.zeros((len(uv), 3))
+    for n in range(len(uv)):
+        x, y = uv[n, 0] * width - 0.5, (1.0 - uv[n, 1]) * height - 0.5
+        left, top = np.floor(x), np.floor(y)
+        for corner in range(4):
+            right, down = corner % 2, corner // 2
+            share = (x - left if right else 1.0 - x + left) * (y - top if down else 1.0 - y + top)
+            texel = texture[(int(top) + down) % height, (int(left) + right) % width]
+            for channel in range(3):
+                sampled[n, channel] += share * light[texel[channel]]
+    return sampled

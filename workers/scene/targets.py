@@ -16,23 +16,24 @@ from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
 from schemas.scene.view import LAYERS, Camera, PixelKind
-from workers.geometry.colour import SRGB_STEPS, decode_srgb, encode_codes
+from workers.geometry.colour import SRGB_STEPS, decode_srgb
 from workers.geometry.frames import invert, transform
+from workers.geometry.mesh import corner_weights, mix
 from workers.geometry.pixels import quantise_depth
-from workers.geometry.surfaces import (
-    Surfaces,
-    Triangles,
-    all_surfaces,
-    corner_weights,
-    mix,
-    nearest_faces,
-    sample_texture,
-    triangles_of,
-)
 from workers.scene.context import Stopwatch
+from workers.scene.painting import (
+    FULL,
+    Surface,
+    paint_albedo,
+    paint_faces,
+    paint_layers,
+    paint_points,
+    paint_silhouettes,
+)
+from workers.scene.surfaces import Surfaces, Triangles, all_surfaces, nearest_faces, triangles_of
 
-FULL = 65_535
-"""The code of 1 in an image of 16 bits."""
+WHITE = np.full((1, 1, 3), 255, np.uint8)
+"""The texture of a part without one."""
 
 OF_NEAREST, OF_ALL = ("normals", "coordinates", "albedo"), ("layers", "amodal")
 """Targets of what is seen, and of everything along a pixel's ray."""
@@ -89,8 +90,8 @@ def draw_normals(seen: Seen, targets: Targets) -> NDArray[np.uint16]:
     """[H, W, 3]: unit normals n in the camera's frame, towards the camera, as (n + 1) / 2; of shading with `targets.smooth`."""
     normals, offsets = seen.triangles.planes
     towards = np.where(offsets[:, None] > 0.0, -normals, normals)
-    codes = np.concatenate([_sixteen_bits((towards + 1.0) / 2.0), np.zeros((1, 3), np.uint16)])
-    image = codes[seen.face]
+    image = np.zeros((*seen.face.shape, 3), np.uint16)
+    paint_faces(seen.face, _sixteen_bits((towards + 1.0) / 2.0), image)
     if targets.smooth:
         flat = image.reshape(-1, 3)
         for thing, pixels in seen.by_thing():
@@ -109,12 +110,11 @@ def draw_normals(seen: Seen, targets: Targets) -> NDArray[np.uint16]:
 def draw_coordinates(seen: Seen, targets: Targets) -> NDArray[np.uint16]:
     """[H, W, 3]: where on its object each pixel is: the middle of the object's box at 0.5, the box's diagonal as 1 (NOCS)."""
     image = np.zeros((*seen.face.shape, 3), np.uint16)
-    flat = image.reshape(-1, 3)
-    for thing, pixels in seen.by_thing():
+    for thing in seen.things:
         if thing.region_id >= REGION_FIRST_OBJECT:
-            scale, offset = coordinate_scale(thing.shape)
-            points = transform(invert(thing.T_world_shape) @ seen.camera.T_world_cam, seen.points_at(pixels))
-            flat[pixels] = _sixteen_bits((points - offset) / scale)
+            T_obj_cam = invert(thing.T_world_shape) @ seen.camera.T_world_cam
+            place = np.ascontiguousarray(T_obj_cam), seen.triangles.k, *coordinate_scale(thing.shape)
+            paint_points((seen.face, seen.z), seen.triangles.region, np.uint8(thing.region_id), *place, image)
     return image
 
 
@@ -128,19 +128,23 @@ def coordinate_scale(shape: Shape) -> tuple[float, Array]:
 def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     """[H, W, 3] sRGB: base colours, of textures bilinear among four texels in linear light, without light and shadow."""
     image = np.zeros((*seen.face.shape, 3), np.uint8)
-    flat = image.reshape(-1, 3)
-    for thing, pixels in seen.by_thing():
-        for part, some, corners, weights in _parts_of(seen, thing, pixels):
-            base = decode_srgb(np.array(part.material.base_color[:3]))
-            if part.material.texture is None and part.colors is None:
-                flat[some] = encode_codes(base)
-                continue
-            light = np.broadcast_to(base, (len(some), 3))
+    triangles, T_cam_world = seen.triangles, invert(seen.camera.T_world_cam)
+    for thing in seen.things:
+        first = 0
+        for part in thing.shape.parts:
+            textured = part.uv is not None and part.material.texture is not None
+            values = np.ones((len(part.vertices), 5))
+            if part.uv is not None:
+                values[:, :2] = part.uv
             if part.colors is not None:
-                light = light * mix(SRGB_STEPS[part.colors[:, :3]], corners, weights)
-            if part.material.texture is not None and part.uv is not None:
-                light = light * sample_texture(part.material.texture, mix(part.uv, corners, weights), SRGB_STEPS)
-            flat[some] = encode_codes(light)
+                values[:, 2:] = SRGB_STEPS[part.colors[:, :3]]
+            points = transform(T_cam_world @ thing.T_world_shape, part.vertices)
+            base = decode_srgb(np.array(part.material.base_color[:3]))
+            texture = part.material.texture if textured else WHITE
+            surface = Surface(first, first + len(part.faces), points, part.faces, values, base, texture)
+            owners = triangles.region, triangles.face
+            paint_albedo((seen.face, seen.z), owners, thing.region_id, surface, triangles.k, image)
+            first += len(part.faces)
     return image
 
 
@@ -150,8 +154,7 @@ def whole_silhouettes(triangles: Triangles, surfaces: Surfaces, regions: Sequenc
     place = np.full(256, -1, np.int64)
     place[list(regions)] = np.arange(len(regions))
     masks = np.zeros((len(regions), height, width), np.uint8)
-    pixel = np.repeat(np.arange(width * height), np.diff(surfaces.start))
-    masks.reshape(len(regions), -1)[place[triangles.region[surfaces.face]], pixel] = 255
+    paint_silhouettes(surfaces.start, triangles.region[surfaces.face], place, masks.reshape(len(regions), -1))
     return masks
 
 
@@ -160,14 +163,12 @@ def peel_layers(
 ) -> dict[PixelKind, NDArray[np.uint16] | NDArray[np.uint8]]:
     """Depth and region [H, W] of the first `count` surfaces of objects along each pixel's ray, and of the last one."""
     width, height = triangles.size
-    start, stop = surfaces.start[:-1], surfaces.start[1:]
+    z, region = np.zeros((count + 1, height, width)), np.zeros((count + 1, height, width), np.uint8)
+    flat = z.reshape(count + 1, -1), region.reshape(count + 1, -1)
+    paint_layers(surfaces.start, surfaces.z, triangles.region[surfaces.face], *flat)
     drawn: dict[PixelKind, NDArray] = {}
-    for name, surface in (*((f"layer{n}", start + n - 1) for n in LAYERS[:count]), ("back", stop - 1)):
-        pixels = np.flatnonzero((surface < stop) & (surface >= start))
-        z, region = np.zeros((height, width)), np.zeros((height, width), np.uint8)
-        z.reshape(-1)[pixels] = surfaces.z[surface[pixels]]
-        region.reshape(-1)[pixels] = triangles.region[surfaces.face[surface[pixels]]]
-        drawn |= {name: quantise_depth(z, images), f"{name}_region": region}
+    for n, name in enumerate([*(f"layer{layer}" for layer in LAYERS[:count]), "back"]):
+        drawn |= {name: quantise_depth(z[n], images), f"{name}_region": region[n]}
     return drawn
 
 

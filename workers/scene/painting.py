@@ -1,0 +1,181 @@
+"""Loops that write an image target where a thing is seen, from the faces and distances of `surfaces.nearest_faces`. Pure.
+
+`seen` is always (face [H, W] int32, -1 for none; z [H, W] float64, metres), `k` fx, fy, cx, cy; pixel centres lie at +0.5.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose
+from workers.geometry.colour import LIMITS, SRGB_STEPS
+from workers.geometry.jit import compiled, compiled_for
+
+SeenFaces = tuple[NDArray[np.int32], Array]
+Intrinsic = tuple[float, float, float, float]
+
+FULL = 65_535
+"""The code of 1 in an image of 16 bits."""
+
+CODES = np.searchsorted(LIMITS, np.arange(FULL + 1) / FULL).astype(np.uint8)
+"""[65536] 8-bit sRGB of linear light in steps of 1 / 65535, of which the darkest code has 20."""
+
+
+@compiled_for("i4[:,::1], u2[:,::1], u2[:,:,::1]")
+def paint_faces(face: NDArray[np.int32], codes: NDArray[np.uint16], image: NDArray[np.uint16]) -> None:
+    """Writes the code [F, 3] of each pixel's face into an image [H, W, 3]."""
+    for row in range(face.shape[0]):
+        for column in range(face.shape[1]):
+            if (own := face[row, column]) >= 0:
+                for channel in range(3):
+                    image[row, column, channel] = codes[own, channel]
+
+
+@compiled_for("Tuple((i4[:,::1], f8[:,::1])), u1[::1], u1, f8[:,::1], UniTuple(f8, 4), f8, f8[::1], u2[:,:,::1]")
+def paint_points(
+    seen: SeenFaces,
+    regions: NDArray[np.uint8],
+    region_id: int,
+    T_obj_cam: Pose,
+    k: Intrinsic,
+    scale: float,
+    offset: Array,
+    image: NDArray[np.uint16],
+) -> None:
+    """Writes (point - offset) / scale, in 16 bits, of what is seen of one object; regions [F] are those of the faces."""
+    face, depth = seen
+    for row in range(face.shape[0]):
+        for column in range(face.shape[1]):
+            own = face[row, column]
+            if own < 0 or regions[own] != region_id:
+                continue
+            z = depth[row, column]
+            x, y = (column + 0.5 - k[2]) / k[0] * z, (row + 0.5 - k[3]) / k[1] * z
+            for axis in range(3):
+                T = T_obj_cam[axis]
+                point = T[0] * x + T[1] * y + T[2] * z + T[3]
+                share = min(max((point - offset[axis]) / scale, 0.0), 1.0)
+                image[row, column, axis] = np.uint16(np.rint(share * FULL))
+
+
+class Surface(NamedTuple):
+    """What `paint_albedo` needs of one part of a shape.
+
+    first, end: numbers of its faces in the shape; values [V, 5]: uv and linear colours of its vertices; base [3] linear light;
+    texture [h, w, 3 or 4] uint8 sRGB, of one white texel for none.
+    """
+
+    first: int
+    end: int
+    points: Array
+    faces: NDArray[np.int32]
+    values: Array
+    base: Array
+    texture: NDArray[np.uint8]
+
+
+def paint_albedo(
+    seen: SeenFaces,
+    owners: tuple[NDArray[np.uint8], NDArray[np.int64]],
+    region_id: int,
+    surface: Surface,
+    k: Intrinsic,
+    image: NDArray[np.uint8],
+) -> None:
+    """Writes the base colour, sRGB, of what is seen of a part into an image [H, W, 3]; points [V, 3] in the camera's frame.
+
+    owners: region [F] and number in its shape [F] of each face. Textures are bilinear among four texels in linear light, and
+    repeat beyond their edges; uv (0, 0) is their lower left corner.
+    """
+    _paint_albedo(seen, owners, np.uint8(region_id), tuple(surface), k, SRGB_STEPS, CODES, image)
+
+
+@compiled
+def _paint_albedo(
+    seen: SeenFaces,
+    owners: tuple[NDArray[np.uint8], NDArray[np.int64]],
+    region_id: int,
+    surface: tuple[int, int, Array, NDArray[np.int32], Array, Array, NDArray[np.uint8]],
+    k: Intrinsic,
+    steps: Array,
+    codes: NDArray[np.uint8],
+    image: NDArray[np.uint8],
+) -> None:
+    face, depth = seen
+    first, end, points, faces, values, base, texture = surface
+    height, width = texture.shape[:2]
+    by_ray, last = np.empty((5, 3)), -1
+    light, value = np.empty(3), np.empty(5)
+    for row in range(face.shape[0]):
+        for column in range(face.shape[1]):
+            own = face[row, column]
+            if own < 0 or owners[0][own] != region_id or not first <= owners[1][own] < end:
+                continue
+            if own != last:
+                _values_by_ray(points, faces[owners[1][own] - first], values, by_ray)
+                last = own
+            x, y, z = (column + 0.5 - k[2]) / k[0], (row + 0.5 - k[3]) / k[1], depth[row, column]
+            for n in range(5):
+                value[n] = z * (by_ray[n, 0] * x + by_ray[n, 1] * y + by_ray[n, 2])
+            for channel in range(3):
+                light[channel] = base[channel] * value[2 + channel]
+            if width * height > 1:
+                u, v = value[0] * width - 0.5, (1.0 - value[1]) * height - 0.5
+                left, top = math.floor(u), math.floor(v)
+                across, down = u - left, v - top
+                x0, y0 = int(left) % width, int(top) % height
+                x1, y1 = (x0 + 1) % width, (y0 + 1) % height
+                for channel in range(3):
+                    upper = (1.0 - across) * steps[texture[y0, x0, channel]] + across * steps[texture[y0, x1, channel]]
+                    lower = (1.0 - across) * steps[texture[y1, x0, channel]] + across * steps[texture[y1, x1, channel]]
+                    light[channel] *= (1.0 - down) * upper + down * lower
+            for channel in range(3):
+                image[row, column, channel] = codes[int(min(max(light[channel], 0.0), 1.0) * FULL + 0.5)]
+
+
+@compiled
+def _values_by_ray(points: Array, corners: NDArray[np.int32], values: Array, by_ray: Array) -> None:
+    """Writes into `by_ray` [C, 3] the map from a point of a face to the values [V, C] of its corners, interpolated there.
+
+    The weights w of corners a, b, c solve w_a a + w_b b + w_c c = p; a plane through the camera has none: the first corner's.
+    """
+    a, b, c = points[corners[0]], points[corners[1]], points[corners[2]]
+    normal = np.empty((3, 3))
+    for axis in range(3):
+        one, two = (axis + 1) % 3, (axis + 2) % 3
+        normal[0, axis] = b[one] * c[two] - b[two] * c[one]
+        normal[1, axis] = c[one] * a[two] - c[two] * a[one]
+        normal[2, axis] = a[one] * b[two] - a[two] * b[one]
+    volume = a[0] * normal[0, 0] + a[1] * normal[0, 1] + a[2] * normal[0, 2]
+    for n in range(by_ray.shape[0]):
+        for axis in range(3):
+            total = 0.0
+            for corner in range(3):
+                total += values[corners[corner], n] * normal[corner, axis]
+            by_ray[n, axis] = total / volume if volume != 0.0 else 0.0
+
+
+@compiled_for("i8[::1], f8[::1], u1[::1], f8[:,::1], u1[:,::1]")
+def paint_layers(
+    start: NDArray[np.int64], z: Array, region: NDArray[np.uint8], depth: Array, regions: NDArray[np.uint8]
+) -> None:
+    """Writes z and region of each pixel's surfaces (`surfaces.Surfaces`) into layers [L, H * W]; into the last, the last one."""
+    layers = len(depth) - 1
+    for pixel in range(len(start) - 1):
+        first, count = start[pixel], start[pixel + 1] - start[pixel]
+        for layer in range(min(count, layers)):
+            depth[layer, pixel], regions[layer, pixel] = z[first + layer], region[first + layer]
+        if count:
+            depth[layers, pixel], regions[layers, pixel] = z[first + count - 1], region[first + count - 1]
+
+
+@compiled_for("i8[::1], u1[::1], i8[::1], u1[:,::1]")
+def paint_silhouettes(
+    start: NDArray[np.int64], region: NDArray[np.uint8], place: NDArray[np.int64], masks: NDArray[np.uint8]
+) -> None:
+    """Writes 255 into the mask [objects, H * W] of every region that a pixel's ray meets; place [256]: of regions in masks."""
+    for pixel in range(len(start) - 1):
+        for n in range(start[pixel], start[pixel + 1]):
+            masks[place[region[n]], pixel] = 255
