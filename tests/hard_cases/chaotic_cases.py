@@ -13,13 +13,14 @@ import numpy as np
 from schemas.base import frozen_array
 from schemas.scene.scene import ObjectStart
 from schemas.scene.shape import Asset
-from tests.hard_cases.bodies import ball, built_in, cube, rod
-from tests.hard_cases.case import Made
-from tests.hard_cases.drops import Drop, X, Y, drop, level, turn
+from tests.hard_cases.bodies import ball, built_in, cube, over_edge, rod
+from tests.hard_cases.case import Made, nudged
+from tests.hard_cases.drops import Drop, X, Y, drop, level, ring, turn
 from tests.hard_cases.groups import Group, dominoes, heavy, pile, put, together, tray
 from tests.hard_cases.hollow_cases import BALL_M, at_the_bottom
 from tests.hard_cases.measures import Made as Objects
-from tests.hard_cases.measures import Measure, Rest, Z, apart, coms, on_a_face, tilt
+from tests.hard_cases.measures import Measure, Rest, Z, apart, both, coms, height, on_a_face, shift, tilt
+from tests.hard_cases.slope_cases import on_wedge, slid_down
 from tests.kit.shapes import asset_of, box
 from workers.geometry.frames import transform, translation, uniform_rotation
 
@@ -233,5 +234,38 @@ CHAOTIC = (
     ),
     Chaotic(
         "ball let go anywhere into a bowl", NOTHING_LESS, at_the_bottom(), ball_into_bowl, tier="slow", first="slow"
+    ),
+    # Moved by at most 10 micrometres and 0.002 degrees, as the table of margins does: these alone end in several ways.
+    Chaotic(
+        "cube of 5 mm from 1 m on a ring 1 mm thick, nudged",
+        NOTHING_LESS,
+        on_a_face(),  # one that bounces on an edge
+        lambda seed: nudged(drop(cube(0.005), ring(0.001), 1.0, xy=(0.45, 0.0)), seed),
+    ),
+    Chaotic(
+        "cube of 1 m, nudged",
+        NOTHING_LESS,
+        both(tilt(0.01), height(0.5, 0.01), shift(1.0)),  # it rocks on its edges, and each time goes aside a little
+        lambda seed: nudged(drop(cube(1.0), level()), seed),
+    ),
+    # It falls by 5 mm first, with a thousand times the energy that tips it.
+    Chaotic(
+        "cube over the edge by 49 %, nudged",
+        0.25,
+        both(tilt(0.1), shift(0.1)),
+        lambda seed: nudged(over_edge(0.49), seed),
+    ),
+    Chaotic(
+        "can spun upright at 200 rad/s, nudged",
+        HARDLY_LESS,
+        on_a_face(),  # it may land on its rim, and roll on that
+        lambda seed: nudged(drop(rod(0.033, 0.12), level()), seed),
+        spin=(0.0, 0.0, 200.0),
+    ),
+    Chaotic(
+        "cube on a wedge of 27.5 degrees, turned by 30 degrees, nudged",
+        NOTHING_LESS,
+        slid_down(),
+        lambda seed: nudged(on_wedge(cube(0.05), 27.5, 30.0), seed),
     ),
 )

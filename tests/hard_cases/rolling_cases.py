@@ -111,14 +111,11 @@ SPINS = (
         lambda: drop(cube(), level()),
         spin=(0.0, 0.0, 200.0),
     ),
-    *(
-        settles(
-            f"can spun upright at {rad_s:g} rad/s",
-            both(tilt(0.1), height(0.06, 0.01)),
-            lambda: drop(rod(0.033, 0.12), level()),
-            spin=(0.0, 0.0, rad_s),
-        )
-        for rad_s in (50.0, 200.0)
+    settles(
+        "can spun upright at 50 rad/s",
+        both(tilt(0.1), height(0.06, 0.01)),
+        lambda: drop(rod(0.033, 0.12), level()),
+        spin=(0.0, 0.0, 50.0),
     ),
     # Nothing slows either: the contact has no friction, or is on the axis of the spin. Production takes the turn that it has.
     settles(

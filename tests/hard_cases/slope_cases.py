@@ -12,7 +12,7 @@ from tests.hard_cases.bodies import ball, cube, rod
 from tests.hard_cases.case import settles
 from tests.hard_cases.drops import EDGE_M, Drop, X, Y, level, table_of, turn
 from tests.hard_cases.groups import FREE_M, Group, place, prism, put, together
-from tests.hard_cases.measures import Z, below, both, height, leaning, moved
+from tests.hard_cases.measures import Measure, Z, below, both, height, leaning, moved
 from tests.kit.shapes import asset_of, box
 
 WEDGE_M, WEDGE_KG = 0.25, 20.0
@@ -71,6 +71,11 @@ def slides_to_m(turned_deg: float, angle_deg: float = 27.5, half_m: float = 0.02
     return half_m * ((math.cos(t) + math.sin(t)) * math.sin(a) + math.cos(a))
 
 
+def slid_down() -> Measure:
+    """Of the cube on the wedge: it has come to the table, turned on its face as it may be."""
+    return below(slides_to_m(45.0) + 0.001, 1)
+
+
 SLOPES = (
     *(
         settles(
@@ -81,14 +86,7 @@ SLOPES = (
         for how, turned in (("", 0.0), (", turned by 30 degrees", 30.0))
     ),
     # It slides with g (sin - 0.49 cos) = 0.27 m/s^2, down to the table, and may turn on its face while it does.
-    *(
-        settles(
-            f"cube on a wedge of 27.5 degrees{how}",
-            below(slides_to_m(45.0) + 0.001, 1),
-            partial(lambda turned: on_wedge(cube(0.05), 27.5, turned), turned),
-        )
-        for how, turned in (("", 0.0), (", turned by 30 degrees", 30.0))
-    ),
+    settles("cube on a wedge of 27.5 degrees", slid_down(), lambda: on_wedge(cube(0.05), 27.5)),
     # A column 20 mm wide and 66 high tips at atan (20 / 66) = 16.9 degrees, long before it slides.
     settles(
         "column on a wedge of 15 degrees, of 16.9",

@@ -7,29 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.hard_cases.case import EITHER, FALL, SETTLE
+from tests.hard_cases.case import ASIDE_M, EITHER, FALL, SETTLE, nudged
 from tests.hard_cases.cases import SINGLE, STACKS
 from tests.hard_cases.margins import (
-    ASIDE_M,
     COLUMNS,
     SEEDS,
     WEAK,
     Ending,
     Series,
     all_series,
-    jolted,
     line_of,
     margin,
     what_is_weak,
 )
 
 WEAK_CASES = {
-    "cube of 5 mm from 1 m on a ring 1 mm thick": "bounces onto another face",
-    "cube of 1 m": "rocks, and slides by half a millimetre where a tenth is its bound",
-    "cube over the edge by 49 %": "falls by 5 mm first, which is a thousand times the energy that tips it",
     "mug hung by its handle on a peg at the edge": "is refused, with a thousandth of its weight out of balance",
-    "cube on a wedge of 27.5 degrees, turned by 30 degrees": "slides down to heights that differ",
-    "can spun upright at 200 rad/s": "lands on its rim, and rolls on that",
 }
 """Cases whose declared outcome holds as they are made, and not with every seed."""
 
@@ -73,17 +66,17 @@ def test_a_margin_is_the_distance_of_the_mean_from_the_bound_in_spreads():
 @pytest.mark.parametrize("case", [SINGLE[0], STACKS[0]], ids=lambda case: case.name)
 def test_a_seed_moves_what_is_let_go_a_little_and_never_down_and_the_first_one_nothing(case):
     made = case.make()
-    assert jolted(made, 0) is made
+    assert nudged(made, 0) is made
     for seed in range(1, 4):
-        moved = jolted(made, seed)
+        moved = nudged(made, seed)
         assert len(moved.starts) == len(made.starts) and moved.table is made.table
         shifts = [b.T_world_obj[:3, 3] - a.T_world_obj[:3, 3] for a, b in zip(made.starts, moved.starts, strict=True)]
         # A turn of 0.002 degrees about the world's origin moves what is a metre off by 35 micrometres.
         assert all(0.0 < np.abs(shift).max() <= ASIDE_M for shift in shifts) and min(s[2] for s in shifts) >= 0.0
         assert not np.array_equal(
-            jolted(made, seed).starts[0].T_world_obj, jolted(made, seed + 1).starts[0].T_world_obj
+            nudged(made, seed).starts[0].T_world_obj, nudged(made, seed + 1).starts[0].T_world_obj
         )
-        assert np.array_equal(moved.starts[0].T_world_obj, jolted(made, seed).starts[0].T_world_obj)
+        assert np.array_equal(moved.starts[0].T_world_obj, nudged(made, seed).starts[0].T_world_obj)
 
 
 @pytest.mark.slow
