@@ -203,10 +203,9 @@ def make_pairs(
         try:
             with watch.stage("views"):
                 images = done.images(number)
-                one: CapturedPair | LeftOut = make_capture_pair(
-                    context.job, thing, images, at, done.synthesize, context.renderer.count_pixels
-                )
-                made += 1
+                pair = make_capture_pair(context.job, thing, images, at, done.synthesize, context.renderer.count_pixels)
+            one: CapturedPair | LeftOut = with_targets(context.job, thing, pair, watch)
+            made += 1
         except (ViewError, CaptureError) as error:
             one = LeftOut(number, "no_pair", error.detail)
         yield one
@@ -227,7 +226,7 @@ def image_effects(job: Job) -> EffectPlan:
         "splat": projection.enabled and projection.splat > 1,
         "hidden_point_removal": projection.enabled and projection.hidden_point_removal,
     }
-    return EffectPlan(tuple(name for name, runs in switches.items() if runs), {})
+    return EffectPlan((*(name for name, runs in switches.items() if runs), *job.targets.views), {})
 
 
 def require_captures(job: Job) -> Captures:

@@ -23,6 +23,7 @@ from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import CountPixels, derive_projected, label_things, projection_shares
 from workers.scene.pairs import object_distance, place_mirror_camera
 from workers.scene.rows import asset_row, encode_view, object_rows, view_row
+from workers.scene.targets import draw_targets
 from workers.store.images import encode_png
 
 
@@ -120,6 +121,18 @@ def make_capture_pair(
     return CapturedPair(images.number, pair, made)
 
 
+def with_targets(job: Job, thing: CapturedObject, made: CapturedPair, watch: Stopwatch) -> CapturedPair:
+    """The pair with its image targets, of the merged mesh: 0 where that has a hole."""
+
+    def drawn(view: View) -> View:
+        assert view.region is not None
+        return replace(view, further=draw_targets(thing.things, view.camera, view.region, job, thing.effects, watch))
+
+    pair = made.pair
+    mirror = None if pair.mirror is None else drawn(pair.mirror)
+    return replace(made, pair=replace(pair, input=drawn(pair.input), mirror=mirror))
+
+
 SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")
 
 
@@ -171,7 +184,7 @@ def record_capture(
                 files += own
                 row = view_row(scene_id, one.pair, view, own, job)
                 views.append(row | {"capture": view_columns(done, one, view.role)})
-                objects += object_rows(scene_id, view, job, ())
+                objects += object_rows(scene_id, view, job, thing.things)
     with watch.stage("encode"):
         path = asset_path(thing.asset.category, thing.asset.instance_id)
         files.append(encoded_file(path, asset_glb(thing.asset, encode_png)))

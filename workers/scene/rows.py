@@ -1,6 +1,6 @@
 """The output of a scene: the images that its views leave, and its rows in each manifest table. Pure."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -170,20 +170,26 @@ def object_rows(scene_id: int, view: View, job: Job, things: Sequence[Placed]) -
             "patch_object_fraction": None
             if label.region_id < REGION_FIRST_OBJECT
             else patch_object_fraction(view, label, job.images.patch),
-            **target_columns(view.further, label.region_id, shapes.get(label.region_id)),
+            **target_columns(view, label, shapes[label.region_id], job.captures is not None),
         }
         for label in view.labels
     ]
 
 
-def target_columns(images: Mapping[PixelKind, NDArray], region_id: int, shape: Shape | None) -> Row:
+def target_columns(view: View, label: ObjectLabel, shape: Shape, captured: bool) -> Row:
     """Columns of `objects` of the image targets that there are; of the table, and without any, all are null."""
     columns: Row = dict.fromkeys(TARGET_COLUMNS)
-    if region_id >= REGION_FIRST_OBJECT and "amodal" in images:
-        columns |= amodal_columns(images["amodal"][region_id - REGION_FIRST_OBJECT])
-    if region_id >= REGION_FIRST_OBJECT and "coordinates" in images and shape is not None:
+    images = view.further
+    if label.region_id < REGION_FIRST_OBJECT:
+        return columns
+    if "amodal" in images:
+        columns |= amodal_columns(images["amodal"][label.region_id - REGION_FIRST_OBJECT])
+    if "coordinates" in images:
         scale, offset = coordinate_scale(shape)
         columns |= {"coordinates_scale_m": scale, "coordinates_offset_m": offset.tolist()}
+    if captured and (drawn := [images[name] for name in ("normals", "coordinates") if name in images]):
+        here = drawn[0][view.region == label.region_id].any(axis=1)
+        columns["targets_share"] = float(here.mean()) if len(here) else None
     return columns
 
 
