@@ -21,7 +21,15 @@ from workers.assets.mass import mass_properties
 from workers.capture.folder import CaptureFolder, open_folder, read_receipt, read_truth
 from workers.capture.reconstruct import estimate_surface, given_files
 from workers.capture.results import digest_inputs
-from workers.capture.rows import CapturedObject, CapturedPair, LeftOut, Origin, make_capture_pair, record_capture
+from workers.capture.rows import (
+    CapturedObject,
+    CapturedPair,
+    LeftOut,
+    Origin,
+    make_capture_pair,
+    record_capture,
+    with_targets,
+)
 from workers.capture.score import read_whole_truth, score_capture
 from workers.capture.simulate.simulate import load_object, simulate_capture
 from workers.capture.views import CaptureViews
