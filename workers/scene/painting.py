@@ -28,7 +28,8 @@ def paint_faces(face: NDArray[np.int32], codes: NDArray[np.uint16], image: NDArr
     """Writes the code [F, 3] of each pixel's face into an image [H, W, 3]."""
     for row in range(face.shape[0]):
         for column in range(face.shape[1]):
-            if (own := face[row, column]) >= 0:
+            own = face[row, column]
+            if own >= 0:
                 for channel in range(3):
                     image[row, column, channel] = codes[own, channel]
 
@@ -54,85 +55,84 @@ def paint_points(
             z = depth[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, (row + 0.5 - k[3]) / k[1] * z
             for axis in range(3):
-                T = T_obj_cam[axis]
-                point = T[0] * x + T[1] * y + T[2] * z + T[3]
+                point = T_obj_cam[axis, 0] * x + T_obj_cam[axis, 1] * y + T_obj_cam[axis, 2] * z + T_obj_cam[axis, 3]
                 share = min(max((point - offset[axis]) / scale, 0.0), 1.0)
                 image[row, column, axis] = np.uint16(np.rint(share * FULL))
 
 
-class Surface(NamedTuple):
-    """What `paint_albedo` needs of one part of a shape.
+class Skin(NamedTuple):
+    """What the faces of a view are coloured by.
 
-    first, end: numbers of its faces in the shape; values [V, 5]: uv and linear colours of its vertices; base [3] linear light;
-    texture [h, w, 3 or 4] uint8 sRGB, of one white texel for none.
+    points [V, 3] in the camera's frame and values [V, 5], uv and linear colours, of vertices; corners [F, 3] and part [F] of
+    faces; base [P, 3] linear light of parts; texels: all textures one after another, [h, w, 3] uint8 sRGB; places [P, 3]: where
+    a part's texture begins, its height and its width, one texel for none.
     """
 
-    first: int
-    end: int
     points: Array
-    faces: NDArray[np.int32]
     values: Array
+    corners: NDArray[np.int32]
+    part: NDArray[np.int32]
     base: Array
-    texture: NDArray[np.uint8]
+    texels: NDArray[np.uint8]
+    places: NDArray[np.int64]
 
 
-def paint_albedo(
-    seen: SeenFaces,
-    owners: tuple[NDArray[np.uint8], NDArray[np.int64]],
-    region_id: int,
-    surface: Surface,
-    k: Intrinsic,
-    image: NDArray[np.uint8],
-) -> None:
-    """Writes the base colour, sRGB, of what is seen of a part into an image [H, W, 3]; points [V, 3] in the camera's frame.
+def paint_albedo(seen: SeenFaces, skin: Skin, k: Intrinsic, image: NDArray[np.uint8]) -> None:
+    """Writes the base colour, sRGB, of what is seen into an image [H, W, 3].
 
-    owners: region [F] and number in its shape [F] of each face. Textures are bilinear among four texels in linear light, and
-    repeat beyond their edges; uv (0, 0) is their lower left corner.
+    Textures are bilinear among four texels in linear light, and repeat beyond their edges; uv (0, 0) is their lower left corner.
     """
-    _paint_albedo(seen, owners, np.uint8(region_id), tuple(surface), k, SRGB_STEPS, CODES, image)
+    _paint_albedo(seen, tuple(skin), k, (SRGB_STEPS, CODES), image)
 
 
 @compiled
 def _paint_albedo(
     seen: SeenFaces,
-    owners: tuple[NDArray[np.uint8], NDArray[np.int64]],
-    region_id: int,
-    surface: tuple[int, int, Array, NDArray[np.int32], Array, Array, NDArray[np.uint8]],
+    skin: tuple[Array, Array, NDArray[np.int32], NDArray[np.int32], Array, NDArray[np.uint8], NDArray[np.int64]],
     k: Intrinsic,
-    steps: Array,
-    codes: NDArray[np.uint8],
+    curves: tuple[Array, NDArray[np.uint8]],
     image: NDArray[np.uint8],
 ) -> None:
     face, depth = seen
-    first, end, points, faces, values, base, texture = surface
-    height, width = texture.shape[:2]
-    by_ray, last = np.empty((5, 3)), -1
-    light, value = np.empty(3), np.empty(5)
+    points, values, corners, part, base, texels, places = skin
+    steps, codes = curves
+    by_ray, light, last = np.zeros((5, 3)), np.empty(3), -1
+    begin, height, width, own = 0, 1, 1, 0
     for row in range(face.shape[0]):
+        ray_y = (row + 0.5 - k[3]) / k[1]
         for column in range(face.shape[1]):
-            own = face[row, column]
-            if own < 0 or owners[0][own] != region_id or not first <= owners[1][own] < end:
+            if face[row, column] < 0:
                 continue
-            if own != last:
-                _values_by_ray(points, faces[owners[1][own] - first], values, by_ray)
-                last = own
-            x, y, z = (column + 0.5 - k[2]) / k[0], (row + 0.5 - k[3]) / k[1], depth[row, column]
-            for n in range(5):
-                value[n] = z * (by_ray[n, 0] * x + by_ray[n, 1] * y + by_ray[n, 2])
+            if face[row, column] != last:
+                last = face[row, column]
+                own = part[last]
+                begin, height, width = places[own, 0], places[own, 1], places[own, 2]
+                _values_by_ray(points, corners[last], values, by_ray)
+            z = depth[row, column]
+            x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
             for channel in range(3):
-                light[channel] = base[channel] * value[2 + channel]
+                n = 2 + channel
+                light[channel] = base[own, channel] * (by_ray[n, 0] * x + by_ray[n, 1] * y + by_ray[n, 2] * z)
             if width * height > 1:
-                u, v = value[0] * width - 0.5, (1.0 - value[1]) * height - 0.5
-                left, top = math.floor(u), math.floor(v)
-                across, down = u - left, v - top
-                x0, y0 = int(left) % width, int(top) % height
-                x1, y1 = (x0 + 1) % width, (y0 + 1) % height
+                u = by_ray[0, 0] * x + by_ray[0, 1] * y + by_ray[0, 2] * z - 0.5 / width
+                v = 1.0 - (by_ray[1, 0] * x + by_ray[1, 1] * y + by_ray[1, 2] * z) - 0.5 / height
+                u, v = (u - math.floor(u)) * width, (v - math.floor(v)) * height
+                x0, y0 = min(int(u), width - 1), min(int(v), height - 1)
+                across, down = u - x0, v - y0
+                x1, y1 = (x0 + 1 if x0 + 1 < width else 0), (y0 + 1 if y0 + 1 < height else 0)
+                # Unsigned numbers are not tested for counting from the end, which would take a third of the time.
+                a, b = np.uint64(begin + 3 * (y0 * width + x0)), np.uint64(begin + 3 * (y0 * width + x1))
+                c, d = np.uint64(begin + 3 * (y1 * width + x0)), np.uint64(begin + 3 * (y1 * width + x1))
+                w_d, w_c, w_b = across * down, (1.0 - across) * down, across * (1.0 - down)
+                w_a = 1.0 - w_b - w_c - w_d
                 for channel in range(3):
-                    upper = (1.0 - across) * steps[texture[y0, x0, channel]] + across * steps[texture[y0, x1, channel]]
-                    lower = (1.0 - across) * steps[texture[y1, x0, channel]] + across * steps[texture[y1, x1, channel]]
-                    light[channel] *= (1.0 - down) * upper + down * lower
+                    n = np.uint64(channel)
+                    upper = w_a * steps[np.uint64(texels[a + n])] + w_b * steps[np.uint64(texels[b + n])]
+                    lower = w_c * steps[np.uint64(texels[c + n])] + w_d * steps[np.uint64(texels[d + n])]
+                    light[channel] *= upper + lower
             for channel in range(3):
-                image[row, column, channel] = codes[int(min(max(light[channel], 0.0), 1.0) * FULL + 0.5)]
+                code = codes[np.uint64(min(max(light[channel], 0.0), 1.0) * FULL + 0.5)]
+                image[row, column, channel] = code
 
 
 @compiled

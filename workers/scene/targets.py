@@ -23,7 +23,7 @@ from workers.geometry.pixels import quantise_depth
 from workers.scene.context import Stopwatch
 from workers.scene.painting import (
     FULL,
-    Surface,
+    Skin,
     paint_albedo,
     paint_faces,
     paint_layers,
@@ -127,25 +127,46 @@ def coordinate_scale(shape: Shape) -> tuple[float, Array]:
 
 def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     """[H, W, 3] sRGB: base colours, of textures bilinear among four texels in linear light, without light and shadow."""
-    image = np.zeros((*seen.face.shape, 3), np.uint8)
-    triangles, T_cam_world = seen.triangles, invert(seen.camera.T_world_cam)
+    image, triangles = np.zeros((*seen.face.shape, 3), np.uint8), seen.triangles
+    part_of, corners = np.empty(len(triangles.face), np.int32), np.empty((len(triangles.face), 3), np.int32)
+    points, parts, vertices = list[Array](), list[Part](), 0
     for thing in seen.things:
-        first = 0
-        for part in thing.shape.parts:
-            textured = part.uv is not None and part.material.texture is not None
-            values = np.ones((len(part.vertices), 5))
-            if part.uv is not None:
-                values[:, :2] = part.uv
-            if part.colors is not None:
-                values[:, 2:] = SRGB_STEPS[part.colors[:, :3]]
-            points = transform(T_cam_world @ thing.T_world_shape, part.vertices)
-            base = decode_srgb(np.array(part.material.base_color[:3]))
-            texture = part.material.texture if textured else WHITE
-            surface = Surface(first, first + len(part.faces), points, part.faces, values, base, texture)
-            owners = triangles.region, triangles.face
-            paint_albedo((seen.face, seen.z), owners, thing.region_id, surface, triangles.k, image)
-            first += len(part.faces)
+        own, shape = triangles.region == thing.region_id, thing.shape
+        ends = np.cumsum([len(part.faces) for part in shape.parts])
+        part_of[own] = len(parts) + np.searchsorted(ends, triangles.face[own], side="right")
+        corners[own] = shape.faces[triangles.face[own]] + vertices
+        points.append(transform(invert(seen.camera.T_world_cam) @ thing.T_world_shape, shape.vertices))
+        vertices += len(shape.vertices)
+        parts += shape.parts
+    base = decode_srgb(np.array([part.material.base_color[:3] for part in parts]))
+    values = np.concatenate([_values_of(part) for part in parts])
+    skin = Skin(np.concatenate(points), values, corners, part_of, base, *_textures_of(parts))
+    paint_albedo((seen.face, seen.z), skin, triangles.k, image)
     return image
+
+
+def _textures_of(parts: Sequence[Part]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """(texels, places) of `painting.Skin`; a texture that several parts have is there once."""
+    found, places, total = dict[int, tuple[int, NDArray[np.uint8]]](), [], 0
+    for part in parts:
+        texture = part.material.texture
+        if texture is None or part.uv is None:
+            texture = WHITE
+        if id(texture) not in found:
+            found[id(texture)] = total, texture
+            total += 3 * texture.shape[0] * texture.shape[1]
+        places.append((found[id(texture)][0], *texture.shape[:2]))
+    return np.concatenate([texture[..., :3].reshape(-1) for _, texture in found.values()]), np.array(places)
+
+
+def _values_of(part: Part) -> Array:
+    """[V, 5]: uv, and linear colours, of a part's vertices; 1 for none."""
+    values = np.ones((len(part.vertices), 5))
+    if part.uv is not None:
+        values[:, :2] = part.uv
+    if part.colors is not None:
+        values[:, 2:] = SRGB_STEPS[part.colors[:, :3]]
+    return values
 
 
 def whole_silhouettes(triangles: Triangles, surfaces: Surfaces, regions: Sequence[int]) -> NDArray[np.uint8]:
