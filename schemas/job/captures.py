@@ -184,7 +184,7 @@ class Synthesis(Frozen):
     """How views from other poses are made."""
 
     views: PositiveInt = 6
-    """Captured views that are merged: those whose optical axes are nearest to the new camera's."""
+    """Captured views that are merged: those with the nearest optical axes."""
     fill_px: NonNegativeInt = 3
     """Holes up to about this size are filled, and counted as not measured."""
 

@@ -167,7 +167,7 @@ class DepthNoise(Frozen):
     preset: Literal["azure_kinect"] = "azure_kinect"
     """Names the defaults of this branch: mode NFOV unbinned."""
     axial_m: NonNegative = 0.0
-    """Standard deviation along the optical axis at any distance, metres [assumed]."""
+    """Standard deviation along the optical axis at distance 0, metres [assumed]."""
     axial_per_m: NonNegative = 17e-3 / 3.86**2
     """The standard deviation grows by this times z squared."""
     incidence_power: NonNegative = 1.0
