@@ -185,16 +185,15 @@ class ProceduralSource(Frozen):
     source: Literal["procedural"]
     """Which kind of source this is."""
     weight: Weight = 1.0
-    """Share of this source among the sources that offer a scene's category."""
+    """Share among the sources that offer a scene's category."""
     seed: Seed = 0
     """Seed of the shapes; instance n of a category is the same in every dataset with this seed."""
     instances: Annotated[int, Field(ge=1, le=10**12)] = 1_000_000
-    """Number of distinct instances of each category. With few, such as 64, scenes share shapes. Up to 10,000 are kept once
-    made."""
+    """Distinct instances of each category; up to 10,000 are kept once made."""
     size: Literal["article", "metric"] = "article"
     """`article`: bounding-box diagonal `diagonal_m`; `metric`: the true size of such an object. Tables are metric."""
     diagonal_m: Positive = 0.25
-    """Bounding-box diagonal of every object where `size` is `article`."""
+    """Bounding-box diagonal for `size: article`."""
     kind: TableKind = "table"
     """Of tables: a tray has a rim of 2 to 6 cm, a bin walls of 12 to 26 cm."""
 
@@ -214,9 +213,9 @@ class ShapeNetSource(Frozen):
     source: Literal["shapenet"]
     """Which kind of source this is."""
     weight: Weight = 1.0
-    """Share of this source among the sources that offer a scene's category."""
+    """Share among the sources that offer a scene's category."""
     folder: Folder
-    """The folder that holds the synset folders (02876657, ...), relative to the job file."""
+    """Folder of the synset folders (02876657, ...), relative to the job file."""
     scale: Positive | None = None
     """Multiplies the normalised units; default 0.25 for objects and 1.5 for tables, as in the article."""
     licence: Text = "ShapeNet terms of use: non-commercial research"
@@ -235,7 +234,7 @@ class FolderSource(Frozen):
     source: Literal["files", "urdf"]
     """Which kind of source this is."""
     weight: Weight = 1.0
-    """Share of this source among the sources that offer a scene's category."""
+    """Share among the sources that offer a scene's category."""
     folder: Folder
     """A folder relative to the job file, or `pybullet_data` for the meshes inside that package."""
     category_map: dict[Folder, MappedName] = Field(default_factory=dict)
@@ -247,7 +246,7 @@ class FolderSource(Frozen):
     scale: Positive = 1.0
     """Multiplies the source's coordinates: 0.001 for millimetres."""
     diagonal_m: Positive | None = None
-    """Resize every object to this bounding-box diagonal; None keeps its own size."""
+    """Bounding-box diagonal that every object is resized to."""
     licence: Text = "unknown"
     """Licence of these shapes, for the `assets` table."""
     copy_assets: bool = False
@@ -314,9 +313,9 @@ class MeshLimits(Frozen):
     max_nodes: PositiveInt = 4096
     """Most parts, files, nodes, links, joints or visuals of an asset."""
     min_size_m: Positive = 0.001
-    """Smallest bounding-box diagonal of an object or table, metres, after scaling."""
+    """Smallest bounding-box diagonal, metres, after scaling."""
     max_size_m: Positive = 20.0
-    """Largest bounding-box diagonal of an object or table, metres, after scaling."""
+    """Largest bounding-box diagonal, metres, after scaling."""
     max_cpu_s: Positive = 30.0
     """Most processor time for reading an asset, seconds."""
     max_memory_mb: Annotated[int, Field(ge=1024)] = 2048

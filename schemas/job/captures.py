@@ -55,9 +55,9 @@ class Board(Frozen):
     first_id: NonNegativeInt = 0
     """Id of the marker at the top left; ids run along the rows."""
     ruler_m: Positive = 0.20
-    """Length of the printed ruler as it should be."""
+    """Nominal length of the printed ruler."""
     measured_ruler_m: Positive | None = None
-    """Length of the ruler as somebody measured it on the print; every length of the board is scaled by it."""
+    """Length of the ruler measured on the print; it scales every length of the board."""
 
     @property
     def scale(self) -> float:
@@ -150,7 +150,7 @@ class Estimation(Frozen):
     """How the camera poses are estimated."""
 
     estimate: Estimate = "joint"
-    """Which of the three estimates the cloud and the dataset are made with; all three are reported."""
+    """Which estimate the cloud and the dataset are made with; all three are reported."""
     compare: bool = True
     """Compute the other two as well."""
     max_iterations: PositiveInt = 100
@@ -173,18 +173,18 @@ class Fusion(Frozen):
     voxel_m: Annotated[float, Field(ge=0.0005, le=0.02)] = 0.002
     """Distance of the points of the cloud."""
     max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 75.0
-    """Pixels that see their surface at a larger angle of incidence are left out."""
+    """Pixels beyond this angle of incidence are left out."""
     board_clearance_m: NonNegative = 0.003
     """What is nearer to the board's plane than this is the board's; more where depth is uneven."""
     min_views: PositiveInt = 2
-    """A point of the cloud must be confirmed by as many views."""
+    """Views that must confirm a point of the cloud."""
 
 
 class Synthesis(Frozen):
     """How views from other poses are made."""
 
     views: PositiveInt = 6
-    """How many captured views are merged, those whose optical axes are nearest to the new camera's."""
+    """Captured views that are merged: those with the nearest optical axes."""
     fill_px: NonNegativeInt = 3
     """Holes up to about this size are filled, and counted as not measured."""
 

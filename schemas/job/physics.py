@@ -37,13 +37,13 @@ class Start(Frozen):
     pose: Literal["upright", "tumbled", "placed"] = "upright"
     """upright: uniform yaw; tumbled: uniform rotation; placed: set down at rest, no drop unless it would tip."""
     offset_m: Interval = Range(-0.25, 0.25)
-    """Offset from the centre of the table top, along x and along y."""
+    """Offset from the centre of the table top, along x and y."""
     arrange: Literal["spread", "pile"] = "spread"
     """Arrangement of several objects: each in its own place, or falling onto one another."""
     pile_offset_m: Interval = Range(-0.03, 0.03)
-    """Offset of each further object of a pile from the first, along x and along y."""
+    """Offset of each further object of a pile from the first, along x and y."""
     clearance_m: Interval = Range(0.005, 0.05)
-    """Height of the lowest point above the table, or above what is below it in a pile, at the start of a drop."""
+    """Height of the lowest point above what is below it, at the start of a drop."""
     max_redraws: NonNegativeInt = 20
     """Most redraws of a position that is not over the table or has no room, and of `if_lost`."""
     if_lost: Literal["redraw", "remove", "fail"] = "redraw"
@@ -97,7 +97,7 @@ class Physics(Frozen):
     concavity: Annotated[float, Field(ge=0.01, le=1)] = 0.05
     """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2."""
     exact_rest: bool = True
-    """Whether objects are brought to exact rest between the true meshes, and refused beyond the gate of docs/rest.md."""
+    """Whether objects are brought to exact rest, and refused beyond the gate of docs/rest.md."""
 
     @model_validator(mode="after")
     def _rests_in_time(self) -> "Physics":

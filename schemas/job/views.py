@@ -167,13 +167,13 @@ class DepthNoise(Frozen):
     preset: Literal["azure_kinect"] = "azure_kinect"
     """Names the defaults of this branch: mode NFOV unbinned."""
     axial_m: NonNegative = 0.0
-    """Standard deviation along the optical axis that does not depend on the distance, metres [assumed]."""
+    """Standard deviation along the optical axis at distance 0, metres [assumed]."""
     axial_per_m: NonNegative = 17e-3 / 3.86**2
     """The standard deviation grows by this times z squared."""
     incidence_power: NonNegative = 1.0
     """The standard deviation is divided by the cosine of the angle of incidence to this power [assumed]."""
     grazing_deg: Annotated[float, Field(gt=0, le=90)] = 80.0
-    """Pixels that see their surface at a larger angle of incidence have no depth [assumed]."""
+    """Pixels beyond this angle of incidence have no depth [assumed]."""
     offset_m: float = 0.0
     """Systematic error, metres. 0: the specification bounds it by 11 mm, and leaves its sign open."""
     offset_share: Annotated[float, Field(gt=-1, lt=1)] = 0.0
@@ -185,9 +185,9 @@ class DepthNoise(Frozen):
     edge_px: Annotated[int, Field(ge=1, le=8)] = 1
     """Reach of an edge's effects, pixels [assumed]."""
     flying_share: Share = 0.3
-    """Share of the pixels at an edge whose depth is a mixture of the surfaces before and behind [assumed]."""
+    """Share of edge pixels whose depth mixes the surfaces before and behind [assumed]."""
     edge_dropout: Share = 0.2
-    """Share of the pixels at an edge that have no depth [assumed]."""
+    """Share of edge pixels without depth [assumed]."""
     range_m: Interval = Range(0.5, 3.86)
     """Depth outside this interval is not measured."""
 

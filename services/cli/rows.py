@@ -85,7 +85,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
 
 REPORT_COMMANDS: Final[dict[str, Command]] = {
     "report": command(
-        "a dataset as one HTML page: pictures, point clouds, figures, effects and their cost, failures",
+        "a dataset as one HTML page to look at",
         "data/tabletop --out tabletop.html",
         OUT,
         path("--out", "FILE.html", "the page to write (default: OUT-report.html, beside the dataset)", dest="file"),
@@ -98,7 +98,7 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
         ),
     ),
     "serve": command(
-        "the same page live while a job runs: progress, rate, latest pictures, failures; read-only",
+        "the same page live while a job runs; read-only",
         "data/tabletop --port 8722",
         OUT,
         option("--port", "N", "default: 8722; 0: any that is free", read.read_port, default=8722),
@@ -120,7 +120,7 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
 
 STUDY_COMMANDS: Final[dict[str, Command]] = {
     "bench": command(
-        "time by stage on one core, beside the script that people write today and the least that is possible",
+        "time by stage on one core, beside a straightforward script and a lower bound",
         "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
         path("job", "JOB.yaml", "default: a job of built-in shapes", nargs="?"),
         number("--scenes", "how many scenes each side makes", 80),
@@ -282,7 +282,7 @@ COMMANDS: Final[dict[str, Command]] = {
         quiet=True,
     ),
     "pack": command(
-        "print a job file as one word that no shell changes, to give it to a cluster in place of the file",
+        "print a job file as one word that no shell changes, which a cluster takes in place of the file",
         "deploy/jobs/tabletop.yaml",
         path("job", "JOB.yaml"),
     ),
@@ -343,7 +343,7 @@ COMMANDS: Final[dict[str, Command]] = {
         handler="export.export:main",
     ),
     "capture": command(
-        "real photographs of an object on a marker board: print a board, simulate, import, process, make views, score",
+        "real photographs of an object on a marker board",
         "process data/mug",
         commands=CAPTURE_COMMANDS,
     ),
@@ -372,7 +372,7 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
     "lock": command("make the lock files of a checkout anew, with the newest versions that pyproject.toml allows", ""),
     "wheels": command(
-        "build a checkout's two wheels: verso-data, which is all of it, and verso-read, which reads what was made",
+        "build a checkout's wheels: verso-data, all of it, and verso-read, which reads datasets",
         "dist",
         path("dir", "DIR", "where they go"),
     ),

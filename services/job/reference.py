@@ -18,9 +18,9 @@ from schemas.job.physics import MOST_OBJECTS
 HEADER = """\
 # Keys of a job file
 
-Written from `schemas/job/` by `python -m services.job.reference`; a test holds the two together. Every key but `name` has a
-default. A key that is not in this list is refused, and so is a value that is not allowed. Any key can be changed on the
-command line: `--set physics.step_hz=480`. After each key: what is allowed; the default. `null` stands for nothing.
+Written from `schemas/job/` by `python -m services.job.reference`. Every key but `name` has a default. A key that is not in this
+list is refused, and so is a value that is not allowed. Any key can be changed on the command line: `--set physics.step_hz=480`.
+After each key: what is allowed; the default. `null` stands for nothing.
 
 """
 
@@ -99,7 +99,7 @@ def _default(field: FieldInfo) -> str:
     if isinstance(value, Counts):
         return f"`{value.low}`" if value.low == value.high else f"`{list(value)}`"
     if isinstance(value, tuple):
-        return "one `procedural` source" if isinstance(value[0], BaseModel) else f"`{list(value)}`"
+        return "one `procedural` source" if value and isinstance(value[0], BaseModel) else f"`{list(value)}`"
     if isinstance(value, dict):
         return "all, equal weights" if value else "`null`"
     if value is None:
@@ -109,7 +109,7 @@ def _default(field: FieldInfo) -> str:
 
 def write_doc() -> str:
     """The whole page."""
-    lines: list[str] = []
+    rows: dict[str, list[str]] = {}
     told: dict[Any, str] = {}
     again: list[str] = []
     for path, field in list_keys():
@@ -127,9 +127,9 @@ def write_doc() -> str:
             if first != path and path != "assets.tables":
                 again.append(f"{path}.")
                 meaning += f" Its keys are those of `{first}`."
-        default = "" if (shown := _default(field)) == "below" else f"; {shown}"
-        lines.append(f"- `{path}` ({describe_allowed(field)}{default}): {meaning}\n")
-    return HEADER + "".join(lines)
+        allowed = "" if (default := _default(field)) == "below" else f" ({describe_allowed(field)}; {default})"
+        rows.setdefault(f"{allowed}: {meaning}\n", []).append(f"`{path}`")
+    return HEADER + "".join(f"- {', '.join(paths)}{row}" for row, paths in rows.items())
 
 
 if __name__ == "__main__":
