@@ -106,7 +106,7 @@ def _pair(pair: Pair, job: Job) -> dict[str, object]:
     for view in pair.views:
         objects = object_labels(view, pair)
         for path, kind, box in image_boxes(view, objects, objects[0].category, job.images.patch):
-            crop = [end for side in box for end in (side.start, side.stop)] or None
+            crop = [end for side in box if isinstance(side, slice) for end in (side.start, side.stop)] or None
             images.append({"path": path, "view": view.role, "pixels": kind, "crop": crop})
     return {"cameras": cameras, "images": images}
 

@@ -4,7 +4,7 @@ import copy
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
@@ -13,11 +13,14 @@ from schemas.errors import InputError, did_you_mean
 from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job, kind_of
 from schemas.job.keys import set_key
+from schemas.job.targets import ViewTarget
 from services.job.job_file import describe_fault
 from services.study.model import OWN, Changes, Knob, Setting, Value
 
-OTHER_WORLD = frozenset({"friction", "density", "if_lost", "depth_noise", "rgb_noise", "distortion", "exposure"})
-"""Knobs whose cost is shown and which are never recommended: they make another world or another camera, not a better one."""
+OTHER_WORLD = frozenset(
+    {"friction", "density", "if_lost", "depth_noise", "rgb_noise", "distortion", "exposure", "targets"}
+)
+"""Knobs whose cost is shown and which are never recommended: they make another world, another camera or other files."""
 
 FREE: Mapping[str, str] = {
     "verso name seed scenes first_scene preset": "says which scenes",
@@ -27,7 +30,7 @@ FREE: Mapping[str, str] = {
     "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m start.max_redraws": "where things begin",
     "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
     "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
-    "targets": "which files; their time is in the table of timings",
+    "targets.smooth targets.layers targets.shape targets.points": "which files; their time is in the table of timings",
     "cameras.orbit cameras.depth cameras.mirror.enabled cameras.mirror.T_z_m": "where cameras stand",
     "images.depth_range_m images.patch images.projection.enabled": "which files",
     "render.rgb render.path_bounces": "a whole image, or of the path-traced tier alone",
@@ -109,6 +112,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         Knob("pivot_depth", "mirror", _pivot_depths()),
         Knob("splat", "mirror", tuple(splats)),
         *(Knob(name, "labels", values) for name, values in sensors.items()),
+        Knob("targets", "labels", tuple(_targets())),
         Knob("png_level", "labels", tuple(_values("images.png_level", (0, 1, 2, 6, 9)))),
         Knob("colour", "colour", _tiers()),
     )
@@ -116,6 +120,12 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
 
 def _values(key: str, values: Iterable[float]) -> list[Value]:
     return [Value(f"{value:g}", {key: value}) for value in values]
+
+
+def _targets() -> list[Value]:
+    names = get_args(ViewTarget)
+    asked = ((), *((name,) for name in names), names)
+    return [Value(" ".join(some) or "none", {"targets.views": some}) for some in asked]
 
 
 def _collisions(job: Job) -> list[Value]:

@@ -38,7 +38,7 @@ def paint_faces(face: NDArray[np.int32], codes: NDArray[np.uint16], image: NDArr
 def paint_points(
     seen: SeenFaces,
     regions: NDArray[np.uint8],
-    region_id: int,
+    region_id: np.uint8,
     T_obj_cam: Pose,
     k: Intrinsic,
     scale: float,
@@ -82,13 +82,13 @@ def paint_albedo(seen: SeenFaces, skin: Skin, k: Intrinsic, image: NDArray[np.ui
 
     Textures are bilinear among four texels in linear light, and repeat beyond their edges; uv (0, 0) is their lower left corner.
     """
-    _paint_albedo(seen, tuple(skin), k, (SRGB_STEPS, CODES), image)
+    _paint_albedo(seen, skin, k, (SRGB_STEPS, CODES), image)
 
 
 @compiled
 def _paint_albedo(
     seen: SeenFaces,
-    skin: tuple[Array, Array, NDArray[np.int32], NDArray[np.int32], Array, NDArray[np.uint8], NDArray[np.int64]],
+    skin: Skin,
     k: Intrinsic,
     curves: tuple[Array, NDArray[np.uint8]],
     image: NDArray[np.uint8],
@@ -126,9 +126,9 @@ def _paint_albedo(
                 w_d, w_c, w_b = across * down, (1.0 - across) * down, across * (1.0 - down)
                 w_a = 1.0 - w_b - w_c - w_d
                 for channel in range(3):
-                    n = np.uint64(channel)
-                    upper = w_a * steps[np.uint64(texels[a + n])] + w_b * steps[np.uint64(texels[b + n])]
-                    lower = w_c * steps[np.uint64(texels[c + n])] + w_d * steps[np.uint64(texels[d + n])]
+                    more = np.uint64(channel)
+                    upper = w_a * steps[np.uint64(texels[a + more])] + w_b * steps[np.uint64(texels[b + more])]
+                    lower = w_c * steps[np.uint64(texels[c + more])] + w_d * steps[np.uint64(texels[d + more])]
                     light[channel] *= upper + lower
             for channel in range(3):
                 code = codes[np.uint64(min(max(light[channel], 0.0), 1.0) * FULL + 0.5)]

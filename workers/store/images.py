@@ -116,7 +116,7 @@ def _decode_wide(data: bytes, name: str) -> NDArray[np.uint16]:
         position += _CHUNK.size + size + 4
     try:
         rows = np.frombuffer(zlib_ng.decompress(b"".join(body)), np.uint8).reshape(height, 1 + 6 * width)
-    except (zlib_ng.error, ValueError) as error:
+    except (zlib_ng.error, ValueError) as error:  # type: ignore[misc]
         raise CorruptError(f"{name} is a PNG file that cannot be decoded: {error}") from error
     if rows[:, 0].any():
         raise CorruptError(f"{name} is a PNG file of 3 x 16 bits with filters, which none of this data set's has")
