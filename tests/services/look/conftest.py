@@ -10,6 +10,7 @@ import pytest
 from schemas.dataset.tables import SCHEMAS
 from services.look.collect import collect
 from services.look.pictures import Picture, ShownScene, picture_of_colour
+from tests.datasets import make_dataset
 from workers.store.local import LocalStore
 
 HOSTILE = '"><script>alert("&")</script>'
@@ -81,3 +82,14 @@ class Handmade:
 @pytest.fixture(scope="package")
 def figures():
     return collect(Handmade(scenes=SCENES, views=VIEWS, timings=TIMINGS, failures=FAILURES, assets=ASSETS))
+
+
+VIEW_TARGETS = ("normals", "coordinates", "albedo", "amodal", "layers")
+
+
+@pytest.fixture(scope="package")
+def targets(tmp_path_factory) -> LocalStore:
+    """A finished scene of two objects with every image target."""
+    changes = {"scenes": 1, "objects_per_scene": 2, "categories": ["mug"], "start": {"offset_m": [-0.12, 0.12]}}
+    images = {"views": list(VIEW_TARGETS), "layers": 2}
+    return make_dataset(tmp_path_factory.mktemp("targets"), targets=images, **changes)[0]
