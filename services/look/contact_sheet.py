@@ -13,12 +13,12 @@ from schemas.dataset.codec import read_camera
 from schemas.errors import InputError
 from services.look.charts import Histogram
 from services.look.clouds import Cloud, read_samples
-from services.look.pictures import ABOUT, DEPTH_M, FIXED_REGIONS, PATCH, SHOWN_ROLES, show_scene
+from services.look.pictures import DEPTH_M, FIXED_REGIONS, PATCH, SHOWN_ROLES, show_scene
 from services.read.dataset_reader import file_reader, find_scene
 from workers.store.local import open_store
 from workers.store.store import Store
 
-WIDTH, COLUMNS, GAP, LINE = 1600, 6, 10, 22
+WIDTH, COLUMNS, GAP, LINE = 1600, 5, 10, 22
 """Of the sheet, pixels: its width, the space between pictures, and the height of a caption."""
 
 MOST_SAMPLES = 60_000
@@ -41,14 +41,10 @@ def draw_contact_sheet(store: Store, scene_id: int, role: str = "input") -> Imag
         file_reader(store.read, stored), stored, scene, {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
     )
     of_view = [name for name in shown.pictures if name.startswith(f"{role} ")]
-    tiles = [
-        (
-            shown.pictures[name].words.removeprefix(f"{role} view, ").removesuffix(f", {ABOUT}"),
-            shown.pictures[name].data,
-        )
-        for name in [name for name in of_view if name.endswith(PATCH)] or of_view
+    tiles = [shown.pictures[name] for name in [name for name in of_view if name.endswith(PATCH)] or of_view]
+    pictures = [
+        (one.caption.removeprefix(f"{role} · "), Image.open(io.BytesIO(one.data)).convert("RGB")) for one in tiles
     ]
-    pictures = [(words, Image.open(io.BytesIO(data)).convert("RGB")) for words, data in tiles]
     clouds = {cloud.role: cloud for cloud in read_samples(store, scene, MOST_SAMPLES)}
     view, size = next(stored.pairs(scene_id))[0][role], pictures[0][1].size
     size = (_width(), round(size[1] * _width() / size[0]))
@@ -106,7 +102,4 @@ def _lay_out(pictures: Sequence[tuple[str, Image.Image]], size: tuple[int, int])
 
 if __name__ == "__main__":
     out, scene_id, file, *role = sys.argv[1:]
-    # A palette keeps a page that shows the sheet small.
-    draw_contact_sheet(open_store(out), int(scene_id), *role).quantize(256, dither=Image.Dither.NONE).save(
-        file, optimize=True
-    )
+    draw_contact_sheet(open_store(out), int(scene_id), *role).save(file, optimize=True)

@@ -69,6 +69,11 @@ class Picture:
         return f"{hashlib.sha256(self.data).hexdigest()[:24]}.{self.kind}"
 
     @property
+    def caption(self) -> str:
+        """The words in short, for below the picture."""
+        return self.words.replace(" view, ", " · ").replace("colour", "RGB").removesuffix(f", {ABOUT}")
+
+    @property
     def inline(self) -> str:
         """A `data:` address."""
         return f"data:image/{self.kind};base64,{base64.b64encode(self.data).decode('ascii')}"
@@ -85,12 +90,16 @@ def viridis() -> NDArray[np.uint8]:
     return np.asarray(interpolate(np.arange(256), "viridis", dtype=np.uint8)[:, :3])
 
 
-def picture_of_depth(depth_m: NDArray, span_m: tuple[float, float], words: str) -> Picture:
-    """Depth in viridis, near is yellow; pixels without depth (0) are black. `span_m`: depth of first and last colour."""
+def picture_of_depth(depth_m: NDArray, span_m: tuple[float, float], words: str, sharp: bool = False) -> Picture:
+    """Depth in viridis, near is yellow; pixels without depth (0) are black. `span_m`: depth of first and last colour.
+
+    `sharp`: as PNG, for thin parts, whose colours JPEG loses.
+    """
     low, high = span_m
     share = np.clip((depth_m - low) / max(high - low, 1e-6), 0.0, 1.0)
     rgb = viridis()[(255 * (1.0 - share)).astype(np.uint8)]
-    return _jpeg(Image.fromarray(np.where(depth_m[..., None] > 0, rgb, np.uint8(0))), words)
+    image = Image.fromarray(np.where(depth_m[..., None] > 0, rgb, np.uint8(0)))
+    return _png(image, words) if sharp else _jpeg(image, words)
 
 
 def depth_span(depth_m: NDArray, regions: NDArray | None = None) -> tuple[float, float]:
@@ -305,7 +314,9 @@ def view_pictures(role: str, images: Mapping[PixelKind, NDArray], view: Row, suf
     for kinds in series_of(there).values():
         span = _span_of(kinds, there, view)
         for kind in kinds:
-            words = f"{words_of(kind)} {span[0]:.2f} to {span[1]:.2f} m" if span else words_of(kind)
+            words = words_of(kind)
+            if span:
+                words += f"{'' if kind == 'depth' else ','} {span[0]:.2f} to {span[1]:.2f} m"
             if suffix:
                 words = f"{words}, {ABOUT}" if len(there) > 1 else ABOUT
             pictures[f"{role} {kind}{suffix}"] = _paint(kind, there, view, span, f"{role} view, {words}")
@@ -343,7 +354,7 @@ def _paint(
         under = there["rgb"][0] if "rgb" in there else regions[there["region"][0]]
         return picture_of_silhouettes(there[kind], under, words)
     if span is not None:
-        return picture_of_depth(metres_of(pixels, view), span, words)
+        return picture_of_depth(metres_of(pixels, view), span, words, sharp=modality.target is not None)
     if modality.channels == 1:
         return picture_of_regions(pixels, words)
     return picture_of_colour(pixels, words) if modality.dtype == "uint8" else picture_of_codes(pixels, words)

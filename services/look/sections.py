@@ -91,7 +91,7 @@ def space_html(spaces: Sequence[Space], data: str) -> str:
     )
     about = "The stored depth of both cameras as points, with the mesh as it was posed."
     if clouds.keys() & SAMPLES.keys():
-        about += " Input cloud: partial; surface samples: complete."
+        about += " Of an object, the input cloud is the partial cloud and surface samples are the complete one."
     missing = f" There is no mesh: {escape(spaces[0].missing)}." if spaces[0].missing else ""
     keys = "Arrow keys turn, plus and minus zoom, 0 resets."
     return (

@@ -7,7 +7,6 @@ import numpy as np
 
 from schemas.scene.view import MODALITIES, PixelKind
 from services.look.pictures import (
-    ABOUT,
     FIXED_REGIONS,
     OBJECT_REGIONS,
     PATCH,
@@ -77,11 +76,10 @@ def _cells(kind: str, scene: ShownScene, names: Sequence[str], address: Address)
 def _cell(scene: ShownScene, name: str, address: Address) -> str:
     picture = scene.pictures[name]
     words = f"{scene.category}, scene {scene.scene_id}: {picture.words}"
-    caption = picture.words.replace(" view, ", " · ").replace("colour", "RGB").removesuffix(f", {ABOUT}")
     return (
         f'<figure class="{name.replace(" ", "-")}"><img loading="lazy" decoding="async" width="{picture.width}" '
         f'height="{picture.height}" alt="{escape(words)}" data-name="{name}" src="{address(picture)}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
+        f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
     )
 
 

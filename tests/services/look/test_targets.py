@@ -80,7 +80,7 @@ def test_a_new_modality_is_painted_and_compared_by_its_row_alone(monkeypatch):
     pictures = view_pictures("input", {"flow": flow, "rim": rim}, ROW)
     assert (decoded(pictures["input flow"]) == 128).all() and pictures[
         "input rim"
-    ].words == "input view, rim 1.00 to 1.00 m"
+    ].words == "input view, rim, 1.00 to 1.00 m"
     html = compare_html([scene(3, "box", ("input rim", "mirror rim", "input rgb"))])
     assert re.findall(r'data-kind="([^"]*)"', html) == ["rim"]
 
