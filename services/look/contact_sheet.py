@@ -21,7 +21,7 @@ from workers.store.store import Store
 WIDTH, COLUMNS, GAP, LINE = 1600, 5, 10, 22
 """Of the sheet, pixels: its width, the space between pictures, and the height of a caption."""
 
-MOST_SAMPLES = 60_000
+MOST_SAMPLES = 300_000
 """Samples of each kind that are drawn."""
 
 SLICE_SHARE = 0.04

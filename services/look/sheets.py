@@ -59,14 +59,18 @@ def _scene_html(scene: ShownScene, address: Address) -> str:
 
 
 def _targets(scene: ShownScene, targets: Sequence[str], close: Sequence[str], address: Address) -> str:
-    """A row for each view: its patches, or its targets where it has none; and folded up the targets of whole views."""
+    """A row for each view: its patches, or its targets where it has none; folded up whole views and the rest of series."""
+    later = {kind for kinds in series_of(MODALITIES).values() for kind in kinds[1:]}
     rows, folded = [], []
     for role in SHOWN_ROLES:
         near, whole = ([name for name in names if name.startswith(f"{role} ")] for names in (close, targets))
-        rows.append(_cells("cells targets", scene, near or whole, address))
-        folded += whole if near else []
-    more = f"<details><summary>Targets of the whole views</summary>{_cells('cells targets', scene, folded, address)}</details>"
-    return "".join(rows) + (more if folded else "")
+        first = [name for name in near or whole if name.split(" ")[1] not in later]
+        rows.append(_cells("cells targets", scene, first, address))
+        folded += [name for name in near + whole if name not in first]
+    more = "<summary>Further targets, and those of the whole views</summary>"
+    return "".join(rows) + (
+        f"<details>{more}{_cells('cells targets', scene, folded, address)}</details>" if folded else ""
+    )
 
 
 def _cells(kind: str, scene: ShownScene, names: Sequence[str], address: Address) -> str:

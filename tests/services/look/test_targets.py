@@ -8,7 +8,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 from schemas.errors import CorruptError
@@ -99,23 +98,6 @@ def test_images_of_one_target_share_a_button_and_a_slider_and_without_targets_th
     html = compare_html(plain)
     assert re.findall(r'data-kind="([^"]*)"', html) == ["rgb"]
     assert "wipe-member" not in html and "wipe-close" not in html and "targets" not in sheets_html(plain, address)
-
-
-# ---------------------------------------------------------------------------------------------- samples of shapes
-
-
-@pytest.fixture(scope="module")
-def sampled(targets, tmp_path_factory):
-    """The same scene with samples: the corners of each mesh as the surface, half as far out as inside, twice as outside."""
-    store = LocalStore(shutil.copytree(targets.root, tmp_path_factory.mktemp("sampled") / "sampled"))
-    for file in (store.root / "assets" / "mug").glob("*.glb"):
-        v = np.asarray(trimesh.load(file, force="mesh", process=False).vertices, np.float32)
-        colors = np.full((len(v), 3), (10, 200, 30), np.uint8)
-        distance = np.repeat(np.array([-1, 1], np.float32), len(v))
-        surface = {"surface_points": v, "surface_normals": np.zeros_like(v), "surface_colors": colors}
-        volume = {"volume_points": np.concatenate([v / 2, v * 2]), "volume_distance": distance}
-        np.savez(file.with_suffix(".npz"), **surface, **volume, volume_occupancy=np.uint8(distance < 0))
-    return store
 
 
 def test_samples_lie_on_the_posed_mesh_and_those_of_the_volume_have_the_colour_of_their_side(targets, sampled):
