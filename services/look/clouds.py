@@ -1,23 +1,26 @@
-"""Point clouds of a pair from both cameras with the posed mesh, packed for the page's 3-D view; world frame, metres, z up."""
+"""Point clouds of a pair, the posed mesh and samples of shapes, packed for the page's 3-D view; world frame, metres, z up."""
 
 import base64
+import io
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
+from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_camera, read_world_poses
-from schemas.errors import VersoError
+from schemas.dataset.layout import samples_path
+from schemas.errors import CorruptError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from services.look.collect import choose_spread
-from services.look.pictures import PairImages, metres_of, read_pair
+from services.look.pictures import OBJECT_REGIONS, PLAIN, SHOWN_ROLES, PairImages, metres_of, read_pair
 from services.read.dataset_reader import file_reader, find_scene
-from services.read.scene_geometry import posed_scene
+from services.read.scene_geometry import posed_scene, region_names
 from workers.geometry.camera import unproject
+from workers.geometry.frames import transform
 from workers.store.store import Store
 
 MOST_POINTS = 90_000
@@ -41,19 +44,30 @@ MOST_FACES = 120_000
 GRID_STEPS = 160
 """Cells of that grid along the longest side of the mesh."""
 
+MOST_SAMPLES = 4_000
+"""Samples of one kind, of all objects of a scene: they travel with every page."""
+
+INSIDE, OUTSIDE = OBJECT_REGIONS[1], OBJECT_REGIONS[0]
+"""Colours of samples of the volume."""
+
+DOT_SHARE = 1 / 150
+"""Size of a sample of the volume, of the diagonal of all of them."""
+
 
 @dataclass(frozen=True)
 class Cloud:
-    """The points of one view."""
+    """The points of one view, or samples of the objects' shapes."""
 
     role: str
+    """The view's, or `surface`, `inside`, `outside`."""
     points: Array
     """[N, 3] metres, world."""
     colors: NDArray[np.uint8]
     """[N, 3] sRGB."""
     size_m: float
     """Distance between neighbouring points of an object that faces the camera."""
-    T_world_cam: Array
+    T_world_cam: Array | None = None
+    """Of a view's cloud."""
 
 
 @dataclass(frozen=True)
@@ -95,17 +109,67 @@ def read_space(store: Store, scene_id: int, most_points: int = MOST_POINTS) -> S
     if scene is None:
         return None
     views, _ = next(stored.pairs(scene_id))
-    images = read_pair(file_reader(store.read, stored), views)
+    images = read_pair(file_reader(store.read, stored), views, PLAIN)
     target = np.mean([pose[:3, 3] for region, pose in read_world_poses(scene).items() if region > 2], axis=0)
     clouds = tuple(
-        cloud_of(role, images, views[role], target, most_points)
-        for role in ("input", "mirror")
-        if (role, "depth") in images
+        cloud_of(role, images, views[role], target, most_points) for role in SHOWN_ROLES if (role, "depth") in images
     )
     if not clouds:
         return None
     bodies, missing = _read_bodies(store, scene_id)
-    return Space(scene_id, scene["category"], target, clouds, bodies, missing)
+    return Space(scene_id, scene["category"], target, clouds + read_samples(store, scene), bodies, missing)
+
+
+def read_samples(store: Store, scene: Row, most: int = MOST_SAMPLES) -> tuple[Cloud, ...]:
+    """The stored samples of a scene's objects where these lie, at most `most` of each kind; none without the target.
+
+    Raises CorruptError where a file is damaged.
+    """
+    poses = read_world_poses(scene)
+    clouds: dict[str, Cloud] = {}
+    objects = {region: name for region, name in region_names(scene).items() if region >= REGION_FIRST_OBJECT}
+    for region, name in objects.items():
+        arrays = _read_arrays(store, samples_path(*name))
+        for new in _samples_of(arrays, poses[region], max(most // len(objects), 1)):
+            old = clouds.get(new.role)
+            clouds[new.role] = new if old is None else _joined(old, new)
+    return tuple(clouds.values())
+
+
+def _joined(one: Cloud, other: Cloud) -> Cloud:
+    points, colors = (one.points, other.points), (one.colors, other.colors)
+    return replace(one, points=np.concatenate(points), colors=np.concatenate(colors))
+
+
+def _samples_of(arrays: Mapping[str, NDArray], T_world_obj: Pose, most: int) -> Iterator[Cloud]:
+    """The clouds of one object; samples of the volume are told apart by the sign of their distance."""
+    if "surface_points" in arrays:
+        points = arrays["surface_points"]
+        kept = _evenly(np.arange(len(points)), most)
+        size_m = _diagonal(points) / float(np.sqrt(len(kept)))
+        yield Cloud("surface", transform(T_world_obj, points[kept]), arrays["surface_colors"][kept], size_m)
+    if "volume_points" in arrays:
+        points, inside = arrays["volume_points"], arrays["volume_distance"] < 0.0
+        for role, of, color in (("inside", inside, INSIDE), ("outside", ~inside, OUTSIDE)):
+            kept = _evenly(np.flatnonzero(of), most)
+            colors = np.full((len(kept), 3), color, np.uint8)
+            yield Cloud(role, transform(T_world_obj, points[kept]), colors, DOT_SHARE * _diagonal(points))
+
+
+def _diagonal(points: NDArray) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _read_arrays(store: Store, path: str) -> Mapping[str, NDArray]:
+    try:
+        data = store.read(path)
+    except FileNotFoundError:
+        return {}
+    try:
+        with np.load(io.BytesIO(data)) as stored:
+            return dict(stored)
+    except Exception as error:  # numpy and zipfile raise errors of many kinds for a damaged file
+        raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
 
 
 def cloud_of(role: str, images: PairImages, view: Row, target: Array, most_points: int) -> Cloud:
@@ -187,7 +251,7 @@ def pack_space(space: Space) -> str:
             "points": _base64(np.clip(np.round((cloud.points - space.target) / QUANTUM_M), -32767, 32767), "<i2"),
             "colors": _base64(cloud.colors, "u1"),
             "size": round(cloud.size_m, 6),
-            "camera": [round(float(x), 6) for x in cloud.T_world_cam.ravel()],
+            "camera": None if cloud.T_world_cam is None else [round(float(x), 6) for x in cloud.T_world_cam.ravel()],
         }
         for cloud in space.clouds
     ]

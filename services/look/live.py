@@ -13,9 +13,9 @@ from schemas.dataset.layout import commit_path
 from schemas.errors import OutputError, VersoError, describe_seconds, number, plural
 from services.job.record import read_job
 from services.look.charts import Histogram
-from services.look.pictures import DEPTH_M, Picture, ShownScene, show_scene
+from services.look.pictures import DEPTH_M, PLAIN, Picture, ShownScene, show_scene
 from services.look.report import Section, View, page_of, read_report
-from services.look.sections import Address, strip_html
+from services.look.sheets import Address, strip_html
 from services.read.dataset_reader import file_reader, read_stored
 from services.read.status import Status, read_status
 from services.read.verdict import explain_damage
@@ -108,7 +108,7 @@ def latest_scenes(store: Store, count: int = LATEST) -> list[ShownScene]:
             stored = read_stored(store, read_range(store, start, [retry for one, retry in codes if one == start]))
             read, depth = file_reader(store.read, stored), {role: Histogram(*DEPTH_M) for role in ("input", "mirror")}
             for row in stored.rows["scenes"][: -(count - len(shown)) - 1 : -1]:
-                shown.append(show_scene(read, stored, row, depth))
+                shown.append(show_scene(read, stored, row, depth, PLAIN))
         except VersoError:  # committed a moment ago and not in its place yet, or damaged, which the report tells
             continue
     return shown

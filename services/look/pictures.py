@@ -3,19 +3,22 @@
 import base64
 import hashlib
 import io
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import count, cycle, takewhile
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageFilter
 from trimesh.visual.color import interpolate
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import patch_index
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
+from schemas.scene.view import MODALITIES, PixelKind
 from services.look.charts import Histogram
 from services.look.collect import Tables
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, find_scene, read_image
@@ -39,6 +42,15 @@ FIXED_REGIONS = ((24, 26, 30), (203, 205, 209), (139, 144, 153))
 OBJECT_REGIONS = ((46, 111, 197), (224, 123, 57), (62, 146, 104), (160, 84, 160), (196, 160, 42), (72, 165, 178))
 """Objects in turn, told apart also by those who do not see red and green alike."""
 
+SHOWN_ROLES = ("input", "mirror")
+"""Views that are shown beside one another."""
+
+PATCH, ABOUT = " patch", "patch about the object"
+"""Ends the name of a patch's picture, and the words for it."""
+
+PLAIN = tuple(name for name, modality in MODALITIES.items() if modality.target is None)
+"""Modalities that are no targets."""
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -57,6 +69,11 @@ class Picture:
         return f"{hashlib.sha256(self.data).hexdigest()[:24]}.{self.kind}"
 
     @property
+    def caption(self) -> str:
+        """The words in short, for below the picture."""
+        return self.words.replace(" view, ", " · ").replace("colour", "RGB").removesuffix(f", {ABOUT}")
+
+    @property
     def inline(self) -> str:
         """A `data:` address."""
         return f"data:image/{self.kind};base64,{base64.b64encode(self.data).decode('ascii')}"
@@ -73,12 +90,16 @@ def viridis() -> NDArray[np.uint8]:
     return np.asarray(interpolate(np.arange(256), "viridis", dtype=np.uint8)[:, :3])
 
 
-def picture_of_depth(depth_m: NDArray, span_m: tuple[float, float], words: str) -> Picture:
-    """Depth in viridis, near is yellow; pixels without depth (0) are black. `span_m`: depth of first and last colour."""
+def picture_of_depth(depth_m: NDArray, span_m: tuple[float, float], words: str, sharp: bool = False) -> Picture:
+    """Depth in viridis, near is yellow; pixels without depth (0) are black. `span_m`: depth of first and last colour.
+
+    `sharp`: as PNG, for thin parts, whose colours JPEG loses.
+    """
     low, high = span_m
     share = np.clip((depth_m - low) / max(high - low, 1e-6), 0.0, 1.0)
     rgb = viridis()[(255 * (1.0 - share)).astype(np.uint8)]
-    return _jpeg(Image.fromarray(np.where(depth_m[..., None] > 0, rgb, np.uint8(0))), words)
+    image = Image.fromarray(np.where(depth_m[..., None] > 0, rgb, np.uint8(0)))
+    return _png(image, words) if sharp else _jpeg(image, words)
 
 
 def depth_span(depth_m: NDArray, regions: NDArray | None = None) -> tuple[float, float]:
@@ -95,12 +116,23 @@ def depth_span(depth_m: NDArray, regions: NDArray | None = None) -> tuple[float,
 
 def picture_of_regions(regions: NDArray[np.uint8], words: str) -> Picture:
     """Each region in its colour, as PNG, whose edges stay sharp."""
-    image = Image.fromarray(np.minimum(regions, 255), "L")
-    image = image.resize(_size_of(image), Image.Resampling.NEAREST)
-    image.putpalette(_palette())
-    sink = io.BytesIO()
-    image.save(sink, "PNG", optimize=True)
-    return Picture(sink.getvalue(), "png", image.width, image.height, words)
+    return _png(Image.fromarray(np.minimum(regions, 255), "L"), words, _palette())
+
+
+def picture_of_codes(codes: NDArray[np.uint16], words: str) -> Picture:
+    """[H, W, 3] of 16 bits as colours, red first: normals and coordinates, as they are usually shown; PNG."""
+    return _png(Image.fromarray((codes >> 8).astype(np.uint8)), words)
+
+
+def picture_of_silhouettes(masks: Sequence[NDArray[np.uint8]], under: NDArray[np.uint8], words: str) -> Picture:
+    """The outline of each object's mask [H, W] in the object's colour, over an image [H, W, 3] of RGB."""
+    shown = under.copy()
+    # A line of one pixel would vanish where the picture is shrunk.
+    size = 3 + 2 * ((under.shape[1] - 1) // MOST_WIDTH)
+    for mask, color in zip(masks, cycle(OBJECT_REGIONS)):
+        inner = np.asarray(Image.fromarray(mask).filter(ImageFilter.MinFilter(size)))
+        shown[mask > inner] = color
+    return _jpeg(Image.fromarray(shown), words, subsampling=0)  # thin lines keep their colour
 
 
 def picture_of_projection(mirror: NDArray[np.uint8], projected: NDArray[np.uint8], words: str) -> Picture:
@@ -110,13 +142,22 @@ def picture_of_projection(mirror: NDArray[np.uint8], projected: NDArray[np.uint8
     return _jpeg(Image.fromarray(np.where(known, projected, dimmed)), words)
 
 
-def _jpeg(image: Image.Image, words: str) -> Picture:
+def _jpeg(image: Image.Image, words: str, subsampling: int = 2) -> Picture:
     size = _size_of(image)
     if size != image.size:
         image = image.resize(size, Image.Resampling.BOX)
     sink = io.BytesIO()
-    image.save(sink, "JPEG", quality=JPEG_QUALITY, optimize=True)
+    image.save(sink, "JPEG", quality=JPEG_QUALITY, optimize=True, subsampling=subsampling)
     return Picture(sink.getvalue(), "jpeg", *size, words)
+
+
+def _png(image: Image.Image, words: str, palette: Sequence[int] = ()) -> Picture:
+    image = image.resize(_size_of(image), Image.Resampling.NEAREST)
+    if palette:
+        image.putpalette(palette)
+    sink = io.BytesIO()
+    image.save(sink, "PNG", optimize=True)
+    return Picture(sink.getvalue(), "png", image.width, image.height, words)
 
 
 def _size_of(image: Image.Image) -> tuple[int, int]:
@@ -130,16 +171,20 @@ def _palette() -> list[int]:
 
 
 PairImages: TypeAlias = Mapping[tuple[str, str], NDArray]
-"""Images by role (input, mirror, projected) and kind of pixels (rgb, depth, region), as far as they are stored."""
+"""Images by role (input, mirror, projected) and kind of pixels, as `view_paths` names them, as far as they are stored."""
 
 
-def read_pair(read: ReadFile, views: Mapping[str, Row]) -> PairImages:
-    """The stored images of a pair but for aligned ones. Raises CorruptError where one is missing or damaged."""
+def read_pair(read: ReadFile, views: Mapping[str, Row], kinds: Collection[PixelKind] | None = None) -> PairImages:
+    """The stored images of a pair but for aligned ones, of these modalities or of all.
+
+    Raises CorruptError where one is missing or damaged.
+    """
     return {
         (role, kind): read_image(read, path)
         for role, row in views.items()
         if role != "aligned"
         for kind, path in view_paths(row).items()
+        if kinds is None or kind in kinds
     }
 
 
@@ -155,7 +200,7 @@ DEPTH_M = (0.0, 9.6)
 
 @dataclass(frozen=True)
 class ShownScene:
-    """One scene of the page: its pictures by name (`input rgb`, `mirror depth`, `over`), and what is told beside them."""
+    """One scene of the page: its pictures by name (`input rgb`, `mirror normals patch`, `over`), and what is told beside them."""
 
     scene_id: int
     category: str
@@ -209,7 +254,7 @@ def _shares(by_category: Mapping[str, int], scenes: int) -> dict[str, int]:
 
 def show_scenes(store: Store, scene_ids: Iterable[int]) -> Sample:
     """The pictures of these scenes. Raises CorruptError where an image is missing or damaged."""
-    shown, depth = [], {role: Histogram(*DEPTH_M) for role in ("input", "mirror")}
+    shown, depth = [], {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
     for scene_id in scene_ids:
         stored = find_scene(store, scene_id)
         row = stored.scene(scene_id)
@@ -218,21 +263,29 @@ def show_scenes(store: Store, scene_ids: Iterable[int]) -> Sample:
     return Sample(tuple(shown), depth)
 
 
-def show_scene(read: ReadFile, stored: StoredRange, scene: Row, depth: dict[str, Histogram]) -> ShownScene:
-    """The pictures of a scene's first pair; the depth of its objects is added to `depth`."""
+def show_scene(
+    read: ReadFile,
+    stored: StoredRange,
+    scene: Row,
+    depth: dict[str, Histogram],
+    kinds: Collection[PixelKind] | None = None,
+) -> ShownScene:
+    """The pictures of a scene's first pair, of these modalities or of all; the depth of its objects is added to `depth`."""
     views, _ = next(stored.pairs(scene["scene_id"]))
-    images = read_pair(read, views)
+    images = read_pair(read, views, kinds)
+    bodies = scene["bodies"] or [scene]
+    index = patch_index(REGION_FIRST_OBJECT, len(bodies))
     pictures: dict[str, Picture] = {}
-    for role in ("input", "mirror"):
-        pictures |= _view_pictures(role, images, views)
-        pictures |= _patch_pictures(read, role, views, len(scene["bodies"] or [scene]))
-        if {(role, "depth"), (role, "region")} <= images.keys():
-            metres = metres_of(images[role, "depth"], views[role])
-            depth[role] = depth[role].add(metres[(images[role, "region"] >= REGION_FIRST_OBJECT) & (metres > 0)])
+    for role in (role for role in SHOWN_ROLES if role in views):
+        whole = {kind: pixels for (of, kind), pixels in images.items() if of == role}
+        patches = _read_patches(read, patch_paths(views[role], index), kinds)
+        pictures |= view_pictures(role, whole, views[role]) | view_pictures(role, patches, views[role], PATCH)
+        if {"depth", "region"} <= whole.keys():
+            metres = metres_of(whole["depth"], views[role])
+            depth[role] = depth[role].add(metres[(whole["region"] >= REGION_FIRST_OBJECT) & (metres > 0)])
     mirror, projected = images.get(("mirror", "rgb")), images.get(("projected", "rgb"))
     if mirror is not None and projected is not None:
         pictures["over"] = picture_of_projection(mirror, projected, "input view projected over the mirror view")
-    bodies = scene["bodies"] or [scene]
     first = views["input"]
     return ShownScene(
         scene["scene_id"],
@@ -240,31 +293,87 @@ def show_scene(read: ReadFile, stored: StoredRange, scene: Row, depth: dict[str,
         tuple(body["instance_id"] for body in bodies),
         first["pose_id"],
         pictures,
-        {role: views[role]["visible_fraction"] for role in ("input", "mirror") if role in views},
+        {role: views[role]["visible_fraction"] for role in SHOWN_ROLES if role in views},
         first["d_z_m"],
     )
 
 
-def _patch_pictures(read: ReadFile, role: str, views: Mapping[str, Row], objects: int) -> dict[str, Picture]:
-    """The stored crop of a view about the scene's first object: its colours, or its depth."""
-    paths = patch_paths(views[role], patch_index(REGION_FIRST_OBJECT, objects)) if role in views else {}
-    name, words = f"{role} patch", f"{role} view, patch about the object"
-    if "rgb" in paths:
-        return {name: picture_of_colour(read_image(read, paths["rgb"]), words)}
-    if "depth" in paths:
-        metres = metres_of(read_image(read, paths["depth"]), views[role])
-        return {name: picture_of_depth(metres, depth_span(metres), words)}
-    return {}
+def _read_patches(
+    read: ReadFile, paths: Mapping[PixelKind, str], kinds: Collection[PixelKind] | None
+) -> dict[PixelKind, NDArray]:
+    """The crops about the scene's first object: all of them where there are targets, else its colours, or its depth."""
+    stored = [kind for kind in paths if kinds is None or kind in kinds]
+    plain = [kind for kind in ("rgb", "depth") if kind in stored][:1]
+    return {kind: read_image(read, paths[kind]) for kind in (stored if set(stored) - set(PLAIN) else plain)}
 
 
-def _view_pictures(role: str, images: PairImages, views: Mapping[str, Row]) -> dict[str, Picture]:
+def view_pictures(role: str, images: Mapping[PixelKind, NDArray], view: Row, suffix: str = "") -> dict[str, Picture]:
+    """The pictures of a view's images, or of its patches, by name; depths of one series have the same span of colours."""
+    there = {kind: pixels for kind in MODALITIES if (pixels := _images_of(kind, images))}
     pictures = {}
-    if (rgb := images.get((role, "rgb"))) is not None:
-        pictures[f"{role} rgb"] = picture_of_colour(rgb, f"{role} view, colour")
-    if (depth := images.get((role, "depth"))) is not None:
-        metres = metres_of(depth, views[role])
-        low, high = span = depth_span(metres, images.get((role, "region")))
-        pictures[f"{role} depth"] = picture_of_depth(metres, span, f"{role} view, depth {low:.2f} to {high:.2f} m")
-    if (regions := images.get((role, "region"))) is not None:
-        pictures[f"{role} mask"] = picture_of_regions(regions, f"{role} view, regions")
+    for kinds in series_of(there).values():
+        span = _span_of(kinds, there, view)
+        for kind in kinds:
+            words = words_of(kind)
+            if span:
+                words += f"{'' if kind == 'depth' else ','} {span[0]:.2f} to {span[1]:.2f} m"
+            if suffix:
+                words = f"{words}, {ABOUT}" if len(there) > 1 else ABOUT
+            pictures[f"{role} {kind}{suffix}"] = _paint(kind, there, view, span, f"{role} view, {words}")
     return pictures
+
+
+def _images_of(kind: PixelKind, images: Mapping[PixelKind, NDArray]) -> list[NDArray]:
+    """The image of a modality, or those of each object; none where there is none."""
+    each = takewhile(images.__contains__, (f"{kind}{n}" for n in count()))
+    return [images[name] for name in ([kind] if kind in images else each)]
+
+
+def _span_of(
+    kinds: Sequence[PixelKind], there: Mapping[PixelKind, list[NDArray]], view: Row
+) -> tuple[float, float] | None:
+    """The span of the colours of depths, metres; None for other images. Targets are depths of objects alone."""
+    modality = MODALITIES[kinds[0]]
+    if modality.channels > 1 or modality.dtype == "uint8":
+        return None
+    regions = there["region"][0] if modality.target is None and "region" in there else None
+    return depth_span(np.stack([metres_of(there[kind][0], view) for kind in kinds]), regions)
+
+
+def _paint(
+    kind: PixelKind,
+    there: Mapping[PixelKind, list[NDArray]],
+    view: Row,
+    span: tuple[float, float] | None,
+    words: str,
+) -> Picture:
+    """A modality's picture, as the type of its pixels says."""
+    modality, pixels = MODALITIES[kind], there[kind][0]
+    if modality.each:
+        regions = np.array(_palette(), np.uint8).reshape(-1, 3)
+        under = there["rgb"][0] if "rgb" in there else regions[there["region"][0]]
+        return picture_of_silhouettes(there[kind], under, words)
+    if span is not None:
+        return picture_of_depth(metres_of(pixels, view), span, words, sharp=modality.target is not None)
+    if modality.channels == 1:
+        return picture_of_regions(pixels, words)
+    return picture_of_colour(pixels, words) if modality.dtype == "uint8" else picture_of_codes(pixels, words)
+
+
+def series_of(kinds: Collection[PixelKind]) -> dict[str, tuple[PixelKind, ...]]:
+    """These modalities by what a button calls them: one each, but together those of one target that have such pixels."""
+    groups: dict[tuple[str, str, int], list[PixelKind]] = {}
+    for name, modality in MODALITIES.items():
+        if name in kinds:
+            groups.setdefault((modality.target or name, modality.dtype, modality.channels), []).append(name)
+    named = {}
+    for (target, dtype, _), group in groups.items():
+        several = f"regions of {target}" if dtype == "uint8" else target
+        named[several if len(group) > 1 else words_of(group[0]).replace("colour", "RGB")] = tuple(group)
+    return named
+
+
+def words_of(kind: PixelKind) -> str:
+    """`colour` of `rgb`, `regions` of `region`, `layer 1 region` of `layer1_region`."""
+    spaced = re.sub(r"(?<=[a-z])(?=\d)", " ", kind.replace("_", " "))
+    return {"rgb": "colour", "region": "regions"}.get(kind, spaced)

@@ -18,18 +18,16 @@ from services.look.clouds import Space, pack_spaces, read_spaces
 from services.look.collect import Figures, collect, open_tables
 from services.look.pictures import Sample, choose_scenes, show_scenes
 from services.look.sections import (
-    Address,
     Side,
     beside_html,
     captures_html,
     charts_html,
-    compare_html,
     effects_html,
     failures_html,
     overview_html,
-    sheets_html,
     space_html,
 )
+from services.look.sheets import Address, compare_html, sheets_html
 from workers.store.store import Store
 
 WEB = Path(__file__).with_name("web")

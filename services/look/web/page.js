@@ -20,18 +20,28 @@ function showCategory(name) {
   document.querySelectorAll(".scene").forEach((one) => { one.hidden = Boolean(name) && one.dataset.category !== name; });
 }
 
-const wipe = { kind: "rgb" };
 function pictureOf(scene, name) { return document.querySelector(`.scene[data-scene="${scene}"] img[data-name="${name}"]`); }
-function drawWipe() {
+function drawWipe() { // a button stands for one kind of image, or for a series of which a second slider chooses one
   const select = document.getElementById("compare-scene");
   if (!select) return;
-  for (const role of ["input", "mirror"]) {
-    const shown = document.getElementById(`wipe-${role}`), found = pictureOf(select.value, `${role} ${wipe.kind}`);
+  const series = document.querySelector('[data-kind][aria-pressed="true"]').dataset.kind.split(" ");
+  const member = document.getElementById("wipe-member"), box = document.getElementById("wipe");
+  if (member) { member.max = series.length - 1; member.closest("label").hidden = series.length < 2; }
+  const kind = series[member ? member.value : 0], roles = ["input", "mirror"];
+  const close = document.getElementById("wipe-close")?.checked && roles.every((role) => pictureOf(select.value, `${role} ${kind} patch`));
+  box.classList.toggle("close", Boolean(close));
+  for (const role of roles) {
+    const shown = document.getElementById(`wipe-${role}`), found = pictureOf(select.value, `${role} ${kind}${close ? " patch" : ""}`);
     if (found && shown.src !== found.src) { shown.src = found.src; shown.alt = found.alt; shown.width = found.width; }
+    if (found && member && role === "input") {
+      const told = found.closest("figure").querySelector("figcaption").textContent.split(" · ")[1];
+      document.getElementById("wipe-told").textContent = told;
+      member.setAttribute("aria-valuetext", told);
+    }
   }
   const range = document.getElementById("wipe-range"), share = Number(range.value);
   document.getElementById("wipe-input").style.clipPath = `inset(0 ${100 - share}% 0 0)`;
-  document.querySelector("#wipe .edge").style.left = `${share}%`;
+  box.querySelector(".edge").style.left = `${share}%`;
   range.setAttribute("aria-valuetext", `${share} % input view`);
 }
 function compare(scene) {
@@ -50,9 +60,9 @@ function connect() { // also after the live page has put new contents in
 function connectPictures() {
   each("[data-show]", "click", (one) => showCategory(one.dataset.show));
   each("[data-compare]", "click", (one) => compare(one.dataset.compare));
-  each("#wipe-range", "input", drawWipe);
-  each("#compare-scene", "change", drawWipe);
-  each("[data-kind]", "click", (one) => { wipe.kind = one.dataset.kind; press([...document.querySelectorAll("[data-kind]")], one); drawWipe(); });
+  each("#wipe-range, #wipe-member", "input", drawWipe);
+  each("#compare-scene, #wipe-close", "change", drawWipe);
+  each("[data-kind]", "click", (one) => { press([...document.querySelectorAll("[data-kind]")], one); drawWipe(); });
   const first = document.querySelectorAll("[data-show]")[1];
   if (first) showCategory(first.dataset.show);
   drawWipe();

@@ -1,4 +1,4 @@
-// The 3-D view: two point clouds, the posed mesh and the cameras, drawn when something changes. Needs three.js (r140 or later, global
+// The 3-D view: the point clouds, the posed mesh and the cameras, drawn when something changes. Needs three.js (r140 or later, global
 // `THREE`), which services/look/report.py takes from trimesh's viewer.
 "use strict";
 const space = { parts: {}, clouds: [], eye: { target: new THREE.Vector3() } };
@@ -43,7 +43,7 @@ function fill(data) {
     points.userData.tint = TINTS[cloud.role];
     space.parts[cloud.role] = points;
     space.clouds.push(points);
-    cameras.add(cameraOf(cloud, target));
+    if (cloud.camera) cameras.add(cameraOf(cloud, target));
   }
   data.bodies.forEach((body) => mesh.add(bodyOf(body)));
   Object.assign(space.parts, { mesh, cameras });
@@ -122,7 +122,7 @@ function draw() {
 }
 function setPart(name, on) {
   if (name !== "tint") { if (space.parts[name]) space.parts[name].visible = on; return; }
-  for (const points of space.clouds) {
+  for (const points of space.clouds.filter((one) => one.userData.tint)) {
     points.material.vertexColors = !on;
     points.material.color.set(on ? points.userData.tint : "#ffffff");
     points.material.needsUpdate = true;

@@ -148,7 +148,7 @@ def test_every_picture_is_shown_a_category_alone_where_asked_and_nothing_is_fetc
     widths = opened.run(f"{PICTURES}.map((one) => one.naturalWidth)")
     assert len(widths) == 4 * 9 + 2 and min(widths) > 0
     shown = "[...document.querySelectorAll('.scene:not([hidden])')].map((one) => one.dataset.category)"
-    for name, kept in (("mug", {"mug"}), ("", {"box", "mug"})):
+    for name, kept in (("can", {"can"}), ("", {"box", "can"})):
         opened.run(f"document.querySelector('[data-show=\"{name}\"]').click()")
         assert set(opened.run(shown)) == kept
     assert opened.said == []
@@ -193,6 +193,30 @@ def test_the_view_in_space_draws_turns_with_keys_and_hides_its_parts(opened, tmp
         hidden = picture(opened, "#space-canvas", tmp_path)
         assert part == "cameras" or np.abs(hidden - before).mean() > 0.2
     assert len(np.unique(hidden[4:-4, 4:-4].reshape(-1, 3), axis=0)) == 1
+
+
+@in_browser
+def test_layers_are_slid_through_close_to_the_object_and_samples_are_shown_where_asked(tab, sampled, tmp_path):
+    write_report(sampled, 1, tmp_path / "page.html")
+    tab.said.clear()
+    tab.open((tmp_path / "page.html").as_uri())
+    tab.run("document.querySelector('[data-kind^=\"layer1 \"]').click(); document.getElementById('wipe-close').click()")
+    tab.run("document.getElementById('wipe-member').focus()")
+    told, shown = [], []
+    for _ in range(4):
+        told.append(tab.run("document.getElementById('wipe-told').textContent").partition(",")[0])
+        shown.append(tab.run("document.getElementById('wipe-input').src"))
+        tab.press("ArrowRight", 39)
+    assert told == ["layer 1", "layer 2", "back", "back"] and len(set(shown)) == 3
+    tab.until("document.getElementById('wipe-mirror').naturalWidth === 32")
+    tab.run("document.querySelector('[data-kind=\"normals\"]').click()")
+    assert not tab.run("document.getElementById('wipe-member').checkVisibility()")
+    draw_space(tab)
+    for part in ("surface", "inside", "outside"):
+        before = picture(tab, "#space-canvas", tmp_path)
+        tab.run(f"document.querySelector('[data-part=\"{part}\"]').click()")
+        assert np.abs(picture(tab, "#space-canvas", tmp_path) - before).mean() > 0.01
+    assert tab.said == []
 
 
 @in_browser

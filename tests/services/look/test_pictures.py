@@ -28,7 +28,8 @@ from services.look.pictures import (
     read_pair,
     show_scenes,
 )
-from services.look.sections import compare_html, sheets_html, space_html
+from services.look.sections import space_html
+from services.look.sheets import compare_html, sheets_html
 from services.read.dataset_reader import file_reader, find_scene
 from tests.services.look.conftest import HOSTILE, address, scene
 
@@ -113,14 +114,14 @@ def test_a_scene_has_its_pictures_and_depth_is_counted_of_objects_alone(shown):
     sample = show_scenes(shown, [0, 3])
     assert [scene.scene_id for scene in sample.scenes] == [0, 3]
     first = sample.scenes[0]
-    roles = {f"{role} {kind}" for role in ("input", "mirror") for kind in ("rgb", "depth", "mask")}
-    patches = {"input patch", "mirror patch"}
+    roles = {f"{role} {kind}" for role in ("input", "mirror") for kind in ("rgb", "depth", "region")}
+    patches = {"input rgb patch", "mirror rgb patch"}
     assert set(first.pictures) == roles | {"over"} | patches and all(
         picture.data for picture in first.pictures.values()
     )
     assert 0.0 < first.visible["input"] <= 1.0 and 1.9 < first.d_z_m < 3.0
     crop = cv2.imread(str(shown.root / first.category / "patches" / "RGB00000.png"))[..., ::-1].astype(int)
-    assert np.abs(decoded(first.pictures["input patch"]) - crop).mean() < 12 and crop.std() > 12  # JPEG
+    assert np.abs(decoded(first.pictures["input rgb patch"]) - crop).mean() < 12 and crop.std() > 12  # JPEG
     depth = show_scenes(shown, [0]).depth
     assert 0 < depth["input"].count < 160 * 120 / 10 and np.isfinite(depth["mirror"].mean)
     assert abs(depth["input"].percentile(0.02) - first.d_z_m) < 0.05
