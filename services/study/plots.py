@@ -18,7 +18,7 @@ from matplotlib.transforms import Bbox
 
 from schemas.errors import milliseconds, number
 from services.study.choose import front, own_row
-from services.study.model import Row, Study, as_often, cost, short, shown, unit
+from services.study.model import ERRORS, NEGLIGIBLE, Row, Study, as_often, cost, short, shown, unit
 
 _PHYSICS = "pose_mm outcome_mm penetration_mm gap_mm moved_mm unbalanced_share turned_deg outcome_deg"
 
@@ -116,15 +116,16 @@ def panels_of(rows: Sequence[Row]) -> list[Panel]:
 def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
     """The settings that a panel shows.
 
-    The job, presets, knobs of which a value moves the error by more than `MOVED`, and combinations with such a knob.
+    The job, presets, knobs of which a value moves the error by more than `MOVED` and what is negligible, and combinations with
+    such a knob.
     """
     measured = [row for row in rows if error in row.errors]
-    own = own_row(rows).errors.get(error)
+    own, least = own_row(rows).errors.get(error), NEGLIGIBLE[ERRORS[error].unit]
     moving = {
         row.setting.knob
         for row in measured
         if row.setting.kind == "single"
-        and (own is None or abs(row.errors[error].value - own.value) > MOVED * own.value)
+        and (own is None or abs(row.errors[error].value - own.value) > max(MOVED * own.value, least))
     }
     return [row for row in measured if row.setting.kind in ("own", "preset") or set(dict(row.setting.parts)) & moving]
 
@@ -132,7 +133,7 @@ def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
 def half_row(rows: Sequence[Row], error: str) -> Row | None:
     """The cheapest setting that measured at most half of the job's own error, and less than that with its whole interval."""
     own = own_row(rows).errors.get(error)
-    if own is None or own.value <= 0.0:
+    if own is None or own.value <= NEGLIGIBLE[ERRORS[error].unit]:
         return None
     halves = [row for row in front(rows, error) if row.errors[error].value <= own.value / 2]
     return next((row for row in halves if row.errors[error].high <= own.value), None)
@@ -181,7 +182,9 @@ def _message(rows: Sequence[Row], panel: Panel) -> str:
     if panel.half is not None:
         return f"half the error takes {cost(panel.half.ratio)}"
     own = own_row(rows).errors.get(panel.error)
-    less = 0.0 if own is None or own.value <= 0.0 else 1.0 - best.errors[panel.error].value / own.value
+    if own is not None and own.value <= NEGLIGIBLE[ERRORS[panel.error].unit]:
+        return "the job's own is negligible"
+    less = 0.0 if own is None else 1.0 - best.errors[panel.error].value / own.value
     if less <= MOVED:
         return "nothing better was measured"
     return f"{100 * less:.2g} % less error takes {cost(best.ratio)}"
