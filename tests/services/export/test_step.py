@@ -41,6 +41,8 @@ from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
 
 SPLITS = ("train", "val", "test")
+OF = dict.fromkeys(("occnet", "nocs"), ("shaped", "shaped_tars"))
+"""Datasets that formats which need targets are tested on."""
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -61,12 +63,14 @@ class Killed(BaseException):
 @pytest.mark.parametrize(
     ("points", "name"),
     [
-        *((1, name) for name in ("mirror-recon", "webdataset")),  # a file for each thing, and shards
+        # A file for each thing, shards, and a register
+        *((1, name) for name in ("mirror-recon", "webdataset", "occnet")),
         *(pytest.param(6, name, marks=pytest.mark.minute) for name in FORMATS),
         *(pytest.param(24, name, marks=pytest.mark.slow) for name in FORMATS),
     ],
 )
-def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, name, files, tmp_path, monkeypatch):
+def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, name, request, tmp_path, monkeypatch):
+    files = request.getfixturevalue(OF.get(name, ("files", "tars"))[0])
     replace, calls = os.replace, itertools.count()
 
     def die_at(*numbers):
@@ -101,7 +105,8 @@ def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, nam
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, files, tars, tmp_path):
+def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, request, tmp_path):
+    files, tars = map(request.getfixturevalue, OF.get(name, ("files", "tars")))
     sources = {"files": files, "tars": tars, "bucket": in_a_bucket(tars.root)}
     for place, store in sources.items():
         export_to(store, tmp_path / place, name, shard_mb=0)
