@@ -11,7 +11,7 @@ from scipy.spatial.distance import pdist
 
 from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
-from services.export.shapes import box_of, color_vertices, whole_silhouette
+from services.export.shapes import box_of, color_vertices, reaches_edge, whole_silhouette
 from services.job.record import require_job
 from tests.datasets import make_dataset
 from tests.services.export.bop_reader import load_model, load_shots, points_in_model, read_picture
@@ -270,5 +270,6 @@ def test_a_silhouette_holds_what_is_hidden_and_what_lies_outside_the_image(x_m, 
     assert whole_silhouette(label, view, square(left, seen), None) is None
     all_seen = whole_silhouette({**label, "visible_fraction": 1.0}, view, square(10, 30), None)
     assert (all_seen.pixels, all_seen.box) == (800, (10, 40, 19, 39))
+    assert [reaches_edge(square(*ends)) for ends in ((10, 30), (0, 30), (140, 160))] == [False, True, True]
     assert box_of(np.zeros((4, 4), bool)) == (-1, -1, -1, -1)
     assert box_of(np.outer([0, 0, 1], [0, 1, 0]) > 0) == (1, 2, 0, 0)

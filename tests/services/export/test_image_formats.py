@@ -1,5 +1,7 @@
 """NOCS and nerfstudio, read back as their loaders do it (tests/services/export/image_loaders.py)."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -87,6 +89,17 @@ def test_models_stay_right_way_out_and_classes_have_the_numbers_of_nocs(nocs):
         assert np.einsum("fi,fi->", a, np.cross(b, c)) > 0, "the volume of the stored model"
 
 
+def test_a_folder_that_is_full_is_followed_by_the_next(heap, tmp_path, monkeypatch):
+    monkeypatch.setattr("services.export.nocs.IN_FOLDER", 2)
+    export_to(heap, tmp_path / "new", "nocs")
+    files = sorted(
+        path.relative_to(tmp_path / "new").as_posix() for path in (tmp_path / "new").glob("*/0*/*_color.png")
+    )
+    assert [file.partition("/")[2] for file in files] == [
+        f"{name}_color.png" for name in ("00000/0000", "00000/0001", "00001/0000")
+    ]
+
+
 # ------------------------------------------------------------------------------------------------ nerfstudio
 
 
@@ -120,6 +133,21 @@ def test_the_depth_of_a_view_carried_into_another_meets_its_depth(nerf):
     assert first.T_world_cam[2, 3] > 1.5 and first.T_world_cam[2, 2] > 0, "z is up, and a camera looks along -z"
 
 
+def test_the_floor_is_flat_and_an_object_fills_its_box_in_every_frame(nerf, shaped):
+    """A half pixel would move the floor by 4 mm."""
+    folder, _ = nerf
+    assets = rows_by(shaped, "assets", "instance_id")
+    for path in folder.glob("*/*/transforms_objects.json"):
+        (thing,) = json.loads(path.read_text())["objects"]
+        T, half = np.linalg.inv(thing["transform_matrix"]), np.array(assets[thing["instance_id"],]["extents_m"]) / 2
+        for frame in (frame for frames in load_frames(path).values() for frame in frames):
+            points, pixels = frame.points()
+            floor = points[np.abs(points[:, 2]) < 0.02]
+            assert np.percentile(np.abs(floor[:, 2]), 98) < 0.001, "the table's legs come down to it"
+            own = points[frame.mask[tuple(pixels.T)] > 0] @ T[:3, :3].T + T[:3, 3]
+            assert (np.abs(own) < half + 0.001).all()
+
+
 def test_a_scene_with_masks_counts_its_objects_alone(nerf, shaped):
     folder, _ = nerf
     for path in folder.glob("*/*/transforms_objects.json"):
@@ -139,6 +167,7 @@ def test_without_a_depth_camera_all_views_are_trained_on_and_a_lens_leaves_depth
     manifest = export_to(store, tmp_path / "new", "nerf").manifest
     (path,) = (tmp_path / "new").glob("*/*/transforms.json")
     text = path.read_text()
+    assert json.loads(text)["val_filenames"] == ["images/00000_input.png", "images/00000_mirror.png"]
     assert '"k1": 0.05' in text and "depth_file_path" not in text and not (path.parent / "masks").exists()
     assert manifest["frames"] == 2 and any("lens" in line for line in manifest["not_exported"])
     grey, _ = make_dataset(tmp_path / "grey", scenes=1, categories=["can"], render={"rgb": False})

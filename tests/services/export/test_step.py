@@ -25,7 +25,7 @@ from schemas.scene.view import Camera, Intrinsics
 from services.cli.main import main
 from services.dataset import splits
 from services.dataset.splits import Splits, collect_ids, split_by_category
-from services.export.folder import ExportFolder, Rounds
+from services.export.folder import ExportFolder, Register, Rounds
 from services.export.shapes import Shapes, color_vertices, covered
 from services.export.source import iter_ranges, scenes_of
 from services.export.table import FORMATS
@@ -164,6 +164,19 @@ def test_what_was_appended_after_the_last_checkpoint_is_taken_back(tmp_path):
     assert (place / "a" / "list.txt").read_bytes() == b"one\nthree\n"
     assert sorted(path.name for path in place.iterdir()) == ["a", "export.json"]
     assert ExportFolder(place).finished() == {"pairs": 1}
+
+
+def test_entries_of_a_register_after_the_last_checkpoint_are_taken_back(tmp_path):
+    folder = ExportFolder(tmp_path / "new")
+    with folder.claimed({}):
+        register = Register(folder, 0)
+        assert [register.add("mug/b", "x"), register.add("mug/a"), register.state()] == [1, 2, 2]
+        assert [register.add("mug/a", "late"), register.state()] == [3, 3]  # and no checkpoint
+        register.close()
+        again = Register(folder, 2)
+        assert list(again.counts()) == [("mug/a", 1), ("mug/b", 1)] and again.of("mug/b") == [(1, "x")]
+        assert again.add("mug/a", "new") == 3 and again.of("mug/a") == [(2, ""), (3, "new")]
+        again.close()
 
 
 def test_an_unfinished_export_that_is_anothers_or_damaged_is_refused(tmp_path):
