@@ -73,7 +73,7 @@ class Nerf(Writer):
         """Scenes by split, and the conventions."""
         pinhole = ["depth and masks: they are a pinhole camera's, and colour has a lens"] if self._lens else []
         return {
-            "scenes": dict(sorted(self.kept["scenes"].items())),
+            "nerf_scenes": dict(sorted(self.kept["scenes"].items())),
             "frames": self.kept["frames"],
             "not_exported": ["projected views, patches", *pinhole],
             "poses": "camera to world, metres, z up; the camera looks along -z, y up (OpenGL)",

@@ -112,7 +112,7 @@ def nerf(shaped, tmp_path_factory):
 def test_the_depth_of_a_view_carried_into_another_meets_its_depth(nerf):
     folder, manifest = nerf
     paths = sorted(folder.glob("*/*/transforms.json"))
-    assert len(paths) == sum(manifest["scenes"].values()) == 3 and manifest["frames"] == 9
+    assert len(paths) == sum(manifest["nerf_scenes"].values()) == manifest["scenes"] == 3 and manifest["frames"] == 9
     for path in paths:
         splits = load_frames(path)
         (first, back), (beside,) = splits["train"], splits["test"]
