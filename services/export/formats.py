@@ -267,7 +267,14 @@ class ShardedWriter(Writer):
             "depth": f"{depth}, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
             "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
             "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
+            **({"targets": _TARGETS} if self.record.job.targets.views else {}),
         }
+
+
+_TARGETS: Final = (
+    "normals 2 v / 65535 - 1, camera frame; coordinates coordinates_scale_m v / 65535 + coordinates_offset_m, object frame; "
+    "(0, 0, 0) is none; amodal an image for each object, by region, 255 where it is; layers and back as depth and region"
+)
 
 
 def points_on(glb: bytes, count: int, name: str) -> dict[str, NDArray]:

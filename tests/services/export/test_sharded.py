@@ -135,7 +135,7 @@ def test_the_webdataset_package_reads_every_sample_with_any_of_its_decoders(deco
 
 
 def test_image_targets_are_arrays_and_colours_pictures(heap, tmp_path):
-    export_to(heap, tmp_path / "new", "webdataset")
+    assert "coordinates_offset_m" in export_to(heap, tmp_path / "new", "webdataset").manifest["targets"]
     (sample,) = samples_of(tmp_path / "new").values()
     for kind, (role, word, stored) in targets_of(heap):
         read = (
