@@ -9,7 +9,6 @@ import io
 import json
 import math
 import shutil
-import sqlite3
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,9 +23,17 @@ from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import plural
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part
 from schemas.scene.view import DRAWN_ROLES, Role
-from services.export.folder import ExportFolder
-from services.export.formats import Added, ExportRequest, Writer
-from services.export.shapes import ColoredShape, Shapes, Silhouette, box_of, whole_silhouette
+from services.export.folder import ExportFolder, Register
+from services.export.formats import Added, ExportRequest, Writer, encode_json
+from services.export.shapes import (
+    ColoredShape,
+    Shapes,
+    Silhouette,
+    box_of,
+    reaches_edge,
+    silhouette_of,
+    whole_silhouette,
+)
 from services.export.source import ExportPair, ExportScene
 from workers.geometry.frames import invert
 from workers.store.images import decode_png, encode_mask
@@ -96,12 +103,13 @@ class Bop(Writer):
         number = len(DRAWN_ROLES) * pair.number + DRAWN_ROLES.index(role)
         view, pixels = pair.views[role], decode_png(depth)
         shot = _Shot(number, view, {f"rgb/{number:06d}.png": rgb, f"depth/{number:06d}.png": depth})
+        silhouettes = pair.stack(role, "amodal")
         for label in pair.labels(role):
             if label["region_id"] < REGION_FIRST_OBJECT:
                 continue
-            visible, hidden = region == label["region_id"], label["visible_fraction"] < 1.0
-            colored = self._shapes.load(scene, label["instance_id"]) if hidden else None
-            whole = whole_silhouette(label, view, visible, None if colored is None else colored.shape)
+            visible = region == label["region_id"]
+            stored = None if silhouettes is None else silhouettes[label["region_id"] - REGION_FIRST_OBJECT] > 0
+            whole = self._silhouette(scene, label, view, visible, stored)
             if whole is None:
                 return NO_SHAPE
             name = f"{number:06d}_{len(shot.poses):06d}.png"
@@ -109,6 +117,22 @@ class Bop(Writer):
             shot.poses.append(_pose(numbers[label["region_id"]], label))
             shot.infos.append(_info(whole, visible, pixels))
         return shot
+
+    def _silhouette(
+        self, scene: ExportScene, label: Row, view: Row, visible: NDArray[np.bool_], stored: NDArray[np.bool_] | None
+    ) -> Silhouette | None:
+        """The whole silhouette of an object of which `visible` is seen, None where it cannot be known.
+
+        `stored` is the image `amodal`, where the job asks for it. Where it reaches the image's edge, more lies outside.
+        """
+        if stored is not None and not reaches_edge(stored):
+            return silhouette_of(stored)
+        hidden = label["visible_fraction"] < 1.0
+        colored = self._shapes.load(scene, label["instance_id"]) if hidden else None
+        whole = whole_silhouette(label, view, visible, None if colored is None else colored.shape)
+        if stored is None:
+            return whole
+        return silhouette_of(stored) if whole is None else Silhouette(stored, whole.pixels, whole.box)
 
     def _install(self, place: Path, path: str, shots: list[_Shot]) -> None:
         """Gives a scene's folder its name, unless a killed export did."""
@@ -157,11 +181,6 @@ class Bop(Writer):
         }
 
 
-def encode_json(tree: object) -> bytes:
-    """A JSON file."""
-    return (json.dumps(tree, indent=1) + "\n").encode()
-
-
 def _camera(view: Row) -> Row:
     """An entry of scene_camera.json."""
     T_cam_world = invert(read_matrix(view["T_world_cam"]))
@@ -207,28 +226,24 @@ class BopModels:
     """Gives each instance its number, obj_id, from 1, and writes its model in millimetres when it first appears."""
 
     def __init__(self, folder: ExportFolder, state: dict[str, Any] | None) -> None:
-        self._folder = folder
-        self._next = 1 if state is None else int(state["next_object"])
-        self.without = 0 if state is None else int(state["without_model"])
+        self._folder, begun = folder, state or {"objects": 0, "without_model": 0, "first": True}
+        self._register = Register(folder, begun["objects"])
+        self.count: int = begun["objects"]
+        """How many instances have a number."""
+        self.without: int = begun["without_model"]
         """Objects whose shape is not here."""
-        self._first = True if state is None else bool(state["first"])
-        self._db = sqlite3.connect(folder.work / "objects.sqlite")
-        self._db.execute("PRAGMA synchronous = OFF")  # a power loss is not what this is for
-        self._db.execute("CREATE TABLE IF NOT EXISTS objects (instance TEXT PRIMARY KEY, id INTEGER) WITHOUT ROWID")
-        self._db.execute("DELETE FROM objects WHERE id >= ?", (self._next,))
+        self._first: bool = begun["first"]
         if state is None:
             folder.append(_NAMES, b"obj_id,category,instance_id,split,source,licence\n")
             folder.append(_INFO, b"{")
 
     def number(self, instance_id: str) -> int | None:
         """The obj_id of an instance, None where it is new."""
-        found = self._db.execute("SELECT id FROM objects WHERE instance = ?", (instance_id,)).fetchone()
-        return None if found is None else int(found[0])
+        return next((number for number, _ in self._register.of(instance_id)), None)
 
     def add(self, asset: Row, shape: ColoredShape | None) -> int:
         """The obj_id of a new instance, whose row of `assets` and shape these are."""
-        number, self._next = self._next, self._next + 1
-        self._db.execute("INSERT INTO objects VALUES (?, ?)", (asset["instance_id"], number))
+        number = self.count = self._register.add(asset["instance_id"])
         text = io.StringIO()
         names = ("category", "instance_id", "split", "source", "licence")
         csv.writer(text, lineterminator="\n").writerow((number, *(asset[name] for name in names)))
@@ -244,8 +259,7 @@ class BopModels:
 
     def state(self) -> dict[str, Any]:
         """What a new one must know; the numbers themselves are safe on the disk."""
-        self._db.commit()
-        return {"next_object": self._next, "without_model": self.without, "first": self._first}
+        return {"objects": self._register.state(), "without_model": self.without, "first": self._first}
 
     def finish(self) -> None:
         """Ends models_info.json."""
@@ -253,12 +267,7 @@ class BopModels:
 
     def close(self) -> None:
         """Closes the file of numbers."""
-        self._db.close()
-
-    @property
-    def count(self) -> int:
-        """How many instances have a number."""
-        return self._next - 1
+        self._register.close()
 
 
 def model_info(vertices_mm: Array) -> dict[str, float]:

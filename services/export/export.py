@@ -54,6 +54,7 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
     if root is not None and request.target.resolve().is_relative_to(Path(root).resolve()):  # it would be a foreign file
         raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
     record = require_job(request.store)
+    FORMATS[request.format].load().check(record.job)
     chooser = Chooser(request.choice)
     folder = ExportFolder(request.target)
     plan = _plan(request, record)

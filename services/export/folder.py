@@ -9,6 +9,7 @@ import fcntl
 import json
 import os
 import shutil
+import sqlite3
 import urllib.parse
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -157,6 +158,42 @@ def _read_tree(path: Path) -> Tree | None:
     if not isinstance(tree, dict):
         raise CorruptError(f"{path} is damaged: remove the folder {path.parent.parent}, and export again")
     return tree
+
+
+class Register:
+    """Entries numbered from 1 in the order in which they came, each with a key and a text; on the disk, in constant memory."""
+
+    def __init__(self, folder: ExportFolder, after: int) -> None:
+        """`after`: what `state` was; entries of a killed export that came later are gone."""
+        self._db = sqlite3.connect(folder.work / "register.sqlite")
+        self._db.execute("PRAGMA synchronous = OFF")  # a power loss is not what this is for
+        self._db.execute("CREATE TABLE IF NOT EXISTS entries (id INTEGER PRIMARY KEY, key TEXT, text TEXT)")
+        self._db.execute("CREATE INDEX IF NOT EXISTS by_key ON entries (key)")
+        self._db.execute("DELETE FROM entries WHERE id > ?", (after,))
+        self._last = after
+
+    def add(self, key: str, text: str = "") -> int:
+        """The number of a new entry."""
+        self._last += 1
+        self._db.execute("INSERT INTO entries VALUES (?, ?, ?)", (self._last, key, text))
+        return self._last
+
+    def of(self, key: str) -> list[tuple[int, str]]:
+        """(number, text) of the entries of a key, in order."""
+        return self._db.execute("SELECT id, text FROM entries WHERE key = ? ORDER BY id", (key,)).fetchall()
+
+    def counts(self) -> Iterator[tuple[str, int]]:
+        """(key, how many entries it has), sorted."""
+        yield from self._db.execute("SELECT key, COUNT(*) FROM entries GROUP BY key ORDER BY key")
+
+    def state(self) -> int:
+        """The last number; the entries are safe on the disk."""
+        self._db.commit()
+        return self._last
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._db.close()
 
 
 class Rounds:

@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import io
+import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,8 +19,10 @@ from schemas.base import Frozen
 from schemas.dataset.layout import asset_path
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError, InputError
-from services.export.folder import ExportFolder, Rounds
-from services.export.source import ExportScene
+from schemas.job.job import Job
+from schemas.job.targets import ShapeTarget, ViewTarget
+from services.export.folder import ExportFolder, Register, Rounds
+from services.export.source import ExportPair, ExportScene
 from services.job.record import JobRecord
 from services.read.dataset_reader import StoredRange
 from workers.store.manifest import table_of_rows
@@ -128,6 +131,10 @@ class Writer:
 
     FRESH: ClassVar[dict[str, Any]]
 
+    @classmethod
+    def check(cls, job: Job) -> None:
+        """Raises InputError where a dataset of this job cannot have what the format is made of."""
+
     def __init__(
         self, request: ExportRequest, record: JobRecord, folder: ExportFolder, kept: dict[str, Any] | None
     ) -> None:
@@ -159,6 +166,47 @@ class Writer:
     def count(self, name: str, key: str, more: int) -> None:
         """Adds to the count of `key` in `kept[name]`."""
         self.kept[name][key] = self.kept[name].get(key, 0) + more
+
+
+class ObjectWriter(Writer):
+    """A format with a folder for each object, which gets the views of it scene by scene, numbered from 0."""
+
+    FRESH: ClassVar = {"register": 0, "views": {}}
+
+    def begin(self, request: ExportRequest, fresh: bool) -> None:
+        """Opens the list of views: an entry for each, whose key is the object's folder."""
+        self.register = Register(self.folder, self.kept["register"])
+
+    def add(self, scene: ExportScene) -> Added:
+        """Takes every object of every pair; a pair of which nothing is taken is left out."""
+        left_out = []
+        for pair in scene.pairs:
+            reasons = [self.take(scene, pair, region_id) for region_id in scene.instances]
+            if all(reasons):
+                left_out.append((pair.pose_id, reasons[0]))
+        return Added(len(scene.pairs) - len(left_out), tuple(left_out))
+
+    def take(self, scene: ExportScene, pair: ExportPair, region_id: int) -> str:
+        """Writes the views of an object in a pair; why there are none, or nothing."""
+        raise NotImplementedError
+
+    def state(self) -> dict[str, Any]:
+        """The last view, and counts."""
+        return {**self.kept, "register": self.register.state()}
+
+    def close(self) -> None:
+        """Closes the list."""
+        self.register.close()
+
+
+def require_targets(
+    job: Job, format_name: str, views: Sequence[ViewTarget] = (), shape: Sequence[ShapeTarget] = ()
+) -> None:
+    """Raises InputError where the job does not ask for these targets."""
+    for key, wanted, asked in (("views", views, job.targets.views), ("shape", shape, job.targets.shape)):
+        if missing := [name for name in wanted if name not in asked]:
+            told = f"a dataset whose job has targets.{key}: [{', '.join(wanted)}]"
+            raise InputError(f"{format_name} needs {told}; this one lacks {', '.join(missing)}: make it with them")
 
 
 OF_SCENE: Final = ("scene_id", "category", "instance_id", "source", "table_id", "T_world_obj", "T_world_table")
@@ -219,15 +267,31 @@ class ShardedWriter(Writer):
             "depth": f"{depth}, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
             "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
             "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
+            **({"targets": _TARGETS} if self.record.job.targets.views else {}),
         }
+
+
+_TARGETS: Final = (
+    "normals 2 v / 65535 - 1, camera frame; coordinates coordinates_scale_m v / 65535 + coordinates_offset_m, object frame; "
+    "(0, 0, 0) is none; amodal an image for each object, by region, 255 where it is; layers and back as depth and region"
+)
 
 
 def points_on(glb: bytes, count: int, name: str) -> dict[str, NDArray]:
     """points and normals [count, 3] float32, uniform over the surface, metres; `name` seeds the draw."""
-    mesh = trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False).to_mesh()
+    return sample_mesh(trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False).to_mesh(), count, name)
+
+
+def sample_mesh(mesh: trimesh.Trimesh, count: int, name: str) -> dict[str, NDArray]:
+    """The same of a mesh."""
     seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)[:2]
     return {"points": points.astype(np.float32), "normals": mesh.face_normals[faces].astype(np.float32)}
+
+
+def encode_json(tree: object) -> bytes:
+    """A JSON file."""
+    return (json.dumps(tree, indent=1) + "\n").encode()
 
 
 def encode_npz(arrays: Mapping[str, NDArray]) -> bytes:

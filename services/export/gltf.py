@@ -7,13 +7,11 @@ import math
 from functools import cached_property
 from typing import Any, ClassVar
 
-import numpy as np
-
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import CorruptError, SceneError, VersoError
 from schemas.scene.view import DRAWN_ROLES
 from services.export.formats import Added, Writer
-from services.export.source import ExportScene
+from services.export.source import OPENGL_FROM_OPTICAL, ExportScene
 from services.read.scene_geometry import Sources, pose_shapes
 from workers.assets.glb import join_glb, split_glb
 
@@ -21,8 +19,6 @@ NO_SOURCES = "the sources of the shapes are not here, or have changed"
 
 _Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """x, y, z, w of the rotation that takes z to y."""
-_OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""A glTF camera looks along -z, and its y is up."""
 _NEAR_M = 0.05
 
 
@@ -73,7 +69,7 @@ def with_cameras(glb: bytes, views: list[Row]) -> bytes:
     nodes, cameras = tree["nodes"], tree.setdefault("cameras", [])
     roots = list(tree["scenes"][0]["nodes"])
     for view in views:
-        matrix = read_matrix(view["T_world_cam"]) @ _OPENGL_FROM_OPTICAL
+        matrix = read_matrix(view["T_world_cam"]) @ OPENGL_FROM_OPTICAL
         name = f"{view['role']} {view['pose_id']}"
         roots.append(len(nodes))
         nodes.append({"name": name, "camera": len(cameras), "matrix": matrix.T.ravel().tolist()})

@@ -1,7 +1,8 @@
 """Format `huggingface`: Parquet files with embedded images that `datasets.load_dataset(DIR)` reads, and a dataset card.
 
 A row is a pair. Its columns come from the manifest's schemas: what a view has is a struct `<role>_view`, its images are
-the columns `<role>_rgb`, `<role>_depth` and `<role>_region`, PNG files as they are stored.
+the columns `<role>_rgb`, `<role>_depth`, `<role>_region` and image targets, PNG files as they are stored. Targets of 3 x 16
+bits are plain bytes, because Pillow, which decodes images for `datasets`, makes 8 bits of them without a word.
 """
 
 import hashlib
@@ -15,10 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from schemas.dataset.codec import Row
-from schemas.dataset.layout import ARTICLE, stored_images, stored_roles
-from schemas.dataset.tables import SCHEMAS
+from schemas.dataset.layout import ARTICLE, PixelKind, stored_images, stored_roles
+from schemas.dataset.tables import NOT_IN_DIGEST, SCHEMAS
 from schemas.errors import plural
 from schemas.job.job import Job
+from schemas.scene.view import MODALITIES, Role
 from services.export.formats import OF_SCENE, Added, ShardedWriter
 from services.export.source import ExportPair, ExportScene
 
@@ -29,6 +31,9 @@ ROW_GROUP: Final = 16
 
 IMAGE: Final = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])
 """An image as Hugging Face stores it."""
+IMAGES: Final = pa.list_(IMAGE)
+"""One for each object, by region."""
+_PICTURES: Final = (IMAGE, IMAGES, pa.binary())
 
 _NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "role", "capture")
 _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
@@ -83,11 +88,20 @@ def schema_of_pairs(job: Job) -> pa.Schema:
     fields += [pa.field("split", pa.string()), pa.field("pose_id", pa.int64())]
     views = pa.struct([field for field in SCHEMAS["views"] if field.name not in _NOT_OF_VIEWS])
     for role in stored_roles(job):
-        fields += [pa.field(f"{role}_{image.pixels}", IMAGE) for image in stored_images(role, job)]
+        fields += [pa.field(f"{role}_{image.pixels}", _type_of(image.pixels)) for image in stored_images(role, job)]
         fields.append(pa.field(f"{role}_view", views))
-    objects = pa.struct([field for field in SCHEMAS["objects"] if field.name not in _NOT_OF_OBJECTS])
+    absent = () if job.targets.views else NOT_IN_DIGEST["objects"]
+    objects = pa.struct([field for field in SCHEMAS["objects"] if field.name not in (*_NOT_OF_OBJECTS, *absent)])
     schema = pa.schema([*fields, pa.field("objects", pa.list_(objects))])
     return schema.with_metadata(features_metadata(schema))
+
+
+def _type_of(kind: PixelKind) -> pa.DataType:
+    """The type of the column of a kind of image."""
+    modality = MODALITIES[kind]
+    if (modality.channels, modality.dtype) == (3, "uint16"):
+        return pa.binary()
+    return IMAGES if modality.each else IMAGE
 
 
 def row_of(schema: pa.Schema, scene: ExportScene, pair: ExportPair) -> Row:
@@ -98,17 +112,25 @@ def row_of(schema: pa.Schema, scene: ExportScene, pair: ExportPair) -> Row:
         role, _, kind = name.partition("_")
         if kind == "view":
             row[name] = pair.views.get(role)
-        elif schema.field(name).type == IMAGE:
-            data = pair.image(role, kind)
-            row[name] = None if data is None else {"bytes": data, "path": f"{pair.pose_id:09d}.{role}.{kind}.png"}
+        elif kind in MODALITIES:
+            row[name] = _cell(pair, role, kind)
     return row
+
+
+def _cell(pair: ExportPair, role: Role, kind: PixelKind) -> Any:
+    """What the column of a view's image holds."""
+    name, of = f"{pair.pose_id:09d}.{role}.{kind}", _type_of(kind)
+    if of == IMAGES:
+        return [{"bytes": data, "path": f"{name}{n}.png"} for n, data in enumerate(pair.images(role, kind))]
+    data = pair.image(role, kind)
+    return data if data is None or of == pa.binary() else {"bytes": data, "path": f"{name}.png"}
 
 
 class _Parquet:
     """A Parquet file being written, a row group at a time."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
-        plain = [name for name in schema.names if schema.field(name).type != IMAGE]
+        plain = [name for name in schema.names if schema.field(name).type not in _PICTURES]
         self._writer = pq.ParquetWriter(
             path, schema, compression="snappy", use_dictionary=plain, write_statistics=plain
         )
@@ -118,7 +140,7 @@ class _Parquet:
 
     def add(self, row: Row) -> None:
         self._rows.append(row)
-        self.bytes += sum(len(cell["bytes"]) for cell in row.values() if isinstance(cell, dict) and "bytes" in cell)
+        self.bytes += sum(map(_bytes_in, row.values()))
         if len(self._rows) == ROW_GROUP:
             self._flush()
 
@@ -130,6 +152,15 @@ class _Parquet:
     def close(self) -> None:
         self._flush()
         self._writer.close()
+
+
+def _bytes_in(cell: object) -> int:
+    """Bytes of the images in a cell."""
+    if isinstance(cell, bytes):
+        return len(cell)
+    if isinstance(cell, list):
+        return sum(map(_bytes_in, cell))
+    return len(cell["bytes"]) if isinstance(cell, dict) and "bytes" in cell else 0
 
 
 def features_metadata(schema: pa.Schema) -> dict[bytes, bytes]:
@@ -147,7 +178,13 @@ def _feature(kind: pa.DataType) -> dict[str, Any]:
         return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
     if pa.types.is_list(kind):
         return {"feature": _feature(kind.value_type), "_type": "List"}
-    names = {pa.int64(): "int64", pa.float64(): "float64", pa.string(): "string", pa.bool_(): "bool"}
+    names = {
+        pa.int64(): "int64",
+        pa.float64(): "float64",
+        pa.string(): "string",
+        pa.bool_(): "bool",
+        pa.binary(): "binary",
+    }
     return {"dtype": names[kind], "_type": "Value"}
 
 
@@ -159,6 +196,7 @@ def card_text(name: str, export: str, schema: pa.Schema, rows: Mapping[str, int]
     files = "".join(f"\n  - split: {split}\n    path: data/{split}-*.parquet" for split in sorted(rows)) or " []"
     counts = "".join(f"- {split}: {plural(count, 'pair')}\n" for split, count in sorted(rows.items()))
     columns = "".join(f"- `{field.name}`: {_describe(field)}\n" for field in schema)
+    wide = _WIDE if any(field.type == pa.binary() for field in schema) else ""
     return f"""---
 license: {"cc0-1.0" if set(licences) <= {"CC0-1.0"} else "other"}
 pretty_name: {json.dumps(name)}
@@ -196,13 +234,22 @@ pairs = datasets.load_dataset("path/to/this/folder", split="train")
 - Poses are row-major 4 x 4 matrices in metres: `T_world_cam` takes camera to world coordinates, `T_cam_obj` object to camera
   coordinates. Camera frames are optical: x right, y down, z forward. The world's z is up.
 - `cx`, `cy` have pixel centres at +0.5; `cx_opencv`, `cy_opencv` have them on integers, as OpenCV does.
-- `shapes/<category>/<instance_id>.glb` is the shape of an object of `objects`, in the object frame: metres, z up.
+{wide}- `shapes/<category>/<instance_id>.glb` is the shape of an object of `objects`, in the object frame: metres, z up.
+"""
+
+
+_WIDE: Final = """\
+- PNG files of 3 x 16 bits are bytes, because Pillow makes 8 bits of them without a word. As numbers x from 0 to 1:
+  `cv2.imdecode(numpy.frombuffer(cell, numpy.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535`. A normal is 2 x - 1, in the
+  camera's frame; a point of an object `coordinates_scale_m` x + `coordinates_offset_m`, in its own frame; (0, 0, 0) is none.
 """
 
 
 def _describe(field: pa.Field) -> str:
     if field.type == IMAGE:
         return "image"
+    if field.type in (IMAGES, pa.binary()):
+        return "list of images, one for each object" if field.type == IMAGES else "PNG of 3 x 16 bits, as bytes"
     if pa.types.is_list(field.type):
         return "list of " + ", ".join(f"`{one.name}`" for one in field.type.value_type)
     if pa.types.is_struct(field.type):

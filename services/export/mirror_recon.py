@@ -16,7 +16,7 @@ from schemas.dataset.layout import PixelKind
 from schemas.errors import plural
 from schemas.scene.view import Role
 from services.export.formats import Added, ExportRequest, Writer
-from services.export.source import ExportPair, ExportScene
+from services.export.source import ExportPair, ExportScene, in_units
 from services.merge.tables import escaped
 from workers.store.images import decode_png, encode_png
 
@@ -111,17 +111,9 @@ def _images_of(pair: ExportPair, patch: tuple[int, int] | None = None, place: st
             if data is None:
                 what = "patch" if patch else kind
                 return {}, f"no {role} view" if role not in pair.views else f"no {what} of the {role} view"
-            in_depth = in_units(data, pair.views[role]["depth_units_per_m"]) if kind == "depth" else data
+            in_depth = in_units(data, pair.views[role]["depth_units_per_m"], UNITS_PER_M) if kind == "depth" else data
             images[f"{name}{middle}{ending}"] = in_depth
     return images, ""
-
-
-def in_units(data: bytes, units_per_m: float) -> bytes:
-    """The PNG of a depth image in `UNITS_PER_M`; what does not fit 16 bits becomes 0, as all depth out of range."""
-    if units_per_m == UNITS_PER_M:
-        return data
-    depth = np.rint(decode_png(data) * (UNITS_PER_M / units_per_m))
-    return encode_png(np.where(depth <= np.iinfo(np.uint16).max, depth, 0).astype(np.uint16))
 
 
 def _distance_patch(pair: ExportPair, region_id: int, patch: bytes) -> NDArray[np.uint16]:

@@ -102,13 +102,23 @@ class Silhouette:
     box: Box
 
 
+def silhouette_of(mask: NDArray[np.bool_]) -> Silhouette:
+    """That of an object of which nothing lies outside the image."""
+    return Silhouette(mask, int(mask.sum()), box_of(mask))
+
+
+def reaches_edge(mask: NDArray[np.bool_]) -> bool:
+    """Whether a pixel at the edge of the image is in the mask [H, W]."""
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
+
+
 def whole_silhouette(label: Row, view: Row, visible: NDArray[np.bool_], shape: Shape | None) -> Silhouette | None:
     """The silhouette of the object of `label`, of which `visible` [H, W] is seen.
 
     Nothing is cast where all of it is seen. Otherwise rays through pixel centres meet its mesh alone; None without a shape.
     """
     if label["visible_fraction"] >= 1.0:
-        return Silhouette(visible, int(visible.sum()), box_of(visible))
+        return silhouette_of(visible)
     if shape is None:
         return None
     camera, T_cam_obj = read_camera(view), read_matrix(label["T_cam_obj"])

@@ -1,6 +1,7 @@
 """What an export reads: the scenes and pairs of a dataset that were chosen, and the sources of their shapes."""
 
 import contextlib
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import PixelKind, patch_index
+from schemas.dataset.layout import PixelKind, patch_index, samples_path
 from schemas.errors import CorruptError, InputError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
@@ -21,8 +22,15 @@ from services.dataset.splits import Splits, collect_ids, split_by_category
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
 from services.read.stored_tables import patch_paths, view_paths
 from workers.store.commit import read_committed, split_code
+from workers.store.images import decode_png, encode_png
 from workers.store.ledger import range_rows, read_range
 from workers.store.store import Store
+
+SIDES: tuple[Role, ...] = ("input", "mirror")
+"""Views from two sides; that of the depth camera beside the input camera shows what the input view does."""
+OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""A camera of OpenGL, as glTF and nerfstudio have it, looks along -z, and its y is up."""
+MM_PER_M = 1000.0
 
 _STRICTNESS = ("train", "val", "test")
 
@@ -50,6 +58,27 @@ class ExportPair:
         """The PNG of an image, None where the job stores none. Raises CorruptError where it is committed and missing."""
         row = self.views.get(role)
         return None if row is None else self._read(view_paths(row).get(kind))
+
+    def stack(self, role: Role, kind: PixelKind) -> NDArray | None:
+        """[objects, H, W] of a kind of image that every object has one of, by region; None where there is none."""
+        images = self.images(role, kind)
+        return np.stack([decode_png(data) for data in images]) if images else None
+
+    def images(self, role: Role, kind: PixelKind) -> list[bytes]:
+        """The PNGs of a kind of image that every object has one of, by region; none where the job stores none."""
+        row = self.views.get(role)
+        paths = {} if row is None else view_paths(row)
+        names = [kind] if kind in paths else map(f"{kind}{{}}".format, itertools.count())
+        return [self.read(paths[name]) for name in itertools.takewhile(paths.__contains__, names)]
+
+    def depth(self, role: Role, units_per_m: float) -> bytes | None:
+        """The PNG of a view's depth in other units; what does not fit 16 bits becomes 0, as all depth out of range."""
+        data = self.image(role, "depth")
+        return None if data is None else in_units(data, self.views[role]["depth_units_per_m"], units_per_m)
+
+    def label(self, role: Role, region_id: int) -> Row | None:
+        """The row of `objects` of one region in one view, None where the view is not stored."""
+        return next((row for row in self.labels(role) if row["region_id"] == region_id), None)
 
     def patch(self, role: Role, kind: PixelKind, region_id: int, objects: int) -> bytes | None:
         """The PNG of an object's patch, None where there is none: it would leave the image, or was not asked for."""
@@ -92,11 +121,26 @@ class ExportScene:
         bodies = self.row["bodies"] or [{**self.row, "region_id": REGION_FIRST_OBJECT}]
         return {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
 
+    def samples(self, instance_id: str) -> bytes | None:
+        """The file of the shape targets of an instance, None where none is stored."""
+        try:
+            return self.read(samples_path(self.assets[instance_id]["category"], instance_id))
+        except CorruptError:  # a shape that may not be passed on, or the table
+            return None
+
     @property
     def split(self) -> str:
         """train, val or test: the strictest of its objects, so that no scene of `train` shows an object of `test`."""
         places = [_STRICTNESS.index(self.assets[name]["split"]) for _, name in self.instances.values()]
         return _STRICTNESS[max(places)]
+
+
+def in_units(data: bytes, units_per_m: float, wanted_per_m: float) -> bytes:
+    """The PNG of a depth image in other units, as `ExportPair.depth` has it."""
+    if units_per_m == wanted_per_m:
+        return data
+    depth = np.rint(decode_png(data) * (wanted_per_m / units_per_m))
+    return encode_png(np.where(depth <= np.iinfo(np.uint16).max, depth, 0).astype(np.uint16))
 
 
 def iter_records(store: Store, codes: NDArray[np.int64]) -> Iterator[list[CommitRecord]]:

@@ -29,4 +29,8 @@ FORMATS = {
     "webdataset": Format("webdataset", "WebDataset", sharded=True),
     "huggingface": Format("huggingface", "HuggingFace", sharded=True),
     "gltf": Format("gltf", "Gltf"),
+    "occnet": Format("occnet", "OccNet"),
+    "pcn": Format("pcn", "Pcn"),
+    "nocs": Format("nocs", "Nocs"),
+    "nerf": Format("nerf", "Nerf"),
 }

@@ -1,8 +1,8 @@
 """Format `webdataset`: tar shards of bounded size, a sample for each pair, by split.
 
 The members of a sample are `<pose id>.<role>.rgb.png`, `<pose id>.depth.npz` and `<pose id>.region.npz` with an array for each
-role, and `<pose id>.json` with the rows of scene, views and objects. Numbers are no PNG, because the usual decoders of
-WebDataset turn every picture into colours: 16 bits into 8, and region ids into shares of 255.
+role, likewise image targets of the job, and `<pose id>.json` with the rows of scene, views and objects. Numbers are no PNG,
+because the usual decoders of WebDataset turn every picture into colours: 16 bits into 8, and region ids into shares of 255.
 """
 
 import io
@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from schemas.dataset.codec import Row
+from schemas.dataset.tables import NOT_IN_DIGEST
 from schemas.scene.view import MODALITIES, ROLES
 from services.export.formats import OF_SCENE, Added, ShardedWriter, encode_npz
 from services.export.source import ExportPair, ExportScene
 
-_PICTURES: Final = tuple(name for name, modality in MODALITIES.items() if modality.channels == 3)
+_PICTURES: Final = tuple(name for name, kind in MODALITIES.items() if (kind.channels, kind.dtype) == (3, "uint8"))
 """Modalities that are stored as PNG files; those of numbers are arrays."""
 _OF_SCENE: Final = (*OF_SCENE, "effects")
 _NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "capture")
@@ -53,13 +54,15 @@ class WebDataset(ShardedWriter):
 def members_of(scene: ExportScene, pair: ExportPair) -> list[tuple[str, bytes]]:
     """(name behind the key, bytes) of every member of a sample, in order."""
     members: list[tuple[str, bytes]] = []
-    for kind in MODALITIES:
+    for kind, modality in MODALITIES.items():
         if kind in _PICTURES:
             images = {role: pair.image(role, kind) for role in ROLES}
             members += [(f"{role}.{kind}.png", data) for role, data in images.items() if data is not None]
         else:
-            arrays = {role: pair.pixels(role, kind) for role in ROLES}
-            members.append((f"{kind}.npz", encode_npz({role: one for role, one in arrays.items() if one is not None})))
+            read = pair.stack if modality.each else pair.pixels
+            arrays = {role: one for role in ROLES if (one := read(role, kind)) is not None}
+            if arrays or modality.target is None:
+                members.append((f"{kind}.npz", encode_npz(arrays)))
     return [*members, ("json", _json(scene, pair))]
 
 
@@ -69,10 +72,20 @@ def _json(scene: ExportScene, pair: ExportPair) -> bytes:
     tree |= {"split": scene.split, "pose_id": pair.pose_id, "views": {}}
     for role in ROLES:
         if (row := pair.views.get(role)) is not None:
-            labels = [{k: v for k, v in one.items() if k not in _NOT_OF_OBJECTS} for one in pair.labels(role)]
+            labels = [label_of(one) for one in pair.labels(role)]
             columns = {name: value for name, value in row.items() if name not in _NOT_OF_VIEWS}
             tree["views"][role] = {**columns, "objects": labels}
     return json.dumps(tree).encode()
+
+
+def label_of(row: Row) -> Row:
+    """A row of `objects` without what is stored elsewhere in the sample, and without columns of targets that are not there."""
+    targets = NOT_IN_DIGEST["objects"]
+    return {
+        key: value
+        for key, value in row.items()
+        if key not in _NOT_OF_OBJECTS and not (value is None and key in targets)
+    }
 
 
 class _Tar:

@@ -11,10 +11,10 @@ from scipy.spatial.distance import pdist
 
 from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
-from services.export.shapes import box_of, color_vertices, whole_silhouette
+from services.export.shapes import box_of, color_vertices, reaches_edge, whole_silhouette
 from services.job.record import require_job
 from tests.datasets import make_dataset
-from tests.services.export.bop_reader import load_model, load_shots, points_in_model
+from tests.services.export.bop_reader import load_model, load_shots, points_in_model, read_picture
 from tests.services.export.exported import export_to, source_image, source_rows
 from workers.store.local import LocalStore
 
@@ -190,6 +190,35 @@ def test_pairs_without_colour_and_hidden_objects_without_a_shape_are_left_out(pi
     assert json.loads((tmp_path / "new" / "models" / "models_info.json").read_text()) == {}
 
 
+def test_silhouettes_are_those_of_the_target_and_need_no_shape(heap, tmp_path):
+    shutil.copytree(heap.name, tmp_path / "copy")
+    shutil.rmtree(tmp_path / "copy" / "assets")
+    job, catalogue = tmp_path / "copy" / "job.yaml", require_job(heap).catalogue
+    job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
+    for name, store in (("whole", heap), ("bare", LocalStore(tmp_path / "copy"))):
+        manifest = export_to(store, tmp_path / name, "bop").manifest
+        assert (manifest["pairs"], manifest["models"]) == (1, 3 if name == "whole" else 0)
+        shots, views, seen = shots_of(tmp_path / name), views_by_place(store), 0
+        rows = [row for row in source_rows(heap.root, "objects") if row["region_id"] >= 3]
+        for shot in shots:
+            view = views[shot.scene, shot.number]
+            own = sorted(
+                (one for one in rows if (one["pose_id"], one["role"]) == (view["pose_id"], view["role"])),
+                key=lambda one: one["region_id"],
+            )
+            for number, (thing, row) in enumerate(zip(shot.things, own, strict=True)):
+                word = f"amodal{'Aligned' if view['role'] == 'aligned' else ''}{view['pose_id']:05d}obj{number}"
+                stored = read_picture(heap.root / view["category"] / f"{word}.png") > 0
+                np.testing.assert_array_equal(thing.mask, stored)
+                assert not (thing.mask_visib & ~thing.mask).any()
+                x, y, width, height = row["amodal_bbox_xywh"]
+                assert thing.info["bbox_obj"] == [x, y, width - 1, height - 1]
+                assert thing.info["px_count_all"] == row["amodal_pixels"]
+                assert thing.info["visib_fract"] == pytest.approx(row["visible_fraction"], abs=0.02)
+                seen += row["visible_fraction"] < 0.9
+        assert seen >= 2
+
+
 # ------------------------------------------------------------------------------------------------ models
 
 
@@ -241,5 +270,6 @@ def test_a_silhouette_holds_what_is_hidden_and_what_lies_outside_the_image(x_m, 
     assert whole_silhouette(label, view, square(left, seen), None) is None
     all_seen = whole_silhouette({**label, "visible_fraction": 1.0}, view, square(10, 30), None)
     assert (all_seen.pixels, all_seen.box) == (800, (10, 40, 19, 39))
+    assert [reaches_edge(square(*ends)) for ends in ((10, 30), (0, 30), (140, 160))] == [False, True, True]
     assert box_of(np.zeros((4, 4), bool)) == (-1, -1, -1, -1)
     assert box_of(np.outer([0, 0, 1], [0, 1, 0]) > 0) == (1, 2, 0, 0)

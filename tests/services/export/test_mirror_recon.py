@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from services.export.mirror_recon import in_units
+from services.export.source import in_units
 from tests.datasets import make_dataset
 from tests.services.export.authors_loader import load_pairs, load_several
 from tests.services.export.exported import export_to, source_image, source_poses, source_rows
@@ -138,5 +138,5 @@ def test_a_pair_that_lacks_an_image_is_left_out_and_counted(changes, reason, tmp
 
 def test_depth_in_other_units_is_converted_to_the_nearest_unit():
     depth = np.array([[0, 1000, 1500, 65535]], np.uint16)
-    converted = cv2.imdecode(np.frombuffer(in_units(encode_png(depth), 1000.0), np.uint8), cv2.IMREAD_UNCHANGED)
+    converted = cv2.imdecode(np.frombuffer(in_units(encode_png(depth), 1000.0, 5000.0), np.uint8), cv2.IMREAD_UNCHANGED)
     assert converted.tolist() == [[0, 5000, 7500, 0]]

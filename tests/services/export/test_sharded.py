@@ -134,6 +134,34 @@ def test_the_webdataset_package_reads_every_sample_with_any_of_its_decoders(deco
         assert 3 in one["region.npz"]["mirror"]
 
 
+def test_image_targets_are_arrays_and_colours_pictures(heap, tmp_path):
+    assert "coordinates_offset_m" in export_to(heap, tmp_path / "new", "webdataset").manifest["targets"]
+    (sample,) = samples_of(tmp_path / "new").values()
+    for kind, (role, word, stored) in targets_of(heap):
+        read = (
+            decode(sample[f"{role}.{kind}.png"])
+            if kind == "albedo"
+            else np.load(io.BytesIO(sample[f"{kind}.npz"]))[role]
+        )
+        assert read.dtype == stored.dtype, word
+        np.testing.assert_array_equal(read, stored)
+    told = json.loads(sample["json"])["views"]["mirror"]["objects"]
+    assert all({"amodal_pixels", "coordinates_scale_m"} <= one.keys() for one in told if one["region_id"] > 2)
+
+
+def targets_of(store):
+    """(kind, (role, word in the file's name, pixels)) of every image target that is stored; of `amodal` [objects, H, W]."""
+    words = {"normals": "normals", "coordinates": "coordinates", "albedo": "albedo", "back": "back"}
+    words |= {"back_region": "backSegment", "layer2": "layer2_", "layer2_region": "layerSegment2_", "amodal": "amodal"}
+    (category,) = {path.parent.name for path in store.root.glob("*/RGB00000.png")}
+    for role, ending, pose_id in (("input", "", 0), ("aligned", "Aligned", 0), ("mirror", "", 1)):
+        for kind, word in words.items():
+            numbers = [f"{pose_id:05d}obj{n}" for n in range(3)] if kind == "amodal" else [f"{pose_id:05d}"]
+            files = [store.root / category / f"{word}{ending}{number}.png" for number in numbers]
+            pixels = [decode(path.read_bytes()) for path in files]
+            yield kind, (role, word, np.stack(pixels) if kind == "amodal" else pixels[0])
+
+
 # ------------------------------------------------------------------------------------------------ Hugging Face
 
 
@@ -194,3 +222,26 @@ def test_the_datasets_package_reads_every_image(files, exported, tmp_path):
     export_to(files, other, "huggingface", last_scene=0)
     loaded = datasets.load_dataset(str(other), cache_dir=str(tmp_path / "cache"))
     assert sum(len(rows) for rows in loaded.values()) == 2, "not what is kept of another folder of that name"
+
+
+def test_targets_of_16_bits_keep_them_and_silhouettes_are_a_list(heap, files, exported, tmp_path):
+    """Pillow, with which the package decodes images, makes 8 bits of 3 x 16: those columns are bytes."""
+    datasets = pytest.importorskip("datasets")
+    manifest = export_to(heap, tmp_path / "new", "huggingface").manifest
+    (split,) = manifest["rows"]
+    (row,) = datasets.load_dataset(str(tmp_path / "new"), split=split, cache_dir=str(tmp_path / "cache"))
+    for kind, (role, word, stored) in targets_of(heap):
+        cell = row[f"{role}_{kind}"]
+        read = (
+            decode(cell)
+            if isinstance(cell, bytes)
+            else np.asarray(cell)
+            if kind != "amodal"
+            else np.stack(list(map(np.asarray, cell)))
+        )
+        np.testing.assert_array_equal(read, stored, err_msg=word)
+    assert row["objects"][1]["coordinates_scale_m"] > 0
+    assert "bytes, because Pillow" in (tmp_path / "new" / "README.md").read_text()
+    plain = pq.read_schema(next(exported["huggingface"][0].glob("data/*.parquet")))
+    assert not any("amodal" in name or "normals" in name for name in plain.names)
+    assert not any("amodal" in field.name for field in plain.field("objects").type.value_type)

@@ -25,7 +25,7 @@ from schemas.scene.view import Camera, Intrinsics
 from services.cli.main import main
 from services.dataset import splits
 from services.dataset.splits import Splits, collect_ids, split_by_category
-from services.export.folder import ExportFolder, Rounds
+from services.export.folder import ExportFolder, Register, Rounds
 from services.export.shapes import Shapes, color_vertices, covered
 from services.export.source import iter_ranges, scenes_of
 from services.export.table import FORMATS
@@ -41,6 +41,8 @@ from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
 
 SPLITS = ("train", "val", "test")
+OF = dict.fromkeys(("occnet", "nocs"), ("shaped", "shaped_tars"))
+"""Datasets that formats which need targets are tested on."""
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -61,12 +63,14 @@ class Killed(BaseException):
 @pytest.mark.parametrize(
     ("points", "name"),
     [
-        *((1, name) for name in ("mirror-recon", "webdataset")),  # a file for each thing, and shards
+        # A file for each thing, shards, and a register
+        *((1, name) for name in ("mirror-recon", "webdataset", "occnet")),
         *(pytest.param(6, name, marks=pytest.mark.minute) for name in FORMATS),
         *(pytest.param(24, name, marks=pytest.mark.slow) for name in FORMATS),
     ],
 )
-def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, name, files, tmp_path, monkeypatch):
+def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, name, request, tmp_path, monkeypatch):
+    files = request.getfixturevalue(OF.get(name, ("files", "tars"))[0])
     replace, calls = os.replace, itertools.count()
 
     def die_at(*numbers):
@@ -101,7 +105,8 @@ def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, nam
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, files, tars, tmp_path):
+def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, request, tmp_path):
+    files, tars = map(request.getfixturevalue, OF.get(name, ("files", "tars")))
     sources = {"files": files, "tars": tars, "bucket": in_a_bucket(tars.root)}
     for place, store in sources.items():
         export_to(store, tmp_path / place, name, shard_mb=0)
@@ -159,6 +164,19 @@ def test_what_was_appended_after_the_last_checkpoint_is_taken_back(tmp_path):
     assert (place / "a" / "list.txt").read_bytes() == b"one\nthree\n"
     assert sorted(path.name for path in place.iterdir()) == ["a", "export.json"]
     assert ExportFolder(place).finished() == {"pairs": 1}
+
+
+def test_entries_of_a_register_after_the_last_checkpoint_are_taken_back(tmp_path):
+    folder = ExportFolder(tmp_path / "new")
+    with folder.claimed({}):
+        register = Register(folder, 0)
+        assert [register.add("mug/b", "x"), register.add("mug/a"), register.state()] == [1, 2, 2]
+        assert [register.add("mug/a", "late"), register.state()] == [3, 3]  # and no checkpoint
+        register.close()
+        again = Register(folder, 2)
+        assert list(again.counts()) == [("mug/a", 1), ("mug/b", 1)] and again.of("mug/b") == [(1, "x")]
+        assert again.add("mug/a", "new") == 3 and again.of("mug/a") == [(2, ""), (3, "new")]
+        again.close()
 
 
 def test_an_unfinished_export_that_is_anothers_or_damaged_is_refused(tmp_path):
