@@ -282,11 +282,19 @@ def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
         field = schema.field(column)
         if not field.nullable:
             raise CorruptError(f"{name} lacks the column {column} of the table {table}")
-        rows = rows.append_column(field, pa.nulls(rows.num_rows, field.type))
+        rows = rows.append_column(field, _nulls(rows.num_rows, field.type))
     try:
         return rows.select(schema.names).cast(schema)  # Parquet has other names inside lists
     except (pa.ArrowException, ValueError) as error:
         raise CorruptError(f"{name} cannot be read: {error}; `verso verify` lists every damaged file") from error
+
+
+def _nulls(count: int, kind: pa.DataType) -> pa.Array:
+    """So many missing values. pyarrow's own have missing items below a list of fixed size, which such a list may not have."""
+    if not pa.types.is_fixed_size_list(kind):
+        return pa.nulls(count, kind)
+    items = pa.array(np.zeros(count * kind.list_size), kind.value_type)
+    return pa.FixedSizeListArray.from_arrays(items, type=kind, mask=pa.array([True] * count, pa.bool_()))
 
 
 def join_rows(table: str, parts: Sequence[pa.Table]) -> pa.Table:

@@ -16,11 +16,12 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 @pytest.fixture(scope="module")
-def folder(files, tmp_path_factory):
+def folder(files, shaped, tmp_path_factory):
     """A folder in which the page's commands were run."""
     place = tmp_path_factory.mktemp("page")
     (place / "data").mkdir()
     (place / "data" / "tabletop").symlink_to(files.name)
+    (place / "data" / "targets").symlink_to(shaped.name)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         for words in COMMANDS:
@@ -29,7 +30,7 @@ def folder(files, tmp_path_factory):
 
 
 def test_every_command_of_the_page_exports(folder):
-    assert len(COMMANDS) == 7 and "`--shard-mb` (256)" in PAGE
+    assert len(COMMANDS) == 11 and "`--shard-mb` (256)" in PAGE
     assert {words[words.index("--format") + 1] for words in COMMANDS} == set(FORMATS)
     for words in COMMANDS:
         assert (folder / words[2] / "export.json").exists() and not (folder / words[2] / "_export").exists()
@@ -59,8 +60,9 @@ def test_the_page_names_every_kind_of_file_that_an_export_writes(folder):
     for words in COMMANDS[: len(FORMATS)]:
         for path in contents(folder / words[2]):
             name = re.sub(r"[0-9]{5,}", "#", path.rpartition("/")[2])
-            if path.startswith("shapes/"):
-                name = "<instance_id>.glb"
+            if path.startswith("shapes/") or "/complete/" in path:
+                name = f"<instance_id>{path[-4:]}"
+            name = re.sub(r"^0[0-9]\.pcd", "00.pcd", re.sub(r"^[0-9]{4}_", "0000_", name))
             known = re.sub(r"^(segmentIn|depthIn)", "rgbIn", name)
-            known = re.sub(r"#\.(aligned|mirror|projected)\.", "#.input.", known)
+            known = re.sub(r"#([._])(aligned|mirror|projected)\.", r"#\1input.", known)
             assert known in told, f"{words[2]}/{path}"
