@@ -66,7 +66,7 @@ def draw_samples(asset: Asset, targets: Targets) -> Samples:
             share, notes = None, [*notes, "no samples of the volume: the faces enclose none"]
     if arrays:
         lower, upper = asset.shape.bounds
-        arrays |= {"loc": (lower + upper) / 2.0, "scale": np.float64((upper - lower).max())}
+        arrays |= {"loc": (lower + upper) / 2.0, "scale": np.asarray((upper - lower).max())}
     return Samples(arrays, share, tuple(notes))
 
 
