@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import CorruptError
 from schemas.job.targets import ShapeTarget, Targets
-from schemas.scene.shape import Asset, Mesh, Shape
+from schemas.scene.shape import Asset, Mesh, Part, Shape
 from workers.assets.external.mesh import merge_points
 from workers.assets.mass import unite_bodies
-from workers.geometry.colour import encode_codes
+from workers.geometry.colour import SRGB_STEPS, decode_srgb, encode_codes
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.mesh import face_areas, face_normals
-from workers.geometry.surfaces import base_light
+from workers.geometry.surfaces import mix, sample_texture
 from workers.geometry.winding import winding_numbers, winding_of_closed
 
 GROWN = 1.05
@@ -123,13 +123,26 @@ def _draw_surface(shape: Shape, solid: Mesh | None, count: int, rng: np.random.G
     for part in shape.parts:
         mine = np.flatnonzero((face >= start) & (face < start + len(part.faces)))
         corners = np.ascontiguousarray(part.faces[face[mine] - start])
-        colors[mine] = encode_codes(base_light(part, corners, np.ascontiguousarray(weights[mine])))
+        colors[mine] = encode_codes(_base_light(part, corners, np.ascontiguousarray(weights[mine])))
         start += len(part.faces)
     return {
         "surface_points": points.astype(np.float32),
         "surface_normals": face_normals(mesh.vertices, mesh.faces)[face].astype(np.float32),
         "surface_colors": colors,
     }
+
+
+def _base_light(part: Part, corners: NDArray[np.int32], weights: Array) -> Array:
+    """[N, 3], or [1, 3] where it is the same everywhere: linear light of a part's base colour, vertex colours and texture.
+
+    At the points that weights [N, 3] of corners [N, 3], vertices of the part, add up to; 1 is white.
+    """
+    light = decode_srgb(np.array([part.material.base_color[:3]]))
+    if part.colors is not None:
+        light = light * mix(SRGB_STEPS[part.colors[:, :3]], corners, weights)
+    if part.material.texture is not None and part.uv is not None:
+        light = light * sample_texture(part.material.texture, mix(part.uv, corners, weights), SRGB_STEPS)
+    return light
 
 
 def _draw_volume(

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Mesh, Part
+from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import NEAR_M
-from workers.geometry.colour import SRGB_STEPS, decode_srgb
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import face_planes
@@ -324,19 +323,6 @@ def _mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:
             for channel in range(values.shape[1]):
                 mixed[n, channel] += weights[n, corner] * values[corners[n, corner], channel]
     return mixed
-
-
-def base_light(part: Part, corners: NDArray[np.int32], weights: Array) -> Array:
-    """[N, 3], or [1, 3] where it is the same everywhere: linear light of a part's base colour, vertex colours and texture.
-
-    At the points that weights [N, 3] of corners [N, 3], vertices of the part, add up to; 1 is white.
-    """
-    light = decode_srgb(np.array([part.material.base_color[:3]]))
-    if part.colors is not None:
-        light = light * mix(SRGB_STEPS[part.colors[:, :3]], corners, weights)
-    if part.material.texture is not None and part.uv is not None:
-        light = light * sample_texture(part.material.texture, mix(part.uv, corners, weights), SRGB_STEPS)
-    return light
 
 
 @compiled_for("const(u1[:,:,::1]), f8[:,::1], f8[::1]", "u1[:,:,::1], f8[:,::1], f8[::1]")

@@ -16,17 +16,17 @@ from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
 from schemas.scene.view import LAYERS, Camera, PixelKind
-from workers.geometry.colour import encode_codes
+from workers.geometry.colour import SRGB_STEPS, decode_srgb, encode_codes
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import quantise_depth
 from workers.geometry.surfaces import (
     Surfaces,
     Triangles,
     all_surfaces,
-    base_light,
     corner_weights,
     mix,
     nearest_faces,
+    sample_texture,
     triangles_of,
 )
 from workers.scene.context import Stopwatch
@@ -131,7 +131,16 @@ def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     flat = image.reshape(-1, 3)
     for thing, pixels in seen.by_thing():
         for part, some, corners, weights in _parts_of(seen, thing, pixels):
-            flat[some] = encode_codes(base_light(part, corners, weights))
+            base = decode_srgb(np.array(part.material.base_color[:3]))
+            if part.material.texture is None and part.colors is None:
+                flat[some] = encode_codes(base)
+                continue
+            light = np.broadcast_to(base, (len(some), 3))
+            if part.colors is not None:
+                light = light * mix(SRGB_STEPS[part.colors[:, :3]], corners, weights)
+            if part.material.texture is not None and part.uv is not None:
+                light = light * sample_texture(part.material.texture, mix(part.uv, corners, weights), SRGB_STEPS)
+            flat[some] = encode_codes(light)
     return image
 
 
