@@ -16,6 +16,7 @@ from tests.services.export.exported import export_to
 from tests.services.read.conftest import TINY, spoil
 from workers.assets.samples import decode_samples, encode_samples
 from workers.scene.context import Stopwatch
+from workers.store.commit import committed_files, read_record
 from workers.store.local import LocalStore
 
 POINTS = 300
@@ -38,6 +39,9 @@ def test_scenes_that_share_a_shape_store_its_samples_once_and_its_row_lists_them
     rows = find_scene(sampled, 0).rows["assets"]
     assert rows == find_scene(sampled, 1).rows["assets"] and len(rows) == 2
     assert samples_in(sampled) == sorted(row["samples"]["path"] for row in rows)
+    record = read_record(sampled, 0)
+    named = {entry.path for entry in committed_files(sampled, record)} - {entry.path for entry in record.files}
+    assert set(samples_in(sampled)) <= named, "by the rows alone"
     for row in rows:
         data = sampled.read(row["samples"]["path"])
         assert (row["samples"]["bytes"], row["samples"]["points"], row["samples"]["open_share"]) == (
