@@ -77,7 +77,8 @@ def winding_numbers(points: Array, mesh: Mesh) -> Array:
 
     1 inside a closed body that is wound outwards, the sum where bodies overlap, 0 outside; of an open mesh, what it hides of all
     directions. Faces near by count by their solid angles. A branch of the tree, of area A and with all points within r of its
-    middle, counts as one dipole from a distance R of `WIDE` r on (Barill et al., Fast winding numbers, 2018). That is wrong by at most A r / (2 pi (R - r)^3), as the second derivatives of 1 / (4 pi R) are at most 2 / (4 pi R^3).
+    middle, counts as one dipole from a distance R of `WIDE` r on (Barill et al., Fast winding numbers, 2018). That is wrong by at
+    most A r / (2 pi (R - r)^3), as the second derivatives of 1 / (4 pi R) are at most 2 / (4 pi R^3).
     """
     number = np.zeros(len(points))
     if len(mesh.faces) and len(points):
@@ -90,7 +91,7 @@ def winding_numbers(points: Array, mesh: Mesh) -> Array:
 
 @compiled
 def _expand(corners: Array, tree: Tree) -> Array:
-    """[nodes, 7]: of each node's faces the mean point, the square of the largest distance from it, the sum of area times normal."""
+    """[nodes, 7]: each node's mean point, the square of the largest distance from it, the sum of areas times normals."""
     order, _, _, first, count = tree
     faces = len(corners)
     normal, mean, area = np.empty((faces, 3)), np.empty((faces, 3)), np.empty(faces)
