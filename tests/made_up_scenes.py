@@ -10,11 +10,16 @@ from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import IMAGES, asset_path, file_pose_id, image_path, input_pose_id, patch_path
 from schemas.dataset.tables import NOT_IN_DIGEST
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
+from schemas.scene.view import MODALITIES
 from workers.store.attempt import Attempt, begin_attempt
 from workers.store.store import Store
 
 CATEGORIES = ("bottle", "camera", "mug")
 TERMS = CommitTerms(job_digest="j" * 64, fingerprint="stack-a", range_size=4, pairs_per_scene=1)
+
+
+PLAIN = tuple(image for image in IMAGES if MODALITIES[image.pixels].target is None)
+"""The images of a job without targets."""
 
 
 def terms(**changes) -> CommitTerms:
@@ -50,7 +55,7 @@ def category_of(scene_id: int) -> str:
     return CATEGORIES[int(numbers_of(scene_id).integers(len(CATEGORIES)))]
 
 
-def made_scene(scene_id: int, salt: str = "", images=IMAGES, shapes: bool = True) -> SceneOutput:
+def made_scene(scene_id: int, salt: str = "", images=PLAIN, shapes: bool = True) -> SceneOutput:
     """A scene without failure; `salt` changes its images, as another software stack would; `images` are those it has."""
     category = category_of(scene_id)
     pose_id = input_pose_id(scene_id, 0, 1)
@@ -110,7 +115,7 @@ def scene(scene_id: int) -> SceneOutput:
 
 def small_scene(scene_id: int) -> SceneOutput:
     """The scene with two images and their patches only."""
-    return failed_scene(scene_id) if fails(scene_id) else made_scene(scene_id, images=(IMAGES[0], IMAGES[6]))
+    return failed_scene(scene_id) if fails(scene_id) else made_scene(scene_id, images=(PLAIN[0], PLAIN[6]))
 
 
 def attempt_at(store: Store, start: int, stop: int, settings: CommitTerms = TERMS, make=scene, **span) -> Attempt:
@@ -191,4 +196,5 @@ def _asset(category: str, instance: str, shapes: bool) -> dict[str, object]:
         | {"path": f"models/{instance}.obj" if shapes else None, "extents_m": [0.1, 0.2, 1 / 3], "volume_m3": None}
         | {"sha256": hashlib.sha256(instance.encode()).hexdigest(), "watertight": False, "scale": 1.0}
         | {"T_source_to_object": matrix_of(len(instance)), "split": "train", "notes": []}
+        | dict.fromkeys(NOT_IN_DIGEST["assets"])
     )

@@ -148,6 +148,11 @@ def is_shape(path: str) -> bool:
     return path.startswith(f"{ASSETS}/")
 
 
+def is_glb(path: str) -> bool:
+    """True for the GLB of a shape, which no column of a merged table lists."""
+    return is_shape(path) and path.endswith(".glb")
+
+
 def is_plain_path(path: str) -> bool:
     """Whether a path stays below the folder that it is joined to, and prints as one line.
 

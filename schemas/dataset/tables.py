@@ -251,6 +251,12 @@ T_source_to_object | double[16] | m | object, source | Takes scaled source coord
 scale | double | 1 | - | {scale}
 split | string | - | - | train, val or test, by the instance's id: no shape is in two.
 notes | list of string? | - | - | What was repaired or left out.
+samples | struct?, targets | - | - | Its points (`targets.shape`); null without, and where `notes` says why it has none.
+samples.path | string | - | - | Path below the dataset's folder.
+samples.bytes | int64 | byte | - | Size of the file.
+samples.sha256 | string | - | - | SHA-256 of the file.
+samples.points | int64 | count | - | Number of points of the surface, and as many of the volume.
+samples.open_share | double? | 1 | - | Share of the volume's points of which the faces leave open whether they are inside.
 """,
     "failures": """
 scene_id | int64 | id | - | {scene_id}
@@ -338,5 +344,5 @@ NOT_IN_DIGEST = {
 """Columns that are left out of a table's digest where no row has a value: so a job without targets has the digest of before."""
 
 SHAPE_FILE_COLUMNS = (pa.field("file_bytes", pa.int64()), pa.field("file_sha256", pa.string()))
-"""More columns of `assets` in a range's own file: the size and the SHA-256 of the asset's shape, null where none is
-stored. The merged table does not have them."""
+"""More columns of `assets` in a range's own file: the size and the SHA-256 of the asset's GLB, null where none is
+stored. The merged table does not have them. Its samples are in the column `samples`."""

@@ -243,17 +243,23 @@ class ShardedWriter(Writer):
         self.rounds.close()
 
     def put_shapes(self, scene: ExportScene) -> None:
-        """Writes `shapes/<category>/<instance id>.glb` of all that stands in a scene, and points on it where asked for."""
+        """Writes `shapes/<category>/<instance id>.glb` of all that stands in a scene, and points on it where asked for.
+
+        Samples that the dataset has (`targets.shape`) are copied beside it, as `<instance id>.samples.npz`.
+        """
         for instance_id in (scene.row["table_id"], *(name for _, name in scene.instances.values())):
-            category = scene.assets[instance_id]["category"]
+            asset = scene.assets[instance_id]
+            category, samples = asset["category"], asset["samples"]
             path = f"shapes/{category}/{instance_id}"
             if (self.folder.root / f"{path}.glb").exists():
                 continue
             try:
                 data = scene.read(asset_path(category, instance_id))
             except CorruptError:  # it is not stored: only shapes that may be passed on are
-                self.kept["without_shape"] = sorted({*self.kept["without_shape"], scene.assets[instance_id]["source"]})
+                self.kept["without_shape"] = sorted({*self.kept["without_shape"], asset["source"]})
                 continue
+            if samples is not None:
+                self.folder.put(f"{path}.samples.npz", scene.read(samples["path"]))
             if self._points:
                 self.folder.put(f"{path}.npz", encode_npz(points_on(data, self._points, instance_id)))
             self.folder.put(f"{path}.glb", data)

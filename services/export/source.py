@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import PixelKind, patch_index, samples_path
+from schemas.dataset.layout import PixelKind, patch_index
 from schemas.errors import CorruptError, InputError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
@@ -122,11 +122,9 @@ class ExportScene:
         return {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
 
     def samples(self, instance_id: str) -> bytes | None:
-        """The file of the shape targets of an instance, None where none is stored."""
-        try:
-            return self.read(samples_path(self.assets[instance_id]["category"], instance_id))
-        except CorruptError:  # a shape that may not be passed on, or the table
-            return None
+        """The file of the shape targets of an instance, None where it has none. Raises CorruptError where it is missing."""
+        stored = self.assets[instance_id]["samples"]
+        return None if stored is None else self.read(stored["path"])
 
     @property
     def split(self) -> str:

@@ -11,13 +11,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.dataset.commit import CommitRecord, FileEntry, Span
-from schemas.dataset.layout import RANGES, asset_path, is_range_file, is_shape, pose_of_image, range_table_path
+from schemas.dataset.layout import RANGES, is_range_file, is_shape, pose_of_image, range_table_path
 from schemas.dataset.tables import SCHEMAS, SHAPE_FILE_COLUMNS, TABLES
 from schemas.errors import CorruptError
 from services.merge.shared import explain_full_disk, open_scratch
 from workers.store.commit import committed_files, read_range_file
 from workers.store.ledger import iter_ranges, range_rows
-from workers.store.manifest import conform, decode_rows, join_rows
+from workers.store.manifest import conform, decode_rows, files_of_assets, join_rows
 from workers.store.store import Store, map_ahead
 
 RANGES_PER_BLOCK = 128
@@ -123,16 +123,12 @@ def _check_scenes(spans: Sequence[Span], rows: Mapping[str, pa.Table]) -> None:
 
 def _shapes(assets: pa.Table) -> Iterator[FileEntry]:
     """The shapes that a range made, where its own table of assets lists them. Raises CorruptError as `committed_files`."""
-    names = ["category", "instance_id", *(field.name for field in SHAPE_FILE_COLUMNS)]
-    if not set(names) <= set(assets.column_names):
+    if not {field.name for field in SHAPE_FILE_COLUMNS} <= set(assets.column_names):
         return
-    for category, instance_id, size, sha256 in zip(*(assets.column(n).to_pylist() for n in names), strict=True):
-        path = asset_path(category, instance_id)
-        if sha256 is None:
-            continue
-        if not is_range_file(path, 0, 0):
-            raise CorruptError(f"a row of assets lists {path!r}, which is not the name of a shape")
-        yield FileEntry(path=path, bytes=size, sha256=sha256)
+    for entry in files_of_assets(assets):
+        if not is_range_file(entry.path, 0, 0):
+            raise CorruptError(f"a row of assets lists {entry.path!r}, which is not the name of a shape")
+        yield entry
 
 
 def _concatenated(table: str, parts: Sequence[pa.Table], name: str) -> pa.Table:

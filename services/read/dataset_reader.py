@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
 from workers.store.commit import code_of, list_codes, split_code
@@ -95,7 +96,7 @@ def find_records(store: Store, scene_id: int) -> list[CommitRecord]:
 
 
 def file_reader(read: ReadFile, stored: StoredRange) -> ReadFile:
-    """Reads files of a range by path, from their own place or from a tar (each tar is read once).
+    """Reads images and shapes of a range by path, from their own place or from a tar (each tar is read once).
 
     `read` is the store's. What comes back raises CorruptError where a file is missing.
     """
@@ -113,6 +114,8 @@ def file_reader(read: ReadFile, stored: StoredRange) -> ReadFile:
         members.update(read_tar(path.partition("/")[0], read_committed(path), path))
 
     def read_packed(path: str) -> bytes:
+        if is_shape(path):
+            return read_committed(path)
         if path not in members:
             raise CorruptError(f"{path} is committed and in no tar")
         return members[path]

@@ -16,6 +16,7 @@ from schemas.dataset.layout import (
     JOB_FILE,
     MANIFEST,
     RANGES,
+    is_glb,
     is_shape,
     pose_of_image,
     range_table_path,
@@ -28,6 +29,7 @@ from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, file_reader, find_scene
 from services.read.stored_tables import read_merged
+from workers.assets.samples import decode_samples
 from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
@@ -37,7 +39,7 @@ from workers.store.commit import read_committed
 from workers.store.file_system import temporary_folder
 from workers.store.images import decode_png
 from workers.store.local import LocalStore
-from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
+from workers.store.manifest import decode_table, encode_table, files_of_rows, sorted_rows, table_of_rows
 from workers.store.store import Store
 
 DEPTH_UNITS = 2
@@ -48,6 +50,9 @@ PIXEL_SHARE = 0.002
 
 RGB_STEPS = 3
 """Tolerance of a colour on another stack, of 255 steps."""
+
+SAMPLE_STEP = 1e-6
+"""Tolerance of a shape's samples on another stack, metres for points."""
 
 
 @dataclass(frozen=True)
@@ -90,17 +95,22 @@ def open_context(record: JobRecord) -> WorkerContext:
 
 
 def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:
-    """Differences of a scene's new images from the stored ones, a sentence each."""
-    views = [view for view in stored.rows["views"] if view["scene_id"] == output.scene_id]
-    scene_files = {file["path"]: file["sha256"] for view in views for file in view["files"]}
-    made = {file.path: file for file in output.files if not is_shape(file.path)}
+    """Differences of a scene's new images and samples from the stored ones, a sentence each."""
+    used = {row["instance_id"] for row in output.rows.get("assets", [])}
+    rows = {
+        "views": [view for view in stored.rows["views"] if view["scene_id"] == output.scene_id],
+        "assets": [asset for asset in stored.rows["assets"] if asset["instance_id"] in used],
+    }
+    scene_files = {file["path"]: file["sha256"] for file in files_of_rows(rows)}
+    made = {file.path: file for file in output.files if not is_glb(file.path)}
     only = sorted(made.keys() ^ scene_files.keys())
     differences = [f"{path}: only {'stored' if path in scene_files else 'made now'}" for path in only]
     read = file_reader(store.read, stored)
     for path in sorted(made.keys() & scene_files.keys()):
         if made[path].sha256 == scene_files[path]:
             continue
-        within, how = _compare_pixels(read(path), made[path].data)
+        compare = _compare_samples if is_shape(path) else _compare_pixels
+        within, how = compare(read(path), made[path].data)
         if same_stack or not within:
             differences.append(f"{path}: {how}")
     return differences
@@ -115,6 +125,15 @@ def _compare_pixels(before: bytes, now: bytes) -> tuple[bool, str]:
     allowed = DEPTH_UNITS if a.dtype == np.uint16 else RGB_STEPS if a.ndim == 3 else 0
     share = float((gap > allowed).mean())
     return share <= PIXEL_SHARE, f"{share:.4%} of its values differ by more than {allowed}, at most {gap.max()}"
+
+
+def _compare_samples(before: bytes, now: bytes) -> tuple[bool, str]:
+    """The same for the samples of a shape."""
+    a, b = decode_samples(before), decode_samples(now)
+    if a.keys() != b.keys() or any(a[name].shape != b[name].shape for name in a):
+        return False, f"has {', '.join(a)}, and now {', '.join(b)}"
+    share = max(float((np.abs(a[name].astype(np.float64) - b[name]) > SAMPLE_STEP).mean()) for name in a)
+    return share <= PIXEL_SHARE, f"{share:.4%} of an array's values differ by more than {SAMPLE_STEP}"
 
 
 def compare_rows(stored: StoredRange, output: SceneOutput, ignored: frozenset[str] = frozenset()) -> list[str]:

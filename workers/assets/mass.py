@@ -38,11 +38,11 @@ def weigh(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> tuple[MassP
     vertices, faces = shape.vertices, shape.faces.astype(np.int64)
     if not is_solid(vertices, faces):
         return shell_mass(vertices, faces, shell_kg_m2), 0.0
-    united, common_m3 = _united(vertices, faces)
+    united, common_m3 = unite_bodies(vertices, faces)
     return solid_mass(*united, density_kg_m3), common_m3
 
 
-def _united(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array, NDArray[np.int64]], float | None]:
+def unite_bodies(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array, NDArray[np.int64]], float | None]:
     """The surface of the union of closed bodies, voids taken from the body around them; and the volume that they share.
 
     As they are where none meet another or a void lies in none; None as the volume where it would take too long.

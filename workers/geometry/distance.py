@@ -84,14 +84,18 @@ def distance_to_mesh(points: Array, mesh: Mesh) -> tuple[Array, NDArray[np.int64
     distance, face = np.full(len(points), np.inf), np.full(len(points), -1, np.int64)
     if len(mesh.faces) and len(points):
         corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float64)
-        order, low, high, first, count = _build(corners)
+        order, low, high, first, count = build_tree(corners)
         _search(np.ascontiguousarray(points, np.float64), corners, order, low, high, first, count, distance, face)
     return distance, face
 
 
+Tree = tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], NDArray[np.int64]]
+"""Faces in order of the leaves; of each node low and high corner [nodes, 3], and first and count [nodes] of its faces."""
+
+
 @compiled_for("f8[:,:,::1]")
-def _build(corners: Array) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """A balanced tree as a heap: (faces in order of the leaves; low, high [nodes, 3]; first, count [nodes] of each node's faces).
+def build_tree(corners: Array) -> Tree:
+    """A balanced tree of boxes as a heap: node n has the children 2 n + 1 and 2 n + 2.
 
     Every node is halved at the median centre along its longest side.
     """

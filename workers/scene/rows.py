@@ -1,21 +1,25 @@
 """The output of a scene: the images that its views leave, and its rows in each manifest table. Pure."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
-from schemas.dataset.layout import IMAGES, asset_path, image_path, patch_index, patch_path
+from schemas.dataset.layout import IMAGES, asset_path, image_path, patch_index, patch_path, samples_path
 from schemas.errors import SceneError
 from schemas.job.job import Job
+from schemas.job.targets import Targets
 from schemas.job.views import Images, Patch
 from schemas.scene.scene import EncodedFile, Placed, SceneOutput, encoded_file
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Shape
 from schemas.scene.view import MODALITIES, ObjectLabel, Pair, PixelKind, View, crop_box
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
+from workers.assets.samples import draw_samples, encode_samples
 from workers.geometry.camera import inclination, yaw
 from workers.geometry.pixels import measure_regions
 from workers.scene.context import Stopwatch, WorkerContext
@@ -83,6 +87,8 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
         every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
         assets = list({asset.instance_id: asset for asset in every}.values())
         files += [shape_file(asset) for asset in assets if asset.shareable]
+    sampled = sample_assets(assets, context.job.targets, watch)
+    files += [one.file for one in sampled if one.file is not None]
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,
@@ -92,7 +98,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
             for view in pair.views
             for row in object_rows(scene.plan.scene_id, view, context.job, scene.posed.things)
         ],
-        "assets": [asset_row(asset, context.job) for asset in assets],
+        "assets": [asset_row(asset, context.job, one) for asset, one in zip(assets, sampled, strict=True)],
         "failures": [],
     }
     return SceneOutput(scene.plan.scene_id, tuple(files), rows)
@@ -107,6 +113,56 @@ def shape_file(asset: Asset) -> EncodedFile:
 
 
 _shape_files: WeakKeyDictionary[Asset, EncodedFile] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSamples:
+    """What is stored of an asset's samples: their file and the value of the column `samples`, or why there are none."""
+
+    file: EncodedFile | None = None
+    column: Row | None = None
+    notes: tuple[str, ...] = ()
+
+
+NO_SAMPLES = StoredSamples()
+
+
+def sample_assets(assets: Sequence[Asset], targets: Targets, watch: Stopwatch) -> list[StoredSamples]:
+    """The samples of each asset that the job asks for."""
+    if not targets.shape:
+        return [NO_SAMPLES] * len(assets)
+    with watch.stage("samples"):
+        return [stored_samples(asset, targets) for asset in assets]
+
+
+def stored_samples(asset: Asset, targets: Targets) -> StoredSamples:
+    """Its samples, drawn once as long as they are kept; none of a shape that may not be passed on."""
+    if not asset.shareable:
+        return StoredSamples(notes=("no samples: its source does not say that its shape may be passed on",))
+    if (asset, targets) not in _samples:
+        drawn, file, column = draw_samples(asset, targets), None, None
+        if drawn.arrays:
+            file = encoded_file(samples_path(asset.category, asset.instance_id), encode_samples(drawn.arrays))
+            column = {**file_columns(file), "points": targets.points, "open_share": drawn.open_share}
+        _samples[asset, targets] = StoredSamples(file, column, drawn.notes)
+    return _samples[asset, targets]
+
+
+SAMPLES_BYTES = 256 * 1024 * 1024
+"""Samples that a process keeps: of some sixty shapes with 100,000 points each."""
+
+
+def _bytes_of(stored: StoredSamples) -> int:
+    """What counts of the memory: some also where there is no file, and never more than there is."""
+    return min(max(2**20, 0 if stored.file is None else len(stored.file.data)), SAMPLES_BYTES)
+
+
+_samples: LRUCache[tuple[Asset, Targets], StoredSamples] = LRUCache(SAMPLES_BYTES, getsizeof=_bytes_of)
+
+
+def file_columns(file: EncodedFile) -> Row:
+    """A file as rows list it."""
+    return {"path": file.path, "bytes": len(file.data), "sha256": file.sha256}
 
 
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
@@ -145,7 +201,7 @@ def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile]
         "yaw_rad": yaw(view.camera.T_world_cam),
         "depth_units_per_m": job.images.depth_units_per_m,
         "d_z_m": pair.d_z_m,
-        "files": [{"path": file.path, "bytes": len(file.data), "sha256": file.sha256} for file in files],
+        "files": [file_columns(file) for file in files],
         "object_pixels": None if projected else sum(label.pixels for label in labels),
         "visible_fraction": None if projected else labels[0].visible_fraction,
         "mirror_agreement": None
@@ -202,14 +258,15 @@ def amodal_columns(mask: NDArray[np.uint8]) -> Row:
     return {"amodal_bbox_xywh": list(whole.bbox_xywh), "amodal_pixels": whole.pixels}
 
 
-def asset_row(asset: Asset, job: Job) -> Row:
+def asset_row(asset: Asset, job: Job, samples: StoredSamples = NO_SAMPLES) -> Row:
     """The row of `assets`."""
     return {
         **{name: getattr(asset, name) for name in ASSET_COLUMNS},
         "extents_m": [float(x) for x in asset.extents_m],
         "T_source_to_object": matrix_column(asset.T_source_to_object),
         "split": split_of(asset.instance_id, job.assets.split),
-        "notes": list(asset.notes),
+        "notes": [*asset.notes, *samples.notes],
+        "samples": samples.column,
     }
 
 

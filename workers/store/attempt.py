@@ -49,10 +49,10 @@ from workers.store.commit import committed_files, compare_attempts, encode_recor
 from workers.store.manifest import (
     check_files,
     encode_table,
+    files_of_assets,
     join_rows,
     outcome_of,
     scene_digest,
-    shape_paths,
     sorted_rows,
     table_of_rows,
     with_shape_files,
@@ -217,7 +217,7 @@ class Attempt:
             tables[table] = rows.num_rows
             if table == "assets":
                 rows = with_shape_files(rows, self._files)
-                listed = set(shape_paths(rows))
+                listed = {entry.path for entry in files_of_assets(rows)}
                 entries += [one for path, one in self._files.items() if is_shape(path) and path not in listed]
             file = encoded_file(range_table_path(self.span.start, table, self.span.retry), encode_table(rows))
             with self._skip_if_swept():

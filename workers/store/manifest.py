@@ -4,10 +4,10 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from schemas.dataset.commit import FileEntry, Outcome
-from schemas.dataset.layout import asset_path, is_plain_path, is_shape
+from schemas.dataset.layout import asset_path, is_glb, is_plain_path
 from schemas.dataset.tables import (
     ALWAYS_OF_SCENES,
     DETERMINISTIC_TABLES,
@@ -154,19 +154,27 @@ def outcome_of(output: SceneOutput) -> Outcome:
 
 
 def check_files(output: SceneOutput, entries: Mapping[str, FileEntry]) -> None:
-    """Raises ValueError unless the rows of `views` and the files agree: paths, sizes, digests, each path once."""
+    """Raises ValueError unless the files are those that rows of `views` and `assets` list, each once, and GLBs."""
     if len(entries) != len(output.files):
         raise ValueError(f"scene {output.scene_id} writes a path twice")
     for path in entries:
         if not is_plain_path(path) or path[0] in "_.":
             raise ValueError(f"{path!r} is not a path that a scene may write")
-    views = cast(Sequence[Mapping[str, Any]], output.rows.get("views", ()))
-    listed = [(file["path"], file["bytes"], file["sha256"]) for view in views for file in view["files"]]
-    images = {(path, entry.bytes, entry.sha256) for path, entry in entries.items() if not is_shape(path)}
-    if len(listed) != len(images) or set(listed) != images:
-        paths = {path for path, _, _ in listed}.symmetric_difference(path for path, _, _ in images)
+    listed = [(file["path"], file["bytes"], file["sha256"]) for file in files_of_rows(output.rows)]
+    told = {(path, entry.bytes, entry.sha256) for path, entry in entries.items() if not is_glb(path)}
+    if len(listed) != len(told) or set(listed) != told:
+        paths = {path for path, _, _ in listed}.symmetric_difference(path for path, _, _ in told)
         wrong = sorted(paths) or ["sizes, digests or repetitions"]
-        raise ValueError(f"scene {output.scene_id}: files and the rows of views disagree about {', '.join(wrong[:5])}")
+        raise ValueError(f"scene {output.scene_id}: files and rows disagree about {', '.join(wrong[:5])}")
+
+
+def files_of_rows(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> Iterator[Mapping[str, Any]]:
+    """path, bytes and sha256 of the files that rows of `views` and `assets` list: images and samples."""
+    for view in rows.get("views", ()):
+        yield from view["files"]
+    for asset in rows.get("assets", ()):
+        if asset["samples"] is not None:
+            yield asset["samples"]
 
 
 def scene_digest(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
@@ -220,32 +228,35 @@ def encode_table(rows: pa.Table) -> bytes:
 
 def with_shape_files(assets: pa.Table, files: Mapping[str, FileEntry]) -> pa.Table:
     """Rows of `assets` with the columns `SHAPE_FILE_COLUMNS`, from `files` by path."""
-    found = [files.get(path) for path in shape_paths(assets)]
+    found = [files.get(asset_path(row["category"], row["instance_id"])) for row in assets.to_pylist()]
     for field, name in zip(SHAPE_FILE_COLUMNS, ("bytes", "sha256"), strict=True):
         assets = assets.append_column(field, pa.array([entry and getattr(entry, name) for entry in found], field.type))
     return assets
 
 
-def shape_paths(assets: pa.Table) -> list[str]:
-    """Where the shape of each row of `assets` lies, if the range has one."""
-    names = (assets.column(name).to_pylist() for name in ("category", "instance_id"))
-    return [asset_path(category, instance_id) for category, instance_id in zip(*names, strict=True)]
+def files_of_assets(assets: pa.Table) -> list[FileEntry]:
+    """The files that rows of a range's `assets` list: GLBs, and samples. Raises KeyError without `SHAPE_FILE_COLUMNS`."""
+    sizes, digests = (assets.column(field.name).to_pylist() for field in SHAPE_FILE_COLUMNS)
+    entries = []
+    names = [name for name in ("category", "instance_id", "samples") if name in assets.column_names]
+    for row, size, sha256 in zip(assets.select(names).to_pylist(), sizes, digests, strict=True):
+        if sha256 is not None:
+            path = asset_path(row["category"], row["instance_id"])
+            entries.append(FileEntry(path=path, bytes=size, sha256=sha256))
+        if (samples := row.get("samples")) is not None:
+            entries.append(FileEntry(**{name: samples[name] for name in FileEntry.model_fields}))
+    return entries
 
 
 def listed_files(table: str, data: bytes, name: str) -> list[FileEntry]:
     """The files that a range's `views` (images) or `assets` (shapes) list. Raises CorruptError as `decode_table`."""
-    names = [field.name for field in SHAPE_FILE_COLUMNS]
-    columns = ["files"] if table == "views" else ["category", "instance_id", *names]
+    columns = ["category", "instance_id", "samples", *(field.name for field in SHAPE_FILE_COLUMNS)]
     try:
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
-            rows = file.read(columns=columns)
-        if table == "views":
-            entries = pc.list_flatten(rows.column("files")).to_pylist()
-        else:
-            sizes, digests = (rows.column(name).to_pylist() for name in names)
-            found = zip(shape_paths(rows), sizes, digests, strict=True)
-            entries = [{"path": path, "bytes": size, "sha256": sha} for path, size, sha in found if sha is not None]
-        return [FileEntry.model_validate(entry) for entry in entries]
+            rows = file.read(columns=["files"] if table == "views" else columns)
+        if table == "assets":
+            return files_of_assets(rows)
+        return [FileEntry.model_validate(entry) for entry in pc.list_flatten(rows.column("files")).to_pylist()]
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         raise CorruptError(f"{name} cannot be read: {' '.join(str(error).split())[:300]}") from error
 

@@ -1,0 +1,94 @@
+"""Samples of shapes in a dataset: one file an instance, listed by its row, checked, compared, put back and exported."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from services.job.record import require_job
+from services.read import replay as remake
+from services.read.dataset_reader import find_scene
+from services.read.repair import repair
+from services.read.replay import compare_files, open_context, replay_scene
+from tests.datasets import faults_of, make_dataset
+from tests.services.export.exported import export_to
+from tests.services.read.conftest import TINY, spoil
+from workers.assets.samples import decode_samples, encode_samples
+from workers.scene.context import Stopwatch
+from workers.store.commit import committed_files, read_record
+from workers.store.local import LocalStore
+
+POINTS = 300
+TARGETS = {"shape": ["surface", "volume"], "points": POINTS}
+SHARED = {"objects": [{"source": "procedural", "instances": 1}], "tables": [{"source": "procedural", "instances": 1}]}
+
+
+@pytest.fixture(scope="module", params=["files", "tar"])
+def sampled(request, tmp_path_factory) -> LocalStore:
+    """Two ranges of a scene each, of the same object and table."""
+    changes = {**TINY, "scenes": 2, "categories": ["can"], "assets": SHARED, "targets": TARGETS}
+    return make_dataset(tmp_path_factory.mktemp("sampled"), output={"layout": request.param}, **changes)[0]
+
+
+def samples_in(store: LocalStore) -> list[str]:
+    return sorted(path.relative_to(store.root).as_posix() for path in store.root.rglob("*.npz"))
+
+
+def test_scenes_that_share_a_shape_store_its_samples_once_and_its_row_lists_them(sampled):
+    rows = find_scene(sampled, 0).rows["assets"]
+    assert rows == find_scene(sampled, 1).rows["assets"] and len(rows) == 2
+    assert samples_in(sampled) == sorted(row["samples"]["path"] for row in rows)
+    record = read_record(sampled, 0)
+    named = {entry.path for entry in committed_files(sampled, record)} - {entry.path for entry in record.files}
+    assert set(samples_in(sampled)) <= named, "by the rows alone"
+    for row in rows:
+        data = sampled.read(row["samples"]["path"])
+        assert (row["samples"]["bytes"], row["samples"]["points"], row["samples"]["open_share"]) == (
+            len(data),
+            POINTS,
+            0.0,
+        )
+        arrays = decode_samples(data)
+        assert len(arrays["surface_points"]) == len(arrays["volume_distance"]) == POINTS
+        assert arrays["scale"] == pytest.approx(max(row["extents_m"]))
+
+
+def test_a_missing_or_damaged_file_of_samples_is_told_and_put_back(sampled, tmp_path):
+    out = tmp_path / "copy"
+    shutil.copytree(sampled.root, out)
+    one, other = (out / path for path in samples_in(sampled))
+    before = one.read_bytes(), other.read_bytes()
+    assert faults_of(LocalStore(out)) == []
+    spoil(one)
+    other.unlink()
+    faults = faults_of(LocalStore(out))
+    assert len(faults) == 2 and one.name in faults[0] and "SHA-256" in faults[0]
+    assert other.name in faults[1] and "is committed and missing" in faults[1]
+    found = repair(LocalStore(out), (), lambda _: None)
+    assert (found.verdict.faults, found.left) == ([], [])
+    assert (one.read_bytes(), other.read_bytes()) == before
+
+
+def test_a_replay_compares_samples_to_the_byte_and_on_another_stack_within_a_tolerance(sampled):
+    replayed = replay_scene(sampled, 1)
+    assert (replayed.same_stack, replayed.differences) == (True, ())
+    stored = find_scene(sampled, 0)
+    output = remake.run_scene(open_context(require_job(sampled)), 0, Stopwatch())
+    number, file = next((n, file) for n, file in enumerate(output.files) if file.path.endswith(".npz"))
+    for way_m, too_far in ((1e-8, False), (1e-3, True)):
+        arrays = decode_samples(file.data)
+        arrays["volume_distance"] = (arrays["volume_distance"] + way_m).astype(np.float32)
+        changed = dataclasses.replace(file, data=encode_samples(arrays), sha256="another")
+        now = dataclasses.replace(output, files=(*output.files[:number], changed, *output.files[number + 1 :]))
+        assert len(compare_files(sampled, stored, now, same_stack=True)) == 1
+        assert len(compare_files(sampled, stored, now, same_stack=False)) == too_far
+    less = dataclasses.replace(output, files=(*output.files[:number], *output.files[number + 1 :]))
+    assert compare_files(sampled, stored, less, same_stack=False) == [f"{file.path}: only stored"]
+
+
+def test_an_export_copies_samples_beside_the_shapes(sampled, tmp_path):
+    export_to(sampled, tmp_path / "out", "webdataset")
+    copies = {path.name: path.read_bytes() for path in (tmp_path / "out").rglob("*.samples.npz")}
+    named = {path.rpartition("/")[2].replace(".npz", ".samples.npz"): path for path in samples_in(sampled)}
+    assert copies == {name: sampled.read(path) for name, path in named.items()}
