@@ -26,6 +26,9 @@ layer, beyond half a unit of stored depth."""
 MOST_UNSURE = 12
 """A pixel near the edges of more faces, as at the pole of a sphere, is not judged where the exact answer is not stored."""
 
+ENOUGH_WRONG = 40
+"""After so many wrong pixels of an image, all others without the exact answer count as wrong."""
+
 FLOOR_M = 1e4
 """Half the side of the floor, which is in no file: it is a plane, and its colour is not judged."""
 
@@ -162,7 +165,9 @@ class _Tally:
         for pixel in np.flatnonzero(bad):
             start, stop = np.searchsorted(self.hits.pixel, [pixel, pixel + 1])
             there = self.hits.where(slice(start, stop))
-            if np.count_nonzero(~there.sure) > MOST_UNSURE:
+            if len(wrong) >= ENOUGH_WRONG:
+                wrong.append(int(pixel))
+            elif np.count_nonzero(~there.sure) > MOST_UNSURE:
                 unjudged += 1
             elif not any(fits(int(pixel), there.where(some)) for some in choices(self.faces, there)):
                 wrong.append(int(pixel))
