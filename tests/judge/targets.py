@@ -52,8 +52,8 @@ def stored_pairs(context: WorkerContext, scene: Scene) -> Iterator[StoredPair]:
     """The pairs of a scene as they would be read back."""
     output = record_scene(context, scene, Stopwatch())
     files, job = {file.path: file.data for file in output.files}, context.job.model_dump(mode="json")
-    for parent in sorted({row["parent_id"] for row in output.rows["views"]}):
-        views = {row["role"]: row for row in output.rows["views"] if row["parent_id"] == parent}
+    for parent in (pair.input.pose_id for pair in scene.pairs):
+        views = {str(row["role"]): row for row in output.rows["views"] if row["parent_id"] == parent}
         ids = {row["pose_id"] for row in views.values()}
         objects = [row for row in output.rows["objects"] if row["pose_id"] in ids]
         yield StoredPair(job, output.rows["scenes"][0], views, objects, files.__getitem__)

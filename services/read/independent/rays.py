@@ -11,7 +11,7 @@ to a projected edge may therefore lie on either side of it, and what the face ha
 import json
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -104,6 +104,8 @@ def read_shape(data: bytes) -> Faces:
 
 def _linear_texture(data: bytes) -> Array:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError("a texture is no image")
     share = image[..., ::-1] / 255.0
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
@@ -120,17 +122,22 @@ def _is_closed(points: Array) -> bool:
 
 def place_shapes(shapes: Sequence[tuple[int, Faces, Array]]) -> Faces:
     """The faces of shapes, (region, shape, pose [4, 4]) each, in one frame."""
-    parts, textures = [], []
+    placed, textures = [], list[Array]()
     for region, shape, T in shapes:
-        texture = np.where(shape.texture >= 0, shape.texture + len(textures), -1)
+        placed.append(
+            replace(
+                shape,
+                points=shape.points @ T[:3, :3].T + T[:3, 3],
+                normals=shape.normals @ T[:3, :3].T,
+                texture=np.where(shape.texture >= 0, shape.texture + len(textures), -1),
+                region=np.full(len(shape.points), region),
+            )
+        )
         textures += shape.textures
-        points, normals = shape.points @ T[:3, :3].T + T[:3, 3], shape.normals @ T[:3, :3].T
-        same = shape.closed, shape.rounding_m
-        parts.append((points, normals, shape.colors, shape.uv, texture, np.full(len(points), region), *same))
-    points, normals, colors, uv, texture, region, closed, rounding = (
-        np.concatenate(each) for each in zip(*parts, strict=True)
+    names = (name for name in Faces.__dataclass_fields__ if name != "textures")
+    return Faces(
+        **{name: np.concatenate([getattr(shape, name) for shape in placed]) for name in names}, textures=tuple(textures)
     )
-    return Faces(points, normals, colors, uv, texture, tuple(textures), region, closed, rounding)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +157,8 @@ class Hits:
     covers: NDArray[np.bool_]
     sure: NDArray[np.bool_]
 
-    def where(self, some: NDArray) -> "Hits":
-        """Some of them, by a mask or by numbers."""
+    def where(self, some: NDArray | slice) -> "Hits":
+        """Some of them, by a mask, by numbers or by a range."""
         return Hits(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
 
 

@@ -23,6 +23,9 @@ MOST_DEG, MOST_SHARE, MOST_CODES, MOST_MM = 0.02, 2e-5, 1.0, 0.02
 """Largest errors: of a normal, beyond rounding; of a coordinate, of the box's diagonal; of albedo, in codes before rounding; of a
 layer, beyond half a unit of stored depth."""
 
+EDGE_CODES = 8.0
+"""The same of albedo near an edge: a texture on a steep face changes by some codes within `EDGE_PX`."""
+
 MOST_UNSURE = 12
 """A pixel near the edges of more faces, as at the pole of a sphere, is not judged where the exact answer is not stored."""
 
@@ -72,13 +75,14 @@ def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def faces_of(pair: StoredPair, view: Row) -> Faces:
     """Floor, table and objects in the camera's frame. Raises FileNotFoundError where a shape is not stored."""
-    scene, T_cam_world = pair.scene, np.linalg.inv(matrix(view, "T_world_cam"))
+    scene = pair.scene
+    T_cam_world = np.asarray(np.linalg.inv(matrix(view, "T_world_cam")), np.float64)
     things = [(TABLE, "table", scene["table_id"], matrix(scene, "T_world_table"))]
     things += [
         (body["region_id"], body["category"], body["instance_id"], matrix(body, "T_world_obj"))
         for body in scene["bodies"]
     ]
-    placed = [(FLOOR, pair.shapes.get("floor") or _plane(), T_cam_world)]
+    placed: list[tuple[int, Faces, Array]] = [(FLOOR, pair.shapes.get("floor") or _plane(), T_cam_world)]
     for region, category, instance, T_world in things:
         path = f"assets/{category}/{instance}.glb"
         if path not in pair.shapes:
@@ -147,40 +151,37 @@ def choices(faces: Faces, hits: Hits) -> Iterator[NDArray[np.int64]]:
             yield np.flatnonzero(there)
 
 
-@dataclass
-class _Tally:
-    """Judges pixels that do not have the exact answer by the choices that there are."""
+@dataclass(frozen=True, eq=False)
+class _Exact:
+    """An image beside the exact answer, each [P]: judged pixels, bad ones of them, and how far they are off, in `unit`."""
 
-    pair: StoredPair
-    view: Row
-    faces: Faces
-    hits: Hits
+    target: str
+    unit: str
+    judged: NDArray[np.bool_]
+    bad: NDArray[np.bool_]
+    off: Array
 
-    def settle(self, target: str, unit: str, judged: NDArray[np.bool_], bad: NDArray[np.bool_], off: Array,
-               fits: Callable[[int, Hits], bool]) -> Finding:  # fmt: skip
-        """The finding of pixels `judged` [P], of which `bad` have not the exact answer; off [P]: errors of the exact one."""
-        edge = np.zeros(len(judged), bool)
-        edge[self.hits.pixel[~self.hits.sure]] = True
-        unjudged, wrong = 0, []
-        for pixel in np.flatnonzero(bad):
-            start, stop = np.searchsorted(self.hits.pixel, [pixel, pixel + 1])
-            there = self.hits.where(slice(start, stop))
-            if len(wrong) >= ENOUGH_WRONG:
-                wrong.append(int(pixel))
-            elif np.count_nonzero(~there.sure) > MOST_UNSURE:
-                unjudged += 1
-            elif not any(fits(int(pixel), there.where(some)) for some in choices(self.faces, there)):
-                wrong.append(int(pixel))
-        row, column = divmod(wrong[0], self.view["width"]) if wrong else (-1, -1)
-        plain = off[judged & ~edge]
-        met = np.zeros(len(judged), bool)
-        met[self.hits.pixel] = True
-        counts = (
-            np.count_nonzero(judged & met),
-            np.count_nonzero(judged & edge),
-            np.count_nonzero(bad) - unjudged - len(wrong),
-        )
-        return Finding(target, unit, *counts, unjudged, len(wrong), (column, row), float(plain.max(initial=0.0)))
+
+def _settle(exact: _Exact, view: Row, faces: Faces, hits: Hits, fits: Callable[[int, Hits], bool]) -> Finding:
+    """The finding of an image: pixels without the exact answer are right where one of the `choices` of their hits fits."""
+    met, edge = np.zeros((2, len(exact.judged)), bool)
+    met[hits.pixel] = True
+    edge[hits.pixel[~hits.sure]] = True
+    unjudged, wrong = 0, list[int]()
+    for pixel in np.flatnonzero(exact.bad).tolist():
+        start, stop = np.searchsorted(hits.pixel, [pixel, pixel + 1])
+        there = hits.where(slice(start, stop))
+        if len(wrong) >= ENOUGH_WRONG:
+            wrong.append(pixel)
+        elif np.count_nonzero(~there.sure) > MOST_UNSURE:
+            unjudged += 1
+        elif not any(fits(pixel, there.where(some)) for some in choices(faces, there)):
+            wrong.append(pixel)
+    row, column = divmod(wrong[0], view["width"]) if wrong else (-1, -1)
+    pixels, edges, bad = (int(np.count_nonzero(some)) for some in (exact.judged & met, exact.judged & edge, exact.bad))
+    worst = float(exact.off[exact.judged & ~edge].max(initial=0.0))
+    other = bad - unjudged - len(wrong)
+    return Finding(exact.target, exact.unit, pixels, edges, other, unjudged, len(wrong), (column, row), worst)
 
 
 def _judge_seen(name: str, pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Finding:
@@ -206,8 +207,7 @@ def _judge_seen(name: str, pair: StoredPair, view: Row, faces: Faces, own: Hits)
         error, most = answer(pair, view, faces, first, np.repeat(stored[pixel][None], len(first.z), axis=0))
         return bool((error <= most).any()) and bool(shown[pixel])
 
-    tally = _Tally(pair, view, faces, own)
-    return tally.settle(name, unit, judged, judged & (off > limit), off, fits)
+    return _settle(_Exact(name, unit, judged, judged & (off > limit), off), view, faces, own, fits)
 
 
 def _rays(view: Row, hits: Hits) -> Array:
@@ -277,7 +277,7 @@ def _albedo(pair: StoredPair, view: Row, faces: Faces, hits: Hits, stored: NDArr
     light = np.clip(light, 0.0, 1.0)
     codes = 255.0 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     error = _beyond(codes, stored).max(axis=1, initial=0.0)
-    return error, np.full(len(error), MOST_CODES)
+    return error, np.where(hits.sure, MOST_CODES, EDGE_CODES)
 
 
 def _sample(texture: Array, uv: Array) -> Array:
@@ -305,10 +305,9 @@ def _judge_amodal(pair: StoredPair, view: Row, faces: Faces, objects: Hits, numb
     own = objects.where(faces.region[objects.face] == number)
     expected = np.zeros(len(mask), mask.dtype)
     expected[own.pixel[own.covers]] = 255
-    bad, every = mask != expected, np.ones(len(mask), bool)
-    return _Tally(pair, view, faces, own).settle(
-        "amodal", "of 255", every, bad, bad.astype(float), lambda pixel, hits: mask[pixel] == 255 * bool(len(hits.z))
-    )
+    bad = mask != expected
+    exact = _Exact("amodal", "of 255", np.ones(len(mask), bool), bad, bad.astype(float))
+    return _settle(exact, view, faces, own, lambda pixel, hits: bool(mask[pixel] == 255 * (len(hits.z) > 0)))
 
 
 def _judge_layers(pair: StoredPair, view: Row, faces: Faces, objects: Hits) -> Finding:
@@ -340,9 +339,8 @@ def _judge_layers(pair: StoredPair, view: Row, faces: Faces, objects: Hits) -> F
                 return False
         return True
 
-    judged = np.ones(depth.shape[1], bool)
-    tally = _Tally(pair, view, faces, objects)
-    return tally.settle("layers", "mm", judged, ~fits.all(axis=0), off.max(axis=0), fits_choice)
+    exact = _Exact("layers", "mm", np.ones(depth.shape[1], bool), ~fits.all(axis=0), off.max(axis=0))
+    return _settle(exact, view, faces, objects, fits_choice)
 
 
 def _fits_depth(
