@@ -103,7 +103,9 @@ def read_shape(data: bytes) -> Faces:
 
 
 def _linear_texture(data: bytes) -> Array:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    # glTF has the pixels as they stand in the file, whatever orientation it tells of.
+    kind = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
     if image is None:
         raise ValueError("a texture is no image")
     share = image[..., ::-1] / 255.0
