@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from schemas.base import Range
 from schemas.job.targets import Targets
 from schemas.scene.view import Camera
 from services.job.job_file import validate_job
@@ -20,7 +21,13 @@ from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import Laid, lay_scene, render_scene
 
 EVERY = {"views": ["normals", "coordinates", "albedo", "amodal", "layers"]}
-NEAR = {"objects_per_scene": 3, "start": {"pose": "placed", "offset_m": [-0.1, 0.1]}, "targets": EVERY}
+NEAR = {
+    "objects_per_scene": 3,
+    "start": {"pose": "placed", "offset_m": [-0.1, 0.1]},
+    "images": {"depth_range_m": [1.2, 2.5]},
+    "targets": EVERY,
+}
+"""Three objects, parts of them out of the range of stored depth."""
 
 
 def job_of(changes: dict) -> str:
@@ -31,7 +38,9 @@ def job_of(changes: dict) -> str:
 def three() -> tuple[WorkerContext, Laid]:
     """Three objects at rest, before anything is drawn, for the input camera alone."""
     off = {"enabled": False}
-    context = context_of(job_of(NEAR | {"cameras": {"depth": off, "mirror": off}, "images": {"projection": off}}))
+    context = context_of(
+        job_of(overlaid(NEAR, {"cameras": {"depth": off, "mirror": off}, "images": {"projection": off}}))
+    )
     return context, lay_scene(context, 0, Stopwatch())
 
 
@@ -166,6 +175,13 @@ WRONG: dict[str, tuple[Callable, str]] = {
     "length of the ray": (called("all_surfaces", along_the_ray), "layers: "),
     "depth in half precision": (
         called("quantise_depth", lambda f: lambda z, images: f(z.astype(np.float16).astype(float), images)),
+        "layers: ",
+    ),
+    "depth out of range": (
+        called(
+            "quantise_depth",
+            lambda f: lambda z, images: f(z, images.model_copy(update={"depth_range_m": Range(0.2, 8.0)})),
+        ),
         "layers: ",
     ),
     "the first for the last": (

@@ -350,5 +350,6 @@ def _fits_depth(
     units, (least, most) = view["depth_units_per_m"], pair.job["images"]["depth_range_m"]
     off = np.maximum(np.maximum(low - stored / units, stored / units - high) - 0.5 / units, 0.0) * 1e3
     unstored = (low <= least + MOST_MM / 1e3) | (high >= most - MOST_MM / 1e3)
-    right = np.where(stored > 0, off <= MOST_MM, unstored)
+    storable = (high >= least - MOST_MM / 1e3) & (low <= most + MOST_MM / 1e3)
+    right = np.where(stored > 0, (off <= MOST_MM) & storable, unstored)
     return right, np.where(stored > 0, off, np.where(unstored, 0.0, np.inf))
