@@ -8,6 +8,7 @@ import pytest
 
 from schemas.base import Range
 from schemas.job.targets import Targets
+from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from services.job.job_file import validate_job
 from services.read.audit import verify_independently
@@ -200,6 +201,21 @@ def test_a_wrong_target_is_found(monkeypatch, three, name):
     scene = render_scene(context, laid, Stopwatch())
     faults = [fault for pair in stored_pairs(context, scene) for fault in check_pair(pair)]
     assert any(told in fault for fault in faults), faults
+
+
+def test_a_point_beyond_a_long_narrow_face_has_the_weights_of_the_nearest_point_of_its_edges():
+    """Against points all along the edges. Weights cut one after the other are 40 mm off here."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.9, 0.002, 0.0]])
+    points = np.array(
+        [[0.5, 0.0012, 0.0], [0.5, -0.0001, 3e-5], [0.95, 0.0013, 0.0], [-0.1, 0.0, 0.0], [0.6, 0.001, 0.0]]
+    )
+    face = Mesh(corners, np.array([[0, 1, 2]], np.int32))
+    _, weights = surfaces.corner_weights(points, face, np.zeros(len(points), np.int64))
+    share = np.linspace(0.0, 1.0, 100_001)[:, None]
+    edges = np.concatenate([(1.0 - share) * corners[n] + share * corners[(n + 1) % 3] for n in range(3)])
+    for point, found in zip(points[:4], weights @ corners, strict=False):
+        assert np.linalg.norm(found - edges[np.linalg.norm(edges - point, axis=1).argmin()]) < 1e-4
+    assert np.allclose(weights[4] @ corners, points[4], atol=1e-15)
 
 
 def test_a_stored_dataset_is_judged_and_what_is_not_is_told(tmp_path):

@@ -23,9 +23,6 @@ MOST_DEG, MOST_SHARE, MOST_CODES, MOST_MM = 0.02, 2e-5, 1.0, 0.02
 """Largest errors: of a normal, beyond rounding; of a coordinate, of the box's diagonal; of albedo, in codes before rounding; of a
 layer, beyond half a unit of stored depth."""
 
-EDGE_CODES = 8.0
-"""The same of albedo near an edge: a texture on a steep face changes by some codes within `EDGE_PX`."""
-
 MOST_UNSURE = 12
 """A pixel near the edges of more faces, as at the pole of a sphere, is not judged where the exact answer is not stored."""
 
@@ -223,17 +220,32 @@ def _levels(hits: Hits) -> Array:
 
 
 def _weights(view: Row, faces: Faces, hits: Hits) -> Array:
-    """[1 or 3, N, 3]: with which corners of its face add up to a hit, at the z of `_levels`; on the face."""
+    """[1 or 3, N, 3]: with which corners of its face add up to a hit, at the z of `_levels`; beyond a face, to its edges."""
     points = _rays(view, hits) * _levels(hits)
-    a, b, c = faces.points[hits.face].swapaxes(0, 1)
+    corners = faces.points[hits.face]
+    a, b, c = corners.swapaxes(0, 1)
     normal = np.cross(b - a, c - a)
     shares = [(np.cross(v - points, w - points) * normal).sum(axis=2) for v, w in ((b, c), (c, a), (a, b))]
-    weights = np.maximum(np.stack(shares, axis=2), 0.0)
-    return weights / np.maximum(weights.sum(axis=2, keepdims=True), 1e-300)
+    weights = np.stack(shares, axis=2) / np.maximum((normal * normal).sum(axis=1), 1e-300)[:, None]
+    beyond = (weights < 0.0).any(axis=2) | (weights.sum(axis=2) < 0.5)
+    weights[beyond] = _on_edges(points[beyond], corners[np.nonzero(beyond)[1]])
+    return weights
+
+
+def _on_edges(points: Array, corners: Array) -> Array:
+    """[N, 3]: the weights of the corners [N, 3, 3] of faces with which they add up to the edges' nearest points to `points`."""
+    along = np.roll(corners, -1, axis=1) - corners
+    apart = points[:, None] - corners
+    share = np.clip((apart * along).sum(axis=2) / np.maximum((along * along).sum(axis=2), 1e-300), 0.0, 1.0)
+    side = np.linalg.norm(apart - share[..., None] * along, axis=2).argmin(axis=1)
+    weights, every = np.zeros((len(points), 3)), np.arange(len(points))
+    weights[every, (side + 1) % 3] = share[every, side]
+    weights[every, side] = 1.0 - share[every, side]
+    return weights
 
 
 def _beyond(answers: Array, stored: Array) -> Array:
-    """[N, C]: how far stored values are outside of the answers [1 or 3, N, C] at the z of `_levels`."""
+    """[N, C]: how far stored values are outside of the answers [S, N, C] at several places of a hit."""
     return np.maximum(np.maximum(answers.min(axis=0) - stored, stored - answers.max(axis=0)), 0.0)
 
 
@@ -277,7 +289,7 @@ def _albedo(pair: StoredPair, view: Row, faces: Faces, hits: Hits, stored: NDArr
     light = np.clip(light, 0.0, 1.0)
     codes = 255.0 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     error = _beyond(codes, stored).max(axis=1, initial=0.0)
-    return error, np.where(hits.sure, MOST_CODES, EDGE_CODES)
+    return error, np.full(len(error), MOST_CODES)
 
 
 def _sample(texture: Array, uv: Array) -> Array:
