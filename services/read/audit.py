@@ -23,7 +23,7 @@ from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import Camera, View
 from services.job.record import read_success, require_job
-from services.read.dataset_reader import StoredRange, choose_scenes, file_reader, find_scene
+from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, file_reader, find_scene
 from services.read.independent.derive import StoredPair, check_forces
 from services.read.independent.poses import check_merged, check_pair, list_underived
 from services.read.referee import Held, describe_held, hold_scene, is_installed
@@ -208,14 +208,21 @@ def verify_independently(
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
         stored = find_scene(store, scene_id)
-        scene, read = stored.scene(scene_id), file_reader(store.read, stored)
+        scene, images = stored.scene(scene_id), file_reader(store.read, stored)
         assert scene is not None
         found.faults += check_forces(job, scene)
+
+        def read(path: str, images: ReadFile = images) -> bytes:
+            return store.read(path) if is_shape(path) else images(path)
+
         for pair_views, pair_objects in stored.pairs(scene_id):
+            pair = StoredPair(job, scene, pair_views, pair_objects, read)
             try:
-                found.faults += check_pair(StoredPair(job, scene, pair_views, pair_objects, read))
+                found.faults += check_pair(pair)
             except CorruptError as error:
                 found.faults.append(str(error))
+            if pair.absent:
+                found.underived.append(f"targets of scene {scene_id} are not derived: {pair.absent[0]} is not stored")
             views += pair_views.values()
             objects += pair_objects
             found.pairs += 1

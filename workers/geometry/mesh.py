@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.distance import distance_to_mesh
-from workers.geometry.jit import compiled_for
+from workers.geometry.jit import compiled, compiled_for
 
 
 def bounds_of(points: Array) -> Array:
@@ -263,7 +263,7 @@ def corner_weights(points: Array, mesh: Mesh, face: NDArray[np.int64]) -> tuple[
 
 @compiled_for("f8[:,::1], f8[:,::1], i4[:,::1]", "f8[:,::1], const(f8[:,::1]), i4[:,::1]")
 def _weights(points: Array, vertices: Array, corners: NDArray[np.int32]) -> Array:
-    """Barycentric coordinates (Ericson, Real-Time Collision Detection 2005, 3.4), cut to 0 to 1; of no area, the first corner."""
+    """Barycentric coordinates (Ericson, Real-Time Collision Detection 2005, 3.4); beyond a face, of its edges' nearest point."""
     weights = np.zeros((len(points), 3))
     for n in range(len(points)):
         a, b, c = corners[n, 0], corners[n, 1], corners[n, 2]
@@ -276,13 +276,32 @@ def _weights(points: Array, vertices: Array, corners: NDArray[np.int32]) -> Arra
             d11 += v * v
             d20 += w * u
             d21 += w * v
-        area = d00 * d11 - d01 * d01
-        if area > 0.0:
-            second = min(max((d11 * d20 - d01 * d21) / area, 0.0), 1.0)
-            third = min(max((d00 * d21 - d01 * d20) / area, 0.0), 1.0 - second)
-            weights[n, 1], weights[n, 2] = second, third
-        weights[n, 0] = 1.0 - weights[n, 1] - weights[n, 2]
+        area, second, third = d00 * d11 - d01 * d01, d11 * d20 - d01 * d21, d00 * d21 - d01 * d20
+        if area > 0.0 and second >= 0.0 and third >= 0.0 and second + third <= area:
+            weights[n, 1], weights[n, 2] = second / area, third / area
+            weights[n, 0] = 1.0 - weights[n, 1] - weights[n, 2]
+        else:
+            weigh_edges(points[n], vertices, corners[n], weights[n])
     return weights
+
+
+@compiled
+def weigh_edges(point: Array, vertices: Array, corners: NDArray[np.int32], weights: Array) -> None:
+    """Sets the weights [3] of the point of a face's edges that is nearest to `point`."""
+    nearest = np.inf
+    for side in range(3):
+        start, end, along, square, away = corners[side], corners[(side + 1) % 3], 0.0, 0.0, 0.0
+        for axis in range(3):
+            edge = vertices[end, axis] - vertices[start, axis]
+            along += edge * (point[axis] - vertices[start, axis])
+            square += edge * edge
+        share = min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
+        for axis in range(3):
+            edge = vertices[end, axis] - vertices[start, axis]
+            away += (point[axis] - vertices[start, axis] - share * edge) ** 2
+        if away < nearest:
+            nearest = away
+            weights[side], weights[(side + 1) % 3], weights[(side + 2) % 3] = 1.0 - share, share, 0.0
 
 
 def mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose
 from workers.geometry.colour import LIMITS, SRGB_STEPS
 from workers.geometry.jit import compiled, compiled_for
+from workers.geometry.mesh import weigh_edges
 
 SeenFaces = tuple[NDArray[np.int32], Array]
 Intrinsic = tuple[float, float, float, float]
@@ -96,7 +97,8 @@ def _paint_albedo(
     face, depth = seen
     points, values, corners, part, base, texels, places = skin
     steps, codes = curves
-    by_ray, light, last = np.zeros((5, 3)), np.empty(3), -1
+    by_ray, at_corners, light, last = np.zeros((3, 3)), np.empty((3, 5)), np.empty(3), -1
+    weights, value, point = np.empty(3), np.empty(5), np.empty(3)
     begin, height, width, own = 0, 1, 1, 0
     for row in range(face.shape[0]):
         ray_y = (row + 0.5 - k[3]) / k[1]
@@ -107,15 +109,25 @@ def _paint_albedo(
                 last = face[row, column]
                 own = part[last]
                 begin, height, width = places[own, 0], places[own, 1], places[own, 2]
-                _values_by_ray(points, corners[last], values, by_ray)
+                _weights_by_ray(points, corners[last], by_ray)
+                for corner in range(3):
+                    for n in range(5):
+                        at_corners[corner, n] = values[corners[last, corner], n]
             z = depth[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
+            for corner in range(3):
+                weights[corner] = by_ray[corner, 0] * x + by_ray[corner, 1] * y + by_ray[corner, 2] * z
+            if min(weights[0], weights[1], weights[2]) < 0.0 or not math.isfinite(weights[0]):
+                point[0], point[1], point[2] = x, y, z
+                weigh_edges(point, points, corners[last], weights)
+            for n in range(5):
+                value[n] = 0.0
+                for corner in range(3):
+                    value[n] += weights[corner] * at_corners[corner, n]
             for channel in range(3):
-                n = 2 + channel
-                light[channel] = base[own, channel] * (by_ray[n, 0] * x + by_ray[n, 1] * y + by_ray[n, 2] * z)
+                light[channel] = base[own, channel] * value[2 + channel]
             if width * height > 1:
-                u = by_ray[0, 0] * x + by_ray[0, 1] * y + by_ray[0, 2] * z - 0.5 / width
-                v = 1.0 - (by_ray[1, 0] * x + by_ray[1, 1] * y + by_ray[1, 2] * z) - 0.5 / height
+                u, v = value[0] - 0.5 / width, 1.0 - value[1] - 0.5 / height
                 u, v = (u - math.floor(u)) * width, (v - math.floor(v)) * height
                 x0, y0 = min(int(u), width - 1), min(int(v), height - 1)
                 across, down = u - x0, v - y0
@@ -136,25 +148,21 @@ def _paint_albedo(
 
 
 @compiled
-def _values_by_ray(points: Array, corners: NDArray[np.int32], values: Array, by_ray: Array) -> None:
-    """Writes into `by_ray` [C, 3] the map from a point of a face to the values [V, C] of its corners, interpolated there.
+def _weights_by_ray(points: Array, corners: NDArray[np.int32], by_ray: Array) -> None:
+    """Writes into `by_ray` [3, 3] the map from a point of a face to the weights of its corners there.
 
-    The weights w of corners a, b, c solve w_a a + w_b b + w_c c = p; a plane through the camera has none: the first corner's.
+    Those of corners a, b, c solve w_a a + w_b b + w_c c = p; not finite where the plane goes through the camera.
     """
-    a, b, c = points[corners[0]], points[corners[1]], points[corners[2]]
-    normal = np.empty((3, 3))
-    for axis in range(3):
-        one, two = (axis + 1) % 3, (axis + 2) % 3
-        normal[0, axis] = b[one] * c[two] - b[two] * c[one]
-        normal[1, axis] = c[one] * a[two] - c[two] * a[one]
-        normal[2, axis] = a[one] * b[two] - a[two] * b[one]
-    volume = a[0] * normal[0, 0] + a[1] * normal[0, 1] + a[2] * normal[0, 2]
-    for n in range(by_ray.shape[0]):
+    for corner in range(3):
+        b, c = points[corners[(corner + 1) % 3]], points[corners[(corner + 2) % 3]]
         for axis in range(3):
-            total = 0.0
-            for corner in range(3):
-                total += values[corners[corner], n] * normal[corner, axis]
-            by_ray[n, axis] = total / volume if volume != 0.0 else 0.0
+            one, two = (axis + 1) % 3, (axis + 2) % 3
+            by_ray[corner, axis] = b[one] * c[two] - b[two] * c[one]
+    a = points[corners[0]]
+    volume = a[0] * by_ray[0, 0] + a[1] * by_ray[0, 1] + a[2] * by_ray[0, 2]
+    for corner in range(3):
+        for axis in range(3):
+            by_ray[corner, axis] /= volume
 
 
 @compiled_for("i8[::1], f8[::1], u1[::1], f8[:,::1], u1[:,::1]")

@@ -103,7 +103,7 @@ def _cut_near(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
 def nearest_faces(triangles: Triangles, region: NDArray[np.uint8]) -> tuple[NDArray[np.int32], Array]:
     """(face [H, W] int32, z [H, W] float64, metres): the nearest face of each pixel's own region [H, W], -1 and 0 without one.
 
-    A pixel whose centre no face of its region covers, by a rounding of the renderer, has the face and the plane of a neighbour.
+    A pixel whose centre no face of its region covers, by a rounding of the renderer, has the nearest one beside it.
     """
     t = triangles
     return _nearest_faces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, (t.region, t.closed), region, t.k)
@@ -206,7 +206,7 @@ def _nearest_faces(
                 z = _depth(face, column, row, k, planes, span)
                 if best[row, column] < 0 or z < depth[row, column]:
                     best[row, column], depth[row, column] = face, z
-    _fill_missed(best, depth, kinds[0], region, points, faces, planes, k)
+    _fill_missed(best, depth, corners, kinds, region, points, faces, planes, k)
     return best, depth
 
 
@@ -214,29 +214,41 @@ def _nearest_faces(
 def _fill_missed(
     best: NDArray[np.int32],
     depth: Array,
-    regions: NDArray[np.uint8],
+    corners: NDArray[np.int64],
+    kinds: tuple[NDArray[np.uint8], NDArray[np.bool_]],
     region: NDArray[np.uint8],
     points: Array,
     faces: NDArray[np.int32],
     planes: tuple[Array, Array],
     k: tuple[float, float, float, float],
 ) -> None:
-    """Gives a pixel of a region that none of its faces covers the face of a pixel beside it that one does."""
-    height, width = region.shape
-    found = best.copy()
-    for row in range(height):
-        for column in range(width):
-            if best[row, column] >= 0 or region[row, column] == 0:
+    """Gives a pixel of a region that none of its faces covers the one whose edge is nearest to the pixel's centre."""
+    has_faces = np.zeros(256, np.bool_)
+    for face in range(len(faces)):
+        has_faces[kinds[0][face]] = True
+    for row in range(region.shape[0]):
+        for column in range(region.shape[1]):
+            if best[row, column] >= 0 or not has_faces[region[row, column]]:
                 continue
-            for n in range(9):
-                y, x = row + n // 3 - 1, column + n % 3 - 1
-                if not (0 <= y < height and 0 <= x < width) or region[y, x] != region[row, column]:
+            nearest = np.inf
+            for face in range(len(faces)):
+                area, a, b, c = _oriented(corners, faces, face)
+                if kinds[0][face] != region[row, column] or area == 0 or (area > 0 and kinds[1][face]):
                     continue
-                face = found[y, x]
-                if face >= 0 and regions[face] == region[row, column]:
-                    span = _span(points, faces, face)
-                    best[row, column], depth[row, column] = face, _depth(face, column, row, k, planes, span)
-                    break
+                centre = (256 * column, 256 * row)
+                away = min(_square_away(a, b, centre), _square_away(b, c, centre), _square_away(c, a, centre))
+                z = _depth(face, column, row, k, planes, _span(points, faces, face))
+                if away < nearest or (away == nearest and z < depth[row, column]):
+                    nearest, best[row, column], depth[row, column] = away, face, z
+
+
+@compiled
+def _square_away(a: Corner, b: Corner, point: Corner) -> float:
+    """Square of the distance of a point from an edge."""
+    dx, dy, x, y = b[0] - a[0], b[1] - a[1], point[0] - a[0], point[1] - a[1]
+    square = dx * dx + dy * dy
+    share = min(max((x * dx + y * dy) / square, 0.0), 1.0) if square > 0 else 0.0
+    return (x - share * dx) ** 2 + (y - share * dy) ** 2
 
 
 @compiled_for("i8[:,::1], i4[:,::1], f8[:,::1], Tuple((f8[:,::1], f8[::1])), UniTuple(f8, 4), UniTuple(i8, 2)")

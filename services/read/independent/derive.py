@@ -44,12 +44,26 @@ def beside(job: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return {"aligned" if name == "depth" else name: branch for name, branch in cameras if "offset_m" in branch}
 
 
-def words(role: str) -> dict[str, str]:
-    """Content word of each image of a view, by kind of pixel."""
-    if role in ("input", "mirror"):
-        return {"rgb": "RGB", "depth": "depth", "region": "segment"}
-    said = {"rgb": f"RGB{role}", "depth": f"depth{role.capitalize()}"}
-    return said if role == "projected" else {**said, "region": f"segment{role.capitalize()}"}
+def words(role: str, targets: Mapping[str, Any]) -> dict[str, str]:
+    """Content word of each image of a view, by kind of pixel; `targets` is the job's branch."""
+    suffix = "" if role in ("input", "mirror") else role.capitalize()
+    said = {"rgb": f"RGB{suffix.lower()}", "depth": f"depth{suffix}"}
+    if role == "projected":
+        return said
+    asked = targets["views"]
+    kinds = [name for name in ("normals", "coordinates", "albedo", "amodal") if name in asked]
+    said |= {"region": f"segment{suffix}", **{name: f"{name}{suffix}" for name in kinds}}
+    if "layers" in asked:
+        for n in range(1, targets["layers"] + 1):
+            said |= {f"layer{n}": f"layer{n}_{suffix}", f"layer{n}_region": f"layerSegment{n}_{suffix}"}
+        said |= {"back": f"back{suffix}", "back_region": f"backSegment{suffix}"}
+    return said
+
+
+def pixel_type(kind: str) -> tuple[type[np.unsignedinteger], int]:
+    """(type, channels) of a kind of pixel."""
+    wide = kind in ("depth", "normals", "coordinates") or (kind.startswith(("layer", "back")) and "region" not in kind)
+    return np.uint16 if wide else np.uint8, 3 if kind in ("rgb", "normals", "coordinates", "albedo") else 1
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,12 @@ class StoredPair:
     read: Callable[[str], bytes]
     images: dict[tuple[str, str], NDArray] = field(default_factory=dict)
     """Decoded images by role and kind of pixel."""
+    shapes: dict[str, Any] = field(default_factory=dict)
+    """Shapes that were read, by path; `floor`, which is in no file, where it is known."""
+    found: list[Any] = field(default_factory=list)
+    """Findings of targets, of every view."""
+    absent: list[str] = field(default_factory=list)
+    """Why targets were not judged: shapes that are not stored."""
 
     @property
     def is_captured(self) -> bool:
@@ -75,18 +95,48 @@ class StoredPair:
         sensor = self.job["cameras"]["sensor"]
         return {name: self.views["input"][name] for name in sensor} if self.is_captured else sensor
 
+    @property
+    def targets(self) -> Mapping[str, Any]:
+        """The job's branch `targets`, which one without any has not."""
+        return self.job.get("targets") or {"views": (), "smooth": False}
+
+    @property
+    def regions(self) -> list[int]:
+        """Region ids of the objects."""
+        return [body["region_id"] for body in self.scene["bodies"] or [{"region_id": FIRST_OBJECT}]]
+
     def kinds(self, role: str) -> list[str]:
-        """Kinds of pixel that the job stores of a view."""
-        return [kind for kind in words(role) if kind != "rgb" or self.job["render"]["rgb"]]
+        """Kinds of pixel that the job stores of a view; `amodal3`, `amodal4` of one that each object has."""
+        stored = [kind for kind in words(role, self.targets) if kind != "rgb" or self.job["render"]["rgb"]]
+        each = {"amodal": [f"amodal{region}" for region in self.regions]}
+        return [one for kind in stored for one in each.get(kind, [kind])]
+
+    def path(self, view: Row, kind: str, patch_of: int | None = None) -> str:
+        """`mug/depth00000.png`; of a patch, and of an object's own image, with the object's number where there are several.
+
+        The mirror camera's own images have the mirror's odd id, all others the input's.
+        """
+        number = view["parent_id"] + (view["role"] == "mirror")
+        own = own_region(kind)
+        word = words(view["role"], self.targets)["amodal" if own else kind]
+        region = patch_of or own
+        suffix = f"obj{region - FIRST_OBJECT}" if region and len(self.regions) > 1 else ""
+        return f"{view['category']}/{'patches/' if patch_of else ''}{word}{number:05d}{suffix}.png"
+
+
+def own_region(kind: str) -> int | None:
+    """The object that a kind of pixel is of, where each object has an image of its own."""
+    return int(kind.removeprefix("amodal")) if kind.startswith("amodal") else None
 
 
 def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
     """Decode the view's images; type, size, and every file's size and digest in its row."""
     role, size = view["role"], (view["height"], view["width"])
     for kind in pair.kinds(role):
-        path = _path(view, kind)
+        path = pair.path(view, kind)
         image = pair.images[role, kind] = _decode(pair.read(path))
-        dtype, shape = (np.uint16 if kind == "depth" else np.uint8), ((*size, 3) if kind == "rgb" else size)
+        dtype, channels = pixel_type(kind)
+        shape = size if channels == 1 else (*size, channels)
         if image.dtype != dtype or image.shape != shape:
             yield f"{path}: is {image.dtype} {image.shape}, and must be {np.dtype(dtype)} {shape}"
     for file in view["files"]:
@@ -176,16 +226,15 @@ def check_patches(pair: StoredPair, view: Row) -> Iterator[str]:
     seen_from = "mirror" if role == "projected" else role
     labels = [row for row in pair.objects if row["role"] == seen_from and row["region_id"] >= FIRST_OBJECT]
     stored = {file["path"] for file in view["files"]}
-    expected = {_path(view, kind) for kind in pair.kinds(role)}
+    expected = {pair.path(view, kind) for kind in pair.kinds(role)}
     for label in labels:
         left, top = label["u"] - size["width"] // 2, label["v"] - size["height"] // 2
         right, bottom = left + size["width"], top + size["height"]
         whole = left >= 0 and top >= 0 and right <= view["width"] and bottom <= view["height"]
         if label["u"] < 0 or label["pixels"] == 0 or not whole:
             continue
-        suffix = f"obj{label['region_id'] - FIRST_OBJECT}" if len(labels) > 1 else ""
-        for kind in pair.kinds(role):
-            path = _path(view, kind, "patches/", suffix)
+        for kind in (kind for kind in pair.kinds(role) if own_region(kind) in (None, label["region_id"])):
+            path = pair.path(view, kind, label["region_id"])
             expected.add(path)
             crop = pair.images[role, kind][top:bottom, left:right]
             if path in stored and not np.array_equal(_decode(pair.read(path)), crop):
@@ -224,12 +273,6 @@ def check_projection(pair: StoredPair) -> Iterator[str]:
     broken, ties = np.count_nonzero(differs & several), np.count_nonzero(several)
     if broken > MOST_BROKEN_TIES * ties:
         yield f"{broken} of {ties} ties do not go to the lowest source index"
-
-
-def _path(view: Row, kind: str, folder: str = "", suffix: str = "") -> str:
-    """`mug/depth00000.png`: the mirror camera's own images have the mirror's odd id, all others the input's."""
-    number = view["parent_id"] + (view["role"] == "mirror")
-    return f"{view['category']}/{folder}{words(view['role'])[kind]}{number:05d}{suffix}.png"
 
 
 def _decode(data: bytes) -> NDArray:

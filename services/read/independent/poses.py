@@ -23,6 +23,7 @@ from services.read.independent.derive import (
     matrix,
     unproject,
 )
+from services.read.independent.targets import check_targets
 
 BOARD_M = 0.05
 """Largest median height of a captured board's pixels over its plane: depth or a pose in another convention is further off."""
@@ -123,6 +124,10 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
         told.append("colours of projected images are not derived: sensor.distortion is on")
     if sensor["depth_noise"]:
         told.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
+    if views := job.get("targets", {}).get("views"):
+        captured = job.get("captures") is not None
+        told += [f"contents of {', '.join(views)} of captures are not derived"] if captured else []
+        told += ["albedo of the floor is not derived: its look is in no file"] if "albedo" in views else []
     return told
 
 
@@ -146,6 +151,7 @@ def check_pair(pair: StoredPair) -> list[str]:
         own = [*derive.check_camera(pair, view), *derive.check_patches(pair, view)]
         if role != "projected":
             own += [*derive.check_depth(pair, view), *derive.check_labels(pair, view)]
+            own += check_targets(pair, view)
         elif _has_plain_points(pair.job):
             own += derive.check_projection(pair)
         faults += [f"pose {view['pose_id']} ({role}): {fault}" for fault in own]
