@@ -61,7 +61,8 @@ def farthest_surface(depth_m: Array, region: NDArray[np.uint8], u: Array, v: Arr
     depth_m, region [H, W]; -inf where the pixel has no depth. On a plane 1/z is linear in the image, so it is carried on
     from the pixel's centre by the steps to the next pixels along row and column. Where the surface bends between pixels,
     that may be wrong by as much as the steps differ: the lesser of the differences before and after, as much as a fold of
-    two planes makes, and at most one pixel's width at that depth, so that an outline nearby does not count as a bend.
+    two planes makes; none beside another region, and at most one pixel's width at that depth, so that an outline nearby does
+    not count as a bend.
     """
     inverse = np.pad(
         np.divide(1.0, depth_m, out=np.full(depth_m.shape, np.nan), where=depth_m > 0.0), 2, constant_values=np.nan
@@ -78,6 +79,6 @@ def farthest_surface(depth_m: Array, region: NDArray[np.uint8], u: Array, v: Arr
         )
         last, step, following = here - before, after - here, beyond - after
         there += np.abs(off) * np.nan_to_num(np.where(np.isnan(step), last, step))
-        bend += np.nan_to_num(np.fmin(np.abs(step - last), np.abs(following - step)))
+        bend += np.nan_to_num(np.minimum(np.abs(step - last), np.abs(following - step)))
     z = 1.0 / there
     return np.nan_to_num(z + np.minimum(bend * z * z, z / focal_px), nan=-np.inf)

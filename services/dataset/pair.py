@@ -101,7 +101,7 @@ class Pair:
 
         A point is seen where the pixel that it falls in shows its region, and where it lies at most `tolerance_m` behind the
         surface there: 1 mm is five steps of exact depth, noisy or captured depth needs more. Right but for a pixel along
-        outlines. Raises InputError where the job has no mirror view.
+        outlines, and surfaces within ten degrees of edge-on. Raises InputError where the job has no mirror view.
         """
         if self.mirror is None:
             raise InputError(f"pair {self.pose_id} has no mirror view: the job's cameras.mirror.enabled is false")

@@ -17,16 +17,24 @@ from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 
 TARGETS = {"views": ["normals", "coordinates", "albedo", "amodal", "layers"]}
 JOB = {"name": "derived", "seed": 2024, "targets": TARGETS, "images": {"projection": {"enabled": False}}}
-PILE = {"objects_per_scene": 3, "categories": ["mug", "box", "bowl"], "start": {"offset_m": [-0.12, 0.12]}}
+SIZES = {"objects": [{"source": "procedural", "size": "metric"}]}
+PILE = {
+    "objects_per_scene": 3,
+    "categories": ["mug", "box", "bowl"],
+    "start": {"arrange": "pile"},
+    "assets": SIZES,
+}
 UNIT_M = 1e-4
 """Half a unit of stored depth."""
+EDGE_ON = np.sin(np.radians(10.0))
+"""Least cosine of incidence that is judged: of a steeper surface the next pixel may show a place centimetres away."""
 
 
 @pytest.fixture(scope="module")
 def pairs() -> list[Pair]:
-    """A bowl, a laptop, and three objects that hide one another; every target."""
-    jobs = [JOB | {"categories": ["bowl"]}, JOB | {"categories": ["laptop"]}, JOB | PILE]
-    return [pair for job in jobs for pair in make_scene(job, 1)]
+    """A bowl, a laptop, and a pile of three; every target."""
+    scenes = (JOB | {"categories": ["bowl"]}, 1), (JOB | {"categories": ["laptop"]}, 1), (JOB | PILE, 0)
+    return [pair for job, scene in scenes for pair in make_scene(job, scene)]
 
 
 def views_of(pairs):
@@ -67,6 +75,7 @@ def test_a_cloud_lies_on_the_mesh_in_every_frame(pairs):
             T_cam_obj = next(one.T_cam_obj for one in view.objects if one.region_id == number)
             assert np.allclose(to(T_cam_obj, own.points), camera.points, atol=1e-12)
             assert np.allclose(own.normals @ T_cam_obj[:3, :3].T, camera.normals) and len(own.normals)
+            assert (camera.normals * camera.points).sum(axis=1).max() < 1e-3  # towards the camera
             u, v, w = (view.K @ camera.points.T) / camera.points[:, 2]
             assert np.allclose(np.stack([v, u], axis=1) - 0.5, own.pixels) and np.allclose(w, 1)
         everything = view.cloud("camera", None)
@@ -107,7 +116,8 @@ def test_targets_are_the_mesh_in_numbers(pairs):
         )
         depth, region = view.layers()
         first = (segment >= 3) & (view.depth() > 0)
-        assert depth.shape == (4, *segment.shape) and np.abs(depth[0] - view.depth_m())[first].max() < 2.1 * UNIT_M
+        assert depth.shape == (4, *segment.shape)
+        assert (np.abs(depth[0] - view.depth_m())[first] < 2.1 * UNIT_M).mean() > 0.999
         assert np.array_equal(region[0][first], segment[first])
         for number in objects_of(view):
             mesh, cloud = view.mesh(number), view.cloud("object", number)
@@ -145,7 +155,7 @@ def test_no_pixel_off_outlines_is_seen_or_hidden_wrongly(pairs, back, record_fig
     for pair in pairs:
         source, target = (pair.mirror, pair.input) if back else (pair.input, pair.mirror)
         things, k, eye = things_of(pair), target.camera.intrinsics, target.T_world_cam[:3, 3]
-        depth, region, _ = cast_view(things, source.camera)
+        depth, region, own_cosine = cast_view(things, source.camera)
         known = (region == source.segment()) & (np.abs(depth - source.depth() / 5000.0) < 2 * UNIT_M) & (depth < 8.0)
         rows, columns = np.nonzero(known)
         rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))]) * depth[known]
@@ -159,14 +169,23 @@ def test_no_pixel_off_outlines_is_seen_or_hidden_wrongly(pairs, back, record_fig
         off = np.abs(found.uv[known] - np.stack([u, v], axis=1)).max(axis=1)
         assert np.nanmedian(off) < 0.03 and np.array_equal(np.isnan(off), local[:, 2] <= 0)
         border = (np.abs(np.stack([u, u - k.width, v, v - k.height])) < 1).any(axis=0)
-        wrong = (found.visible[known] != (seen & inside)) & ~border & (local[:, 2] < 7.99)
+        clear = np.minimum(own_cosine[known], np.where(seen, hit.incidence_cos, 1.0)) > EDGE_ON
+        wrong = (found.visible[known] != (seen & inside)) & clear & ~border & (local[:, 2] < 7.99)
         pixels = np.stack([rows, columns], axis=1)[wrong], np.stack([v, u], axis=1)[wrong] - 0.5
         edges = [
             edge_distance_px(things, one.camera, at, True) for one, at in zip((source, target), pixels, strict=True)
         ]
+        lax = pair.correspondence(back, tolerance_m=1.0)
+        at = np.floor(lax.uv[lax.visible]).astype(int)
+        assert np.array_equal(target.segment()[at[:, 1], at[:, 0]], source.segment()[lax.visible])
         bad = int((np.minimum(*edges) > 1).sum())
         record_figure(f"visibility off outlines, {pair.category}, back {back}", "must agree", bad, 0)
-        assert bad == 0 and wrong.sum() < 0.02 * (seen & inside).sum() and (~seen & inside).sum() > 500
+        assert (
+            clear.mean() > 0.95
+            and bad == 0
+            and wrong.sum() < 0.02 * (seen & inside).sum()
+            and (~seen & inside).sum() > 500
+        )
         centre = np.stack(np.meshgrid(np.arange(640) + 0.5, np.arange(480) + 0.5), axis=2)
         assert np.allclose(pair.flow(back) + centre, found.uv, equal_nan=True)
 
