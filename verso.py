@@ -9,11 +9,17 @@ from typing import Any
 
 from schemas.errors import CorruptError, InputError, OutputError, SceneError, VersoError, needs_making
 from schemas.job.job import Job
+from services.dataset.correspondence import Correspondence
 from services.dataset.dataset import Dataset
 from services.dataset.dataset import open_dataset as open
-from services.dataset.pair import Pair, Pixels, View
+from services.dataset.pair import Pair
+from services.dataset.points import Box, Cloud
+from services.dataset.view import Pixels, View
 
 __all__ = [
+    "Box",
+    "Cloud",
+    "Correspondence",
     "CorruptError",
     "Dataset",
     "InputError",

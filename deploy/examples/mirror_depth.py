@@ -15,7 +15,8 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull
 
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
-from services.dataset.pair import Pair, View
+from services.dataset.pair import Pair
+from services.dataset.view import View
 
 CROP = (96, 128)
 """Rows and columns, as the article's patches."""

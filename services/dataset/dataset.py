@@ -20,9 +20,10 @@ from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import InputError, did_you_mean
 from schemas.job.job import Job
 from schemas.scene.view import ROLES
-from services.dataset.pair import Files, Pair, read_pair
+from services.dataset.pair import Pair, read_pair
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.dataset.splits import Splits, collect_ids, split_by_category
+from services.dataset.view import Files
 from services.job.record import read_success, require_job
 from services.read.dataset_reader import find_records
 from services.read.stored_tables import StoredTables
@@ -168,8 +169,11 @@ def iter_pairs(rows: Callable[[str], pa.Table], files: Files, where: pc.Expressi
     if not table.num_rows:
         return
     objects, labels = rows("objects"), defaultdict[tuple[int, str], list[Row]](list)
-    chosen = pc.is_in(objects.column("scene_id"), table.column("scene_id").combine_chunks())
-    for row in objects.filter(chosen).to_pylist():
-        labels[row["pose_id"], row["role"]].append(row)
+    chosen = objects.filter(pc.is_in(objects.column("scene_id"), table.column("scene_id").combine_chunks()))
+    shapes = rows("assets")
+    named = shapes.filter(pc.is_in(shapes.column("instance_id"), chosen.column("instance_id").combine_chunks()))
+    assets = {row["instance_id"]: row for row in named.to_pylist()}
+    for row in chosen.to_pylist():
+        labels[row["pose_id"], row["role"]].append(row | {"asset": assets[row["instance_id"]]})
     for number in np.argsort(table.column("parent_id").to_numpy()):
         yield read_pair(table.slice(number, 1).to_pylist()[0], labels, files)

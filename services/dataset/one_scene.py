@@ -49,7 +49,8 @@ class _MadeFiles:
 
     def __init__(self, output: SceneOutput, record: JobRecord) -> None:
         self._data = {file.path: file.data for file in output.files}
-        self.mesh = Shapes(self._shape, record).mesh
+        shapes = Shapes(self._shape, record)
+        self.mesh, self.samples = shapes.mesh, shapes.samples
         self.patch: Patch = record.job.images.patch
 
     def _shape(self, path: str) -> bytes:

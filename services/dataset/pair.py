@@ -1,133 +1,26 @@
-"""A pair as a user of the data meets it: frozen facts of its scene and views, and images that are decoded when asked for."""
+"""A pair as a user of the data meets it: frozen facts of its scene, its views, and what both views tell together."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.dataset.codec import Row, read_camera, read_label, read_world_poses
-from schemas.dataset.layout import PixelKind, file_pose_id, patch_index
+from schemas.dataset.codec import Row, read_world_poses
 from schemas.errors import InputError
-from schemas.job.views import Patch
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import ROLES, Camera, ObjectLabel, Role, crop_box
-from services.read.stored_tables import patch_paths, view_paths
-from workers.store.images import decode_png
+from schemas.scene.view import ROLES, Role
+from services.dataset.correspondence import Correspondence, correspond
+from services.dataset.points import Frame, pick, sample_mesh
+from services.dataset.view import Files, View, read_mesh, read_view
+from workers.geometry.frames import invert, transform
 
 if TYPE_CHECKING:
     import trimesh
-
-
-class Files(Protocol):
-    """Where the files of a pair come from."""
-
-    patch: Patch
-    """The size of patches in this dataset."""
-
-    def image(self, scene_id: int, path: str) -> bytes:
-        """The bytes of an image. Raises CorruptError where it is missing."""
-
-    def mesh(self, scene: Row, region_id: int) -> "trimesh.Trimesh":
-        """The shape of a region (2 the table, 3 and up the objects) in its own frame, metres."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pixels:
-    """The images of one camera: of a whole view, or of its crop about an object.
-
-    `camera` is that of these pixels: a crop's principal point counts from its own corner.
-    """
-
-    camera: Camera = field(repr=False)
-    depth_units_per_m: float = field(repr=False)
-    _paths: Mapping[PixelKind, str] = field(repr=False)
-    _scene_id: int = field(repr=False)
-    _files: Files = field(repr=False)
-
-    @property
-    def K(self) -> Array:
-        """[3, 3] float64 intrinsics, pixels; the centre of pixel (column i, row j) is at (i + 0.5, j + 0.5)."""
-        k = self.camera.intrinsics
-        return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
-
-    @property
-    def K_opencv(self) -> Array:
-        """[3, 3] float64 intrinsics, pixels, for software that puts pixel centres on whole numbers, as OpenCV does."""
-        k = self.camera.intrinsics
-        return np.array([[k.fx, 0.0, k.cx_opencv], [0.0, k.fy, k.cy_opencv], [0.0, 0.0, 1.0]])
-
-    @property
-    def T_world_cam(self) -> Pose:
-        """[4, 4] float64: camera coordinates (x right, y down, z forward) to world coordinates, metres."""
-        return self.camera.T_world_cam
-
-    @property
-    def images(self) -> Mapping[PixelKind, str]:
-        """Paths below the dataset's folder of the images that there are, by kind: rgb, depth, region."""
-        return self._paths
-
-    def image(self, kind: PixelKind) -> NDArray:
-        """The pixels of an image of any kind in `images`, as they are stored.
-
-        Raises InputError where the dataset has no such image, CorruptError where it is damaged.
-        """
-        if kind not in self._paths:
-            raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}")
-        path = self._paths[kind]
-        return decode_png(self._files.image(self._scene_id, path), path)
-
-    def rgb(self) -> NDArray[np.uint8]:
-        """[H, W, 3] uint8 sRGB."""
-        return self.image("rgb")
-
-    def depth(self) -> NDArray[np.uint16]:
-        """[H, W] uint16: z along the optical axis as it is stored, in units of 1 / `depth_units_per_m`; 0 where unknown."""
-        return self.image("depth")
-
-    def depth_m(self) -> NDArray[np.float32]:
-        """[H, W] float32: z along the optical axis, metres; 0 where unknown."""
-        return (self.depth() / self.depth_units_per_m).astype(np.float32)
-
-    def segment(self) -> NDArray[np.uint8]:
-        """[H, W] uint8 region ids: 0 nothing, 1 floor, 2 table, 3 and up the objects."""
-        return self.image("region")
-
-
-@dataclass(frozen=True, eq=False)
-class View(Pixels):
-    """One view of a pair: its camera, its labels, its images. Every column of its row of `views` is in `row`."""
-
-    role: Role
-    pose_id: int
-    d_z_m: float
-    visible_fraction: float | None
-    """Of the (first) object's own unoccluded pixels; None of projected views."""
-    objects: tuple[ObjectLabel, ...] = field(repr=False)
-    """Labels of the table (region 2) and of every object; the projected view has the mirror view's."""
-    row: Mapping[str, Any] = field(repr=False)
-
-    def patch(self, region_id: int = REGION_FIRST_OBJECT) -> Pixels | None:
-        """The stored crop about an object; None where it would leave the image, or where the object is not seen."""
-        label = next((one for one in self.objects if one.region_id == region_id), None)
-        if label is None or region_id < REGION_FIRST_OBJECT:
-            known = [one.region_id for one in self.objects if one.region_id >= REGION_FIRST_OBJECT]
-            raise InputError(f"region {region_id} is no object of this view; its objects are {known}")
-        box = crop_box(label, self.camera, self._files.patch)
-        if box is None:
-            return None
-        objects = sum(one.region_id >= REGION_FIRST_OBJECT for one in self.objects)
-        k = self.camera.intrinsics
-        size = {"width": self._files.patch.width, "height": self._files.patch.height}
-        moved = k.model_copy(update={**size, "cx": k.cx - box[1].start, "cy": k.cy - box[0].start})
-        paths = patch_paths(self.row, patch_index(region_id, objects))
-        return Pixels(
-            Camera(moved, self.camera.T_world_cam), self.depth_units_per_m, paths, self._scene_id, self._files
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,54 +76,82 @@ class Pair:
         of their textures and normals, so that trimesh calls them not watertight. Raises InputError where there is no such
         region, or where its shape is stored nowhere.
         """
+        T = self._pose_of(region_id)
+        mesh = read_mesh(self._files, self.scene, region_id, welded)
+        return mesh.apply_transform(T if view is None else np.linalg.inv(view.T_world_cam) @ T)
+
+    def samples(self, region: int = REGION_FIRST_OBJECT) -> Mapping[str, NDArray]:
+        """The stored samples of an object's shape, in its own frame, metres, by name: `surface_points` [N, 3] and so on.
+
+        Raises InputError where none are stored.
+        """
+        self._pose_of(region)
+        if not (stored := self._files.samples(self.scene, region)):
+            raise InputError(f"no samples of region {region} are stored: a job stores those that targets.shape names")
+        return stored
+
+    def _pose_of(self, region_id: int) -> Pose:
+        """[4, 4] pose in the world. Raises InputError where there is no such region."""
         if region_id not in self.T_world:
             raise InputError(f"scene {self.scene_id} has the regions {sorted(self.T_world)}, and no {region_id}")
-        mesh = self._files.mesh(dict(self.scene), region_id)
-        if welded:
-            mesh = weld(mesh)
-        T = self.T_world[region_id]
-        mesh.apply_transform(T if view is None else np.linalg.inv(view.T_world_cam) @ T)
-        return mesh
+        return self.T_world[region_id]
 
+    def correspondence(self, back: bool = False, *, tolerance_m: float = 0.001) -> Correspondence:
+        """Where every pixel of the input view lies in the mirror view and whether it is seen there; the other way with `back`.
 
-def weld(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-    """The surface with one vertex at each place, without triangles of two corners and without colours."""
-    import trimesh  # takes as long to load as all the rest
+        A point is seen where the pixel that it falls in shows its region, and where it lies at most `tolerance_m` behind the
+        surface there: 1 mm is five steps of exact depth, noisy or captured depth needs more. Right but for a pixel along
+        outlines, and surfaces within ten degrees of edge-on. Raises InputError where the job has no mirror view.
+        """
+        if self.mirror is None:
+            raise InputError(f"pair {self.pose_id} has no mirror view: the job's cameras.mirror.enabled is false")
+        source, target = (self.mirror, self.input) if back else (self.input, self.mirror)
+        return correspond(source, target, tolerance_m)
 
-    places, at = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces = at.reshape(-1)[mesh.faces]
-    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return trimesh.Trimesh(places, faces[whole], process=False)
+    def flow(self, back: bool = False) -> Array:
+        """[H, W, 2] float64: how far, pixels, each pixel of the input view moves to the mirror view; nan where not known.
+
+        Also of what the mirror view does not see: `correspondence` tells.
+        """
+        return self.correspondence(back).flow()
+
+    def partial_and_complete(
+        self, n: int, seed: int = 0, *, frame: Frame = "object", region: int = REGION_FIRST_OBJECT
+    ) -> tuple[Array, Array]:
+        """(n points of the input view's cloud, n of the object's whole surface), each [n, 3] float64, in one frame, metres.
+
+        The surface's are of the stored `surface_points`, or uniform over the stored mesh without them. Points are drawn
+        anew from those there are; only of fewer than `n` some are drawn again. Raises InputError where the view sees no point.
+        """
+        seen = self.input.cloud(frame, region).points
+        if n < 1:
+            raise InputError(f"n is {n}: it must be at least 1")
+        if not len(seen):
+            raise InputError(
+                f"the input view of pair {self.pose_id} has no depth of region {region}: choose another pair"
+            )
+        rng = np.random.default_rng(seed)
+        partial, stored = pick(seen, n, rng), self._files.samples(self.scene, region)
+        if "surface_points" in stored:
+            whole = pick(stored["surface_points"].astype(np.float64), n, rng)
+        else:
+            whole = sample_mesh(read_mesh(self._files, self.scene, region, False), n, seed)
+        T_frame_cam, T_cam_world = self.input.T_frame_cam(frame, region), invert(self.input.T_world_cam)
+        return partial, transform(T_frame_cam @ T_cam_world @ self.T_world[region], whole)
 
 
 def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> Pair:
-    """The pair of a row of `pair_table`; `labels`: rows of `objects` by (pose id, role)."""
-    scene = {name: value for name, value in row.items() if name not in (*ROLES, "asset", "parent_id")}
+    """The pair of a row of `pair_table`; `labels`: rows of `objects`, with that of `assets`, by (pose id, role)."""
+    scene = MappingProxyType({name: value for name, value in row.items() if name not in (*ROLES, "asset", "parent_id")})
     return Pair(
         pose_id=row["parent_id"],
         scene_id=row["scene_id"],
         category=row["category"],
         instance_id=row["instance_id"],
-        scene=MappingProxyType(scene),
+        scene=scene,
         asset=MappingProxyType(row["asset"] or {}),
-        views=MappingProxyType({role: _read_view(row[role], labels, files) for role in ROLES if row[role] is not None}),
+        views=MappingProxyType(
+            {role: read_view(row[role], labels, scene, files) for role in ROLES if row[role] is not None}
+        ),
         _files=files,
-    )
-
-
-def _read_view(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> View:
-    labelled: Role = "mirror" if row["role"] == "projected" else row["role"]
-    pose_id = file_pose_id(labelled, row["parent_id"])
-    return View(
-        camera=read_camera(row),
-        depth_units_per_m=row["depth_units_per_m"],
-        _paths=view_paths(row),
-        _scene_id=row["scene_id"],
-        _files=files,
-        role=row["role"],
-        pose_id=row["pose_id"],
-        d_z_m=row["d_z_m"],
-        visible_fraction=row["visible_fraction"],
-        objects=tuple(read_label(one) for one in labels.get((pose_id, labelled), ())),
-        row=MappingProxyType(row),
     )

@@ -1,13 +1,17 @@
 """Shapes of a dataset's objects as meshes in the object frame, and the files of its pairs, from single files or from tars."""
 
+import io
+import zipfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from cachetools import LRUCache
+from numpy.typing import NDArray
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import tar_path
+from schemas.dataset.layout import samples_path, tar_path
 from schemas.errors import CorruptError
 from schemas.job.views import Patch
 from services.job.record import JobRecord
@@ -36,6 +40,22 @@ class Shapes:
         from services.read.scene_geometry import region_names
 
         return self._kept(region_names(scene)[region_id], scene["scene_id"]).copy()
+
+    def samples(self, scene: Mapping[str, Any], region_id: int) -> Mapping[str, NDArray]:
+        """The stored samples of the same shape by name, own frame, metres; none where none are stored.
+
+        Raises CorruptError where they are damaged.
+        """
+        from services.read.scene_geometry import region_names
+
+        path = samples_path(*region_names(scene)[region_id])
+        try:
+            with np.load(io.BytesIO(self._read(path)), allow_pickle=False) as stored:
+                return dict(stored)
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
+            raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
 
     @cached_property
     def _sources(self) -> "Sources":
@@ -87,7 +107,7 @@ class RangeFiles:
 
     def __init__(self, files: StoredFiles, records: Sequence[CommitRecord]) -> None:
         self._files, self._records = files, records
-        self.patch, self.mesh = files.patch, files.shapes.mesh
+        self.patch, self.mesh, self.samples = files.patch, files.shapes.mesh, files.shapes.samples
 
     def image(self, scene_id: int, path: str) -> bytes:
         """The bytes of an image, published or not yet. Raises CorruptError where it is missing."""

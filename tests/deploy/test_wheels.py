@@ -139,6 +139,7 @@ began = time.process_time()
 import verso
 pair = next(iter(verso.open(sys.argv[1]).pairs()))
 made = {"shape": pair.input.rgb().shape, "watertight": pair.mesh(welded=True).is_watertight}
+made["pairs"] = [len(points) for points in pair.partial_and_complete(8)] + [pair.correspondence().visible.ndim]
 try:
     verso.make_scene({}, 0)
 except verso.VersoError as error:
@@ -163,7 +164,8 @@ def test_the_wheel_installs_and_reads_on(version, built, dataset, tmp_path):
         [str(own / "python"), "-c", PYTHON, str(dataset)], capture_output=True, text=True, cwd=tmp_path
     )
     found = json.loads(ended.stdout)
-    assert found["watertight"] and len(found["shape"]) == 3 and "verso-data" in found["told"], ended.stderr
+    assert found["pairs"] == [8, 8, 2] and found["watertight"] and len(found["shape"]) == 3, ended.stderr
+    assert "verso-data" in found["told"], ended.stderr
 
 
 def find_python(version: str) -> str | None:

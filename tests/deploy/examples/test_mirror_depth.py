@@ -9,7 +9,7 @@ from mirror_depth import CHANNELS, CROP, is_unseen, make_example, ms_ssim, score
 from splits import instances_of, pairs_of_split
 
 from services.dataset.dataset import open_dataset
-from services.dataset.pair import View
+from services.dataset.view import View
 from tests.datasets import make_dataset
 
 
