@@ -15,9 +15,8 @@ from services.read.audit import verify_independently
 from services.read.independent.poses import check_pair
 from tests.datasets import SMALL, make_dataset, overlaid
 from tests.judge.targets import context_of, judge_scene, stored_pairs
-from workers.geometry import surfaces
-from workers.geometry.colour import decode_srgb
-from workers.scene import rows, targets
+from workers.geometry.mesh import corner_weights
+from workers.scene import painting, rows, surfaces, targets
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import Laid, lay_scene, render_scene
 
@@ -132,9 +131,20 @@ def of_the_world(original: Callable) -> Callable:
     return planted
 
 
-def mixed_in_srgb(original: Callable) -> Callable:
+def mixed_in_srgb(monkeypatch) -> None:
     """Texels are mixed as codes."""
-    return lambda texture, uv, light: decode_srgb(original(texture, uv, np.arange(256) / 255.0))
+    monkeypatch.setattr(painting, "SRGB_STEPS", np.arange(256) / 255.0)
+    monkeypatch.setattr(painting, "CODES", np.rint(np.arange(65_536) / 65_535 * 255).astype(np.uint8))
+
+
+def a_millimetre_off(original: Callable) -> Callable:
+    """Objects are a millimetre aside."""
+    aside = np.array([[0.0, 0.0, 0.0, 1e-3], *[[0.0] * 4] * 3])
+    return lambda found, regions, region_id, T, *more: original(found, regions, region_id, T + aside, *more)
+
+
+def in_half_precision(image, *_):
+    return np.rint((image / 65_535).astype(np.float16).astype(float) * 65_535).astype(np.uint16)
 
 
 WRONG: dict[str, tuple[Callable, str]] = {
@@ -145,14 +155,8 @@ WRONG: dict[str, tuple[Callable, str]] = {
         "normals: ",
     ),
     "half a pixel": (called("triangles_of", lambda f: lambda things, camera: f(things, shifted(camera))), "layers: "),
-    "a millimetre": (
-        called("points_at", lambda f: lambda own, pixels: f(own, pixels) + np.array([1e-3, 0.0, 0.0]), targets.Seen),
-        "coordinates: ",
-    ),
-    "half precision": (
-        called("_sixteen_bits", lambda f: lambda share: f(share.astype(np.float16).astype(float))),
-        "coordinates: ",
-    ),
+    "a millimetre": (called("paint_points", a_millimetre_off), "coordinates: "),
+    "half precision": (seen("coordinates", in_half_precision), "coordinates: "),
     "the longest side as 1": (
         called(
             "coordinate_scale", lambda f: lambda shape: (np.ptp(shape.bounds, axis=0).max().item(), f(shape)[1]), rows
@@ -164,7 +168,7 @@ WRONG: dict[str, tuple[Callable, str]] = {
         "coordinates: ",
     ),
     "red and blue": (seen("albedo", lambda image, *_: image[..., ::-1]), "albedo: "),
-    "texels mixed in sRGB": (called("sample_texture", mixed_in_srgb), "albedo: "),
+    "texels mixed in sRGB": (mixed_in_srgb, "albedo: "),
     "nothing hidden": (called("whole_silhouettes", only_visible), "amodal: "),
     "a pixel too many": (
         called(
@@ -210,7 +214,7 @@ def test_a_point_beyond_a_long_narrow_face_has_the_weights_of_the_nearest_point_
         [[0.5, 0.0012, 0.0], [0.5, -0.0001, 3e-5], [0.95, 0.0013, 0.0], [-0.1, 0.0, 0.0], [0.6, 0.001, 0.0]]
     )
     face = Mesh(corners, np.array([[0, 1, 2]], np.int32))
-    _, weights = surfaces.corner_weights(points, face, np.zeros(len(points), np.int64))
+    _, weights = corner_weights(points, face, np.zeros(len(points), np.int64))
     share = np.linspace(0.0, 1.0, 100_001)[:, None]
     edges = np.concatenate([(1.0 - share) * corners[n] + share * corners[(n + 1) % 3] for n in range(3)])
     for point, found in zip(points[:4], weights @ corners, strict=False):
