@@ -97,9 +97,9 @@ def _paint_albedo(
     face, depth = seen
     points, values, corners, part, base, texels, places = skin
     steps, codes = curves
-    by_ray, at_corners, light, last = np.zeros((3, 3)), np.empty((3, 5)), np.empty(3), -1
+    weights_by_ray, by_ray, last = np.zeros((3, 3)), np.zeros((5, 3)), -1
     weights, value, point = np.empty(3), np.empty(5), np.empty(3)
-    begin, height, width, own = 0, 1, 1, 0
+    begin, height, width, own, alike = 0, 1, 1, 0, True
     for row in range(face.shape[0]):
         ray_y = (row + 0.5 - k[3]) / k[1]
         for column in range(face.shape[1]):
@@ -109,42 +109,62 @@ def _paint_albedo(
                 last = face[row, column]
                 own = part[last]
                 begin, height, width = places[own, 0], places[own, 1], places[own, 2]
-                _weights_by_ray(points, corners[last], by_ray)
-                for corner in range(3):
-                    for n in range(5):
-                        at_corners[corner, n] = values[corners[last, corner], n]
+                alike = _follow_corners(points, corners[last], values, weights_by_ray, by_ray) and width * height == 1
+            if alike:
+                for channel in range(3):
+                    light = base[own, channel] * values[corners[last, 0], 2 + channel]
+                    image[row, column, channel] = codes[np.uint64(light * FULL + 0.5)]
+                continue
             z = depth[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
-            for corner in range(3):
-                weights[corner] = by_ray[corner, 0] * x + by_ray[corner, 1] * y + by_ray[corner, 2] * z
-            if min(weights[0], weights[1], weights[2]) < 0.0 or not math.isfinite(weights[0]):
+            second = weights_by_ray[1, 0] * x + weights_by_ray[1, 1] * y + weights_by_ray[1, 2] * z
+            third = weights_by_ray[2, 0] * x + weights_by_ray[2, 1] * y + weights_by_ray[2, 2] * z
+            if second >= 0.0 and third >= 0.0 and second + third <= 1.0:
+                for n in range(5):
+                    value[n] = by_ray[n, 0] * x + by_ray[n, 1] * y + by_ray[n, 2] * z
+            else:  # beyond the face, or its plane goes through the camera: the nearest point of its edges
                 point[0], point[1], point[2] = x, y, z
                 weigh_edges(point, points, corners[last], weights)
-            for n in range(5):
-                value[n] = 0.0
-                for corner in range(3):
-                    value[n] += weights[corner] * at_corners[corner, n]
+                for n in range(5):
+                    value[n] = 0.0
+                    for corner in range(3):
+                        value[n] += weights[corner] * values[corners[last, corner], n]
+            u, v = value[0] - 0.5 / width, 1.0 - value[1] - 0.5 / height
+            u, v = (u - math.floor(u)) * width, (v - math.floor(v)) * height
+            x0, y0 = min(int(u), width - 1), min(int(v), height - 1)
+            across, down = u - x0, v - y0
+            x1, y1 = (x0 + 1 if x0 + 1 < width else 0), (y0 + 1 if y0 + 1 < height else 0)
+            # Unsigned numbers are not tested for counting from the end, which would take a third of the time.
+            a, b = np.uint64(begin + 3 * (y0 * width + x0)), np.uint64(begin + 3 * (y0 * width + x1))
+            c, d = np.uint64(begin + 3 * (y1 * width + x0)), np.uint64(begin + 3 * (y1 * width + x1))
+            w_d, w_c, w_b = across * down, (1.0 - across) * down, across * (1.0 - down)
+            w_a = 1.0 - w_b - w_c - w_d
             for channel in range(3):
-                light[channel] = base[own, channel] * value[2 + channel]
-            if width * height > 1:
-                u, v = value[0] - 0.5 / width, 1.0 - value[1] - 0.5 / height
-                u, v = (u - math.floor(u)) * width, (v - math.floor(v)) * height
-                x0, y0 = min(int(u), width - 1), min(int(v), height - 1)
-                across, down = u - x0, v - y0
-                x1, y1 = (x0 + 1 if x0 + 1 < width else 0), (y0 + 1 if y0 + 1 < height else 0)
-                # Unsigned numbers are not tested for counting from the end, which would take a third of the time.
-                a, b = np.uint64(begin + 3 * (y0 * width + x0)), np.uint64(begin + 3 * (y0 * width + x1))
-                c, d = np.uint64(begin + 3 * (y1 * width + x0)), np.uint64(begin + 3 * (y1 * width + x1))
-                w_d, w_c, w_b = across * down, (1.0 - across) * down, across * (1.0 - down)
-                w_a = 1.0 - w_b - w_c - w_d
-                for channel in range(3):
-                    more = np.uint64(channel)
-                    upper = w_a * steps[np.uint64(texels[a + more])] + w_b * steps[np.uint64(texels[b + more])]
-                    lower = w_c * steps[np.uint64(texels[c + more])] + w_d * steps[np.uint64(texels[d + more])]
-                    light[channel] *= upper + lower
-            for channel in range(3):
-                code = codes[np.uint64(min(max(light[channel], 0.0), 1.0) * FULL + 0.5)]
-                image[row, column, channel] = code
+                more = np.uint64(channel)
+                upper = w_a * steps[np.uint64(texels[a + more])] + w_b * steps[np.uint64(texels[b + more])]
+                lower = w_c * steps[np.uint64(texels[c + more])] + w_d * steps[np.uint64(texels[d + more])]
+                light = base[own, channel] * value[2 + channel] * (upper + lower)
+                image[row, column, channel] = codes[np.uint64(min(max(light, 0.0), 1.0) * FULL + 0.5)]
+
+
+@compiled
+def _follow_corners(
+    points: Array, corners: NDArray[np.int32], values: Array, weights_by_ray: Array, by_ray: Array
+) -> bool:
+    """Writes the maps from a point of a face to its corners' weights [3, 3], and to their values [5, 3], interpolated.
+
+    Returns whether all corners have the same colour.
+    """
+    _weights_by_ray(points, corners, weights_by_ray)
+    alike = True
+    for n in range(5):
+        for axis in range(3):
+            by_ray[n, axis] = 0.0
+            for corner in range(3):
+                by_ray[n, axis] += values[corners[corner], n] * weights_by_ray[corner, axis]
+        if n >= 2:
+            alike &= values[corners[0], n] == values[corners[1], n] == values[corners[2], n]
+    return alike
 
 
 @compiled
