@@ -20,6 +20,12 @@ from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import face_planes
 from workers.geometry.zbuffer import Corner, cut_row, to_grid
 
+MISSED = 8.0
+"""1/256 pixel: a mask's pixel that no face covers has one as near as this, by a rounding; farther ones are holes."""
+
+MOST_MISSED = 64
+"""More pixels of an image are no roundings, of which there is one in 100,000 pixels, but holes: none of them is looked at."""
+
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
@@ -226,11 +232,17 @@ def _fill_missed(
     has_faces = np.zeros(256, np.bool_)
     for face in range(len(faces)):
         has_faces[kinds[0][face]] = True
+    missed = 0
+    for row in range(region.shape[0]):
+        for column in range(region.shape[1]):
+            missed += best[row, column] < 0 and has_faces[region[row, column]]
+    if missed > MOST_MISSED:
+        return
     for row in range(region.shape[0]):
         for column in range(region.shape[1]):
             if best[row, column] >= 0 or not has_faces[region[row, column]]:
                 continue
-            nearest = np.inf
+            nearest = MISSED**2
             for face in range(len(faces)):
                 area, a, b, c = _oriented(corners, faces, face)
                 if kinds[0][face] != region[row, column] or area == 0 or (area > 0 and kinds[1][face]):

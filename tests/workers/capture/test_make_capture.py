@@ -33,11 +33,13 @@ from workers.capture.make_capture import (
     run_capture,
 )
 from workers.capture.results import open_sources
-from workers.capture.rows import CapturedObject, LeftOut, Origin, make_capture_pair, record_capture
+from workers.capture.rows import CapturedObject, LeftOut, Origin, make_capture_pair, record_capture, with_targets
+from workers.geometry.camera import unproject
 from workers.geometry.frames import translation
 from workers.geometry.projection import Bounds, Seen, compare_covisible
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.rows import object_rows
 from workers.store.images import decode_png
 from workers.store.manifest import check_files, table_of_rows
 
@@ -100,6 +102,33 @@ def test_the_board_has_one_place_in_both_views_and_no_region_is_where_nothing_wa
     assert len(difference_m) > 1000 and set(region.tolist()) == {2} and np.median(difference_m) < 0.0005
     assert pair.agreement is None
     assert not mirror.region[mirror.depth == 0].any() and (mirror.region == 3).any()
+
+
+def test_targets_are_of_the_merged_mesh_and_say_what_share_of_the_object_it_has():
+    job = captures_job(cameras={"mirror": {"T_z_m": 0.6}}, targets={"views": ["normals", "coordinates", "layers"]})
+    across = DONE.surface.vertices[DONE.surface.faces][..., 1].mean(axis=1)
+    holed = dataclasses.replace(DONE.surface, faces=DONE.surface.faces[across < np.median(across)])
+    for surface_of, least, most in ((DONE.surface, 0.999, 1.0), (holed, 0.2, 0.95)):
+        placed = place_capture(job, 2, dataclasses.replace(DONE, surface=surface_of), "mug", "capture")
+        made = make_capture_pair(job, placed, DONE.images(1), 1, DONE.synthesize, shared_renderer().count_pixels)
+        pair = with_targets(job, placed, made, Stopwatch()).pair
+        for view in (pair.input, pair.mirror):
+            (row,) = (one for one in object_rows(2, view, job, placed.things) if one["region_id"] == 3)
+            share, there = row["targets_share"], view.further["coordinates"].any(axis=2)
+            assert (
+                least <= share <= most and share == there[view.region == 3].mean() and not there[view.region != 3].any()
+            )
+            rows, columns = np.nonzero(there & (view.depth > 0))
+            seen = unproject(
+                rows, columns, view.depth[rows, columns] / job.images.depth_units_per_m, view.camera.intrinsics
+            )
+            T = np.linalg.inv(placed.T_world_obj) @ view.camera.T_world_cam
+            told = view.further["coordinates"][rows, columns] / 65535 * row["coordinates_scale_m"]
+            off = np.linalg.norm(told + row["coordinates_offset_m"] - (seen @ T[:3, :3].T + T[:3, 3]), axis=1)
+            # Behind a hole the next wall is seen, which the photograph does not show.
+            assert np.quantile(off, 0.9 if surface_of is DONE.surface else 0.1) < 0.0003
+            normals = view.further["normals"][rows, columns] / 65535 * 2 - 1
+            assert ((normals * seen).sum(axis=1) < 0).all()
 
 
 def test_pose_ids_follow_from_capture_and_place_and_labels_name_board_and_object():
