@@ -336,7 +336,6 @@ def test_a_taken_port_is_told_connections_beyond_the_most_are_closed_and_stalled
     monkeypatch.setattr(server._Handler, "timeout", 0.5)
     with serving(follower, Place("127.0.0.1", 0, None)) as place:
         stalled = [socket.create_connection(("127.0.0.1", place.port), 20) for _ in range(2)]
-        time.sleep(0.2)
         with socket.create_connection(("127.0.0.1", place.port), 20) as third:
             assert third.recv(1) == b""
         for link in stalled:
