@@ -5,7 +5,7 @@
 A margin is the distance of the mean figure from its bound in standard deviations over seeds. A seed moves every object at
 release by up to 10 micrometres and 0.002 degrees, which changes no declared outcome; a chaotic case has seeds of its own,
 and of what cameras measure the noise has them. The other setting takes away AVX2 and FMA from numpy, OpenBLAS and numba.
-Lines that the table has stay: delete a line to measure its case again.
+Lines that the table has stay, and each new line is written as soon as it is there: delete a line to measure its case again.
 """
 
 import argparse
@@ -17,10 +17,11 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import groupby
+from multiprocessing.pool import Pool
 from pathlib import Path
 
 from schemas.environment import KEEP
@@ -52,6 +53,9 @@ OTHER_PROCESSOR = {
     "NUMBA_CPU_NAME": "nehalem",
     "NUMBA_CPU_FEATURES": "+sse4.2",
 }
+
+TIERS = ("", "minute", "slow")
+"""Markers of tests, by what they take."""
 
 COLUMNS = (
     *("case", "declared", "ended", "wrong", "measured", "figure"),
@@ -201,10 +205,15 @@ def _timed(task: tuple[int, int]) -> tuple[tuple[int, int], Ending]:
     return task, dataclasses.replace(end, seconds=time.process_time() - began)
 
 
-def measured(tasks: Iterable[tuple[int, int]], processes: int) -> Iterator[tuple[tuple[int, int], Ending]]:
-    """The endings of cases and seeds, in the tasks' order."""
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        yield from pool.imap(_timed, tasks, chunksize=2)
+def _pool(processes: int, environment: Mapping[str, str]) -> Pool:
+    """Processes that have these variables beside this one's."""
+    kept = dict(os.environ)
+    os.environ |= environment
+    try:
+        return multiprocessing.get_context("spawn").Pool(processes)
+    finally:
+        os.environ.clear()
+        os.environ |= kept
 
 
 def main() -> int:
@@ -218,17 +227,14 @@ def main() -> int:
     kept = _kept(given.file)
     wanted = [place for place, one in enumerate(all_series()) if given.all or not one.tier or one.name in kept]
     places = [place for place in wanted if all_series()[place].name not in kept]
-    usual = {name: os.environ[name] for name in OTHER_PROCESSOR if name in os.environ}
-    os.environ |= OTHER_PROCESSOR
-    others = dict(measured([(place, 0) for place in places], given.processes))
-    for name in OTHER_PROCESSOR:
-        del os.environ[name]
-    os.environ |= usual
+    places.sort(key=lambda place: TIERS.index(all_series()[place].tier))  # what is quick comes first
     tasks = [(place, seed) for place in places for seed in range(given.seeds if all_series()[place].seeded else 1)]
-    for place, some in groupby(measured(tasks, given.processes), lambda one: one[0][0]):
-        line = line_of(all_series()[place], [end for _, end in some], others[place, 0])
-        kept[line["case"]] = line
-        _write(given.file, [kept[one.name] for one in all_series() if one.name in kept])
+    with _pool(1, OTHER_PROCESSOR) as other, _pool(given.processes, {}) as usual:
+        others = other.imap(_timed, [(place, 0) for place in places])
+        for place, some in groupby(usual.imap(_timed, tasks, chunksize=2), lambda one: one[0][0]):
+            line = line_of(all_series()[place], [end for _, end in some], next(others)[1])
+            kept[line["case"]] = line
+            _write(given.file, [kept[one.name] for one in all_series() if one.name in kept])
     weak = {name: said for name, line in kept.items() if (said := what_is_weak(line))}
     for name, said in weak.items():
         print(f"{name}: {said}")

@@ -223,7 +223,8 @@ def rest(
     """
     surfaces, at, near = [*(thing.surface for thing in things), ground], tuple(poses), None
     reaches = np.array([np.linalg.norm(one.surface.vertices - one.mass.com, axis=1).max() for one in things])
-    fall_m, known_m, nudges, sliding = FALL_M, 0.0, 0, 0
+    fall_m, longest_m, known_m, nudges, sliding = FALL_M, LONGEST_FALL_M, 0.0, 0, 0
+    pushed = np.zeros(0)
     for number in range(MOST_STEPS + (MOST_SPUN if spinning_m else 0)):
         sliding += fall_m < SLIDING_FALL_M
         if sliding > most_sliding and number < MOST_STEPS:
@@ -240,7 +241,7 @@ def rest(
             if moved_m <= STILL * fall_m and nudges < MOST_NUDGES:
                 nudge, nudges = _nudge(inertias, contacts, friction, reaches, spun_m), nudges + 1
                 if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
-                    motion, moved_m = nudge, _farthest(nudge, reaches)
+                    motion, moved_m, pushed = nudge, _farthest(nudge, reaches), np.zeros(0)
         except JammedError:
             return Rested(at, False, number)
         if moved_m <= STILL * fall_m:
@@ -251,17 +252,31 @@ def rest(
             for T, body, move, turn in zip(at, inertias, motion.moves, motion.turns, strict=True)
         )
         known_m -= share * moved_m
+        before, pushed = pushed, np.concatenate([motion.moves, motion.turns * reaches[:, None]]).ravel() / fall_m
+        if len(before) and _swings_wider(before, pushed):
+            longest_m = fall_m = max(FALL_M, fall_m / 4)
+            continue
         # So that bodies move by something below half of `REACH_M`
         if moved_m > REACH_M / 2:
             fall_m = max(FALL_M, fall_m / 2)
         elif moved_m < REACH_M / 4:
-            fall_m = min(LONGEST_FALL_M, 2 * fall_m)
+            fall_m = min(longest_m, 2 * fall_m)
     return Rested(at, False, MOST_STEPS)
 
 
 def _farthest(motion: Motion, reaches: Array) -> float:
     """Bound on the distance that any point moves; reaches [bodies]: of the points from their centre of mass, metres."""
     return float((np.linalg.norm(motion.moves, axis=1) + np.linalg.norm(motion.turns, axis=1) * reaches).max())
+
+
+def _swings_wider(before: Array, now: Array) -> bool:
+    """Whether motions of two steps, each as a share of its free fall, are opposed and grow.
+
+    A step moves what hangs along the tangent of its swing, and beyond its lowest point where the free fall is over its length;
+    over twice its length each step ends farther away than the one before.
+    """
+    sizes = float(np.linalg.norm(before)), float(np.linalg.norm(now))
+    return sizes[1] > sizes[0] and float(before @ now) < -0.5 * sizes[0] * sizes[1]
 
 
 def _nudge(bodies: Sequence[Inertia], contacts: Contacts, friction: float, reaches: Array, spinning_m: float) -> Motion:

@@ -418,3 +418,15 @@ def test_a_dimple_above_the_floor_of_a_tray_is_not_taken_for_what_lies_below_it(
         surfaces = [surface_of(mesh_of(each), True, outward) for each in (dimpled, hollow)]
         gaps = contacts_within(surfaces, [above, np.eye(4)], 0.003).gaps
         assert len(gaps) and bool(gaps.min() >= 0.0) is outward and gaps.min() >= fewest
+
+
+@pytest.mark.parametrize("radius_m", [0.03, 0.06])
+@pytest.mark.parametrize("lean_deg", [0.3, 5.0])
+def test_what_hangs_ends_its_swing_below_what_it_hangs_on(radius_m, lean_deg):
+    """A ring on the two edges of a bar. Its length is far below the free fall of the longest step, 400 mm."""
+    upright = pose(rotation_about(np.array([0.0, 1.0, 0.0]), math.pi / 2), np.zeros(3))
+    ring = mesh_of(trimesh.creation.torus(radius_m, 0.1 * radius_m, 48, 24), upright)
+    bar = box((10 * radius_m, 0.2 * radius_m, 0.1 * radius_m))
+    found = settle([ring], [pose(tipped(math.radians(lean_deg)), np.array([0.0, 0.0, -0.838 * radius_m]))], bar)
+    assert found.still
+    assert abs(found.poses[0][0, 2]) < 1e-5  # turned by so many radians about the bar's short side
