@@ -3,14 +3,13 @@
 `seen` is always (face [H, W] int32, -1 for none; z [H, W] float64, metres), `k` fx, fy, cx, cy; pixel centres lie at +0.5.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from workers.geometry.colour import LIMITS, SRGB_STEPS
+from workers.geometry.colour import LIMITS
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import weigh_edges
 
@@ -65,8 +64,9 @@ class Skin(NamedTuple):
     """What the faces of a view are coloured by.
 
     points [V, 3] in the camera's frame and values [V, 5], uv and linear colours, of vertices; corners [F, 3] and part [F] of
-    faces; base [P, 3] linear light of parts; texels: all textures one after another, [h, w, 3] uint8 sRGB; places [P, 3]: where
-    a part's texture begins, its height and its width, one texel for none.
+    faces; base [P, 3] linear light of parts; texels [T, 3] uint16: linear light of all textures one after another, in steps of
+    1 / FULL, each with its first row and column once more at its end; places [P, 3]: where a part's texture begins, its height
+    and its width, one texel for none.
     """
 
     points: Array
@@ -74,7 +74,7 @@ class Skin(NamedTuple):
     corners: NDArray[np.int32]
     part: NDArray[np.int32]
     base: Array
-    texels: NDArray[np.uint8]
+    texels: NDArray[np.uint16]
     places: NDArray[np.int64]
 
 
@@ -83,68 +83,121 @@ def paint_albedo(seen: SeenFaces, skin: Skin, k: Intrinsic, image: NDArray[np.ui
 
     Textures are bilinear among four texels in linear light, and repeat beyond their edges; uv (0, 0) is their lower left corner.
     """
-    _paint_albedo(seen, skin, k, (SRGB_STEPS, CODES), image)
+    _paint_albedo(seen, skin, k, CODES, image)
 
 
 @compiled
 def _paint_albedo(
-    seen: SeenFaces,
-    skin: Skin,
-    k: Intrinsic,
-    curves: tuple[Array, NDArray[np.uint8]],
-    image: NDArray[np.uint8],
+    seen: SeenFaces, skin: Skin, k: Intrinsic, codes: NDArray[np.uint8], image: NDArray[np.uint8]
 ) -> None:
+    """In runs of pixels of one face, whose loops the compiler can make vectors of."""
     face, depth = seen
-    points, values, corners, part, base, texels, places = skin
-    steps, codes = curves
-    weights_by_ray, by_ray, last = np.zeros((3, 3)), np.zeros((5, 3)), -1
-    weights, value, point = np.empty(3), np.empty(5), np.empty(3)
-    begin, height, width, own, alike = 0, 1, 1, 0, True
-    for row in range(face.shape[0]):
-        ray_y = (row + 0.5 - k[3]) / k[1]
-        for column in range(face.shape[1]):
-            if face[row, column] < 0:
+    height, width = face.shape
+    weights_by_ray, by_ray = np.zeros((3, 3)), np.zeros((5, 3))
+    values, tint = np.empty((5, width)), np.empty((3, width), np.float32)
+    texel, share = np.empty((2, width), np.int32), np.empty((2, width), np.float32)
+    for row in range(height):
+        end = 0
+        while end < width:
+            first, own = end, face[row, end]
+            while end < width and face[row, end] == own:
+                end += 1
+            if own < 0:
                 continue
-            if face[row, column] != last:
-                last = face[row, column]
-                own = part[last]
-                begin, height, width = places[own, 0], places[own, 1], places[own, 2]
-                alike = _follow_corners(points, corners[last], values, weights_by_ray, by_ray) and width * height == 1
-            if alike:
+            count, part, colours = end - first, skin.part[own], image[row, first:end]
+            texture, base = skin.places[part], skin.base[part]
+            alike = _follow_corners(skin.points, skin.corners[own], skin.values, weights_by_ray, by_ray)
+            if alike and texture[1] * texture[2] == 1:
                 for channel in range(3):
-                    light = base[own, channel] * values[corners[last, 0], 2 + channel]
-                    image[row, column, channel] = codes[np.uint64(light * FULL + 0.5)]
+                    light = base[channel] * skin.values[skin.corners[own, 0], 2 + channel]
+                    colours[:, channel] = codes[np.uint64(light * FULL + 0.5)]
                 continue
-            z = depth[row, column]
-            x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
-            second = weights_by_ray[1, 0] * x + weights_by_ray[1, 1] * y + weights_by_ray[1, 2] * z
-            third = weights_by_ray[2, 0] * x + weights_by_ray[2, 1] * y + weights_by_ray[2, 2] * z
-            if second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-                for n in range(5):
-                    value[n] = by_ray[n, 0] * x + by_ray[n, 1] * y + by_ray[n, 2] * z
-            else:  # beyond the face, or its plane goes through the camera: the nearest point of its edges
-                point[0], point[1], point[2] = x, y, z
-                weigh_edges(point, points, corners[last], weights)
-                for n in range(5):
-                    value[n] = 0.0
-                    for corner in range(3):
-                        value[n] += weights[corner] * values[corners[last, corner], n]
-            u, v = value[0] - 0.5 / width, 1.0 - value[1] - 0.5 / height
-            u, v = (u - math.floor(u)) * width, (v - math.floor(v)) * height
-            x0, y0 = min(int(u), width - 1), min(int(v), height - 1)
-            across, down = u - x0, v - y0
-            x1, y1 = (x0 + 1 if x0 + 1 < width else 0), (y0 + 1 if y0 + 1 < height else 0)
-            # Unsigned numbers are not tested for counting from the end, which would take a third of the time.
-            a, b = np.uint64(begin + 3 * (y0 * width + x0)), np.uint64(begin + 3 * (y0 * width + x1))
-            c, d = np.uint64(begin + 3 * (y1 * width + x0)), np.uint64(begin + 3 * (y1 * width + x1))
-            w_d, w_c, w_b = across * down, (1.0 - across) * down, across * (1.0 - down)
-            w_a = 1.0 - w_b - w_c - w_d
+            ray = (first + 0.5 - k[2]) / k[0], (row + 0.5 - k[3]) / k[1], 1.0 / k[0]
+            z = depth[row, first:end]
+            _interpolate(by_ray, ray, z, values)
+            _keep_inside(skin, own, weights_by_ray, ray, z, values)
             for channel in range(3):
-                more = np.uint64(channel)
-                upper = w_a * steps[np.uint64(texels[a + more])] + w_b * steps[np.uint64(texels[b + more])]
-                lower = w_c * steps[np.uint64(texels[c + more])] + w_d * steps[np.uint64(texels[d + more])]
-                light = base[own, channel] * value[2 + channel] * (upper + lower)
-                image[row, column, channel] = codes[np.uint64(min(max(light, 0.0), 1.0) * FULL + 0.5)]
+                for j in range(count):
+                    tint[channel, j] = base[channel] * values[2 + channel, j]
+            _find_texels(values, count, texture, texel, share)
+            _blend(tint, texel, share, texture, skin.texels, codes, colours)
+
+
+@compiled
+def _interpolate(by_ray: Array, ray: tuple[float, float, float], z: Array, values: Array) -> None:
+    """Writes the values [5, N] of a face along a row; ray: x and y of the first, at z = 1, and how x grows."""
+    for n in range(5):
+        begin = by_ray[n, 0] * ray[0] + by_ray[n, 1] * ray[1] + by_ray[n, 2]
+        more = by_ray[n, 0] * ray[2]
+        for j in range(len(z)):
+            values[n, j] = z[j] * (begin + more * np.float64(j))
+
+
+@compiled
+def _keep_inside(
+    skin: Skin, own: int, weights_by_ray: Array, ray: tuple[float, float, float], z: Array, values: Array
+) -> None:
+    """Overwrites values [5, N] of what is beyond the face, or whose plane goes through the camera: the nearest of its edges."""
+    two, three, inside = weights_by_ray[1], weights_by_ray[2], True
+    begin = two[0] * ray[0] + two[1] * ray[1] + two[2], three[0] * ray[0] + three[1] * ray[1] + three[2]
+    more = two[0] * ray[2], three[0] * ray[2]
+    for j in range(len(z)):
+        second, third = z[j] * (begin[0] + more[0] * np.float64(j)), z[j] * (begin[1] + more[1] * np.float64(j))
+        inside &= (second >= 0.0) & (third >= 0.0) & (second + third <= 1.0)
+    if inside:
+        return
+    point, weights, corners = np.empty(3), np.empty(3), skin.corners[own]
+    for j in range(len(z)):
+        second, third = z[j] * (begin[0] + more[0] * np.float64(j)), z[j] * (begin[1] + more[1] * np.float64(j))
+        if not (second >= 0.0 and third >= 0.0 and second + third <= 1.0):
+            point[0], point[1], point[2] = (ray[0] + j * ray[2]) * z[j], ray[1] * z[j], z[j]
+            weigh_edges(point, skin.points, corners, weights)
+            for n in range(5):
+                values[n, j] = 0.0
+                for corner in range(3):
+                    values[n, j] += weights[corner] * skin.values[corners[corner], n]
+
+
+@compiled
+def _find_texels(
+    values: Array, count: int, texture: NDArray[np.int64], texel: NDArray[np.int32], share: NDArray[np.float32]
+) -> None:
+    """Writes column and row [2, N] of the upper left of four texels, and how far from their centre to the next each point is."""
+    height, width = np.float64(texture[1]), np.float64(texture[2])
+    for j in range(count):
+        u, v = values[0, j] - 0.5 / width, 1.0 - values[1, j] - 0.5 / height
+        u, v = (u - np.floor(u)) * width, (v - np.floor(v)) * height
+        left, upper = min(np.floor(u), width - 1.0), min(np.floor(v), height - 1.0)
+        texel[0, j], texel[1, j] = np.int32(left), np.int32(upper)
+        share[0, j], share[1, j] = u - left, v - upper
+
+
+@compiled
+def _blend(
+    tint: NDArray[np.float32],
+    texel: NDArray[np.int32],
+    share: NDArray[np.float32],
+    texture: NDArray[np.int64],
+    texels: NDArray[np.uint16],
+    codes: NDArray[np.uint8],
+    colours: NDArray[np.uint8],
+) -> None:
+    """Writes the colours [N, 3] of a row's points: texels, bilinear, times tint."""
+    wide, half, most = texture[2] + 1, np.float32(0.5), np.float32(FULL)
+    for j in range(len(colours)):
+        # Unsigned numbers are not tested for counting from the end, which would take a third of the time.
+        a = np.uint64(texture[0] + texel[1, j] * wide + texel[0, j])
+        b, c, d = a + np.uint64(1), a + np.uint64(wide), a + np.uint64(wide + 1)
+        across, down = share[0, j], share[1, j]
+        w_d = across * down
+        w_c, w_b = down - w_d, across - w_d
+        w_a = np.float32(1.0) - across - w_c
+        r = w_a * texels[a, 0] + w_b * texels[b, 0] + w_c * texels[c, 0] + w_d * texels[d, 0]
+        g = w_a * texels[a, 1] + w_b * texels[b, 1] + w_c * texels[c, 1] + w_d * texels[d, 1]
+        b_ = w_a * texels[a, 2] + w_b * texels[b, 2] + w_c * texels[c, 2] + w_d * texels[d, 2]
+        colours[j, 0] = codes[np.uint64(np.int32(min(r * tint[0, j], most) + half))]
+        colours[j, 1] = codes[np.uint64(np.int32(min(g * tint[1, j], most) + half))]
+        colours[j, 2] = codes[np.uint64(np.int32(min(b_ * tint[2, j], most) + half))]
 
 
 @compiled
@@ -185,9 +238,13 @@ def _weights_by_ray(points: Array, corners: NDArray[np.int32], by_ray: Array) ->
             by_ray[corner, axis] /= volume
 
 
-@compiled_for("i8[::1], f8[::1], u1[::1], f8[:,::1], u1[:,::1]")
+@compiled_for("i8[::1], u2[::1], u1[::1], u2[:,::1], u1[:,::1]")
 def paint_layers(
-    start: NDArray[np.int64], z: Array, region: NDArray[np.uint8], depth: Array, regions: NDArray[np.uint8]
+    start: NDArray[np.int64],
+    z: NDArray[np.uint16],
+    region: NDArray[np.uint8],
+    depth: NDArray[np.uint16],
+    regions: NDArray[np.uint8],
 ) -> None:
     """Writes z and region of each pixel's surfaces (`surfaces.Surfaces`) into layers [L, H * W]; into the last, the last one."""
     layers = len(depth) - 1

@@ -5,6 +5,7 @@ there is not is 0. Coordinates and normals are 16-bit: `value / 65535` is the st
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from schemas.job.job import Job
 from schemas.job.targets import Targets
 from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
+from schemas.scene.shape import REGION_FIRST_OBJECT, Material, Mesh, Part, Shape
 from schemas.scene.view import LAYERS, Camera, PixelKind
 from workers.geometry.colour import SRGB_STEPS, decode_srgb
 from workers.geometry.frames import invert, transform
@@ -32,8 +33,11 @@ from workers.scene.painting import (
 )
 from workers.scene.surfaces import Surfaces, Triangles, all_surfaces, nearest_faces, triangles_of
 
-WHITE = np.full((1, 1, 3), 255, np.uint8)
-"""The texture of a part without one."""
+WHITE = Material()
+"""Has the texture of a part without one."""
+
+LINEAR = np.rint(SRGB_STEPS * FULL).astype(np.uint16)
+"""[256] linear light of sRGB codes, in steps of 1 / FULL, of which the darkest code has 20."""
 
 OF_NEAREST, OF_ALL = ("normals", "coordinates", "albedo"), ("layers", "amodal")
 """Targets of what is seen, and of everything along a pixel's ray."""
@@ -145,18 +149,23 @@ def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     return image
 
 
-def _textures_of(parts: Sequence[Part]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def _textures_of(parts: Sequence[Part]) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
     """(texels, places) of `painting.Skin`; a texture that several parts have is there once."""
-    found, places, total = dict[int, tuple[int, NDArray[np.uint8]]](), [], 0
+    found, places, total = dict[int, tuple[int, NDArray[np.uint16]]](), [], 0
     for part in parts:
-        texture = part.material.texture
-        if texture is None or part.uv is None:
-            texture = WHITE
-        if id(texture) not in found:
-            found[id(texture)] = total, texture
-            total += 3 * texture.shape[0] * texture.shape[1]
-        places.append((found[id(texture)][0], *texture.shape[:2]))
-    return np.concatenate([texture[..., :3].reshape(-1) for _, texture in found.values()]), np.array(places)
+        texels = _texels_of(WHITE if part.uv is None else part.material)
+        if id(texels) not in found:
+            found[id(texels)] = total, texels
+            total += texels.shape[0] * texels.shape[1]
+        places.append((found[id(texels)][0], texels.shape[0] - 1, texels.shape[1] - 1))
+    return np.concatenate([texels.reshape(-1, 3) for _, texels in found.values()]), np.array(places)
+
+
+@lru_cache(maxsize=16)
+def _texels_of(material: Material) -> NDArray[np.uint16]:
+    """[h + 1, w + 1, 3]: the linear light of a texture, or of a white texel, and its first row and column once more."""
+    texture = np.full((1, 1, 3), 255, np.uint8) if material.texture is None else material.texture
+    return np.pad(LINEAR[texture[..., :3]], ((0, 1), (0, 1), (0, 0)), mode="wrap")
 
 
 def _values_of(part: Part) -> Array:
@@ -184,12 +193,12 @@ def peel_layers(
 ) -> dict[PixelKind, NDArray[np.uint16] | NDArray[np.uint8]]:
     """Depth and region [H, W] of the first `count` surfaces of objects along each pixel's ray, and of the last one."""
     width, height = triangles.size
-    z, region = np.zeros((count + 1, height, width)), np.zeros((count + 1, height, width), np.uint8)
-    flat = z.reshape(count + 1, -1), region.reshape(count + 1, -1)
-    paint_layers(surfaces.start, surfaces.z, triangles.region[surfaces.face], *flat)
+    depth, region = np.zeros((count + 1, height, width), np.uint16), np.zeros((count + 1, height, width), np.uint8)
+    z, flat = quantise_depth(surfaces.z[None], images)[0], (depth.reshape(count + 1, -1), region.reshape(count + 1, -1))
+    paint_layers(surfaces.start, z, triangles.region[surfaces.face], *flat)
     drawn: dict[PixelKind, NDArray] = {}
     for n, name in enumerate([*(f"layer{layer}" for layer in LAYERS[:count]), "back"]):
-        drawn |= {name: quantise_depth(z[n], images), f"{name}_region": region[n]}
+        drawn |= {name: depth[n], f"{name}_region": region[n]}
     return drawn
 
 
