@@ -46,6 +46,9 @@ def main(options: argparse.Namespace) -> int:
         job, job_folder = load_job(options.job, options.changes), options.job.parent
     if options.effects is not None:
         return _print(options, job, effects.measure_effects(job, job_folder, options.effects), effects.describe)
+    if options.targets is not None:
+        timed = effects.measure_targets(job, job_folder, options.targets)
+        return _print(options, job, timed, effects.describe_targets)
     refuse_unmatched(job)
     with bench_folder(options.folder) as folder:
         if options.nodes is not None:

@@ -1,4 +1,4 @@
-"""`verso bench --effects N`: time of settling by each scene's plan of effects, and with effects forced."""
+"""`verso bench --effects N`, time of settling by plan and with effects forced; `--targets N`, of scenes with image targets."""
 
 import contextlib
 import time
@@ -6,21 +6,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from schemas.base import Array
 from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
+from schemas.job.targets import ViewTarget
 from services.bench.figures import Spread, describe_head, describe_machine, format_spread, pinned
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.settle import settle_scene
 from workers.scene.chance import SceneChance
-from workers.scene.context import open_worker
+from workers.scene.context import Stopwatch, open_worker
 from workers.scene.effects import PHYSICS_EFFECTS, Facts, plan_effects
+from workers.scene.make_scene import make_scene
 from workers.scene.plan import plan_scene, pouring_of
+from workers.scene.rows import record_scene
 
 ROUNDS = 3
 """Timed rounds, after one round that fills the caches."""
@@ -37,6 +40,14 @@ FORCED: dict[str, frozenset[str]] = {
     **{name: frozenset({name}) for name in EFFECTS},
 }
 """Forced effects by the variant's name; an effect's own name stands for the plan and that effect."""
+
+
+TARGETS: dict[str, tuple[ViewTarget, ...]] = {
+    "none": (),
+    **{name: (name,) for name in get_args(ViewTarget)},
+    "all": get_args(ViewTarget),
+}
+"""Image targets by the variant's name."""
 
 
 def measure_effects(job: Job, job_folder: Path, count: int) -> dict[str, Any]:
@@ -141,3 +152,54 @@ def describe(figures: dict[str, Any]) -> list[str]:
 
 def _ms(side: Mapping[str, float]) -> str:
     return f"{side['median_ms']:8.1f} ({side['mean_ms']:.1f})"
+
+
+def measure_targets(job: Job, job_folder: Path, count: int) -> dict[str, Any]:
+    """Time the job's first scenes, made and encoded, without image targets, with each and with all of them, in turn.
+
+    Raises RunError where no scene is made.
+    """
+    with pinned() as core:
+        catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
+        contexts = {
+            name: open_worker(
+                job.model_copy(update={"targets": job.targets.model_copy(update={"views": views, "shape": ()})}),
+                catalogue,
+            )
+            for name, views in TARGETS.items()
+        }
+        seconds = {name: np.full((ROUNDS + 1, count), np.nan) for name in TARGETS}
+        for lap, number, name in product(range(ROUNDS + 1), range(count), TARGETS):
+            began, watch = time.process_time(), Stopwatch()
+            with contextlib.suppress(SceneError):
+                record_scene(contexts[name], make_scene(contexts[name], job.first_scene + number, watch), watch)
+                seconds[name][lap, number] = time.process_time() - began
+        machine = describe_machine(contexts["none"].renderer.name)
+    return {"machine": machine, "core": core, **summarise_targets({name: each[1:] for name, each in seconds.items()})}
+
+
+def summarise_targets(seconds: Mapping[str, Array]) -> dict[str, Any]:
+    """Milliseconds a scene, and in each round the median of scenes' ratios to the same without targets; [rounds, scenes] each."""
+    made = np.asarray(~np.isnan(seconds["none"]).any(axis=0))
+    if not made.any():
+        raise RunError(f"none of {made.size} scenes could be made")
+    ratios = {name: np.median(each[:, made] / seconds["none"][:, made], axis=1) for name, each in seconds.items()}
+    sides = {
+        name: {**_side(each[:, made]), "ratio": asdict(Spread.of(ratios[name].tolist()))}
+        for name, each in seconds.items()
+    }
+    return {"scenes": int(made.sum()), "rounds": len(seconds["none"]), "targets": sides}
+
+
+def describe_targets(figures: dict[str, Any]) -> list[str]:
+    """The figures of `measure_targets` as text, line by line."""
+    return [
+        *describe_head(figures),
+        f"measured   {figures['scenes']} scenes, made and encoded, {figures['rounds']} times with each in turn on core "
+        f"{figures['core']}, caches warm; ms of processor a scene, median (mean)",
+        "",
+        *(
+            f"{name:12} {_ms(side)}   {format_spread(side['ratio'])} times a scene without"
+            for name, side in figures["targets"].items()
+        ),
+    ]

@@ -139,6 +139,7 @@ STUDY_COMMANDS: Final[dict[str, Command]] = {
             "--effects",
             "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
         ),
+        number("--targets", "time image targets instead: N scenes without, with each, and with all"),
         handler="bench.command:main",
         starts_ray=lambda options: options.workers is not None or options.nodes is not None,
         kept="no figures are kept",

@@ -185,6 +185,27 @@ def test_two_scenes_of_a_job_are_told_of_in_words_and_in_json(monkeypatch, capsy
     assert any("all but decomposition forced" in line and "the plan saves" in line for line in lines)
 
 
+def test_image_targets_are_compared_with_the_same_scenes_without():
+    """Of three scenes, the last of which could not be made, all targets take twice and four times as long."""
+    seconds = {name: np.array([[0.1, 0.2, np.nan]] * 2) for name in effects.TARGETS}
+    seconds["all"] = np.array([[0.2, 0.8, np.nan], [0.4, 0.8, np.nan]])
+    figures = effects.summarise_targets(seconds)
+    assert (figures["scenes"], figures["rounds"]) == (2, 2)
+    assert figures["targets"]["all"]["ratio"] == pytest.approx({"median": 3.5, "least": 3.0, "most": 4.0})
+    assert figures["targets"]["layers"]["ratio"]["median"] == 1.0 and figures["targets"]["none"]["mean_ms"] == 150.0
+    with pytest.raises(RunError, match="none of 3 scenes"):
+        effects.summarise_targets(dict.fromkeys(effects.TARGETS, np.full((2, 3), np.nan)))
+
+
+def test_the_targets_of_a_scene_are_told_of_in_words_and_in_json(monkeypatch, capsys):
+    monkeypatch.setattr(effects, "ROUNDS", 1)
+    assert main(["bench", "--targets", "1", "--json", "--set", "categories=[laptop]"]) == 0
+    *lines, answer = capsys.readouterr().out.splitlines()
+    sides = json.loads(answer)["targets"]
+    assert [*sides] == [*effects.TARGETS] and sides["none"]["ratio"]["median"] == 1.0 < sides["all"]["ratio"]["median"]
+    assert any(line.startswith("all ") and "times a scene without" in line for line in lines)
+
+
 # ---------------------------------------------------------------------------------------------- several at once
 
 
