@@ -52,6 +52,12 @@ class Triangles:
         return k.fx, k.fy, k.cx, k.cy
 
     @property
+    def grid(self) -> tuple[float, float, float, float]:
+        """1 / fx, 1 / fy, cx, cy: what takes a pixel to its ray without a division."""
+        k = self.intrinsics
+        return 1.0 / k.fx, 1.0 / k.fy, k.cx, k.cy
+
+    @property
     def size(self) -> tuple[int, int]:
         """Width and height, pixels."""
         return self.intrinsics.width, self.intrinsics.height
@@ -112,7 +118,7 @@ def nearest_faces(triangles: Triangles, region: NDArray[np.uint8]) -> tuple[NDAr
     A pixel whose centre no face of its region covers, by a rounding of the renderer, has the nearest one beside it.
     """
     t = triangles
-    return _nearest_faces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, (t.region, t.closed), region, t.k)
+    return _nearest_faces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, (t.region, t.closed), region, t.grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +136,7 @@ class Surfaces:
 def all_surfaces(triangles: Triangles) -> Surfaces:
     """Every face that a pixel's ray meets, either side up."""
     t = triangles
-    return Surfaces(*_all_surfaces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, t.k, t.size))
+    return Surfaces(*_all_surfaces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, t.grid, t.size))
 
 
 @compiled
@@ -166,13 +172,13 @@ def _depth(
     face: int,
     column: int,
     row: int,
-    k: tuple[float, float, float, float],
+    grid: tuple[float, float, float, float],
     planes: tuple[Array, Array],
     span: tuple[float, float],
 ) -> float:
     """z at which a pixel's ray meets a face's plane; within `span`, that of the face, also where it is seen edge-on."""
     normal = planes[0][face]
-    along = normal[0] * ((column + 0.5 - k[2]) / k[0]) + normal[1] * ((row + 0.5 - k[3]) / k[1]) + normal[2]
+    along = normal[0] * ((column + 0.5 - grid[2]) * grid[0]) + normal[1] * ((row + 0.5 - grid[3]) * grid[1]) + normal[2]
     z = planes[1][face] / along if along != 0.0 else span[0]
     return min(max(z, span[0]), span[1])
 
@@ -194,7 +200,7 @@ def _nearest_faces(
     planes: tuple[Array, Array],
     kinds: tuple[NDArray[np.uint8], NDArray[np.bool_]],
     region: NDArray[np.uint8],
-    k: tuple[float, float, float, float],
+    grid: tuple[float, float, float, float],
 ) -> tuple[NDArray[np.int32], Array]:
     height, width = region.shape
     best, depth = np.full((height, width), -1, np.int32), np.zeros((height, width))
@@ -209,10 +215,10 @@ def _nearest_faces(
             for column in range(left, right + 1):
                 if region[row, column] != own:
                     continue
-                z = _depth(face, column, row, k, planes, span)
+                z = _depth(face, column, row, grid, planes, span)
                 if best[row, column] < 0 or z < depth[row, column]:
                     best[row, column], depth[row, column] = face, z
-    _fill_missed(best, depth, corners, kinds, region, points, faces, planes, k)
+    _fill_missed(best, depth, corners, kinds, region, points, faces, planes, grid)
     return best, depth
 
 
@@ -226,7 +232,7 @@ def _fill_missed(
     points: Array,
     faces: NDArray[np.int32],
     planes: tuple[Array, Array],
-    k: tuple[float, float, float, float],
+    grid: tuple[float, float, float, float],
 ) -> None:
     """Gives a pixel of a region that none of its faces covers the one whose edge is nearest to the pixel's centre."""
     has_faces = np.zeros(256, np.bool_)
@@ -249,7 +255,7 @@ def _fill_missed(
                     continue
                 centre = (256 * column, 256 * row)
                 away = min(_square_away(a, b, centre), _square_away(b, c, centre), _square_away(c, a, centre))
-                z = _depth(face, column, row, k, planes, _span(points, faces, face))
+                z = _depth(face, column, row, grid, planes, _span(points, faces, face))
                 if away < nearest or (away == nearest and z < depth[row, column]):
                     nearest, best[row, column], depth[row, column] = away, face, z
 
@@ -269,7 +275,7 @@ def _all_surfaces(
     faces: NDArray[np.int32],
     points: Array,
     planes: tuple[Array, Array],
-    k: tuple[float, float, float, float],
+    grid: tuple[float, float, float, float],
     size: tuple[int, int],
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int32]]:
     width, height = size
@@ -295,7 +301,7 @@ def _all_surfaces(
             left, right = _columns(a, b, c, row, first, last)
             for column in range(left, right + 1):
                 pixel = row * width + column
-                own, place = _depth(face, column, row, k, planes, span), start[pixel] + filled[pixel]
+                own, place = _depth(face, column, row, grid, planes, span), start[pixel] + filled[pixel]
                 filled[pixel] += 1
                 while place > start[pixel] and z[place - 1] > own:
                     z[place], owner[place] = z[place - 1], owner[place - 1]
