@@ -252,7 +252,12 @@ def test_complete_is_of_the_stored_samples_where_there_are_some(copy):
         pair.samples()
     path = copy / "assets" / pair.category / f"{pair.instance_id}.npz"
     points = np.arange(30, dtype=np.float32).reshape(10, 3)
-    np.savez(path, surface_points=points)
+    normals, colors, place = (
+        np.zeros_like(points),
+        np.zeros((10, 3), np.uint8),
+        {"loc": np.zeros(3), "scale": np.float64(1)},
+    )
+    np.savez(path, surface_points=points, surface_normals=normals, surface_colors=colors, **place)
     assert np.array_equal(pair.samples()["surface_points"], points)
     complete = pair.partial_and_complete(10, frame="object")[1]
     assert np.allclose(complete[np.argsort(complete[:, 0])], points, atol=1e-9)

@@ -11,7 +11,6 @@ import pytest
 import trimesh
 from scipy.stats import chisquare
 
-from schemas.errors import CorruptError
 from schemas.job.assets import CATEGORIES, ProceduralSource
 from schemas.job.targets import Targets
 from schemas.scene.shape import Asset, Material, Mesh, Part, Shape
@@ -20,7 +19,7 @@ from tests.judge.nearest import winding_numbers as exact_winding_numbers
 from tests.kit.shapes import asset_of, box
 from tests.workers.assets.oracles import welded
 from workers.assets.builtin.make import make_asset
-from workers.assets.samples import decode_samples, draw_samples, encode_samples
+from workers.assets.samples import draw_samples, encode_samples
 from workers.assets.winding import winding_numbers
 from workers.scene.rows import stored_samples
 
@@ -138,15 +137,15 @@ def test_the_same_bytes_come_for_each_target_whatever_else_is_asked_and_whenever
     volume = draw_samples(mug, Targets(shape=("volume",), points=BOTH.points)).arrays
     assert set(samples("mug")) - set(volume) == {"surface_points", "surface_normals", "surface_colors"}
     assert all((array == samples("mug")[name]).all() for name, array in volume.items())
-    assert {name: array.dtype.str for name, array in decode_samples(data).items()} == {
+    with np.load(io.BytesIO(data)) as stored:
+        kinds = {name: array.dtype.str for name, array in stored.items()}
+    assert kinds == {
         **dict.fromkeys(("surface_points", "surface_normals", "volume_points", "volume_distance"), "<f4"),
         "surface_colors": "|u1",
         "volume_occupancy": "|u1",
         "loc": "<f8",
         "scale": "<f8",
     }
-    with pytest.raises(CorruptError, match="cannot be read"):
-        decode_samples(data[:-40])
 
 
 def test_a_shape_without_a_target_has_none_and_says_why():
