@@ -30,23 +30,23 @@ class Shapes:
         self._read, self._record = read, record
         self._kept = lru_cache(16)(self._load)
 
-    def mesh(self, scene: Mapping[str, Any], region_id: int) -> "trimesh.Trimesh":
+    def mesh(self, scene: Mapping[str, Any], region: int) -> "trimesh.Trimesh":
         """The shape of the table or of an object of a scene, own frame, metres; a copy that the caller may change.
 
         Raises InputError where it is neither stored nor to be had from the job's sources, CorruptError where it is damaged.
         """
         from services.read.scene_geometry import region_names
 
-        return self._kept(region_names(scene)[region_id], scene["scene_id"]).copy()
+        return self._kept(region_names(scene)[region], scene["scene_id"]).copy()
 
-    def samples(self, scene: Mapping[str, Any], region_id: int) -> Mapping[str, NDArray]:
+    def samples(self, scene: Mapping[str, Any], region: int) -> Mapping[str, NDArray]:
         """The stored samples of the same shape by name, own frame, metres; none where none are stored.
 
         Raises CorruptError where they are damaged.
         """
         from services.read.scene_geometry import region_names
 
-        path = samples_path(*region_names(scene)[region_id])
+        path = samples_path(*region_names(scene)[region])
         try:
             return decode_samples(self._read(path), path)
         except FileNotFoundError:
