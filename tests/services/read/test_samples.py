@@ -4,6 +4,7 @@ import dataclasses
 import io
 import shutil
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,36 +42,31 @@ def samples_in(store: LocalStore) -> list[str]:
 def test_scenes_that_share_a_shape_store_its_samples_once_and_its_row_lists_them(sampled):
     rows = find_scene(sampled, 0).rows["assets"]
     assert rows == find_scene(sampled, 1).rows["assets"] and len(rows) == 2
-    assert samples_in(sampled) == sorted(row["samples"]["path"] for row in rows)
+    assert [row["category"] for row in rows if row["samples"] is None] == ["table"]
+    row = next(row for row in rows if row["samples"] is not None)
+    assert samples_in(sampled) == [row["samples"]["path"]]
     record = read_record(sampled, 0)
     named = {entry.path for entry in committed_files(sampled, record)} - {entry.path for entry in record.files}
     assert set(samples_in(sampled)) <= named, "by the rows alone"
-    for row in rows:
-        data = sampled.read(row["samples"]["path"])
-        assert (row["samples"]["bytes"], row["samples"]["points"], row["samples"]["open_share"]) == (
-            len(data),
-            POINTS,
-            0.0,
-        )
-        arrays = decode_samples(data, "")
-        assert len(arrays["surface_points"]) == len(arrays["volume_distance"]) == POINTS
-        assert arrays["scale"] == pytest.approx(max(row["extents_m"]))
+    data, named = sampled.read(row["samples"]["path"]), ("bytes", "points", "open_share")
+    assert [row["samples"][name] for name in named] == [len(data), POINTS, 0.0]
+    arrays = decode_samples(data, "")
+    assert len(arrays["surface_points"]) == len(arrays["volume_distance"]) == POINTS
+    assert arrays["scale"] == pytest.approx(max(row["extents_m"]))
 
 
 def test_a_missing_or_damaged_file_of_samples_is_told_and_put_back(sampled, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(sampled.root, out)
-    one, other = (out / path for path in samples_in(sampled))
-    before = one.read_bytes(), other.read_bytes()
+    (file,) = (out / path for path in samples_in(sampled))
+    before = file.read_bytes()
     assert faults_of(LocalStore(out)) == []
-    spoil(one)
-    other.unlink()
-    faults = faults_of(LocalStore(out))
-    assert len(faults) == 2 and one.name in faults[0] and "SHA-256" in faults[0]
-    assert other.name in faults[1] and "is committed and missing" in faults[1]
-    found = repair(LocalStore(out), (), lambda _: None)
-    assert (found.verdict.faults, found.left) == ([], [])
-    assert (one.read_bytes(), other.read_bytes()) == before
+    for harm, told in ((spoil, "SHA-256"), (Path.unlink, "is committed and missing")):
+        harm(file)
+        (fault,) = faults_of(LocalStore(out))
+        assert file.name in fault and told in fault
+        found = repair(LocalStore(out), (), lambda _: None)
+        assert (found.verdict.faults, found.left, file.read_bytes()) == ([], [], before)
 
 
 def test_a_replay_compares_samples_to_the_byte_and_on_another_stack_within_a_tolerance(sampled):
