@@ -251,7 +251,7 @@ T_source_to_object | double[16] | m | object, source | Takes scaled source coord
 scale | double | 1 | - | {scale}
 split | string | - | - | train, val or test, by the instance's id: no shape is in two.
 notes | list of string? | - | - | What was repaired or left out.
-samples | struct?, targets | - | - | Its points (`targets.shape`); null without, and where `notes` says why it has none.
+samples | struct?, targets | - | - | An object's points (`targets.shape`); null without, and where `notes` says why.
 samples.path | string | - | - | Path below the dataset's folder.
 samples.bytes | int64 | byte | - | Size of the file.
 samples.sha256 | string | - | - | SHA-256 of the file.

@@ -51,6 +51,9 @@ DRAWN_ROLES: tuple[Role, ...] = tuple(role.name for role in VIEW_ROLES.values() 
 PixelKind = str
 """The name of a modality."""
 
+FULL = 65_535
+"""The code of 1 in an image of 16 bits."""
+
 LAYERS = range(1, MOST_LAYERS + 1)
 """Numbers of the surfaces along a pixel's ray, from the front."""
 

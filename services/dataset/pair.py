@@ -68,7 +68,7 @@ class Pair:
         return MappingProxyType(read_world_poses(self.scene))
 
     def mesh(
-        self, region_id: int = REGION_FIRST_OBJECT, view: View | None = None, *, welded: bool = False
+        self, region: int = REGION_FIRST_OBJECT, view: View | None = None, *, welded: bool = False
     ) -> "trimesh.Trimesh":
         """An object's shape (or the table's, 2) where it rests: in the world, or in the frame of a view's camera, metres.
 
@@ -76,8 +76,8 @@ class Pair:
         of their textures and normals, so that trimesh calls them not watertight. Raises InputError where there is no such
         region, or where its shape is stored nowhere.
         """
-        T = self._pose_of(region_id)
-        mesh = read_mesh(self._files, self.scene, region_id, welded)
+        T = self._pose_of(region)
+        mesh = read_mesh(self._files, self.scene, region, welded)
         return mesh.apply_transform(T if view is None else np.linalg.inv(view.T_world_cam) @ T)
 
     def samples(self, region: int = REGION_FIRST_OBJECT) -> Mapping[str, NDArray]:
@@ -90,11 +90,11 @@ class Pair:
             raise InputError(f"no samples of region {region} are stored: a job stores those that targets.shape names")
         return stored
 
-    def _pose_of(self, region_id: int) -> Pose:
+    def _pose_of(self, region: int) -> Pose:
         """[4, 4] pose in the world. Raises InputError where there is no such region."""
-        if region_id not in self.T_world:
-            raise InputError(f"scene {self.scene_id} has the regions {sorted(self.T_world)}, and no {region_id}")
-        return self.T_world[region_id]
+        if region not in self.T_world:
+            raise InputError(f"scene {self.scene_id} has the regions {sorted(self.T_world)}, and no {region}")
+        return self.T_world[region]
 
     def correspondence(self, back: bool = False, *, tolerance_m: float = 0.001) -> Correspondence:
         """Where every pixel of the input view lies in the mirror view and whether it is seen there; the other way with `back`.

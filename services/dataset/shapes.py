@@ -1,12 +1,9 @@
 """Shapes of a dataset's objects as meshes in the object frame, and the files of its pairs, from single files or from tars."""
 
-import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
@@ -15,6 +12,7 @@ from schemas.dataset.layout import samples_path, tar_path
 from schemas.errors import CorruptError
 from schemas.job.views import Patch
 from services.job.record import JobRecord
+from services.read.dataset_reader import decode_samples
 from workers.store.commit import read_committed
 from workers.store.store import Store
 from workers.store.tars import read_tar
@@ -32,30 +30,27 @@ class Shapes:
         self._read, self._record = read, record
         self._kept = lru_cache(16)(self._load)
 
-    def mesh(self, scene: Mapping[str, Any], region_id: int) -> "trimesh.Trimesh":
+    def mesh(self, scene: Mapping[str, Any], region: int) -> "trimesh.Trimesh":
         """The shape of the table or of an object of a scene, own frame, metres; a copy that the caller may change.
 
         Raises InputError where it is neither stored nor to be had from the job's sources, CorruptError where it is damaged.
         """
         from services.read.scene_geometry import region_names
 
-        return self._kept(region_names(scene)[region_id], scene["scene_id"]).copy()
+        return self._kept(region_names(scene)[region], scene["scene_id"]).copy()
 
-    def samples(self, scene: Mapping[str, Any], region_id: int) -> Mapping[str, NDArray]:
+    def samples(self, scene: Mapping[str, Any], region: int) -> Mapping[str, NDArray]:
         """The stored samples of the same shape by name, own frame, metres; none where none are stored.
 
         Raises CorruptError where they are damaged.
         """
         from services.read.scene_geometry import region_names
 
-        path = samples_path(*region_names(scene)[region_id])
+        path = samples_path(*region_names(scene)[region])
         try:
-            with np.load(io.BytesIO(self._read(path)), allow_pickle=False) as stored:
-                return dict(stored)
+            return decode_samples(self._read(path), path)
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
 
     @cached_property
     def _sources(self) -> "Sources":

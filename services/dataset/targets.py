@@ -7,11 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import Intrinsics
+from schemas.scene.view import FULL, Intrinsics
 from workers.geometry.camera import unproject
-
-FULL = 65_535
-"""The code of 1 in an image of 16 bits."""
 
 
 def decode_normals(codes: NDArray[np.uint16]) -> NDArray[np.float32]:

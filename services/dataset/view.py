@@ -35,10 +35,10 @@ class Files(Protocol):
     def image(self, scene_id: int, path: str) -> bytes:
         """The bytes of an image. Raises CorruptError where it is missing."""
 
-    def mesh(self, scene: Mapping[str, Any], region_id: int) -> "trimesh.Trimesh":
+    def mesh(self, scene: Mapping[str, Any], region: int) -> "trimesh.Trimesh":
         """The shape of a region (2 the table, 3 and up the objects) in its own frame, metres."""
 
-    def samples(self, scene: Mapping[str, Any], region_id: int) -> Mapping[str, NDArray]:
+    def samples(self, scene: Mapping[str, Any], region: int) -> Mapping[str, NDArray]:
         """The stored samples of the same shape by name; none where none are stored."""
 
 
@@ -165,13 +165,13 @@ class Pixels:
         T_cam_obj = read_matrix(self._labelled(region)["T_cam_obj"])
         return read_mesh(self._files, self._scene, region, welded).apply_transform(T_cam_obj)
 
-    def _labelled(self, region_id: int | None, first: int = REGION_TABLE) -> Mapping[str, Any]:
+    def _labelled(self, region: int | None, first: int = REGION_TABLE) -> Mapping[str, Any]:
         """What is known of a region. Raises InputError where the view has no label of it, or its id is below `first`."""
         known = [one for one in sorted(self.regions) if one >= first]
-        if region_id not in known:
+        if region not in known:
             kind = "object" if first == REGION_FIRST_OBJECT else "object or table"
-            raise InputError(f"region {region_id} is no {kind} of this view; its {kind}s are {known}")
-        return self.regions[region_id]
+            raise InputError(f"region {region} is no {kind} of this view; its {kind}s are {known}")
+        return self.regions[region]
 
     def T_frame_cam(self, frame: Frame, region: int | None = REGION_FIRST_OBJECT) -> Pose:
         """[4, 4]: camera coordinates to those of a frame, metres; the object's is that of a region."""
@@ -195,9 +195,9 @@ class View(Pixels):
     """Labels of the table (region 2) and of every object; the projected view has the mirror view's."""
     row: Mapping[str, Any] = field(repr=False)
 
-    def patch(self, region_id: int = REGION_FIRST_OBJECT) -> Pixels | None:
+    def patch(self, region: int = REGION_FIRST_OBJECT) -> Pixels | None:
         """The stored crop about an object; None where it would leave the image, or where the object is not seen."""
-        label = read_label(self._labelled(region_id, REGION_FIRST_OBJECT))
+        label = read_label(self._labelled(region, REGION_FIRST_OBJECT))
         box = crop_box(label, self.camera, self._files.patch)
         if box is None:
             return None
@@ -205,14 +205,14 @@ class View(Pixels):
         k = self.camera.intrinsics
         size = {"width": self._files.patch.width, "height": self._files.patch.height}
         moved = k.model_copy(update={**size, "cx": k.cx - box[1].start, "cy": k.cy - box[0].start})
-        paths = patch_paths(self.row, patch_index(region_id, objects))
+        paths = patch_paths(self.row, patch_index(region, objects))
         camera = Camera(moved, self.camera.T_world_cam)
         return Pixels(camera, self.depth_units_per_m, self.regions, paths, self._scene, self._files)
 
-    def amodal(self, region_id: int = REGION_FIRST_OBJECT) -> NDArray[np.bool_]:
+    def amodal(self, region: int = REGION_FIRST_OBJECT) -> NDArray[np.bool_]:
         """[H, W] bool: where an object would be seen if nothing stood in front of it."""
-        self._labelled(region_id, REGION_FIRST_OBJECT)
-        several = f"amodal{region_id - REGION_FIRST_OBJECT}"
+        self._labelled(region, REGION_FIRST_OBJECT)
+        several = f"amodal{region - REGION_FIRST_OBJECT}"
         mask: NDArray[np.bool_] = self.image(several if several in self._paths else "amodal") > 0
         return mask
 
@@ -237,9 +237,9 @@ def read_view(row: Row, labels: Mapping[tuple[int, str], list[Row]], scene: Mapp
     )
 
 
-def read_mesh(files: Files, scene: Mapping[str, Any], region_id: int, welded: bool) -> "trimesh.Trimesh":
+def read_mesh(files: Files, scene: Mapping[str, Any], region: int, welded: bool) -> "trimesh.Trimesh":
     """The shape of a region in its own frame."""
-    mesh = files.mesh(scene, region_id)
+    mesh = files.mesh(scene, region)
     return weld(mesh) if welded else mesh
 
 

@@ -9,7 +9,7 @@ image of 137 x 137 pixels measured from its left and upper edge. The object's z 
 import io
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -71,11 +71,10 @@ class OccNet(ObjectWriter):
 
     def _begin_object(self, scene: ExportScene, split: str, category: str, instance_id: str) -> bool:
         """Writes an object's points and names it in its list; False where the dataset has no samples of its shape."""
-        data = scene.samples(instance_id)
-        files = None if data is None else points_of(data)
-        if files is None:
+        stored = scene.samples(instance_id)
+        if not {"surface_points", "volume_points"} <= stored.keys():
             return False
-        for name, arrays in files.items():
+        for name, arrays in points_of(stored).items():
             self.folder.put(f"{category}/{instance_id}/{name}.npz", encode_npz(arrays))
         listed = f"{category}/{split}.lst"
         # Those loaders cut the list at line ends, and take an empty last line for a name.
@@ -113,17 +112,14 @@ class OccNet(ObjectWriter):
         }
 
 
-def points_of(data: bytes) -> dict[str, dict[str, NDArray]] | None:
-    """The arrays of points.npz and pointcloud.npz of a file of samples of a shape; None where it lacks surface or volume."""
-    stored = np.load(io.BytesIO(data))
-    if not {"surface_points", "volume_points"} <= set(stored):
-        return None
-    loc, scale = stored["loc"].astype(np.float64), np.float64(stored["scale"])
+def points_of(stored: Mapping[str, NDArray]) -> dict[str, dict[str, NDArray]]:
+    """The arrays of points.npz and pointcloud.npz from samples of a shape's surface and volume."""
+    loc, scale = stored["loc"], stored["scale"]
 
     def unit(name: str) -> NDArray[np.float32]:
         return ((stored[name] - loc) / scale).astype(np.float32)
 
-    place = {"loc": loc, "scale": np.array(scale)}
+    place = {"loc": loc, "scale": scale}
     bits = np.packbits(stored["volume_occupancy"].astype(np.bool_))
     return {
         "pointcloud": {"points": unit("surface_points"), "normals": stored["surface_normals"], **place},

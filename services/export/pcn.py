@@ -72,11 +72,9 @@ class Pcn(ObjectWriter):
 
     def _complete(self, scene: ExportScene, instance_id: str) -> NDArray[np.float32] | None:
         """[POINTS, 3] on the surface, object frame, metres: stored samples where there are enough, else drawn on the mesh."""
-        if (data := scene.samples(instance_id)) is not None:
-            stored = np.load(io.BytesIO(data))
-            if "surface_points" in stored and len(stored["surface_points"]) >= POINTS:
-                points: NDArray[np.float32] = stored["surface_points"][:POINTS]
-                return points
+        stored: NDArray[np.float32] = scene.samples(instance_id).get("surface_points", np.zeros((0, 3), np.float32))
+        if len(stored) >= POINTS:
+            return stored[:POINTS]
         if (colored := self._shapes.load(scene, instance_id)) is None:
             return None
         mesh = trimesh.Trimesh(colored.shape.vertices, colored.shape.faces, process=False)

@@ -2,7 +2,7 @@
 
 import contextlib
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -19,7 +19,7 @@ from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
 from services.dataset.splits import Splits, collect_ids, split_by_category
-from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
+from services.read.dataset_reader import ReadFile, StoredRange, decode_samples, file_reader, read_image, read_stored
 from services.read.stored_tables import patch_paths, view_paths
 from workers.store.commit import read_committed, split_code
 from workers.store.images import decode_png, encode_png
@@ -121,10 +121,10 @@ class ExportScene:
         bodies = self.row["bodies"] or [{**self.row, "region_id": REGION_FIRST_OBJECT}]
         return {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
 
-    def samples(self, instance_id: str) -> bytes | None:
-        """The file of the shape targets of an instance, None where it has none. Raises CorruptError where it is missing."""
+    def samples(self, instance_id: str) -> Mapping[str, NDArray]:
+        """The shape targets of an instance by key; none where it has none. Raises CorruptError for a damaged or missing file."""
         stored = self.assets[instance_id]["samples"]
-        return None if stored is None else self.read(stored["path"])
+        return {} if stored is None else decode_samples(self.read(stored["path"]), stored["path"])
 
     @property
     def split(self) -> str:

@@ -1,7 +1,6 @@
 """Point clouds of a pair, the posed mesh and samples of shapes, packed for the page's 3-D view; world frame, metres, z up."""
 
 import base64
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from schemas.errors import CorruptError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from services.look.collect import choose_spread
 from services.look.pictures import OBJECT_REGIONS, PLAIN, SHOWN_ROLES, PairImages, metres_of, read_pair
-from services.read.dataset_reader import file_reader, find_scene
+from services.read.dataset_reader import decode_samples, file_reader, find_scene
 from services.read.scene_geometry import posed_scene, region_names
 from workers.geometry.camera import unproject
 from workers.geometry.frames import transform
@@ -92,7 +91,7 @@ class Space:
     clouds: tuple[Cloud, ...]
     bodies: tuple[Body, ...]
     missing: str
-    """Why there is no mesh; empty where there is."""
+    """Sentences that say why there is no mesh, or no samples; empty where nothing is missing."""
 
 
 def read_spaces(store: Store, scene_ids: Sequence[int]) -> tuple[Space, ...]:
@@ -117,7 +116,11 @@ def read_space(store: Store, scene_id: int, most_points: int = MOST_POINTS) -> S
     if not clouds:
         return None
     bodies, missing = _read_bodies(store, scene_id)
-    return Space(scene_id, scene["category"], target, clouds + read_samples(store, scene), bodies, missing)
+    try:
+        clouds += read_samples(store, scene)
+    except CorruptError as error:
+        missing += f" There are no samples: {error}."
+    return Space(scene_id, scene["category"], target, clouds, bodies, missing)
 
 
 def read_samples(store: Store, scene: Row, most: int = MOST_SAMPLES) -> tuple[Cloud, ...]:
@@ -162,14 +165,9 @@ def _diagonal(points: NDArray) -> float:
 
 def _read_arrays(store: Store, path: str) -> Mapping[str, NDArray]:
     try:
-        data = store.read(path)
+        return decode_samples(store.read(path), path)
     except FileNotFoundError:
         return {}
-    try:
-        with np.load(io.BytesIO(data)) as stored:
-            return dict(stored)
-    except Exception as error:  # numpy and zipfile raise errors of many kinds for a damaged file
-        raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
 
 
 def cloud_of(role: str, images: PairImages, view: Row, target: Array, most_points: int) -> Cloud:
@@ -207,11 +205,11 @@ def _evenly(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 def _read_bodies(store: Store, scene_id: int) -> tuple[tuple[Body, ...], str]:
-    """(the meshes of a scene but for the floor, why there are none)."""
+    """(the meshes of a scene but for the floor, a sentence why there are none)."""
     try:
         scene = posed_scene(store, scene_id)
     except VersoError as error:
-        return (), str(error)
+        return (), f" There is no mesh: {error}."
     bodies = []
     for node in scene.graph.nodes_geometry:
         T, name = scene.graph[node]

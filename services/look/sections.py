@@ -85,17 +85,16 @@ def space_html(spaces: Sequence[Space], data: str) -> str:
     )
     boxes += '<label><input type="checkbox" data-part="tint"> colour by camera</label>'
     options = "".join(
-        f'<option value="{at}" data-missing="{escape(f" There is no mesh: {one.missing}." if one.missing else "")}">'
+        f'<option value="{at}" data-missing="{escape(one.missing)}">'
         f"{escape(one.category)}, scene {one.scene_id}</option>"
         for at, one in enumerate(spaces)
     )
     about = "The stored depth of both cameras as points, with the mesh as it was posed."
     if clouds.keys() & SAMPLES.keys():
         about += " Of an object, the input cloud is the partial cloud and surface samples are the complete one."
-    missing = f" There is no mesh: {escape(spaces[0].missing)}." if spaces[0].missing else ""
     keys = "Arrow keys turn, plus and minus zoom, 0 resets."
     return (
-        f'<p class="sub">{about}<span id="space-missing">{missing}</span></p>'
+        f'<p class="sub">{about}<span id="space-missing">{escape(spaces[0].missing)}</span></p>'
         f'<div class="tools"><label>Scene <select id="space-scene">{options}</select></label>{boxes}'
         '<button type="button" class="quiet" id="space-reset">Reset</button></div>'
         '<div class="space"><canvas id="space-canvas" tabindex="0" role="img" '

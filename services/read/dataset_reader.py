@@ -1,6 +1,8 @@
 """Stored rows and images of a dataset, range by range or scene by scene, finished or not."""
 
-from collections.abc import Callable, Iterator, Sequence
+import io
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,3 +131,56 @@ def read_image(read: ReadFile, path: str) -> NDArray:
         return decode_png(read(path), path)
     except ValueError as error:
         raise CorruptError(f"{path} is not a whole PNG: {error}") from error
+
+
+_SAMPLES: Mapping[str, tuple[str, tuple[int, ...]]] = {
+    "surface_points": ("<f4", (3,)),
+    "surface_normals": ("<f4", (3,)),
+    "surface_colors": ("|u1", (3,)),
+    "volume_points": ("<f4", (3,)),
+    "volume_distance": ("<f4", ()),
+    "volume_occupancy": ("|u1", ()),
+    "loc": ("<f8", (3,)),
+    "scale": ("<f8", ()),
+}
+"""(dtype, shape) of the arrays of a shape's samples; of surface and volume those of one point."""
+
+
+def decode_samples(data: bytes, name: str) -> dict[str, NDArray]:
+    """The arrays of the file `name` of a shape's samples by key, as docs/targets.md has them, all finite.
+
+    Raises CorruptError where it is damaged or another file. Nothing is unpacked of one that would unpack to more bytes than
+    it has: arrays are stored uncompressed.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as file:
+            if (unpacked := sum(member.file_size for member in file.infolist())) > len(data):
+                raise ValueError(f"its {len(data):,} bytes would unpack to {unpacked:,}")
+            arrays = {one.filename.removesuffix(".npy"): _decode_array(file.read(one)) for one in file.infolist()}
+        _check_samples(arrays)
+    except Exception as error:  # zipfile and numpy raise errors of many kinds for a damaged file
+        raise CorruptError(f"{name} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
+    return arrays
+
+
+def _decode_array(data: bytes) -> NDArray:
+    """The array of a .npy file of plain numbers. Its header is not believed: so many bytes have to follow."""
+    stream = io.BytesIO(data)
+    np.lib.format.read_magic(stream)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape).copy()
+
+
+def _check_samples(arrays: Mapping[str, NDArray]) -> None:
+    """Raises ValueError for a key, a type, a shape or a number that samples do not have."""
+    kinds = {key.partition("_")[0] for key in arrays} & {"surface", "volume"} or {"surface", "volume"}
+    wanted = [key for key in _SAMPLES if key.partition("_")[0] in {*kinds, "loc", "scale"}]
+    if arrays.keys() != set(wanted):
+        raise ValueError(f"it has {', '.join(arrays) or 'no array'}, not {', '.join(wanted)}")
+    for key, array in arrays.items():
+        (dtype, shape), kind = _SAMPLES[key], key.partition("_")[0]
+        shape = (*arrays[f"{kind}_points"].shape[:1], *shape) if kind in kinds else shape
+        if (array.dtype.str, array.shape) != (dtype, shape):
+            raise ValueError(f"{key} is {array.dtype.str} {array.shape}, not {dtype} {shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{key} has a number that is not finite")

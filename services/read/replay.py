@@ -27,9 +27,8 @@ from schemas.errors import CorruptError, MachineError
 from schemas.job.identity import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
-from services.read.dataset_reader import StoredRange, file_reader, find_scene
+from services.read.dataset_reader import StoredRange, decode_samples, file_reader, find_scene
 from services.read.stored_tables import read_merged
-from workers.assets.samples import decode_samples
 from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
@@ -110,15 +109,15 @@ def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_s
         if made[path].sha256 == scene_files[path]:
             continue
         compare = _compare_samples if is_shape(path) else _compare_pixels
-        within, how = compare(read(path), made[path].data)
+        within, how = compare(read(path), made[path].data, path)
         if same_stack or not within:
             differences.append(f"{path}: {how}")
     return differences
 
 
-def _compare_pixels(before: bytes, now: bytes) -> tuple[bool, str]:
+def _compare_pixels(before: bytes, now: bytes, path: str) -> tuple[bool, str]:
     """(whether two images agree within the tolerances of another stack, how they differ)."""
-    a, b = decode_png(before), decode_png(now)
+    a, b = decode_png(before, path), decode_png(now, path)
     if a.shape != b.shape or a.dtype != b.dtype:
         return False, f"was {a.dtype} {a.shape}, is {b.dtype} {b.shape}"
     gap = np.abs(a.astype(np.int64) - b.astype(np.int64))
@@ -127,9 +126,9 @@ def _compare_pixels(before: bytes, now: bytes) -> tuple[bool, str]:
     return share <= PIXEL_SHARE, f"{share:.4%} of its values differ by more than {allowed}, at most {gap.max()}"
 
 
-def _compare_samples(before: bytes, now: bytes) -> tuple[bool, str]:
+def _compare_samples(before: bytes, now: bytes, path: str) -> tuple[bool, str]:
     """The same for the samples of a shape."""
-    a, b = decode_samples(before), decode_samples(now)
+    a, b = decode_samples(before, path), decode_samples(now, path)
     if a.keys() != b.keys() or any(a[name].shape != b[name].shape for name in a):
         return False, f"has {', '.join(a)}, and now {', '.join(b)}"
     share = max(float((np.abs(a[name].astype(np.float64) - b[name]) > SAMPLE_STEP).mean()) for name in a)

@@ -4,7 +4,6 @@ They are drawn from the digest of the asset's source, so that every scene and ev
 """
 
 import io
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.errors import CorruptError
 from schemas.job.targets import ShapeTarget, Targets
 from schemas.scene.shape import Asset, Mesh, Part, Shape
 from workers.assets.external.mesh import merge_points
@@ -77,15 +75,6 @@ def encode_samples(arrays: Mapping[str, NDArray]) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **arrays)
     return stream.getvalue()
-
-
-def decode_samples(data: bytes) -> dict[str, NDArray]:
-    """The arrays of a stored file. Raises CorruptError where it is damaged."""
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            return dict(file)
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise CorruptError(f"the samples of a shape cannot be read: {error}") from error
 
 
 def _chance(asset: Asset, target: ShapeTarget) -> np.random.Generator:

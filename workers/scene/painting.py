@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
+from schemas.scene.view import FULL
 from workers.geometry.colour import LIMITS
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import weigh_edges
 
 SeenFaces = tuple[NDArray[np.int32], Array]
 Intrinsic = tuple[float, float, float, float]
-
-FULL = 65_535
-"""The code of 1 in an image of 16 bits."""
 
 CODES = np.searchsorted(LIMITS, np.arange(FULL + 1) / FULL).astype(np.uint8)
 """[65536] 8-bit sRGB of linear light in steps of 1 / 65535, of which the darkest code has 20."""

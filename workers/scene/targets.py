@@ -16,14 +16,13 @@ from schemas.job.targets import Targets
 from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Material, Mesh, Part, Shape
-from schemas.scene.view import LAYERS, Camera, PixelKind
+from schemas.scene.view import FULL, LAYERS, Camera, PixelKind
 from workers.geometry.colour import SRGB_STEPS, decode_srgb
 from workers.geometry.frames import invert, transform
 from workers.geometry.mesh import corner_weights, mix
 from workers.geometry.pixels import quantise_depth
 from workers.scene.context import Stopwatch
 from workers.scene.painting import (
-    FULL,
     Skin,
     paint_albedo,
     paint_faces,

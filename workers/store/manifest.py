@@ -301,9 +301,12 @@ def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
 
 
 def _nulls(count: int, kind: pa.DataType) -> pa.Array:
-    """So many missing values. pyarrow's own have missing items below a list of fixed size, which such a list may not have."""
+    """So many missing values. pyarrow's own have missing items below a list of fixed size, and `pa.nulls` below a struct too.
+
+    A schema in which these items may not be missing does not take them.
+    """
     if not pa.types.is_fixed_size_list(kind):
-        return pa.nulls(count, kind)
+        return pa.array([None] * count, kind)
     items = pa.array(np.zeros(count * kind.list_size), kind.value_type)
     return pa.FixedSizeListArray.from_arrays(items, type=kind, mask=pa.array([True] * count, pa.bool_()))
 

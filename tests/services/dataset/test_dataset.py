@@ -124,8 +124,8 @@ def test_what_is_wrong_is_told_at_once_and_clearly(files, tmp_path):
         (InputError, "part", lambda: dataset.pairs(part=(2, 2))),
         (OutputError, r"holds no job\.yaml", lambda: open_dataset(tmp_path / "nowhere")),
         (InputError, "no image of kind 'region', only rgb, depth", lambda: pair.projected.segment()),
-        (InputError, r"region 9 is no object of this view; its objects are \[3\]", lambda: pair.input.patch(9)),
-        (InputError, r"has the regions \[2, 3\], and no 1", lambda: pair.mesh(1)),
+        (InputError, r"region 9 is no object of this view; its objects are \[3\]", lambda: pair.input.patch(region=9)),
+        (InputError, r"has the regions \[2, 3\], and no 1", lambda: pair.mesh(region=1)),
     ):
         with pytest.raises(error, match=told):
             call()

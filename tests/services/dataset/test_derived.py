@@ -252,7 +252,12 @@ def test_complete_is_of_the_stored_samples_where_there_are_some(copy):
         pair.samples()
     path = copy / "assets" / pair.category / f"{pair.instance_id}.npz"
     points = np.arange(30, dtype=np.float32).reshape(10, 3)
-    np.savez(path, surface_points=points)
+    normals, colors, place = (
+        np.zeros_like(points),
+        np.zeros((10, 3), np.uint8),
+        {"loc": np.zeros(3), "scale": np.float64(1)},
+    )
+    np.savez(path, surface_points=points, surface_normals=normals, surface_colors=colors, **place)
     assert np.array_equal(pair.samples()["surface_points"], points)
     complete = pair.partial_and_complete(10, frame="object")[1]
     assert np.allclose(complete[np.argsort(complete[:, 0])], points, atol=1e-9)
@@ -284,14 +289,14 @@ def test_what_cannot_be_had_is_told_with_what_to_ask_for(files, pairs, copy):
         ),
         (r"region None is no object or table", lambda: view.cloud("object", None)),
         (r"region 1 is no object or table", lambda: view.box(1)),
-        (r"region 9 is no object or table", lambda: view.mesh(9)),
-        (r"region 2 is no object of this view; its objects are \[3, 4, 5\]", lambda: pairs[-1].input.amodal(2)),
+        (r"region 9 is no object or table", lambda: view.mesh(region=9)),
+        (r"region 2 is no object of this view; its objects are \[3, 4, 5\]", lambda: pairs[-1].input.amodal(region=2)),
         (r"there is no frame 'robot': frames are object, camera and world", lambda: view.cloud("robot")),
         (r"pair 0 has no mirror view: .*cameras\.mirror\.enabled", alone.correspondence),
         (r"cameras\.mirror\.enabled", alone.flow),
         (r"n is 0", lambda: plain.partial_and_complete(0)),
         (r"region 9 is no object or table", lambda: plain.partial_and_complete(5, region=9)),
-        (r"regions \[2, 3\], and no 9", lambda: plain.samples(9)),
+        (r"regions \[2, 3\], and no 9", lambda: plain.samples(region=9)),
     ):
         with pytest.raises(InputError, match=told):
             call()

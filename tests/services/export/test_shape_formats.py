@@ -107,7 +107,7 @@ def test_cameras_project_the_cloud_onto_the_object_and_its_colours(shaped, expor
 
 def test_an_object_whose_shape_has_no_samples_is_left_out(shaped, tmp_path, monkeypatch):
     read, without = ExportScene.samples, min(objects_of(shaped))
-    monkeypatch.setattr(ExportScene, "samples", lambda self, name: None if name == without else read(self, name))
+    monkeypatch.setattr(ExportScene, "samples", lambda self, name: {} if name == without else read(self, name))
     manifest = export_to(shaped, tmp_path / "new", "occnet").manifest
     assert manifest["left_out"] == {NO_SAMPLES: 1} and manifest["pairs"] == 2
     assert models_of(tmp_path / "new").keys() == objects_of(shaped).keys() - {without}

@@ -106,5 +106,6 @@ def sampled(targets, tmp_path_factory):
         distance = np.repeat(np.array([-1, 1], np.float32), len(v))
         surface = {"surface_points": v, "surface_normals": np.zeros_like(v), "surface_colors": colors}
         volume = {"volume_points": np.concatenate([v / 2, v * 2]), "volume_distance": distance}
-        np.savez(file.with_suffix(".npz"), **surface, **volume, volume_occupancy=np.uint8(distance < 0))
+        volume |= {"volume_occupancy": np.uint8(distance < 0), "loc": np.zeros(3), "scale": np.float64(1)}
+        np.savez(file.with_suffix(".npz"), **surface, **volume)
     return store

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from schemas.errors import CorruptError
 from schemas.scene.view import MODALITIES, Modality
 from services.look.clouds import INSIDE, OUTSIDE, Cloud, pack_space, read_samples, read_space
 from services.look.contact_sheet import WIDTH, draw_contact_sheet, draw_points
@@ -122,12 +121,14 @@ def test_samples_lie_on_the_posed_mesh_and_those_of_the_volume_have_the_colour_o
     ]  # fmt: skip
 
 
-def test_damaged_samples_are_named(sampled, tmp_path):
+def test_the_page_says_which_samples_are_damaged_and_shows_the_rest(sampled, tmp_path):
     store = LocalStore(shutil.copytree(sampled.root, tmp_path / "damaged"))
     file = next((store.root / "assets" / "mug").glob("*.npz"))
     file.write_bytes(file.read_bytes()[:1000])
-    with pytest.raises(CorruptError, match=rf"assets/mug/{file.name} cannot be read.*verso replay"):
-        read_space(store, 0)
+    told = rf" There are no samples: assets/mug/{file.name} cannot be read: [^.]*; `verso replay OUT --repair` makes it again\."
+    space = read_space(store, 0)
+    assert re.fullmatch(told, space.missing) and [cloud.role for cloud in space.clouds] == ["input", "mirror"]
+    assert space.bodies and re.search(told, space_html([space], "{}"))
 
 
 def test_the_contact_sheet_has_every_target_and_a_slice_of_the_volume(sampled):

@@ -1,20 +1,24 @@
 """Samples of shapes in a dataset: one file an instance, listed by its row, checked, compared, put back and exported."""
 
 import dataclasses
+import io
 import shutil
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from schemas.errors import CorruptError
 from services.job.record import require_job
 from services.read import replay as remake
-from services.read.dataset_reader import find_scene
+from services.read.dataset_reader import decode_samples, find_scene
 from services.read.repair import repair
 from services.read.replay import compare_files, open_context, replay_scene
 from tests.datasets import faults_of, make_dataset
 from tests.services.export.exported import export_to
 from tests.services.read.conftest import TINY, spoil
-from workers.assets.samples import decode_samples, encode_samples
+from workers.assets.samples import encode_samples
 from workers.scene.context import Stopwatch
 from workers.store.commit import committed_files, read_record
 from workers.store.local import LocalStore
@@ -38,36 +42,31 @@ def samples_in(store: LocalStore) -> list[str]:
 def test_scenes_that_share_a_shape_store_its_samples_once_and_its_row_lists_them(sampled):
     rows = find_scene(sampled, 0).rows["assets"]
     assert rows == find_scene(sampled, 1).rows["assets"] and len(rows) == 2
-    assert samples_in(sampled) == sorted(row["samples"]["path"] for row in rows)
+    assert [row["category"] for row in rows if row["samples"] is None] == ["table"]
+    row = next(row for row in rows if row["samples"] is not None)
+    assert samples_in(sampled) == [row["samples"]["path"]]
     record = read_record(sampled, 0)
     named = {entry.path for entry in committed_files(sampled, record)} - {entry.path for entry in record.files}
     assert set(samples_in(sampled)) <= named, "by the rows alone"
-    for row in rows:
-        data = sampled.read(row["samples"]["path"])
-        assert (row["samples"]["bytes"], row["samples"]["points"], row["samples"]["open_share"]) == (
-            len(data),
-            POINTS,
-            0.0,
-        )
-        arrays = decode_samples(data)
-        assert len(arrays["surface_points"]) == len(arrays["volume_distance"]) == POINTS
-        assert arrays["scale"] == pytest.approx(max(row["extents_m"]))
+    data, named = sampled.read(row["samples"]["path"]), ("bytes", "points", "open_share")
+    assert [row["samples"][name] for name in named] == [len(data), POINTS, 0.0]
+    arrays = decode_samples(data, "")
+    assert len(arrays["surface_points"]) == len(arrays["volume_distance"]) == POINTS
+    assert arrays["scale"] == pytest.approx(max(row["extents_m"]))
 
 
 def test_a_missing_or_damaged_file_of_samples_is_told_and_put_back(sampled, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(sampled.root, out)
-    one, other = (out / path for path in samples_in(sampled))
-    before = one.read_bytes(), other.read_bytes()
+    (file,) = (out / path for path in samples_in(sampled))
+    before = file.read_bytes()
     assert faults_of(LocalStore(out)) == []
-    spoil(one)
-    other.unlink()
-    faults = faults_of(LocalStore(out))
-    assert len(faults) == 2 and one.name in faults[0] and "SHA-256" in faults[0]
-    assert other.name in faults[1] and "is committed and missing" in faults[1]
-    found = repair(LocalStore(out), (), lambda _: None)
-    assert (found.verdict.faults, found.left) == ([], [])
-    assert (one.read_bytes(), other.read_bytes()) == before
+    for harm, told in ((spoil, "SHA-256"), (Path.unlink, "is committed and missing")):
+        harm(file)
+        (fault,) = faults_of(LocalStore(out))
+        assert file.name in fault and told in fault
+        found = repair(LocalStore(out), (), lambda _: None)
+        assert (found.verdict.faults, found.left, file.read_bytes()) == ([], [], before)
 
 
 def test_a_replay_compares_samples_to_the_byte_and_on_another_stack_within_a_tolerance(sampled):
@@ -77,7 +76,7 @@ def test_a_replay_compares_samples_to_the_byte_and_on_another_stack_within_a_tol
     output = remake.run_scene(open_context(require_job(sampled)), 0, Stopwatch())
     number, file = next((n, file) for n, file in enumerate(output.files) if file.path.endswith(".npz"))
     for way_m, too_far in ((1e-8, False), (1e-3, True)):
-        arrays = decode_samples(file.data)
+        arrays = decode_samples(file.data, file.path)
         arrays["volume_distance"] = (arrays["volume_distance"] + way_m).astype(np.float32)
         changed = dataclasses.replace(file, data=encode_samples(arrays), sha256="another")
         now = dataclasses.replace(output, files=(*output.files[:number], changed, *output.files[number + 1 :]))
@@ -92,3 +91,40 @@ def test_an_export_copies_samples_beside_the_shapes(sampled, tmp_path):
     copies = {path.name: path.read_bytes() for path in (tmp_path / "out").rglob("*.samples.npz")}
     named = {path.rpartition("/")[2].replace(".npz", ".samples.npz"): path for path in samples_in(sampled)}
     assert copies == {name: sampled.read(path) for name, path in named.items()}
+
+
+def test_a_file_of_samples_that_is_damaged_or_another_is_named_and_nothing_of_it_is_believed(sampled):
+    data = sampled.read(samples_in(sampled)[0])
+    good = decode_samples(data, "")
+    hole, packed, lying = good["loc"].copy(), io.BytesIO(), io.BytesIO()
+    hole[1] = np.nan
+    np.savez_compressed(packed, **{**good, "surface_colors": np.zeros((10_000_000, 3), np.uint8)})
+    with zipfile.ZipFile(lying, "w") as file:
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, {"shape": (10**12, 3), "fortran_order": False, "descr": "<f4"})
+        file.writestr("surface_points.npy", header.getvalue())
+    files = {
+        "not a zip file": data[:-40],
+        "CRC-32": data[:1000] + bytes([data[1000] ^ 1]) + data[1001:],
+        "would unpack to 30,": packed.getvalue(),
+        "cannot reshape": lying.getvalue(),
+        "OBJECT": encode({**good, "scale": np.array(None)}),
+        "has loc, not surface_points, .*, scale": encode({"loc": good["loc"]}),
+        "has surface_points, .*, not .*scale": encode({name: good[name] for name in good if name != "volume_distance"}),
+        f"surface_colors is .u1 .9, 3., not .u1 .{POINTS}, 3": encode(
+            {**good, "surface_colors": good["surface_colors"][:9]}
+        ),
+        "scale is <f4": encode({**good, "scale": good["scale"].astype(np.float32)}),
+        "loc has a number that is not finite": encode({**good, "loc": hole}),
+    }
+    for told, one in files.items():
+        with pytest.raises(CorruptError, match=rf"a/b.npz cannot be read: .*{told}.*; `verso replay OUT --repair`"):
+            decode_samples(one, "a/b.npz")
+    volume = {name: array for name, array in good.items() if not name.startswith("surface")}
+    assert decode_samples(encode(volume), "").keys() == volume.keys()
+
+
+def encode(arrays) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=True, **arrays)
+    return stream.getvalue()
