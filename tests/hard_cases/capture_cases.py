@@ -214,7 +214,7 @@ CAPTURES = (
     CaptureCase("nothing wrong", HOLD),
     CaptureCase("one marker in one view", FLAG, change=only([3], [0]), words="uncertain", first=True),
     CaptureCase("one marker in every view", refuse("poses"), change=only([3]), words="uncertain"),
-    CaptureCase("two markers in one view", HOLD, 4.0, change=only([3, 4], [0]), first=True),
+    CaptureCase("three markers in one view", HOLD, 4.0, change=only([3, 17, 31], [0]), first=True),
     CaptureCase("markers of one row only", HOLD, 5.0, change=only(range(7))),
     CaptureCase("board at 80 degrees", HOLD, 5.0, poses=LOW),
     CaptureCase("frontal board", HOLD, 1.0, poses=[TOP, *ORBIT[1:]], first=True),

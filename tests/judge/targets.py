@@ -2,6 +2,7 @@
 
 Every pixel of every view is judged by services/read/independent, from the rows and files that the scene would leave; the floor's
 shape, which is in no file, is handed over. Prints one row for each target, and each fault. Ends with 1 where there is one.
+With `--job deploy/jobs/captures.yaml` captures are: `--views` photographs of each, of size `--image-scale` 1 at most.
 """
 
 import argparse
@@ -20,12 +21,14 @@ import yaml
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.targets import ViewTarget
+from schemas.scene.scene import SceneOutput
 from services.read.independent.derive import StoredPair
 from services.read.independent.poses import check_pair
-from services.read.independent.rays import read_shape
+from services.read.independent.rays import Faces, read_shape
 from services.read.independent.targets import Finding
 from tests.judge.piles import catalogue_of
 from workers.assets.glb import asset_glb
+from workers.capture.make_capture import run_capture
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.rows import record_scene
@@ -50,26 +53,34 @@ def context_of(job_json: str) -> WorkerContext:
 
 def stored_pairs(context: WorkerContext, scene: Scene) -> Iterator[StoredPair]:
     """The pairs of a scene as they would be read back."""
-    output = record_scene(context, scene, Stopwatch())
-    files, job = {file.path: file.data for file in output.files}, context.job.model_dump(mode="json")
-    for parent in (pair.input.pose_id for pair in scene.pairs):
+    return pairs_of(context.job, record_scene(context, scene, Stopwatch()))
+
+
+def pairs_of(job: Job, output: SceneOutput) -> Iterator[StoredPair]:
+    """The pairs of what a scene or a capture leaves."""
+    files, keys = {file.path: file.data for file in output.files}, job.model_dump(mode="json")
+    for parent in dict.fromkeys(row["parent_id"] for row in output.rows["views"]):
         views = {str(row["role"]): row for row in output.rows["views"] if row["parent_id"] == parent}
         ids = {row["pose_id"] for row in views.values()}
         objects = [row for row in output.rows["objects"] if row["pose_id"] in ids]
-        yield StoredPair(job, output.rows["scenes"][0], views, objects, files.__getitem__)
+        yield StoredPair(keys, output.rows["scenes"][0], views, objects, files.__getitem__)
 
 
 def judge_scene(job_json: str, scene_id: int) -> Judged:
-    """Makes a scene and judges all its targets."""
-    context = context_of(job_json)
+    """Makes a scene, or a capture, and judges all its targets."""
+    context, shapes = context_of(job_json), dict[str, Faces]()
     try:
-        scene = make_scene(context, scene_id, Stopwatch())
+        if context.job.captures is not None:
+            pairs = pairs_of(context.job, run_capture(context, scene_id, Stopwatch()))
+        else:
+            scene = make_scene(context, scene_id, Stopwatch())
+            floor = dataclasses.replace(scene.plan.table.asset, shape=scene.plan.floor)
+            shapes["floor"], pairs = read_shape(asset_glb(floor)), stored_pairs(context, scene)
     except SceneError as error:
         return Judged(scene_id, refused=error.reason)
-    floor = read_shape(asset_glb(dataclasses.replace(scene.plan.table.asset, shape=scene.plan.floor)))
     began, findings, faults = time.process_time(), list[Finding](), list[str]()
-    for pair in stored_pairs(context, scene):
-        pair.shapes["floor"] = floor
+    for pair in pairs:
+        pair.shapes.update(shapes)
         faults += check_pair(pair)
         findings += pair.found
     return Judged(scene_id, tuple(findings), tuple(faults), seconds=time.process_time() - began)
@@ -93,7 +104,11 @@ def main() -> int:
     given = _arguments()
     document = yaml.safe_load(Path(given.job).read_text())
     document.pop("verso", None)
-    document["targets"] = {"views": list(get_args(ViewTarget)), "smooth": given.smooth}
+    asked = list(get_args(ViewTarget))
+    if captures := document.get("captures"):
+        asked = [name for name in asked if name not in ("albedo", "amodal")]
+        captures["simulate"] |= {"views": given.views, "image_scale": given.image_scale}
+    document["targets"] = {"views": asked, "smooth": given.smooth}
     if given.objects:
         document["objects_per_scene"] = given.objects
     job = Job.model_validate(document).model_dump_json()
@@ -118,6 +133,8 @@ def _arguments() -> argparse.Namespace:
     ask.add_argument("--scenes", type=int, default=20)
     ask.add_argument("--first", type=int, default=0, help="number of the first scene")
     ask.add_argument("--objects", type=int, nargs=2, help="least and most objects of a scene, instead of the job's")
+    ask.add_argument("--views", type=int, default=8, help="photographs of a capture")
+    ask.add_argument("--image-scale", type=float, default=0.5, help="size of photographs over the Azure Kinect's")
     ask.add_argument("--smooth", action="store_true", help="normals of shading")
     ask.add_argument("--processes", type=int, default=1)
     return ask.parse_args()

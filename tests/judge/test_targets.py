@@ -12,9 +12,13 @@ from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from services.job.job_file import validate_job
 from services.read.audit import verify_independently
+from services.read.independent.derive import StoredPair, check_images
 from services.read.independent.poses import check_pair
+from services.read.independent.targets import check_targets
+from tests.captures import captures_job, exact_capture, use_exact_captures
 from tests.datasets import SMALL, make_dataset, overlaid
-from tests.judge.targets import context_of, judge_scene, stored_pairs
+from tests.judge.targets import context_of, judge_scene, pairs_of, stored_pairs
+from workers.capture import make_capture
 from workers.geometry.mesh import corner_weights
 from workers.scene import painting, rows, surfaces, targets
 from workers.scene.context import Stopwatch, WorkerContext
@@ -231,3 +235,54 @@ def test_a_stored_dataset_is_judged_and_what_is_not_is_told(tmp_path):
         path.unlink()
     found = verify_independently(store, 2, lambda _: None)
     assert found.faults == [] and sum("is not stored" in line for line in found.underived) == 2
+
+
+@pytest.fixture(scope="module")
+def holed() -> StoredPair:
+    """Of a capture whose merged mesh has half of its faces."""
+    done = exact_capture()
+    across = done.surface.vertices[done.surface.faces][..., 1].mean(axis=1)
+    used, faces = np.unique(done.surface.faces[across < np.median(across)], return_inverse=True)
+    vertices, colors = done.surface.vertices[used], done.surface.vertex_colors[used]
+    half = dataclasses.replace(
+        done.surface, vertices=vertices, faces=faces.reshape(-1, 3).astype(np.int32), vertex_colors=colors
+    )
+    context = context_of(captures_job(targets={"views": CAPTURED}).model_dump_json())
+    with pytest.MonkeyPatch.context() as patch:
+        use_exact_captures(patch)
+        patch.setattr(make_capture, "process_capture", lambda *_: dataclasses.replace(done, surface=half))
+        return next(pairs_of(context.job, make_capture.run_capture(context, 0, Stopwatch())))
+
+
+CAPTURED = ["normals", "coordinates", "layers"]
+BROKEN: dict[str, tuple[str, str, int, int | tuple[int, int, int]]] = {
+    "a normal by 0.07 degrees": ("normals", "seen", 1, (40, 0, 0)),
+    "a coordinate by two codes": ("coordinates", "seen", 1, (0, 2, 0)),
+    "a normal of a hole": ("normals", "hole", 0, (0, 0, 32_767)),
+    "a coordinate of a hole": ("coordinates", "hole", 0, 32_767),
+    "a hole where there is none": ("coordinates", "seen", 0, 0),
+    "no normal of the board": ("normals", "board", 0, 0),
+    "a layer by two units": ("layer1", "seen", 1, 2),
+    "no region of the last surface": ("back_region", "seen", 0, 0),
+    "a surface too many": ("layer4", "board", 0, 4_000),
+}
+"""(kind, where its one wrong pixel is, what its value is multiplied with, what is added)."""
+
+
+@pytest.mark.parametrize("role", ["input", "mirror"])
+def test_a_wrong_pixel_of_a_capture_is_found_also_over_a_hole_and_a_wrong_share_of_it(holed, role):
+    view = holed.views[role]
+    assert [*check_images(holed, view), *check_targets(holed, view)] == []
+    region, there = holed.images[role, "region"], holed.images[role, "coordinates"].any(axis=2)
+    clear = ~holed.images[role, "layer1"].astype(bool)
+    places = {"seen": (region == 3) & there, "hole": (region == 3) & clear, "board": (region == 2) & clear}
+    for name, (kind, place, times, more) in BROKEN.items():
+        where = np.argwhere(places[place])
+        image, (row, column) = holed.images[role, kind].copy(), where[len(where) // 2]
+        image[row, column] = times * image[row, column].astype(int) + more
+        faults = check_targets(dataclasses.replace(holed, images=holed.images | {(role, kind): image}), view)
+        assert any(": 1 of " in fault and f"({column}, {row})" in fault for fault in faults), name
+    own = [{**row, "targets_share": 0.5} for row in holed.objects]
+    faults = list(check_targets(dataclasses.replace(holed, objects=own), view))
+    assert sum("targets_share is 0.5, its image gives 0." in fault for fault in faults) == 1
+    assert sum("region 2: targets_share is 0.5, its image gives None" in fault for fault in faults) == 1

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Pose
+from schemas.base import Pose, frozen_array
 from schemas.capture import CaptureEstimate, PosedImages, ProcessedCapture, SynthesizedView, ViewScore
 from schemas.dataset.codec import Row, matrix_column
 from schemas.dataset.layout import asset_path, file_pose_id, input_pose_id
@@ -122,11 +122,17 @@ def make_capture_pair(
 
 
 def with_targets(job: Job, thing: CapturedObject, made: CapturedPair, watch: Stopwatch) -> CapturedPair:
-    """The pair with its image targets, of the merged mesh: 0 where that has a hole."""
+    """The pair with its image targets, of the merged mesh as its file has it, in float32: 0 where that has a hole."""
+    board, body = thing.things
+    # Faces of marching cubes are a micrometre narrow: rounding turns them by more than the steps of a stored normal.
+    parts = (replace(part, vertices=frozen_array(np.float32(part.vertices))) for part in body.shape.parts)
+    body = replace(body, shape=replace(body.shape, parts=tuple(parts)))
+    # Its mask is a rectangle by rays: drawn a little larger, no pixel of its edge is without a face by a rounding.
+    board = replace(board, T_world_shape=np.diag([1.01, 1.01, 1.0, 1.0]))
 
     def drawn(view: View) -> View:
         assert view.region is not None
-        return replace(view, further=draw_targets(thing.things, view.camera, view.region, job, thing.effects, watch))
+        return replace(view, further=draw_targets((board, body), view.camera, view.region, job, thing.effects, watch))
 
     pair = made.pair
     mirror = None if pair.mirror is None else drawn(pair.mirror)

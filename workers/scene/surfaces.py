@@ -21,10 +21,10 @@ from workers.geometry.mesh import face_planes
 from workers.geometry.zbuffer import Corner, cut_row, to_grid
 
 MISSED = 8.0
-"""1/256 pixel: a mask's pixel that no face covers has one as near as this, by a rounding; farther ones are holes."""
+"""1/256 pixel: a drawn mask's pixel that no face covers has one as near as this, by a rounding."""
 
 MOST_MISSED = 64
-"""More pixels of an image are no roundings, of which there is one in 100,000 pixels, but holes: none of them is looked at."""
+"""More pixels of an image are no roundings, of which there is one in 100,000 pixels: none of them is looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +112,16 @@ def _cut_near(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
     return Mesh(np.concatenate(vertices), np.concatenate(faces, dtype=np.int32)), np.concatenate(owners)
 
 
-def nearest_faces(triangles: Triangles, region: NDArray[np.uint8]) -> tuple[NDArray[np.int32], Array]:
+def nearest_faces(triangles: Triangles, region: NDArray[np.uint8], drawn: bool) -> tuple[NDArray[np.int32], Array]:
     """(face [H, W] int32, z [H, W] float64, metres): the nearest face of each pixel's own region [H, W], -1 and 0 without one.
 
-    A pixel whose centre no face of its region covers, by a rounding of the renderer, has the nearest one beside it.
+    Of a mask that was drawn of these faces, a pixel whose centre none of its region covers, by a rounding of the renderer, has
+    the nearest one beside it; of a photograph's it has none.
     """
     t = triangles
-    return _nearest_faces(t.corners, t.mesh.faces, t.mesh.vertices, t.planes, (t.region, t.closed), region, t.grid)
+    return _nearest_faces(
+        t.corners, t.mesh.faces, t.mesh.vertices, t.planes, (t.region, t.closed), region, t.grid, drawn
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +194,7 @@ def _span(points: Array, faces: NDArray[np.int32], face: int) -> tuple[float, fl
 
 
 @compiled_for(
-    "i8[:,::1], i4[:,::1], f8[:,::1], Tuple((f8[:,::1], f8[::1])), Tuple((u1[::1], b1[::1])), const(u1[:,::1]), UniTuple(f8, 4)"
+    "i8[:,::1], i4[:,::1], f8[:,::1], Tuple((f8[:,::1], f8[::1])), Tuple((u1[::1], b1[::1])), const(u1[:,::1]), UniTuple(f8,4),b1"
 )
 def _nearest_faces(
     corners: NDArray[np.int64],
@@ -201,6 +204,7 @@ def _nearest_faces(
     kinds: tuple[NDArray[np.uint8], NDArray[np.bool_]],
     region: NDArray[np.uint8],
     grid: tuple[float, float, float, float],
+    drawn: bool,
 ) -> tuple[NDArray[np.int32], Array]:
     height, width = region.shape
     best, depth = np.full((height, width), -1, np.int32), np.zeros((height, width))
@@ -218,7 +222,8 @@ def _nearest_faces(
                 z = _depth(face, column, row, grid, planes, span)
                 if best[row, column] < 0 or z < depth[row, column]:
                     best[row, column], depth[row, column] = face, z
-    _fill_missed(best, depth, corners, kinds, region, points, faces, planes, grid)
+    if drawn:
+        _fill_missed(best, depth, corners, kinds, region, points, faces, planes, grid)
     return best, depth
 
 

@@ -50,7 +50,8 @@ def draw_targets(
     objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
     if any(effects.runs(name) for name in OF_NEAREST):
         with watch.stage("targets"):
-            seen = Seen(things if effects.runs("normals") or effects.runs("albedo") else objects, camera, region)
+            shown = things if effects.runs("normals") or effects.runs("albedo") else objects
+            seen = Seen(shown, camera, region, drawn=job.captures is None)
         for name in filter(effects.runs, OF_NEAREST):
             with watch.stage("targets", name):
                 drawn[name] = _OF_SEEN[name](seen, job.targets)
@@ -68,12 +69,15 @@ def draw_targets(
 
 
 class Seen:
-    """What is seen at each pixel of a mask [H, W]: face [H, W] int32 of `triangles`, -1 for none, and z [H, W], metres."""
+    """What is seen at each pixel of a mask [H, W]: face [H, W] int32 of `triangles`, -1 for none, and z [H, W], metres.
 
-    def __init__(self, things: Sequence[Placed], camera: Camera, region: NDArray[np.uint8]) -> None:
+    `drawn`: whether the mask is of these things, and not of a photograph.
+    """
+
+    def __init__(self, things: Sequence[Placed], camera: Camera, region: NDArray[np.uint8], drawn: bool) -> None:
         self.things, self.camera = things, camera
         self.triangles = triangles_of(things, camera)
-        self.face, self.z = nearest_faces(self.triangles, region)
+        self.face, self.z = nearest_faces(self.triangles, region, drawn)
 
     def points_at(self, pixels: NDArray[np.int64]) -> Array:
         """[N, 3]: the points, in the camera's frame, that are seen at pixels (flat numbers)."""

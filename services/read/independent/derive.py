@@ -101,9 +101,14 @@ class StoredPair:
         return self.job.get("targets") or {"views": (), "smooth": False}
 
     @property
+    def bodies(self) -> Sequence[Row]:
+        """region_id, category, instance_id and T_world_obj of the objects; the one of a capture is in the scene's own columns."""
+        return self.scene["bodies"] or [{**self.scene, "region_id": FIRST_OBJECT}]
+
+    @property
     def regions(self) -> list[int]:
         """Region ids of the objects."""
-        return [body["region_id"] for body in self.scene["bodies"] or [{"region_id": FIRST_OBJECT}]]
+        return [body["region_id"] for body in self.bodies]
 
     def kinds(self, role: str) -> list[str]:
         """Kinds of pixel that the job stores of a view; `amodal3`, `amodal4` of one that each object has."""
@@ -189,8 +194,7 @@ def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
 def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
     """Regions, pixel counts, boxes, object poses and image coordinates."""
     region, scene = pair.images[view["role"], "region"], pair.scene
-    bodies = scene["bodies"] or [{"region_id": FIRST_OBJECT, "T_world_obj": scene["T_world_obj"]}]
-    poses = {body["region_id"]: matrix(body, "T_world_obj") for body in bodies}
+    poses = {body["region_id"]: matrix(body, "T_world_obj") for body in pair.bodies}
     poses[TABLE] = matrix(scene, "T_world_table")
     labels = {row["region_id"]: row for row in pair.objects if row["role"] == view["role"]}
     if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses}:

@@ -125,8 +125,6 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
     if sensor["depth_noise"]:
         told.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
     if views := job.get("targets", {}).get("views"):
-        captured = job.get("captures") is not None
-        told += [f"contents of {', '.join(views)} of captures are not derived"] if captured else []
         told += ["albedo of the floor is not derived: its look is in no file"] if "albedo" in views else []
     return told
 

@@ -8,6 +8,7 @@ so 0.0055 pixel at most along the diagonal; its arithmetic in float32 adds less 
 to a projected edge may therefore lie on either side of it, and what the face has within `EDGE_PX` of the centre may be its own.
 """
 
+import functools
 import json
 import struct
 from collections.abc import Sequence
@@ -48,6 +49,7 @@ class Faces:
     closed: NDArray[np.bool_]
     rounding_m: Array
 
+    @functools.cached_property
     def plane_normals(self) -> tuple[Array, Array]:
         """(normals [F, 3] of the faces' planes, unit; heights [F] of the triangles over their longest sides, metres)."""
         a, b, c = self.points.swapaxes(0, 1)
@@ -180,7 +182,7 @@ def cast(faces: Faces, view: Row) -> Hits:
     sure = inside > EDGE_PX
     reach = np.where(sure, 0.0, reach)
     low, high = 1.0 / np.clip(inverse + reach, least, most), 1.0 / np.clip(inverse - reach, least, most)
-    normals, _ = faces.plane_normals()
+    normals, _ = faces.plane_normals
     rays = (at - [view["cx"], view["cy"], 0.0]) / [view["fx"], view["fy"], 1.0]
     slope = np.abs((normals[face] * rays).sum(axis=1))
     slack = np.minimum(faces.rounding_m[face] / np.maximum(slope, 1e-300), 1.0 / least - 1.0 / most + 1e-6)

@@ -2,7 +2,8 @@
 
 normals, coordinates and albedo are of the nearest surface of the thing that the mask shows; amodal and layers of all surfaces of
 objects, seen from either side. Where a centre is near a projected edge, any choice of the faces there is right in which every
-closed body is met an even number of times.
+closed body is met an even number of times. The mask of a capture is a photograph's, and its object the merged mesh: where that
+has a hole, nothing is right.
 """
 
 import itertools
@@ -30,7 +31,7 @@ ENOUGH_WRONG = 40
 """After so many wrong pixels of an image, all others without the exact answer count as wrong."""
 
 FLOOR_M = 1e4
-"""Half the side of the floor, which is in no file: it is a plane, and its colour is not judged."""
+"""Half the side of a floor, or of a capture's board, which are in no file: planes, whose colour is not judged."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Finding:
 
 def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
     """Images and columns of targets that differ from their definitions, a sentence each; none where a shape is in no file."""
-    if not pair.targets["views"] or pair.is_captured:
+    if not pair.targets["views"]:
         return
     try:
         faces = faces_of(pair, view)
@@ -71,25 +72,30 @@ def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
 
 
 def faces_of(pair: StoredPair, view: Row) -> Faces:
-    """Floor, table and objects in the camera's frame. Raises FileNotFoundError where a shape is not stored."""
+    """Floor, table and objects, or board and object, in the camera's frame. Raises FileNotFoundError without a shape's file.
+
+    Targets of a capture are of the stored corners, and not of those before rounding.
+    """
     scene = pair.scene
     T_cam_world = np.asarray(np.linalg.inv(matrix(view, "T_world_cam")), np.float64)
-    things = [(TABLE, "table", scene["table_id"], matrix(scene, "T_world_table"))]
+    table = (TABLE, "table", scene["table_id"], matrix(scene, "T_world_table"))
+    plane, things = (TABLE, []) if pair.is_captured else (FLOOR, [table])
     things += [
-        (body["region_id"], body["category"], body["instance_id"], matrix(body, "T_world_obj"))
-        for body in scene["bodies"]
+        (body["region_id"], body["category"], body["instance_id"], matrix(body, "T_world_obj")) for body in pair.bodies
     ]
-    placed: list[tuple[int, Faces, Array]] = [(FLOOR, pair.shapes.get("floor") or _plane(), T_cam_world)]
+    placed: list[tuple[int, Faces, Array]] = [(plane, pair.shapes.get("floor") or _plane(), T_cam_world)]
     for region, category, instance, T_world in things:
         path = f"assets/{category}/{instance}.glb"
         if path not in pair.shapes:
-            pair.shapes[path] = read_shape(pair.read(path))
+            shape = read_shape(pair.read(path))
+            rounding_m = shape.rounding_m * (not pair.is_captured)
+            pair.shapes[path] = replace(shape, rounding_m=rounding_m)
         placed.append((region, pair.shapes[path], T_cam_world @ T_world))
     return place_shapes(placed)
 
 
 def _plane() -> Faces:
-    """The floor, without a colour."""
+    """A floor or a board, without a colour."""
     corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     points, some = corners[[[0, 1, 2], [0, 2, 3]]], np.zeros(2)
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
@@ -98,14 +104,19 @@ def _plane() -> Faces:
 
 
 def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
-    """Extents of silhouettes against their images, scale and offset of coordinates against the boxes of the shapes."""
+    """Extents and shares against their images, scale and offset of coordinates against the boxes of the shapes."""
     rows = {row["region_id"]: row for row in pair.objects if row["role"] == view["role"]}
-    asked, shapes = pair.targets["views"], {body["region_id"]: body for body in pair.scene["bodies"]}
+    asked, shapes = pair.targets["views"], {body["region_id"]: body for body in pair.bodies}
     for region, row in rows.items():
-        expected: dict[str, object] = {"amodal_pixels": None, "amodal_bbox_xywh": None}
+        expected: dict[str, object] = {"amodal_pixels": None, "amodal_bbox_xywh": None, "targets_share": None}
         mask = pair.images.get((view["role"], f"amodal{region}"))
         if mask is not None:
-            expected = {"amodal_pixels": np.count_nonzero(mask), "amodal_bbox_xywh": list(cv2.boundingRect(mask))}
+            expected |= {"amodal_pixels": np.count_nonzero(mask), "amodal_bbox_xywh": list(cv2.boundingRect(mask))}
+        own = pair.images[view["role"], "region"] == region
+        for name in ("normals", "coordinates") if pair.is_captured and region >= FIRST_OBJECT and own.any() else ():
+            if name in asked:
+                there = pair.images[view["role"], name][own].any(axis=1)
+                expected["targets_share"] = np.count_nonzero(there) / len(there)
         for name, value in expected.items():
             if row[name] != value:
                 yield f"region {region}: {name} is {row[name]}, its image gives {value}"
@@ -191,7 +202,8 @@ def _judge_seen(name: str, pair: StoredPair, view: Row, faces: Faces, own: Hits)
         shown &= region != FLOOR
     judged = shown | (region < least)
     off = np.where(stored.any(axis=1), np.inf, 0.0)
-    off[shown] = np.inf
+    if not pair.is_captured:
+        off[shown] = np.inf
     covers = own.where(own.covers & shown[own.pixel])
     nearest = covers.where(np.unique(covers.pixel, return_index=True)[1])
     nearest = replace(nearest, low=nearest.z, high=nearest.z)
@@ -200,6 +212,8 @@ def _judge_seen(name: str, pair: StoredPair, view: Row, faces: Faces, own: Hits)
     limit[nearest.pixel] = most
 
     def fits(pixel: int, hits: Hits) -> bool:
+        if pair.is_captured and not len(hits.z):
+            return not stored[pixel].any()
         first = hits.where(hits.low <= hits.high.min(initial=np.inf))
         error, most = answer(pair, view, faces, first, np.repeat(stored[pixel][None], len(first.z), axis=0))
         return bool((error <= most).any()) and bool(shown[pixel])
@@ -251,7 +265,7 @@ def _beyond(answers: Array, stored: Array) -> Array:
 
 def _normals(pair: StoredPair, view: Row, faces: Faces, hits: Hits, stored: NDArray) -> tuple[Array, Array]:
     """(errors [N], largest right ones [N]), degrees: of (n + 1) / 2, n the unit normal towards the camera."""
-    planes, heights = (each[hits.face] for each in faces.plane_normals())
+    planes, heights = (each[hits.face] for each in faces.plane_normals)
     rays = _rays(view, hits)
     planes = planes * np.where((planes * rays).sum(axis=1) > 0.0, -1.0, 1.0)[:, None]
     answers = planes[None]

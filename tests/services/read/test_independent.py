@@ -20,9 +20,10 @@ from services.read.audit import describe_independent, verify_independently
 from services.read.independent.derive import check_forces
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, make_dataset, run_here
-from workers.capture import make_capture
+from workers.capture import make_capture, rows
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.targets import draw_targets
 from workers.shard.fingerprint import take_fingerprint
 
 HEALTHY = {
@@ -265,6 +266,24 @@ def test_depth_of_photographs_along_the_ray_instead_of_the_axis_is_found(tmp_pat
     monkeypatch.setattr(make_capture, "process_capture", process)
     store, _ = run_here(captures_job(scenes=1), tmp_path)
     assert any("off the board's plane" in fault for fault in verify_independently(store, 1, lambda _: None).faults)
+
+
+def test_one_wrong_pixel_of_a_target_of_stored_captures_is_found(tmp_path, monkeypatch):
+    use_exact_captures(monkeypatch)
+    job = captures_job(scenes=1, targets={"views": ["coordinates"]})
+
+    def planted(things, camera, region, *rest):
+        images = draw_targets(things, camera, region, *rest)
+        own = np.argwhere(region == 3)
+        row, column = own[len(own) // 2]
+        images["coordinates"][row, column, 0] += 3
+        return images
+
+    monkeypatch.setattr(rows, "draw_targets", planted)
+    store, _ = run_here(job, tmp_path)
+    assert faults_of(store) == []
+    faults = verify_independently(store, 1, lambda _: None).faults
+    assert len(faults) == 4 and all("coordinates: 1 of" in fault for fault in faults)
 
 
 JOB = {"physics": {"friction": 0.7, "exact_rest": True}, "captures": None}

@@ -15,6 +15,7 @@ from schemas.job.assets import Assets
 from schemas.job.captures import Board, Captures, Estimation
 from schemas.job.job import Job
 from schemas.scene.scene import SceneOutput
+from schemas.scene.view import Camera, Intrinsics, Pair, View
 from tests.captures import captures_job, exact_capture, use_exact_captures, write_folder
 from tests.workers.capture.simulated import box, copy_of
 from workers.assets.catalogue import open_catalogue, split_of
@@ -33,7 +34,16 @@ from workers.capture.make_capture import (
     run_capture,
 )
 from workers.capture.results import open_sources
-from workers.capture.rows import CapturedObject, LeftOut, Origin, make_capture_pair, record_capture, with_targets
+from workers.capture.rows import (
+    CapturedObject,
+    CapturedPair,
+    LeftOut,
+    Origin,
+    capture_regions,
+    make_capture_pair,
+    record_capture,
+    with_targets,
+)
 from workers.geometry.camera import unproject
 from workers.geometry.frames import translation
 from workers.geometry.projection import Bounds, Seen, compare_covisible
@@ -129,6 +139,27 @@ def test_targets_are_of_the_merged_mesh_and_say_what_share_of_the_object_it_has(
             assert np.quantile(off, 0.9 if surface_of is DONE.surface else 0.1) < 0.0003
             normals = view.further["normals"][rows, columns] / 65535 * 2 - 1
             assert ((normals * seen).sum(axis=1) < 0).all()
+
+
+def test_every_pixel_of_the_board_has_a_normal_and_one_beyond_the_mesh_has_none():
+    """From above: the board's edges lie on pixel centres, the mesh's a fortieth of a pixel within the mask's last centres."""
+    job = captures_job(targets={"views": ["normals"]})
+    side = 2 * (0.07 - 0.00025) * 0.9
+    body = trimesh.creation.box((side, side, 0.1))
+    vertices = np.asarray(body.vertices) + np.array([0.0, 0.0, 0.05])
+    mesh = dataclasses.replace(
+        DONE.surface, vertices=vertices, faces=body.faces, vertex_colors=vertices.astype(np.uint8)
+    )
+    above = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+    camera = Camera(Intrinsics(width=121, height=101, fx=100.0, fy=100.0, cx=60.5, cy=50.5), above)
+    mask = np.zeros((101, 121), bool)
+    mask[43:58, 53:68] = True
+    view = View("input", 0, 0, camera, None, mask.astype(np.uint16), capture_regions(camera, DONE.board, mask), ())
+    placed = place_capture(job, 0, dataclasses.replace(DONE, surface=mesh), "box", "capture")
+    made = with_targets(job, placed, CapturedPair(1, Pair(0.9, view), None), Stopwatch()).pair.input
+    there = made.further["normals"].any(axis=2)
+    assert np.count_nonzero(view.region == 2) == 61 * 41 - 15 * 15 and there[view.region == 2].all()
+    assert np.count_nonzero(there & mask) == 13 * 13 and there[44:57, 54:67].all()
 
 
 def test_pose_ids_follow_from_capture_and_place_and_labels_name_board_and_object():
