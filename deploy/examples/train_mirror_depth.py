@@ -89,10 +89,10 @@ def stack(items: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.stack([item[name] for item in items]) for name in items[0]}
 
 
-def train(net: nn.Module, data: dict[str, Tensor], epochs: int, loss_of: Loss = loss_of) -> None:
+def train(net: nn.Module, data: dict[str, Tensor], epochs: int, loss_of: Loss = loss_of, size: int = BATCH) -> None:
     """Adam with one cycle of the learning rate."""
     names, all_of_it = list(data), TensorDataset(*data.values())
-    loader = DataLoader(all_of_it, BATCH, shuffle=True, drop_last=len(all_of_it) > BATCH)
+    loader = DataLoader(all_of_it, size, shuffle=True, drop_last=len(all_of_it) > size)
     optimiser = torch.optim.AdamW(net.parameters(), RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * len(loader))
     begun = time.monotonic()
