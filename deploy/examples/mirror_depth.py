@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from services.dataset.pair import Pair
-from services.dataset.view import View
+from services.dataset.view import Pixels, View
 
 CROP = (96, 128)
 """Rows and columns, as the article's patches."""
@@ -75,13 +75,13 @@ def make_example(pair: Pair) -> Example | None:
     return Example(features, baseline, background, nearest(seen, other, background), truth, mask, hidden, middle)
 
 
-def unproject(view: View, depth: Image, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+def unproject(view: Pixels, depth: Image, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
     """[N, 3] points in the camera's frame, metres, of the chosen pixels that have depth."""
     rows, columns = np.nonzero(chosen & (depth > 0))
     return rays_through(view, rows, columns) * depth[rows, columns, None]
 
 
-def rays_through(view: View, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+def rays_through(view: Pixels, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
     """[N, 3] rays through the centres of pixels, in the camera's frame, with z = 1."""
     k = view.camera.intrinsics
     return np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(len(rows))], axis=1)
@@ -92,7 +92,7 @@ def transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def pixels_of(view: View, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pixels_of(view: Pixels, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(row, column) of the pixels that points in the camera's frame fall into."""
     u, v, _ = view.K @ (points / points[:, 2:]).T
     return np.floor(v).astype(int), np.floor(u).astype(int)

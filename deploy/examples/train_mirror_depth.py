@@ -11,7 +11,9 @@ import argparse
 import dataclasses
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,20 +29,22 @@ from services.dataset.dataset import open_dataset
 BATCH = 16
 RATE = 2e-3
 
+Loss = Callable[[Any, dict[str, Tensor]], Tensor]
+
 
 class Net(nn.Module):
-    """A U-Net on 2 x 2 blocks of pixels: [B, CHANNELS, H, W] -> logit of the object and its depth, [B, 2, H, W]."""
+    """A U-Net on 2 x 2 blocks of pixels: [B, channels, H, W] -> [B, outputs, H, W]; H and W are multiples of 16."""
 
-    def __init__(self, width: int = 32) -> None:
+    def __init__(self, width: int = 32, channels: int = CHANNELS, outputs: int = 2) -> None:
         super().__init__()
         sizes = (width, 2 * width, 3 * width)
-        self.first = block(4 * CHANNELS, width)
+        self.first = block(4 * channels, width)
         self.down = nn.ModuleList([block(a, b) for a, b in zip(sizes, (*sizes[1:], sizes[-1]), strict=True)])
         self.up = nn.ModuleList([block(2 * sizes[2], sizes[1]), block(2 * sizes[1], sizes[0]), block(2 * width, width)])
-        self.last = nn.Conv2d(width, 8, 1)
+        self.last = nn.Conv2d(width, 4 * outputs, 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Depth counts from the middle of the object's seen points, in SCALE_M."""
+        """What the images say of each pixel."""
         x = self.first(functional.pixel_unshuffle(features, 2))
         kept = []
         for down in self.down:
@@ -61,7 +65,7 @@ def block(before: int, after: int) -> nn.Sequential:
 
 
 def predict(net: Net, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """(logit of the object, its depth in metres), [B, 1, H, W] each."""
+    """(logit of the object, its depth in metres), [B, 1, H, W] each; the network's counts from `middle_m`, in SCALE_M."""
     logit, relative = net(batch["features"]).split(1, dim=1)
     return logit, batch["middle_m"] + SCALE_M * relative
 
@@ -77,14 +81,18 @@ def loss_of(net: Net, batch: dict[str, Tensor]) -> Tensor:
 def load(place: str) -> dict[str, Tensor]:
     """All training pairs in memory: some hundred are small."""
     pairs = MirrorDepthPairs(place, "train")
-    items = [pairs[number] for number in range(len(pairs))]
+    return stack([pairs[number] for number in range(len(pairs))])
+
+
+def stack(items: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Each tensor of all items, [N, ...]."""
     return {name: torch.stack([item[name] for item in items]) for name in items[0]}
 
 
-def train(net: Net, data: dict[str, Tensor], epochs: int) -> None:
+def train(net: nn.Module, data: dict[str, Tensor], epochs: int, loss_of: Loss = loss_of, size: int = BATCH) -> None:
     """Adam with one cycle of the learning rate."""
-    names = list(data)
-    loader = DataLoader(TensorDataset(*data.values()), BATCH, shuffle=True, drop_last=len(data["mask"]) > BATCH)
+    names, all_of_it = list(data), TensorDataset(*data.values())
+    loader = DataLoader(all_of_it, size, shuffle=True, drop_last=len(all_of_it) > size)
     optimiser = torch.optim.AdamW(net.parameters(), RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * len(loader))
     begun = time.monotonic()
@@ -133,26 +141,42 @@ def evaluate(net: Net, place: str) -> tuple[dict[str, dict[str, float]], list[np
     return means, rows
 
 
-def main() -> None:
-    """Train, score, print, and keep the network and a sheet of pictures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def read_options(told: str, epochs: int) -> argparse.Namespace:
+    """The words of the command line: place, epochs, seed (which is set), out."""
+    parser = argparse.ArgumentParser(description=told.splitlines()[0])
     parser.add_argument("place", metavar="DATASET", help="a folder, or a bucket")
-    parser.add_argument("--epochs", type=int, default=12, help="default: 12")
+    parser.add_argument("--epochs", type=int, default=epochs, help=f"default: {epochs}")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="folder for network.pt and sheet.png")
+    parser.add_argument("--out", type=Path, help="folder for network.pt and what else is kept")
     options = parser.parse_args()
     torch.manual_seed(options.seed)
-    data = load(options.place)
-    net = Net()
-    print(f"{len(data['mask'])} training pairs, {sum(p.numel() for p in net.parameters()) / 1e3:.0f} thousand weights")
-    train(net, data, options.epochs)
-    scores, rows = evaluate(net, options.place)
+    return options
+
+
+def tell_size(net: nn.Module, data: dict[str, Tensor]) -> None:
+    """Print how much is learnt from how much."""
+    pairs, weights = len(next(iter(data.values()))), sum(p.numel() for p in net.parameters())
+    print(f"{pairs} training pairs, {weights / 1e3:.0f} thousand weights", flush=True)
+
+
+def keep(net: nn.Module, scores: dict[str, dict[str, float]], options: argparse.Namespace) -> None:
+    """Write network.pt, if `--out` names a folder."""
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        torch.save(
-            {"weights": net.state_dict(), "scores": scores, "epochs": options.epochs, "seed": options.seed},
-            options.out / "network.pt",
-        )
+        told = {"weights": net.state_dict(), "scores": scores, "epochs": options.epochs, "seed": options.seed}
+        torch.save(told, options.out / "network.pt")
+
+
+def main() -> None:
+    """Train, score, print, and keep the network and a sheet of pictures."""
+    options = read_options(__doc__, epochs=12)
+    data = load(options.place)
+    net = Net()
+    tell_size(net, data)
+    train(net, data, options.epochs)
+    scores, rows = evaluate(net, options.place)
+    keep(net, scores, options)
+    if options.out is not None:
         draw_sheet(rows).save(options.out / "sheet.png")
         print(f"{options.out}: network.pt, sheet.png")
     print(f"{'':14}{'L1':>10}{'in mask':>10}{'unseen':>10}{'MS-SSIM':>10}")

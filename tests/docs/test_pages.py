@@ -45,7 +45,7 @@ FOR_A_WHILE = r"\./verso (serve|supervise|logs .*--follow)"
 TINY = "--set captures.simulate.image_scale=0.3"
 
 SMALLER = {
-    r"--scenes 600\b": "--scenes 16",
+    r"--scenes [46]00\b": "--scenes 16",
     r"^\./verso test$": "./verso test tests/test_layers.py",
     r"tests/hard_cases": "tests/test_layers.py",
     r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
@@ -55,7 +55,7 @@ SMALLER = {
     r"~/my_meshes": "meshes",
     r"/shared/": "shared/",
     r"s3://bucket/": "bucket/",
-    r"(train_mirror_depth.py data/training)": r"\1 --epochs 1",
+    r"(train_\w+.py data/\w+)": r"\1 --epochs 1",
 }
 """The same command with less to do, or in places that are here."""
 

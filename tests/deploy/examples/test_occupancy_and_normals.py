@@ -1,0 +1,118 @@
+"""What the two target examples give a network, their baselines and their scores, without PyTorch."""
+
+from types import SimpleNamespace
+
+import normals
+import numpy as np
+import occupancy
+import pytest
+
+from schemas.scene.view import Intrinsics
+from services.dataset.dataset import open_dataset
+from services.dataset.view import Pixels
+
+
+@pytest.fixture(scope="module")
+def pairs(few):
+    return list(open_dataset(few.root).pairs())
+
+
+@pytest.fixture(scope="module")
+def shapes(pairs):
+    return [(pair, occupancy.make_example(pair)) for pair in pairs]
+
+
+def in_world(pair, q):
+    """Points [N, 3] of the network's frame in the world, as the docstring has it: table top, level view, seen points."""
+    away = pair.input.T_world_cam[:2, 2] / np.linalg.norm(pair.input.T_world_cam[:2, 2])
+    x, y, z = 0.1 * q.T
+    seen = np.median(pair.input.cloud("world").points[:, :2], axis=0)
+    level = seen + np.outer(x, away) + np.outer(y, [-away[1], away[0]])
+    return np.column_stack([level, z + pair.mesh(2).vertices[:, 2].max()])
+
+
+def test_a_sample_in_the_frame_of_the_network_is_inside_where_the_resting_mesh_is_solid(shapes):
+    for pair, one in shapes:
+        world = in_world(pair, one.queries[:, :3].astype(float))
+        solid = pair.mesh(welded=True).contains(world)
+        assert 0.02 < solid.mean() < 0.9 and (solid == one.inside).mean() > 0.995
+        assert one.seen.shape == (occupancy.SEEN, 3) and one.queries.shape == (2000, occupancy.FEATURES)
+        distance = np.linalg.norm(in_world(pair, one.seen)[:, None] - pair.input.cloud("world").points, axis=2)
+        assert distance.min(axis=1).max() < 1e-5
+
+
+def test_the_shadow_is_what_a_ray_from_the_camera_meets_behind_the_object_and_a_box_lies_in_it(shapes):
+    for pair, one in shapes:
+        world, eye = in_world(pair, one.queries[:, :3].astype(float))[:400], pair.input.T_world_cam[:3, 3]
+        mesh, first = pair.mesh(), np.full(len(world), np.inf)
+        places, at, _ = mesh.ray.intersects_location(np.tile(eye, (len(world), 1)), world - eye, multiple_hits=False)
+        first[at] = np.linalg.norm(places - eye, axis=1)
+        hidden = (first < np.linalg.norm(world - eye, axis=1)) & (one.queries[:400, 2] > 0)
+        assert (hidden == one.shadow[:400]).mean() > 0.9
+        assert (one.turned <= one.shadow).all() and one.turned.any() and (one.turned < one.shadow).any()
+        if pair.category == "box":
+            assert one.shadow[one.inside].mean() > 0.9 and occupancy.iou(one.shadow, one.inside) > 0.5
+
+
+def test_half_a_turn_takes_a_cylinder_to_itself():
+    angle, height = np.random.default_rng(1).uniform(0, [[2 * np.pi], [0.3]], (2, 4000))
+    cylinder = np.column_stack([0.1 + 0.2 * np.cos(angle), 0.2 * np.sin(angle) - 0.05, height])
+    turned = occupancy.half_turn(cylinder, cylinder[cylinder[:, 0] < 0.1])
+    assert np.abs(np.hypot(turned[:, 0] - 0.1, turned[:, 1] + 0.05) - 0.2).max() < 0.01
+    assert np.abs(turned - cylinder)[:, :2].max() > 0.39 and np.array_equal(turned[:, 2], cylinder[:, 2])
+
+
+def test_iou_is_one_for_the_truth_and_falls_when_answers_are_shuffled(shapes):
+    none, every = np.zeros(2000, bool), np.ones(2000, bool)
+    assert np.isnan(occupancy.iou(none, none)) and occupancy.iou(none, every) == 0
+    for _, one in shapes:
+        share = one.inside.mean()
+        assert occupancy.iou(one.inside, one.inside) == 1 and occupancy.iou(every, one.inside) == share
+        shuffled = np.random.default_rng(1).permutation(one.inside)
+        assert occupancy.iou(shuffled, one.inside) == pytest.approx(
+            share / (2 - share), abs=0.04
+        )  # of independent draws
+
+
+@pytest.mark.parametrize("size", normals.WINDOWS.values())
+def test_planes_fitted_to_the_depth_of_two_planes_have_their_normals_up_to_the_step_between_them(size):
+    k = Intrinsics(width=64, height=48, fx=200.0, fy=150.0, cx=30.0, cy=20.0)
+    y, x = np.mgrid[:48, :64] + 0.5
+    rays = np.stack([(x - k.cx) / k.fx, (y - k.cy) / k.fy, np.ones_like(x)], axis=2)
+    left, right = np.array([0.3, -0.2, 1.0]), np.array([-0.4, 0.5, 1.0])
+    depth = np.where(x < 32, 1 / (rays @ left), 2 / (rays @ right))
+    depth[10, 10] = 0
+    found = normals.normals_of_depth(
+        SimpleNamespace(camera=SimpleNamespace(intrinsics=k)), depth.astype(np.float32), size
+    )
+    expected = np.where(x[..., None] < 32, -left / np.linalg.norm(left), -right / np.linalg.norm(right))
+    expected[10, 10] = -rays[10, 10] / np.linalg.norm(rays[10, 10])
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_normals_of_exact_depth_are_nearly_the_stored_ones_and_what_goes_in_holds_nothing_of_them(pairs, monkeypatch):
+    examples = [normals.make_example(pair) for pair in pairs]
+    for pair, one in zip(pairs, examples, strict=True):
+        assert one.features.shape == (normals.CHANNELS, *one.mask.shape) and one.mask.any()
+        if pair.category == "box":
+            assert normals.score(normals.errors_deg(one.baselines["planes"], one))["median"] < 3
+    monkeypatch.setattr(Pixels, "normals", lambda self: np.zeros((*self.depth().shape, 3), np.float32))
+    for pair, one in zip(pairs, examples, strict=True):
+        blind = normals.make_example(pair)
+        assert np.array_equal(blind.features, one.features) and not blind.mask.any()
+
+
+def test_scores_of_normals_are_those_of_known_angles(pairs):
+    one = normals.make_example(pairs[0])
+    assert normals.score(normals.errors_deg(one.truth, one)) == {
+        "mean": 0, "median": 0, "within 11.25": 1, "within 22.5": 1, "within 30": 1,
+    }  # fmt: skip
+    axis = np.cross(one.truth, [1.0, 2.0, 3.0])
+    axis /= np.maximum(np.linalg.norm(axis, axis=2, keepdims=True), 1e-9)
+    turned = one.truth * np.cos(np.radians(20)) + np.cross(axis, one.truth) * np.sin(np.radians(20))
+    found = normals.score(normals.errors_deg(turned, one))
+    assert found["mean"] == pytest.approx(20, abs=0.01) == found["median"]
+    assert (found["within 11.25"], found["within 22.5"], found["within 30"]) == (0, 1, 1)
+    other = np.zeros_like(one.truth)
+    other[one.mask] = np.random.default_rng(1).permutation(one.truth[one.mask])
+    assert normals.score(normals.errors_deg(other, one))["mean"] > 20
