@@ -69,7 +69,7 @@ def test_tars_hold_the_same_images(three, tmp_path):
 @pytest.mark.minute
 def test_a_scene_that_has_one_object_by_chance_is_the_scene_of_a_job_with_one(tmp_path):
     """Of a range of counts: the same images, under names without `obj`."""
-    six: dict[str, Any] = {"scenes": 6, "categories": THREE["categories"]}
+    six = {"scenes": 6, "categories": THREE["categories"]}
     ranged, _ = make_dataset(tmp_path / "ranged", **six, objects_per_scene=[1, 3])
     counts = [len(row["bodies"]) for row in rows(ranged, "select bodies from scenes order by scene_id")]
     assert set(counts) == {1, 2, 3}
