@@ -55,8 +55,8 @@ def signal_to(number: signal.Signals, link: int) -> Callable[[int, int], None]:
 LOST = "the run ended without a word (exit code 1), as it does where Ray is lost"
 WAYS = {
     "an agent of Ray": (kill_processes("ray::DashboardAgent", signal.SIGKILL), LOST),
-    "SIGTERM": (signal_to(signal.SIGTERM, 0), "stopped by SIGTERM"),
     "Ctrl-C": (interrupt, "interrupted"),
+    "SIGTERM": (signal_to(signal.SIGTERM, 0), "stopped by SIGTERM"),
     "another agent": (kill_processes("ray::RuntimeEnvAgent", signal.SIGKILL), "as it does where Ray is lost"),
     "the raylet": (kill_processes("raylet/raylet", signal.SIGKILL), "as it does where Ray is lost"),
     "the GCS": (kill_processes("gcs/gcs_server", signal.SIGKILL), "as it does where Ray is lost"),
@@ -66,11 +66,11 @@ WAYS = {
     "SIGTERM of the driver": (signal_to(signal.SIGTERM, 2), ""),
     "SIGABRT of the driver": (signal_to(signal.SIGABRT, 2), "crashed"),
 }
-"""How a run loses a process or gets a signal, and what it says then; all but the first three are slow."""
+"""How a run loses a process or gets a signal, and what it says then; all but the first two are slow."""
 
 
 @pytest.mark.parametrize(
-    "way", [*list(WAYS)[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in list(WAYS)[3:])]
+    "way", [*list(WAYS)[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in list(WAYS)[2:])]
 )
 def test_a_lost_process_or_a_signal_is_one_line_and_leaves_nothing(tmp_path, folder, way):
     disturb, words = WAYS[way]

@@ -176,7 +176,9 @@ SPARED = {
 }
 
 
-@pytest.mark.parametrize("name", SPARED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * name.endswith(("scene 1", "scene 2"))) for name in SPARED]
+)
 def test_what_came_to_rest_without_an_effect_stays_where_it_is_under_it(name):
     """Released for a second: within 0.05 mm and 0.01 degrees."""
     effect, facts = SPARED[name][0], SPARED[name][1]()

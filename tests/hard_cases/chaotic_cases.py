@@ -131,7 +131,7 @@ CHAOTIC = (
             tier="slow",
             first=first,
         )
-        for ratio, first in ((10, ""), (100, "minute"), (1_000, "slow"), (10_000, "slow"))
+        for ratio, first in ((10, "minute"), (100, "minute"), (1_000, "slow"), (10_000, "slow"))
     ),
     # Walls 150 mm high hold twenty boxes of about 105 cm^3, 2.1 l of 13.5. The pile's own bar: 95 % certified.
     Chaotic("pile of eight boxes", HARDLY_LESS, within(0.15), lambda seed: pile(8, seed), tier="slow", first="minute"),
@@ -149,7 +149,9 @@ CHAOTIC = (
     ),
     Chaotic("eight balls poured into a tray", HARDLY_LESS, within(0.1), poured, tier="slow", first="slow"),
     # It lies on its side, or stands; it has no other face. Upright it keeps its base's share of the solid angle at most.
-    Chaotic("mug tumbled from 1 m", HARDLY_LESS, on_a_face(), lambda seed: tumbled(built_in("mug"), seed, 1.0)),
+    Chaotic(
+        "mug tumbled from 1 m", HARDLY_LESS, on_a_face(), lambda seed: tumbled(built_in("mug"), seed, 1.0), tier="slow"
+    ),
     Chaotic("cube of 2 mm tumbled from 1 m", NOTHING_LESS, on_a_face(), lambda seed: tumbled(cube(0.002), seed, 1.0)),
     Chaotic(
         "needle of 0.2 by 200 mm tumbled",
@@ -168,6 +170,7 @@ CHAOTIC = (
         lambda seed: jolted(drop(rod(0.012, 0.002), level(), 0.0002, turn(X, 90) @ turn(Z, 3.75)), seed),
         counted=Measure("height of its middle, mm", 13.0, lambda made, rest: coms(made, rest)[0, 2] * 1e3),
         share=(1.0, 1.0),
+        tier="slow",
     ),
     # 50 rad/s about the vertical are some 2.5 turns of precession; friction ends it within seconds, and it lies flat.
     Chaotic(
@@ -186,6 +189,8 @@ CHAOTIC = (
         on_a_face(),
         lambda seed: jolted(drop(ball(0.04, 3), level(), 0.1), seed),
         physics={"restitution": 0.9},
+        tier="slow",
+        first="minute",
     ),
     # 0.8 and 2 J/kg of spin and height: some go over the edge at 0.7 m, most stop before.
     Chaotic(
@@ -241,6 +246,7 @@ CHAOTIC = (
         NOTHING_LESS,
         on_a_face(),  # one that bounces on an edge
         lambda seed: nudged(drop(cube(0.005), ring(0.001), 1.0, xy=(0.45, 0.0)), seed),
+        tier="slow",
     ),
     Chaotic(
         "cube of 1 m, nudged",
@@ -261,11 +267,15 @@ CHAOTIC = (
         on_a_face(),  # it may land on its rim, and roll on that
         lambda seed: nudged(drop(rod(0.033, 0.12), level()), seed),
         spin=(0.0, 0.0, 200.0),
+        tier="slow",
+        first="minute",
     ),
     Chaotic(
         "cube on a wedge of 27.5 degrees, turned by 30 degrees, nudged",
         NOTHING_LESS,
         slid_down(),
         lambda seed: nudged(on_wedge(cube(0.05), 27.5, 30.0), seed),
+        tier="slow",
+        first="minute",
     ),
 )

@@ -101,6 +101,7 @@ STACKS = (
         "cube of 10 kg on one of 10 g",
         heights(0.03, 0.09, bound_mm=0.02),
         lambda: stack(heavy(cube(0.06), 0.01), heavy(cube(0.06), 10.0)),
+        tier="minute",
         again="slow",
     ),
     settles(
@@ -125,7 +126,7 @@ STACKS = (
     ),
     settles("four bricks over one another by 105 % of what balances", below(0.09, 3), lambda: stairs(1.05)),
     settles("six cubes in a pyramid", heights(*[S / 2] * 3, *[1.5 * S] * 2, 2.5 * S, bound_mm=0.05), pyramid_of_cubes),
-    settles("five balls in a pyramid in a tray", balls_up(2), partial(pyramid_of_balls, 2)),
+    settles("five balls in a pyramid in a tray", balls_up(2), partial(pyramid_of_balls, 2), again="slow"),
     settles("fourteen balls in a pyramid in a tray", balls_up(3), partial(pyramid_of_balls, 3), tier="slow"),
     settles("row of six dominoes", tilts(*[0.0] * 6, bound_deg=0.1), lambda: dominoes(6, 0.0)),
     # The last lies flat, and each before it leans on the next: all have gone beyond 45 degrees.

@@ -81,6 +81,7 @@ TIPPING = (
         "cone on its tip, 1 degree aside",
         leaning(cone_lies_deg, 0.1),
         lambda: drop(cone(), level(), 0.0002, turn(X, 181)),
+        again="minute",
     ),
     settles("cone on its base", both(tilt(0.1), height(0.015, 0.01)), lambda: drop(cone(), level())),
 )

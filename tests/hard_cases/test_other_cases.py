@@ -10,10 +10,20 @@ from tests.hard_cases.recording_cases import DEPTH_MM, RECORDINGS
 from tests.hard_cases.surface_cases import P95_MM, SURFACES, p95_mm
 from workers.render.raster.gbuffer import shared_renderer
 
+OF_SECONDS = {
+    *("a shiny half without depth", "a shiny spot without depth that moves with the camera"),
+    *("a transparent sphere in front of a box", "no depth on half of the board", "board at 80 degrees"),
+    *("print seen in a mirror", "wrong dictionary"),
+}
+"""Cases of two seconds and more, of which the default suite has one or two of each kind."""
+
 
 def rows(cases):
     assert len({case.name for case in cases}) == len(cases)
-    return pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in cases])
+    marked = [
+        pytest.param(case, id=case.name, marks=[pytest.mark.minute] * (case.name in OF_SECONDS)) for case in cases
+    ]
+    return pytest.mark.parametrize("case", marked)
 
 
 @rows(CAMERAS)

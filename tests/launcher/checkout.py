@@ -33,6 +33,7 @@ case "$*" in
      [ -e "$FAULTS/pip-is-slow" ] && sleep 0.5; true ;;
   "-P -m services.cli.environment") echo "OMP_NUM_THREADS=1" ;;
   "-m pytest "*) printf '%s|' pytest "${@:3}" "path=$PYTHONPATH" "threads=$OMP_NUM_THREADS" "in=$PWD"
+     [ -z "${PYTHONDONTWRITEBYTECODE-}" ] || echo "compiles all anew"
      exit "$(cat "$FAULTS/pytest" 2>/dev/null || echo 0)" ;;
   "-m ruff "* | "-m mypy") echo "${@:2}"; [ ! -e "$FAULTS/$2-fails" ] ;;
   "-P -m services.cli.main"*) printf '%s|' "${@:4}" "path=${PYTHONPATH-}" "in=$PWD" "typed=$VERSO_TYPED"
@@ -82,7 +83,12 @@ class Checkout:
         self.environ: dict[str, str] = {}
 
     def start(self, *args: str, launcher: Path | None = None, cwd: Path | None = None) -> subprocess.Popen[str]:
-        environ = {"PATH": f"{self.bin}:/usr/bin:/bin", "FAULTS": str(self.faults), "PYTHONPATH": "/opt/ros"}
+        environ = {
+            "PATH": f"{self.bin}:/usr/bin:/bin",
+            "FAULTS": str(self.faults),
+            "PYTHONPATH": "/opt/ros",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
         environ |= {"HOME": str(self.faults.parent), **self.environ}
         command = [str(launcher or self.root / "verso"), *args]
         pipe = subprocess.PIPE

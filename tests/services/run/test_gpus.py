@@ -56,6 +56,7 @@ def enter_on_simulated_gpus(folder: Path, *arguments):
 
 
 @pytest.mark.ray
+@pytest.mark.minute
 @pytest.mark.timeout(300)
 def test_a_run_on_two_gpus_draws_on_both_and_makes_the_same_bytes(tmp_path, monkeypatch):
     keys = {"scenes": 12, "run": {"range_size": 1, "shard_size": 1, "device": "any"}}

@@ -87,7 +87,7 @@ def test_the_same_command_measures_nothing_twice_and_a_longer_budget_goes_on(mea
     code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--target", "depth_mm=0.01")
     assert code == 1 and "units=8000" in text and "depth_mm" in text and "0.06" in text
     assert (len(set(before)) == len(before) and "not decided" in text) or "convergence" in text
-    code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--budget", "70s")
+    code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--budget", "66s")
     assert code == 0 and units()[: len(before)] == before and len(set(units())) == len(units())
     code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--set", "seed=5")
     assert code == 2 and "another study" in text and "--out" in text
@@ -95,7 +95,7 @@ def test_the_same_command_measures_nothing_twice_and_a_longer_budget_goes_on(mea
 
 @pytest.mark.minute
 def test_a_target_writes_the_job_with_the_cheapest_setting_that_meets_it(measured, capsys):
-    words = ["--target", "depth_mm=0.3,kept_share=0.9", "--budget", "90s", "--json"]
+    words = ["--target", "depth_mm=0.3,kept_share=0.9", "--budget", "76s", "--json"]
     assert main(["tradeoff", TABLETOP, "--out", str(measured), *SMALL, *words]) == 0
     answer = json.loads(capsys.readouterr().out.splitlines()[-1])
     tree = yaml.safe_load((measured / "job.yaml").read_text())

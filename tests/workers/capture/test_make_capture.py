@@ -333,7 +333,8 @@ def test_folders_are_relative_to_the_job_file_and_their_files_decide_the_digest(
 # ---------------------------------------------------------------------------------------------- the whole chain
 
 
-def test_a_capture_is_processed_without_a_file_more_or_less_in_its_folder(tmp_path):
+@pytest.mark.minute
+def test_a_capture_is_processed_without_a_file_more_or_less_in_its_folder():
     path, watch = box(), Stopwatch()
     before, truth = sorted(path.rglob("*")), read_truth(path)
     done = process_capture(open_folder(path), Captures(estimation=Estimation(compare=True)), watch)
@@ -343,7 +344,10 @@ def test_a_capture_is_processed_without_a_file_more_or_less_in_its_folder(tmp_pa
     for view in used:
         assert np.linalg.norm(view.T_board_cam[:3, 3] - truth.T_board_cam[view.number][:3, 3]) < 0.003
     assert set(done.score.views) == {view.number for view in used} and done.images(used[0].number).mask.any()
-    bare = copy_of(path, tmp_path)  # without truth there is no score, and a manual correction is its view's pose
+
+
+def test_without_truth_there_is_no_score_and_a_manual_correction_is_its_views_pose(tmp_path):
+    bare, truth = copy_of(box(), tmp_path), read_truth(box())
     for file in sorted(bare.glob("truth/**/*"), reverse=True):
         file.rmdir() if file.is_dir() else file.unlink()
     write_pose(bare / "board_00002.txt", truth.T_board_cam[2])
