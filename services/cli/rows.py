@@ -323,6 +323,17 @@ COMMANDS: Final[dict[str, Command]] = {
         ),
     ),
     **REPORT_COMMANDS,
+    "score": command(
+        "score predictions of a dataset's other side: depth, RGB, shapes, volumes, poses",
+        "data/tabletop predictions",
+        OUT,
+        path("predictions", "PREDICTIONS", "depth/ID.png|npy, rgb/ID.png, shape/ID.glb, ..., poses.csv", nargs="?"),
+        path("--out", "DIR", "where the score goes (default: PREDICTIONS/score)", dest="score"),
+        choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
+        path("--compare", "DIR", "which of two scores is better, A B", nargs=2),
+        handler="score.command:main",
+        kept="what is scored is kept",
+    ),
     "export": command(
         "write the dataset in a layout that other people's loaders read",
         "data/tabletop data/recon --format mirror-recon --category mug",

@@ -1,0 +1,332 @@
+"""The items of a pair: what is true, what is predicted, whether it can be scored, and its scores. A row for each item.
+
+An item is a kind of prediction, a pose id and, for shapes, volumes and poses, a region. Every pair has an item of every kind
+that is predicted at all. Its status is `ok`, `missing`, or `refused` with a reason. Columns of metrics are named
+kind_metric_unit, for parts of an image kind_metric_part_unit: `depth_mae_m` is that of the object, `depth_mae_hidden_m` of
+the part of it that the input view does not see.
+
+Parts of the mirror view: `object`, all pixels of objects; `seen` and `hidden`, those of them whose surface the input view
+sees and does not (services/dataset/correspondence.py); `boundary`, within two pixels of an object's outline; `scene`, all
+with truth. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they would
+drown it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from schemas.base import Array, Pose
+from schemas.dataset.codec import Row, read_matrix
+from schemas.errors import InputError, VersoError
+from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
+from services.dataset.correspondence import correspond
+from services.dataset.pair import Pair
+from services.dataset.view import View
+from services.score.colour import score_colour
+from services.score.depth import score_depth
+from services.score.pose import score_pose
+from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
+from services.score.shape import score_shape, score_volume
+from workers.geometry.frames import invert, transform
+
+PredictedFrame = Literal["object", "camera", "input", "world"]
+FRAMES: Final[tuple[PredictedFrame, ...]] = get_args(PredictedFrame)
+"""The frame of predicted shapes: the object's, the mirror camera's, the input camera's, the world's."""
+
+SEEN_TOLERANCE_M: Final = 0.001
+"""How far behind the input view's surface a point may lie that it sees: as `Pair.correspondence`."""
+
+BOUNDARY_PX: Final = 2
+LEAST_PIXELS: Final = 50
+"""Pixels with truth and prediction without which neither unit nor sign is judged."""
+
+UNIT_SLACK: Final = 1.25
+"""A median ratio to the truth within this factor of that of a unit is that unit."""
+
+INVERTED: Final = -0.8
+"""Correlation with the truth below which depth is inverted: of disparity it is near -1, of a poor guess near 0."""
+
+SIZE_SLACK: Final = 3.0
+"""Most ratio of the diagonals of a predicted and the true box, and most distance of their centres in diagonals."""
+
+_UNITS: Final = {1e3: "millimetres", 1e2: "centimetres", 1e-3: "kilometres: it was divided by 1,000 once too often"}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the command line asks for."""
+
+    kinds: tuple[str, ...]
+    frame: PredictedFrame = "object"
+    samples: int = 10_000
+    """Points drawn on a surface."""
+    seed: int = 0
+
+
+def column(kind: str, name: str) -> str:
+    """The column of a metric as the scoring functions name it: ("depth", "hidden.mae_m") is `depth_mae_hidden_m`."""
+    if kind != "depth":
+        return f"{kind}_{name.replace('.', '_')}"
+    part, _, metric = name.partition(".")
+    infix = "" if part == "object" else f"_{part}"
+    return f"depth_{metric.removesuffix('_m')}{infix}_m" if metric.endswith("_m") else f"depth_{metric}{infix}"
+
+
+def score_pair(pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], asked: Asked) -> list[Row]:
+    """A row for each item of a pair. Raises InputError where the dataset has no mirror view, CorruptError where it is damaged."""
+    if pair.mirror is None:
+        raise InputError("the dataset has no mirror view to score: its job's cameras.mirror.enabled is false")
+    truth, rows = Truth(pair, pair.mirror), []
+    for kind in asked.kinds:
+        for region in [0] if kind in ("depth", "rgb") else truth.regions:
+            label = pair.mirror.regions.get(region or REGION_FIRST_OBJECT)
+            row: Row = {
+                "kind": kind,
+                "pose_id": pair.mirror.pose_id,
+                "scene_id": pair.scene_id,
+                "category": label["category"] if label else pair.category,
+                "instance": label["instance_id"] if label else pair.instance_id,
+                "region": region,
+                "visible_fraction": pair.input.visible_fraction,
+                "diagonal_m": truth.diagonal_m(region or REGION_FIRST_OBJECT),
+            }
+            names = found.get((kind, pair.mirror.pose_id, region), ())
+            rows.append(row | _score(kind, names, region, truth, folder, asked))
+    return rows
+
+
+def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folder: Path, asked: Asked) -> Row:
+    """Status, reason and metrics of one item."""
+    if not names:
+        return {"status": "missing", "reason": None}
+    prepared = truth.prepare(kind, region, asked)
+    try:
+        if len(names) > 1:
+            told = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
+            raise InputError(f"the id is there {len(names)} times: {told}")
+        scores, note = _SCORERS[kind](
+            folder / kind / names[0] if kind != "pose" else names[0], region, prepared, truth, asked
+        )
+    except VersoError as error:
+        return {"status": "refused", "reason": str(error).replace(f"{folder}/", "")}
+    return {"status": "ok", "reason": note} | {column(kind, name): value for name, value in scores.items()}
+
+
+class Truth:
+    """What is true of a pair; images are decoded once, and only when asked for. Raises CorruptError where they are damaged."""
+
+    def __init__(self, pair: Pair, mirror: View) -> None:
+        self.pair, self.view = pair, mirror
+        self.regions = [region for region in sorted(pair.T_world) if region >= REGION_FIRST_OBJECT]
+
+    def diagonal_m(self, region: int) -> float:
+        """Of the object's bounding box; nan where nothing is known of it."""
+        label = self.view.regions.get(region)
+        asset = label["asset"] if label else self.pair.asset
+        return float(np.linalg.norm(asset["extents_m"])) if asset.get("extents_m") else float("nan")
+
+    @cached_property
+    def units(self) -> NDArray[np.uint16]:
+        """[H, W] stored depth."""
+        return self.view.depth()
+
+    @cached_property
+    def depth_m(self) -> Array:
+        """[H, W] float64 metres."""
+        return self.units / self.view.depth_units_per_m
+
+    @cached_property
+    def segment(self) -> NDArray[np.uint8]:
+        """[H, W] region ids."""
+        return self.view.segment()
+
+    @cached_property
+    def parts(self) -> Mapping[str, NDArray[np.bool_]]:
+        """[H, W] bool by name, as the head of this file has them."""
+        mask = self.segment >= REGION_FIRST_OBJECT
+        source = _Part(self.view, np.where(mask, self.units, 0), self.segment)
+        seen = correspond(cast(Any, source), self.pair.input, SEEN_TOLERANCE_M).visible & mask
+        return {
+            "object": mask,
+            "scene": self.units > 0,
+            "seen": seen,
+            "hidden": mask & ~seen & (self.units > 0),
+            "boundary": _outline(self.segment),
+        }
+
+    def shape(self, region: int, frame: PredictedFrame) -> Mesh:
+        """The object's surface, one vertex at a place, in a frame, metres."""
+        mesh = self.pair.mesh(region, welded=True)
+        vertices = transform(self.T_frame_world(region, frame), np.asarray(mesh.vertices))
+        return Mesh(vertices, np.asarray(mesh.faces, np.int32))
+
+    def T_frame_world(self, region: int, frame: PredictedFrame) -> Pose:
+        """[4, 4]."""
+        if frame == "world":
+            return np.eye(4)
+        return invert(
+            {"object": self.pair.T_world[region], "input": self.pair.input.T_world_cam}.get(
+                frame, self.view.T_world_cam
+            )
+        )
+
+    def prepare(self, kind: str, region: int, asked: Asked) -> Any:
+        """What an item is held against. Raises InputError where the dataset does not store it."""
+        if kind == "depth":
+            return self.depth_m, self.parts
+        if kind == "rgb":
+            return self.view.rgb()
+        if kind == "volume":
+            stored = self.pair.samples(region)
+            if "volume_distance" not in stored and "volume_occupancy" not in stored:
+                raise InputError("the dataset stores no volume samples: its job's targets.shape names none")
+            return stored
+        return self.shape(region, asked.frame if kind == "shape" else "object")
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A view of whose depth only a part is there."""
+
+    view: View
+    units: NDArray
+    regions: NDArray
+
+    def depth(self) -> NDArray:
+        return self.units
+
+    def segment(self) -> NDArray:
+        return self.regions
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.view, name)
+
+
+def _outline(segment: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """[H, W]: pixels within `BOUNDARY_PX` of another region, if either is of an object."""
+    found = np.zeros(segment.shape, np.bool_)
+    rows, columns = np.nonzero(segment >= REGION_FIRST_OBJECT)
+    if not len(rows):
+        return found
+    near = tuple(
+        slice(max(int(at.min()) - BOUNDARY_PX - 1, 0), int(at.max()) + BOUNDARY_PX + 2) for at in (rows, columns)
+    )
+    crop = np.where(segment[near] >= REGION_FIRST_OBJECT, segment[near], 0)
+    size = 2 * BOUNDARY_PX + 1
+    found[near] = ndimage.maximum_filter(crop, size, mode="nearest") != ndimage.minimum_filter(
+        crop, size, mode="nearest"
+    )
+    return found
+
+
+# ---------------------------------------------------------------------------------------------- one item of each kind
+
+Scored = tuple[Mapping[str, float | None], str | None]
+"""Metrics by name, and a note."""
+
+
+def _score_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+    true_m, parts = prepared
+    predicted_m = read_image(path, true_m.shape, truth.view.depth_units_per_m)
+    check_depth(predicted_m, true_m, truth.view.depth_units_per_m)
+    return score_depth(predicted_m, true_m, parts), None
+
+
+def check_depth(predicted_m: Array, true_m: Array, units_per_m: float) -> None:
+    """Raises InputError where depth [H, W] is in another unit than metres, or inverted: it is said and not mended."""
+    both = (predicted_m > 0.0) & (true_m > 0.0)
+    if np.count_nonzero(both) < LEAST_PIXELS:
+        return
+    predicted, true = predicted_m[both], true_m[both]
+    ratio = float(np.median(predicted / true))
+    units = _UNITS | {units_per_m: "the units of stored images", 1e3 / units_per_m: "a PNG of millimetres"}
+    for factor, unit in units.items():
+        if max(factor, 1.0 / factor) > SIZE_SLACK and max(ratio / factor, factor / ratio) < UNIT_SLACK:
+            told = f"{units_per_m:g} units a metre in a PNG, metres in an array"
+            raise InputError(f"depth is {ratio:.4g} times the truth: it seems to be {unit}; write {told}")
+    a, b = predicted - predicted.mean(), true - true.mean()
+    norm = float(np.sqrt((a @ a) * (b @ b)))
+    if norm > 0.0 and float(a @ b) / norm < INVERTED:
+        raise InputError(f"depth is inverted: its correlation with the truth is {float(a @ b) / norm:.2f}")
+
+
+def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+    return score_colour(read_image(path, prepared.shape), prepared), None
+
+
+def _score_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+    predicted = read_shape(path)
+    points = predicted.vertices if isinstance(predicted, Mesh) else predicted
+    check_box(points, prepared.vertices, lambda frame: truth.shape(region, frame).vertices)
+    scores = score_shape(predicted, prepared, truth.diagonal_m(region), asked.samples, asked.seed)
+    open_mesh = isinstance(predicted, Mesh) and scores.get("iou") is None
+    return scores, "the mesh has no volume: its IoU counts as 0" if open_mesh else None
+
+
+def check_box(points: Array, true: Array, true_in: Callable[[PredictedFrame], Array]) -> None:
+    """Raises InputError where the box of points [N, 3] has another size or place than the true one, with what would fit.
+
+    true [M, 3]: vertices in the frame that was asked for; true_in: in another.
+    """
+    centre, size = _box(points)
+    true_centre, true_size = _box(true)
+    ratio = size / true_size
+    if not 1.0 / SIZE_SLACK <= ratio <= SIZE_SLACK:
+        fits = [unit for factor, unit in _UNITS.items() if 1.0 / SIZE_SLACK <= ratio / factor <= SIZE_SLACK]
+        told = f": it seems to be in {fits[0]}" if fits else ""
+        raise InputError(f"the box is {ratio:.4g} times the true one{told}; shapes are in metres")
+    if np.linalg.norm(centre - true_centre) > SIZE_SLACK * true_size:
+        fits = [name for name in FRAMES if np.linalg.norm(centre - _box(true_in(name))[0]) < true_size]
+        told = f": it fits --frame {fits[0]}" if fits else ""
+        raise InputError(f"the box is {np.linalg.norm(centre - true_centre):.3g} m from the true one{told}")
+
+
+def _box(points: Array) -> tuple[Array, float]:
+    """The middle [3] and the diagonal of a box about points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2.0, float(np.linalg.norm(high - low))
+
+
+def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+    """Values from 0 to 1 are occupancy, values of which some are negative signed distance, metres, negative inside."""
+    count = len(prepared["volume_points"])
+    predicted = read_array(path, (count,))
+    if not np.isfinite(predicted).all():
+        raise InputError("the array has values that are not finite")
+    is_distance = bool((predicted < 0.0).any())
+    name = "volume_distance" if is_distance else "volume_occupancy"
+    if not is_distance and (predicted.max() > 1.0 or name not in prepared):
+        raise InputError(
+            f"the values are {predicted.min():.3g} to {predicted.max():.3g}: neither occupancy (0 to 1) nor distance"
+        )
+    if name not in prepared:
+        raise InputError(f"the dataset stores no {name.removeprefix('volume_')} to hold it against")
+    true = prepared[name].astype(np.float64)
+    if is_distance and np.abs(predicted).max() > 100.0 * np.abs(true).max():
+        raise InputError(f"distances reach {np.abs(predicted).max():.3g}: they seem to be in millimetres; write metres")
+    return score_volume(predicted, true, is_distance), None
+
+
+def _score_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+    view = truth.pair.input if asked.frame == "input" else truth.view
+    T_true = read_matrix(view.regions[region]["T_cam_obj"])
+    T = read_pose(text)
+    off_m, away_m = float(np.linalg.norm(T[:3, 3])), float(np.linalg.norm(T_true[:3, 3]))
+    if not 1e-2 < off_m / away_m < 1e2:
+        raise InputError(f"t is {off_m / away_m:.4g} times as far as the object: BOP's csv has millimetres")
+    return score_pose(T, T_true, prepared.vertices, (), view.K), None
+
+
+_SCORERS: Final[Mapping[str, Any]] = {
+    "depth": _score_depth,
+    "rgb": _score_rgb,
+    "shape": _score_shape,
+    "volume": _score_volume,
+    "pose": _score_pose,
+}

@@ -1,0 +1,208 @@
+"""Errors of a predicted shape: a mesh, a cloud, or values at points of space. Pure.
+
+Points are drawn uniformly by area; their distances to the other surface are exact. So sampling adds an error but no bias.
+"""
+
+import math
+
+import manifold3d
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from schemas.base import Array
+from schemas.scene.shape import Mesh
+from workers.assets.external.mesh import is_solid, merge_points
+from workers.assets.mass import unite_bodies
+from workers.assets.winding import winding_numbers
+from workers.geometry.distance import distance_to_mesh
+from workers.geometry.mesh import face_areas, face_normals, solid_of, weld
+
+ERRORS = 3.0
+"""Standard errors in a stated sampling error: about three seeds in a thousand lie farther off."""
+
+METRICS = (
+    *("chamfer_l1_m", "chamfer_l2_m2", "accuracy_m", "completeness_m", "hausdorff95_m", "chamfer_l1_rel"),
+    *("fscore_1mm", "fscore_2mm", "fscore_5mm", "fscore_1pct", "normal_consistency", "iou"),
+)
+
+Estimate = tuple[float, float]
+"""A value and its sampling error."""
+
+
+def score_shape(
+    predicted: Mesh | Array, true: Mesh, diagonal_m: float, samples: int = 40_000, seed: int = 0
+) -> dict[str, float | None]:
+    """Errors of a mesh, or a cloud [N, 3], in the frame of the true mesh, metres. diagonal_m: of the true bounding box.
+
+    accuracy_m, completeness_m: mean distance of the predicted surface's points to the true surface, and of the true surface's
+    to the predicted one (Mescheder et al. 2019, section 4 and supplement). A cloud's own points are all taken as they are, and
+    the true surface's distances are to the nearest of them.
+    chamfer_l1_m, chamfer_l2_m2: mean of the two, and of the two mean squares (ibid.; Fan et al. 2017, eq. 1, adds them up);
+    chamfer_l1_rel: chamfer_l1_m by diagonal_m.
+    fscore_1mm, fscore_2mm, fscore_5mm, fscore_1pct: harmonic mean of the shares of either that are within that distance of the
+    other, 1pct of the diagonal (Knapitsch et al. 2017, section 3.3); 0 where both are 0.
+    normal_consistency: mean |n . m| of a point's normal and that of the nearest face (at an edge either's), mean of both
+    ways (Mescheder et al. 2019); None of a cloud.
+    hausdorff95_m: the larger of the two ways' 95th percentiles (Huttenlocher et al. 1993, section V, the partial distance).
+    iou: common volume by that of both together (ibid.). Of closed meshes exact; where one is open, of points uniform in the box
+    about both, inside where the winding number is beyond 0.5 either way (Jacobson et al. 2013). None where one has no volume.
+
+    `metric.sampling`: three standard errors, 0 where nothing was sampled: of means by the samples' deviation, of shares by the
+    binomial with two points added of either kind (Agresti and Coull 1998), of the percentile by the order statistics at
+    three standard errors of its rank. `samples`: of each surface, and of the box.
+
+    All are nan, and iou and normal_consistency None, where a surface is empty or has a number that is not finite, or
+    diagonal_m is not positive.
+    """
+    scores: dict[str, float | None] = {name: math.nan for metric in METRICS for name in (metric, f"{metric}.sampling")}
+    scores |= {name: None for name in scores if name.startswith(("iou", "normal"))}
+    if not (_is_usable(predicted) and _is_usable(true) and 0.0 < diagonal_m < math.inf):
+        return scores
+    points, normals = _draw(true, np.random.default_rng([seed, 0]), samples)
+    found: dict[str, Estimate | None] = {}
+    if isinstance(predicted, Mesh):
+        own, own_normals = _draw(predicted, np.random.default_rng([seed, 1]), samples)
+        there, met = _nearest(own, true)
+        back, met_back = _nearest(points, predicted)
+        dots = [np.abs((a * b).sum(axis=1)) for a, b in ((own_normals, met), (normals, met_back))]
+        found["normal_consistency"] = _half(_mean(dots[0]), _mean(dots[1]))
+        found["iou"] = _iou(predicted, true, np.random.default_rng([seed, 2]), samples)
+    else:
+        there = _nearest(np.asarray(predicted, np.float64), true)[0]
+        back = np.asarray(cKDTree(predicted).query(points)[0])
+    found |= _of_distances(there, back, isinstance(predicted, Mesh), diagonal_m)
+    for name, estimate in found.items():
+        scores[name], scores[f"{name}.sampling"] = estimate or (None, None)
+    return scores
+
+
+def _of_distances(there: Array, back: Array, drawn: bool, diagonal_m: float) -> dict[str, Estimate]:
+    """The metrics of distances, metres, from predicted points [N], which were `drawn` or are all, and from true ones [M]."""
+    accuracy, completeness = _mean(there, drawn), _mean(back)
+    chamfer = _half(accuracy, completeness)
+    limits = {"1mm": 0.001, "2mm": 0.002, "5mm": 0.005, "1pct": diagonal_m / 100.0}
+    return {
+        "accuracy_m": accuracy,
+        "completeness_m": completeness,
+        "chamfer_l1_m": chamfer,
+        "chamfer_l1_rel": (chamfer[0] / diagonal_m, chamfer[1] / diagonal_m),
+        "chamfer_l2_m2": _half(_mean(there**2, drawn), _mean(back**2)),
+        "hausdorff95_m": _hausdorff95(there, back, drawn),
+        **{f"fscore_{name}": _fscore(there <= limit, back <= limit, drawn) for name, limit in limits.items()},
+    }
+
+
+def _mean(values: Array, drawn: bool = True) -> Estimate:
+    return float(values.mean()), ERRORS * float(values.std()) / math.sqrt(len(values)) if drawn else 0.0
+
+
+def _half(one: Estimate, other: Estimate) -> Estimate:
+    return (one[0] + other[0]) / 2.0, math.hypot(one[1], other[1]) / 2.0
+
+
+def _hausdorff95(there: Array, back: Array, drawn: bool) -> Estimate:
+    ways = []
+    for distances, sampled in ((there, drawn), (back, True)):
+        spread = ERRORS * math.sqrt(0.95 * 0.05 / len(distances)) if sampled else 0.0
+        ways.append(np.quantile(distances, np.clip([0.95, 0.95 - spread, 0.95 + spread], 0.0, 1.0)))
+    value, low, high = np.max(ways, axis=0).tolist()
+    return value, max(value - low, high - value)
+
+
+def _fscore(right: NDArray[np.bool_], within: NDArray[np.bool_], drawn: bool) -> Estimate:
+    """The harmonic mean of two shares; its error is that of either times the slope 2 r^2 / (p + r)^2 by the other."""
+    p, r = float(right.mean()), float(within.mean())
+    (p_near, p_error), (r_near, r_error) = _share(right, drawn), _share(within)
+    total = p_near + r_near
+    error = 2.0 * math.hypot(p_error * r_near**2, r_error * p_near**2) / total**2 if total > 0.0 else 0.0
+    return (2.0 * p * r / (p + r) if p + r > 0.0 else 0.0), error
+
+
+def _share(hits: NDArray[np.bool_], drawn: bool = True) -> Estimate:
+    """A share and its error, which is not 0 where all samples agree, as others may not (Agresti and Coull 1998)."""
+    share = (float(hits.sum()) + 2.0) / (len(hits) + 4.0)
+    return (share, ERRORS * math.sqrt(share * (1.0 - share) / len(hits))) if drawn else (float(hits.mean()), 0.0)
+
+
+def _is_usable(shape: Mesh | Array) -> bool:
+    """Whether a cloud has points, and a mesh an area and faces of its vertices, and all are finite."""
+    points = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape)
+    finite = len(points) > 0 and bool(np.isfinite(points).all())
+    if not finite or not isinstance(shape, Mesh):
+        return finite
+    known = len(shape.faces) > 0 and shape.faces.min() >= 0 and shape.faces.max() < len(points)
+    return bool(known and face_areas(points, shape.faces).any())
+
+
+def _draw(mesh: Mesh, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+    """(points [N, 3], unit normals of their faces [N, 3]), uniform by area."""
+    points, face = trimesh.sample.sample_surface(
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), count, seed=rng
+    )
+    return np.asarray(points), _normals(mesh)[face]
+
+
+def _nearest(points: Array, mesh: Mesh) -> tuple[Array, Array]:
+    """(distances [N] of points [N, 3] to a mesh, unit normals of the nearest faces [N, 3])."""
+    with_area = Mesh(mesh.vertices, mesh.faces[face_areas(mesh.vertices, mesh.faces) > 0.0])
+    distance, face = distance_to_mesh(points, with_area)
+    return distance, _normals(with_area)[face]
+
+
+def _normals(mesh: Mesh) -> Array:
+    return face_normals(np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int32))
+
+
+def _iou(predicted: Mesh, true: Mesh, rng: np.random.Generator, count: int) -> Estimate | None:
+    """The volume IoU of two meshes; None where one of them has no volume."""
+    one, other = _solid(predicted), _solid(true)
+    if one is not None and other is not None:
+        common_m3 = (one ^ other).volume()
+        return common_m3 / (one.volume() + other.volume() - common_m3), 0.0
+    corners = np.concatenate([mesh.vertices[mesh.faces].reshape(-1, 3) for mesh in (predicted, true)])
+    points = rng.uniform(corners.min(axis=0), corners.max(axis=0), (count, 3))
+    within, inside = (np.abs(winding_numbers(points, mesh)) > 0.5 for mesh in (predicted, true))
+    if not (within.any() and inside.any()):
+        return None
+    both = (within & inside)[within | inside]
+    return float(both.mean()), _share(both)[1]
+
+
+def _solid(mesh: Mesh) -> manifold3d.Manifold | None:
+    """The solid that closed bodies are together, wound either way; None where a mesh is open, or its bodies too many to unite."""
+    vertices = np.ascontiguousarray(mesh.vertices, np.float64)
+    for faces in (mesh.faces.astype(np.int64), mesh.faces[:, ::-1].astype(np.int64)):
+        if not is_solid(vertices, faces):
+            continue
+        (vertices, faces), common_m3 = unite_bodies(vertices, faces)
+        point = merge_points(vertices)
+        places = np.empty((int(point.max()) + 1, 3))
+        places[point] = vertices
+        return None if common_m3 is None else solid_of(weld(Mesh(places, point[faces].astype(np.int32))))
+    return None
+
+
+def score_volume(predicted: NDArray, true: NDArray, is_distance: bool) -> dict[str, float | None]:
+    """Errors at the same points of space, as many as [M], of occupancy, or of signed distance, metres, negative inside.
+
+    Inside is a distance below 0, an occupancy above 0.5.
+    iou: points inside both by those inside either (Mescheder et al. 2019, section 4); None where none is in either. It is of the
+    points, which lie more densely about the surface, not of the volume.
+    accuracy: share of points on the right side. distance_mae_m: mean |difference|, metres; None of occupancy.
+
+    A true value that is not finite does not count. A predicted one is wrong: in accuracy, and in iou as a point inside one of
+    the two; it is left out of distance_mae_m. nan where no value is left. Raises ValueError where sizes differ.
+    """
+    if np.shape(predicted) != np.shape(true):
+        raise ValueError(f"{np.shape(predicted)} values of {np.shape(true)} points")
+    truth, values = (np.asarray(each, np.float64)[np.isfinite(true)] for each in (true, predicted))
+    known = np.isfinite(values)
+    within, inside = ((each < 0.0 if is_distance else each > 0.5) for each in (truth, values))
+    either, error = int((within | inside | ~known).sum()), np.abs(values - truth)[known]
+    return {
+        "iou": float((within & inside & known).sum() / either) if either else None,
+        "accuracy": float(((within == inside) & known).mean()) if len(truth) else math.nan,
+        "distance_mae_m": None if not is_distance else float(error.mean()) if len(error) else math.nan,
+    }
