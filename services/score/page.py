@@ -100,7 +100,7 @@ def page_of(
         "Seen and hidden: the object's pixels whose surface the input view sees, and does not."
     )
     sections = [
-        Section("answer", "Answer", f"{answer}"),
+        Section("answer", "Answer", answer),
         Section("metrics", "Metrics", f'{_metrics(summary["metrics"])}<p class="note">{note}</p>'),
         Section("groups", "By group", "".join(_group(name, of) for name, of in summary["by"].items())),
         Section("distributions", "Distributions", _charts(table)),

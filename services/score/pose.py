@@ -32,7 +32,7 @@ def score_pose(
     where one is not finite. mspd_px is inf where a predicted point is behind the camera, else nan where a true one is.
     """
     scores = dict.fromkeys(("add_m", "add_s_m", "rotation_deg", "translation_m", "mssd_m", "mspd_px"), math.nan)
-    if not (_is_rigid(T_predicted) and _is_rigid(T_true)):
+    if not (is_rigid(T_predicted) and is_rigid(T_true)):
         return scores
     same = [T_true, *(T_true @ symmetry for symmetry in symmetries)]
     scores["rotation_deg"] = math.degrees(min(angle_between(T_predicted[:3, :3], T[:3, :3]) for T in same))
@@ -51,8 +51,8 @@ def score_pose(
     return scores
 
 
-def _is_rigid(T: Pose) -> bool:
-    """Whether a matrix is a rotation, to rounding of its text, and a translation."""
+def is_rigid(T: Pose) -> bool:
+    """Whether a matrix is [4, 4] of a rotation, to rounding of its text, and a translation, all finite."""
     T = np.asarray(T)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False

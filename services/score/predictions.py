@@ -26,6 +26,7 @@ from schemas.base import Array, Pose
 from schemas.errors import InputError, plain_line
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
+from services.score.pose import is_rigid
 from workers.assets.external.formats import load_shape, read_bytes
 from workers.assets.external.plain import count_ply
 from workers.store.images import decode_png
@@ -193,6 +194,6 @@ def read_pose(text: str) -> Pose:
         T[:3, :3], T[:3, 3] = R.reshape(3, 3), t.reshape(3) / 1e3
     except ValueError as error:
         raise InputError(f"the pose is not nine numbers R and three numbers t: {plain_line(text)}") from error
-    if not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T) < 0.0:
+    if not is_rigid(T):
         raise InputError(f"R is no rotation: {plain_line(text)}")
     return T

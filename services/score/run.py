@@ -113,7 +113,7 @@ def _stamp(path: Path) -> tuple[int, int]:
     """(bytes, time of change in ns) of a file, 0 for a line of a table, whose text is told."""
     try:
         found = path.stat()
-    except (FileNotFoundError, NotADirectoryError, OSError):
+    except OSError:
         return 0, 0
     return found.st_size, found.st_mtime_ns
 

@@ -18,6 +18,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from schemas.base import Array
+from services.score.predictions import KINDS
 
 HEADLINES: Final = (
     *("depth_mae_m", "depth_mae_seen_m", "depth_mae_hidden_m", "depth_mae_boundary_m", "depth_mae_scene_m"),
@@ -45,11 +46,8 @@ Figure = Mapping[str, float | int | None]
 
 def metrics_of(table: pa.Table) -> list[str]:
     """The columns that are scores, headlines first."""
-    names = [name for name in table.column_names if name.partition("_")[0] in KIND_NAMES and not _NO_SCORE.search(name)]
+    names = [name for name in table.column_names if name.partition("_")[0] in KINDS and not _NO_SCORE.search(name)]
     return sorted(names, key=lambda name: (HEADLINES.index(name) if name in HEADLINES else len(HEADLINES), name))
-
-
-KIND_NAMES: Final = ("depth", "rgb", "shape", "volume", "pose")
 
 
 def is_better_high(name: str) -> bool:
@@ -74,9 +72,8 @@ def values_of(table: pa.Table, name: str) -> Array:
 def _has_truth(table: pa.Table, name: str, values: Array) -> NDArray[np.bool_]:
     """[N]: where a scored item without a value predicts nothing, and not: has nothing to be held against."""
     if not name.startswith("depth_"):
-        return np.isinf(values) | (
-            pc.is_valid(table["reason"]).to_numpy() if name == "shape_iou" else np.isnan(values) & False
-        )
+        without_volume = pc.is_valid(table["reason"]).to_numpy() if name == "shape_iou" else False
+        return np.isinf(values) | without_volume
     part = next((one for one in ("scene", "seen", "hidden", "boundary") if f"_{one}" in name), "")
     return _numbers(table, f"depth_pixels{part and '_'}{part}") > 0.0
 
@@ -129,17 +126,15 @@ def summarise(table: pa.Table) -> dict[str, Any]:
 
 def figures(values: Array, scenes: NDArray[np.int64], chosen: NDArray[np.bool_]) -> list[Figure]:
     """A figure for each column of values [N, M], of the items that are chosen [N]; scenes [N]: numbers from 0 up."""
+    if not values.shape[1]:
+        return []
     counts = np.isfinite(values) & chosen[:, None]
     there = np.unique(scenes[chosen])
     at = np.searchsorted(there, scenes[chosen])
     sums, items = (
         np.stack([np.bincount(at, column, len(there)) for column in array[chosen].T], axis=1)
-        if values.shape[1]
-        else np.zeros((0, 0))
         for array in (np.where(counts, values, 0.0), counts.astype(np.float64))
     )
-    if not values.shape[1]:
-        return []
     rng = np.random.default_rng(SEED)
     draws = [
         np.bincount(rng.integers(0, len(there), len(there)), minlength=len(there))

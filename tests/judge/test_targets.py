@@ -138,7 +138,7 @@ def of_the_world(original: Callable) -> Callable:
 def mixed_in_srgb(monkeypatch) -> None:
     """Texels are mixed as codes."""
     monkeypatch.setattr(targets, "LINEAR", np.arange(256, dtype=np.uint16) * np.uint16(257))
-    monkeypatch.setattr(targets, "_texels_of", targets._texels_of.__wrapped__)  # keeps none
+    monkeypatch.setattr(targets, "_kept_texels", targets._texels_of)
     monkeypatch.setattr(painting, "CODES", np.rint(np.arange(65_536) / 65_535 * 255).astype(np.uint8))
 
 

@@ -38,6 +38,9 @@ WHITE = Material()
 LINEAR = np.rint(SRGB_STEPS * FULL).astype(np.uint16)
 """[256] linear light of sRGB codes, in steps of 1 / FULL, of which the darkest code has 20."""
 
+MOST_KEPT = 1 << 22
+"""Numbers of a texture that is kept for the next view: a larger one would outlive its asset by hundreds of megabytes."""
+
 OF_NEAREST, OF_ALL = ("normals", "coordinates", "albedo"), ("layers", "amodal")
 """Targets of what is seen, and of everything along a pixel's ray."""
 
@@ -156,19 +159,25 @@ def _textures_of(parts: Sequence[Part]) -> tuple[NDArray[np.uint16], NDArray[np.
     """(texels, places) of `painting.Skin`; a texture that several parts have is there once."""
     found, places, total = dict[int, tuple[int, NDArray[np.uint16]]](), [], 0
     for part in parts:
-        texels = _texels_of(WHITE if part.uv is None else part.material)
-        if id(texels) not in found:
-            found[id(texels)] = total, texels
+        material = WHITE if part.uv is None else part.material
+        key = id(material.texture)
+        if key not in found:
+            small = material.texture is None or material.texture.size <= MOST_KEPT
+            texels = (_kept_texels if small else _texels_of)(material)
+            found[key] = total, texels
             total += texels.shape[0] * texels.shape[1]
-        places.append((found[id(texels)][0], texels.shape[0] - 1, texels.shape[1] - 1))
+        start, texels = found[key]
+        places.append((start, texels.shape[0] - 1, texels.shape[1] - 1))
     return np.concatenate([texels.reshape(-1, 3) for _, texels in found.values()]), np.array(places)
 
 
-@lru_cache(maxsize=16)
 def _texels_of(material: Material) -> NDArray[np.uint16]:
     """[h + 1, w + 1, 3]: the linear light of a texture, or of a white texel, and its first row and column once more."""
     texture = np.full((1, 1, 3), 255, np.uint8) if material.texture is None else material.texture
     return np.pad(LINEAR[texture[..., :3]], ((0, 1), (0, 1), (0, 0)), mode="wrap")
+
+
+_kept_texels = lru_cache(maxsize=16)(_texels_of)
 
 
 def _values_of(part: Part) -> Array:
