@@ -102,7 +102,6 @@ def test_each_fault_is_an_item_with_its_reason_and_counts_as_worst(files, truth,
     )  # of seven, and one of another dataset
 
 
-@pytest.mark.slow
 def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp_path, capsys):
     near = write_truth(files, tmp_path / "near", lambda depth_m, _: depth_m + 0.001 * (depth_m > 0))
     far = write_truth(files, tmp_path / "far", lambda depth_m, n: depth_m + (0.004 + 0.0001 * n) * (depth_m > 0))
