@@ -1,7 +1,7 @@
 """Edge: scores the items of a dataset range by range, in processes side by side, and keeps what is scored.
 
 A range's rows are a Parquet file of SCORE/_kept, whose name is the digest of all that they follow from: the range's commit,
-the predictions' sizes and times, what was asked, and this room's code. The same command reads it instead of scoring again.
+the predictions' bytes, what was asked, and this room's code. The same command reads it instead of scoring again.
 """
 
 import hashlib
@@ -101,7 +101,8 @@ def _ranges(store: Store, predictions: Predictions, asked: Asked, kept: Path) ->
         scenes = [by_scene[one] for one in range(records[0].span.start, records[0].span.stop) if one in by_scene]
         found = {key: names for scene in scenes for key, names in scene.items()}
         files = [
-            (key, names, [_stamp(predictions.folder / key[0] / name) for name in names]) for key, names in found.items()
+            (key, names, [_digest(predictions.folder / key[0] / name) for name in names])
+            for key, names in found.items()
         ]
         commits = [record.model_dump_json() for record in records]
         told = json.dumps([code, str(predictions.folder), asdict(asked), commits, files])
@@ -109,13 +110,13 @@ def _ranges(store: Store, predictions: Predictions, asked: Asked, kept: Path) ->
         yield _Range(store.name, records, predictions.folder, found, asked, kept / f"{digest}.parquet")
 
 
-def _stamp(path: Path) -> tuple[int, int]:
-    """(bytes, time of change in ns) of a file, 0 for a line of a table, whose text is told."""
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, empty for a line of a table, whose text is told. A clock that is set back may hide a change."""
     try:
-        found = path.stat()
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
-        return 0, 0
-    return found.st_size, found.st_mtime_ns
+        return ""
 
 
 def _scored(ranges: Sequence[_Range]) -> Iterator[None]:

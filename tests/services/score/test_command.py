@@ -1,6 +1,7 @@
 """`verso score` from the command line: truth is perfect, each fault is an item with a reason, scores are compared and kept."""
 
 import json
+import os
 import re
 import shutil
 
@@ -113,6 +114,11 @@ def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp
     kept = {path.name: path.stat().st_mtime_ns for path in (near / "score" / "_kept").iterdir()}
     assert score(capsys, files.root, near)[1] == answers[0]
     assert {path.name: path.stat().st_mtime_ns for path in (near / "score" / "_kept").iterdir()} == kept
+    first = min((near / "depth").glob("*.npy"))
+    time_of_change = first.stat().st_mtime_ns
+    np.save(first, np.load(first) + 0.01)
+    os.utime(first, ns=(time_of_change, time_of_change))  # as where the clock was set back
+    assert score(capsys, files.root, near)[1]["metrics"]["depth_mae_m"]["value"] > 0.002
 
 
 @pytest.mark.parametrize(
