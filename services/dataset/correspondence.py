@@ -38,21 +38,42 @@ def correspond(source: "Pixels", target: "Pixels", tolerance_m: float) -> Corres
     A point is seen where the pixel that it falls in shows its region, and where it lies no more than `tolerance_m` behind
     what `farthest_surface` expects there.
     """
-    z, region = source.depth() / source.depth_units_per_m, source.segment()
-    rows, columns = np.nonzero(z)
-    T_target_source = invert(target.T_world_cam) @ source.T_world_cam
-    points = transform(T_target_source, unproject(rows, columns, z[rows, columns], source.camera.intrinsics))
-    ahead = points[:, 2] > 0.0
-    rows, columns, points = rows[ahead], columns[ahead], points[ahead]
-    k, there = target.camera.intrinsics, target.segment()
-    u, v = project(points, k)
-    uv, visible = np.full((*z.shape, 2), np.nan), np.zeros(z.shape, np.bool_)
-    uv[rows, columns] = np.stack([u, v], axis=1)
-    inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
-    inside[inside] = there[v[inside].astype(np.int64), u[inside].astype(np.int64)] == region[rows, columns][inside]
-    farthest_m = farthest_surface(target.depth() / target.depth_units_per_m, there, u[inside], v[inside], k.fx)
-    visible[rows[inside], columns[inside]] = points[inside, 2] <= farthest_m + tolerance_m
+    units, region = source.depth(), source.segment()
+    rows, columns = np.nonzero(units)
+    z = units[rows, columns] / source.depth_units_per_m
+    found, seen = carry(source, target, rows, columns, z, region[rows, columns], tolerance_m)
+    uv, visible = np.full((*units.shape, 2), np.nan), np.zeros(units.shape, np.bool_)
+    uv[rows, columns], visible[rows, columns] = found, seen
     return Correspondence(uv, visible)
+
+
+def carry(
+    source: "Pixels",
+    target: "Pixels",
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    z_m: Array,
+    region: NDArray[np.uint8],
+    tolerance_m: float,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(uv [N, 2], visible [N]) as in `Correspondence`, of N pixels of the source with depth z_m [N] and these regions [N]."""
+    T_target_source = invert(target.T_world_cam) @ source.T_world_cam
+    points = transform(T_target_source, unproject(rows, columns, z_m, source.camera.intrinsics))
+    uv, visible = np.full((len(points), 2), np.nan), np.zeros(len(points), np.bool_)
+    ahead = np.flatnonzero(points[:, 2] > 0.0)
+    k, there = target.camera.intrinsics, target.segment()
+    u, v = project(points[ahead], k)
+    uv[ahead, 0], uv[ahead, 1] = u, v
+    inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
+    inside[inside] = there[v[inside].astype(np.int64), u[inside].astype(np.int64)] == region[ahead[inside]]
+    if inside.any():
+        at, u, v = ahead[inside], u[inside], v[inside]
+        # Only the part of the image about these pixels: an object has one pixel in a hundred.
+        top, left = max(int(v.min()) - 2, 0), max(int(u.min()) - 2, 0)
+        near = slice(top, int(v.max()) + 3), slice(left, int(u.max()) + 3)
+        depth_m = target.depth()[near] / target.depth_units_per_m
+        visible[at] = points[at, 2] <= tolerance_m + farthest_surface(depth_m, there[near], u - left, v - top, k.fx)
+    return uv, visible
 
 
 def farthest_surface(depth_m: Array, region: NDArray[np.uint8], u: Array, v: Array, focal_px: float) -> Array:

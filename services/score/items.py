@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Literal, cast, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
-from services.dataset.correspondence import correspond
+from services.dataset.correspondence import carry
 from services.dataset.pair import Pair
 from services.dataset.view import View
 from services.score.colour import score_colour
@@ -45,6 +45,9 @@ SEEN_TOLERANCE_M: Final = 0.001
 BOUNDARY_PX: Final = 2
 LEAST_PIXELS: Final = 50
 """Pixels with truth and prediction without which neither unit nor sign is judged."""
+
+JUDGED_PIXELS: Final = 10_000
+"""About how many pixels, spread over the image, are looked at for them: all 307,200 take a quarter of the time of scoring."""
 
 UNIT_SLACK: Final = 1.25
 """A median ratio to the truth within this factor of that of a unit is that unit."""
@@ -150,8 +153,10 @@ class Truth:
     def parts(self) -> Mapping[str, NDArray[np.bool_]]:
         """[H, W] bool by name, as the head of this file has them."""
         mask = self.segment >= REGION_FIRST_OBJECT
-        source = _Part(self.view, np.where(mask, self.units, 0), self.segment)
-        seen = correspond(cast(Any, source), self.pair.input, SEEN_TOLERANCE_M).visible & mask
+        rows, columns = np.divmod(np.flatnonzero(mask & (self.units > 0)), mask.shape[1])
+        z_m, region = self.depth_m[rows, columns], self.segment[rows, columns]
+        seen = np.zeros(mask.shape, np.bool_)
+        seen[rows, columns] = carry(self.view, self.pair.input, rows, columns, z_m, region, SEEN_TOLERANCE_M)[1]
         return {
             "object": mask,
             "scene": self.units > 0,
@@ -190,28 +195,10 @@ class Truth:
         return self.shape(region, asked.frame if kind == "shape" else "object")
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A view of whose depth only a part is there."""
-
-    view: View
-    units: NDArray
-    regions: NDArray
-
-    def depth(self) -> NDArray:
-        return self.units
-
-    def segment(self) -> NDArray:
-        return self.regions
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.view, name)
-
-
 def _outline(segment: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """[H, W]: pixels within `BOUNDARY_PX` of another region, if either is of an object."""
     found = np.zeros(segment.shape, np.bool_)
-    rows, columns = np.nonzero(segment >= REGION_FIRST_OBJECT)
+    rows, columns = np.divmod(np.flatnonzero(segment >= REGION_FIRST_OBJECT), segment.shape[1])  # 4 times nonzero's speed
     if not len(rows):
         return found
     near = tuple(
@@ -240,20 +227,24 @@ def _score_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: As
 
 def check_depth(predicted_m: Array, true_m: Array, units_per_m: float) -> None:
     """Raises InputError where depth [H, W] is in another unit than metres, or inverted: it is said and not mended."""
-    both = (predicted_m > 0.0) & (true_m > 0.0)
+    every = max(1, true_m.size // JUDGED_PIXELS)  # a step that shares no factor with the width, to reach all columns
+    while np.gcd(every, true_m.shape[1]) > 1:
+        every += 1
+    predicted, true = predicted_m.ravel()[::every], true_m.ravel()[::every]
+    both = (predicted > 0.0) & (true > 0.0)
     if np.count_nonzero(both) < LEAST_PIXELS:
         return
-    predicted, true = predicted_m[both], true_m[both]
+    predicted, true = predicted[both], true[both]
+    a, b = predicted - predicted.mean(), true - true.mean()
+    norm = float(np.sqrt((a @ a) * (b @ b)))
+    if norm > 0.0 and float(a @ b) / norm < INVERTED:  # before the unit: disparity may look like another one
+        raise InputError(f"depth is inverted: its correlation with the truth is {float(a @ b) / norm:.2f}")
     ratio = float(np.median(predicted / true))
     units = _UNITS | {units_per_m: "the units of stored images", 1e3 / units_per_m: "a PNG of millimetres"}
     for factor, unit in units.items():
         if max(factor, 1.0 / factor) > SIZE_SLACK and max(ratio / factor, factor / ratio) < UNIT_SLACK:
             told = f"{units_per_m:g} units a metre in a PNG, metres in an array"
             raise InputError(f"depth is {ratio:.4g} times the truth: it seems to be {unit}; write {told}")
-    a, b = predicted - predicted.mean(), true - true.mean()
-    norm = float(np.sqrt((a @ a) * (b @ b)))
-    if norm > 0.0 and float(a @ b) / norm < INVERTED:
-        raise InputError(f"depth is inverted: its correlation with the truth is {float(a @ b) / norm:.2f}")
 
 
 def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
