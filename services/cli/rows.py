@@ -330,6 +330,8 @@ COMMANDS: Final[dict[str, Command]] = {
         path("predictions", "PREDICTIONS", "depth/ID.png|npy, rgb/ID.png, shape/ID.glb, ..., poses.csv", nargs="?"),
         path("--out", "DIR", "where the score goes (default: PREDICTIONS/score)", dest="score"),
         choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
+        choice("--align", ("none", "scale", "similarity"), "of depth and shapes with the truth", default="none"),
+        flag("--flip", "FLIP of RGB as well (0.7 s an image; needs verso extra study)"),
         path("--compare", "DIR", "which of two scores is better, A B", nargs=2),
         handler="score.command:main",
         kept="what is scored is kept",

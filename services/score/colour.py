@@ -19,7 +19,7 @@ SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
 def score_colour(
-    predicted: NDArray[np.uint8], true: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+    predicted: NDArray[np.uint8], true: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None, flip: bool = True
 ) -> dict[str, float | None]:
     """Likeness of sRGB images [H, W, 3] uint8 of one size; with a mask [H, W], of its pixels.
 
@@ -30,7 +30,8 @@ def score_colour(
     ms_ssim: the same at five scales (Wang, Simoncelli and Bovik 2003, eq. 7): product of the mean contrast and structure at
     each scale, and of luminance too at the last, to the powers `SCALES`; a scale is the means of 2 x 2 pixels of the one before,
     an odd last row or column left out; a negative mean counts as 0.
-    flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None with a mask, and without flip-evaluator.
+    flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None with a mask, where
+    `flip` is false, and without flip-evaluator.
 
     nan where there is nothing to compare: no pixels (all), no whole window (ssim), none at the fifth scale (ms_ssim: images below
     176 pixels). A window counts by its middle pixel, at coarse scales by that pixel's share in the mask. Raises ValueError where
@@ -48,7 +49,7 @@ def score_colour(
         "psnr_db": math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error),
         "ssim": ssim,
         "ms_ssim": ms_ssim,
-        "flip": None if mask is not None else _flip(predicted, true),
+        "flip": None if mask is not None or not flip else _flip(predicted, true),
     }
 
 

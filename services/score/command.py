@@ -38,7 +38,7 @@ def main(options: argparse.Namespace) -> int:
             "name the folder of predictions: verso score OUT PREDICTIONS, or --compare A B for two that are scored"
         )
     given = find_predictions(options.predictions)
-    asked = Asked(given.kinds, options.frame)
+    asked = Asked(given.kinds, options.frame, align=options.align, flip=options.flip)
     target = options.score or options.predictions / "score"
     with explain_damage(store):
         path = score_dataset(store, given, asked, target)
@@ -50,7 +50,7 @@ def main(options: argparse.Namespace) -> int:
             "digest": digest,
             "predictions": str(given.folder),
         }
-        summary = {**head, "alignment": "none", **asdict(asked), **summarise(table)}
+        summary = {**head, **asdict(asked), **summarise(table)}
         _write(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
         troubles = describe_refused(path)
         _write(target / PAGE_FILE, page_of(summary, table, troubles, Dataset(store), given))
@@ -74,6 +74,9 @@ def _compare(options: argparse.Namespace) -> int:
     (a, one), (b, other) = (_read_score(path) for path in options.compare)
     if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != options.out:
         raise InputError(f"{options.compare[0]} and {options.compare[1]} are scores of different datasets")
+    if one["align"] != other["align"]:
+        how = f"with --align {one['align']} and {other['align']}"
+        raise InputError(f"{options.compare[0]} and {options.compare[1]} were scored {how}: score both alike")
     found = compare(a, b)
     for name in [name for name in found if name in HEADLINES]:
         row = found[name]

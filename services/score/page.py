@@ -106,7 +106,9 @@ def page_of(
         Section("distributions", "Distributions", _charts(table)),
         Section("cases", "Cases", "".join(_cases(table, dataset, given))),
     ]
-    page = Page(f"Score of {given.folder.name}", f"Against {summary['dataset']}; alignment: none", sections, "")
+    page = Page(
+        f"Score of {given.folder.name}", f"Against {summary['dataset']}; alignment: {summary['align']}", sections, ""
+    )
     icon = f"data:image/svg+xml,{quote(read_web('icon.svg').strip())}"
     style = f"<style>{read_web('page.css')}{_STYLE}</style>"
     return fill_page(

@@ -1,17 +1,29 @@
 """Errors of a predicted pose of a rigid body. Pure."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
+from schemas.scene.shape import Mesh
+from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import angle_between, transform
+from workers.geometry.mesh import face_areas
 
 ROTATION = 1e-3
 """How far the products of a rotation's rows may be from 0 and 1: csv files of poses have as few as four digits."""
+
+SAME = 0.01
+"""How far, as a share of the diagonal, a surface may be from itself after a turn that is a symmetry (as facets of a tube are)."""
+
+STEP_DEG = 2.0
+LOOKED_AT = 500
+"""About how many vertices are looked at for symmetries."""
 
 
 def score_pose(
@@ -49,6 +61,39 @@ def score_pose(
         pixels = _project(predicted, K)
         scores["mspd_px"] = min(float(np.linalg.norm(pixels - _project(each, K), axis=1).max()) for each in true)
     return scores
+
+
+def symmetries_of(mesh: Mesh) -> list[Pose]:
+    """Rotations [4, 4] of the object's frame after which a mesh, metres, looks the same but for its colours.
+
+    About the axes of the frame through the surface's centroid: a half, third and quarter turn, or, where any turn does, steps
+    of `STEP_DEG`; and their products. The same: no vertex moves farther from the surface than `SAME` of the diagonal.
+    """
+    vertices = np.asarray(mesh.vertices, np.float64)
+    areas = face_areas(vertices, mesh.faces)
+    middle = areas @ vertices[mesh.faces].mean(axis=1) / areas.sum()
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    some, limit = vertices[:: -(-len(vertices) // LOOKED_AT)], SAME * float(np.linalg.norm(high - low))
+
+    def turn(axis: int, degrees: float) -> Pose:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec(np.eye(3)[axis] * degrees, degrees=True).as_matrix()
+        T[:3, 3] = middle - T[:3, :3] @ middle
+        return T
+
+    def same(axis: int, degrees: float) -> bool:
+        return bool(distance_to_mesh(transform(turn(axis, degrees), some), mesh)[0].max() <= limit)
+
+    turns: list[list[float]] = []
+    for axis in range(3):
+        whole = all(same(axis, 180.0 * n * (math.sqrt(5.0) - 1.0)) for n in range(1, 6))  # no two alike by any fold
+        folds = [fold for fold in (2, 3, 4) if not whole and same(axis, 360.0 / fold)]
+        found = {0.0} | {360.0 * k / fold for fold in folds for k in range(fold)}
+        turns.append(np.arange(0.0, 360.0, STEP_DEG).tolist() if whole else sorted(found))
+    if sum(len(one) > 12 for one in turns) > 1:  # a ball: products would fill all rotations
+        return [turn(axis, angle) for axis, some_turns in enumerate(turns) for angle in some_turns]
+    products = [turn(2, c) @ turn(1, b) @ turn(0, a) for a, b, c in itertools.product(*turns)]
+    return list({(np.round(T, 6) + 0.0).tobytes(): T for T in products}.values())
 
 
 def is_rigid(T: Pose) -> bool:

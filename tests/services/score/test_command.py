@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import zipfile
 
 import cv2
 import numpy as np
@@ -61,13 +62,13 @@ def test_truth_is_perfect_and_its_page_needs_no_network(files, truth, tmp_path, 
 
 
 def spoil(folder):
-    """Ten faults, and one prediction that is missing."""
+    """Eleven faults, and one prediction that is missing."""
     depth = sorted((folder / "depth").glob("*.npy"))
     values = np.load(depth[0])
     np.save(depth[0], values * 1000.0)
     np.save(depth[1], values[:50])
-    near_is_far = np.load(depth[2])
-    np.save(depth[2], np.where(near_is_far > 0, near_is_far.max() + 0.1 - near_is_far, 0.0))
+    far = np.load(depth[2])
+    np.save(depth[2], np.divide(1.0, far, out=np.zeros_like(far), where=far > 0.0))
     depth[3].write_bytes(depth[3].read_bytes()[:500])
     np.save(depth[4], np.array([{"a": 1}], dtype=object), allow_pickle=True)
     cv2.imwrite(str(depth[5].with_suffix(".png")), np.zeros(values.shape, np.uint16))
@@ -76,6 +77,9 @@ def spoil(folder):
     shape = sorted((folder / "shape").glob("*.ply"))
     trimesh.load(shape[0], process=False).apply_scale(1000.0).export(shape[0])
     shape[1].write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    shape[2].unlink()
+    with zipfile.ZipFile(shape[2].with_suffix(".npz"), "w", zipfile.ZIP_DEFLATED) as bomb:
+        bomb.writestr("points.npy", b"\0" * 200_000_000)
     rgb = sorted((folder / "rgb").glob("*.png"))
     rgb[0].write_bytes(rgb[0].read_bytes()[:-40])
 
@@ -84,7 +88,7 @@ def test_each_fault_is_an_item_with_its_reason_and_counts_as_worst(files, truth,
     folder = shutil.copytree(truth, tmp_path / "spoilt")
     spoil(folder)
     status, answer, said = score(capsys, files.root, folder, "--out", tmp_path / "score")
-    assert (status, answer["refused"], answer["missing"]) == (1, 10, 1)
+    assert (status, answer["refused"], answer["missing"]) == (1, 11, 1)
     rows = pq.read_table(tmp_path / "score" / "items.parquet").to_pylist()
     reasons = [row["reason"] for row in rows if row["status"] == "refused"]
     for told in (
@@ -95,6 +99,7 @@ def test_each_fault_is_an_item_with_its_reason_and_counts_as_worst(files, truth,
         "pickle|objects",
         "there 2 times",
         "90001",
+        "unpacks to 200 MB",
     ):
         assert sum(bool(re.search(told, reason)) for reason in reasons) >= 1, (told, reasons)
     assert "missing" in said and answer["metrics"]["depth_mae_m"]["value"] > 0.0
@@ -109,6 +114,11 @@ def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp
     answers = [score(capsys, files.root, folder)[1] for folder in (near, far)]
     assert answers[0]["metrics"]["depth_mae_m"]["value"] == pytest.approx(0.001, abs=1e-6)
     assert answers[1]["metrics"]["depth_mae_m"]["low"] < 0.00435 < answers[1]["metrics"]["depth_mae_m"]["high"]
+    scaled = write_truth(files, tmp_path / "scaled", lambda depth_m, _: 3.0 * depth_m)
+    answer = score(capsys, files.root, scaled, "--align", "scale")[1]
+    assert answer["refused"] == 0 and answer["metrics"]["depth_mae_scene_m"]["value"] < 1e-9
+    assert main(["score", str(files.root), "--compare", str(near), str(scaled)]) == 2
+    assert "--align none and scale" in capsys.readouterr().err
     found = score(capsys, files.root, "--compare", near, far)[1]["metrics"]
     assert found["depth_mae_m"]["better"] == "a" and found["rgb_ssim"]["better"] is None
     kept = {path.name: path.stat().st_mtime_ns for path in (near / "score" / "_kept").iterdir()}

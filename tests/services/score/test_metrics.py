@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from schemas.scene.shape import Mesh
+from services.score.align import align_depth, align_shape
 from services.score.colour import score_colour
 from services.score.depth import score_depth
-from services.score.pose import score_pose
+from services.score.pose import score_pose, symmetries_of
 from services.score.shape import score_shape, score_volume
+from workers.geometry.frames import transform
 
 CASES = 100
 EXACT = 1e-6
@@ -150,6 +152,55 @@ def test_pose_errors_are_those_of_the_bop_toolkit():
             "translation_m": math.dist(predicted[:3, 3], true[:3, 3]),
         }
         agree(ours, theirs)
+
+
+def prism(sides, radius, height):
+    return mesh_of(trimesh.creation.cylinder(radius, height, sections=sides))
+
+
+TURNS = {
+    "a box of three lengths": (mesh_of(trimesh.creation.box((0.1, 0.2, 0.05))), 4),
+    "a box on a square": (mesh_of(trimesh.creation.box((0.1, 0.1, 0.05))), 8),
+    "a cube off the origin": (mesh_of(trimesh.creation.box((0.1,) * 3, rigid(np.random.default_rng(0), 0.0, 0.1))), 24),
+    "a prism on a triangle": (prism(3, 0.05, 0.1), 6),
+    "a can": (prism(128, 0.03, 0.1), 2 * 180),
+    "a cone": (mesh_of(trimesh.creation.cone(0.04, 0.1, sections=128)), 180),
+    "two boxes": (
+        mesh_of(trimesh.util.concatenate([trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box(
+            bounds=[[0.05, -0.05, 0.02], [0.1, 0.03, 0.05]])])), 1),
+}  # fmt: skip
+"""A body, and how many turns of its group are told, any turn counting as 180."""
+
+
+@pytest.mark.parametrize(("body", "count"), TURNS.values(), ids=TURNS)
+def test_a_body_looks_the_same_after_as_many_turns_as_its_group_has_and_those_cost_no_error(body, count):
+    turns = symmetries_of(body)
+    assert len(turns) == count
+    true = rigid(np.random.default_rng(1), 2.0, 0.1)
+    true[2, 3] += 1.0
+    for turn in turns[:: max(1, count // 20)]:
+        scores = score_pose(true @ turn, true, body.vertices, turns, K)
+        assert max(scores["mssd_m"], scores["rotation_deg"], scores["mspd_px"]) < 1e-6
+        assert scores["add_s_m"] < 0.002
+
+
+def test_what_is_aligned_is_what_was_asked_for():
+    rng = np.random.default_rng(6)
+    true = rng.uniform(1.0, 3.0, (40, 50))
+    holes = rng.random(true.shape) < 0.1
+    for how, predicted in (("scale", true / 3.0), ("similarity", (true - 0.4) / 3.0)):
+        aligned = align_depth(np.where(holes, 0.0, predicted), true, how)
+        assert (aligned[holes] == 0.0).all()
+        np.testing.assert_allclose(aligned[~holes], true[~holes], rtol=1e-12)
+    body = TURNS["two boxes"][0]
+    for seed in range(10):
+        T = rigid(np.random.default_rng(seed), 0.3, 0.02)
+        T[:3] *= 0.5 + 0.2 * seed
+        _, found = align_shape(Mesh(transform(T, body.vertices), body.faces), body, "similarity", seed)
+        np.testing.assert_allclose(found @ T, np.eye(4), atol=2e-5)
+        grown = Mesh(body.vertices * (0.5 + 0.2 * seed), body.faces)
+        moved, found = align_shape(grown, body, "scale", seed)
+        np.testing.assert_allclose(moved.vertices, body.vertices, atol=1e-6)
 
 
 def test_volume_counts_points_one_by_one():
