@@ -21,7 +21,7 @@ from tests.physics.settling import start_at
 from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
 from workers.physics import exact_rest
 from workers.physics.contact_surface import crop, faces_within, find_near, skin_of, surface_of
-from workers.physics.contacts import contacts_within
+from workers.physics.contacts import Contacts, contacts_within
 from workers.physics.exact_rest import MANY, Motion, Rested, rest, step
 from workers.physics.placement import FARTHEST_M, Form, Support, find_gaps_m, find_overlaps_m, measure_supports, place
 from workers.physics.placement import forms_of as forms
@@ -305,6 +305,32 @@ def test_three_that_overlap_or_hover_come_to_a_stack():
 # ---------------------------------------------------------------------------------------------- gaps
 
 CUBE_FORM, GROUND_FORM = Form(CUBE), Form(box((2.0, 2.0, 0.1), (0, 0, -0.05)))
+
+
+@pytest.mark.parametrize(
+    ("deep_m", "calls", "still"), [(9.5e-4, 3, True), (9.5e-4, 10**6, False), (5e-5, 10**6, False)]
+)
+def test_what_passes_a_deep_crossing_that_nothing_can_undo_comes_to_rest_behind_it_and_never_in_it(
+    deep_m, calls, still, monkeypatch
+):
+    """A box on the ground with a contact that would push it further down, for so many calls, as edges of a wall make it."""
+    true, count = exact_rest.find_contacts, itertools.count()
+
+    def with_crossing(*arguments):
+        found = true(*arguments)
+        if next(count) >= calls:
+            return found
+        rows = zip(
+            (found.upper, found.lower, found.points, found.normals, found.gaps),
+            (0, 1, UP * 0, -UP, -deep_m),
+            strict=True,
+        )
+        return Contacts(*(np.concatenate([all_of, np.array([one], all_of.dtype)]) for all_of, one in rows))
+
+    monkeypatch.setattr(exact_rest, "find_contacts", with_crossing)
+    rested = settle([CUBE], [translation(0.0, 0.0, 0.0505)])
+    assert rested.still == still
+    assert rested.poses[0][2, 3] == pytest.approx(0.05, abs=1e-8)
 
 
 def gap(one: Form, T_one, other: Form, T_other) -> float:
