@@ -10,7 +10,7 @@ import trimesh
 
 from schemas.capture import CaptureCamera, CapturedView, CaptureTruth
 from schemas.errors import CaptureError
-from schemas.job.captures import Board
+from schemas.job.captures import GRID_KEYS, Board
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
 from workers.capture.folder import (
@@ -51,6 +51,9 @@ NORMALS = POINTS / np.linalg.norm(POINTS, axis=1)[:, None]
 COLORS = RNG.integers(0, 256, (50, 3)).astype(np.uint8)
 VIEWS = RNG.integers(1, 40, 50).astype(np.int32)
 FACES = RNG.integers(0, 50, (30, 3)).astype(np.int32)
+QUAD = [[-0.05, 0.05, 0.0], [0.05, 0.05, 0.0], [0.05, -0.05, 0.0], [-0.05, -0.05, 0.0]]
+GRIDLESS: dict[str, object] = dict.fromkeys(GRID_KEYS)
+"""Takes a grid's keys out of board.json."""
 
 
 @pytest.fixture
@@ -111,6 +114,20 @@ def test_a_wrong_or_missing_description_names_file_and_key(folder):
         ("board.json", {"marker_m": 0.5}, "columns|width_m is"),
         ("board.json", {"columns": "many"}, "columns"),
         ("board.json", {"measured_ruler_m": 2.0}, "measured_ruler_m over ruler_m is 10"),
+        ("board.json", {"markers": [{"id": 1, "corners": QUAD}]}, "columns is of a grid"),
+        ("board.json", {"squares": [QUAD]}, "squares stand beside markers"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD}] * 2}, "marker 1 is there twice"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[1::-1] + QUAD[2:]}]}, "marker 1.* no square"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[:1] * 4}]}, "marker 1.* no square"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[::-1]}]}, "all markers face down"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[:3]}]}, "markers.0.corners"),
+        ("board.json", GRIDLESS | {"markers": [{"id": -1, "corners": QUAD}]}, "markers.0.id"),
+        (
+            "board.json",
+            GRIDLESS | {"markers": [{"id": 1, "corners": QUAD}], "width_m": 0.05},
+            "marker 1 needs 0.1 about",
+        ),
+        ("board.json", {"border_bits": 0}, "border_bits"),
         ("capture.json", {"category": "../etc"}, "category"),
         ("capture.json", {"frame": "left"}, "frame"),
     ):
