@@ -181,8 +181,8 @@ def import_recording(options: argparse.Namespace) -> int:
         words = f"--{first['loc'][0]} {first['input']!r}: letters, digits, - and _ only, at most 64"
         raise InputError(words) from error
     board = read_board(Path(options.board)) if options.board else Board()
-    if not recording.is_file():
-        raise InputError(f"{recording}: no such file")
+    if not recording.exists():
+        raise InputError(f"{recording}: no such file or folder")
     made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
     notes = work.describe_losses(made.losses)
     views = f"{plural(len(made.views), 'view')} of {plural(made.frames, 'frame')}"
