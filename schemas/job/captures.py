@@ -42,9 +42,9 @@ class Marker(Frozen):
     """One marker of a board that is no grid."""
 
     id: NonNegativeInt
+    """In the dictionary."""
     corners: Quad
-    """Top left, top right, bottom right, bottom left of OpenCV's picture of the marker, board frame, metres. An AprilTag
-    that stands upright on its print is upside down in OpenCV's picture."""
+    """Clockwise from the upper left of OpenCV's picture; metres."""
 
 
 GRID_KEYS = ("columns", "rows", "marker_m", "gap_m", "first_id")
@@ -68,7 +68,7 @@ class Board(Frozen):
     gap_m: Annotated[float, Field(gt=0, le=10)] = 0.02
     """Between two markers, metres."""
     width_m: Annotated[float, Field(gt=0, le=100)] = 0.60
-    """Width of the whole board, which is centred on the origin."""
+    """Width of the whole board about the origin."""
     height_m: Annotated[float, Field(gt=0, le=100)] = 0.40
     """Height of the whole board."""
     first_id: NonNegativeInt = 0
@@ -80,9 +80,9 @@ class Board(Frozen):
     border_bits: Annotated[int, Field(ge=1, le=4)] = 1
     """Width of the markers' black border, in bits."""
     markers: Annotated[tuple[Marker, ...], Field(max_length=10_000)] = ()
-    """Markers of any ids in any places, also out of the plane; in place of the grid."""
+    """Any ids in any places; in place of the grid."""
     squares: Annotated[tuple[Quad, ...], Field(max_length=20_000)] = ()
-    """Corners of plain black squares beside `markers`: those of a chessboard, whose corners are measured too."""
+    """Plain black squares beside `markers`, such as a chessboard's."""
 
     @property
     def scale(self) -> float:

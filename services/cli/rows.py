@@ -24,7 +24,7 @@ SET = option("--set", "KEY=VALUE", SET_HELP, action="append", default=[], dest="
 
 CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     "board": command(
-        "write a marker board for printing, at true scale and with a ruler to check the print, or describe one you have",
+        "print a marker board at true scale, with a ruler to check it, or describe one you have",
         "board.pdf --tiles a4",
         path(
             "file",
