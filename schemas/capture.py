@@ -1,6 +1,6 @@
 """What the steps of a capture hand to one another: cameras, views, detections, estimates, results."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -46,6 +46,41 @@ class CaptureCamera:
 
 
 @dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One image of a recording, decoded when it is asked for.
+
+    load(small): colour as rgb [H, W, 3] uint8, or small as grey [H / 2, W / 2] uint8; depth as [h, w] float64 metres, 0 for
+    none, or small as anything at all. None for a frame that is damaged. `camera` where it is not the recording's: of colour
+    the intrinsics, of depth the depth camera.
+    """
+
+    is_depth: bool
+    stamp_us: int
+    load: Callable[[bool], NDArray | None]
+    camera: Intrinsics | DepthCamera | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """An opened recording of any format: what every reader of one gives.
+
+    `frames` may be called again, and gives frames of colour and depth each in the order of time. `depth` is None where depth
+    is registered to the colour camera. Time is microseconds; depth frames are `depth_delay_us` later than the colour
+    frames they belong to; `duration_us` is the last time stamp by the file's own word, None where it has none because the
+    recorder was interrupted. `told` goes into recording.json.
+    """
+
+    path: Path
+    color: CaptureCamera
+    depth: DepthCamera | None
+    period_us: float
+    frames: Callable[[], Iterator[RecordedFrame]]
+    duration_us: float | None
+    depth_delay_us: float = 0.0
+    told: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class CapturedView:
     """The images of one view as they are stored.
 
@@ -65,13 +100,16 @@ class Detection:
 
     ids [M] int64, ascending, unique; corners_px [M, 4, 2] float64, as stored (not undistorted), pixel centres at +0.5, in
     the order top left, top right, bottom right, bottom left of the printed marker. `dropped` says in words what was found and
-    not used (a marker twice, an id that is not on the board).
+    not used (a marker twice, an id that is not on the board). chess [K] int64: which corners of the board's chessboard were
+    found, and chess_px [K, 2] where; none on other boards.
     """
 
     number: int
     ids: NDArray[np.int64]
     corners_px: Array
     dropped: tuple[str, ...] = ()
+    chess: NDArray[np.int64] = field(default_factory=lambda: frozen_array([], np.int64))
+    chess_px: Array = field(default_factory=lambda: frozen_array(np.zeros((0, 2))))
 
 
 @dataclass(frozen=True, eq=False)

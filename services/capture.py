@@ -47,42 +47,83 @@ def capture_settings(changes: Sequence[str] = (), keys: Mapping[str, Any] | None
 
 
 def board(options: argparse.Namespace) -> int:
-    """Writes options.file (.pdf or .png), and a board.json beside it; reads `board`, `tiles`, `dpi` and `json`. Returns 0."""
-    from workers.capture.folder import read_board
+    """Writes options.file (.pdf, .png, or .json alone), and a board.json beside it. Returns 0.
+
+    Reads `board`, `other`, `kind` with `size`, `marker`, `pitch` and `dictionary`, `tiles`, `dpi` and `json`.
+    """
     from workers.capture.sheets import board_pdf, board_png, tiled_pdf
 
     path = Path(options.file)
-    spec = read_board(options.board) if options.board else Board()
+    spec = _chosen_board(options)
     kind = path.suffix.lower()
+    data = None
     if kind == ".pdf":
         data = tiled_pdf(spec) if options.tiles else board_pdf(spec)
+    elif options.tiles:
+        raise InputError("--tiles makes pages: name a file that ends in .pdf")
     elif kind == ".png":
-        if options.tiles:
-            raise InputError("--tiles makes pages, and a PNG has none: name a file that ends in .pdf")
         data = board_png(spec, options.dpi)
-    else:
-        raise InputError(f"{path}: name a file that ends in .pdf or .png")
-    described = path.with_suffix(".json")
-    new = not described.exists()  # else it may hold what somebody measured
-    if not new and read_board(described).model_copy(update={"measured_ruler_m": spec.measured_ruler_m}) != spec:
-        raise InputError(f"{described} is of another board: print that with --board {described}, or name another file")
-    measured = spec.model_copy(update={"measured_ruler_m": spec.measured_ruler_m or spec.ruler_m})
-    try:
-        path.write_bytes(data)
-        if new:
-            described.write_text(measured.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
-    told = "A4 pages to glue" if options.tiles else "print at 100 %"
-    print(f"{path}: {spec.columns} x {spec.rows} markers of {spec.marker_m * 1000:g} mm ({spec.dictionary}); {told}")
+    elif kind != ".json":
+        raise InputError(f"{path}: name a file that ends in .pdf, .png or .json")
+    described, new = _describe_board(path, spec, data)
+    answer: dict[str, Any] = {"board_file": str(described), "board": spec.model_dump(mode="json")}
+    size = "" if spec.markers else f" of {spec.marker_m * 1000:g} mm"
+    if data is not None:
+        told = "A4 pages to glue" if options.tiles else "print at 100 %"
+        print(f"{path}: {spec.words}{size} ({spec.dictionary}); {told}")
+        answer["file"] = str(path)
     print(f"{described}: {'the board, for --board' if new else 'was there and is kept'}")
-    print(
-        f"measure the printed ruler; if it is not {spec.ruler_m * 1000:g} mm, say so in {described} (measured_ruler_m)"
-    )
+    if data is not None:
+        ruler = f"measure the printed ruler; if it is not {spec.ruler_m * 1000:g} mm"
+        print(f"{ruler}, say so in {described} (measured_ruler_m)")
     if options.json:
-        answer = {"file": str(path), "board_file": str(described), "board": spec.model_dump(mode="json")}
         print(json.dumps({"ok": True, **answer}))
     return 0
+
+
+def _chosen_board(options: argparse.Namespace) -> Board:
+    """The board of the file --board, of another program's file --from, or of --kind. Raises InputError."""
+    sizes = {"size": options.size, "marker": options.marker, "pitch": options.pitch}
+    given = [name for name in ("board", "other", "kind") if getattr(options, name)]
+    names = {"board": "--board", "other": "--from", "kind": "--kind"}
+    if len(given) > 1:
+        raise InputError(f"{names[given[0]]} and {names[given[1]]} are two boards: give one of them")
+    if not options.kind:
+        if stray := next((name for name, value in {**sizes, "dictionary": options.dictionary}.items() if value), None):
+            raise InputError(f"--{stray} is of a board that --kind names: add --kind grid, charuco or aprilgrid")
+        from workers.capture.board_kinds import read_board_file
+        from workers.capture.folder import read_board
+
+        return (
+            read_board_file(options.other) if options.other else read_board(options.board) if options.board else Board()
+        )
+    from workers.capture.board_kinds import KINDS, BoardSizes
+
+    if missing := next((name for name, value in sizes.items() if not value), None):
+        raise InputError(f"--kind {options.kind} needs --{missing}, such as --size 8x6 --marker 0.022 --pitch 0.03")
+    usual = "DICT_APRILTAG_36h11" if options.kind == "aprilgrid" else Board().dictionary
+    columns, rows = options.size
+    sizes_m = (options.marker, options.pitch)
+    return KINDS[options.kind](BoardSizes(columns, rows, *sizes_m, options.dictionary or usual))
+
+
+def _describe_board(path: Path, spec: Board, data: bytes | None) -> tuple[Path, bool]:
+    """Writes the print, if there is one, and a description unless one is there, which may hold what somebody measured."""
+    from workers.capture.folder import read_board
+
+    described = path.with_suffix(".json")
+    new = not described.exists()
+    if not new and read_board(described).model_copy(update={"measured_ruler_m": spec.measured_ruler_m}) != spec:
+        raise InputError(f"{described} is of another board: print that with --board {described}, or name another file")
+    printed = {"measured_ruler_m": spec.measured_ruler_m or spec.ruler_m} if data is not None else {}
+    try:
+        if data is not None:
+            path.write_bytes(data)
+        if new:
+            described.write_text(spec.model_copy(update=printed).model_dump_json(indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+    return described, new
 
 
 def simulate(options: argparse.Namespace) -> int:
@@ -140,15 +181,15 @@ def import_recording(options: argparse.Namespace) -> int:
         words = f"--{first['loc'][0]} {first['input']!r}: letters, digits, - and _ only, at most 64"
         raise InputError(words) from error
     board = read_board(Path(options.board)) if options.board else Board()
-    if not recording.is_file():
-        raise InputError(f"{recording}: no such file")
+    if not recording.exists():
+        raise InputError(f"{recording}: no such file or folder")
     made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
     notes = work.describe_losses(made.losses)
     views = f"{plural(len(made.views), 'view')} of {plural(made.frames, 'frame')}"
     print(f"{out}: {views}, depth registered by the recording's own calibration")
     print("\n".join(f"  {note}" for note in notes), end="\n" if notes else "")
     if not options.board:
-        print(f"  no --board: board.json is the default board ({board.columns} x {board.rows}, {board.dictionary})")
+        print(f"  no --board: board.json is the default board ({board.words}, {board.dictionary})")
     if options.json:
         told = {"ok": True, "out": str(out), "frames": made.frames, "notes": notes, "default_board": not options.board}
         print(json.dumps({**told, "losses": asdict(made.losses), "views": [asdict(view) for view in made.views]}))

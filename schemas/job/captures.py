@@ -3,10 +3,12 @@
 A job with this branch makes captures in place of scenes: capture number n is the scene with id first_scene + n.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, model_serializer, model_validator
+from pydantic import SerializerFunctionWrapHandler as Dump
 
 from schemas.base import (
     Folder,
@@ -19,6 +21,7 @@ from schemas.base import (
     Range,
     Share,
     Text,
+    left_out,
 )
 from schemas.job.assets import CategoryName
 from schemas.job.keys import with_defaults
@@ -26,16 +29,32 @@ from schemas.job.views import Distortion, Exposure, RgbNoise
 
 Estimate = Literal["markers", "article", "joint"]
 BoardFrame = Literal["centre", "opencv", "opencv_old"]
-"""Where a board pose has its origin: ours at the grid's centre, y up the print, z out; OpenCV's since 4.6 at the top left,
-y down, z into the board; OpenCV's before at the bottom left, y up, z out."""
+"""Where a board pose has its origin: `centre` as board.json has it, y up the print, z out; OpenCV's since 4.6 at the top left,
+y down, z into the board; OpenCV's before, and Kalibr's, at the bottom left, y up, z out."""
 ESTIMATES: tuple[Estimate, ...] = ("markers", "article", "joint")
 
 
-class Board(Frozen):
-    """A grid of unique square ArUco markers on a flat board (board.json).
+Point = tuple[float, float, float]
+Quad = tuple[Point, Point, Point, Point]
 
-    Board frame: origin at the centre of the printed grid, x along the rows to the right, y up the print, z out of the board,
-    metres. Marker `first_id` is at the top left; ids run along the rows.
+
+class Marker(Frozen):
+    """One marker of a board that is no grid."""
+
+    id: NonNegativeInt
+    """In the dictionary."""
+    corners: Quad
+    """Clockwise from the upper left of OpenCV's picture; metres."""
+
+
+GRID_KEYS = ("columns", "rows", "marker_m", "gap_m", "first_id")
+
+
+class Board(Frozen):
+    """The markers beside the object (board.json): a grid of unique ArUco markers on a flat board, or `markers` anywhere.
+
+    Board frame: z = 0 is the surface that the object stands on, z up, metres. Of a grid, origin at its centre, x along the rows
+    to the right, y up the print; marker `first_id` is at the top left, and ids run along the rows.
     """
 
     dictionary: Text = "DICT_4X4_50"
@@ -49,7 +68,7 @@ class Board(Frozen):
     gap_m: Annotated[float, Field(gt=0, le=10)] = 0.02
     """Between two markers, metres."""
     width_m: Annotated[float, Field(gt=0, le=100)] = 0.60
-    """Width of the whole board, which is centred on the grid."""
+    """Width of the whole board about the origin."""
     height_m: Annotated[float, Field(gt=0, le=100)] = 0.40
     """Height of the whole board."""
     first_id: NonNegativeInt = 0
@@ -58,21 +77,87 @@ class Board(Frozen):
     """Nominal length of the printed ruler."""
     measured_ruler_m: Positive | None = None
     """Length of the ruler measured on the print; it scales every length of the board."""
+    border_bits: Annotated[int, Field(ge=1, le=4)] = 1
+    """Width of the markers' black border, in bits."""
+    markers: Annotated[tuple[Marker, ...], Field(max_length=10_000)] = ()
+    """Any ids in any places; in place of the grid."""
+    squares: Annotated[tuple[Quad, ...], Field(max_length=20_000)] = ()
+    """Plain black squares beside `markers`, such as a chessboard's."""
 
     @property
     def scale(self) -> float:
         """True size over nominal size of the print; 1 where nobody measured it."""
         return 1.0 if self.measured_ruler_m is None else self.measured_ruler_m / self.ruler_m
 
+    @property
+    def words(self) -> str:
+        """How many markers there are: `7 x 5 markers`, or `12 markers`."""
+        return f"{len(self.markers) or f'{self.columns} x {self.rows}'} markers"
+
+    @model_serializer(mode="wrap")
+    def _leave_out_later(self, dump: Dump) -> dict[str, Any]:
+        """A grid is written, and digested, as it was when every board was one; of other boards there is no grid."""
+        keys = left_out(dump(self), border_bits=1)
+        left = GRID_KEYS if self.markers else ("markers", "squares")
+        return {name: value for name, value in keys.items() if name not in left}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_one_kind(cls, keys: Any) -> Any:
+        if isinstance(keys, Mapping):
+            grid = [name for name in GRID_KEYS if name in keys]
+            if keys.get("markers") and grid:
+                raise ValueError(f"{grid[0]} is of a grid, and markers are given one by one: leave one of both out")
+            if keys.get("squares") and not keys.get("markers"):
+                raise ValueError("squares stand beside markers that are given one by one, and there are no markers")
+        return keys
+
     @model_validator(mode="after")
     def _fits(self) -> "Board":
         for name, count, size in (("width_m", self.columns, self.width_m), ("height_m", self.rows, self.height_m)):
             needed = count * self.marker_m + (count - 1) * self.gap_m
-            if needed > size + 1e-9:
+            if needed > size + 1e-9 and not self.markers:
                 raise ValueError(f"{name} is {size:g}, and {count} markers with their gaps need {needed:g}")
         if not 0.5 <= self.scale <= 2.0:
             raise ValueError(f"measured_ruler_m over ruler_m is {self.scale:g}: must be between 0.5 and 2")
         return self
+
+    @model_validator(mode="after")
+    def _has_square_markers(self) -> "Board":
+        once: set[int] = set()
+        for marker in self.markers:
+            if marker.id in once:
+                raise ValueError(f"marker {marker.id} is there twice")
+            once.add(marker.id)
+        quads = {f"marker {marker.id}": marker.corners for marker in self.markers}
+        quads |= {f"square {n}": corners for n, corners in enumerate(self.squares)}
+        for name, corners in quads.items():
+            if not _is_square(corners):
+                raise ValueError(f"{name}: its corners {[list(p) for p in corners]} are no square, one after the other")
+            for key, axis, size in (("width_m", 0, self.width_m), ("height_m", 1, self.height_m)):
+                if (reach := 2 * max(abs(p[axis]) for p in corners)) > size + 1e-9:
+                    raise ValueError(f"{key} is {size:g}, and {name} needs {reach:g} about the origin")
+        if self.markers and all(_height_of_normal(marker.corners) < -0.5 for marker in self.markers):
+            raise ValueError("all markers face down: their corners run clockwise as seen from above, z up")
+        return self
+
+
+SQUARE = 0.02
+"""Share by which sides and diagonals of a marker may differ from a square's: it was measured by hand."""
+
+
+def _is_square(corners: Quad) -> bool:
+    sides = [math.dist(corners[k], corners[(k + 1) % 4]) for k in range(4)]
+    diagonals = [math.dist(corners[k], corners[k + 2]) / math.sqrt(2.0) for k in range(2)]
+    low, high = min(*sides, *diagonals), max(*sides, *diagonals)
+    return low > 0.0 and high <= 10.0 and high <= low * (1.0 + SQUARE)
+
+
+def _height_of_normal(corners: Quad) -> float:
+    """z of the unit normal of a square, towards who sees its corners run clockwise."""
+    (ax, ay, _), (bx, by, _), _, (dx, dy, _) = corners
+    area = math.dist(corners[0], corners[1]) * math.dist(corners[0], corners[3])
+    return ((by - ay) * (dx - ax) - (bx - ax) * (dy - ay)) / area
 
 
 class KinectDepthNoise(Frozen):

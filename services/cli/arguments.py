@@ -67,6 +67,20 @@ def read_span(text: str) -> tuple[int, int]:
     return span
 
 
+def read_size(text: str) -> tuple[int, int]:
+    """Two counts, 8x6. Raises argparse.ArgumentTypeError."""
+    if not (found := re.fullmatch(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", text, re.ASCII)):
+        raise refusal(text, " is no size: write COLUMNSxROWS, such as 8x6")
+    return int(found[1]), int(found[2])
+
+
+def read_length(text: str) -> float:
+    """A length in metres, up to 10. Raises argparse.ArgumentTypeError."""
+    if not re.fullmatch(r"[0-9]*\.?[0-9]+(e-?[0-9]+)?", text, re.ASCII) or not 0.0 < float(text) <= 10.0:
+        raise refusal(text, " is no length in metres, such as 0.03")
+    return float(text)
+
+
 def read_path(text: str) -> Path:
     """A file or folder. Raises argparse.ArgumentTypeError where none can have that name."""
     return Path(read_place(text))

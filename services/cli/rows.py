@@ -24,11 +24,25 @@ SET = option("--set", "KEY=VALUE", SET_HELP, action="append", default=[], dest="
 
 CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     "board": command(
-        "write the marker board for printing, at true scale and with a ruler to check the print",
+        "print a marker board at true scale, with a ruler to check it, or describe one you have",
         "board.pdf --tiles a4",
-        path("file", "FILE.pdf", "or FILE.png, for a printer's shop"),
+        path(
+            "file",
+            "FILE.pdf",
+            "or FILE.png, for a printer's shop; FILE.json: the description alone, of a board you have",
+        ),
         choice("--tiles", ("a4",), "several sheets to glue together instead of one large one"),
         BOARD,
+        path(
+            "--from", "FILE", "board of another program: Kalibr, apriltag_ros, ArUco's marker map, OpenCV", dest="other"
+        ),
+        choice("--kind", ("grid", "charuco", "charuco_old", "aprilgrid"), "what is made of the next four options"),
+        option("--size", "8x6", "markers, of a charuco squares, across and up", read.read_size),
+        option("--marker", "M", "side of a marker, metres", read.read_length),
+        option(
+            "--pitch", "M", "from a marker to the next, of a charuco the side of a square, metres", read.read_length
+        ),
+        option("--dictionary", "NAME", "of OpenCV (default: DICT_4X4_50; of an aprilgrid DICT_APRILTAG_36h11)"),
         number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
         handler="capture:board",
     ),
@@ -43,9 +57,9 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         handler="capture:simulate",
     ),
     "import": command(
-        "make a capture from an Azure Kinect recording, without its SDK",
+        "make a capture from a recording of an RGB-D camera, without its SDK",
         "recording.mkv --out data/mug-1 --frames 40 --board board.json --name mug-1 --category mug",
-        path("recording", "RECORDING.mkv"),
+        path("recording", "RECORDING", "a file or folder: .mkv, .bag, .r3d, TUM, BOP, Open3D, Polycam, ARKitScenes"),
         NEW_DIR,
         number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
         BOARD,

@@ -89,8 +89,7 @@ def _describe_captures(captures: Captures, catalogue: "Catalogue") -> str:
     origin = f"{len(catalogue.captures)} folders of photographs with registered depth, each with the board in its board.json."
     if not captures.folders:
         shapes = "\n".join(f"- {line}" for line in describe_sources(catalogue) if not line.startswith("tables"))
-        markers = f"{board.columns} x {board.rows} markers"
-        origin = f"virtual, of {captures.simulate.views} views, {markers}, and shapes from\n\n{shapes}"
+        origin = f"virtual, of {captures.simulate.views} views, {board.words}, and shapes from\n\n{shapes}"
     return f"""## Captures
 
 Each scene is a capture of one object on a board of markers; its world is the board's frame. The captures are {origin}

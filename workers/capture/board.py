@@ -1,5 +1,6 @@
 """The marker board: its frame and those of others, the corners of its markers, and what is printed beside them."""
 
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,27 +8,108 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from schemas.base import Array, Pose
 from schemas.errors import CaptureError, InputError
 from schemas.job.captures import Board, BoardFrame
 from workers.geometry.frames import pose
 
+TOUCHING_M = 1e-5
+"""Corners so near to one another are one: places in a file are rounded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Where all that is printed lies, board frame, metres, true size; what any kind of board is made into.
+
+    ids [N] int64 ascending; corners [N, 4, 3]: top left, top right, bottom right, bottom left of OpenCV's picture of each
+    marker; squares [S, 4, 3]: plain black squares. chess [K, 3]: where two of them meet, corners of a chessboard;
+    chess_squares, chess_corners [K, 2]: which two, and by which of their corners; chess_free_m [K]: half the side of the
+    largest window about each that shows nothing else. right, below [N]: the marker whose left (upper) edge lies opposite to
+    the right (lower) edge of one, at most a marker's side away, or -1. touching: squares touch corners of markers, as Kalibr
+    prints them.
+    """
+
+    ids: NDArray[np.int64]
+    corners: Array
+    squares: Array
+    chess: Array
+    chess_squares: NDArray[np.int64]
+    chess_corners: NDArray[np.int64]
+    chess_free_m: Array
+    right: NDArray[np.int64]
+    below: NDArray[np.int64]
+    touching: bool
+
+    def index(self, ids: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Place of each id, which must be on the board."""
+        return np.searchsorted(self.ids, ids)
+
+
+@functools.lru_cache(maxsize=16)
+def board_geometry(board: Board) -> Geometry:
+    """What lies where; kept, because every view asks for it."""
+    corners = marker_corners(board)
+    squares = board.scale * np.array(board.squares, dtype=np.float64).reshape(-1, 4, 3)
+    pairs = cKDTree(squares.reshape(-1, 3)).query_pairs(TOUCHING_M, output_type="ndarray")
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    touching = bool(len(squares)) and bool(
+        (cKDTree(squares.reshape(-1, 3)).query(corners.reshape(-1, 3))[0] < TOUCHING_M).any()
+    )
+    right, below = _opposite(corners, (1, 2), (0, 3)), _opposite(corners, (2, 3), (1, 0))
+    chess = squares.reshape(-1, 3)[pairs[:, 0]]
+    sides = np.linalg.norm(squares[pairs[:, 0] // 4, 1] - squares[pairs[:, 0] // 4, 0], axis=1)
+    nearest = cKDTree(corners.reshape(-1, 3)).query(chess)[0] if len(chess) else np.zeros(0)
+    free_m = np.minimum(nearest / math.sqrt(2.0), 0.5 * sides)  # a marker's corner lies on the diagonal
+    ids = np.sort(np.array([m.id for m in board.markers], np.int64)) if board.markers else _grid_ids(board)
+    return Geometry(ids, corners, squares, chess, pairs // 4, pairs % 4, free_m, right, below, touching)
+
+
+def _grid_ids(board: Board) -> NDArray[np.int64]:
+    return board.first_id + np.arange(board.columns * board.rows)
+
+
+def _opposite(corners: Array, edge: tuple[int, int], other: tuple[int, int]) -> NDArray[np.int64]:
+    """[N]: the nearest marker whose corners `other` lie straight beyond a marker's corners `edge`, or -1."""
+    inward = corners[:, edge[0]] - corners[:, other[0]]  # across the marker, out of its edge
+    side = np.linalg.norm(inward, axis=1)
+    found = np.full(len(corners), -1)
+    middle, faced = (corners[:, list(pair)].mean(axis=1) for pair in (edge, other))
+    for n, near in enumerate(cKDTree(faced).query_ball_point(middle, side * (1.0 + SAME_SHARE))):
+        gaps = corners[near][:, list(other)] - corners[n, list(edge)]
+        along = gaps[:, 0] @ inward[n] / side[n]
+        straight = np.abs(gaps - along[:, None, None] * inward[n] / side[n]).max(axis=(1, 2), initial=0.0)
+        fits = (straight < SAME_SHARE * side[n]) & (along > SAME_SHARE * side[n])
+        if fits.any():
+            found[n] = np.array(near)[fits][np.argmin(along[fits])]
+    return found
+
+
+SAME_SHARE = 0.01
+"""Of a marker's side: edges that are so nearly in line face one another."""
+
 
 def frame_in_board(board: Board, frame: BoardFrame) -> Pose:
     """T_board_frame [4, 4]: takes coordinates of the other frame to ours.
 
-    `opencv`: OpenCV 4.6 and later, origin at the top left of the grid, y down, z into the board; `opencv_old`: before, origin
-    at the bottom left, y up, z out of the board.
+    `opencv`: OpenCV 4.6 and later, origin at the top left of the print, y down, z into the board; `opencv_old`: before, and
+    Kalibr's, origin at the bottom left, y up, z out of the board. The print is the markers, with the squares of a chessboard.
+    Raises CaptureError for another frame of a board whose markers do not lie in its plane.
     """
-    width, height = (
-        board.scale * (count * (board.marker_m + board.gap_m) - board.gap_m) for count in (board.columns, board.rows)
-    )
+    if frame == "centre":
+        return np.eye(4)
+    geometry = board_geometry(board)
+    printed = [geometry.corners, geometry.squares[np.unique(geometry.chess_squares)]]
+    points = np.concatenate(printed).reshape(-1, 3)
+    if np.abs(points[:, 2]).max() > TOUCHING_M:
+        raise CaptureError(
+            "frame", f"frame {frame} is of a flat board, and this one's markers lie elsewhere: use centre"
+        )
+    low, high = points.min(axis=0), points.max(axis=0)
     if frame == "opencv":
-        return pose(np.diag([1.0, -1.0, -1.0]), np.array([-width / 2, height / 2, 0.0]))
-    if frame == "opencv_old":
-        return pose(np.eye(3), np.array([-width / 2, -height / 2, 0.0]))
-    return np.eye(4)
+        return pose(np.diag([1.0, -1.0, -1.0]), np.array([low[0], high[1], 0.0]))
+    return pose(np.eye(3), np.array([low[0], low[1], 0.0]))
 
 
 PREDEFINED = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
@@ -35,10 +117,12 @@ PREDEFINED = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DI
 
 
 def marker_corners(board: Board) -> Array:
-    """[M, 4, 3] float64, metres, board frame: top left, top right, bottom right, bottom left of each marker as printed.
+    """[N, 4, 3] float64, metres, board frame: corners of each marker as in `Geometry`, by ascending id.
 
-    Marker m has the id first_id + m. Sizes are the nominal ones times `board.scale`.
+    Sizes are the nominal ones times `board.scale`.
     """
+    if board.markers:
+        return board.scale * np.array([m.corners for m in sorted(board.markers, key=lambda m: m.id)], np.float64)
     pitch = board.marker_m + board.gap_m
     columns, rows = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
     left = columns.ravel() * pitch - 0.5 * (board.columns * pitch - board.gap_m)
@@ -46,6 +130,18 @@ def marker_corners(board: Board) -> Array:
     right, bottom = left + board.marker_m, top - board.marker_m
     flat = np.stack([left, top, right, top, right, bottom, left, bottom], axis=1).reshape(-1, 4, 2)
     return np.concatenate([flat, np.zeros((len(flat), 4, 1))], axis=2) * board.scale
+
+
+def id_words(ids: NDArray[np.int64]) -> str:
+    """Ascending ids in words: `3 to 37`, or one by one."""
+    if len(ids) > 1 and ids[-1] - ids[0] == len(ids) - 1:
+        return f"{ids[0]} to {ids[-1]}"
+    shown = ", ".join(map(str, ids[:MOST_SHOWN]))
+    return shown if len(ids) <= MOST_SHOWN else f"{shown}, ... {ids[-1]}"
+
+
+MOST_SHOWN = 12
+"""Ids that a message lists."""
 
 
 def open_dictionary(board: Board, folder: Path | None = None) -> "cv2.aruco.Dictionary":
@@ -58,7 +154,7 @@ def open_dictionary(board: Board, folder: Path | None = None) -> "cv2.aruco.Dict
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     else:
         dictionary = _read_dictionary(board.dictionary, folder)
-    count, needed = len(dictionary.bytesList), board.first_id + board.columns * board.rows
+    count, needed = len(dictionary.bytesList), int(board_geometry(board).ids[-1]) + 1
     if count < needed:
         raise CaptureError(
             "dictionary", f"the dictionary {board.dictionary} has {count} markers, and the board needs {needed}"
@@ -121,40 +217,61 @@ def lay_out_print(board: Board) -> PrintLayout:
 
     Raises InputError where the ruler is longer than the sheet is high, CaptureError for a dictionary that cannot be used.
     """
-    grid_width = board.columns * board.marker_m + (board.columns - 1) * board.gap_m
-    width = max(board.width_m, grid_width + 2 * MARGIN_M)
+    geometry = board_geometry(board.model_copy(update={"measured_ruler_m": None}))
+    black = [
+        _black_runs(*upright(cells, corners))
+        for cells, corners in zip(marker_cells(board), geometry.corners, strict=True)
+    ]
+    black += [_black_runs(*upright(np.ones((1, 1), np.bool_), corners)) for corners in geometry.squares]
+    markers = np.concatenate(black)
+    print_width = 2.0 * float(np.abs(markers[:, [0, 2]]).max())
+    width = max(board.width_m, print_width + 2 * MARGIN_M)
     height = board.height_m
     if board.ruler_m > height - 0.02:
         raise InputError(
             f"ruler_m is {board.ruler_m:g}, and the sheet is {height:g} m high: make it at most {height - 0.02:g}"
         )
-    margin = 0.5 * (width - grid_width)
+    margin = 0.5 * (width - print_width)
     ruler_x, top = -0.5 * width + 0.25 * margin, 0.5 * height - 0.01
-    markers = [_black_runs(cells, corners) for cells, corners in zip(marker_cells(board), nominal(board), strict=True)]
     ruler, figures = _ruler(ruler_x, top, board.ruler_m)
     arrow_y = top - board.ruler_m - 0.035
     arrow = np.array([ruler_x + 0.005, arrow_y]) + np.array([[-0.005, 0.0], [0.005, 0.0], [0.0, 0.012]])
     words = (Words(ruler_x, arrow_y - 0.006, 0.004, "TOP"), *figures, *_instructions(board, 0.5 * width, margin, top))
-    return PrintLayout(width, height, np.concatenate(markers), ruler, arrow, words)
+    return PrintLayout(width, height, markers, ruler, arrow, words)
 
 
 def nominal(board: Board) -> Array:
-    """[M, 4, 3] float64: the markers' corners where the print is exact."""
+    """[N, 4, 3] float64: the markers' corners where the print is exact."""
     return marker_corners(board.model_copy(update={"measured_ruler_m": None}))
 
 
-def marker_cells(board: Board) -> NDArray[np.bool_]:
-    """[M, n, n] bool: the black cells of each marker with its border, top row of the print first."""
-    dictionary = open_dictionary(board)
-    side = dictionary.markerSize + 2
-    ids = range(board.first_id, board.first_id + board.columns * board.rows)
-    return np.stack([cv2.aruco.generateImageMarker(dictionary, number, side) == 0 for number in ids])
+def marker_cells(board: Board, folder: Path | None = None) -> NDArray[np.bool_]:
+    """[N, n, n] bool: the black cells of each marker with its border, top row of OpenCV's picture first, by ascending id."""
+    dictionary = open_dictionary(board, folder)
+    side, border = dictionary.markerSize + 2 * board.border_bits, board.border_bits
+    ids = board_geometry(board).ids.tolist()
+    return np.stack([cv2.aruco.generateImageMarker(dictionary, n, side, borderBits=border) == 0 for n in ids])
 
 
-def _black_runs(cells: NDArray[np.bool_], corners: Array) -> Array:
+def upright(cells: NDArray[np.bool_], corners: Array) -> tuple[NDArray[np.bool_], float, float, float]:
+    """(cells [n, n] as they lie on the sheet, x of the left edge, y of the upper edge, side) of a marker at corners [4, 3].
+
+    Raises InputError where its edges do not run along the sheet's.
+    """
+    first = int(np.lexsort((np.round(corners[:, 0], 6), -np.round(corners[:, 1], 6)))[0])
+    turned = np.roll(corners, -first, axis=0)
+    side = float(turned[1, 0] - turned[0, 0])
+    level = np.array([*turned[0, :2], 0.0])
+    flat = level + np.array([[0, 0, 0], [side, 0, 0], [side, -side, 0], [0, -side, 0]])
+    if np.abs(flat - turned).max() > TOUCHING_M:
+        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in corners)
+        raise InputError(f"the marker at {where} is turned, or not in the plane of the board: a sheet cannot show it")
+    return np.rot90(cells, first), float(turned[0, 0]), float(turned[0, 1]), side
+
+
+def _black_runs(cells: NDArray[np.bool_], left: float, top: float, whole: float) -> Array:
     """[N, 4]: runs of black cells along rows and along columns, so that no renderer shows a seam between two of them."""
-    side = (corners[1, 0] - corners[0, 0]) / len(cells)
-    left, top = corners[0, :2]
+    side = whole / len(cells)
     runs = [(start, row, stop, row + 1) for row, line in enumerate(cells) for start, stop in _runs(line)]
     runs += [(column, start, column + 1, stop) for column, line in enumerate(cells.T) for start, stop in _runs(line)]
     return np.array([[left + a * side, top - d * side, left + c * side, top - b * side] for a, b, c, d in runs])
@@ -181,15 +298,14 @@ def _ruler(x: float, top: float, length_m: float) -> tuple[Array, list[Words]]:
 
 def _instructions(board: Board, right: float, margin: float, top: float) -> list[Words]:
     """Lines that run downwards in the right margin, outer line last."""
-    last = board.first_id + board.columns * board.rows - 1
-    grid = [count * board.marker_m + (count - 1) * board.gap_m for count in (board.columns, board.rows)]
+    size = np.ptp(board_geometry(board.model_copy(update={"measured_ruler_m": None})).corners, axis=(0, 1)) * 1000
     lines = [
-        f"Verso marker board: {board.dictionary}, ids {board.first_id} to {last}, markers {board.marker_m * 1000:g} mm, "
-        f"gaps {board.gap_m * 1000:g} mm, grid {grid[0] * 1000:g} x {grid[1] * 1000:g} mm.",
+        f"Verso marker board: {board.dictionary}, ids {id_words(board_geometry(board).ids)}, {board.words}, "
+        f"{size[0]:g} x {size[1]:g} mm over all markers.",
         "Print at 100 % (no scaling, no 'fit to page'); glue to a flat, stiff plate.",
         f"Measure the ruler at the left. Are its end lines {board.ruler_m * 1000:g} mm apart? If not, put the length measured,",
         f'in metres, into board.json, e.g. "measured_ruler_m": {board.ruler_m * 0.9945:.4f}, and all lengths are scaled by it.',
     ]
-    size = min(0.003, 0.1 * margin)
+    high = min(0.003, 0.1 * margin)
     x = right - margin + 0.35 * margin
-    return [Words(x + i * 1.5 * size, top, size, line, -90) for i, line in enumerate(reversed(lines))]
+    return [Words(x + i * 1.5 * high, top, high, line, -90) for i, line in enumerate(reversed(lines))]

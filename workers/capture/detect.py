@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.capture import Detection
 from schemas.job.captures import Board
-from workers.capture.board import PREDEFINED
+from workers.capture.board import PREDEFINED, Geometry, board_geometry, id_words
 from workers.geometry.colour import SRGB_STEPS
 
 SAMPLES = 24
@@ -35,7 +35,7 @@ LINEAR = SRGB_STEPS.astype(np.float32)
 """[256]: light of each code. Blur adds up light: in codes the middle of a blurred edge lies 0.1 to 0.2 px on its dark side."""
 
 
-def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: int) -> Array:
+def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: float) -> Array:
     """[M, 4, 2] float64: corners [M, 4, 2] refined, pixel centres at integers as in OpenCV.
 
     `bits` is the marker's width in bits, its border included: a profile is shorter than the border is wide.
@@ -121,13 +121,124 @@ def detect_markers(
 ) -> Detection:
     """The board's markers in an image [H, W, 3]; ids that are not on the board, or that are seen twice, are dropped."""
     gray: NDArray[np.uint8] = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
-    quads, found, _ = _detector(dictionary).detectMarkers(gray)
-    ids = np.zeros(0, np.int64) if found is None else found.ravel().astype(np.int64)
-    kept, dropped = _usable(ids, board)
-    corners = np.array([quads[k][0] for k in kept], dtype=np.float64).reshape(-1, 4, 2)
-    corners = refine_corners(gray, corners, dictionary.markerSize + 2) + 0.5
-    corners.setflags(write=False)
-    return Detection(number, ids[kept], corners, dropped)
+    geometry, border = board_geometry(board), board.border_bits
+    quads, ids = _read_markers(gray, dictionary, geometry, border)
+    kept, dropped = _usable(ids, geometry.ids)
+    corners = quads[kept]
+    corners = refine_corners(gray, corners, dictionary.markerSize + 2 * border)
+    chess, chess_px = _find_chess(gray, geometry, ids[kept], corners)
+    for pixels in (corners, chess_px):
+        pixels += 0.5
+        pixels.setflags(write=False)
+    return Detection(number, ids[kept], corners, dropped, chess, chess_px)
+
+
+APART_PX = 3
+"""Width of the window whose brightest pixel parts a large marker from squares that touch its corners; blur parts a small one."""
+
+
+def _read_markers(
+    gray: NDArray[np.uint8], dictionary: "cv2.aruco.Dictionary", geometry: Geometry, border_bits: int
+) -> tuple[Array, NDArray[np.int64]]:
+    """([M, 4, 2] corners, [M] ids) of all markers of the dictionary, pixel centres at integers; unrefined."""
+    detector, pictures = _detector(dictionary, border_bits=border_bits), [gray]
+    if geometry.touching:
+        parted = cv2.dilate(gray, np.ones((APART_PX, APART_PX), np.uint8)).astype(np.uint8, copy=False)
+        pictures.append(parted)
+    quads, ids = np.zeros((0, 4, 2)), np.zeros(0, np.int64)
+    for picture in pictures:
+        seen, found, _ = detector.detectMarkers(picture)
+        if found is not None:
+            new = ~np.isin(found.ravel(), ids)
+            quads = np.concatenate([quads, np.array(seen, np.float64).reshape(-1, 4, 2)[new]])
+            ids = np.concatenate([ids, found.ravel()[new].astype(np.int64)])
+    return quads, ids
+
+
+NEAR_MARKERS = 4
+"""A square is looked for where so many of the nearest markers put it: farther ones know less of the lens."""
+
+CHESS_REACH = 1.5
+"""Farthest marker that tells of a square, in sides of it."""
+
+BESIDE = 0.6
+"""Where light is looked at to tell a corner, as a share of the way to the nearest marker."""
+
+CONTRAST = 0.3
+"""Least difference of light between white and black at a corner, over that of the brightest and the darkest there."""
+UNEVEN_PX = 0.5
+"""Two squares whose corners are apart by so much more or less than usual in the image: something hides one of them."""
+DARK = 0.02
+"""Least difference of light, of 1, that is more than noise."""
+
+
+def _find_chess(
+    gray: NDArray[np.uint8], geometry: Geometry, ids: NDArray[np.int64], corners_px: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """([K] which corners of the chessboard are seen, [K, 2] where), pixel centres at integers as in OpenCV.
+
+    ids [M] and corners_px [M, 4, 2] are the markers found. The two black squares at a corner are refined as markers are, and
+    the corner is in the middle between theirs: ink that spreads moves them apart by as much.
+    """
+    none = np.zeros(0, np.int64), np.zeros((0, 2))
+    if not (len(geometry.chess) and len(ids)):
+        return none
+    markers = geometry.corners[geometry.index(ids)]
+    start = np.stack([_near_homography(square, square, markers, corners_px) for square in geometry.squares])
+    known = np.isfinite(start).all(axis=(1, 2))
+    side_m = np.linalg.norm(geometry.squares[0, 1] - geometry.squares[0, 0])
+    start[known] = refine_corners(gray, start[known], float(0.5 * side_m / geometry.chess_free_m.min()))
+    pairs = start[geometry.chess_squares, geometry.chess_corners]  # [K, 2, 2]
+    places, light = pairs.mean(axis=1), LINEAR[gray]
+    seen = [n for n in range(len(places)) if _is_corner(light, pairs[n], _beside(n, geometry, markers, corners_px))]
+    if not seen:
+        return none
+    gaps = np.linalg.norm(pairs[seen, 1] - pairs[seen, 0], axis=1)
+    chosen = np.array(seen)[np.abs(gaps - np.median(gaps)) <= UNEVEN_PX]
+    return chosen, places[chosen]
+
+
+def _near_homography(points: Array, square: Array, markers: Array, corners_px: Array) -> Array:
+    """[N, 2] pixels of points [N, 3] in the plane of a square [4, 3], by the markers near it; nan without any."""
+    x, y = square[1] - square[0], square[3] - square[0]
+    side = float(np.linalg.norm(x))
+    distance = np.linalg.norm(markers.mean(axis=1) - square.mean(axis=0), axis=1)
+    near = np.argsort(distance, kind="stable")[:NEAR_MARKERS]
+    near = near[distance[near] < CHESS_REACH * side]
+    axes = np.stack([x, y], axis=1) / side
+    H = None
+    if len(near):
+        flat = (markers[near].reshape(-1, 3) - square[0]) @ axes
+        H, _ = cv2.findHomography(flat, corners_px[near].reshape(-1, 2))
+    if H is None:
+        return np.full((len(points), 2), np.nan)
+    return cv2.perspectiveTransform(((points - square[0]) @ axes)[None], H)[0].astype(np.float64)
+
+
+def _beside(number: int, geometry: Geometry, markers: Array, corners_px: Array) -> Array:
+    """[5, 2] pixels: a corner of the chessboard, two points beside it in its black squares, and two in its white ones."""
+    at, squares = geometry.chess[number], geometry.squares[geometry.chess_squares[number]]
+    x, y = (squares[0, k] - squares[0, 0] for k in (1, 3))
+    to_black = squares.mean(axis=1) - at
+    to_white = to_black - 2.0 * np.outer(to_black @ y, y) / (y @ y)
+    reach = BESIDE * geometry.chess_free_m[number] / (0.5 * np.linalg.norm(x))
+    points = at + np.concatenate([np.zeros((1, 3)), reach * to_black, reach * to_white])
+    return _near_homography(points, squares[0], markers, corners_px)
+
+
+def _is_corner(light: NDArray[np.float32], pair: Array, points: Array) -> bool:
+    """Whether the light about the middle of a pair [2, 2] is a chessboard's; points [5, 2] as in `_beside`."""
+    height, width = light.shape
+    if not (
+        (points >= 0).all() and (points < [width - 1, height - 1]).all() and np.isfinite(pair).all()
+    ):  # false of nan
+        return False
+    free_px = float(np.linalg.norm(points[1:] - points[0], axis=1).min()) / (BESIDE * 2.0**0.5)
+    off_px = max(np.linalg.norm(pair.mean(axis=0) - points[0]), np.linalg.norm(pair[1] - pair[0]))
+    u, v = (points[1:] - points[0] + pair.mean(axis=0)).astype(np.float32).T[..., None]
+    seen = cv2.remap(light, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+    apart = float(seen[2:].min() - seen[:2].max())
+    return free_px >= MIN_HALF_PX and off_px < free_px and apart > max(CONTRAST * float(np.ptp(seen)), DARK)
 
 
 def other_dictionaries(rgb: NDArray[np.uint8]) -> str:
@@ -157,23 +268,25 @@ def _smallest(name: str, usual_id: int) -> str:
     return f"{family}_{next(n for n in (50, 100, 250, 1000) if n > usual_id)}" if size == "1000" else name
 
 
-def _detector(dictionary: "cv2.aruco.Dictionary", min_perimeter: float = MIN_PERIMETER) -> "cv2.aruco.ArucoDetector":
+def _detector(
+    dictionary: "cv2.aruco.Dictionary", min_perimeter: float = MIN_PERIMETER, border_bits: int = 1
+) -> "cv2.aruco.ArucoDetector":
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     settings.minMarkerPerimeterRate = min_perimeter
+    settings.markerBorderBits = border_bits
     return cv2.aruco.ArucoDetector(dictionary, settings)
 
 
-def _usable(ids: NDArray[np.int64], board: Board) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+def _usable(ids: NDArray[np.int64], on_board: NDArray[np.int64]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """(indices of the ids that are used, by ascending id; what is dropped, in words)."""
-    last = board.first_id + board.columns * board.rows - 1
     values, counts = np.unique(ids, return_counts=True)
-    on_board = (values >= board.first_id) & (values <= last)
-    dropped = [f"marker {value} is not on the board ({board.first_id} to {last})" for value in values[~on_board]]
+    known = np.isin(values, on_board)
+    dropped = [f"marker {value} is not on the board ({id_words(on_board)})" for value in values[~known]]
     dropped += [
         f"marker {value} was seen {count} times"
-        for value, count in zip(values[on_board], counts[on_board], strict=True)
+        for value, count in zip(values[known], counts[known], strict=True)
         if count > 1
     ]
-    kept = np.flatnonzero(np.isin(ids, values[on_board & (counts == 1)]))
+    kept = np.flatnonzero(np.isin(ids, values[known & (counts == 1)]))
     return kept[np.argsort(ids[kept], kind="stable")], tuple(dropped)

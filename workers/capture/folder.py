@@ -1,13 +1,17 @@
 """A capture's folder: its photographs, cameras and board, and the truth of a simulated one. Read and written here alone.
 
     camera.json  board.json  capture.json (name and category; may be missing)
-    rgb_00000.png  depth_00000.png  mask_00000.png  board_00000.txt  correction_00000.txt
+    rgb_00000.png  depth_00000.png  mask_00000.png  board_00000.txt  correction_00000.txt  camera_00000.json
     truth/       what a simulation knows, for evaluation alone: truth.json (poses, print scale, depth camera, lens, receipt
                  of effects), mesh.glb (the true object in its own frame, metres, z up), mask_00000.png, held_out/
 
 Depth and masks may be missing, in some views or in all. camera.json has width, height, fx, fy, cx, cy, `pixel_centre`
-("0" as in OpenCV and the Azure Kinect's calibration, or "0.5" from the image's edge), `distortion` (OpenCV's order, 0
-to 8 numbers) and `depth_units_per_m`. board.json is the job file's branch `captures.board`.
+("0" as in OpenCV and the Azure Kinect's calibration, or "0.5" from the image's edge), `distortion` (OpenCV's order, up
+to 14 numbers, or 4 with `lens_model` "fisheye"), `depth_units_per_m`, and `depth_camera` where depth is not registered.
+camera_00000.json has fx, fy, cx and cy of one view, where they change. board.json is the job file's branch `captures.board`.
+
+What is read has one camera: pictures of other intrinsics are resampled, lenses beyond eight numbers are taken out, and depth
+of another camera is registered.
 """
 
 import json
@@ -20,19 +24,57 @@ from typing import Annotated, Any, Literal, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from schemas.base import Array, Frozen, Pose, Positive, PositiveInt, Text, frozen_array
-from schemas.capture import CaptureCamera, CapturedView, CaptureTruth
+from schemas.capture import CaptureCamera, CapturedView, CaptureTruth, DepthCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, BoardFrame
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
+from workers.capture.pictures import PictureError, change_camera, decode_depth, pinhole_maps, remap
+from workers.geometry.zbuffer import register_depth
 from workers.store.images import encode_mask, encode_png
 
 CAMERA_FILE, BOARD_FILE, CAPTURE_FILE, TRUTH = "camera.json", "board.json", "capture.json", "truth"
 Model = TypeVar("Model", bound=Frozen)
-_FILE_OF_VIEW = re.compile(r"(rgb|depth|mask|board|correction)_([0-9]{1,9})\.(png|txt)")
+ENDINGS = {
+    "rgb": ("png", "jpg", "jpeg"),
+    "depth": ("png", "npy", "tif", "tiff", "exr", "depth"),
+    "mask": ("png",),
+    "board": ("txt",),
+    "correction": ("txt",),
+    "camera": ("json",),
+}
+"""Of the files of a view, by their first word; one file a kind and view."""
+FILE_OF_VIEW = re.compile("|".join(rf"{kind}_[0-9]{{1,9}}\.(?:{'|'.join(ends)})" for kind, ends in ENDINGS.items()))
+
+
+class ViewFile(Frozen):
+    """camera_00000.json: intrinsics of one view."""
+
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+
+
+class DepthFile(ViewFile):
+    """`depth_camera` of camera.json."""
+
+    width: PositiveInt
+    height: PositiveInt
+    distortion: Annotated[list[float], Field(max_length=8)] = Field(default_factory=list)
+    T_color_depth: Annotated[
+        list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
+    ]
+    """Takes coordinates of the depth camera to the colour camera's, metres."""
+
+    @model_validator(mode="after")
+    def _has_a_rigid_transform(self) -> "DepthFile":
+        if not _is_rigid(np.array(self.T_color_depth)):
+            raise ValueError("T_color_depth is no rigid transform: 4 rows of 4, the last 0 0 0 1")
+        return self
 
 
 class CameraFile(Frozen):
@@ -46,8 +88,19 @@ class CameraFile(Frozen):
     cy: float
     pixel_centre: Literal["0", "0.5"]
     """Coordinate of the first pixel's centre."""
-    distortion: Annotated[list[float], Field(max_length=8)] = Field(default_factory=list)
+    distortion: Annotated[list[float], Field(max_length=14)] = Field(default_factory=list)
+    lens_model: Literal["opencv", "fisheye"] = "opencv"
     depth_units_per_m: Positive = 1000.0
+    depth_camera: DepthFile | None = None
+    """The camera of depth that is not registered to colour; its principal point counts as the colour camera's."""
+
+    @model_validator(mode="after")
+    def _has_a_lens(self) -> "CameraFile":
+        count, fisheye = len(self.distortion), self.lens_model == "fisheye"
+        if (count != 4) if fisheye else count in (9, 10, 11, 13):
+            known = "4 of fisheye" if fisheye else "4, 5, 8, 12 or 14"
+            raise ValueError(f"distortion has {count} numbers: OpenCV's lenses have {known}")
+        return self
 
 
 class CaptureFile(Frozen):
@@ -62,13 +115,22 @@ class CaptureFile(Frozen):
 
 @dataclass(frozen=True)
 class CaptureFolder:
-    """An opened capture: its camera, its board, and the numbers of its views in ascending order."""
+    """An opened capture: its camera, its board, and the numbers of its views in ascending order.
+
+    `camera` is that of what `read_view` gives, and `stored` what camera.json says of the files.
+    """
 
     path: Path
     about: CaptureFile
     camera: CaptureCamera
     board: Board
     numbers: tuple[int, ...]
+    stored: CameraFile
+
+    def file(self, kind: str, number: int) -> Path | None:
+        """The file of a kind (a key of ENDINGS) and view, None where there is none."""
+        names = (self.path / f"{kind}_{number:05d}.{ending}" for ending in ENDINGS[kind])
+        return next((name for name in names if name.exists()), None)
 
 
 def open_folder(path: Path) -> CaptureFolder:
@@ -82,7 +144,7 @@ def open_folder(path: Path) -> CaptureFolder:
         if (path / CAPTURE_FILE).exists()
         else CaptureFile(name=derive_name(path.resolve().name))
     )
-    return CaptureFolder(path, about, _camera(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers))
+    return CaptureFolder(path, about, _camera(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers), spec)
 
 
 def derive_name(words: str) -> str:
@@ -94,11 +156,14 @@ def _view_numbers(path: Path) -> list[int]:
     """Numbers of the views, ascending. Raises CaptureError for a file of a view whose rgb_ is missing, and for odd names."""
     found: dict[str, set[int]] = {}
     for file in sorted(path.iterdir()):
-        if match := _FILE_OF_VIEW.fullmatch(file.name):
-            kind, digits, ending = match.groups()
+        if FILE_OF_VIEW.fullmatch(file.name):
+            kind, _, rest = file.name.partition("_")
+            digits, _, ending = rest.partition(".")
             if digits != f"{int(digits):05d}":
                 raise CaptureError("name", f"{file} must be named {kind}_{int(digits):05d}.{ending}")
-            found.setdefault(kind, set()).add(int(digits))
+            if int(digits) in found.setdefault(kind, set()):
+                raise CaptureError("name", f"{path} has two files {kind}_{digits}: keep one of them")
+            found[kind].add(int(digits))
     rgb = found.pop("rgb", set())
     if not rgb:
         raise CaptureError(
@@ -120,11 +185,53 @@ def read_board(path: Path) -> Board:
 
 def read_view(folder: CaptureFolder, number: int) -> CapturedView:
     """One view's images. Raises CaptureError where one cannot be read or has the wrong size."""
-    rgb = _read_image(folder, f"rgb_{number:05d}.png", cv2.IMREAD_COLOR_RGB, np.uint8)
-    assert rgb is not None
-    depth = _read_image(folder, f"depth_{number:05d}.png", cv2.IMREAD_UNCHANGED, np.uint16, optional=True)
-    mask = _read_image(folder, f"mask_{number:05d}.png", cv2.IMREAD_GRAYSCALE, np.uint8, optional=True)
-    return CapturedView(number, rgb, depth, None if mask is None else mask > 0)
+    own = _own_intrinsics(folder, number)
+    rgb = _read_image(folder, "rgb", number, cv2.IMREAD_COLOR_RGB)
+    if rgb is None:
+        raise CaptureError("missing", f"{folder.path} has no rgb_{number:05d}.png")
+    mask = _read_image(folder, "mask", number, cv2.IMREAD_GRAYSCALE)
+    rgb = _as_read(folder, rgb, own, between=True)
+    mask = None if mask is None else _as_read(folder, mask, own, between=False) > 0
+    return CapturedView(number, rgb, _read_depth(folder, number, own), mask)
+
+
+def _own_intrinsics(folder: CaptureFolder, number: int) -> Intrinsics:
+    """Of the files of one view."""
+    common, path = folder.camera.intrinsics, folder.file("camera", number)
+    return common if path is None else _intrinsics(folder.stored, _read_json(path, ViewFile))
+
+
+def _as_read(folder: CaptureFolder, image: NDArray, own: Intrinsics, between: bool) -> NDArray:
+    """An image of a view's own intrinsics and of any lens as the folder's camera has it."""
+    stored = folder.stored
+    common = _intrinsics(stored, stored)
+    image = change_camera(image, own, common, between) if own != folder.camera.intrinsics else image
+    if not _is_taken_out(stored):
+        return image
+    return remap(image, pinhole_maps(common, tuple(stored.distortion), stored.lens_model == "fisheye"), between)
+
+
+def _read_depth(folder: CaptureFolder, number: int, own: Intrinsics) -> NDArray[np.uint16] | None:
+    """[H, W] in the folder's camera and units, None where the view has none."""
+    path, spec = folder.file("depth", number), folder.stored.depth_camera
+    if path is None:
+        return None
+    if path.suffix == ".png" and spec is None:
+        return _as_read(folder, _checked(folder, path, _decoded(path, cv2.IMREAD_UNCHANGED), np.uint16, 2), own, False)
+    size = (folder.stored.width, folder.stored.height) if spec is None else (spec.width, spec.height)
+    try:
+        depth_m = decode_depth(path.read_bytes(), size, folder.stored.depth_units_per_m)
+    except PictureError as error:
+        raise CaptureError("unreadable", f"{path} {error}") from error
+    if spec is None:
+        depth_m = _as_read(folder, depth_m, own, between=False)
+    else:
+        camera = DepthCamera(
+            _intrinsics(folder.stored, spec), _eight(spec.distortion), frozen_array(np.array(spec.T_color_depth))
+        )
+        depth_m = register_depth(depth_m, camera, folder.camera.intrinsics, folder.camera.lens)
+    units = np.rint(depth_m * folder.camera.depth_units_per_m)
+    return np.where(units < 65536.0, units, 0.0).astype(np.uint16)  # depth beyond what 16 bits hold is none
 
 
 def write_view(path: Path, view: CapturedView) -> None:
@@ -184,12 +291,24 @@ def _is_rigid(T: Pose) -> bool:
 
 
 def _camera(spec: CameraFile) -> CaptureCamera:
-    shift = 0.5 - float(spec.pixel_centre)
-    lens: Array = np.zeros(8)
-    lens[: len(spec.distortion)] = spec.distortion
-    lens.setflags(write=False)
-    size = spec.model_dump(include={"width", "height", "fx", "fy"})
-    return CaptureCamera(Intrinsics(**size, cx=spec.cx + shift, cy=spec.cy + shift), lens, spec.depth_units_per_m)
+    lens = _eight([] if _is_taken_out(spec) else spec.distortion)
+    return CaptureCamera(_intrinsics(spec, spec), lens, spec.depth_units_per_m)
+
+
+def _is_taken_out(spec: CameraFile) -> bool:
+    """Whether the lens is none that the steps after this one know, so that pictures are read without it."""
+    return spec.lens_model == "fisheye" or len(spec.distortion) > 8
+
+
+def _eight(distortion: list[float]) -> Array:
+    return frozen_array([*distortion, *[0.0] * (8 - len(distortion))])
+
+
+def _intrinsics(whole: CameraFile, part: CameraFile | ViewFile) -> Intrinsics:
+    """Of the camera, of one view or of depth, pixel centres at +0.5."""
+    shift, size = 0.5 - float(whole.pixel_centre), part if isinstance(part, DepthFile) else whole
+    numbers = {"fx": part.fx, "fy": part.fy, "cx": part.cx + shift, "cy": part.cy + shift}
+    return Intrinsics(width=size.width, height=size.height, **numbers)
 
 
 def _read_json(path: Path, model: type[Model]) -> Model:
@@ -211,25 +330,32 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _read_image(folder: CaptureFolder, name: str, flags: int, dtype: type, optional: bool = False) -> NDArray | None:
-    path = folder.path / name
-    if not path.exists():
-        if optional:
-            return None
-        raise CaptureError("missing", f"{folder.path} has no {name}")
+def _read_image(folder: CaptureFolder, kind: str, number: int, flags: int) -> NDArray | None:
+    """Of colour or a mask, None where the view has none."""
+    path = folder.file(kind, number)
+    if path is None:
+        return None
+    ndim = 3 if flags == cv2.IMREAD_COLOR_RGB else 2
+    return _checked(folder, path, _decoded(path, flags | cv2.IMREAD_IGNORE_ORIENTATION), np.uint8, ndim)
+
+
+def _decoded(path: Path, flags: int) -> NDArray:
     image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), flags)
     if image is None:
         raise CaptureError("unreadable", f"{path} is no image that can be read: take it out, or copy it again")
-    k = folder.camera.intrinsics
-    if (
-        image.dtype != dtype
-        or image.shape[:2] != (k.height, k.width)
-        or image.ndim != (3 if flags == cv2.IMREAD_COLOR_RGB else 2)
-    ):
+    return image
+
+
+def _checked(folder: CaptureFolder, path: Path, image: NDArray, dtype: type, ndim: int) -> NDArray:
+    k = folder.stored
+    if image.dtype != dtype or image.shape[:2] != (k.height, k.width) or image.ndim != ndim:
         kind = (
             f"{image.shape[1]} x {image.shape[0]} of {image.dtype}, {1 if image.ndim == 2 else image.shape[2]} channels"
         )
-        raise CaptureError("size", f"{path} is {kind}, and camera.json says {k.width} x {k.height} ({np.dtype(dtype)})")
+        told = " (another size of depth: describe depth_camera)" if dtype is np.uint16 and image.dtype == dtype else ""
+        raise CaptureError(
+            "size", f"{path} is {kind}, and camera.json says {k.width} x {k.height} ({np.dtype(dtype)}){told}"
+        )
     return image
 
 

@@ -1,6 +1,7 @@
-"""From an Azure Kinect recording to the folder of a capture: frames paired, chosen and registered."""
+"""From a recording of any format to the folder of a capture: frames paired, chosen and registered."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -10,24 +11,64 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import shortest_path
 
 from schemas.base import Array
-from schemas.capture import CapturedView
+from schemas.capture import CapturedView, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
+from schemas.scene.view import Intrinsics
 from workers.capture.folder import CaptureFile, write_description, write_view
-from workers.capture.recording import (
-    DEPTH_FORMAT,
-    DEPTH_UNITS_PER_M,
-    DeviceCalibration,
-    Recording,
-    decode_color,
-    decode_depth,
-    decode_gray,
-    is_whole,
-    open_recording,
-    read_calibration,
-    read_frames,
-)
+from workers.capture.pictures import PictureError, change_camera
+from workers.capture.readers.bags import is_bag, open_bag
+from workers.capture.readers.folders import FOLDERS
+from workers.capture.recording import is_kinect, open_kinect
 from workers.geometry.zbuffer import register_depth
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One format: its name, whether a path is of it by a glance, and what opens it (raises CaptureError)."""
+
+    name: str
+    sniff: Callable[[Path], bool]
+    open: Callable[[Path], Recorded]
+
+
+READERS = (
+    Reader("an Azure Kinect recording (.mkv)", is_kinect, open_kinect),
+    Reader("a ROS bag of a RealSense (.bag)", is_bag, open_bag),
+    *(Reader(name, *row) for name, row in FOLDERS.items()),
+)
+"""Formats that are read, in the order in which they are tried."""
+
+NOT_READ = {
+    b"SQLite format 3": "a ROS 2 bag: convert it (rosbags-convert) to a ROS 1 .bag, or export its frames",
+    b"\x89MCAP": "an MCAP file: convert it (rosbags-convert) to a ROS 1 .bag, or export its frames",
+    b"\0\0\0": "a video alone: depth is in other files, import the folder that holds both",
+}
+"""First bytes of formats that are known, and not read."""
+
+
+def open_any(path: Path) -> Recorded:
+    """The recording at a path. Raises CaptureError that names the formats that are read."""
+    if not path.exists():
+        raise CaptureError("missing", f"{path}: no such file or folder")
+    if path.is_file() and path.stat().st_size == 0:
+        raise CaptureError("empty", f"{path} has no bytes: copy it again")
+    try:
+        for reader in READERS:
+            if reader.sniff(path):
+                return reader.open(path)
+        head = b""
+        if path.is_file():
+            with open(path, "rb") as stream:
+                head = stream.read(16)
+    except PictureError as error:
+        raise CaptureError("unreadable", f"{path} {error}") from error
+    except OSError as error:
+        raise CaptureError("unreadable", f"{path} cannot be read: {error.strerror or error}") from error
+    told = next((f"{path} is {what}" for start, what in NOT_READ.items() if head.startswith(start)), "")
+    known = "; ".join(reader.name for reader in READERS)
+    raise CaptureError("format", told or f"{path} is none of the formats that are read: {known}")
+
 
 Stamps = NDArray[np.int64]
 
@@ -199,8 +240,7 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
     The images keep the lens of the colour camera, which camera.json has. What describes the folder is written last, so that a
     folder that was left half-made is not taken for a capture. Raises CaptureError for a recording that cannot be used.
     """
-    recording = open_recording(path)
-    device = _read_device(recording)
+    recording = open_any(path)
     color_us, measures, depth_us, damaged = _measure(recording)
     pairs = pair_frames(color_us, depth_us, recording.period_us, recording.depth_delay_us)
     if not pairs:
@@ -215,77 +255,72 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
     made = tuple(
         ImportedView(n, int(color_us[i]), int(depth_us[pairs[i]]), measures[i].sharpness) for n, i in enumerate(chosen)
     )
-    _write_views(recording, device, made, out)
+    _write_views(recording, made, out)
     told = {
         "recording": path.name,
-        "serial_number": recording.serial_number,
-        "depth_mode": recording.depth_mode,
+        **recording.told,
         "losses": asdict(losses),
         "views": [asdict(view) for view in made],
     }
     (out / RECORDING_FILE).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-    write_description(out, about, device.color, board)
+    write_description(out, about, recording.color, board)
     return Imported(made, len(pairs), losses)
 
 
-def _read_device(recording: Recording) -> DeviceCalibration:
-    """The recording's cameras. Raises CaptureError that names the file."""
-    path = recording.path
-    try:
-        device = read_calibration(recording.calibration, recording.color_size, recording.depth_mode)
-    except CaptureError as error:
-        raise CaptureError(error.reason, f"{path}: {error.detail}") from error
-    size = (device.depth.intrinsics.width, device.depth.intrinsics.height)
-    if recording.depth_size != size:
-        raise CaptureError(
-            "mode", f"{path}: depth is {recording.depth_size}, and the mode {recording.depth_mode} has {size}"
-        )
-    return device
-
-
-def _measure(recording: Recording) -> tuple[Stamps, list[FrameMeasure], Stamps, int]:
+def _measure(recording: Recorded) -> tuple[Stamps, list[FrameMeasure], Stamps, int]:
     """(stamps and measures of the colour frames that can be used, stamps of depth frames, damaged frames), read once."""
     color: dict[int, FrameMeasure] = {}
     depth: set[int] = set()
     damaged = 0
-    for frame in read_frames(recording):
-        if frame.is_depth:
-            if is_whole(frame.data, DEPTH_FORMAT, recording.depth_size):
-                depth.add(frame.stamp_us)
-            continue
-        whole = is_whole(frame.data, recording.color_format, recording.color_size)
-        gray = decode_gray(frame.data, recording.color_format, recording.color_size) if whole else None
-        if gray is None:
+    for frame in recording.frames():
+        image = _load(recording, frame, True)
+        if frame.is_depth and image is not None:
+            depth.add(frame.stamp_us)
+        elif image is not None:
+            color[frame.stamp_us] = measure_frame(image)
+        elif not frame.is_depth:
             damaged += 1
-        else:
-            color[frame.stamp_us] = measure_frame(gray)
     stamps = sorted(color)
     return np.array(stamps, np.int64), [color[t] for t in stamps], np.array(sorted(depth), np.int64), damaged
 
 
-def _write_views(recording: Recording, device: DeviceCalibration, views: tuple[ImportedView, ...], out: Path) -> None:
+def _load(recording: Recorded, frame: RecordedFrame, small: bool) -> NDArray | None:
+    try:
+        return frame.load(small)
+    except PictureError as error:
+        what = "depth" if frame.is_depth else "colour"
+        told = f"{recording.path}: {what} at {frame.stamp_us / 1e6:.3f} s {error}"
+        raise CaptureError("unreadable", told) from error
+
+
+def _write_views(recording: Recorded, views: tuple[ImportedView, ...], out: Path) -> None:
     """Reads the recording again and writes the chosen frames; a view is written as soon as both its frames are there."""
     color = {view.color_us: [view] for view in views}
     depth: dict[int, list[ImportedView]] = {}
     for view in views:
         depth.setdefault(view.depth_us, []).append(view)
-    half: dict[int, bytes] = {}
-    for frame in read_frames(recording):
-        waiting = (depth if frame.is_depth else color).get(frame.stamp_us, [])
-        for view in waiting:
-            if view.number not in half:
-                half[view.number] = frame.data
-                continue
-            other = half.pop(view.number)
-            pair = (other, frame.data) if frame.is_depth else (frame.data, other)
-            write_view(out, _view(recording, device, view.number, *pair))
+    half: dict[int, RecordedFrame] = {}
+    for frame in recording.frames():
+        for view in (depth if frame.is_depth else color).get(frame.stamp_us, []):
+            other = half.setdefault(view.number, frame)
+            if other.is_depth != frame.is_depth:
+                pair = (other, frame) if frame.is_depth else (frame, other)
+                write_view(out, _view(recording, view.number, *pair))
+                del half[view.number]
 
 
-def _view(recording: Recording, device: DeviceCalibration, number: int, color: bytes, depth: bytes) -> CapturedView:
-    rgb = decode_color(color, recording.color_format, recording.color_size)
-    if rgb is None:
+def _view(recording: Recorded, number: int, color: RecordedFrame, depth: RecordedFrame) -> CapturedView:
+    """Both images in the recording's colour camera."""
+    rgb, depth_m = _load(recording, color, False), _load(recording, depth, False)
+    if rgb is None or depth_m is None:
         raise CaptureError("unreadable", f"{recording.path}: the colour frame of view {number} cannot be decoded")
-    depth_m = decode_depth(depth, recording.depth_size) / DEPTH_UNITS_PER_M
-    seen = register_depth(depth_m, device.depth, device.color.intrinsics, device.color.lens)
-    units = np.rint(seen * DEPTH_UNITS_PER_M)  # depth beyond what 16 bits hold is none
+    common, units_per_m = recording.color, recording.color.depth_units_per_m
+    own = color.camera if isinstance(color.camera, Intrinsics) else common.intrinsics
+    camera = depth.camera if isinstance(depth.camera, DepthCamera) else recording.depth
+    if camera is None:
+        depth_m = change_camera(depth_m, own, common.intrinsics, between=False)
+    else:
+        depth_m = register_depth(depth_m, camera, common.intrinsics, common.lens)
+    units = np.rint(depth_m * units_per_m)  # depth beyond what 16 bits hold is none
+    rgb = change_camera(rgb, own, common.intrinsics, between=True)
     return CapturedView(number, rgb, np.where(units < 65536.0, units, 0.0).astype(np.uint16), None)

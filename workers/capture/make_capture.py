@@ -1,5 +1,6 @@
 """One capture from its id to what is written: the list of steps."""
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -82,8 +83,10 @@ def board_asset(board: Board, settings: Assets) -> Asset:
     x, y = 0.5 * board.scale * board.width_m, 0.5 * board.scale * board.height_m
     corners = frozen_array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
     shape = Shape((Part("board", corners, frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)),))
-    size = f"{board.columns}x{board.rows}-{1e3 * board.scale * board.marker_m:g}mm"
-    names = CaptureNames(f"{board.dictionary}-{size}-from-{board.first_id}", BOARD, "CC0-1.0", BOARD)
+    size = f"{board.columns}x{board.rows}-{1e3 * board.scale * board.marker_m:g}mm-from-{board.first_id}"
+    if board.markers:
+        size = f"{len(board.markers)}-markers-{hashlib.sha256(board.model_dump_json().encode()).hexdigest()[:8]}"
+    names = CaptureNames(f"{board.dictionary}-{size}", BOARD, "CC0-1.0", BOARD)
     return _asset(names, shape, settings, frozen_array(np.eye(4)), ("its markers are not drawn",))
 
 

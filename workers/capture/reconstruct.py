@@ -136,7 +136,7 @@ def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedVie
 def read_used(given: Given, estimate: CaptureEstimate) -> Iterator[PosedView]:
     """The used views that have a depth image with anything in it, in order."""
     for view in estimate.used:
-        if (given.folder.path / f"depth_{view.number:05d}.png").exists():
+        if given.folder.file("depth", view.number) is not None:
             posed = read_posed(given, estimate, view.number)
             if posed.depth_m.any():
                 yield posed

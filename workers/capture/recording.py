@@ -10,6 +10,7 @@ intrinsic_transformation.c): principal point and focal lengths are shares of the
 upper left corner of the image; Rt takes points of the rig to points of the camera, metres; the lens is OpenCV's rational model.
 """
 
+import functools
 import json
 import re
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.base import Pose, frozen_array
-from schemas.capture import CaptureCamera, DepthCamera
+from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
 from workers.geometry.frames import invert, pose
@@ -215,6 +216,46 @@ def _calibration(path: Path, container: InputContainer) -> bytes:
         f"{path} has no attachment calibration.json, without which depth cannot be brought into the colour camera "
         f"(tools that cut or convert files drop it): {AS_RECORDED}, {PLACES}",
     )
+
+
+def is_kinect(path: Path) -> bool:
+    """Whether a file is Matroska, by its first bytes or its name."""
+    if not path.is_file() or path.suffix.lower() == ".mkv":
+        return path.is_file()
+    with open(path, "rb") as stream:
+        return stream.read(4) == b"\x1a\x45\xdf\xa3"
+
+
+def open_kinect(path: Path) -> Recorded:
+    """A recording with its calibration. Raises CaptureError that names the file."""
+    recording = open_recording(path)
+    try:
+        device = read_calibration(recording.calibration, recording.color_size, recording.depth_mode)
+    except CaptureError as error:
+        raise CaptureError(error.reason, f"{path}: {error.detail}") from error
+    size = (device.depth.intrinsics.width, device.depth.intrinsics.height)
+    if recording.depth_size != size:
+        raise CaptureError(
+            "mode", f"{path}: depth is {recording.depth_size}, and the mode {recording.depth_mode} has {size}"
+        )
+
+    def frames() -> Iterator[RecordedFrame]:
+        for frame in read_frames(recording):
+            yield RecordedFrame(frame.is_depth, frame.stamp_us, functools.partial(_load, recording, frame))
+
+    told = {"serial_number": recording.serial_number, "depth_mode": recording.depth_mode}
+    clock = (recording.period_us, frames, recording.duration_us, recording.depth_delay_us)
+    return Recorded(path, device.color, device.depth, *clock, told)
+
+
+def _load(recording: Recording, frame: TrackFrame, small: bool) -> NDArray | None:
+    """As `RecordedFrame.load`."""
+    if frame.is_depth:
+        whole = is_whole(frame.data, DEPTH_FORMAT, recording.depth_size)
+        return decode_depth(frame.data, recording.depth_size) / DEPTH_UNITS_PER_M if whole else None
+    decode = decode_gray if small else decode_color
+    whole = is_whole(frame.data, recording.color_format, recording.color_size)
+    return decode(frame.data, recording.color_format, recording.color_size) if whole else None
 
 
 DEPTH_UNITS_PER_M = 1000.0

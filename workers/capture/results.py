@@ -27,7 +27,7 @@ from schemas.errors import AssetSourceError, CaptureError
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.assets.external.listing import Watch, ignore
-from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, TRUTH
+from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW, TRUTH
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
@@ -133,9 +133,6 @@ def _digest_of(file: Path) -> str | None:
         return None
 
 
-_IMAGE = re.compile(r"(?:rgb|depth|mask)_[0-9]{5,9}\.png|(?:board|correction)_[0-9]{5,9}\.txt")
-
-
 def list_inputs(path: Path) -> list[Path]:
     """Every file that decides the result, sorted by name: descriptions, images, corrections, truth, a dictionary of markers.
 
@@ -163,7 +160,7 @@ def digest_inputs(path: Path) -> str:
 
 
 def _is_input(name: str) -> bool:
-    return name in (CAMERA_FILE, BOARD_FILE, CAPTURE_FILE) or _IMAGE.fullmatch(name) is not None
+    return name in (CAMERA_FILE, BOARD_FILE, CAPTURE_FILE) or FILE_OF_VIEW.fullmatch(name) is not None
 
 
 def _dictionary(path: Path) -> Iterator[Path]:

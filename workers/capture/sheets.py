@@ -14,7 +14,7 @@ from reportlab.pdfgen.canvas import Canvas
 from schemas.base import Array
 from schemas.errors import InputError
 from schemas.job.captures import Board
-from workers.capture.board import PrintLayout, Words, lay_out_print, marker_cells, nominal
+from workers.capture.board import PrintLayout, Words, board_geometry, lay_out_print, marker_cells, upright
 
 MOST_PIXELS = 400_000_000
 """Of a picture: more would not fit into the memory of a small machine."""
@@ -56,10 +56,14 @@ def _light_of_markers(board: Board, size_m: tuple[float, float], px_per_m: float
     """[H, W] float64: the white share of each pixel of a sheet of a size, with the markers in its middle."""
     width, height = (math.ceil(size * px_per_m - 1e-6) for size in size_m)
     light: Array = np.ones((height, width))
-    for cells, corners in zip(marker_cells(board), nominal(board), strict=True):
-        edges = np.linspace(0.0, board.marker_m, len(cells) + 1)
-        across, column = _cover((corners[0, 0] + 0.5 * size_m[0] + edges) * px_per_m, width)
-        down, row = _cover((0.5 * size_m[1] - corners[0, 1] + edges) * px_per_m, height)
+    geometry = board_geometry(board.model_copy(update={"measured_ruler_m": None}))
+    plain = np.ones((1, 1), np.bool_)
+    printed = [*zip(marker_cells(board), geometry.corners, strict=True), *((plain, quad) for quad in geometry.squares)]
+    for black, corners in printed:
+        cells, left, top, side = upright(black, corners)
+        edges = np.linspace(0.0, side, len(cells) + 1)
+        across, column = _cover((left + 0.5 * size_m[0] + edges) * px_per_m, width)
+        down, row = _cover((0.5 * size_m[1] - top + edges) * px_per_m, height)
         light[row : row + len(down), column : column + len(across)] -= down @ cells.astype(np.float64) @ across.T
     return light
 
@@ -125,7 +129,12 @@ def board_pdf(board: Board) -> bytes:
 
 
 def tiled_pdf(board: Board) -> bytes:
-    """PDF bytes: A4 pages of the same sheet, row by row, with lines to cut along and the place of each page."""
+    """PDF bytes: A4 pages of the same sheet, row by row, with lines to cut along and the place of each page.
+
+    Raises InputError for a board that is no grid: seams would cut its markers.
+    """
+    if board.markers:
+        raise InputError(f"a board of {board.words} has no gaps to cut along: print it on one sheet, without --tiles")
     layout = lay_out_print(board)
     page, tiles = tile_sheet(board, layout)
     stream, canvas = _canvas(board, page)

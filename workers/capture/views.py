@@ -44,7 +44,7 @@ class CaptureViews:
         self.cameras = {
             view.number: view.T_board_cam @ self.estimate.depth.T_cam_depth
             for view in self.estimate.used
-            if view.T_board_cam is not None and (self.folder.path / f"depth_{view.number:05d}.png").exists()
+            if view.T_board_cam is not None and self.folder.file("depth", view.number) is not None
         }
         """T_board_depth [4, 4] of the views that can be sources."""
 

@@ -63,7 +63,11 @@ def test_board_writes_the_sheet_that_was_asked_for_or_says_why_not(run, tmp_path
     wrong.write_text('{"columns": 30}')
     assert "3 x 3 markers" in run("board", tmp_path / "own.pdf", "--board", own)[1]
     for words, refusal, told in (
-        ((tmp_path / "b.jpg",), InputError, "ends in"),
+        ((tmp_path / "b.jpg",), InputError, "ends in .pdf, .png or .json"),
+        ((tmp_path / "k.pdf", "--kind", "charuco", "--size", "8x6"), InputError, "--kind charuco needs --marker"),
+        ((tmp_path / "k.pdf", "--marker", "0.03"), InputError, "add --kind grid"),
+        ((tmp_path / "k.pdf", "--kind", "grid", "--from", own), InputError, "--from and --kind are two boards"),
+        ((tmp_path / "k.pdf", "--from", own), InputError, "describes no board that is known"),
         ((tmp_path / "b",), InputError, "ends in"),
         ((tmp_path / "b.png", "--tiles", "a4"), InputError, "ends in"),
         ((tmp_path / "x.pdf", "--board", wrong), CaptureError, "wrong.json"),
@@ -73,6 +77,27 @@ def test_board_writes_the_sheet_that_was_asked_for_or_says_why_not(run, tmp_path
     ):
         code, _, err, _ = run("board", *words)
         assert code == refusal.exit_code and told in err and not words[0].exists()
+
+
+def test_a_board_of_any_kind_is_printed_or_described_and_read_again(run, tmp_path):
+    target = tmp_path / "target.yaml"
+    target.write_text("target_type: aprilgrid\ntagCols: 4\ntagRows: 3\ntagSize: 0.05\ntagSpacing: 0.3\n")
+    code, _, _, answer = run("board", tmp_path / "april.json", "--from", target, "--json")
+    april = read_board(tmp_path / "april.json")
+    assert code == 0 and len(april.markers) == 12 and april.border_bits == 2 and april.measured_ruler_m is None
+    assert "file" not in answer and answer["board"]["dictionary"] == "DICT_APRILTAG_36h11"
+    sizes = ("--size", "4x3", "--marker", "0.05", "--pitch", "0.065")
+    assert run("board", tmp_path / "same.pdf", "--kind", "aprilgrid", *sizes)[0] == 0
+    assert read_board(tmp_path / "same.json").model_copy(update={"measured_ruler_m": None}) == april
+    assert (
+        run("board", tmp_path / "grid.png", "--kind", "grid", *sizes, "--dictionary", "DICT_4X4_100", "--dpi", 50)[0]
+        == 0
+    )
+    assert read_board(tmp_path / "grid.json").gap_m == pytest.approx(0.015)
+    for wrong in (("--size", "8by6"), ("--size", "0x6"), ("--marker", "nan"), ("--pitch", "0"), ("--kind", "dots")):
+        with pytest.raises(SystemExit) as stopped:
+            run("board", tmp_path / "k.pdf", *wrong)
+        assert stopped.value.code == 2
 
 
 SMALL = ("--set", "captures.simulate.image_scale=0.1")
@@ -116,7 +141,7 @@ def test_import_writes_a_capture_and_tells_what_is_lost(run, tmp_path):
     data = recording(3)
     saved.write_bytes(data)
     code, told, _, answer = run("import", saved, "--out", out, "--frames", 2, "--category", "mug", "--json")
-    assert code == 0 and "default board (7 x 5, DICT_4X4_50)" in told
+    assert code == 0 and "default board (7 x 5 markers, DICT_4X4_50)" in told
     assert (answer["frames"], len(answer["views"]), answer["notes"], answer["default_board"]) == (3, 2, [], True)
     folder = open_folder(out)
     assert (folder.about.name, folder.about.category, folder.numbers) == ("my_mug", "mug", (0, 1))

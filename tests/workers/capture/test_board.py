@@ -1,6 +1,7 @@
 """The marker board: its layout against OpenCV's, the sheet that is printed, and the body that is simulated."""
 
 import io
+import itertools
 import re
 
 import cv2
@@ -10,10 +11,21 @@ import trimesh
 from PIL import Image
 
 from schemas.errors import CaptureError, InputError
-from schemas.job.captures import Board
-from workers.capture.board import frame_in_board, lay_out_print, marker_cells, marker_corners, nominal, open_dictionary
+from schemas.job.captures import GRID_KEYS, Board
+from workers.capture.board import (
+    board_geometry,
+    frame_in_board,
+    lay_out_print,
+    marker_cells,
+    marker_corners,
+    nominal,
+    open_dictionary,
+)
+from workers.capture.board_kinds import KINDS, BoardSizes, read_board_file
+from workers.capture.detect import detect_markers
 from workers.capture.sheets import A4_M, EDGE_M, OVERLAP_M, board_pdf, board_png, tile_sheet, tiled_pdf
 from workers.capture.simulate.photograph import THICKNESS_M, board_body
+from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import transform
 
 BOARD = Board()
@@ -35,6 +47,159 @@ def test_opencvs_own_board_lies_on_ours():
         assert old[:3, 3] == pytest.approx(ours.reshape(-1, 3).min(axis=0)) and np.array_equal(old[:3, :3], np.eye(3))
     assert marker_corners(BOARD)[0, 0] == pytest.approx([-0.27, 0.19, 0.0])
     assert marker_corners(Board(measured_ruler_m=0.204)) == pytest.approx(marker_corners(BOARD) * 1.02)
+
+
+def test_opencvs_charuco_boards_lie_on_ours_in_both_patterns():
+    """Markers, ids and the chessboard's corners are OpenCV's, whose frame has its origin at the top left and y down."""
+    for (columns, rows), old in itertools.product([(7, 5), (8, 6), (5, 8)], [False, True]):
+        board = KINDS["charuco_old" if old else "charuco"](BoardSizes(columns, rows, 0.03, 0.04, "DICT_5X5_100"))
+        theirs = cv2.aruco.CharucoBoard((columns, rows), 0.04, 0.03, open_dictionary(board))
+        theirs.setLegacyPattern(old)
+        geometry, T = board_geometry(board), frame_in_board(board, "opencv")
+        assert geometry.ids.tolist() == theirs.getIds().ravel().tolist() and not geometry.touching
+        ours = transform(T, np.array(theirs.getObjPoints(), np.float64).reshape(-1, 3))
+        assert geometry.corners.reshape(-1, 3) == pytest.approx(ours, abs=1e-7)
+        chess = transform(T, np.array(theirs.getChessboardCorners(), np.float64))
+        apart = np.linalg.norm(geometry.chess[:, None] - chess, axis=2)
+        assert len(chess) == len(geometry.chess) == (columns - 1) * (rows - 1) and apart.min(axis=1).max() < 2e-7
+        assert np.abs(geometry.chess_free_m - 0.005).max() < 1e-6  # the white about a marker
+        assert read_again(board) == board
+
+
+def read_again(board):
+    return Board.model_validate_json(board.model_dump_json())
+
+
+def test_a_grid_written_marker_by_marker_is_the_same_board():
+    """One mechanism: neighbours, corners and frames of a list are those of the grid; and a grid is written as it always was."""
+    grid = Board(columns=4, rows=3, first_id=5, measured_ruler_m=0.21)
+    markers = [{"id": 5 + n, "corners": quad} for n, quad in enumerate(nominal(grid).tolist())]
+    listed = Board.model_validate({"markers": markers[::-1], "measured_ruler_m": 0.21})
+    one, other = board_geometry(grid), board_geometry(listed)
+    for name in ("ids", "corners", "right", "below"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name)), name
+    assert one.right.reshape(3, 4).tolist() == [[1, 2, 3, -1], [5, 6, 7, -1], [9, 10, 11, -1]]
+    assert one.below.reshape(3, 4).tolist() == [[4, 5, 6, 7], [8, 9, 10, 11], [-1] * 4]
+    for frame in ("centre", "opencv", "opencv_old"):
+        assert frame_in_board(grid, frame) == pytest.approx(frame_in_board(listed, frame))
+    assert read_again(listed) == listed and set(listed.model_dump()) & set(GRID_KEYS) == set()
+    first_keys = "dictionary columns rows marker_m gap_m width_m height_m first_id ruler_m measured_ruler_m"
+    assert list(grid.model_dump()) == first_keys.split()
+    stands = [{"id": 0, "corners": [[0, 0, 0.1], [0.1, 0, 0.1], [0.1, 0, 0], [0, 0, 0]]}]
+    with pytest.raises(CaptureError, match="frame opencv is of a flat board"):
+        frame_in_board(Board.model_validate({"markers": stands}), "opencv")
+    with pytest.raises(InputError, match="turned, or not in the plane"):
+        lay_out_print(Board.model_validate({"markers": stands}))
+    with pytest.raises(InputError, match="without --tiles"):
+        tiled_pdf(listed)
+
+
+CODES = (0xD5D628584, 0xD97F18B49, 0xDD280910E, 0xE479E9C98)
+"""The first four of the family tag36h11, as the AprilTag library publishes them: 36 bits, row by row, 1 for white."""
+TAG_PX, GAP_PX = 200, 60
+
+
+def kalibrs_picture():
+    """2 x 2 tags drawn by Kalibr's rules: upright, border of two bits, id 0 at the lower left, squares at all corners."""
+    picture = np.full((2 * TAG_PX + 5 * GAP_PX,) * 2, 255, np.uint8)
+    for number, code in enumerate(CODES):
+        bits = np.pad([[int(b) for b in format(code, "036b")[6 * r : 6 * r + 6]] for r in range(6)], 2)
+        x, y = 2 * GAP_PX + (number % 2) * (TAG_PX + GAP_PX), 2 * GAP_PX + (1 - number // 2) * (TAG_PX + GAP_PX)
+        picture[y : y + TAG_PX, x : x + TAG_PX] = np.kron(255 * bits, np.ones((20, 20)))
+        for u, v in itertools.product((x - GAP_PX, x + TAG_PX), (y - GAP_PX, y + TAG_PX)):
+            picture[v : v + GAP_PX, u : u + GAP_PX] = 0
+    return picture
+
+
+def test_kalibrs_grid_is_found_where_its_target_file_has_it(tmp_path):
+    (tmp_path / "target.yaml").write_text(
+        "target_type: 'aprilgrid' #gridtype\ntagCols: 2\ntagRows: 2\ntagSize: 0.1\ntagSpacing: 0.3  # ratio\n"
+    )
+    board = read_board_file(tmp_path / "target.yaml")
+    geometry, picture = board_geometry(board), kalibrs_picture()
+    assert geometry.touching and not len(geometry.chess) and len(geometry.squares) == 9
+    # Kalibr's frame: origin at the lower left corner of tag 0, y up, z out of the board; pixels from the image's edge.
+    from_kalibr = np.array([[2000.0, 0, 120], [0, -2000, 120 + 460]])
+    T_kalibr_board = np.linalg.inv(frame_in_board(board, "opencv_old"))
+    for blur_px in (0.5, 1.5):
+        light = cv2.GaussianBlur(0.02 + 0.8 * (picture / 255.0), (0, 0), blur_px)
+        blurred = np.rint(255 * encode_srgb(light)).astype(np.uint8)
+        found = detect_markers(np.repeat(blurred[..., None], 3, 2), board, open_dictionary(board))
+        assert found.ids.tolist() == [0, 1, 2, 3] and not found.dropped
+        points = transform(T_kalibr_board, geometry.corners.reshape(-1, 3))
+        expected = points[:, :2] @ from_kalibr[:, :2].T + from_kalibr[:, 2]
+        assert np.abs(found.corners_px.reshape(-1, 2) - expected).max() < 0.05
+    ours = Image.open(io.BytesIO(board_png(board, 254.0)))  # and our print is Kalibr's
+    bits = np.asarray(ours.resize((ours.width // 50, ours.height // 50), Image.Resampling.BOX)) < 128
+    theirs = picture[GAP_PX:-GAP_PX, GAP_PX:-GAP_PX][5::10, 5::10] < 128
+    top, left = (n // 2 - m // 2 for n, m in zip(bits.shape, theirs.shape, strict=True))
+    assert (bits[top : top + len(theirs), left : left + len(theirs)] == theirs).mean() > 0.99
+
+
+def test_boards_of_other_programs_are_read_from_their_own_files(tmp_path):
+    """A bundle's tags have their frame x to the right of the upright tag, y up, z out; the others list corners or sizes."""
+
+    def read(name, text):
+        (tmp_path / name).write_text(text)
+        return read_board_file(tmp_path / name)
+
+    turned = "qw: 0.7071068, qx: 0.7071068, qy: 0, qz: 0"  # about x by a quarter: y of the tag is z, its print faces -y
+    bundle = f"""tag_family: tag36h11
+tag_border: 1
+standalone_tags: []
+tag_bundles:
+  [{{name: 'b', layout: [{{id: 2, size: 0.04, x: 0.1, y: 0.2, z: 0.05, {turned}}}, {{id: 0, size: 0.06, x: 0, y: 0, z: 0}}]}}]
+"""
+    board = read("tags.yaml", bundle)
+    geometry = board_geometry(board)
+    assert board.dictionary == "DICT_APRILTAG_36h11" and geometry.ids.tolist() == [0, 2] and board.border_bits == 1
+    # The upright tag's corners from the upper left, clockwise; OpenCV's picture begins at the opposite one.
+    upright = np.array([[-0.03, 0.03, 0], [0.03, 0.03, 0], [0.03, -0.03, 0], [-0.03, -0.03, 0]])
+    assert geometry.corners[0] == pytest.approx(upright[[2, 3, 0, 1]])
+    stands = np.array([[0.08, 0.2, 0.07], [0.12, 0.2, 0.07], [0.12, 0.2, 0.03], [0.08, 0.2, 0.03]])
+    assert geometry.corners[1] == pytest.approx(stands[[2, 3, 0, 1]], abs=1e-7)
+    file = cv2.FileStorage(str(tmp_path / "map.yml"), cv2.FILE_STORAGE_WRITE)
+    file.write("aruco_bc_dict", "ARUCO_MIP_36h12")
+    file.write("aruco_bc_mInfoType", 1)
+    file.startWriteStruct("aruco_bc_markers", cv2.FILE_NODE_SEQ)
+    file.startWriteStruct("", cv2.FILE_NODE_MAP | cv2.FILE_NODE_FLOW)
+    file.write("id", 17)
+    file.startWriteStruct("corners", cv2.FILE_NODE_SEQ | cv2.FILE_NODE_FLOW)
+    for x, y in upright[:, :2]:
+        file.startWriteStruct("", cv2.FILE_NODE_SEQ | cv2.FILE_NODE_FLOW)
+        for value in (x, y, 0.0):
+            file.write("", value)
+        file.endWriteStruct()
+    for _ in range(3):
+        file.endWriteStruct()
+    file.release()
+    mapped = read_board_file(tmp_path / "map.yml")
+    assert mapped.markers[0].id == 17 and np.array(mapped.markers[0].corners) == pytest.approx(upright)
+    keys = {"BoardSize_Width": 7, "BoardSize_Height": 5, "Square_Size": 40, "Marker_Size": 30}
+    words = "".join(f"<{name}>{value}</{name}>" for name, value in keys.items())
+    words += '<Calibrate_Pattern>"CHARUCOBOARD"</Calibrate_Pattern><ArUco_Dict_Name>DICT_5X5_100</ArUco_Dict_Name>'
+    xml = f'<?xml version="1.0"?><opencv_storage><Settings>{words}</Settings></opencv_storage>'
+    assert read("vid.xml", xml) == KINDS["charuco"](BoardSizes(8, 6, 0.03, 0.04, "DICT_5X5_100"))
+    for text, told in (
+        ("target_type: 'checkerboard'", "whose corners have no ids: aprilgrid is read"),
+        ("target_type: aprilgrid\ntagCols: 2", "has no 'tagSize'"),
+        ("target_type: aprilgrid\ntagCols: 2\ntagRows: 2\ntagSize: .nan\ntagSpacing: 0.3", "cannot be"),
+        (
+            "target_type: aprilgrid\ntagCols: 2\ntagRows: 2\ntagSize: 0.1\ntagSpacing: 0.3\ntagFamily: t25h7",
+            "no dictionary",
+        ),
+        (bundle.replace("0.7071068", "0.5"), "quaternion of tag 2 has not length 1"),
+        ("standalone_tags: [{id: 1, size: 0.1}, {id: 2, size: 0.1}]", "2 tags that stand alone"),
+        ("aruco_bc_mInfoType: 0\naruco_bc_markers: []", "its lengths are pixels"),
+        (xml.replace("CHARUCOBOARD", "CHESSBOARD"), "CHARUCOBOARD is read"),
+        (xml.replace(">40<", ">0.04<"), "in millimetres"),
+        (xml.replace(">30<", ">50<"), "make the squares larger than the markers"),
+        ("target_type: &a [1, 2]\nb: *a", "describes no board"),
+        ("\0\1\2", "describes no board"),
+        ("[" * 5000, "describes no board"),
+    ):
+        with pytest.raises(InputError, match=told):
+            read("x.yaml", text)
 
 
 def test_dictionary_that_does_not_exist_or_is_too_small_is_refused():
@@ -84,7 +249,10 @@ def test_a_sheet_is_wide_enough_for_its_ruler_or_refused():
         board_png(BOARD, 10_000.0)
 
 
-@pytest.mark.parametrize(("board", "dpi"), [(BOARD, 40.0), (SMALL, 101.6)])
+CHARUCO = KINDS["charuco"](BoardSizes(6, 5, 0.03, 0.04, "DICT_5X5_100"))
+
+
+@pytest.mark.parametrize(("board", "dpi"), [(BOARD, 40.0), (SMALL, 101.6), (CHARUCO, 101.6)])
 def test_every_marker_of_the_png_is_found_where_the_layout_has_it(board, dpi):
     image = Image.open(io.BytesIO(board_png(board, dpi)))
     assert image.info["dpi"][0] == pytest.approx(dpi, abs=0.02)
@@ -93,9 +261,9 @@ def test_every_marker_of_the_png_is_found_where_the_layout_has_it(board, dpi):
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     corners, ids, _ = cv2.aruco.ArucoDetector(open_dictionary(board), parameters).detectMarkers(np.asarray(image))
-    assert sorted(ids.ravel()) == list(range(board.first_id, board.first_id + board.columns * board.rows))
+    assert sorted(ids.ravel()) == board_geometry(board).ids.tolist()
     for found, number in zip(corners, ids.ravel(), strict=True):
-        true = nominal(board)[int(number) - board.first_id, :, :2]
+        true = nominal(board)[board_geometry(board).index(int(number)), :, :2]
         pixels = (true * [1, -1] + [0.5 * layout.width_m, 0.5 * layout.height_m]) * px_per_m
         assert np.abs(found[0] + 0.5 - pixels).max() < 0.2
 

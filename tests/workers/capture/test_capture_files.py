@@ -1,16 +1,18 @@
 """Files of a capture: the user's folder, what processing writes beside it, and the truth of a simulation, read and refused."""
 
+import io
 import json
 import os
 
 import cv2
+import lzfse
 import numpy as np
 import pytest
 import trimesh
 
 from schemas.capture import CaptureCamera, CapturedView, CaptureTruth
 from schemas.errors import CaptureError
-from schemas.job.captures import Board
+from schemas.job.captures import GRID_KEYS, Board
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
 from workers.capture.folder import (
@@ -51,6 +53,9 @@ NORMALS = POINTS / np.linalg.norm(POINTS, axis=1)[:, None]
 COLORS = RNG.integers(0, 256, (50, 3)).astype(np.uint8)
 VIEWS = RNG.integers(1, 40, 50).astype(np.int32)
 FACES = RNG.integers(0, 50, (30, 3)).astype(np.int32)
+QUAD = [[-0.05, 0.05, 0.0], [0.05, 0.05, 0.0], [0.05, -0.05, 0.0], [-0.05, -0.05, 0.0]]
+GRIDLESS: dict[str, object] = dict.fromkeys(GRID_KEYS)
+"""Takes a grid's keys out of board.json."""
 
 
 @pytest.fixture
@@ -106,11 +111,25 @@ def test_a_wrong_or_missing_description_names_file_and_key(folder):
         ("camera.json", {"fx": float("nan")}, "camera.json is no JSON: NaN"),
         ("camera.json", {"cx": float("inf")}, "camera.json is no JSON: Infinity"),
         ("camera.json", {"pixel_centre": "1"}, "pixel_centre"),
-        ("camera.json", {"distortion": [0.0] * 9}, "distortion"),
+        ("camera.json", {"distortion": [0.0] * 9}, "distortion has 9 numbers"),
         ("camera.json", {"zoom": 2}, "zoom: Extra inputs"),
         ("board.json", {"marker_m": 0.5}, "columns|width_m is"),
         ("board.json", {"columns": "many"}, "columns"),
         ("board.json", {"measured_ruler_m": 2.0}, "measured_ruler_m over ruler_m is 10"),
+        ("board.json", {"markers": [{"id": 1, "corners": QUAD}]}, "columns is of a grid"),
+        ("board.json", {"squares": [QUAD]}, "squares stand beside markers"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD}] * 2}, "marker 1 is there twice"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[1::-1] + QUAD[2:]}]}, "marker 1.* no square"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[:1] * 4}]}, "marker 1.* no square"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[::-1]}]}, "all markers face down"),
+        ("board.json", GRIDLESS | {"markers": [{"id": 1, "corners": QUAD[:3]}]}, "markers.0.corners"),
+        ("board.json", GRIDLESS | {"markers": [{"id": -1, "corners": QUAD}]}, "markers.0.id"),
+        (
+            "board.json",
+            GRIDLESS | {"markers": [{"id": 1, "corners": QUAD}], "width_m": 0.05},
+            "marker 1 needs 0.1 about",
+        ),
+        ("board.json", {"border_bits": 0}, "border_bits"),
         ("capture.json", {"category": "../etc"}, "category"),
         ("capture.json", {"frame": "left"}, "frame"),
     ):
@@ -282,3 +301,182 @@ def test_every_byte_and_name_of_the_inputs_is_in_their_digest_and_nothing_else(f
     assert len(digests | {digest_inputs(folder)}) == 5
     with pytest.raises(CaptureError, match="nowhere"):
         digest_inputs(folder / "nowhere")
+
+
+# ---------------------------------------------------------------------------------------------- other cameras and files
+
+WIDE = Intrinsics(width=160, height=120, fx=110.0, fy=112.0, cx=81.3, cy=58.2)
+
+
+def described(path, view=None, **changes):
+    """The folder with a camera.json of WIDE and these keys, and an image of a view unless it has one."""
+    path.mkdir(exist_ok=True)
+    spec = WIDE.model_dump() | {"pixel_centre": "0.5"} | changes
+    (path / "camera.json").write_text(json.dumps(spec))
+    (path / "board.json").write_text("{}")
+    if not (path / "rgb_00000.png").exists() and not (path / "rgb_00000.jpg").exists():
+        cv2.imwrite(
+            str(path / "rgb_00000.png"), np.zeros((WIDE.height, WIDE.width, 3), np.uint8) if view is None else view
+        )
+    return open_folder(path)
+
+
+def spot(at):
+    """A picture with a blurred spot about a pixel (first centre at +0.5)."""
+    v, u = np.mgrid[: WIDE.height, : WIDE.width] + 0.5
+    light = 250 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * 2.5**2))
+    return np.repeat(np.rint(light).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def middle(rgb):
+    weight = rgb[..., 0].astype(float)
+    v, u = np.mgrid[: weight.shape[0], : weight.shape[1]] + 0.5
+    return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
+
+
+POINT = np.array([0.21, -0.14, 0.8])
+"""In camera axes, off the optical axis, so that every lens bends its ray."""
+STRAIGHT = np.array([WIDE.fx * POINT[0] / POINT[2] + WIDE.cx, WIDE.fy * POINT[1] / POINT[2] + WIDE.cy])
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("opencv", [0.3, -0.1, 5e-3, -8e-3, 0.02, 0.01, 0, 0, 0.05, -0.01, 0.04, 0.005]),
+        ("opencv", [0.3, -0.1, 5e-3, -8e-3, 0.02, 0.01, 0, 0, 0.05, -0.01, 0.04, 0.005, 0.02, -0.06]),
+        ("fisheye", [0.05, -0.02, 0.01, 0.0]),
+    ],
+)
+def test_a_lens_that_the_steps_do_not_know_is_taken_out_of_what_is_read(model, lens, tmp_path):
+    """A point's spot is drawn where OpenCV projects the point, and is read where a pinhole has it."""
+    K = np.array([[WIDE.fx, 0, WIDE.cx - 0.5], [0, WIDE.fy, WIDE.cy - 0.5], [0, 0, 1]])
+    project = cv2.fisheye.projectPoints if model == "fisheye" else cv2.projectPoints
+    zero = np.zeros(3)
+    pixels, _ = project(POINT.reshape(1, 1, 3), zero, zero, K, np.array(lens))
+    at = pixels.ravel() + 0.5
+    assert np.linalg.norm(at - STRAIGHT) > 0.8, "the lens bends enough to be told"
+    if model == "opencv":
+        shorter = {12: 8, 14: 12}[len(lens)]
+        less, _ = cv2.projectPoints(POINT.reshape(1, 1, 3), zero, zero, K, np.array(lens[:shorter]))
+        assert np.linalg.norm(less.ravel() + 0.5 - at) > 0.3, "and so do its last numbers"
+    path = tmp_path / "capture"
+    folder = described(path, spot(at), distortion=lens, lens_model=model)
+    cv2.imwrite(str(path / "mask_00000.png"), (spot(at)[..., 0] > 100).astype(np.uint8) * 255)
+    cv2.imwrite(str(path / "depth_00000.png"), np.where(spot(at)[..., 0] > 100, 800, 0).astype(np.uint16))
+    view = read_view(folder, 0)
+    assert not folder.camera.has_lens and folder.camera.intrinsics == WIDE
+    assert np.linalg.norm(middle(view.rgb) - STRAIGHT) < 0.15
+    for region in (view.mask, view.depth == 800):
+        assert np.linalg.norm(np.argwhere(region).mean(axis=0)[::-1] + 0.5 - STRAIGHT) < 0.5
+    for known in ([0.1, -0.05, 1e-3, 0], [0.1, -0.05, 1e-3, 0, 0.02], [0.1, -0.05, 1e-3, 0, 0.02, 0.01, 0, 0]):
+        kept = described(path, distortion=known)
+        assert kept.camera.lens[: len(known)].tolist() == known, "and is kept in the picture as it was"
+
+
+def test_a_view_with_intrinsics_of_its_own_is_read_as_the_others(tmp_path):
+    path = tmp_path / "capture"
+    own = {"fx": 104.0, "fy": 107.0, "cx": 79.0, "cy": 61.0}
+    at = np.array([own["fx"] * POINT[0] / POINT[2] + own["cx"], own["fy"] * POINT[1] / POINT[2] + own["cy"]])
+    folder = described(path, spot(at))
+    (path / "camera_00000.json").write_text(json.dumps(own))
+    assert np.linalg.norm(middle(read_view(folder, 0).rgb) - STRAIGHT) < 0.1
+    (path / "camera_00000.json").write_text("{}")
+    with pytest.raises(CaptureError, match=r"camera_00000\.json: fx: Field required"):
+        read_view(folder, 0)
+    (path / "camera_00000.json").rename(path / "camera_00007.json")
+    with pytest.raises(CaptureError, match=r"camera_00007 has no rgb_00007"):
+        open_folder(path)
+
+
+def test_depth_of_any_encoding_and_colour_as_jpeg_are_read(tmp_path):
+    path = tmp_path / "capture"
+    path.mkdir()
+    metres = np.round(0.5 + 2 * RNG.random((WIDE.height, WIDE.width)), 3)
+    metres[RNG.random(metres.shape) < 0.2] = 0
+    ramp = np.repeat(np.linspace(20, 200, WIDE.width).astype(np.uint8)[None, :, None], WIDE.height, 0).repeat(3, 2)
+    (path / "rgb_00000.jpg").write_bytes(cv2.imencode(".jpg", ramp)[1].tobytes())
+    folder, single = described(path), metres.astype(np.float32)
+    units = np.rint(1000 * metres).astype(np.uint16)
+    written = io.BytesIO()
+    np.save(written, single)
+    whole_numbers = io.BytesIO()
+    np.save(whole_numbers, units)
+    with_nan = single.copy()
+    with_nan[0, 0] = np.nan
+    for ending, data in (
+        ("npy", written.getvalue()),
+        ("npy", whole_numbers.getvalue()),
+        ("tif", cv2.imencode(".tiff", single)[1].tobytes()),
+        ("tiff", cv2.imencode(".tiff", units)[1].tobytes()),
+        ("depth", single.tobytes()),
+        ("depth", units.tobytes()),
+        ("depth", lzfse.compress(single.tobytes())),
+        ("depth", with_nan.tobytes()),
+    ):
+        file = path / f"depth_00000.{ending}"
+        file.write_bytes(data)
+        view = read_view(folder, 0)
+        assert view.depth.dtype == np.uint16
+        assert np.array_equal(view.depth[1:], units[1:]), ending
+        assert digest_inputs(path) and file in list_inputs(path)
+        file.unlink()
+    assert np.abs(view.rgb.astype(int) - ramp).max() <= 4  # a smooth picture through JPEG of the usual quality
+    size = f"{WIDE.width} x {WIDE.height}"
+    bomb = (
+        b"\x93NUMPY\x01\0v\0"
+        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999, 9999), }".ljust(117)
+        + b"\n"
+    )
+    objects = io.BytesIO()
+    np.save(objects, np.full((WIDE.height, WIDE.width), None), allow_pickle=True)
+    for ending, data, told in (
+        ("exr", b"v/1\x01" + bytes(100), "is OpenEXR, which is not read here: save depth as float TIFF"),
+        ("npy", bomb, "holds .99999999, 9999. of float64"),
+        ("npy", objects.getvalue(), "of object"),
+        ("npy", written.getvalue()[:200], f"its camera has {size}"),
+        ("npy", b"\x93NUMPY", "is no .npy that can be read"),
+        ("depth", bytes(77), f"has 77 bytes, and depth of {size} has 76800"),
+        ("depth", b"bvx2" + bytes(50), "compressed by LZFSE, and cut or altered"),
+        ("tif", b"II*\0" + bytes(50), "is no image that can be read"),
+        ("tif", cv2.imencode(".tiff", single[:50])[1].tobytes(), f"is 160 x 50, and its camera has {size}"),
+        ("tif", cv2.imencode(".tiff", ramp)[1].tobytes(), "uint8 with 3 channels: depth has one"),
+        ("png", cv2.imencode(".png", units[:50])[1].tobytes(), "another size of depth: describe depth_camera"),
+    ):
+        (path / f"depth_00000.{ending}").write_bytes(data)
+        with pytest.raises(CaptureError, match=told):
+            read_view(folder, 0)
+        (path / f"depth_00000.{ending}").unlink()
+    (path / "rgb_00000.png").write_bytes(b"")
+    with pytest.raises(CaptureError, match="has two files rgb_00000: keep one"):
+        open_folder(path)
+
+
+def test_depth_of_a_camera_of_its_own_is_registered_to_colour(tmp_path):
+    """Of a slanted plane n p = d, whose depth each camera's rays tell; the depth camera stands aside and is turned."""
+    path, k = tmp_path / "capture", Intrinsics(width=100, height=80, fx=70.0, fy=71.0, cx=50.5, cy=40.5)
+    T_color_depth = pose(cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0], np.array([-0.03, 0.01, 0.004]))
+    n, d = np.array([0.2, -0.1, 1.0]), 0.9
+
+    def rays(camera):
+        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+        return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+
+    turned = T_color_depth[:3, :3].T @ n
+    seen = (d - n @ T_color_depth[:3, 3]) / (rays(k) @ turned)
+    spec = k.model_dump() | {"T_color_depth": T_color_depth.tolist()}
+    folder = described(path, depth_camera=spec, depth_units_per_m=10_000.0)
+    np.save(path / "depth_00000.npy", seen)
+    view = read_view(folder, 0)
+    true = d / (rays(WIDE) @ n)
+    filled = view.depth > 0
+    assert filled[20:-20, 20:-20].all() and np.abs(view.depth / 10_000 - true)[filled].max() < 1e-4
+    for change, told in (
+        ({"T_color_depth": np.diag([1.0, 1, 2, 1]).tolist()}, "no rigid transform"),
+        ({"T_color_depth": [[1.0] * 4] * 3}, "depth_camera.T_color_depth"),
+        ({"fx": 0}, "depth_camera.fx"),
+    ):
+        with pytest.raises(CaptureError, match=told):
+            described(path, depth_camera=spec | change)
+    for lens, model in (([0.0] * 9, "opencv"), ([0.0] * 13, "opencv"), ([0.0] * 5, "fisheye"), ([], "fisheye")):
+        with pytest.raises(CaptureError, match=f"distortion has {len(lens)} numbers: OpenCV's lenses have"):
+            described(path, distortion=lens, lens_model=model)

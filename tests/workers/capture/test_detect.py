@@ -1,5 +1,6 @@
 """Markers and their corners in drawn pictures, and in the photograph of OpenCV's ArUco tutorial."""
 
+import itertools
 import time
 
 import cv2
@@ -7,16 +8,25 @@ import numpy as np
 import pytest
 
 from schemas.capture import CaptureCamera
-from schemas.job.captures import Board, Estimation
+from schemas.job.captures import Board, Estimation, Simulate
+from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Intrinsics
 from tests.conftest import SHARED_DATA
-from tests.workers.capture.drawn import HALF, KINECT, hand_held, photograph, printed, true_corners
-from workers.capture.board import frame_in_board, marker_corners, open_dictionary
+from tests.workers.capture.drawn import HALF, KINECT, errors, hand_held, photograph, printed, true_corners
+from tests.workers.capture.simulated import asset_of
+from workers.capture.board import board_geometry, frame_in_board, marker_corners, open_dictionary
+from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.detect import detect_markers, refine_corners
 from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
-from workers.geometry.colour import encode_srgb
+from workers.capture.simulate.photograph import build_studio, place_object, take_light
+from workers.capture.simulate.simulate import plan_path
+from workers.geometry.colour import encode_codes, encode_srgb
+from workers.geometry.frames import pose, rotation_about, transform
+from workers.scene.chance import SceneChance, Stream
+from workers.scene.effects import plan_capture
 
 BOARD = Board()
 DICTIONARY = open_dictionary(BOARD)
@@ -75,6 +85,80 @@ def test_markers_that_are_seen_twice_or_are_not_on_the_board_are_dropped():
     assert found.ids.shape == (0,) and found.corners_px.shape == (0, 4, 2)
 
 
+# ------------------------------------------------- boards of other kinds, in simulated photographs
+
+
+def square_on(T, side):
+    """Corners [4, 3] of a marker of a side in the plane z = 0 of a frame, clockwise from the upper left."""
+    return transform(T, 0.5 * side * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]))
+
+
+def scattered():
+    """Twelve ids anywhere, turned at random, around the object."""
+    rng, markers = np.random.default_rng(1), []
+    ids = (3, 7, 8, 12, 19, 20, 25, 31, 33, 40, 41, 49)
+    for n, number in enumerate(ids):
+        angle = 2 * np.pi * n / len(ids)
+        place = np.array([0.24 * np.cos(angle), 0.16 * np.sin(angle), 0.0])
+        R = rotation_about(np.array([0.0, 0, 1]), rng.uniform(0, 2 * np.pi))
+        markers.append({"id": number, "corners": square_on(pose(R, place), 0.05).tolist()})
+    return Board.model_validate({"markers": markers})
+
+
+def cube():
+    """A cube of 20 cm beside the object, four tags of 8 cm on each of four sides and on its top."""
+    upright = rotation_about(np.array([1.0, 0, 0]), np.pi / 2)  # the print faces -y
+    sides = [rotation_about(np.array([0.0, 0, 1]), k * np.pi / 2) @ upright for k in range(4)]
+    markers = []
+    for R, (u, v) in itertools.product((*sides, np.eye(3)), itertools.product((-0.047, 0.047), repeat=2)):
+        place = np.array([-0.22, 0.0, 0.1]) + R @ [u, v, 0.1]
+        markers.append({"id": len(markers), "corners": square_on(pose(R, place), 0.08).tolist()})
+    return Board.model_validate({"markers": markers, "width_m": 0.8})
+
+
+ANY_BOARD = {
+    "charuco": lambda: KINDS["charuco"](BoardSizes(9, 6, 0.045, 0.06, "DICT_5X5_100")),
+    "charuco, old pattern": lambda: KINDS["charuco_old"](BoardSizes(9, 6, 0.045, 0.06, "DICT_5X5_100")),
+    "aprilgrid": lambda: KINDS["aprilgrid"](BoardSizes(6, 5, 0.06, 0.078, "DICT_APRILTAG_36h11")),
+    "twelve scattered ids": scattered,
+    "cube of tags": cube,
+}
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize("kind", ANY_BOARD)
+def test_poses_from_any_board_are_a_tenth_of_a_millimetre_off_at_most(kind, record_figure):
+    """By the simulator's photographs, whose poses are known; each view by its own markers."""
+    board, simulate, chance, thing = ANY_BOARD[kind](), Simulate(views=3), SceneChance(11, 0), asset_of()
+    placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
+    studio = build_studio(simulate, board, placed, plan_capture(simulate), chance)
+    poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
+    setup = Setup(CaptureCamera(studio.rig.color, np.zeros(8)), board, Estimation())
+    dictionary, seen = open_dictionary(board), []
+    for number, T in enumerate(poses):
+        rgb = encode_codes(take_light(studio, number, studio.T_world_board @ T))
+        found = detect_markers(rgb, board, dictionary, number)
+        seen.append((found, *observe_view(found, None, setup)))
+    estimate = estimate_markers(Evidence.of(setup, [one[1] for one in seen], [one[2] for one in seen]))
+    assert all(view.status == "used" for view in estimate.views) and not any(one[0].dropped for one in seen)
+    if "charuco" in kind:
+        assert all(len(one[0].chess) >= 30 for one in seen), "of 40, one or a few behind the can"
+        off = [
+            one[0].chess_px - pixels_of_points(board_geometry(board).chess[one[0].chess], T, setup.camera)
+            for one, T in zip(seen, poses, strict=True)
+        ]
+        assert np.sqrt(np.square(np.concatenate(off)).mean()) < 0.1 and np.abs(np.concatenate(off)).max() < 0.5
+    every = np.array([errors(v.T_board_cam, T) for v, T in zip(estimate.views, poses, strict=True)])
+    median, worst = np.median(every, axis=0), every.max(axis=0)
+    most_mm = (
+        0.2 if kind == "cube of tags" else 0.1
+    )  # the can hides a part of the cube, whose extent is a third of a board's
+    for what, unit, n, bounds in (("position", "mm", 0, (0.1, most_mm)), ("rotation", "degrees", 1, (0.01, 0.02))):
+        record_figure(f"{kind}: camera {what}, median of 3 views", unit, median[n], bounds[0])
+        record_figure(f"{kind}: camera {what}, the worst of 3 views", unit, worst[n], bounds[1])
+        assert median[n] <= bounds[0] and worst[n] <= bounds[1], what
+
+
 # ------------------------------------------------- a real camera, a real print, an older dictionary and board
 
 FOLDER = SHARED_DATA / "board"
@@ -92,8 +176,8 @@ def estimated():
     camera = CaptureCamera(k, np.concatenate([lens, np.zeros(3)]))
     found = detect_markers(rgb, REAL, open_dictionary(REAL, FOLDER))
     setup = Setup(camera, REAL, Estimation())
-    seen, pose = observe_view(found, None, setup)
-    return camera, found, estimate_markers(Evidence.of(setup, [seen], [pose])).views[0]
+    seen, by_markers = observe_view(found, None, setup)
+    return camera, found, estimate_markers(Evidence.of(setup, [seen], [by_markers])).views[0]
 
 
 def off_px(points, found):

@@ -32,6 +32,7 @@ from workers.capture.poses.markers import (
     Judged,
     cross_matrix,
     exponential,
+    first_poses,
     fit_markers,
     fit_pose,
     is_ambiguous,
@@ -40,7 +41,6 @@ from workers.capture.poses.markers import (
     measured_corner_px,
     moved,
     observe_view,
-    planar_poses,
     residuals_of,
     spread,
 )
@@ -250,7 +250,7 @@ def test_one_small_marker_is_ambiguous_and_a_whole_board_is_not():
         whole.append(is_ambiguous(fit_markers(observe(T, rng), PINHOLE, SPEC), 0.2))
     assert np.mean(one) > 0.5 and not any(whole)
     for T in hand_held(rng, 10, distance_m=(1.2, 1.2)):  # of the two poses that look alike one is near the truth
-        starts = planar_poses(observe(T, rng, ids=[17]).corners)
+        starts = first_poses(observe(T, rng, ids=[17]).corners)
         assert min(errors(start, T)[1] for start in starts) < 10  # degrees; before refinement
 
 

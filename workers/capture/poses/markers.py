@@ -179,7 +179,7 @@ def fit_markers(observation: Observation, camera: CaptureCamera, spec: Estimatio
             number, None, reason=f"{found} markers of the board found, and min_markers is {spec.min_markers}"
         )
     focal = focal_lengths(camera)
-    fits = [fit_pose(start, corners.board, corners.rays, focal, FLOOR_PX) for start in planar_poses(corners)]
+    fits = [fit_pose(start, corners.board, corners.rays, focal, FLOOR_PX) for start in first_poses(corners)]
     above = [fit for fit in fits if np.isfinite(fit.T_board_cam).all() and fit.T_board_cam[2, 3] > 0]
     fits = sorted(above, key=lambda fit: fit.cost)
     if not fits:
@@ -193,16 +193,33 @@ def fit_markers(observation: Observation, camera: CaptureCamera, spec: Estimatio
     return MarkerPose(number, fits[0], rival)
 
 
-def planar_poses(corners: Corners) -> list[Pose]:
-    """T_board_cam of the one or two poses from which a planar target looks alike (Collins and Bartoli 2014)."""
+FLAT = 1e-4
+"""Points whose thickness is less than this share of their extent are a plane: a board's print is flatter than that."""
+
+
+def first_poses(corners: Corners) -> list[Pose]:
+    """T_board_cam of the one or two poses from which a plane looks alike (Collins and Bartoli 2014).
+
+    Points that lie in no plane have one pose (SQPnP, Terzakis and Lourakis 2020).
+    """
+    middle = corners.board.mean(axis=0)
+    _, extents, axes = np.linalg.svd(corners.board - middle, full_matrices=False)
+    flat, T_board_plane = bool(extents[2] <= FLAT * extents[0]), np.eye(4)
+    if flat and corners.board[:, 2].any():
+        T_board_plane = pose(axes.T * np.linalg.det(axes), middle)
+    points = transform(invert(T_board_plane), corners.board)
     found, rotations, translations, _ = cv2.solvePnPGeneric(
-        corners.board.reshape(-1, 1, 3), corners.rays.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        points.reshape(-1, 1, 3),
+        corners.rays.reshape(-1, 1, 2),
+        np.eye(3),
+        None,
+        flags=cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP,
     )
     poses = []
     for rotation, position in zip(rotations[:found], translations[:found], strict=True):
-        T_cam_board = pose(cv2.Rodrigues(rotation)[0].astype(np.float64), position.ravel().astype(np.float64))
-        if np.isfinite(T_cam_board).all():
-            poses.append(invert(T_cam_board))
+        T_cam_plane = pose(cv2.Rodrigues(rotation)[0].astype(np.float64), position.ravel().astype(np.float64))
+        if np.isfinite(T_cam_plane).all():
+            poses.append(T_board_plane @ invert(T_cam_plane))
     return poses
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board, Estimation
-from workers.capture.board import marker_corners
+from workers.capture.board import TOUCHING_M, Geometry, board_geometry
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import invert, transform
 from workers.geometry.lens import project_points, rays_of_pixels
@@ -29,7 +29,7 @@ class Corners:
     """The corners found in one view.
 
     board [K, 3] metres, where they lie on the board; pixels [K, 2] as stored, centres at +0.5; rays [K, 2] (x / z, y / z);
-    markers [K] ids; depth_m [K]: depth measured around the corner, 0 where there is none.
+    markers [K] ids, -1 for a chessboard's; depth_m [K]: depth measured around the corner, 0 where there is none.
     """
 
     board: Array
@@ -79,7 +79,7 @@ class Observation:
     @property
     def markers(self) -> int:
         """How many markers were found."""
-        return len(self.corners.board) // 4
+        return int((self.corners.markers >= 0).sum()) // 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +93,16 @@ class Setup:
 
 def corners_of(detection: Detection, board: Board, camera: CaptureCamera) -> Corners:
     """The corners of the detected markers; a marker where the lens cannot be inverted is left out. No depth yet."""
-    pixels = detection.corners_px.reshape(-1, 2)
+    geometry = board_geometry(board)
+    pixels = np.concatenate([detection.corners_px.reshape(-1, 2), detection.chess_px])
+    points = np.concatenate(
+        [geometry.corners[geometry.index(detection.ids)].reshape(-1, 3), geometry.chess[detection.chess]]
+    )
+    ids = np.concatenate([np.repeat(detection.ids, 4), np.full(len(detection.chess), -1)])
     rays = rays_of_pixels(pixels, camera.intrinsics, camera.lens)
-    whole = np.repeat(np.isfinite(rays).all(axis=1).reshape(-1, 4).all(axis=1), 4)
-    points = marker_corners(board)[detection.ids - board.first_id].reshape(-1, 3)
-    ids = np.repeat(detection.ids, 4)
+    single: NDArray[np.bool_] = np.isfinite(rays[:, 0])
+    quads = single[: 4 * len(detection.ids)].reshape(-1, 4).all(axis=1)
+    whole = np.concatenate([np.repeat(quads, 4), single[4 * len(detection.ids) :]])
     return Corners(points[whole], pixels[whole], rays[whole], ids[whole], np.zeros(int(whole.sum())))
 
 
@@ -115,11 +120,15 @@ CORNER_WINDOW_PX = 2
 
 
 def board_patches(depth: NDArray[np.uint16], detection: Detection, board: Board, camera: CaptureCamera) -> Patches:
-    """A patch for each marker found, and for each gap between two: what covers one would have kept it from being found.
+    """A patch for each marker found in the board's plane, and for each gap between two: what covers one hid it.
 
     The gaps are white where black ink may swallow the infrared light that depth is measured with.
     """
-    quads = np.concatenate([detection.corners_px, _gaps(detection, board)])
+    geometry = board_geometry(board)
+    places = geometry.index(detection.ids)
+    level = np.abs(geometry.corners[places, :, 2]).max(axis=1) < TOUCHING_M
+    corners = detection.corners_px[level]
+    quads = np.concatenate([corners, _gaps(places[level], corners, geometry)])
     place = np.linspace(MARGIN, 1 - MARGIN, GRID)
     s, t = (axis.ravel() for axis in np.meshgrid(place, place))
     weights = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], axis=1)  # of the corners, clockwise
@@ -127,13 +136,12 @@ def board_patches(depth: NDArray[np.uint16], detection: Detection, board: Board,
     return sample_patches(depth, pixels, camera)
 
 
-def _gaps(detection: Detection, board: Board) -> Array:
-    """[G, 4, 2] pixels: the areas between markers found side by side or one above the other."""
-    place = {int(marker) - board.first_id: n for n, marker in enumerate(detection.ids)}
-    corners, gaps = detection.corners_px, []
-    for marker, n in place.items():
-        right, below = place.get(marker + 1), place.get(marker + board.columns)
-        if right is not None and (marker + 1) % board.columns:
+def _gaps(places: NDArray[np.intp], corners: Array, geometry: Geometry) -> Array:
+    """[G, 4, 2] pixels: the areas between markers found side by side or one above the other; corners [M, 4, 2]."""
+    found, gaps = {int(place): n for n, place in enumerate(places)}, []
+    for place, n in found.items():
+        right, below = found.get(int(geometry.right[place])), found.get(int(geometry.below[place]))
+        if right is not None:
             gaps.append([corners[n, 1], corners[right, 0], corners[right, 3], corners[n, 2]])
         if below is not None:
             gaps.append([corners[n, 3], corners[n, 2], corners[below, 1], corners[below, 0]])

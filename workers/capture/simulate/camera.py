@@ -136,6 +136,7 @@ YELLOW = (0.93, 0.86, 0.45, 1.0)
 def cover_markers(hidden: HiddenMarkers, board: Board, rng: np.random.Generator) -> Shape | None:
     """Level slips in the board frame, metres, one over a part of each chosen marker; None where none is chosen."""
     corners = marker_corners(board)
+    corners = corners[np.abs(corners[..., 2]).max(axis=1) == 0.0]  # those that lie on the board
     chosen = np.sort(rng.permutation(len(corners))[: round(hidden.share * len(corners))])
     if not len(chosen):
         return None

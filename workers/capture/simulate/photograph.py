@@ -23,7 +23,7 @@ from schemas.scene.shape import (
 )
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
-from workers.capture.board import marker_cells, marker_corners
+from workers.capture.board import TOUCHING_M, board_geometry, marker_cells, marker_corners
 from workers.capture.simulate.camera import (
     AT_REST,
     CENTRE,
@@ -69,10 +69,13 @@ PAPER, INK = (0.91, 0.91, 0.90, 1.0), (0.20, 0.20, 0.21, 1.0)
 
 
 def board_body(board: Board) -> Shape:
-    """A closed box in the board frame, metres, its print at z = 0; sizes are those of `marker_corners`.
+    """A closed box in the board frame, metres, its print at z = 0; sizes are those of `board_geometry`.
 
-    Faces share their vertices along every edge of the print, so that no view shows a gap between them.
+    Faces share their vertices along every edge of the print of a grid, so that no view shows a gap between them. Other
+    markers lie over their paper, those out of the plane on plates of their own.
     """
+    if board.markers:
+        return _layout_body(board)
     across, up, ink = _cells(board)
     vertices, top = _grid(across, up)
     quads, black = top.reshape(-1, 4), ink.ravel()
@@ -86,6 +89,55 @@ def board_body(board: Board) -> Shape:
         ),
         closed=True,
     )
+
+
+INK_M = 0.00003
+"""Of ink above its paper: more than a z-buffer confuses, and too little to be seen."""
+
+AROUND = frozen_array([[0, 0], [1, 0], [1, 1], [0, 1]])
+"""Corners of a square, clockwise as seen from the front with y down."""
+
+PLATE_M = 0.002
+"""Thickness of the plate behind a marker that stands out of the plane."""
+
+
+def _layout_body(board: Board) -> Shape:
+    """Ink at the places of markers and squares, over the board's sheet and over plates a bit wider than their markers."""
+    geometry, half = board_geometry(board), 0.5 * board.scale * np.array([board.width_m, board.height_m])
+    x, y = half
+    sheet = np.array([[-x, y, 0.0], [x, y, 0.0], [x, -y, 0.0], [-x, -y, 0.0]])
+    boxes, ink = [_box_behind(sheet, THICKNESS_M)], [geometry.squares]
+    for cells, corners in zip(marker_cells(board), geometry.corners, strict=True):
+        if np.abs(corners[:, 2]).max() > TOUCHING_M:
+            wider = AROUND + (2.0 * AROUND - 1.0) / len(cells)  # by one bit of white on each side
+            boxes.append(_box_behind(_on_quad(corners, wider), PLATE_M))
+        row, column = np.nonzero(cells)
+        places = np.stack([column, row], axis=1)[:, None] + AROUND
+        ink.append(_on_quad(corners, places / len(cells)))
+    quads = np.concatenate(ink)[:, ::-1]  # counter-clockwise as seen from the front
+    solid = np.concatenate(boxes)
+    numbers = [np.arange(4 * len(some), dtype=np.int32).reshape(-1, 4) for some in (solid, quads)]
+    return Shape(
+        (
+            Part("paper", frozen_array(solid.reshape(-1, 3)), _triangles(numbers[0]), Material(PAPER, roughness=1.0)),
+            Part("ink", frozen_array(quads.reshape(-1, 3)), _triangles(numbers[1]), Material(INK, roughness=1.0)),
+        )
+    )
+
+
+def _on_quad(corners: Array, places: Array) -> Array:
+    """[..., 3]: points of a parallelogram at shares [..., 2] of its upper and its left edge."""
+    right, down = corners[1] - corners[0], corners[3] - corners[0]
+    return corners[0] + places[..., :1] * right + places[..., 1:] * down
+
+
+def _box_behind(face: Array, thickness_m: float) -> Array:
+    """[6, 4, 3]: the faces of a box, counter-clockwise from outside, whose front lies `INK_M` behind a quad [4, 3]."""
+    into = np.cross(face[1] - face[0], face[3] - face[0])
+    into /= np.linalg.norm(into)
+    front, back = face + INK_M * into, face + thickness_m * into
+    sides = [[front[k], front[(k + 1) % 4], back[(k + 1) % 4], back[k]] for k in range(4)]
+    return np.array([front[::-1], back, *sides])
 
 
 def _cells(board: Board) -> tuple[Array, Array, NDArray[np.bool_]]:

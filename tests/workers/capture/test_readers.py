@@ -1,0 +1,476 @@
+"""Recordings of other cameras, written here byte by byte from their published layouts: every frame, time and camera read back."""
+
+import bz2
+import contextlib
+import io
+import json
+import struct
+import zipfile
+
+import cv2
+import lzfse
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from schemas.capture import DepthCamera
+from schemas.errors import CaptureError
+from schemas.job.captures import Board
+from workers.capture.folder import CaptureFile, open_folder, read_view
+from workers.capture.import_recording import import_recording, open_any
+from workers.capture.pictures import PictureError
+
+W, H, COUNT = 64, 48, 3
+RNG = np.random.default_rng(5)
+SMOOTH = [
+    cv2.resize(RNG.integers(0, 256, (6, 8, 3), np.uint8), (W, H), interpolation=cv2.INTER_CUBIC) for _ in range(COUNT)
+]
+JPEG_CODES = 6
+"""What JPEG of quality 100 changes at most of these: it rounds brightness and colour, and all their waves."""
+DEPTH_MM = [RNG.integers(500, 3000, (H, W)).astype(np.uint16) * (RNG.random((H, W)) > 0.2) for _ in range(COUNT)]
+STAMPS_US = [1_305_031_452_791_720 + i * 33_333 for i in range(COUNT)]
+FX, FY, CX, CY = 61.5, 62.25, 30.5, 22.75
+
+
+def png(pixels):
+    return cv2.imencode(".png", pixels[..., ::-1] if pixels.ndim == 3 else pixels)[1].tobytes()
+
+
+def jpg(pixels):
+    return cv2.imencode(
+        ".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
+    )[1].tobytes()
+
+
+def put(path, data):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+# ---------------------------------------------------------------------------------------------- what is written
+
+
+def write_tum(path, units_per_mm=5):
+    path = path / "rgbd_dataset_freiburg3_desk"
+    for kind, late_us in (("rgb", 0), ("depth", 7_000)):
+        stamps = [t + late_us for t in STAMPS_US]
+        lines = [f"# {kind} images", *(f"{t / 1e6:.6f} {kind}/{t / 1e6:.6f}.png" for t in stamps)]
+        put(path / f"{kind}.txt", "\n".join(lines) + "\n")
+        for n, t in enumerate(stamps):
+            pixels = SMOOTH[n] if kind == "rgb" else DEPTH_MM[n] * units_per_mm
+            put(path / kind / f"{t / 1e6:.6f}.png", png(pixels))
+    return path
+
+
+def write_bop(path):
+    cameras = {}
+    for n in range(COUNT):
+        cameras[str(n)] = {"cam_K": [FX + n, 0, CX, 0, FY + n, CY, 0, 0, 1], "depth_scale": 0.1}
+        put(path / "rgb" / f"{n:06d}.png", png(SMOOTH[n]))
+        put(path / "depth" / f"{n:06d}.png", png(DEPTH_MM[n] * 10))
+    put(path / "scene_camera.json", json.dumps(cameras))
+    return path
+
+
+def write_open3d(path):
+    put(
+        path / "intrinsic.json",
+        json.dumps({"width": W, "height": H, "intrinsic_matrix": [FX, 0, 0, 0, FY, 0, CX, CY, 1]}),
+    )
+    for n in range(COUNT):
+        put(path / "color" / f"{n:05d}.jpg", jpg(SMOOTH[n]))
+        put(path / "depth" / f"{n:05d}.png", png(DEPTH_MM[n]))
+    return path
+
+
+DW, DH = 16, 12
+SMALL_M = [(0.5 + RNG.random((DH, DW))).astype(np.float32) for _ in range(COUNT)]
+
+
+def write_record3d(path, **changes):
+    own = [[FX + n, FY + n, CX, CY] for n in range(COUNT)]
+    metadata = {"w": W, "h": H, "dw": DW, "dh": DH, "fps": 30, "K": [FX, 0, 0, 0, FY, 0, CX, CY, 1]}
+    metadata |= {"perFrameIntrinsicCoeffs": own, "frameTimestamps": [n / 30 for n in range(COUNT)]} | changes
+    with zipfile.ZipFile(path / "shot.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", json.dumps(metadata))
+        for n in range(COUNT):
+            archive.writestr(f"rgbd/{n}.jpg", jpg(SMOOTH[n]))
+            archive.writestr(f"rgbd/{n}.depth", lzfse.compress(SMALL_M[n].tobytes()))
+    return path / "shot.r3d"
+
+
+def write_polycam(path):
+    for n in range(COUNT):
+        camera = {
+            "fx": FX + n,
+            "fy": FY + n,
+            "cx": CX,
+            "cy": CY,
+            "width": W,
+            "height": H,
+            "t_00": 1.0,
+            "blur_score": 90.0,
+        }
+        put(path / "keyframes" / "cameras" / f"{638443502 + n * 33_333}.json", json.dumps(camera))
+        put(path / "keyframes" / "images" / f"{638443502 + n * 33_333}.jpg", jpg(SMOOTH[n]))
+        small = np.rint(SMALL_M[n] * 1000).astype(np.uint16)
+        put(path / "keyframes" / "depth" / f"{638443502 + n * 33_333}.png", png(small))
+    return path
+
+
+def write_arkit(path):
+    for n in range(COUNT):
+        name, near = f"41069021_{305.377 + n / 30:.3f}", f"41069021_{305.376 + n / 30:.3f}"
+        put(path / "lowres_wide" / f"{name}.png", png(SMOOTH[n]))
+        put(path / "lowres_depth" / f"{name}.png", png(DEPTH_MM[n]))
+        put(path / "lowres_wide_intrinsics" / f"{near}.pincam", f"{W} {H} {FX + n} {FY + n} {CX} {CY}")
+    return path
+
+
+# ---------------------------------------------------------------------------------------------- a bag
+
+T_COLOR_REF = np.eye(4)
+T_COLOR_REF[:3, 3] = [0.015, 0.001, -0.002]
+
+
+def block(data):
+    data = data.encode() if isinstance(data, str) else data
+    return struct.pack("<I", len(data)) + data
+
+
+def record(data, **head):
+    return block(b"".join(block(name.encode() + b"=" + value) for name, value in head.items())) + block(data)
+
+
+def stamp(us):
+    return struct.pack("<II", us // 1_000_000, us % 1_000_000 * 1000)
+
+
+def header(us):
+    return struct.pack("<I", 0) + stamp(us) + block("camera")
+
+
+def image(us, encoding, pixels):
+    height, width = pixels.shape[:2]
+    body = struct.pack("<II", height, width) + block(encoding)
+    return header(us) + body + struct.pack("<BI", 0, pixels.strides[0]) + block(np.ascontiguousarray(pixels).tobytes())
+
+
+def info(width, height, lens=(0.0,) * 5, model="Brown Conrady", fx=FX):
+    D = struct.pack(f"<I{len(lens)}d", len(lens), *lens)
+    return (
+        header(0)
+        + struct.pack("<II", height, width)
+        + block(model)
+        + D
+        + struct.pack("<9d", fx, 0, CX, 0, FY, CY, 0, 0, 1)
+    )
+
+
+def transform_message(T):
+    return struct.pack("<7d", *T[:3, 3], 0.0, 0.0, 0.0, 1.0)
+
+
+COLOR, DEPTH = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
+
+
+def realsense(lens=(0.0,) * 5, model="Brown Conrady"):
+    """(topic, type, time, message) of an SDK's recording: depth in units of a tenth of a millimetre."""
+    said = [
+        ("/device_0/sensor_0/option/Depth Units/value", "std_msgs/Float32", 0, struct.pack("<f", 0.0001)),
+        (f"{COLOR}/info/camera_info", "sensor_msgs/CameraInfo", 0, info(W, H, lens, model)),
+        (f"{DEPTH}/info/camera_info", "sensor_msgs/CameraInfo", 0, info(W, H)),
+        (f"{DEPTH}/tf/0", "geometry_msgs/Transform", 0, transform_message(np.eye(4))),
+        (f"{COLOR}/tf/0", "geometry_msgs/Transform", 0, transform_message(T_COLOR_REF)),
+    ]
+    for n, t in enumerate(STAMPS_US):
+        said.append((f"{DEPTH}/image/data", "sensor_msgs/Image", t, image(t, "mono16", DEPTH_MM[n] * 10)))
+        said.append((f"{COLOR}/image/data", "sensor_msgs/Image", t + 900, image(t + 900, "rgb8", SMOOTH[n])))
+    return said
+
+
+def bag(said, compression="lz4"):
+    """Bytes of a bag, two messages a chunk."""
+    topics = {topic: n for n, topic in enumerate(dict.fromkeys(topic for topic, *_ in said))}
+    pieces = [
+        b"#ROSBAG V2.0\n",
+        record(b" " * 100, op=b"\x03", index_pos=bytes(8), conn_count=bytes(4), chunk_count=bytes(4)),
+    ]
+    for start in range(0, len(said), 2):
+        inner = b""
+        for topic, kind, us, data in said[start : start + 2]:
+            conn = struct.pack("<I", topics[topic])
+            described = b"".join(block(f"{a}={b}") for a, b in (("topic", topic), ("type", kind), ("md5sum", "*")))
+            inner += record(described, op=b"\x07", conn=conn, topic=topic.encode())
+            inner += record(data, op=b"\x02", conn=conn, time=stamp(us))
+        how = {"lz4": lambda b: pa.compress(b, codec="lz4", asbytes=True), "bz2": bz2.compress, "none": bytes}
+        size = struct.pack("<I", len(inner))
+        pieces.append(record(how[compression](inner), op=b"\x05", compression=compression.encode(), size=size))
+        pieces.append(
+            record(bytes(12), op=b"\x04", ver=struct.pack("<I", 1), conn=bytes(4), count=struct.pack("<I", 1))
+        )
+    return b"".join(pieces)
+
+
+def write_bag(path, said=None, compression="lz4"):
+    put(path / "shot.bag", bag(said or realsense(), compression))
+    return path / "shot.bag"
+
+
+WRITTEN = {
+    "tum": write_tum,
+    "bop": write_bop,
+    "open3d": write_open3d,
+    "record3d": write_record3d,
+    "polycam": write_polycam,
+    "arkit": write_arkit,
+    "bag": write_bag,
+}
+
+
+# ---------------------------------------------------------------------------------------------- what is read
+
+
+def frames_of(recording):
+    found = list(recording.frames())
+    return [f for f in found if not f.is_depth], [f for f in found if f.is_depth]
+
+
+def k_of(frame, recording):
+    k = frame.camera or recording.color.intrinsics
+    return [k.fx, k.fy, k.cx, k.cy]
+
+
+@pytest.mark.parametrize("kind", WRITTEN)
+def test_every_frame_time_and_camera_is_what_was_written(kind, tmp_path):
+    recording = open_any(WRITTEN[kind](tmp_path))
+    color, depth = frames_of(recording)
+    apple = kind in ("record3d", "polycam", "arkit")  # whose principal point counts from the image's corner
+    own = [0, 1, 2] if kind in ("bop", "record3d", "polycam", "arkit") else [0] * COUNT
+    written = (535.4, 539.2, 320.1, 247.6) if kind == "tum" else (FX, FY, CX, CY)
+    first_us = {"tum": STAMPS_US[0], "bag": STAMPS_US[0] + 900, "polycam": 638443502, "arkit": 305_377_000}.get(kind, 0)
+    assert len(color) == len(depth) == COUNT
+    for n, (rgb, z) in enumerate(zip(color, depth, strict=True)):
+        assert rgb.stamp_us == pytest.approx(first_us + n * 33_333, abs=1 + 500 * (kind == "arkit"))
+        late = {"tum": 7_000, "bag": -900}.get(kind, 0)
+        assert z.stamp_us - rgb.stamp_us == late
+        centre = 0.0 if apple else 0.5
+        fx, fy, cx, cy = written
+        expected = [fx + own[n], fy + own[n], cx + centre, cy + centre]
+        assert k_of(rgb, recording) == pytest.approx(expected)
+        seen = rgb.load(False)
+        loss = 0 if kind in ("tum", "bop", "arkit", "bag") else JPEG_CODES
+        assert seen.shape == (H, W, 3) and np.abs(seen.astype(int) - SMOOTH[n]).max() <= loss
+        assert rgb.load(True).shape == (H // 2, W // 2)
+        small = kind in ("record3d", "polycam")
+        true = SMALL_M[n] if small else DEPTH_MM[n] / 1000
+        assert z.load(False) == pytest.approx(true, abs=5.1e-4 if kind == "polycam" else 1e-7)
+        if small:
+            assert isinstance(z.camera, DepthCamera) and np.array_equal(z.camera.T_color_depth, np.eye(4))
+            k = z.camera.intrinsics
+            assert [k.width, k.height, k.fx, k.cx, k.cy] == pytest.approx([DW, DH, (FX + n) / 4, CX / 4, CY / 4])
+    assert recording.period_us == pytest.approx(33_333, abs=700)
+    assert recording.color.intrinsics.fx == pytest.approx(written[0] + sorted(own)[COUNT // 2])
+    if kind == "bag":
+        assert recording.color.depth_units_per_m == pytest.approx(10_000)
+        # The transforms take the reference's coordinates to a stream's, so this one takes depth's to colour's.
+        assert recording.depth.T_color_depth == pytest.approx(T_COLOR_REF)
+
+
+@pytest.mark.parametrize("kind", WRITTEN)
+def test_a_recording_of_any_kind_becomes_a_folder(kind, tmp_path):
+    out = tmp_path / "capture"
+    out.mkdir()
+    made = import_recording(
+        WRITTEN[kind](tmp_path / "from" if kind != "record3d" else tmp_path), out, CaptureFile(name="x"), Board(), 9
+    )
+    folder = open_folder(out)
+    assert len(made.views) == made.frames == COUNT and folder.numbers == (0, 1, 2)
+    assert (made.losses.dropped, made.losses.without_depth, made.losses.damaged, made.losses.cut) == (0, 0, 0, 0)
+    for n in range(COUNT):
+        view = read_view(folder, n)
+        units = folder.camera.depth_units_per_m
+        assert view.depth.any() and 0.4 < np.median(view.depth[view.depth > 0]) / units < 3.0
+        if kind in ("tum", "open3d") or (kind in ("bop", "arkit") and n == 1):  # the camera of the middle focal length
+            assert view.depth / units == pytest.approx(DEPTH_MM[n] / 1000, abs=1e-7)
+            assert np.abs(view.rgb.astype(int) - SMOOTH[n]).max() <= JPEG_CODES
+
+
+def test_a_focal_length_that_changes_is_made_one(tmp_path):
+    """A picture of a plane, ramps of colour over the ray, is the same after another focal length is made the common one."""
+    focal = (60.0, 63.0, 66.0)
+    cameras = {}
+    for n, f in enumerate(focal):
+        x = (np.arange(W) - CX) / f
+        ramp = np.repeat(np.clip(128 + 200 * x, 0, 255)[None, :], H, axis=0)
+        put(tmp_path / "rgb" / f"{n:06d}.png", png(np.repeat(np.rint(ramp).astype(np.uint8)[..., None], 3, axis=2)))
+        put(tmp_path / "depth" / f"{n:06d}.png", png(np.full((H, W), 1000, np.uint16)))
+        cameras[str(n)] = {"cam_K": [f, 0, CX, 0, f, CY, 0, 0, 1], "depth_scale": 1.0}
+    put(tmp_path / "scene_camera.json", json.dumps(cameras))
+    out = tmp_path / "capture"
+    out.mkdir()
+    import_recording(tmp_path, out, CaptureFile(name="x"), Board(), 9)
+    folder = open_folder(out)
+    views = [read_view(folder, n).rgb[5:-5, 5:-5, 0].astype(int) for n in range(3)]
+    assert folder.camera.intrinsics.fx == 63.0
+    assert np.abs(views[0] - views[1]).max() <= 1 and np.abs(views[2] - views[1]).max() <= 1
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2"])
+def test_chunks_of_a_bag_are_read_however_they_are_packed(compression, tmp_path):
+    color, depth = frames_of(open_any(write_bag(tmp_path, compression=compression)))
+    assert all(np.array_equal(frame.load(False), SMOOTH[n]) for n, frame in enumerate(color))
+    assert len(depth) == COUNT
+
+
+def test_a_drivers_bag_needs_depth_registered_to_colour(tmp_path):
+    def published(depth_topic):
+        said = [
+            (
+                "/camera/color/camera_info",
+                "sensor_msgs/CameraInfo",
+                0,
+                info(W, H, (0.1, -0.2, 1e-3, 0, 0.05), "plumb_bob"),
+            ),
+            (f"/camera/{depth_topic}/camera_info", "sensor_msgs/CameraInfo", 0, info(W, H)),
+        ]
+        for n, t in enumerate(STAMPS_US):
+            said.append(("/camera/color/image_raw", "sensor_msgs/Image", t, image(t, "bgr8", SMOOTH[n][..., ::-1])))
+            said.append((f"/camera/{depth_topic}/image_raw", "sensor_msgs/Image", t, image(t, "16UC1", DEPTH_MM[n])))
+        return said
+
+    recording = open_any(write_bag(tmp_path, published("aligned_depth_to_color")))
+    color, depth = frames_of(recording)
+    assert recording.depth is None and recording.color.lens.tolist() == [0.1, -0.2, 1e-3, 0, 0.05, 0, 0, 0]
+    assert np.array_equal(color[1].load(False), SMOOTH[1]) and depth[1].load(False) == pytest.approx(DEPTH_MM[1] / 1000)
+    with pytest.raises(CaptureError, match="record the topic aligned_depth_to_color"):
+        open_any(write_bag(tmp_path, published("depth")))
+
+
+# ---------------------------------------------------------------------------------------------- what is refused
+
+
+def everything(path):
+    """Opens a recording and loads all of it, as an import does."""
+    recording = open_any(path)
+    for frame in recording.frames():
+        frame.load(False)
+    return recording
+
+
+def refused(path, told):
+    with pytest.raises((CaptureError, PictureError), match=told) as error:
+        everything(path)
+    assert "\n" not in str(error.value)
+
+
+def test_what_cannot_be_read_is_named_in_one_line(tmp_path):
+    for name, data, told in (
+        ("a.db3", b"SQLite format 3\0" + bytes(64), "is a ROS 2 bag: convert it"),
+        ("a.mcap", b"\x89MCAP0\r\n", "is an MCAP file: convert it"),
+        ("a.mp4", b"\0\0\0\x18ftypmp42", "is a video alone"),
+        ("a.txt", b"hello", "none of the formats that are read: an Azure Kinect"),
+        ("a.r3d", b"PK\5\6" + bytes(18), "none of the formats"),
+        ("a.mkv", b"hello", "cannot be read as a Matroska file"),
+        ("a.bag", b"", "has no bytes"),
+    ):
+        put(tmp_path / name, data)
+        refused(tmp_path / name, told)
+    refused(tmp_path / "none", "no such file or folder")
+    refused(tmp_path, "none of the formats")
+
+
+def test_hostile_folders_end_in_one_line(tmp_path):
+    def changed(kind, name, data, told):
+        path = WRITTEN[kind](tmp_path / str(len(list(tmp_path.iterdir()))))
+        put(path / name, data)
+        refused(path, told)
+
+    K = [FX, 0, CX, 0, FY, CY, 0, 0, 1]
+    bomb = png(np.zeros((12_000, 12_000), np.uint8))
+    changed("tum", "rgb.txt", "1.0 ../../../etc/passwd\n", "which is not in it")
+    changed("tum", "rgb.txt", "nan rgb/1.png\n", "is not a time in seconds and a file")
+    changed("tum", "rgb.txt", "# none\n", "names no image")
+    changed("tum", "depth.txt", "1.0 depth/none.png\n", "cannot be read: No such file")
+    changed(
+        "tum", f"depth/{(STAMPS_US[0] + 7_000) / 1e6:.6f}.png", bomb, "is 12000 x 12000, and its camera has 64 x 48"
+    )
+    changed("tum", f"rgb/{STAMPS_US[1] / 1e6:.6f}.png", png(SMOOTH[1])[:700], "no image that can be read")
+    changed("bop", "scene_camera.json", '{"0": {"cam_K": [NaN]}}', "NaN is no number of JSON")
+    changed("bop", "scene_camera.json", json.dumps({"0": {"cam_K": K}}), "depth_scale is None")
+    changed(
+        "bop", "scene_camera.json", json.dumps({"0": {"cam_K": [-1, *K[1:]], "depth_scale": 1}}), "no usable intrinsics"
+    )
+    changed("bop", "scene_camera.json", json.dumps({"9": {"cam_K": K, "depth_scale": 1}}), "has no rgb/000009.png")
+    changed("bop", "scene_camera.json", "[" * 100_000, "is no JSON")
+    changed("bop", "depth/000001.png", png(SMOOTH[0]), "uint8 with 3 channels: depth has one")
+    changed("open3d", "intrinsic.json", "{}", "no intrinsic_matrix of nine numbers")
+    changed("open3d", "color/00009.jpg", jpg(SMOOTH[0]), "4 images in color/ and 3 in depth/")
+    changed("polycam", "keyframes/cameras/7.json", "{}", "must be named by its time and have fx")
+    changed("arkit", "lowres_wide/x.png", png(SMOOTH[0]), "must be named VIDEO_SECONDS")
+    changed("arkit", "lowres_wide/1_9.png", png(SMOOTH[0]), "has no camera for 1_9.png")
+    unknown = write_tum(tmp_path / "u")
+    refused(unknown.rename(unknown.parent / "desk"), "names none of freiburg1")
+
+
+def test_hostile_archives_end_in_one_line(tmp_path):
+    for changes, told in (
+        ({"K": None, "perFrameIntrinsicCoeffs": None}, "no usable intrinsics"),
+        ({"perFrameIntrinsicCoeffs": [[float("inf")] * 4] * 3}, "is no number of JSON"),
+        ({"dw": 10**9}, "cannot be"),
+        ({"dw": "wide"}, "metadata lacks"),
+        ({"dw": 17}, "has 768 bytes, and depth of 17 x 12 has 816"),
+        ({"w": 640}, "is 64 x 48, and its camera has 640 x 48"),
+        ({"frameTimestamps": [0.0]}, "metadata lacks"),
+    ):
+        refused(write_record3d(tmp_path, **changes), told)
+    whole = write_record3d(tmp_path).read_bytes()
+    for data in (whole[: len(whole) // 2], whole[:100]):
+        put(tmp_path / "cut.r3d", data)
+        refused(tmp_path / "cut.r3d", "none of the formats")
+    with zipfile.ZipFile(tmp_path / "bomb.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", b"0" * 300_000_000)
+    refused(tmp_path / "bomb.r3d", "unpacks to more than 256 MB")
+    with zipfile.ZipFile(io.BytesIO(whole)) as before, zipfile.ZipFile(tmp_path / "torn.r3d", "w") as after:
+        for name in before.namelist():
+            data = before.read(name)
+            after.writestr(name, data[:30] if name.endswith("1.depth") else data)
+    refused(tmp_path / "torn.r3d", "compressed by LZFSE, and cut or altered")
+
+
+def test_hostile_bags_are_used_as_far_as_they_go_or_end_in_one_line(tmp_path):
+    said = realsense()
+    for changed, told in (
+        ([m for m in said if "Color" not in m[0]], "has no images of colour; it has /device_0"),
+        ([m for m in said if "camera_info" not in m[0]], "has no camera_info for"),
+        ([m for m in said if "/tf/" not in m[0]], "does not say where the depth camera is"),
+        (realsense((0.1,) * 5, "Inverse Brown Conrady"), "lens 'Inverse Brown Conrady' with .* is not read"),
+        (realsense((float("nan"),) * 5), "lens 'Brown Conrady' with"),
+        ([(t, k, u, d.replace(b"rgb8", b"bay8")) for t, k, u, d in said], "colour is 'bay8', not one of rgb8"),
+        (
+            [(t, "sensor_msgs/CompressedImage" if "Color" in t else k, u, d) for t, k, u, d in said],
+            "compressed: convert them",
+        ),
+        (
+            [(t, k, u, info(W, H, fx=float("nan")) if "camera_info" in t else d) for t, k, u, d in said],
+            "no usable intrinsics",
+        ),
+    ):
+        refused(write_bag(tmp_path, changed), told)
+    whole = bag(said)
+    put(tmp_path / "cut.bag", whole[: int(0.8 * len(whole))])
+    color, depth = frames_of(open_any(tmp_path / "cut.bag"))
+    assert 1 <= len(color) <= len(depth) < COUNT + 1 and np.array_equal(color[0].load(False), SMOOTH[0])
+    bomb = record(bytes(100), op=b"\x05", compression=b"lz4", size=struct.pack("<I", 2**32 - 1))
+    huge = struct.pack("<I", 2**31)
+    for tail in (bomb, huge, bytes(3), record(b"\xff" * 50, op=b"\x07", conn=bytes(4), topic=b"x")):
+        put(tmp_path / "odd.bag", b"#ROSBAG V2.0\n" + tail)
+        refused(tmp_path / "odd.bag", "has no images of colour; it has no topic of images")
+    rng = np.random.default_rng(0)
+    for _ in range(40):  # any byte may be another: the frames that are left, or one line
+        data = bytearray(whole)
+        for at in rng.integers(13, len(data), 20):
+            data[at] = rng.integers(256)
+        put(tmp_path / "noise.bag", bytes(data))
+        with contextlib.suppress(CaptureError):
+            everything(tmp_path / "noise.bag")

@@ -1,0 +1,372 @@
+"""Recordings that are folders of images, and Record3D's archive of them, each by its published layout.
+
+TUM RGB-D (rgb.txt, depth.txt, 5000 units a metre, registered; the calibrations of its three cameras), BOP scenes
+(scene_camera.json; depth_scale in millimetres), Open3D's recorder (intrinsic.json, column by column), Record3D (.r3d: a zip of
+JPEG and of depth in metres compressed by LZFSE), Polycam's raw data (keyframes/), ARKitScenes (lowres_wide/).
+
+Principal points count from the first pixel's centre in the first three, and from the image's corner in Apple's.
+"""
+
+import json
+import re
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from schemas.base import frozen_array
+from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
+from schemas.errors import CaptureError
+from schemas.scene.view import Intrinsics
+from workers.capture.pictures import PictureError, Size, decode_depth, decode_rgb, decode_small, head_size
+
+MOST_BYTES = 256_000_000
+"""Of one file or one member of an archive."""
+
+UNITS_PER_M = 1000.0
+"""Of depth that is written: whole millimetres, and finer where a recording's is finer."""
+
+NO_TIME_US = 33_333
+"""Between two frames of a recording without time stamps."""
+
+Read = Callable[[], bytes]
+
+
+def _wrong(path: Path, what: str) -> CaptureError:
+    return CaptureError("unreadable", f"{path}: {what}")
+
+
+def _bytes_of(path: Path) -> bytes:
+    """Of a file. Raises CaptureError where it is missing or far too large."""
+    try:
+        with open(path, "rb") as stream:
+            data = stream.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise _wrong(path, f"cannot be read: {error.strerror}") from error
+    if len(data) > MOST_BYTES:
+        raise _wrong(path, f"is larger than {MOST_BYTES // 1_000_000} MB")
+    return data
+
+
+def _tree_of(path: Path, data: bytes) -> Any:
+    """Of JSON without NaN. Raises CaptureError."""
+    try:
+        return json.loads(data, parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise _wrong(path, f"is no JSON: {error}") from error
+
+
+def _refuse(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _size_of(path: Path) -> Size:
+    """Width and height in the head of an image. Raises CaptureError."""
+    try:
+        return head_size(_bytes_of(path))
+    except PictureError as error:
+        raise _wrong(path, str(error)) from error
+
+
+def _intrinsics(path: Path, size: Size, numbers: Iterable[Any], centre: float) -> Intrinsics:
+    """Of fx, fy, cx, cy, whose first pixel's centre is at `centre`. Raises CaptureError."""
+    try:
+        fx, fy, cx, cy = (float(x) for x in numbers)
+        if not np.isfinite([fx, fy, cx, cy]).all() or min(fx, fy) <= 0 or max(abs(cx), abs(cy)) > 1e6:
+            raise ValueError(f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}")
+        shift = 0.5 - centre
+        return Intrinsics(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx + shift, cy=cy + shift)
+    except (TypeError, ValueError, ValidationError) as error:
+        raise _wrong(path, f"has no usable intrinsics ({error})") from error
+
+
+def _scaled(k: Intrinsics, size: Size) -> DepthCamera:
+    """A depth camera that sees the same as a colour camera, in an image of another size."""
+    x, y = size[0] / k.width, size[1] / k.height
+    small = Intrinsics(width=size[0], height=size[1], fx=x * k.fx, fy=y * k.fy, cx=x * k.cx, cy=y * k.cy)
+    return DepthCamera(small, frozen_array(np.zeros(8)), frozen_array(np.eye(4)))
+
+
+def _color(stamp_us: int, read: Read, k: Intrinsics) -> RecordedFrame:
+    size = (k.width, k.height)
+    return RecordedFrame(False, stamp_us, lambda small: (decode_small if small else decode_rgb)(read(), size), k)
+
+
+def _depth(stamp_us: int, read: Read, k: Intrinsics, units_per_m: float, size: Size | None = None) -> RecordedFrame:
+    """Of the colour camera `k`, registered to it or, with a `size`, seen by it in an image of that size."""
+    own = size or (k.width, k.height)
+    camera = k if own == (k.width, k.height) else _scaled(k, own)
+
+    def load(small: bool) -> np.ndarray | None:
+        return np.zeros(0) if small else decode_depth(read(), own, units_per_m)
+
+    return RecordedFrame(True, stamp_us, load, camera)
+
+
+def _recorded(
+    path: Path, frames: list[RecordedFrame], lens: Iterable[float] = (), units_per_m: float = UNITS_PER_M
+) -> Recorded:
+    """A recording of these frames, its camera that of the middle focal length. Raises CaptureError without any."""
+    frames = sorted(frames, key=lambda frame: (frame.stamp_us, frame.is_depth))
+    colors = [frame for frame in frames if not frame.is_depth]
+    if not colors or len(colors) == len(frames):
+        raise CaptureError("empty", f"{path} has {len(colors)} colour images and {len(frames) - len(colors)} of depth")
+    cameras = [frame.camera for frame in colors if isinstance(frame.camera, Intrinsics)]
+    sizes = {(k.width, k.height) for k in cameras}
+    if len(sizes) > 1:
+        raise _wrong(path, f"has colour images of {len(sizes)} sizes: import each by itself")
+    k = sorted(cameras, key=lambda one: one.fx)[len(cameras) // 2]
+    whole = np.zeros(8)
+    whole[: len(tuple(lens))] = tuple(lens)
+    stamps = np.array([frame.stamp_us for frame in colors])
+    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else float(NO_TIME_US)
+    camera = CaptureCamera(k, frozen_array(whole), units_per_m)
+    return Recorded(path, camera, None, max(period, 1.0), lambda: iter(frames), float(stamps[-1]))
+
+
+def _below(folder: Path, name: str) -> Path:
+    """The file of a name that a list in the folder gives. Raises CaptureError where it leads out of the folder."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise _wrong(folder, f"names the file {name!r}, which is not in it")
+    return path
+
+
+# ---------------------------------------------------------------------------------------------- TUM RGB-D
+
+TUM_UNITS_PER_M = 5000.0
+
+TUM_CAMERAS = {
+    "freiburg1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+"""fx, fy, cx, cy and lens of the colour cameras, by a word in the folder's name, as the data set's page has them."""
+
+
+def _is_tum(path: Path) -> bool:
+    return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+
+
+def _open_tum(path: Path) -> Recorded:
+    word = next((word for word in TUM_CAMERAS if word in path.resolve().name.lower()), None)
+    if word is None:
+        known = ", ".join(TUM_CAMERAS)
+        raise CaptureError(
+            "calibration", f"{path} names none of {known}, and no file in it has its camera: rename the folder"
+        )
+    numbers, lens = TUM_CAMERAS[word]
+    color, depth = (list(_tum_list(path, name)) for name in ("rgb.txt", "depth.txt"))
+    if not color:
+        raise CaptureError("empty", f"{path}/rgb.txt names no image")
+    k = _intrinsics(path, _size_of(color[0][1]), numbers, 0.0)
+    frames = [_color(stamp, _reader(file), k) for stamp, file in color]
+    frames += [_depth(stamp, _reader(file), k, TUM_UNITS_PER_M) for stamp, file in depth]
+    return _recorded(path, frames, lens, TUM_UNITS_PER_M)
+
+
+def _tum_list(folder: Path, name: str) -> Iterator[tuple[int, Path]]:
+    """(microseconds, file) of each line `seconds file`."""
+    for line in _bytes_of(folder / name).decode("utf-8", "replace").splitlines():
+        parts = line.split()
+        if parts and not line.lstrip().startswith("#"):
+            if len(parts) != 2 or not re.fullmatch(r"[0-9]{1,12}(\.[0-9]{1,12})?", parts[0]):
+                raise _wrong(folder / name, f"the line {line[:60]!r} is not a time in seconds and a file")
+            yield round(float(parts[0]) * 1e6), _below(folder, parts[1])
+
+
+def _reader(path: Path) -> Read:
+    return lambda: _bytes_of(path)
+
+
+# ---------------------------------------------------------------------------------------------- BOP, Open3D
+
+
+def _is_bop(path: Path) -> bool:
+    return (path / "scene_camera.json").is_file()
+
+
+def _open_bop(path: Path) -> Recorded:
+    described = path / "scene_camera.json"
+    tree, frames = _tree_of(described, _bytes_of(described)), []
+    if not isinstance(tree, dict) or not all(isinstance(one, dict) and name.isdecimal() for name, one in tree.items()):
+        raise _wrong(described, "is no list of cameras by the number of an image")
+    for name, one in sorted(tree.items(), key=lambda item: int(item[0])):
+        stamp = int(name) * NO_TIME_US
+        color = next((f for end in ("png", "jpg") if (f := path / "rgb" / f"{int(name):06d}.{end}").is_file()), None)
+        if color is None:
+            raise CaptureError("missing", f"{path} has no rgb/{int(name):06d}.png or .jpg")
+        K, scale = one.get("cam_K"), one.get("depth_scale")
+        if not isinstance(K, list) or len(K) != 9:
+            raise _wrong(described, f"{name}: cam_K must be nine numbers")
+        if not isinstance(scale, int | float) or not 0 < scale < 1e6:
+            raise _wrong(described, f"{name}: depth_scale is {scale!r}, and must be millimetres a unit")
+        k = _intrinsics(described, _size_of(color), (K[0], K[4], K[2], K[5]), 0.0)
+        frames.append(_color(stamp, _reader(color), k))
+        frames.append(_depth(stamp, _reader(path / "depth" / f"{int(name):06d}.png"), k, 1000.0 / scale))
+    finest = max((1000.0 / one["depth_scale"] for one in tree.values()), default=UNITS_PER_M)
+    return _recorded(path, frames, (), min(max(finest, UNITS_PER_M), 10_000.0))
+
+
+OPEN3D_FILES = ("intrinsic.json", "camera_intrinsic.json", "camera.json")
+
+
+def _is_open3d(path: Path) -> bool:
+    return all((path / name).is_dir() for name in ("color", "depth")) and _open3d_camera(path) is not None
+
+
+def _open3d_camera(path: Path) -> Path | None:
+    return next((path / name for name in OPEN3D_FILES if (path / name).is_file()), None)
+
+
+def _open_open3d(path: Path) -> Recorded:
+    described = _open3d_camera(path)
+    assert described is not None
+    tree = _tree_of(described, _bytes_of(described))
+    matrix = tree.get("intrinsic_matrix") if isinstance(tree, dict) else None
+    if not isinstance(matrix, list) or len(matrix) != 9:
+        raise _wrong(described, "has no intrinsic_matrix of nine numbers, column by column")
+    color, depth = (sorted(f for f in (path / name).iterdir() if f.is_file()) for name in ("color", "depth"))
+    if [file.stem for file in color] != [file.stem for file in depth]:
+        raise CaptureError(
+            "counts", f"{path} has {len(color)} images in color/ and {len(depth)} in depth/, or of other names"
+        )
+    frames = []
+    for number, (rgb, z) in enumerate(zip(color, depth, strict=True)):
+        k = _intrinsics(described, _size_of(rgb), (matrix[0], matrix[4], matrix[6], matrix[7]), 0.0)
+        frames += [_color(number * NO_TIME_US, _reader(rgb), k), _depth(number * NO_TIME_US, _reader(z), k, 1000.0)]
+    return _recorded(path, frames)
+
+
+# ---------------------------------------------------------------------------------------------- Apple's
+
+
+def _is_record3d(path: Path) -> bool:
+    if not path.is_file() or not zipfile.is_zipfile(path):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "metadata" in archive.namelist()
+    except zipfile.BadZipFile:
+        return False
+
+
+def _open_record3d(path: Path) -> Recorded:
+    tree = _tree_of(path, _member(path, "metadata")())
+    with zipfile.ZipFile(path) as archive:
+        names = set(archive.namelist())
+    numbers = sorted(int(found[1]) for name in names if (found := re.fullmatch(r"rgbd/([0-9]{1,9})\.jpg", name)))
+    try:
+        size, depth_size = ((int(tree[w]), int(tree[h])) for w, h in (("w", "h"), ("dw", "dh")))
+        K = tree.get("K") or [0] * 9
+        own = tree.get("perFrameIntrinsicCoeffs") or []
+        times = tree.get("frameTimestamps") or [n / float(tree.get("fps", 30)) for n in range(len(numbers))]
+        stamps = [round(float(times[n]) * 1e6) for n in numbers]
+        cameras = [own[n] if n < len(own) else (K[0], K[4], K[6], K[7]) for n in numbers]
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError, ZeroDivisionError, AttributeError) as error:
+        raise _wrong(
+            path, f"its metadata lacks sizes, intrinsics or times of {len(numbers)} frames ({error!r})"
+        ) from error
+    if not all(0 < side <= 20_000 for side in (*size, *depth_size)):
+        raise _wrong(path, f"images of {size} and depth of {depth_size} cannot be")
+    frames = []
+    for number, stamp, camera in zip(numbers, stamps, cameras, strict=True):
+        k = _intrinsics(path, size, camera, 0.5)
+        frames.append(_color(stamp, _member(path, f"rgbd/{number}.jpg"), k))
+        if f"rgbd/{number}.depth" in names:
+            frames.append(_depth(stamp, _member(path, f"rgbd/{number}.depth"), k, 1000.0, depth_size))
+    return _recorded(path, frames)
+
+
+def _member(path: Path, name: str) -> Read:
+    """Of an archive, read when it is asked for; a bomb is refused by what it says of itself, and by what comes out."""
+
+    def read() -> bytes:
+        try:
+            with zipfile.ZipFile(path) as archive, archive.open(name) as stream:
+                data = stream.read(MOST_BYTES + 1)
+        except (
+            KeyError,
+            zipfile.BadZipFile,
+            zipfile.LargeZipFile,
+            OSError,
+            EOFError,
+            RuntimeError,
+            ValueError,
+        ) as error:
+            raise _wrong(path, f"{name} cannot be read ({error}): copy it again") from error
+        except (NotImplementedError, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
+            raise _wrong(path, f"{name} cannot be unpacked ({error}): copy it again") from error
+        if len(data) > MOST_BYTES:
+            raise _wrong(path, f"{name} unpacks to more than {MOST_BYTES // 1_000_000} MB")
+        return data
+
+    return read
+
+
+def _keyframes(path: Path) -> Path:
+    return path / "keyframes" if (path / "keyframes").is_dir() else path
+
+
+def _is_polycam(path: Path) -> bool:
+    return all((_keyframes(path) / name).is_dir() for name in ("images", "depth", "cameras"))
+
+
+def _open_polycam(path: Path) -> Recorded:
+    root, frames = _keyframes(path), []
+    for described in sorted((root / "cameras").glob("*.json")):
+        tree = _tree_of(described, _bytes_of(described))
+        if not described.stem.isdecimal() or not isinstance(tree, dict) or not {"fx", "fy", "cx", "cy"} <= set(tree):
+            raise _wrong(described, "must be named by its time and have fx, fy, cx and cy")
+        color, depth = root / "images" / f"{described.stem}.jpg", root / "depth" / f"{described.stem}.png"
+        k = _intrinsics(described, _size_of(color), (tree[name] for name in ("fx", "fy", "cx", "cy")), 0.5)
+        frames.append(_color(int(described.stem), _reader(color), k))
+        if depth.is_file():
+            frames.append(_depth(int(described.stem), _reader(depth), k, 1000.0, _size_of(depth)))
+    return _recorded(path, frames)
+
+
+ARKIT_FOLDERS = ("lowres_wide", "lowres_depth", "lowres_wide_intrinsics")
+
+
+def _is_arkit(path: Path) -> bool:
+    return all((path / name).is_dir() for name in ARKIT_FOLDERS)
+
+
+def _open_arkit(path: Path) -> Recorded:
+    color, depth, described = (path / name for name in ARKIT_FOLDERS)
+    cameras = {_milliseconds(file): file for file in described.glob("*.pincam")}
+    frames = []
+    for file in sorted(color.glob("*.png")):
+        at = _milliseconds(file)
+        camera = next((cameras[at + off] for off in (0, 1, -1) if at + off in cameras), None)  # their times are rounded
+        if camera is None:
+            raise CaptureError("missing", f"{described} has no camera for {file.name}")
+        numbers = _bytes_of(camera).decode("utf-8", "replace").split()
+        k = _intrinsics(camera, _size_of(file), numbers[2:], 0.5)
+        frames.append(_color(1000 * at, _reader(file), k))
+        if (seen := depth / file.name).is_file():
+            frames.append(_depth(1000 * at, _reader(seen), k, 1000.0, _size_of(seen)))
+    return _recorded(path, frames)
+
+
+def _milliseconds(path: Path) -> int:
+    """Of the name VIDEO_SECONDS. Raises CaptureError."""
+    found = re.fullmatch(r"[0-9]+_([0-9]{1,9}(?:\.[0-9]{1,6})?)", path.stem)
+    if not found:
+        raise _wrong(path, "must be named VIDEO_SECONDS, such as 41069021_305.377.png")
+    return round(float(found[1]) * 1000)
+
+
+FOLDERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Recorded]]] = {
+    "a TUM RGB-D folder (rgb.txt, depth.txt)": (_is_tum, _open_tum),
+    "a BOP scene (scene_camera.json, rgb/, depth/)": (_is_bop, _open_bop),
+    "an Open3D folder (color/, depth/, intrinsic.json)": (_is_open3d, _open_open3d),
+    "a Record3D file (.r3d)": (_is_record3d, _open_record3d),
+    "Polycam's raw data (keyframes/)": (_is_polycam, _open_polycam),
+    "an ARKitScenes folder (lowres_wide/, lowres_depth/)": (_is_arkit, _open_arkit),
+}
+"""(by a glance, opened) of each format."""
