@@ -27,8 +27,7 @@ class Geometry:
     marker; squares [S, 4, 3]: plain black squares. chess [K, 3]: where two of them meet, corners of a chessboard;
     chess_squares, chess_corners [K, 2]: which two, and by which of their corners; chess_free_m [K]: half the side of the
     largest window about each that shows nothing else. right, below [N]: the marker whose left (upper) edge lies opposite to
-    the right (lower) edge of one, at most a marker's side away, or -1. touching: squares touch corners of markers, as Kalibr
-    prints them.
+    the right (lower) edge of one, at most a marker's side away, or -1.
     """
 
     ids: NDArray[np.int64]
@@ -40,7 +39,6 @@ class Geometry:
     chess_free_m: Array
     right: NDArray[np.int64]
     below: NDArray[np.int64]
-    touching: bool
 
     def index(self, ids: NDArray[np.int64]) -> NDArray[np.intp]:
         """Place of each id, which must be on the board."""
@@ -54,16 +52,13 @@ def board_geometry(board: Board) -> Geometry:
     squares = board.scale * np.array(board.squares, dtype=np.float64).reshape(-1, 4, 3)
     pairs = cKDTree(squares.reshape(-1, 3)).query_pairs(TOUCHING_M, output_type="ndarray")
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
-    touching = bool(len(squares)) and bool(
-        (cKDTree(squares.reshape(-1, 3)).query(corners.reshape(-1, 3))[0] < TOUCHING_M).any()
-    )
     right, below = _opposite(corners, (1, 2), (0, 3)), _opposite(corners, (2, 3), (1, 0))
     chess = squares.reshape(-1, 3)[pairs[:, 0]]
     sides = np.linalg.norm(squares[pairs[:, 0] // 4, 1] - squares[pairs[:, 0] // 4, 0], axis=1)
     nearest = cKDTree(corners.reshape(-1, 3)).query(chess)[0] if len(chess) else np.zeros(0)
     free_m = np.minimum(nearest / math.sqrt(2.0), 0.5 * sides)  # a marker's corner lies on the diagonal
     ids = np.sort(np.array([m.id for m in board.markers], np.int64)) if board.markers else _grid_ids(board)
-    return Geometry(ids, corners, squares, chess, pairs // 4, pairs % 4, free_m, right, below, touching)
+    return Geometry(ids, corners, squares, chess, pairs // 4, pairs % 4, free_m, right, below)
 
 
 def _grid_ids(board: Board) -> NDArray[np.int64]:

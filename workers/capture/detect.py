@@ -122,37 +122,16 @@ def detect_markers(
     """The board's markers in an image [H, W, 3]; ids that are not on the board, or that are seen twice, are dropped."""
     gray: NDArray[np.uint8] = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
     geometry, border = board_geometry(board), board.border_bits
-    quads, ids = _read_markers(gray, dictionary, geometry, border)
+    quads, found, _ = _detector(dictionary, border_bits=border).detectMarkers(gray)
+    ids = np.zeros(0, np.int64) if found is None else found.ravel().astype(np.int64)
     kept, dropped = _usable(ids, geometry.ids)
-    corners = quads[kept]
+    corners = np.array([quads[k][0] for k in kept], dtype=np.float64).reshape(-1, 4, 2)
     corners = refine_corners(gray, corners, dictionary.markerSize + 2 * border)
     chess, chess_px = _find_chess(gray, geometry, ids[kept], corners)
     for pixels in (corners, chess_px):
         pixels += 0.5
         pixels.setflags(write=False)
     return Detection(number, ids[kept], corners, dropped, chess, chess_px)
-
-
-APART_PX = 3
-"""Width of the window whose brightest pixel parts a large marker from squares that touch its corners; blur parts a small one."""
-
-
-def _read_markers(
-    gray: NDArray[np.uint8], dictionary: "cv2.aruco.Dictionary", geometry: Geometry, border_bits: int
-) -> tuple[Array, NDArray[np.int64]]:
-    """([M, 4, 2] corners, [M] ids) of all markers of the dictionary, pixel centres at integers; unrefined."""
-    detector, pictures = _detector(dictionary, border_bits=border_bits), [gray]
-    if geometry.touching:
-        parted = cv2.dilate(gray, np.ones((APART_PX, APART_PX), np.uint8)).astype(np.uint8, copy=False)
-        pictures.append(parted)
-    quads, ids = np.zeros((0, 4, 2)), np.zeros(0, np.int64)
-    for picture in pictures:
-        seen, found, _ = detector.detectMarkers(picture)
-        if found is not None:
-            new = ~np.isin(found.ravel(), ids)
-            quads = np.concatenate([quads, np.array(seen, np.float64).reshape(-1, 4, 2)[new]])
-            ids = np.concatenate([ids, found.ravel()[new].astype(np.int64)])
-    return quads, ids
 
 
 NEAR_MARKERS = 4

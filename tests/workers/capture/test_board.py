@@ -56,7 +56,7 @@ def test_opencvs_charuco_boards_lie_on_ours_in_both_patterns():
         theirs = cv2.aruco.CharucoBoard((columns, rows), 0.04, 0.03, open_dictionary(board))
         theirs.setLegacyPattern(old)
         geometry, T = board_geometry(board), frame_in_board(board, "opencv")
-        assert geometry.ids.tolist() == theirs.getIds().ravel().tolist() and not geometry.touching
+        assert geometry.ids.tolist() == theirs.getIds().ravel().tolist()
         ours = transform(T, np.array(theirs.getObjPoints(), np.float64).reshape(-1, 3))
         assert geometry.corners.reshape(-1, 3) == pytest.approx(ours, abs=1e-7)
         chess = transform(T, np.array(theirs.getChessboardCorners(), np.float64))
@@ -82,6 +82,10 @@ def test_a_grid_written_marker_by_marker_is_the_same_board():
     assert one.below.reshape(3, 4).tolist() == [[4, 5, 6, 7], [8, 9, 10, 11], [-1] * 4]
     for frame in ("centre", "opencv", "opencv_old"):
         assert frame_in_board(grid, frame) == pytest.approx(frame_in_board(listed, frame))
+    beside = np.array([[-0.05, 0.05, 0.0], [0.0, 0.05, 0.0], [0.0, 0.0, 0.0], [-0.05, 0.0, 0.0]])
+    for moved, met in (([0.07, 0, 0], 1), ([0.07, 0.01, 0], -1), ([0.07, 0, 0.01], -1), ([0.12, 0, 0], -1)):
+        two = [{"id": n, "corners": (beside + n * np.array(moved)).tolist()} for n in (0, 1)]
+        assert board_geometry(Board.model_validate({"markers": two})).right.tolist() == [met, -1]
     assert read_again(listed) == listed and set(listed.model_dump()) & set(GRID_KEYS) == set()
     first_keys = "dictionary columns rows marker_m gap_m width_m height_m first_id ruler_m measured_ruler_m"
     assert list(grid.model_dump()) == first_keys.split()
@@ -117,7 +121,7 @@ def test_kalibrs_grid_is_found_where_its_target_file_has_it(tmp_path):
     )
     board = read_board_file(tmp_path / "target.yaml")
     geometry, picture = board_geometry(board), kalibrs_picture()
-    assert geometry.touching and not len(geometry.chess) and len(geometry.squares) == 9
+    assert not len(geometry.chess) and len(geometry.squares) == 9
     # Kalibr's frame: origin at the lower left corner of tag 0, y up, z out of the board; pixels from the image's edge.
     from_kalibr = np.array([[2000.0, 0, 120], [0, -2000, 120 + 460]])
     T_kalibr_board = np.linalg.inv(frame_in_board(board, "opencv_old"))
@@ -143,7 +147,7 @@ def test_boards_of_other_programs_are_read_from_their_own_files(tmp_path):
         (tmp_path / name).write_text(text)
         return read_board_file(tmp_path / name)
 
-    turned = "qw: 0.7071068, qx: 0.7071068, qy: 0, qz: 0"  # about x by a quarter: y of the tag is z, its print faces -y
+    turned = "qw: 0.5, qx: 0.5, qy: 0.5, qz: 0.5"  # takes x to y, y to z and z to x, where its print faces
     bundle = f"""tag_family: tag36h11
 tag_border: 1
 standalone_tags: []
@@ -156,7 +160,7 @@ tag_bundles:
     # The upright tag's corners from the upper left, clockwise; OpenCV's picture begins at the opposite one.
     upright = np.array([[-0.03, 0.03, 0], [0.03, 0.03, 0], [0.03, -0.03, 0], [-0.03, -0.03, 0]])
     assert geometry.corners[0] == pytest.approx(upright[[2, 3, 0, 1]])
-    stands = np.array([[0.08, 0.2, 0.07], [0.12, 0.2, 0.07], [0.12, 0.2, 0.03], [0.08, 0.2, 0.03]])
+    stands = np.array([[0.1, 0.18, 0.07], [0.1, 0.22, 0.07], [0.1, 0.22, 0.03], [0.1, 0.18, 0.03]])
     assert geometry.corners[1] == pytest.approx(stands[[2, 3, 0, 1]], abs=1e-7)
     file = cv2.FileStorage(str(tmp_path / "map.yml"), cv2.FILE_STORAGE_WRITE)
     file.write("aruco_bc_dict", "ARUCO_MIP_36h12")
@@ -188,7 +192,7 @@ tag_bundles:
             "target_type: aprilgrid\ntagCols: 2\ntagRows: 2\ntagSize: 0.1\ntagSpacing: 0.3\ntagFamily: t25h7",
             "no dictionary",
         ),
-        (bundle.replace("0.7071068", "0.5"), "quaternion of tag 2 has not length 1"),
+        (bundle.replace("qw: 0.5", "qw: 0.9"), "quaternion of tag 2 has not length 1"),
         ("standalone_tags: [{id: 1, size: 0.1}, {id: 2, size: 0.1}]", "2 tags that stand alone"),
         ("aruco_bc_mInfoType: 0\naruco_bc_markers: []", "its lengths are pixels"),
         (xml.replace("CHARUCOBOARD", "CHESSBOARD"), "CHARUCOBOARD is read"),
