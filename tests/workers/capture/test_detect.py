@@ -21,7 +21,7 @@ from workers.capture.detect import detect_markers, refine_corners
 from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
-from workers.capture.simulate.photograph import build_studio, place_object, take_light
+from workers.capture.simulate.photograph import build_studio, mark_object, place_object, take_light
 from workers.capture.simulate.simulate import plan_path
 from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import pose, rotation_about, transform
@@ -125,37 +125,52 @@ ANY_BOARD = {
 }
 
 
-@pytest.mark.minute
-@pytest.mark.parametrize("kind", ANY_BOARD)
-def test_poses_from_any_board_are_a_tenth_of_a_millimetre_off_at_most(kind, record_figure):
-    """By the simulator's photographs, whose poses are known; each view by its own markers."""
-    board, simulate, chance, thing = ANY_BOARD[kind](), Simulate(views=3), SceneChance(11, 0), asset_of()
+def in_sight(board, studio, T, camera):
+    """How many corners of the chessboard are in the image and 15 pixels away from the object's, at least."""
+    hidden = cv2.dilate(mark_object(studio, studio.T_world_board @ T).astype(np.uint8), np.ones((31, 31)))
+    pixels = np.floor(pixels_of_points(board_geometry(board).chess, T, camera)).astype(int)
+    inside = ((pixels > 15) & (pixels < np.array(hidden.shape[::-1]) - 15)).all(axis=1)
+    return int((hidden[tuple(pixels[inside].T[::-1])] == 0).sum())
+
+
+def simulated_views(board, seed):
+    """(pose, what was found, pose from markers, corners of the chessboard in sight, set-up) of three photographs of a can."""
+    simulate, chance, thing = Simulate(views=3), SceneChance(seed, 0), asset_of()
     placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
     studio = build_studio(simulate, board, placed, plan_capture(simulate), chance)
-    poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
     setup = Setup(CaptureCamera(studio.rig.color, np.zeros(8)), board, Estimation())
-    dictionary, seen = open_dictionary(board), []
+    poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
     for number, T in enumerate(poses):
         rgb = encode_codes(take_light(studio, number, studio.T_world_board @ T))
-        found = detect_markers(rgb, board, dictionary, number)
-        seen.append((found, *observe_view(found, None, setup)))
-    estimate = estimate_markers(Evidence.of(setup, [one[1] for one in seen], [one[2] for one in seen]))
-    assert all(view.status == "used" for view in estimate.views) and not any(one[0].dropped for one in seen)
+        found = detect_markers(rgb, board, open_dictionary(board), number)
+        yield T, found, *observe_view(found, None, setup), in_sight(board, studio, T, setup.camera), setup
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize("kind", ANY_BOARD)
+def test_poses_from_any_board_are_a_tenth_of_a_millimetre_off(kind, record_figure):
+    """By the simulator's photographs, whose poses are known, of six views, each by its own markers."""
+    board = ANY_BOARD[kind]()
+    poses, found, seen, by_markers, visible, setups = zip(
+        *itertools.chain(*(simulated_views(board, seed) for seed in (11, 14))), strict=True
+    )
+    estimate = estimate_markers(Evidence.of(setups[0], list(seen), list(by_markers)))
+    assert all(view.status == "used" for view in estimate.views) and not any(one.dropped for one in found)
     if "charuco" in kind:
-        assert all(len(one[0].chess) >= 30 for one in seen), "of 40, one or a few behind the can"
-        off = [
-            one[0].chess_px - pixels_of_points(board_geometry(board).chess[one[0].chess], T, setup.camera)
-            for one, T in zip(seen, poses, strict=True)
+        assert sum(len(one.chess) for one in found) >= 0.9 * sum(visible) > 100
+        true = [
+            pixels_of_points(board_geometry(board).chess[f.chess], T, setups[0].camera)
+            for f, T in zip(found, poses, strict=True)
         ]
-        assert np.sqrt(np.square(np.concatenate(off)).mean()) < 0.1 and np.abs(np.concatenate(off)).max() < 0.5
+        off = np.concatenate([one.chess_px for one in found]) - np.concatenate(true)
+        assert np.sqrt(np.square(off).mean()) < 0.1 and np.abs(off).max() < 0.5
     every = np.array([errors(v.T_board_cam, T) for v, T in zip(estimate.views, poses, strict=True)])
     median, worst = np.median(every, axis=0), every.max(axis=0)
-    most_mm = (
-        0.2 if kind == "cube of tags" else 0.1
-    )  # the can hides a part of the cube, whose extent is a third of a board's
-    for what, unit, n, bounds in (("position", "mm", 0, (0.1, most_mm)), ("rotation", "degrees", 1, (0.01, 0.02))):
-        record_figure(f"{kind}: camera {what}, median of 3 views", unit, median[n], bounds[0])
-        record_figure(f"{kind}: camera {what}, the worst of 3 views", unit, worst[n], bounds[1])
+    # The can hides parts of the cube, whose extent is a third of a board's.
+    mm, degrees = ((0.2, 0.25), (0.015, 0.02)) if kind == "cube of tags" else ((0.1, 0.15), (0.01, 0.01))
+    for what, unit, n, bounds in (("position", "mm", 0, mm), ("rotation", "degrees", 1, degrees)):
+        record_figure(f"{kind}: camera {what}, median of 6 views", unit, median[n], bounds[0])
+        record_figure(f"{kind}: camera {what}, the worst of 6 views", unit, worst[n], bounds[1])
         assert median[n] <= bounds[0] and worst[n] <= bounds[1], what
 
 
