@@ -29,6 +29,7 @@ from scipy import ndimage
 from splits import pairs_of_split
 
 from schemas.dataset.codec import read_matrix
+from schemas.dataset.layout import PixelKind
 from schemas.errors import InputError
 from schemas.job.job import Job
 from schemas.job.views import DepthNoise, RgbNoise, SensorEffects
@@ -39,7 +40,6 @@ from services.dataset.pair import Pair
 from services.dataset.view import Files
 from services.job.record import require_job
 from services.score.items import Asked
-from services.score.page import interval, told
 from services.score.predictions import find_predictions
 from services.score.run import score_dataset
 from services.score.summary import summarise
@@ -51,19 +51,29 @@ from workers.scene.sensor import sense_depth, sense_rgb
 from workers.store.images import encode_png
 from workers.store.local import open_store
 
-METRICS: Final = (
-    *("depth_mae_m", "depth_mae_hidden_m", "depth_within_2mm", "depth_holes", "rgb_psnr_db", "rgb_ssim"),
-    *("shape_chamfer_l1_m", "shape_fscore_2mm", "shape_iou", "volume_iou", "pose_add_m", "pose_rotation_deg"),
-)
-"""Of the columns of items.parquet, those in the table."""
+METRICS: Final = {
+    "depth_mae_m": "depth, mm",
+    "depth_mae_hidden_m": "hidden, mm",
+    "depth_within_2mm": "in 2 mm",
+    "depth_holes": "holes",
+    "rgb_psnr_db": "PSNR, dB",
+    "rgb_ssim": "SSIM",
+    "shape_chamfer_l1_m": "Chamfer, mm",
+    "shape_fscore_2mm": "F, 2 mm",
+    "shape_iou": "IoU",
+    "volume_iou": "IoU of points",
+    "pose_add_m": "ADD, mm",
+    "pose_rotation_deg": "turn, °",
+}
+"""Of the columns of items.parquet, those in the table, and what it calls them."""
 
-COLUMNS: Final = ("name", "level", "job", "metric", "value", "low", "high", "items", "seconds")
+COLUMNS: Final = ("name", "job", "scenes", "level", "metric", "value", "low", "high", "items", "seconds")
 """Of benchmark.csv; docs/benchmark.md tells them."""
 
 NOISY: Final = 3
 """The level whose input views are noisy; below it a level is 1 for a scene of one object, else 2."""
 
-SENSOR: Final = SensorEffects(depth_noise=DepthNoise(), rgb_noise=RgbNoise())
+DEPTH_NOISE, RGB_NOISE = DepthNoise(), SensorEffects(rgb_noise=RgbNoise())
 """What level 3 has between the scene and the input view."""
 
 SILHOUETTE_PX: Final = 64
@@ -237,14 +247,15 @@ BASELINES: Final[Mapping[str, Callable[[Dataset], Predictor]]] = {
     "truth": lambda dataset: tell_truth,
     "input copied": lambda dataset: copy_input,
     "projected": lambda dataset: project_input,
-    "projected, filled": lambda dataset: project_and_fill,
+    "projected and filled": lambda dataset: project_and_fill,
     "nearest training shape": find_shapes,
     "mirror-depth network": train_depth,
     "occupancy network": train_volume,
 }
-"""What makes a predictor of a dataset, by name; networks by PyTorch."""
+"""What makes a predictor of a dataset, by name."""
 
 NETWORKS: Final = ("mirror-depth network", "occupancy network")
+"""Those that PyTorch trains."""
 
 
 # ---------------------------------------------------------------------------------------------------- predictions and scores
@@ -270,12 +281,12 @@ def write(folder: Path, pair: Pair, found: Prediction) -> None:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(data)
     if found.poses:
-        path = folder / "poses.csv"
-        lines = [] if path.exists() else ["scene_id,im_id,obj_id,R,t\n"]
+        table = folder / "poses.csv"
+        lines = [] if table.exists() else ["scene_id,im_id,obj_id,R,t\n"]
         for region, T in found.poses.items():
             R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
             lines.append(f"{pair.scene_id},{pair.mirror.pose_id},{region},{R},{t}\n")
-        with path.open("a") as file:
+        with table.open("a") as file:
             file.writelines(lines)
 
 
@@ -292,23 +303,23 @@ class SensedFiles:
 
 
 def sense_input(pair: Pair, job: Job) -> Pair:
-    """The pair with the input view, patches included, that the same job with `SENSOR` stores: the same bytes."""
+    """The pair with the input view, patches included, that the same job with this noise stores: the same pixels."""
     view = pair.input
     chance, number = SceneChance(job.seed, pair.scene_id), pair.pose_id // 2 % job.pairs_per_scene
-    streams = (Stream.SENSOR_DEPTH, Stream.SENSOR_RGB, Stream.SENSOR_EXPOSURE)
-    depth_rng, rgb_rng, no_rng = (chance.stream(name, number, ROLES.index("input")) for name in streams)
+    streams = (Stream.SENSOR_DEPTH, Stream.SENSOR_RGB)
+    depth_rng, rgb_rng = (chance.stream(name, number, ROLES.index("input")) for name in streams)
     exact_m = dequantise_depth(view.depth(), job.images)
-    sensed_m = sense_depth(exact_m, view.segment(), view.camera, SENSOR.depth_noise, depth_rng)
-    sensed = {
+    sensed_m = sense_depth(exact_m, view.segment(), view.camera, DEPTH_NOISE, depth_rng)
+    sensed: dict[PixelKind, Any] = {
         "depth": quantise_depth(sensed_m, job.images),
-        "rgb": sense_rgb(view.rgb(), view.camera.intrinsics, SENSOR, no_rng, rgb_rng),
+        "rgb": sense_rgb(view.rgb(), view.camera.intrinsics, RGB_NOISE, rgb_rng, rgb_rng),
     }
     crops = [patch for region in regions_of(pair) if (patch := view.patch(region)) is not None]
     images = {}
-    for pixels, (kind, whole) in product([view, *crops], sensed.items()):
+    for pixels, kind in product([view, *crops], sensed):
         k, moved = view.camera.intrinsics, pixels.camera.intrinsics
         top, left = round(k.cy - moved.cy), round(k.cx - moved.cx)
-        images[pixels.images[kind]] = encode_png(whole[top : top + moved.height, left : left + moved.width])
+        images[pixels.images[kind]] = encode_png(sensed[kind][top : top + moved.height, left : left + moved.width])
     changed = dataclasses.replace(view, _files=SensedFiles(view._files, images))
     return dataclasses.replace(pair, views={**pair.views, "input": changed})
 
@@ -319,53 +330,51 @@ def score(dataset: Dataset, folder: Path) -> pa.Table:
     return pq.read_table(score_dataset(store, given, Asked(given.kinds), folder / "score"))
 
 
-def rows_of(
-    name: str, job: str, table: pa.Table, scenes: Mapping[int, int], seconds: float
-) -> Iterator[dict[str, Any]]:
-    """Lines of benchmark.csv; scenes: the level by scene id."""
-    for level in sorted(set(scenes.values())):
-        chosen = pa.array([scene for scene in scenes if scenes[scene] == level], pa.int64())
+def run(name: str, dataset: Dataset, out: Path) -> list[dict[str, Any]]:
+    """The lines of benchmark.csv of a baseline, whose predictions are made first, or of predictions of one's own in OUT/NAME."""
+    head = {"name": name, "job": require_job(open_store(dataset.place)).digest[:12], "scenes": dataset.job.scenes}
+    predict, rows = BASELINES[name](dataset) if name in BASELINES else None, list[dict[str, Any]]()
+    for sensor in ("exact", "noisy"):
+        folder, levels, seconds = out / name.replace(" ", "_") / sensor, dict[int, int](), 0.0
+        if predict is not None:
+            (folder / "poses.csv").unlink(missing_ok=True)
+        for pair in pairs_of_split(dataset, "test"):
+            levels[pair.scene_id] = NOISY if sensor == "noisy" else 1 if len(regions_of(pair)) == 1 else 2
+            if predict is not None:
+                seen = sense_input(pair, dataset.job) if sensor == "noisy" else pair
+                begun = time.process_time()
+                found = predict(seen)
+                seconds += time.process_time() - begun
+                write(folder, pair, found)
+        told = f"{seconds / max(len(levels), 1):.2g}" if predict is not None else ""
+        rows += [{**head, **row, "seconds": told} for row in rows_of(score(dataset, folder), levels, folder)]
+    return rows
+
+
+def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterator[dict[str, Any]]:
+    """Level, metric and figure, for each; levels: by scene id. Raises InputError where items are missing."""
+    for level in sorted(set(levels.values())):
+        chosen = pa.array([scene for scene in levels if levels[scene] == level], pa.int64())
         items = table.filter(pc.is_in(table["scene_id"], chosen))
-        if count := pc.sum(pc.not_equal(items["status"], "ok")).as_py():
-            raise InputError(f"{name}: {count} items of level {level} are missing or refused")
+        if count := pc.sum(pc.equal(items["status"], "missing")).as_py():
+            raise InputError(f"{folder}: {count} items of test scenes are missing: predict every one, if only as empty")
         figures = summarise(items)["metrics"]
         for metric in (one for one in METRICS if one in figures and figures[one]["items"]):
-            numbers = {key: shorten(figures[metric][key]) for key in ("value", "low", "high")}
-            yield {"name": name, "level": level, "job": job, "metric": metric, **numbers} | {
-                "items": figures[metric]["items"], "seconds": shorten(seconds, 2)
-            }  # fmt: skip
+            yield {"level": level, "metric": metric, **{key: number(value) for key, value in figures[metric].items()}}
 
 
-def shorten(value: float | None, digits: int = 5) -> str:
-    """A number with so many digits; empty for none."""
-    return "" if value is None else f"{value:.{digits}g}"
-
-
-def run(name: str, dataset: Dataset, out: Path) -> list[dict[str, Any]]:
-    """Predicts and scores the test split with a baseline: its lines of benchmark.csv."""
-    job = require_job(open_store(dataset.place)).digest
-    predict, rows = BASELINES[name](dataset), list[dict[str, Any]]()
-    for sensor in ("exact", "noisy"):
-        folder, scenes, seconds = out / name.replace(" ", "_") / sensor, dict[int, int](), 0.0
-        (folder / "poses.csv").unlink(missing_ok=True)
-        for pair in pairs_of_split(dataset, "test"):
-            scenes[pair.scene_id] = NOISY if sensor == "noisy" else 1 if len(regions_of(pair)) == 1 else 2
-            seen = sense_input(pair, dataset.job) if sensor == "noisy" else pair
-            begun = time.process_time()
-            found = predict(seen)
-            seconds += time.process_time() - begun
-            write(folder, pair, found)
-        rows += rows_of(name, job, score(dataset, folder), scenes, seconds / max(len(scenes), 1))
-    return rows
+def number(value: float | int | None) -> str:
+    """Five digits, more than an interval leaves meaning to; empty for none."""
+    return "" if value is None else f"{value:.5g}"
 
 
 # ---------------------------------------------------------------------------------------------------- table
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The lines of benchmark.csv as Markdown: values, and in brackets their intervals; lengths in millimetres."""
+    """The lines of benchmark.csv as Markdown: a value and, in brackets, its interval; lengths in millimetres."""
     there = [metric for metric in METRICS if any(row["metric"] == metric for row in rows)]
-    lines = [["", "level", *(metric.removesuffix("_m").removesuffix("_db").replace("_", " ") for metric in there)]]
+    lines = [["", "level", *(METRICS[metric] for metric in there)]]
     lines.append(["---"] * len(lines[0]))
     figures = {(row["name"], str(row["level"]), row["metric"]): row for row in rows}
     for name, level in dict.fromkeys((row["name"], str(row["level"])) for row in rows):
@@ -374,12 +383,14 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def cell(metric: str, row: Mapping[str, Any] | None) -> str:
-    """`3.1 mm (2.9 mm to 3.4 mm)`; empty for none."""
+    """`3.1 (2.9–3.4)`; empty for none."""
     if row is None:
         return ""
-    figure = {key: float(row[key]) if row[key] else None for key in ("value", "low", "high")}
-    between = interval(metric, figure)
-    return told(metric, figure["value"]) + (f" ({between})" if between else "")
+    value, low, high = (
+        f"{(1e3 if metric.endswith('_m') else 1.0) * float(row[key]):.3g}" if row[key] else ""
+        for key in ("value", "low", "high")
+    )
+    return f"{value} ({low}–{high})" if low else value
 
 
 def read_options() -> argparse.Namespace:
@@ -387,7 +398,7 @@ def read_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("place", metavar="DATASET", help="of deploy/jobs/benchmark.yaml")
     parser.add_argument("--out", type=Path, required=True, help="folder for predictions, scores and benchmark.csv")
-    parser.add_argument("--only", action="append", choices=BASELINES, help="a baseline; may be given several times")
+    parser.add_argument("--only", action="append", help="a baseline, or a folder of OUT with your own predictions")
     return parser.parse_args()
 
 
