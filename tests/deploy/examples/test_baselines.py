@@ -1,4 +1,4 @@
-"""The benchmark: no shape is in two splits, truth scores full marks, level 3 is what a sensor stores, rows repeat and fit the job."""
+"""The benchmark: no shape is in two splits, truth scores full marks, level 3 is what a sensor stores, rows repeat and fit."""
 
 import csv
 import re
