@@ -10,6 +10,7 @@ import argparse
 import csv
 import dataclasses
 import importlib.util
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,7 +31,7 @@ from splits import pairs_of_split
 
 from schemas.dataset.codec import read_matrix
 from schemas.dataset.layout import PixelKind
-from schemas.errors import InputError
+from schemas.errors import InputError, VersoError, plural
 from schemas.job.job import Job
 from schemas.job.views import DepthNoise, RgbNoise, SensorEffects
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
@@ -357,7 +358,9 @@ def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterato
         chosen = pa.array([scene for scene in levels if levels[scene] == level], pa.int64())
         items = table.filter(pc.is_in(table["scene_id"], chosen))
         if count := pc.sum(pc.equal(items["status"], "missing")).as_py():
-            raise InputError(f"{folder}: {count} items of test scenes are missing: predict every one, if only as empty")
+            raise InputError(
+                f"{folder} misses {plural(count, 'item')} of test scenes: predict every one, if only as empty"
+            )
         figures = summarise(items)["metrics"]
         for metric in (one for one in METRICS if one in figures and figures[one]["items"]):
             yield {"level": level, "metric": metric, **{key: number(value) for key, value in figures[metric].items()}}
@@ -421,4 +424,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except VersoError as error:
+        sys.exit(f"baselines: {error}")
