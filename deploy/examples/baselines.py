@@ -375,25 +375,25 @@ def number(value: float | int | None) -> str:
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The lines of benchmark.csv as Markdown: a value and, in brackets, its interval; lengths in millimetres."""
+    """The lines of benchmark.csv as Markdown: a value and, in brackets, its interval; lengths in millimetres; and the seconds."""
     there = [metric for metric in METRICS if any(row["metric"] == metric for row in rows)]
-    lines = [["", "level", *(METRICS[metric] for metric in there)]]
+    lines = [["", "level", *(METRICS[metric] for metric in there), "s"]]
     lines.append(["---"] * len(lines[0]))
-    figures = {(row["name"], str(row["level"]), row["metric"]): row for row in rows}
-    for name, level in dict.fromkeys((row["name"], str(row["level"])) for row in rows):
-        lines.append([name, level, *(cell(metric, figures.get((name, level, metric))) for metric in there)])
+    groups = dict[tuple[str, str], dict[str, Mapping[str, Any]]]()
+    for row in rows:
+        groups.setdefault((row["name"], str(row["level"])), {})[row["metric"]] = row
+    for names, group in groups.items():
+        cells = [cell(metric, group[metric]) if metric in group else "" for metric in there]
+        lines.append([*names, *cells, next(iter(group.values()))["seconds"]])
     return "\n".join(f"|{'|'.join(line)}|" for line in lines)
 
 
-def cell(metric: str, row: Mapping[str, Any] | None) -> str:
-    """`3.1 (2.9–3.4)`; empty for none."""
-    if row is None:
-        return ""
-    value, low, high = (
-        f"{(1e3 if metric.endswith('_m') else 1.0) * float(row[key]):.3g}" if row[key] else ""
-        for key in ("value", "low", "high")
-    )
-    return f"{value} ({low}–{high})" if low else value
+def cell(metric: str, row: Mapping[str, Any]) -> str:
+    """`3.1 (2.9–3.4)`; the value alone where there is no interval, or none to speak of."""
+    scale = 1e3 if metric.endswith("_m") else 1.0
+    value, low, high = (scale * float(row[key] or "nan") for key in ("value", "low", "high"))
+    told = [f"{one:.0f}" if abs(one) >= 1e3 else f"{one:.3g}" for one in (value, low, high)]
+    return f"{told[0]} ({told[1]}–{told[2]})" if low < high else told[0]
 
 
 def read_options() -> argparse.Namespace:
