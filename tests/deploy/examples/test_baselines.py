@@ -31,6 +31,7 @@ def benchmark(tmp_path_factory):
     return open_dataset(run_here(load_job(JOB, ["first_scene=214", "scenes=4"]), folder, JOB.parent)[0].root)
 
 
+@pytest.mark.minute
 def test_truth_scores_full_marks_at_every_level_of_the_benchmark(benchmark, tmp_path):
     rows = baselines.run("truth", benchmark, tmp_path)
     assert {row["level"] for row in rows} == {1, 2, 3}
@@ -42,6 +43,7 @@ def test_truth_scores_full_marks_at_every_level_of_the_benchmark(benchmark, tmp_
     assert {row["metric"] for row in rows} == set(baselines.METRICS)
 
 
+@pytest.mark.minute
 def test_no_shape_of_a_test_scene_is_in_a_training_scene(benchmark):
     rows = benchmark.table("assets").to_table(columns=["instance_id", "split"]).to_pylist()
     split_of = {row["instance_id"]: row["split"] for row in rows}
@@ -54,7 +56,7 @@ def test_no_shape_of_a_test_scene_is_in_a_training_scene(benchmark):
     )
 
 
-HALVES = {"scenes": 8, "categories": ["mug", "box"], "assets": {"split": {"train": 0.5, "val": 0.0, "test": 0.5}}}
+HALVES = {"scenes": 6, "categories": ["mug", "box"], "assets": {"split": {"train": 0.5, "val": 0.0, "test": 0.5}}}
 
 
 @pytest.fixture(scope="module")
@@ -79,14 +81,15 @@ def test_level_3_has_the_pixels_that_the_same_job_with_noise_stores(small, tmp_p
     assert patches > 0
 
 
+@pytest.mark.minute
 def test_baselines_without_a_network_repeat_and_rank_as_they_must(small, tmp_path):
     names = [name for name in baselines.BASELINES if name not in baselines.NETWORKS]
-    rows, again = (
-        [row for name in names for row in baselines.run(name, small, tmp_path / folder)] for folder in ("a", "b")
-    )
+    rows = [row for name in names for row in baselines.run(name, small, tmp_path / "a")]
+    some = ("projected and filled", "nearest training shape")
+    again = [row for name in some for row in baselines.run(name, small, tmp_path / "b")]
     for row in (*rows, *again):
         del row["seconds"]
-    assert rows == again
+    assert [row for row in rows if row["name"] in some] == again
     value = {(row["name"], row["level"], row["metric"]): float(row["value"]) for row in rows}
     for level in (1, 3):
         depth = [value[name, level, "depth_within_2mm"] for name in ("truth", "projected and filled", "input copied")]
