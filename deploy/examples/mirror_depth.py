@@ -36,7 +36,7 @@ class Example:
     features [C, H, W]; baseline: the projection, holes filled, planes put in; background: the planes alone; turned: the seen
     points and the same turned by half a turn about the object's assumed axis. Truth: depth, 0 where unknown; mask [H, W]
     bool, the object; unseen [H, W] bool, that part of it that the input view does not show. `middle_m`: the depth that
-    features count from.
+    features count from. `corner`: row and column of the crop's first pixel in the mirror image.
     """
 
     features: Image
@@ -47,15 +47,17 @@ class Example:
     mask: NDArray[np.bool_]
     unseen: NDArray[np.bool_]
     middle_m: float
+    corner: tuple[int, int]
 
 
-def make_example(pair: Pair) -> Example | None:
-    """The example of a pair; None where the object's seen points fall so near the rim that the crop leaves the image."""
+def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT) -> Example | None:
+    """The example of an object of a pair; None where so few of its points are seen, or so near the rim, that there is no crop."""
     view, mirror = pair.input, pair.mirror
     assert mirror is not None
-    depth, region, rgb = view.depth_m(), view.segment(), view.rgb()
+    depth, rgb = view.depth_m(), view.rgb()
+    here = view.segment() == region
     T = np.linalg.inv(mirror.T_world_cam) @ view.T_world_cam
-    own = transform(T, unproject(view, depth, region == REGION_FIRST_OBJECT))
+    own = transform(T, unproject(view, depth, here))
     if len(own) < 20:
         return None
     corner = crop_corner(mirror, own)
@@ -67,12 +69,14 @@ def make_example(pair: Pair) -> Example | None:
     background, gap = put_planes(pair, mirror, corner)
     seen, other = (close_holes(splat(mirror, cloud, corner)) for cloud in (own, turned))
     baseline = nearest(seen, background)
-    color = splat_values(mirror, own, rgb[(region == REGION_FIRST_OBJECT) & (depth > 0)], corner)
+    color = splat_values(mirror, own, rgb[here & (depth > 0)], corner)
     features = stack_features(seen, other, background, color, gap, middle)
     window = np.s_[corner[0] : corner[0] + CROP[0], corner[1] : corner[1] + CROP[1]]
-    truth, mask = mirror.depth_m()[window], mirror.segment()[window] == REGION_FIRST_OBJECT
+    truth, mask = mirror.depth_m()[window], mirror.segment()[window] == region
     hidden = is_unseen(view, depth, mirror, truth, corner) & mask
-    return Example(features, baseline, background, nearest(seen, other, background), truth, mask, hidden, middle)
+    return Example(
+        features, baseline, background, nearest(seen, other, background), truth, mask, hidden, middle, corner
+    )
 
 
 def unproject(view: Pixels, depth: Image, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:

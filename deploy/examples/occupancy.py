@@ -39,8 +39,8 @@ class Example:
 
     seen [SEEN, 3] float32: points of the input view. queries [M, FEATURES] float32: where is asked, and `shadow_of` of that
     place and of the same after half a turn. inside [M]: the truth. Baselines [M]: shadow, all that is behind the seen
-    surface; turned, what is so after half a turn as well. M are the stored samples that are uniform in the object's box times
-    1.05; those about its surface are left out, because they lie nearer to it than the noise of depth.
+    surface; turned, what is so after half a turn as well. M are all stored samples, or those that are uniform in the object's
+    box times 1.05: those about its surface lie nearer to it than the noise of depth.
     """
 
     seen: NDArray[np.float32]
@@ -50,23 +50,23 @@ class Example:
     turned: Flags
 
 
-def make_example(pair: Pair) -> Example | None:
-    """The example of a pair; None where the patch leaves the image, or has fewer than 20 points of the object.
+def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT, uniform: bool = True) -> Example | None:
+    """The example of an object of a pair; None where the patch leaves the image, or has fewer than 20 points of the object.
 
-    Raises InputError where the dataset has no samples.
+    uniform: without the samples about the surface. Raises InputError where the dataset has no samples.
     """
-    samples, view = pair.samples(), pair.input.patch()
+    samples, view = pair.samples(region), pair.input.patch(region)
     if view is None:
         return None
-    depth, mask = view.depth_m(), view.segment() == REGION_FIRST_OBJECT
+    depth, mask = view.depth_m(), view.segment() == region
     cloud = transform(view.T_world_cam, unproject(view, depth, mask))
     if len(cloud) < 20:
         return None
     T_net_world = upright_frame(view.T_world_cam, cloud, table_top(pair)[0])
     seen = transform(T_net_world, cloud)
-    uniform = slice((len(samples["volume_points"]) + 1) // 2)
-    stored = samples["volume_points"][uniform].astype(np.float64)
-    points = transform(T_net_world @ pair.T_world[REGION_FIRST_OBJECT], stored)
+    chosen = slice((len(samples["volume_points"]) + 1) // 2 if uniform else None)
+    stored = samples["volume_points"][chosen].astype(np.float64)
+    points = transform(T_net_world @ pair.T_world[region], stored)
     front = np.where(mask, close_holes(np.where(mask, depth, np.float32(0))), np.float32(0))
     T_cam_net = np.asarray(np.linalg.inv(T_net_world @ view.T_world_cam), np.float64)
     shadows = [shadow_of(view, front, transform(T_cam_net, one)) for one in (points, half_turn(points, seen))]
@@ -74,7 +74,7 @@ def make_example(pair: Pair) -> Example | None:
     return Example(
         pick(seen, SEEN, np.random.default_rng(pair.pose_id)).astype(np.float32),
         np.concatenate([points, *shadows], axis=1).astype(np.float32),
-        samples["volume_occupancy"][uniform] > 0,
+        samples["volume_occupancy"][chosen] > 0,
         shadow,
         shadow & other,
     )

@@ -28,6 +28,7 @@ from services.dataset.dataset import open_dataset
 
 BATCH = 16
 RATE = 2e-3
+EPOCHS = 12
 
 Loss = Callable[[Any, dict[str, Tensor]], Tensor]
 
@@ -169,7 +170,7 @@ def keep(net: nn.Module, scores: dict[str, dict[str, float]], options: argparse.
 
 def main() -> None:
     """Train, score, print, and keep the network and a sheet of pictures."""
-    options = read_options(__doc__, epochs=12)
+    options = read_options(__doc__, EPOCHS)
     data = load(options.place)
     net = Net()
     tell_size(net, data)

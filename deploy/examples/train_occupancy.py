@@ -22,6 +22,7 @@ from services.dataset.dataset import open_dataset
 
 SURE = 0.3
 """Probability from which a place counts as inside: the best of the validation split, since few places of thin shapes are."""
+EPOCHS = 40
 ASKED = 512
 """Places of each object in a training step."""
 
@@ -92,7 +93,7 @@ def evaluate(net: OccupancyNet, place: str) -> dict[str, dict[str, float]]:
 
 def main() -> None:
     """Train, score, print, and keep the network."""
-    options = read_options(__doc__, epochs=40)
+    options = read_options(__doc__, EPOCHS)
     data, net = load(options.place), OccupancyNet()
     tell_size(net, data)
     train(net, data, options.epochs, loss_of)

@@ -46,6 +46,7 @@ TINY = "--set captures.simulate.image_scale=0.3"
 
 SMALLER = {
     r"--scenes [46]00\b": "--scenes 16",
+    r"(run deploy/jobs/benchmark.yaml)": r"\1 --scenes 24",
     r"^\./verso test$": "./verso test tests/test_layers.py",
     r"tests/hard_cases": "tests/test_layers.py",
     r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
@@ -61,6 +62,7 @@ SMALLER = {
 
 PAGES = {
     "README.md": pytest.mark.minute,
+    "docs/benchmark.md": pytest.mark.slow,
     "docs/captures.md": pytest.mark.slow,
     "docs/commands.md": pytest.mark.slow,
     "docs/export.md": pytest.mark.slow,
