@@ -8,6 +8,7 @@ shows it.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -40,6 +41,9 @@ FLOOR_M = 0.001
 
 FLOOR_REACH_CELLS = 4
 """A floor goes on below the walls around it for so far, where no cell beside it shows the board."""
+
+MEDIAN_PX = 5
+"""Side of the square of pixels whose median depth says whether a pixel is the board's: that of the fit."""
 
 LEAST_CELLS = 6
 """A smaller thing, 1 cm^2, is noise."""
@@ -96,18 +100,21 @@ class ObjectRegion(Ground):
         high = self.height_m(points) + self.lift_m(points) > self.clearance_m
         return np.asarray(self._cells(points, self.footprint) & high)
 
-
     def lift_m(self, points: Array) -> Array:
         """[N] height to add to points [N, 3] above a floor, so that the clearance leaves of it what is above `floor_m`."""
         return np.where(self._cells(points, self.floor), self.clearance_m - self.floor_m, 0.0)
 
     def split_depth(self, depth_m: NDArray[np.float32], camera: Camera) -> SplitDepth:
-        """A depth image [H, W], metres, of a camera in the board frame, in two: a pixel below the clearance is the board's."""
+        """A depth image [H, W], metres, of a camera in the board frame, in two: a pixel below the clearance is the board's.
+
+        Which it is the median of the pixels around says, because noise lifts single pixels of the board above the clearance.
+        """
         k = camera.intrinsics
         found = SplitDepth(*(np.zeros(depth_m.shape, np.float32) for _ in range(3)))
         out = (found.object_m, found.board_inverse, found.board_facing)
         ground = (self.plane, self.clearance_m, self.floor, self.corner)
-        _split(depth_m, (k.fx, k.fy, k.cx, k.cy), camera.T_world_cam, ground, out)
+        quiet_m = cv2.medianBlur(np.ascontiguousarray(depth_m), MEDIAN_PX) if depth_m.size else depth_m
+        _split(depth_m, quiet_m, (k.fx, k.fy, k.cx, k.cy), camera.T_world_cam, ground, out)
         return found
 
     def _cells(self, points: Array, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -121,6 +128,7 @@ class ObjectRegion(Ground):
 @compiled
 def _split(
     depth_m: NDArray[np.float32],
+    quiet_m: NDArray[np.float32],
     k: tuple[float, float, float, float],
     T: Array,
     ground: tuple[tuple[float, float, float], float, NDArray[np.bool_], Array],
@@ -140,12 +148,13 @@ def _split(
             z = depth_m[row, column]
             if not z > 0.0:
                 continue
+            q = quiet_m[row, column] if quiet_m[row, column] > 0.0 else z
             x = (column + 0.5 - k[2]) / k[0]
             along = w[0] * x + w[1] * y + w[2]
-            i = int(np.floor((z * (T[0, 0] * x + T[0, 1] * y + T[0, 2]) + T[0, 3] - corner[0]) / CELL_M))
-            j = int(np.floor((z * (T[1, 0] * x + T[1, 1] * y + T[1, 2]) + T[1, 3] - corner[1]) / CELL_M))
+            i = int(np.floor((q * (T[0, 0] * x + T[0, 1] * y + T[0, 2]) + T[0, 3] - corner[0]) / CELL_M))
+            j = int(np.floor((q * (T[1, 0] * x + T[1, 1] * y + T[1, 2]) + T[1, 3] - corner[1]) / CELL_M))
             on_floor = 0 <= i < floor.shape[0] and 0 <= j < floor.shape[1] and floor[i, j]
-            if on_floor or z * along + above > clearance_m:
+            if on_floor or q * along + above > clearance_m:
                 object_m[row, column] = z
             elif along < 0.0 < above:
                 board_inverse[row, column] = -along / above
