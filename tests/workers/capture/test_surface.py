@@ -124,11 +124,11 @@ def test_a_ramp_of_mixed_pixels_between_two_surfaces_is_left_out_and_a_steep_pla
         rng = np.random.default_rng(seed)
         step = np.interp(columns, [58, 62], [0.600, 0.612])  # a lip 12 mm in front of a wall, and three pixels between
         noise = rng.normal(0, 0.0005, (90, 120))
-        fitted = fit_surfaces((step + noise).astype(np.float32), WINDOW, 75.0)
-        mixed = fitted.inverse[10:-10, 59:62]
-        assert (mixed > 0).mean() < 0.02 and (
-            fit_depth((step + noise).astype(np.float32), WINDOW, 75.0).inverse > 0
-        ).all()
+        depth, mixed = (step + noise).astype(np.float32), np.s_[10:-10, 59:62]
+        fitted = fit_surfaces(depth, WINDOW, 75.0)
+        assert (
+            (fitted.inverse[mixed] > 0).mean() < 0.02 < 0.9 < (fit_depth(depth, WINDOW, 75.0).inverse[mixed] > 0).mean()
+        )
         assert (fitted.inverse[10:-10, 10:55] > 0).mean() > 0.95 and (fitted.inverse[10:-10, 66:-10] > 0).mean() > 0.95
         steep, along, rays = plane_depth(WINDOW, (1.9, 0, 1), 0.3)
         fitted = fit_surfaces(steep + noise.astype(np.float32), WINDOW, 75.0)
@@ -387,6 +387,7 @@ def test_the_silhouette_is_the_objects_and_its_walls_reach_the_board_and_no_fart
     assert np.array_equal(closed.faces[: len(mesh.faces)], mesh.faces)
 
 
+@pytest.mark.minute
 def test_no_point_above_the_board_has_the_boards_place_or_colour(record_figure):
     """The foot of a box: the colour is _paint's, which the board's grey and the box's blue differ in by 60 codes."""
     for seed in range(3):
@@ -394,8 +395,9 @@ def test_no_point_above_the_board_has_the_boards_place_or_colour(record_figure):
         low = (found.points[:, 2] < 0.006) & (Thing(sphere=None).distance(found.points) < 0.02)
         blue = found.colors[low, 2].astype(int) - found.colors[low, 0]
         off_mm = 1e3 * np.quantile(Thing().distance(found.points[low]), 0.95)
-        record_figure(f"lowest 6 mm of a box, seed {seed}", "95 % off, mm", off_mm, 2.0)
-        assert low.sum() > 200 and (blue < 60).mean() < 0.01 and off_mm < 2.0
+        record_figure(f"lowest 6 mm of a box, seed {seed}", "95 % off, mm", off_mm, 1.5)
+        # Pixels are 3 mm wide here, and a colour is interpolated between two.
+        assert low.sum() > 200 and (blue < 60).mean() < 0.04 and off_mm < 1.5
 
 
 def wall(x, y, width, depth, height_m):
@@ -414,20 +416,19 @@ CUP = Thing(
 """A tray of 3 cm with a floor of 2.5 mm, below the clearance of 3 mm."""
 
 
+@pytest.mark.minute
 def test_a_thin_floor_is_in_the_cloud_and_a_hole_shows_the_board(record_figure):
     x, y = np.meshgrid(np.linspace(-0.035, 0.035, 29), np.linspace(-0.035, 0.035, 29))
     floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, CUP_FLOOR_M)], axis=1)
     for seed in range(3):
-        found = fuse(capture(CUP, sigma_m=0.002, seed=seed)).points
+        found = fuse(capture(CUP, count=12, sigma_m=0.002, seed=seed)).points
         inside = (np.abs(found[:, :2]) < 0.035).all(axis=1)
         covered = (cKDTree(found).query(floor)[0] < 0.003).mean()
         record_figure(f"floor of 2.5 mm, seed {seed}", "covered", covered)
-        assert covered > 0.95 and np.abs(found[inside, 2] - CUP_FLOOR_M).max() < 0.0015
-        ring = capture(Thing(sphere=None, boxes=CUP.boxes[:4]), sigma_m=0.002, seed=seed)
-        hole = fuse(ring).points
-        assert (
-            not (np.abs(hole[:, :2]) < 0.035).all(axis=1).any() and not find_object(ring, BOARD, Fusion()).floor.any()
-        )
+        assert covered > 0.95 and np.quantile(np.abs(found[inside, 2] - CUP_FLOOR_M), 0.99) < 0.0015
+    ring = capture(Thing(sphere=None, boxes=CUP.boxes[:4]), count=12, sigma_m=0.002)
+    hole = fuse(ring).points
+    assert not (np.abs(hole[:, :2]) < 0.035).all(axis=1).any() and not find_object(ring, BOARD, Fusion()).floor.any()
 
 
 def test_the_hidden_share_is_that_of_the_walls_below_the_clearance():

@@ -113,7 +113,9 @@ class ObjectRegion(Ground):
         found = SplitDepth(*(np.zeros(depth_m.shape, np.float32) for _ in range(3)))
         out = (found.object_m, found.board_inverse, found.board_facing)
         ground = (self.plane, self.clearance_m, self.floor, self.corner)
-        quiet_m = cv2.medianBlur(np.ascontiguousarray(depth_m), MEDIAN_PX) if depth_m.size else depth_m
+        quiet_m = depth_m
+        if depth_m.size:
+            quiet_m = np.asarray(cv2.medianBlur(np.ascontiguousarray(depth_m), MEDIAN_PX), np.float32)
         _split(depth_m, quiet_m, (k.fx, k.fy, k.cx, k.cy), camera.T_world_cam, ground, out)
         return found
 
