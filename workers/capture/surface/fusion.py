@@ -149,7 +149,7 @@ def _observe(
             slope -= n[axis] * ray
         least = least_cos * math.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
         row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
-        past[i] = (z - _nearest_around(beyond, row, column)) * max(slope, least) < -within_m
+        past[i] = _sees_past(inverse, beyond, row, column, z, within_m / max(slope, least))
         q = sample_inverse(inverse, x, y)
         s = (z - 1.0 / q) * slope if q > 0.0 else np.inf
         if slope >= LENIENT * least and abs(s) < within_m:
@@ -159,15 +159,20 @@ def _observe(
 
 
 @compiled
-def _nearest_around(beyond: NDArray[np.float32], row: int, column: int) -> float:
-    """The nearest z in a pixel and those around it, so that no outline is seen past; 0 where one of them has none."""
-    best = 0.0
+def _sees_past(
+    inverse: NDArray[np.float32], beyond: NDArray[np.float32], row: int, column: int, z: float, reach_m: float
+) -> bool:
+    """Whether a pixel and those around it all lie more than reach_m behind z, so that no outline is seen past.
+
+    Where they all are the board's, whose plane is known well, whatever is above it is seen past.
+    """
+    nearest, board = 0.0, True
     for i in range(max(row - 1, 0), min(row + 2, beyond.shape[0])):
         for j in range(max(column - 1, 0), min(column + 2, beyond.shape[1])):
             if not beyond[i, j] > 0.0:
-                return 0.0
-            best = max(best, beyond[i, j])
-    return 1.0 / best
+                return False
+            nearest, board = max(nearest, beyond[i, j]), board and inverse[i, j] == 0.0
+    return bool(1.0 / nearest - z > (0.0 if board else reach_m))
 
 
 def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> NDArray[np.uint8]:

@@ -45,6 +45,9 @@ FLOOR_REACH_CELLS = 4
 MEDIAN_PX = 5
 """Side of the square of pixels whose median depth says whether a pixel is the board's: that of the fit."""
 
+LIFTED = 2.0
+"""Noise lifts no pixel of the board above so many clearances: what is higher is the object's, thin as it may be."""
+
 LEAST_CELLS = 6
 """A smaller thing, 1 cm^2, is noise."""
 
@@ -156,7 +159,7 @@ def _split(
             i = int(np.floor((q * (T[0, 0] * x + T[0, 1] * y + T[0, 2]) + T[0, 3] - corner[0]) / CELL_M))
             j = int(np.floor((q * (T[1, 0] * x + T[1, 1] * y + T[1, 2]) + T[1, 3] - corner[1]) / CELL_M))
             on_floor = 0 <= i < floor.shape[0] and 0 <= j < floor.shape[1] and floor[i, j]
-            if on_floor or q * along + above > clearance_m:
+            if on_floor or q * along + above > clearance_m or z * along + above > LIFTED * clearance_m:
                 object_m[row, column] = z
             elif along < 0.0 < above:
                 board_inverse[row, column] = -along / above
