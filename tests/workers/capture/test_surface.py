@@ -436,8 +436,8 @@ def test_the_hidden_share_is_that_of_the_walls_below_the_clearance():
         views = capture(FLAT, sigma_m=0.001, seed=seed)
         region, found = find_object(views, BOARD, LOW_M), fuse(views, LOW_M)
         merged = Merged(region, found, down_to_board(Mesh(found.vertices, found.faces), region), ())
-        # 90 x 60 x 4 mm: 300 mm around, 2 mm of them hidden; rounded edges take a fifth of the walls.
-        assert merged.hidden_share == pytest.approx(600 / (5400 + 1200), abs=0.02)
+        # 90 x 60 x 4 mm: 300 mm around, the lower 2 mm hidden. A rim of voxels zigzags: it is at most the root of 2 longer.
+        assert 1.0 < merged.hidden_share / (600 / (5400 + 1200)) < 1.42
 
 
 @pytest.mark.shared_data
