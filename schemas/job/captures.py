@@ -260,9 +260,9 @@ class Fusion(Frozen):
     max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 75.0
     """Pixels beyond this angle of incidence are left out."""
     board_clearance_m: NonNegative = 0.003
-    """What is nearer to the board's plane than this is the board's; more where depth is uneven."""
+    """What is nearer to the board's plane than this is the board's, but for floors; more where depth is uneven."""
     min_views: PositiveInt = 2
-    """Views that must confirm a point of the cloud."""
+    """Views that must confirm a point, or one that none contradicts."""
 
 
 class Synthesis(Frozen):

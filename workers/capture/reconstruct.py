@@ -26,12 +26,16 @@ from workers.capture.results import own_files
 from workers.capture.surface.fusion import fuse_views
 from workers.capture.surface.object_mask import ObjectRegion, down_to_board, find_object
 from workers.capture.surface.posed_view import PosedView, pose_view
+from workers.capture.surface.tsdf import face_areas
 from workers.geometry.frames import invert
 from workers.scene.context import Stopwatch
 
 MANUAL = "its pose is that of the manual correction"
 FEW_POINTS = 500
 """The user is told of a cloud with fewer."""
+
+MUCH_HIDDEN = 0.05
+"""The user is told where more of the surface lies below the clearance: as much as a good capture may miss."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,12 @@ class Merged:
     body: Mesh
     notes: tuple[str, ...]
 
+    @property
+    def hidden_share(self) -> float:
+        """Share of the body's area between the board and the clearance: nobody measured it, and it is in no cloud."""
+        areas = face_areas(self.body)
+        return float(areas[len(self.surface.faces) :].sum() / areas.sum())
+
 
 def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedView:
     """One view with its pose in an estimate; the mask is the user's. Raises CaptureError where it has no pose or no depth."""
@@ -166,7 +176,14 @@ def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: St
             f"the cloud has {len(points)} points over {extent:.0f} mm: the object is small, or has little depth"
         )
     body = down_to_board(Mesh(surface.vertices, surface.faces), region)
-    return Merged(region, surface, body, tuple(notes))
+    merged = Merged(region, surface, body, tuple(notes))
+    if merged.hidden_share <= MUCH_HIDDEN:
+        return merged
+    told = (
+        f"{merged.hidden_share:.0%} of the surface lies within {region.clearance_m * 1e3:.1f} mm of the board and is not in the "
+        f"cloud: fusion.board_clearance_m may be as little as {region.floor_m * 1e3:.1f} mm here"
+    )
+    return replace(merged, notes=(*notes, told))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,25 +18,27 @@ from workers.capture.surface.object_mask import ObjectRegion
 from workers.capture.surface.posed_view import PosedView, visible_points
 from workers.capture.surface.tsdf import (
     FRONT_VOXELS,
-    FittedDepth,
+    SurfaceDepth,
     cut_below,
     empty_volume,
     extract_surface,
-    fit_depth,
+    fit_surfaces,
     integrate,
     keep_vertices,
     large_parts,
     sample_inverse,
     vertex_normals,
-    views_near,
 )
 from workers.geometry.camera import project_bounds
 from workers.geometry.colour import SRGB_STEPS, encode_codes
-from workers.geometry.frames import invert, transform
+from workers.geometry.frames import UP, invert, transform
 from workers.geometry.jit import compiled
 
 UNSEEN = 128
 """The code of each channel where no view sees anything."""
+
+SUREST = 2
+"""Of `SurfaceDepth.sure`: the pixels around are of the same surface."""
 
 LEAST_LIGHT = 0.02
 """Darker colours, in linear light, say nothing about a view's exposure."""
@@ -47,39 +49,73 @@ class Sight:
     """A view ready to be asked: its pictures, the fit of its depth about the object, and the smallest cosine of incidence."""
 
     view: PosedView
-    fitted: FittedDepth
+    fitted: SurfaceDepth
     least_cos: float
 
 
 @dataclass(frozen=True, eq=False)
-class Offsets:
-    """How far the views see the surface beyond each point along its normal: mean [N], metres; `views` [N] that see it."""
+class Seen:
+    """What a view says of points, each [N].
+
+    offset_m: along the normal to the surface that it sees; weight: 0 where it does not see the point within the limit asked
+    for; sure: that of the pixel, 0 where weight is 0; past: it sees something farther off there.
+    """
+
+    offset_m: Array
+    weight: Array
+    sure: NDArray[np.uint8]
+    past: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """How far the views see the surface beyond each point along its normal: mean [N], metres; `views` [N] that see it.
+
+    past [N]: views that see past it; sure [N] bool: a view sees it away from any edge.
+    """
 
     mean_m: Array
     views: NDArray[np.int32]
+    past: NDArray[np.int32]
+    sure: NDArray[np.bool_]
+
+    def confirmed(self, min_views: int) -> NDArray[np.bool_]:
+        """[N] bool: seen by as many views and by no more views seen past, or seen surely by a view that none sees past."""
+        many = (self.views >= min_views) & (self.past <= self.views)
+        return np.asarray(many | (self.sure & (self.past == 0)))
 
 
-def measure_offsets(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> Offsets:
+def measure_support(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> Support:
     """Mean over the views, weighted by inverse variance, of the distance to the surface that they see there."""
     total, weight = np.zeros(len(points)), np.zeros(len(points))
-    views = np.zeros(len(points), np.int32)
+    views, past = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    sure = np.zeros(len(points), np.bool_)
     for sight in sights:
-        offset, w = observe(points, normals, sight, within_m)
-        total += offset * w
-        weight += w
-        views += w > 0.0
-    return Offsets(np.where(weight > 0.0, total / np.where(weight > 0.0, weight, 1.0), 0.0), views)
+        seen = observe(points, normals, sight, within_m)
+        total += seen.offset_m * seen.weight
+        weight += seen.weight
+        views += seen.weight > 0.0
+        past += seen.past
+        sure |= seen.sure > 0
+    return Support(np.where(weight > 0.0, total / np.where(weight > 0.0, weight, 1.0), 0.0), views, past, sure)
 
 
-def observe(points: Array, normals: Array, sight: Sight, within_m: float) -> tuple[Array, Array]:
-    """(offset along the normal, weight), each [N]: weight 0 where the view does not see a point within `within_m`."""
-    offset, weight = np.zeros(len(points)), np.zeros(len(points))
+def observe(points: Array, normals: Array, sight: Sight, within_m: float) -> Seen:
+    """What a view says of points [N, 3] with unit normals [N, 3], board frame."""
+    count = len(points)
+    seen = Seen(np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), np.zeros(count, np.bool_))
     camera, fitted = sight.view.depth_camera, sight.fitted
     k = camera.intrinsics
     intrinsics = (k.fx, k.fy, k.cx - fitted.left - 0.5, k.cy - fitted.top - 0.5)
-    T = invert(camera.T_world_cam)
-    _observe(points, normals, T, intrinsics, fitted.inverse, sight.least_cos, within_m, offset, weight)
-    return offset, weight
+    T, limits = invert(camera.T_world_cam), (within_m, sight.least_cos)
+    pictures = (fitted.inverse, fitted.beyond, fitted.sure)
+    _observe(points, normals, T, intrinsics, pictures, limits, (seen.offset_m, seen.weight, seen.sure, seen.past))
+    return seen
+
+
+LENIENT = 0.5
+"""Share of the smallest cosine of incidence down to which a point's own normal may turn away: it is rougher than the fit of
+the pixel, which keeps to the whole."""
 
 
 @compiled
@@ -88,13 +124,14 @@ def _observe(
     normals: Array,
     T: Array,
     k: tuple[float, float, float, float],
-    inverse: NDArray[np.float32],
-    least_cos: float,
-    within_m: float,
-    offset: Array,
-    weight: Array,
+    pictures: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]],
+    limits: tuple[float, float],
+    out: tuple[Array, Array, NDArray[np.uint8], NDArray[np.bool_]],
 ) -> None:
     """A difference of z times (normal . ray) is the distance along the normal; weights as in the distance field."""
+    inverse, beyond, sures = pictures
+    within_m, least_cos = limits
+    offset, weight, sure, past = out
     height, width = inverse.shape
     for i in range(len(points)):
         p, n = points[i], normals[i]
@@ -106,19 +143,36 @@ def _observe(
         x, y = k[0] * ray_x + k[2], k[1] * ray_y + k[3]
         if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
             continue
-        q = sample_inverse(inverse, x, y)
-        if q == 0.0:
-            continue
         slope = 0.0  # of the ray against the normal
         for axis in range(3):
             ray = T[0, axis] * ray_x + T[1, axis] * ray_y + T[2, axis]
             slope -= n[axis] * ray
-        if slope < least_cos * math.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y):
-            continue
-        s = (z - 1.0 / q) * slope
-        if abs(s) < within_m:
+        least = least_cos * math.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
+        row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+        past[i] = _sees_past(inverse, beyond, row, column, z, within_m / max(slope, least))
+        q = sample_inverse(inverse, x, y)
+        s = (z - 1.0 / q) * slope if q > 0.0 else np.inf
+        if slope >= LENIENT * least and abs(s) < within_m:
             offset[i] = s
             weight[i] = slope * slope * q * q * q * q
+            sure[i] = sures[row, column]
+
+
+@compiled
+def _sees_past(
+    inverse: NDArray[np.float32], beyond: NDArray[np.float32], row: int, column: int, z: float, reach_m: float
+) -> bool:
+    """Whether a pixel and those around it all lie more than reach_m behind z, so that no outline is seen past.
+
+    Where they all are the board's, whose plane is known well, whatever is above it is seen past.
+    """
+    nearest, board = 0.0, True
+    for i in range(max(row - 1, 0), min(row + 2, beyond.shape[0])):
+        for j in range(max(column - 1, 0), min(column + 2, beyond.shape[1])):
+            if not beyond[i, j] > 0.0:
+                return False
+            nearest, board = max(nearest, beyond[i, j]), board and inverse[i, j] == 0.0
+    return bool(1.0 / nearest - z > (0.0 if board else reach_m))
 
 
 def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> NDArray[np.uint8]:
@@ -129,7 +183,9 @@ def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_
     light = np.zeros((len(sights), len(points), 3), np.float32)
     score = np.zeros((len(sights), len(points)), np.float32)
     for number, sight in enumerate(sights):
-        _, weight = observe(points, normals, sight, within_m)
+        found = observe(points, normals, sight, within_m)
+        # A pixel on an outline has the colour of what is beside it, as white of the board.
+        weight = np.where(found.sure == SUREST, found.weight, 0.0)
         seen = np.flatnonzero(weight > 0.0)
         colors, inside = sample_light(sight.view.rgb, sight.view.camera, points[seen])
         light[number, seen] = colors
@@ -228,10 +284,25 @@ def sight_object(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion)
     sights = []
     for view in views:
         window = object_window(region, view.depth_camera)
-        fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics, spec.max_edge_deg, window)
+        fitted = fit_object(view, region, spec.max_edge_deg, window)
         if fitted.inverse.any():
             sights.append(Sight(view, fitted, least_cos))
     return sights
+
+
+def fit_object(
+    view: PosedView, region: ObjectRegion, max_edge_deg: float, window: tuple[int, int, int, int]
+) -> SurfaceDepth:
+    """The fit of the depth that is not the board's; of the board a view says where nothing is, and no plane mixes the two."""
+    top, left, bottom, right = window
+    k, T = view.depth_camera.intrinsics, view.depth_camera.T_world_cam
+    k = k.model_copy(update={"cx": k.cx - left, "cy": k.cy - top})
+    split = region.split_depth(view.depth_m[top:bottom, left:right], Camera(k, T))
+    fitted = fit_surfaces(split.object_m, k, max_edge_deg)
+    empty = fitted.inverse == 0.0
+    beyond = np.where(empty, split.board_inverse, fitted.inverse)
+    facing = np.where(empty, split.board_facing, fitted.facing)
+    return replace(fitted, top=top, left=left, facing=facing, beyond=beyond)
 
 
 def object_window(region: ObjectRegion, camera: Camera) -> tuple[int, int, int, int]:
@@ -259,10 +330,9 @@ def fuse_views(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -
         integrate(volume, sight.fitted, sight.view.depth_camera)
     within_m = FRONT_VOXELS * spec.voxel_m
     mesh = extract_surface(volume)
-    mesh, _ = keep_vertices(mesh, views_near(volume, mesh.vertices) >= spec.min_views)
-    mesh = _outside(mesh, sights, spec)
+    mesh = _confirm(mesh, sights, spec)
     mesh = _settle(mesh, sights, within_m)
-    mesh = _clean(cut_below(mesh, region.plane, region.clearance_m), region)
+    mesh = _clean(mesh, region)
     if not len(mesh.faces):
         raise CaptureError(
             "no_surface",
@@ -270,35 +340,36 @@ def fuse_views(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -
             "object has no depth (shiny, black or transparent)",
         )
     normals = vertex_normals(mesh)
-    count = views_near(volume, mesh.vertices)
+    count = measure_support(mesh.vertices, normals, sights, within_m).views
     colors = color_points(mesh.vertices, normals, sights, within_m)
-    sure = count >= spec.min_views
+    seen = count > 0
     return Reconstruction(
-        points=mesh.vertices[sure],
-        normals=normals[sure],
-        colors=colors[sure],
-        views=count[sure],
+        points=mesh.vertices[seen],
+        normals=normals[seen],
+        colors=colors[seen],
+        views=count[seen],
         vertices=mesh.vertices,
         faces=mesh.faces,
         vertex_colors=colors,
     )
 
 
-def _outside(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
-    """What a camera can see past what the views measured face to face.
+def _confirm(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
+    """What the views confirm, and a camera can see past what they confirm.
 
     A pixel that mixes two surfaces looks into the object, and there the field has a second surface behind the first.
     """
     if not len(mesh.faces):
         return mesh
     normals = vertex_normals(mesh)
-    faced = measure_offsets(mesh.vertices, normals, sights, FRONT_VOXELS * spec.voxel_m).views >= spec.min_views
-    hiding, _ = keep_vertices(mesh, faced)
+    confirmed = measure_support(mesh.vertices, normals, sights, FRONT_VOXELS * spec.voxel_m).confirmed(spec.min_views)
+    hiding, old = keep_vertices(mesh, confirmed)
     if not len(hiding.faces):
-        return mesh
+        return hiding
     cameras = [sight.view.depth_camera for sight in sights]
-    seen = visible_points(hiding, mesh.vertices, normals, cameras, LIFT_VOXELS * spec.voxel_m, FACING_AWAY)
-    return keep_vertices(mesh, seen)[0]
+    lift_m = LIFT_VOXELS * spec.voxel_m
+    seen = visible_points(hiding, hiding.vertices, normals[old], cameras, lift_m, FACING_AWAY)
+    return keep_vertices(hiding, seen)[0]
 
 
 def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:
@@ -312,7 +383,7 @@ def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:
         if not len(mesh.faces):
             break
         normals = vertex_normals(Mesh(vertices, mesh.faces))
-        moved = measure_offsets(vertices, normals, sights, within_m).mean_m
+        moved = measure_support(vertices, normals, sights, within_m).mean_m
         vertices = vertices + normals * _smooth(moved, mesh)[:, None]
     return Mesh(vertices, mesh.faces)
 
@@ -327,8 +398,11 @@ def _smooth(values: Array, mesh: Mesh) -> Array:
 
 
 def _clean(mesh: Mesh, region: ObjectRegion) -> Mesh:
-    """Without what is beside the footprint, and without small loose parts."""
+    """What stands above the clearance and the footprint, without small loose parts."""
+    # Floors below the clearance are lifted above it while the mesh is cut.
+    lifted = Mesh(mesh.vertices + UP * region.lift_m(mesh.vertices)[:, None], mesh.faces)
+    cut = cut_below(lifted, region.plane, region.clearance_m)
+    mesh = Mesh(cut.vertices - UP * region.lift_m(cut.vertices)[:, None], cut.faces)
     # The cut lies on the clearance itself, and its points must not fall below it by rounding.
-    lifted = mesh.vertices + np.array([0.0, 0.0, 1e-6])
-    mesh, _ = keep_vertices(mesh, region.holds(lifted))
+    mesh, _ = keep_vertices(mesh, region.holds(mesh.vertices + 1e-6 * UP))
     return keep_vertices(mesh, large_parts(mesh, LEAST_PART))[0]

@@ -8,6 +8,7 @@ shows it.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -35,6 +36,18 @@ SAMPLES = 300_000
 LEAST_SAMPLES = 12
 """A cell with as many is known; where views are few or small, one with a third of what most cells have."""
 
+FLOOR_M = 0.001
+"""A cell whose median is as high may be the object's: five times what the median of a hundred pixels of 2 mm is off."""
+
+FLOOR_REACH_CELLS = 4
+"""A floor goes on below the walls around it for so far, where no cell beside it shows the board."""
+
+MEDIAN_PX = 5
+"""Side of the square of pixels whose median depth says whether a pixel is the board's: that of the fit."""
+
+LIFTED = 2.0
+"""Noise lifts no pixel of the board above so many clearances: what is higher is the object's, thin as it may be."""
+
 LEAST_CELLS = 6
 """A smaller thing, 1 cm^2, is noise."""
 
@@ -56,11 +69,24 @@ class Ground:
 
 
 @dataclass(frozen=True, eq=False)
+class SplitDepth:
+    """object_m [H, W]: depth without the board's pixels; board_inverse, board_facing [H, W]: the board's plane in those.
+
+    float32, 0 elsewhere: 1/z, 1/m, and the cosine of incidence times the length of the ray at z = 1.
+    """
+
+    object_m: NDArray[np.float32]
+    board_inverse: NDArray[np.float32]
+    board_facing: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
 class ObjectRegion(Ground):
     """The object's surroundings, board frame, metres.
 
     low, high [3]: a box around it; spread_m: standard deviation of the board's cells about its plane. `footprint` [cells in x,
-    cells in y] bool, cell (0, 0) beginning at `corner` [2]. `notes` for the user.
+    cells in y] bool, cell (0, 0) beginning at `corner` [2]; `floor`, likewise: cells of the object that show nothing of the
+    board, where its surface is above floor_m and counts although it may lie below the clearance. `notes` for the user.
     """
 
     low: Array
@@ -68,14 +94,76 @@ class ObjectRegion(Ground):
     spread_m: float
     footprint: NDArray[np.bool_]
     corner: Array
+    floor: NDArray[np.bool_]
+    floor_m: float
     notes: tuple[str, ...] = ()
 
     def holds(self, points: Array) -> NDArray[np.bool_]:
         """[N] bool: points [N, 3] above the footprint and above the clearance."""
-        cell = np.floor((points[:, :2] - self.corner) / CELL_M).astype(np.int64)
-        inside = ((cell >= 0) & (cell < self.footprint.shape)).all(axis=1)
-        cell[~inside] = 0
-        return inside & self.footprint[cell[:, 0], cell[:, 1]] & (self.height_m(points) > self.clearance_m)
+        high = self.height_m(points) + self.lift_m(points) > self.clearance_m
+        return np.asarray(self._cells(points, self.footprint) & high)
+
+    def lift_m(self, points: Array) -> Array:
+        """[N] height to add to points [N, 3] above a floor, so that the clearance leaves of it what is above `floor_m`."""
+        return np.where(self._cells(points, self.floor), self.clearance_m - self.floor_m, 0.0)
+
+    def split_depth(self, depth_m: NDArray[np.float32], camera: Camera) -> SplitDepth:
+        """A depth image [H, W], metres, of a camera in the board frame, in two: a pixel below the clearance is the board's.
+
+        Which it is the median of the pixels around says, because noise lifts single pixels of the board above the clearance.
+        """
+        k = camera.intrinsics
+        found = SplitDepth(*(np.zeros(depth_m.shape, np.float32) for _ in range(3)))
+        out = (found.object_m, found.board_inverse, found.board_facing)
+        ground = (self.plane, self.clearance_m, self.floor, self.corner)
+        quiet_m = depth_m
+        if depth_m.size:
+            quiet_m = np.asarray(cv2.medianBlur(np.ascontiguousarray(depth_m), MEDIAN_PX), np.float32)
+        _split(depth_m, quiet_m, (k.fx, k.fy, k.cx, k.cy), camera.T_world_cam, ground, out)
+        return found
+
+    def _cells(self, points: Array, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """[N] bool: points above the cells that are named."""
+        at = np.floor((points[:, :2] - self.corner) / CELL_M).astype(np.int64)
+        inside = ((at >= 0) & (at < cells.shape)).all(axis=1)
+        at[~inside] = 0
+        return np.asarray(inside & cells[at[:, 0], at[:, 1]])
+
+
+@compiled
+def _split(
+    depth_m: NDArray[np.float32],
+    quiet_m: NDArray[np.float32],
+    k: tuple[float, float, float, float],
+    T: Array,
+    ground: tuple[tuple[float, float, float], float, NDArray[np.bool_], Array],
+    out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
+    """The height of a pixel is z (w . ray) + above, with w the plane's upward normal in camera axes; it is 0 on the plane."""
+    (a, b, c), clearance_m, floor, corner = ground
+    object_m, board_inverse, board_facing = out
+    w = np.empty(3)
+    for axis in range(3):
+        w[axis] = T[2, axis] - a * T[0, axis] - b * T[1, axis]
+    above = T[2, 3] - a * T[0, 3] - b * T[1, 3] - c
+    size = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    for row in range(depth_m.shape[0]):
+        y = (row + 0.5 - k[3]) / k[1]
+        for column in range(depth_m.shape[1]):
+            z = depth_m[row, column]
+            if not z > 0.0:
+                continue
+            q = quiet_m[row, column] if quiet_m[row, column] > 0.0 else z
+            x = (column + 0.5 - k[2]) / k[0]
+            along = w[0] * x + w[1] * y + w[2]
+            i = int(np.floor((q * (T[0, 0] * x + T[0, 1] * y + T[0, 2]) + T[0, 3] - corner[0]) / CELL_M))
+            j = int(np.floor((q * (T[1, 0] * x + T[1, 1] * y + T[1, 2]) + T[1, 3] - corner[1]) / CELL_M))
+            on_floor = 0 <= i < floor.shape[0] and 0 <= j < floor.shape[1] and floor[i, j]
+            if on_floor or q * along + above > clearance_m or z * along + above > LIFTED * clearance_m:
+                object_m[row, column] = z
+            elif along < 0.0 < above:
+                board_inverse[row, column] = -along / above
+                board_facing[row, column] = -along / size
 
 
 def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> ObjectRegion:
@@ -118,7 +206,10 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
         notes.append(
             f"the board's surface is uneven by {spread * 1e3:.2f} mm, so the clearance is {clearance * 1e3:.1f} mm"
         )
-    return _region(footprint, tall_bins, -half, plane, (spread, clearance), tuple(notes))
+    floor_m = min(max(FLOOR_M, 4.0 * spread), clearance)
+    floor = _floor(footprint, known & (above > floor_m), known & (above <= floor_m))
+    ground = (plane, spread, clearance, floor_m)
+    return _region(footprint, floor, tall_bins, -half, ground, tuple(notes))
 
 
 @compiled
@@ -209,24 +300,32 @@ def _largest(found: NDArray[np.bool_], above: Array) -> tuple[NDArray[np.bool_] 
     return labels == best + 1, int((volume > 0.1 * volume[best]).sum()) - 1
 
 
+def _floor(footprint: NDArray[np.bool_], raised: NDArray[np.bool_], board: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Raised cells that hang together with the footprint, and what is around them, away from cells of the board."""
+    around = np.ones((3, 3), np.bool_)
+    apart = ~ndimage.binary_dilation(board, around)
+    part = ndimage.binary_propagation(footprint, around, mask=footprint | raised) & ~footprint
+    return np.asarray(ndimage.binary_dilation(part & apart, around, iterations=FLOOR_REACH_CELLS) & apart)
+
+
 def _region(
     footprint: NDArray[np.bool_],
+    floor: NDArray[np.bool_],
     tall_bins: NDArray[np.int32],
     corner: Array,
-    plane: tuple[float, float, float],
-    spread_and_clearance: tuple[float, float],
+    ground: tuple[tuple[float, float, float], float, float, float],
     notes: tuple[str, ...],
 ) -> ObjectRegion:
     """The region around a footprint, which grows by three cells, for what hangs over and for the error of its rim."""
+    plane, spread, clearance, floor_m = ground
     levels = tall_bins[footprint].sum(axis=0)
     filled = np.flatnonzero(levels > max(LEAST_SAMPLES, 2e-4 * levels.sum()))
     top = (int(filled[-1]) + 1 if len(filled) else 1) * REACH_M
-    grown = ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3)
+    grown = ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3) | floor
     i, j = np.nonzero(grown)
     low = np.array([corner[0] + i.min() * CELL_M, corner[1] + j.min() * CELL_M, plane[2] - 0.008])
     high = np.array([corner[0] + (i.max() + 1) * CELL_M, corner[1] + (j.max() + 1) * CELL_M, plane[2] + top + 0.01])
-    spread, clearance = spread_and_clearance
-    return ObjectRegion(plane, clearance, low, high, spread, grown, corner, notes)
+    return ObjectRegion(plane, clearance, low, high, spread, grown, corner, floor, floor_m, notes)
 
 
 RIM_M = 0.0005

@@ -24,8 +24,11 @@ from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
 
-REACH = 2
-"""Samples to each side: 5 x 5."""
+REACHES = (2, 1)
+"""Samples to each side: 5 x 5, and 3 x 3 where those do not lie on a plane, as at a rim."""
+
+SMALL_EDGE_DEG = 60.0
+"""Largest angle of incidence of a fit to 3 x 3 samples: three samples across an edge always lie on some steep plane."""
 
 STRIDE_FOCAL_PX = 456.0
 """Focal length at which neighbouring samples are one pixel apart: two pixels at the Azure Kinect's 912, about a depth pixel."""
@@ -40,6 +43,22 @@ surface: 6 mm at 0.8 m, three times the noise of a depth pixel that has twice th
 
 LEAST_SHARE = 0.44
 """A pixel with fewer samples on its own surface, 11 of 25, is a speck or between two surfaces: it is left out."""
+
+ROUGHEST = 1.6
+"""Samples that scatter about their plane by so many times the view's median lie on no plane. The scatter of 25 samples of
+which some nine are independent varies by a quarter: noise alone does this in one pixel of a hundred."""
+
+LEAST_ROUGH = 0.0003
+"""Scatter of 1/z, 1/m, that rounding to millimetres leaves at 1 m: views without noise are not held to less."""
+
+RAMP = 1.6
+"""A steep pixel between two surfaces whose cosines of incidence are so many times its own lies on neither of them."""
+
+RAMP_REACH = 4
+"""Samples to each side within which those two surfaces are looked for: the width of the window, and a mixed pixel."""
+
+STEEP = 0.5
+"""Cosine of incidence below which a pixel may be a ramp: 60 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,17 +75,85 @@ class FittedDepth:
     facing: NDArray[np.float32]
 
 
+@dataclass(frozen=True, eq=False)
+class SurfaceDepth(FittedDepth):
+    """The fit with what is on an edge found out.
+
+    sure [h, w] uint8: 1 where all samples were fitted, 2 where they were in the pixels around, too, else 0. beyond [h, w]
+    float32: `inverse` and, where that is 0, 1/z of the board where the view shows it: there `facing` is the board's.
+    """
+
+    sure: NDArray[np.uint8]
+    beyond: NDArray[np.float32]
+
+
 def fit_depth(
     depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float, window: tuple[int, int, int, int] | None = None
 ) -> FittedDepth:
     """The fit of depth [H, W] in a window (top, left, bottom, right), all of it by default."""
     top, left, bottom, right = window or (0, 0, *depth_m.shape)
     shape = (max(bottom - top, 0), max(right - left, 0))
-    inverse, facing = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    stride = max(1, round(k.fx / STRIDE_FOCAL_PX))
-    least_cos = math.cos(math.radians(max_edge_deg))
-    _fit(depth_m, (k.fx, k.fy, k.cx, k.cy), stride, least_cos, (top, left), inverse, facing)
+    inverse, facing, rough = (np.zeros(shape, np.float32) for _ in range(3))
+    _fit(depth_m, _focal(k), _stride(k), _least_cos(max_edge_deg), (top, left), REACHES[0], inverse, facing, rough)
     return FittedDepth(top, left, inverse, facing)
+
+
+def fit_surfaces(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float) -> SurfaceDepth:
+    """The fit of depth [H, W] with fewer samples where more do not lie on a plane, and without ramps between two surfaces."""
+    inverse, facing, rough = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
+    stride, least_cos, corner = _stride(k), _least_cos(max_edge_deg), (0, 0)
+    _fit(depth_m, _focal(k), stride, least_cos, corner, REACHES[0], inverse, facing, rough)
+    usual = float(np.median(rough[inverse > 0.0])) if inverse.any() else 0.0
+    roughest = ROUGHEST * max(usual, LEAST_ROUGH)
+    bent = rough > roughest
+    inverse[bent] = 0.0
+    whole = inverse > 0.0
+    rough[~bent] = SETTLED
+    least_cos = max(least_cos, _least_cos(SMALL_EDGE_DEG))
+    _fit(depth_m, _focal(k), stride, least_cos, corner, REACHES[1], inverse, facing, rough)
+    inverse[rough > roughest] = 0.0
+    ramps = _ramps(inverse, facing, stride)
+    inverse[ramps] = 0.0
+    whole &= ~ramps
+    sure = whole.astype(np.uint8) + ndimage.binary_erosion(whole, np.ones((3, 3), np.bool_))
+    return SurfaceDepth(0, 0, inverse, facing, sure, inverse)
+
+
+def _focal(k: Intrinsics) -> tuple[float, float, float, float]:
+    return k.fx, k.fy, k.cx, k.cy
+
+
+def _stride(k: Intrinsics) -> int:
+    return max(1, round(k.fx / STRIDE_FOCAL_PX))
+
+
+def _least_cos(max_edge_deg: float) -> float:
+    return math.cos(math.radians(max_edge_deg))
+
+
+def _ramps(inverse: NDArray[np.float32], facing: NDArray[np.float32], stride: int) -> NDArray[np.bool_]:
+    """[h, w] bool: steep pixels between two less steep ones, along a row or a column, that are no farther off than `WIDE`.
+
+    Where two surfaces lie one behind the other by less than that, mixed pixels join them, and a plane fits the ramp.
+    """
+    (height, width), reach = inverse.shape, RAMP_REACH * stride
+    q, facing_around, found = np.pad(inverse, reach), np.pad(facing, reach), np.zeros(inverse.shape, np.bool_)
+
+    def flattest(down: int, right: int) -> NDArray[np.float32]:
+        best = np.zeros(inverse.shape, np.float32)
+        for n in range(2 * stride, reach + 1):
+            at = np.s_[reach + n * down :, reach + n * right :]
+            near = np.abs(q[at][:height, :width] - inverse) < WIDE * inverse
+            best = np.maximum(best, np.where(near, facing_around[at][:height, :width], 0.0))
+        return best
+
+    for down, right in ((0, 1), (1, 0)):
+        found |= np.minimum(flattest(down, right), flattest(-down, -right)) > RAMP * facing
+    return found & (facing < STEEP)
+
+
+SETTLED = -1.0
+"""Roughness of a pixel that is not fitted again."""
 
 
 @compiled
@@ -76,12 +163,18 @@ def _fit(
     stride: int,
     least_cos: float,
     corner: tuple[int, int],
+    reach: int,
     inverse: NDArray[np.float32],
     facing: NDArray[np.float32],
+    rough: NDArray[np.float32],
 ) -> None:
-    """Two fits of 1/z = a + b du + c dv: to the samples at about the pixel's depth, then to those near the first plane."""
+    """Two fits of 1/z = a + b du + c dv: to the samples at about the pixel's depth, then to those near the first plane.
+
+    `reach`: samples to each side. rough [h, w] is `SETTLED` where nothing is to be done; it becomes the scatter of 1/z about
+    the plane, 1/m, times the slope, by which a depth camera's noise grows.
+    """
     height, width = depth_m.shape
-    side = 2 * REACH + 1
+    side = 2 * reach + 1
     least = int(np.ceil(LEAST_SHARE * side * side))
     q, at_x, at_y = np.empty(side * side), np.empty(side * side), np.empty(side * side)
     plane = np.empty(3)
@@ -91,12 +184,13 @@ def _fit(
         for at_column in range(inverse.shape[1]):
             column = at_column + corner[1]
             z0 = depth_m[row, column]
-            if not z0 > 0.0:
+            if not z0 > 0.0 or rough[at_row, at_column] < 0.0:
                 continue
+            rough[at_row, at_column] = 0.0
             n = 0
-            for i in range(-REACH, REACH + 1):
+            for i in range(-reach, reach + 1):
                 y = row + i * stride
-                for j in range(-REACH, REACH + 1):
+                for j in range(-reach, reach + 1):
                     x = column + j * stride
                     if 0 <= y < height and 0 <= x < width:
                         z = depth_m[y, x]
@@ -121,6 +215,11 @@ def _fit(
             if slope >= least_cos * ray and abs(1.0 / z0 - plane[0]) < gate:
                 inverse[at_row, at_column] = plane[0]
                 facing[at_row, at_column] = slope
+                total = 0.0
+                for i in range(kept):
+                    error = q[i] - plane[0] - plane[1] * at_x[i] - plane[2] * at_y[i]
+                    total += error * error
+                rough[at_row, at_column] = slope * np.sqrt(total / (kept - 3))
 
 
 @compiled
@@ -166,47 +265,37 @@ BACK_VOXELS = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Voxel centres at origin + voxel_m * (i, j, k), board frame; distance_m and weight [X, Y, Z] float32, near [X, Y, Z] uint16.
+    """Voxel centres at origin + voxel_m * (i, j, k), board frame; distance_m and weight [X, Y, Z] float32.
 
-    distance_m is positive outside; weight is 0 where no view has seen the voxel. near counts the views that have their surface
-    within the truncation.
+    distance_m is positive outside; weight is 0 where no view has seen the voxel.
     """
 
     origin: Array
     voxel_m: float
     distance_m: NDArray[np.float32]
     weight: NDArray[np.float32]
-    near: NDArray[np.uint16]
 
 
 def empty_volume(low: Array, high: Array, voxel_m: float) -> Volume:
     """A volume without views that reaches from corner to corner, board frame, metres."""
     shape = np.maximum(np.ceil((high - low) / voxel_m).astype(np.int64) + 1, 2)
     distance_m, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    return Volume(np.array(low), voxel_m, distance_m, weight, np.zeros(shape, np.uint16))
+    return Volume(np.array(low), voxel_m, distance_m, weight)
 
 
-def views_near(volume: Volume, points: Array) -> NDArray[np.int32]:
-    """[N] views that have a surface near points [N, 3] on the edges between voxels: the more of an edge's two ends."""
-    at = (points - volume.origin) / volume.voxel_m
-    last = np.array(volume.near.shape) - 1
-    ends = [np.clip(turn(at).astype(np.int64), 0, last) for turn in (np.floor, np.ceil)]
-    return np.maximum(*(volume.near[end[:, 0], end[:, 1], end[:, 2]] for end in ends)).astype(np.int32)
-
-
-def integrate(volume: Volume, fitted: FittedDepth, camera: Camera) -> None:
+def integrate(volume: Volume, fitted: SurfaceDepth, camera: Camera) -> None:
     """Adds one view's depth to the volume."""
     k = camera.intrinsics
     _integrate(
         volume.distance_m,
         volume.weight,
-        volume.near,
         volume.origin,
         volume.voxel_m,
         invert(camera.T_world_cam),
         (k.fx, k.fy, k.cx - fitted.left - 0.5, k.cy - fitted.top - 0.5),
         fitted.inverse,
         fitted.facing,
+        fitted.beyond,
     )
 
 
@@ -237,13 +326,13 @@ def sample_inverse(inverse: NDArray[np.float32], x: float, y: float) -> float:
 def _integrate(
     distance_m: NDArray[np.float32],
     weight: NDArray[np.float32],
-    near: NDArray[np.uint16],
     origin: Array,
     voxel_m: float,
     T: Array,
     k: tuple[float, float, float, float],
     inverse: NDArray[np.float32],
     facing: NDArray[np.float32],
+    beyond: NDArray[np.float32],
 ) -> None:
     """T: board to camera; k: fx, fy, cx, cy of the window with pixel centres on integers."""
     front, back, full = FRONT_VOXELS * voxel_m, BACK_VOXELS * voxel_m, 0.5 * BACK_VOXELS * voxel_m
@@ -260,22 +349,21 @@ def _integrate(
                 y = k[1] * (T[1, 0] * bx + T[1, 1] * by + T[1, 2] * bz + T[1, 3]) / z + k[3]
                 if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
                     continue
-                q = sample_inverse(inverse, x, y)
-                if q == 0.0:
-                    continue
-                slope = facing[int(np.floor(y + 0.5)), int(np.floor(x + 0.5))]
+                row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                q, slope, behind = sample_inverse(inverse, x, y), facing[row, column], back
+                if q == 0.0:  # of the board a view says where nothing is
+                    q, behind = beyond[row, column], 0.0
+                    if q == 0.0:
+                        continue
                 s = (1.0 / q - z) * slope
-                if s <= -back:
+                if s <= -behind:
                     continue
                 # Depth's standard deviation grows with z^2 and with 1 / cosine.
                 w = slope * slope * q * q * q * q
                 if s < -full:
                     w *= (back + s) / (back - full)
                 total = weight[i, j, n] + w
-                if s > front:
-                    s = front
-                else:
-                    near[i, j, n] += 1
+                s = min(s, front)
                 distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
                 weight[i, j, n] = total
 
