@@ -18,13 +18,23 @@ from functools import partial
 from pathlib import Path
 from typing import get_args
 
+import cv2
+import numpy as np
 import pytest
 
+from schemas.job.assets import ProceduralSource
+from schemas.job.captures import KinectDepthNoise, Simulate
+from schemas.job.views import RgbNoise
 from services.cli.main import build_parser
 from services.queue.queue import RESTARTS, JobState
 from services.queue.supervise import PAUSES_S
 from tests.services.init.own_meshes import cup, write_mesh
 from tests.workers.capture.recordings import recording
+from tests.workers.capture.test_readers import write_realsense
+from workers.assets.builtin.make import make_asset
+from workers.capture.board_kinds import KINDS, BoardSizes
+from workers.capture.simulate.simulate import simulate_capture
+from workers.scene.chance import SceneChance
 
 ROOT = Path(__file__).resolve().parents[2]
 DIGEST = "724b3dddcac8b293848aa243cc456f058255ce99e4018df878151f3ca5da96e3"
@@ -63,7 +73,7 @@ SMALLER = {
 PAGES = {
     "README.md": pytest.mark.minute,
     "docs/benchmark.md": pytest.mark.slow,
-    "docs/captures.md": pytest.mark.slow,
+    "docs/captures.md": pytest.mark.minute,
     "docs/commands.md": pytest.mark.slow,
     "docs/export.md": pytest.mark.slow,
     "docs/measured.md": pytest.mark.minute,
@@ -162,6 +172,9 @@ def checkout_at(root: Path) -> Path:
     write_mesh(root / "meshes/mug/b.ply", cup(0.12, 0.05))
     write_mesh(root / "scan.ply", cup())
     (root / "recording.mkv").write_bytes(recording())
+    predictions = root / "predictions" / "depth"
+    predictions.mkdir(parents=True)
+    cv2.imwrite(str(predictions / "00001.png"), np.full((480, 640), 5 * 1300, np.uint16))
     (root / "shared").mkdir()  # what hosts see under one name
     return root
 
@@ -221,6 +234,8 @@ def test_a_page_runs_from_top_to_bottom(page, first, tmp_path, monkeypatch):
     shutil.copytree(first / "data", root / "data")
     monkeypatch.chdir(root)
     monkeypatch.setenv("PYTHONPATH", "")
+    if page == "docs/captures.md":
+        write_realsense(made_on_charuco(tmp_path / "shots"), root / "recording.bag")
     names: dict = {}
     job = "j0a1b2c3d"
     for language, line in steps((ROOT / page).read_text()):
@@ -244,6 +259,15 @@ def test_a_page_runs_from_top_to_bottom(page, first, tmp_path, monkeypatch):
             told = type_it(line, root)
             if line.startswith("./verso submit"):
                 job = re.findall(r"\bj[0-9a-f]{8}\b", told)[0]
+
+
+def made_on_charuco(folder: Path) -> Path:
+    """A virtual capture of a mug on the board that the page of captures prints."""
+    board = KINDS["charuco"](BoardSizes(12, 8, 0.037, 0.05, "DICT_4X4_50"))
+    asset = make_asset("mug", ProceduralSource(source="procedural", size="metric"), 3, 600.0)
+    settings = Simulate(views=8, image_scale=0.5, depth_noise=KinectDepthNoise(), rgb_noise=RgbNoise())
+    simulate_capture(settings, board, asset, SceneChance(3, 0), folder)
+    return folder
 
 
 def has_torch() -> bool:

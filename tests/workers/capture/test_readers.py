@@ -156,14 +156,14 @@ def image(us, encoding, pixels):
     return header(us) + body + struct.pack("<BI", 0, pixels.strides[0]) + block(np.ascontiguousarray(pixels).tobytes())
 
 
-def info(width, height, lens=(0.0,) * 5, model="Brown Conrady", fx=FX):
+def info(width, height, lens=(0.0,) * 5, model="Brown Conrady", k=(FX, FY, CX, CY)):
     D = struct.pack(f"<I{len(lens)}d", len(lens), *lens)
     return (
         header(0)
         + struct.pack("<II", height, width)
         + block(model)
         + D
-        + struct.pack("<9d", fx, 0, CX, 0, FY, CY, 0, 0, 1)
+        + struct.pack("<9d", k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1)
     )
 
 
@@ -176,16 +176,24 @@ COLOR, DEPTH = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
 
 def realsense(lens=(0.0,) * 5, model="Brown Conrady"):
     """(topic, type, time, message) of an SDK's recording: depth in units of a tenth of a millimetre."""
+    pictures = [(t, mm * 10, rgb) for t, mm, rgb in zip(STAMPS_US, DEPTH_MM, SMOOTH, strict=True)]
+    return recorded(pictures, 0.0001, T_COLOR_REF, lens=lens, model=model)
+
+
+def recorded(pictures, unit_m, T_color_ref, **camera):
+    """The messages of an SDK's recording of (time, depth [H, W], RGB [H, W, 3]); `camera`: what `info` takes, of colour."""
+    height, width = pictures[0][1].shape
+    k = {"k": camera["k"]} if "k" in camera else {}
     said = [
-        ("/device_0/sensor_0/option/Depth Units/value", "std_msgs/Float32", 0, struct.pack("<f", 0.0001)),
-        (f"{COLOR}/info/camera_info", "sensor_msgs/CameraInfo", 0, info(W, H, lens, model)),
-        (f"{DEPTH}/info/camera_info", "sensor_msgs/CameraInfo", 0, info(W, H)),
+        ("/device_0/sensor_0/option/Depth Units/value", "std_msgs/Float32", 0, struct.pack("<f", unit_m)),
+        (f"{COLOR}/info/camera_info", "sensor_msgs/CameraInfo", 0, info(width, height, **camera)),
+        (f"{DEPTH}/info/camera_info", "sensor_msgs/CameraInfo", 0, info(width, height, **k)),
         (f"{DEPTH}/tf/0", "geometry_msgs/Transform", 0, transform_message(np.eye(4))),
-        (f"{COLOR}/tf/0", "geometry_msgs/Transform", 0, transform_message(T_COLOR_REF)),
+        (f"{COLOR}/tf/0", "geometry_msgs/Transform", 0, transform_message(T_color_ref)),
     ]
-    for n, t in enumerate(STAMPS_US):
-        said.append((f"{DEPTH}/image/data", "sensor_msgs/Image", t, image(t, "mono16", DEPTH_MM[n] * 10)))
-        said.append((f"{COLOR}/image/data", "sensor_msgs/Image", t + 900, image(t + 900, "rgb8", SMOOTH[n])))
+    for t, depth, rgb in pictures:
+        said.append((f"{DEPTH}/image/data", "sensor_msgs/Image", t, image(t, "mono16", depth)))
+        said.append((f"{COLOR}/image/data", "sensor_msgs/Image", t + 900, image(t + 900, "rgb8", rgb)))
     return said
 
 
@@ -215,6 +223,17 @@ def bag(said, compression="lz4"):
 def write_bag(path, said=None, compression="lz4"):
     put(path / "shot.bag", bag(said or realsense(), compression))
     return path / "shot.bag"
+
+
+def write_realsense(capture, path):
+    """The photographs of a capture's folder as a RealSense's recording, its depth camera where the colour camera is."""
+    camera = json.loads((capture / "camera.json").read_text())
+    pictures = []
+    for n, rgb in enumerate(sorted(capture.glob("rgb_*.png"))):
+        depth = cv2.imread(str(rgb).replace("rgb_", "depth_"), cv2.IMREAD_UNCHANGED)
+        pictures.append((1_000_000 + 33_333 * n, depth, cv2.cvtColor(cv2.imread(str(rgb)), cv2.COLOR_BGR2RGB)))
+    k = tuple(camera[name] for name in ("fx", "fy", "cx", "cy"))
+    path.write_bytes(bag(recorded(pictures, 1.0 / camera["depth_units_per_m"], np.eye(4), k=k)))
 
 
 WRITTEN = {
@@ -452,7 +471,7 @@ def test_hostile_bags_are_used_as_far_as_they_go_or_end_in_one_line(tmp_path):
             "compressed: convert them",
         ),
         (
-            [(t, k, u, info(W, H, fx=float("nan")) if "camera_info" in t else d) for t, k, u, d in said],
+            [(t, k, u, info(W, H, k=(float("nan"), FY, CX, CY)) if "camera_info" in t else d) for t, k, u, d in said],
             "no usable intrinsics",
         ),
     ):
