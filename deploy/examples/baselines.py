@@ -69,7 +69,8 @@ METRICS: Final = {
 """Of the columns of items.parquet, those in the table, and what it calls them."""
 
 COLUMNS: Final = ("name", "job", "scenes", "level", "metric", "value", "low", "high", "items", "seconds")
-"""Of benchmark.csv; docs/benchmark.md tells them."""
+"""Of benchmark.csv. job: how its digest begins; scenes: of the dataset; items: how many count; seconds: of a core, for a scene's
+prediction."""
 
 NOISY: Final = 3
 """The level whose input views are noisy; below it a level is 1 for a scene of one object, else 2."""
@@ -79,8 +80,6 @@ DEPTH_NOISE, RGB_NOISE = DepthNoise(), SensorEffects(rgb_noise=RgbNoise())
 
 SILHOUETTE_PX: Final = 64
 """Side of the window in which masks are compared: an object of 0.25 m has 53 pixels at 2.5 m."""
-
-Shapes = Mapping[int, trimesh.Trimesh]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ class Prediction:
 
     depth_m: NDArray | None = None
     rgb: NDArray[np.uint8] | None = None
-    shapes: Shapes = field(default_factory=dict)
+    shapes: Mapping[int, trimesh.Trimesh] = field(default_factory=dict)
     volumes: Mapping[int, NDArray] = field(default_factory=dict)
     poses: Mapping[int, NDArray] = field(default_factory=dict)
 
