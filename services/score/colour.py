@@ -3,9 +3,9 @@
 import importlib.util
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from schemas.base import Array
 
@@ -59,6 +59,8 @@ def _similarities(a: Array, b: Array, weights: Array) -> tuple[float, float]:
     for scale, exponent in enumerate(SCALES):
         if scale:
             a, b, weights = _halve(a), _halve(b), _halve(weights)
+        if min(a.shape[:2]) <= 2 * RADIUS_PX:  # no whole window
+            return ssim, math.nan
         inner = (slice(RADIUS_PX, -RADIUS_PX),) * 2
         luminance, contrast = (each[inner] for each in _similarity_maps(a, b))
         whole, part = _mean(luminance * contrast, weights[inner]), _mean(contrast, weights[inner])
@@ -71,7 +73,7 @@ def _similarities(a: Array, b: Array, weights: Array) -> tuple[float, float]:
 def _similarity_maps(a: Array, b: Array) -> tuple[Array, Array]:
     """(luminance, contrast times structure), both [H, W, 3], of the windows about each pixel."""
     mean_a, mean_b, square_a, square_b, both = (
-        gaussian_filter(image, (SIGMA_PX, SIGMA_PX, 0.0), radius=(RADIUS_PX, RADIUS_PX, 0))
+        cv2.GaussianBlur(image, (2 * RADIUS_PX + 1,) * 2, SIGMA_PX)
         for image in (a, b, a * a, b * b, a * b)
     )
     variance_a, variance_b, covariance = square_a - mean_a**2, square_b - mean_b**2, both - mean_a * mean_b
