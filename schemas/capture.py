@@ -142,7 +142,8 @@ class CaptureEstimate:
     """One of the three estimates of a capture: every view in order of number, and what all views share.
 
     `print_scale`: true size of the print over the size in board.json, 1 unless estimated. `notes`: what the user must know,
-    for example that print and depth disagree about the scale. `seconds` of processor time, by stage.
+    for example that print and depth disagree about the scale. `camera`: what the markers say where camera.json does not fit
+    them. `seconds` of processor time, by stage.
     """
 
     estimate: Estimate
@@ -152,6 +153,7 @@ class CaptureEstimate:
     iterations: int = 0
     converged: bool = True
     notes: tuple[str, ...] = ()
+    camera: CaptureCamera | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property

@@ -163,6 +163,8 @@ class Estimation(Frozen):
     """Standard deviation of a detected corner, which weighs corners against depth."""
     depth_sigma_m: Positive = 0.003
     """Standard deviation of depth at 1 m, which grows with the square of the distance; measured anew from the capture."""
+    calibrate: bool = False
+    """Take the camera from the markers of all views where camera.json does not fit them."""
     trust: Literal["print", "depth"] = "print"
     """What is metric truth where the print and the depth disagree about the scale."""
 

@@ -82,7 +82,7 @@ def open_folder(path: Path) -> CaptureFolder:
         if (path / CAPTURE_FILE).exists()
         else CaptureFile(name=derive_name(path.resolve().name))
     )
-    return CaptureFolder(path, about, _camera(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers))
+    return CaptureFolder(path, about, camera_of(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers))
 
 
 def derive_name(words: str) -> str:
@@ -138,8 +138,14 @@ def write_view(path: Path, view: CapturedView) -> None:
 
 def write_description(path: Path, about: CaptureFile, camera: CaptureCamera, board: Board) -> None:
     """Writes camera.json, board.json and capture.json; the principal point with pixel centres at 0, as the Kinect has it."""
+    for name, model in ((CAMERA_FILE, describe_camera(camera)), (BOARD_FILE, board), (CAPTURE_FILE, about)):
+        (path / name).write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def describe_camera(camera: CaptureCamera) -> CameraFile:
+    """What camera.json says of a camera."""
     k = camera.intrinsics
-    spec = CameraFile(
+    return CameraFile(
         **k.model_dump(include={"width", "height", "fx", "fy"}),
         cx=k.cx_opencv,
         cy=k.cy_opencv,
@@ -147,8 +153,6 @@ def write_description(path: Path, about: CaptureFile, camera: CaptureCamera, boa
         distortion=[float(x) for x in camera.lens] if camera.has_lens else [],
         depth_units_per_m=camera.depth_units_per_m,
     )
-    for name, model in ((CAMERA_FILE, spec), (BOARD_FILE, board), (CAPTURE_FILE, about)):
-        (path / name).write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
 def read_pose(path: Path) -> Pose | None:
@@ -183,7 +187,8 @@ def _is_rigid(T: Pose) -> bool:
     )
 
 
-def _camera(spec: CameraFile) -> CaptureCamera:
+def camera_of(spec: CameraFile) -> CaptureCamera:
+    """The camera that camera.json describes."""
     shift = 0.5 - float(spec.pixel_centre)
     lens: Array = np.zeros(8)
     lens[: len(spec.distortion)] = spec.distortion

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import re
 import time
 
 import cv2
@@ -17,8 +18,9 @@ from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CaptureError, OutputError
 from schemas.job.captures import Board, Captures, Estimation, Fusion
 from schemas.scene.shape import Mesh
-from tests.workers.capture.drawn import KINECT, errors, write_capture
-from tests.workers.capture.simulated import CAPTURES, VIEWS, box, copy_of, processed, true_estimates
+from tests.conftest import SHARED_DATA
+from tests.workers.capture.drawn import KINECT, errors, median_errors, write_capture
+from tests.workers.capture.simulated import CAPTURES, VIEWS, box, copy_of, made, processed, true_estimates
 from workers.capture.board import frame_in_board
 from workers.capture.folder import open_folder, pose_text, read_pose, read_truth, read_view, write_pose
 from workers.capture.process import SCHEMA, pose_table, process_folder
@@ -118,6 +120,64 @@ def test_a_board_pose_serves_where_no_marker_is_seen_and_our_own_files_of_an_ear
     write_pose(copy / "correction_00003.txt", CORRECTION)
     with pytest.raises(CaptureError, match="corrects nothing"):
         estimate_poses(opened(copy), Estimation())
+
+
+# ---------------------------------------------------------------------------------------------- the camera
+
+
+def rewrite(path, **numbers):
+    """camera.json with other numbers."""
+    spec = json.loads((path / "camera.json").read_bytes())
+    (path / "camera.json").write_text(json.dumps(spec | {k: v(spec[k]) for k, v in numbers.items()}))
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_the_markers_tell_a_focal_length_that_is_wrong_and_replace_it_on_request(seed, tmp_path):
+    path = copy_of(made(seed, views=VIEWS, image_scale=0.35).folder.path, tmp_path)
+    right, truth = open_folder(path).camera, read_truth(path)
+    rewrite(path, fx=lambda fx: 1.01 * fx, fy=lambda fy: 1.01 * fy)
+
+    def off_mm(spec):
+        found = estimate_poses(given_files(open_folder(path), spec), spec).estimate
+        return found, median_errors(found, truth.T_board_cam)[0]
+
+    found, before = off_mm(Estimation(compare=False))
+    assert found.notes[0].startswith("camera.json does not fit") and before > 4
+    said = [float(number) for number in re.findall(r"f[xy] = ([0-9.]+) ", found.notes[0])]
+    assert said == pytest.approx([right.intrinsics.fx, right.intrinsics.fy], rel=0.006)
+    calibrated, after = off_mm(Estimation(compare=False, calibrate=True))
+    assert after < 0.3 * before and "camera.json does not fit" not in calibrated.notes[0]
+
+
+def test_a_folder_that_was_processed_with_the_markers_camera_is_read_back_with_it(tmp_path):
+    path = copy_of(box(), tmp_path)
+    rewrite(path, cx=lambda cx: cx + 8)
+    quick = Captures(estimation=Estimation(compare=False, calibrate=True), fusion=Fusion(voxel_m=0.004))
+    done = process_folder(path, quick)
+    assert any("the camera is the markers' in place of camera.json's: fx = " in note for note in done.notes)
+    right, read = open_folder(box()).camera.intrinsics, read_result(path).folder.camera.intrinsics
+    assert abs(read.cx - right.cx) < 0.8 and open_folder(path).camera.intrinsics.cx == pytest.approx(right.cx + 8)
+    assert done.estimates.estimate.views[0].T_board_cam == pytest.approx(read_truth(path).T_board_cam[0], abs=5e-3)
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize(
+    ("file", "number", "right"), [("fx_plus_1pc", "fx", 611.8), ("no_lens", "k1", None), ("cx_plus_15", "cx", 639.3)]
+)
+def test_a_wrong_camera_of_an_independent_capture_is_told(file, number, right, tmp_path):
+    """The mug of ../shared/data/captures, drawn by a ray caster that is not ours."""
+    path, truth = copy_of(SHARED_DATA / "captures" / "m_ref", tmp_path), np.load(SHARED_DATA / "captures/mug.truth.npy")
+    (path / "camera.json").write_bytes((SHARED_DATA / "captures" / "wrong_camera" / f"{file}.json").read_bytes())
+    found = estimate_poses(opened(path), Estimation(compare=False)).estimate
+    said = re.search(rf"{number} = ([0-9.]+) \(", found.notes[0])
+    assert found.notes[0].startswith("camera.json does not fit") and said
+    assert right is None or float(said[1]) == pytest.approx(right, abs=0.2)
+    for view in found.views:
+        mm, sigma_mm = (
+            errors(view.T_board_cam, truth[view.number])[0],
+            1000 * np.sqrt(np.trace(view.covariance[:3, :3])),
+        )
+        assert mm < 1.25 * sigma_mm
 
 
 # ---------------------------------------------------------------------------------------------- manual corrections

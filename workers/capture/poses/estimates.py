@@ -10,9 +10,9 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from schemas.base import Array, Pose
-from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
+from schemas.capture import CaptureCamera, CaptureEstimate, DepthCorrection, ViewEstimate
 from schemas.job.captures import Board, Estimation
-from workers.capture.poses.joint import MIN_COSINE, Joint, Views, gather, placed, solve_jointly
+from workers.capture.poses.joint import MIN_COSINE, CameraFit, Joint, Views, fit_camera, gather, placed, solve_jointly
 from workers.capture.poses.markers import (
     AMBIGUOUS,
     Evidence,
@@ -21,7 +21,6 @@ from workers.capture.poses.markers import (
     MarkerPose,
     cross_matrix,
     exponential,
-    focal_lengths,
     is_ambiguous,
     judge,
     median_reprojection,
@@ -173,6 +172,45 @@ def scale_note(joint: Joint, board: Board, spec: Estimation) -> str:
         f"{start}. Which is right cannot be identified from the capture alone; {believed} was believed. "
         f"Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as measured_ruler_m"
     )
+
+
+MATERIAL = 5e-4
+"""Another camera is told of where it moves a pose by more than this share of its distance: a calibration is no better."""
+
+
+def camera_note(fitted: CameraFit, camera: CaptureCamera, poses: Array) -> str:
+    """That camera.json does not fit, with what the markers say instead; empty where it hardly matters to any pose."""
+    moved_by = fitted.shift_m()
+    if float(np.max(moved_by / np.linalg.norm(poses[:, :3, 3], axis=1))) < MATERIAL:
+        return ""
+    sure = np.abs(fitted.numbers) > SIGNIFICANT * fitted.sigma
+    if not sure.any():
+        return (
+            "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is "
+            "wrong: calibrate the camera at this size of image, or take views from more sides"
+        )
+    return (
+        f"camera.json does not fit: the markers say {compare_cameras(fitted.camera, camera, sure)}, which moves the poses by "
+        f"{1000 * float(np.median(moved_by)):.1f} mm. Calibrate the camera at this size of image, or use --calibrate "
+        "(estimation.calibrate), which takes what the markers say"
+    )
+
+
+def compare_cameras(found: CaptureCamera, given: CaptureCamera, chosen: NDArray[np.bool_] | None = None) -> str:
+    """Numbers of two cameras in words, as camera.json has them with pixel_centre 0: all five, or those chosen."""
+    k, of = found.intrinsics, given.intrinsics
+    pairs = [(k.fx, of.fx), (k.fy, of.fy), (k.cx_opencv, of.cx_opencv), (k.cy_opencv, of.cy_opencv)]
+    words = [f"{name} = {a:.1f} ({b:.1f} given)" for name, (a, b) in zip(("fx", "fy", "cx", "cy"), pairs, strict=True)]
+    words.append(f"k1 = {found.lens[0]:.4f} ({given.lens[0]:.4f} given)")
+    return ", ".join(word for n, word in enumerate(words) if chosen is None or chosen[n])
+
+
+def _less_certain(view: ViewEstimate, fitted: CameraFit, place: int) -> ViewEstimate:
+    """The view with the uncertainty of the camera in its covariance, whether it is used or not."""
+    if view.covariance is None:
+        return view
+    by_camera = np.outer(fitted.motion[place], fitted.motion[place]) + fitted.covariance[place]
+    return dataclasses.replace(view, covariance=view.covariance + by_camera)
 
 
 def noise_notes(joint: Joint, views: Views) -> list[str]:
@@ -334,7 +372,7 @@ def _problem(starts: list[Start], evidence: Evidence) -> Views:
         np.stack([start.T_board_cam for start in starts]),
         np.stack([start.covariance for start in starts]),
         np.array([start.fixed for start in starts]),
-        focal_lengths(evidence.camera),
+        evidence.camera,
         evidence.corner_px,
     )
 
@@ -383,7 +421,10 @@ def _outside(index: int, evidence: Evidence, shared: Shared) -> ViewEstimate:
 
 
 def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidence) -> CaptureEstimate:
-    solution = joint.solution
+    solution, fitted = joint.solution, fit_camera(problem, joint.solution, evidence.spec.max_iterations)
+    asked = fitted if fitted is not None and (fitted.significant or evidence.spec.calibrate) else None
+    misfit = fitted is not None and fitted.significant
+    told = camera_note(fitted, evidence.camera, solution.poses) if fitted is not None and misfit else ""
     shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
     correction = shared.correction(identified(sigma, joint.prior))
     views = {}
@@ -399,10 +440,11 @@ def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidenc
         if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:
             reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
             view = dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
-        views[start.index] = view
+        views[start.index] = view if asked is None else _less_certain(view, asked, place)
     for index in set(range(len(evidence.observations))) - set(views):
         views[index] = _outside(index, evidence, shared)
-    notes = [scale_note(joint, evidence.board, evidence.spec), *noise_notes(joint, problem)]
+    # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
+    notes = [told or scale_note(joint, evidence.board, evidence.spec), *noise_notes(joint, problem)]
     return CaptureEstimate(
         "joint",
         tuple(views[index] for index in sorted(views)),
@@ -411,6 +453,7 @@ def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidenc
         solution.iterations,
         solution.converged,
         tuple(note for note in notes if note),
+        fitted.camera if fitted is not None and fitted.is_known() else None,
     )
 
 

@@ -58,6 +58,12 @@ def moved(T: Pose, motion: Array) -> Pose:
     return pose(U @ V, T[:3, 3] + T[:3, :3] @ motion[:3])
 
 
+def motion_between(T: Pose, other: Pose) -> Array:
+    """[6]: the small motion (metres, then radians) in the axes of T that takes T to the other."""
+    step = invert(T) @ other
+    return np.concatenate([step[:3, 3], logarithm(step[:3, :3])])
+
+
 CAUCHY = 3.0
 """A residual of this many standard deviations has half the weight of a small one."""
 MAX_ROUNDS = 30
