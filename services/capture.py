@@ -167,7 +167,10 @@ def _make_empty(out: Path) -> Path:
 
 
 def process(options: argparse.Namespace) -> int:
-    """Processes options.folder; reads `estimate`, `calibrate`, `changes` (--set) and `json`. Returns 0. Raises JobError, CaptureError."""
+    """Processes options.folder; reads `estimate`, `calibrate`, `changes` (--set) and `json`. Returns 0.
+
+    Raises JobError, CaptureError.
+    """
     keys = {
         "captures.estimation.estimate": options.estimate,
         "captures.estimation.calibrate": options.calibrate or None,

@@ -7,7 +7,8 @@
 
 Depth and masks may be missing, in some views or in all. camera.json has width, height, fx, fy, cx, cy, `pixel_centre`
 ("0" as in OpenCV and the Azure Kinect's calibration, or "0.5" from the image's edge), `distortion` (OpenCV's order, 0
-to 8 numbers) and `depth_units_per_m`. board.json is the job file's branch `captures.board`.
+to 8 numbers), `depth_units_per_m` and `depth` ("z", or "ray" for distances along the ray).
+board.json is the job file's branch `captures.board`.
 """
 
 import json
@@ -28,6 +29,7 @@ from schemas.errors import CaptureError
 from schemas.job.captures import Board, BoardFrame
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
+from workers.geometry.lens import pixel_rays
 from workers.store.images import encode_mask, encode_png
 
 CAMERA_FILE, BOARD_FILE, CAPTURE_FILE, TRUTH = "camera.json", "board.json", "capture.json", "truth"
@@ -48,6 +50,8 @@ class CameraFile(Frozen):
     """Coordinate of the first pixel's centre."""
     distortion: Annotated[list[float], Field(max_length=8)] = Field(default_factory=list)
     depth_units_per_m: Positive = 1000.0
+    depth: Literal["z", "ray"] = "z"
+    """What a pixel of depth measures: z along the optical axis, or the distance along its ray."""
 
 
 class CaptureFile(Frozen):
@@ -119,12 +123,20 @@ def read_board(path: Path) -> Board:
 
 
 def read_view(folder: CaptureFolder, number: int) -> CapturedView:
-    """One view's images. Raises CaptureError where one cannot be read or has the wrong size."""
+    """One view's images, depth as z. Raises CaptureError where one cannot be read or has the wrong size."""
     rgb = _read_image(folder, f"rgb_{number:05d}.png", cv2.IMREAD_COLOR_RGB, np.uint8)
     assert rgb is not None
     depth = _read_image(folder, f"depth_{number:05d}.png", cv2.IMREAD_UNCHANGED, np.uint16, optional=True)
+    if depth is not None and folder.camera.depth == "ray":
+        depth = depth_along_axis(depth, folder.camera)
     mask = _read_image(folder, f"mask_{number:05d}.png", cv2.IMREAD_GRAYSCALE, np.uint8, optional=True)
     return CapturedView(number, rgb, depth, None if mask is None else mask > 0)
+
+
+def depth_along_axis(along_ray: NDArray[np.uint16], camera: CaptureCamera) -> NDArray[np.uint16]:
+    """[H, W] z of distances along the ray [H, W], in the same units; 0 where the lens has no ray."""
+    rays = pixel_rays(camera.intrinsics, camera.lens)
+    return np.rint(np.nan_to_num(along_ray / np.sqrt(1.0 + (rays**2).sum(axis=2)))).astype(np.uint16)
 
 
 def write_view(path: Path, view: CapturedView) -> None:
@@ -152,6 +164,7 @@ def describe_camera(camera: CaptureCamera) -> CameraFile:
         pixel_centre="0",
         distortion=[float(x) for x in camera.lens] if camera.has_lens else [],
         depth_units_per_m=camera.depth_units_per_m,
+        depth=camera.depth,
     )
 
 
@@ -194,7 +207,8 @@ def camera_of(spec: CameraFile) -> CaptureCamera:
     lens[: len(spec.distortion)] = spec.distortion
     lens.setflags(write=False)
     size = spec.model_dump(include={"width", "height", "fx", "fy"})
-    return CaptureCamera(Intrinsics(**size, cx=spec.cx + shift, cy=spec.cy + shift), lens, spec.depth_units_per_m)
+    k = Intrinsics(**size, cx=spec.cx + shift, cy=spec.cy + shift)
+    return CaptureCamera(k, lens, spec.depth_units_per_m, spec.depth)
 
 
 def _read_json(path: Path, model: type[Model]) -> Model:

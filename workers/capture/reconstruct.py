@@ -20,7 +20,7 @@ from workers.capture.board import frame_in_board, open_dictionary
 from workers.capture.detect import detect_markers, other_dictionaries
 from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.estimates import compare_cameras, estimate_article, estimate_joint, estimate_markers
-from workers.capture.poses.markers import Evidence, MarkerPose, observe_view
+from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, observe_view
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.results import own_files
 from workers.capture.surface.fusion import fuse_views
@@ -216,6 +216,7 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     given_poses = any(seen.manual_T_board_cam is not None for seen in evidence.observations)
     if not given_poses and not any(len(found.ids) for found in detections):
         raise CaptureError("markers", _no_markers(folder))
+    check_depth(evidence)
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):
         own = ProcessorClock()

@@ -278,7 +278,7 @@ def test_the_right_camera_is_never_blamed_nor_any_by_views_that_cannot_tell():
 
 
 def test_a_focal_length_is_told_before_the_print_is_blamed_for_it():
-    truth, evidence = make(Virtual(views=10))
+    _, evidence = make(Virtual(views=10))
     k = evidence.camera.intrinsics
     given = with_numbers(evidence.camera, fx=1.03 * k.fx, fy=1.03 * k.fy)
     squeezed = np.array([1 / 1.03, 1 / 1.03, 1.0])  # what pixels mean to the other camera

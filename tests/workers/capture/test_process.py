@@ -16,7 +16,7 @@ from schemas.base import frozen_array
 from schemas.capture import CaptureCamera, CaptureEstimate, DepthCorrection, Estimates, ViewEstimate
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CaptureError, OutputError
-from schemas.job.captures import Board, Captures, Estimation, Fusion
+from schemas.job.captures import Board, Captures, Estimation, Fusion, KinectDepthNoise
 from schemas.scene.shape import Mesh
 from tests.conftest import SHARED_DATA
 from tests.workers.capture.drawn import KINECT, errors, median_errors, write_capture
@@ -128,7 +128,7 @@ def test_a_board_pose_serves_where_no_marker_is_seen_and_our_own_files_of_an_ear
 def rewrite(path, **numbers):
     """camera.json with other numbers."""
     spec = json.loads((path / "camera.json").read_bytes())
-    (path / "camera.json").write_text(json.dumps(spec | {k: v(spec[k]) for k, v in numbers.items()}))
+    (path / "camera.json").write_text(json.dumps(spec | {k: v(spec.get(k)) for k, v in numbers.items()}))
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
@@ -178,6 +178,53 @@ def test_a_wrong_camera_of_an_independent_capture_is_told(file, number, right, t
             1000 * np.sqrt(np.trace(view.covariance[:3, :3])),
         )
         assert mm < 1.25 * sigma_mm
+
+
+# ---------------------------------------------------------------------------------------------- what depth measures
+
+
+def remeasure(path, change):
+    """Every depth image with `change`(z, length of the pixel's ray at z = 1) in place of its z."""
+    k = open_folder(path).camera.intrinsics
+    rows, columns = np.mgrid[: k.height, : k.width] + 0.5
+    length = np.sqrt(1 + ((columns - k.cx) / k.fx) ** 2 + ((rows - k.cy) / k.fy) ** 2)
+    for file in path.glob("depth_*.png"):
+        z = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(file), np.where(z > 0, np.rint(change(z.astype(float), length)), 0).astype(np.uint16))
+
+
+DEPTH = {
+    "ray": (lambda z, length: z * length, {}, r'is the distance along the ray, and .* says z: .* write "depth": "ray"'),
+    "z said to be ray": (lambda z, length: z, {"depth": "ray"}, r'is z along the optical axis, .* write "depth": "z"'),
+    "tenths of millimetres": (
+        lambda z, length: 10 * z,
+        {},
+        r"depth_units_per_m in camera\.json is 1000, and 10000 would fit",
+    ),
+    "metres": (lambda z, length: z, {"depth_units_per_m": 1.0}, r"is 1000 times .* is 1, and 1000 would fit"),
+    "100 mm off": (lambda z, length: z + 100, {}, r"depth is off by \+(9|10)\d mm at every distance"),
+}
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_depth_that_no_sensor_measures_is_named_with_the_key_to_change(seed, tmp_path):
+    kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise()).folder.path
+    for name, (change, said, words) in DEPTH.items():
+        path = copy_of(kept, tmp_path / name)
+        remeasure(path, change)
+        rewrite(path, **{key: lambda _, value=value: value for key, value in said.items()})
+        with pytest.raises(CaptureError, match=words):
+            estimate_poses(opened(path), Estimation())
+        (path / "camera.json").write_bytes((kept / "camera.json").read_bytes())
+        if name == "ray":  # read as what it is, it is what it was
+            rewrite(path, depth=lambda _: "ray")
+            mended, before = (read_view(open_folder(p), 4).depth.astype(int) for p in (path, kept))
+            assert np.abs(mended - before).max() <= 1
+            assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
+    remeasure(
+        path := copy_of(kept, tmp_path / "usual"), lambda z, _: 1.03 * z - 15
+    )  # a print and a sensor as they may be
+    assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
 
 
 # ---------------------------------------------------------------------------------------------- manual corrections

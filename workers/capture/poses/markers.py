@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, DepthCorrection, Detection, ViewEstimate, ViewStatus
+from schemas.errors import CaptureError
 from schemas.job.captures import Estimation
 from workers.capture.poses.observation import (
     Corners,
@@ -237,6 +238,69 @@ def is_ambiguous(found: MarkerPose, corner_px: float) -> bool:
     if found.fit is None or found.rival is None:
         return False
     return found.rival.cost - found.fit.cost < AMBIGUOUS * corner_px**2
+
+
+MANY = 40
+"""So many corners with depth, in views with a pose from markers, tell what depth measures."""
+NO_PRINT = 1.25
+"""Depth of a scale beyond this is in other units: no print is wrong by as much."""
+NO_SENSOR_M = 0.05
+"""Nor has a sensor such an offset: specifications are near 0.01."""
+CLEARLY = 0.5
+"""Depth along the ray leaves at most this share of the spread that depth along the axis leaves."""
+UNITS = (1.0, 100.0, 256.0, 1000.0, 4000.0, 5000.0, 8000.0, 10_000.0, 65_535.0)
+"""Of depth images that are in use, a metre; one of them is named where it fits to a tenth."""
+
+
+def check_depth(evidence: "Evidence") -> None:
+    """Raises CaptureError where depth at the markers is what no sensor measures, with the key of camera.json to change.
+
+    Units, an offset, and distances along the ray in place of z: these grow with the angle to the axis as sqrt(1 + x^2 + y^2).
+    """
+    parts = [
+        _depth_of(o, f.fit.T_board_cam) for o, f in zip(evidence.observations, evidence.markers, strict=True) if f.fit
+    ]
+    z, true_z, length = np.concatenate(parts or [np.zeros((0, 3))]).T
+    if len(z) < MANY:
+        return
+    camera, scale = evidence.camera, float(np.median(z / true_z))
+    if not 1 / NO_PRINT < scale < NO_PRINT:
+        fits = camera.depth_units_per_m * scale
+        fits = next((known for known in UNITS if abs(known / fits - 1) < 0.1), float(f"{fits:.3g}"))
+        given = f"depth_units_per_m in camera.json is {camera.depth_units_per_m:g}"
+        raise CaptureError(
+            "depth", f"depth is {float(f'{scale:.3g}'):g} times what the markers say: {given}, and {fits:g} would fit"
+        )
+    # Scale and offset are left open: a print of another size and a sensor's own error are no matter of the ray.
+    by_kind = {power: _affine(true_z * length**power, z) for power in (-1, 0, 1)}
+    best = min(by_kind, key=lambda power: by_kind[power][1])
+    if best and by_kind[best][1] < CLEARLY * by_kind[0][1]:
+        seen, word = ("the distance along the ray", "ray") if best > 0 else ("z along the optical axis", "z")
+        grows = f'its error grows with the angle to the optical axis; write "depth": "{word}" into camera.json'
+        raise CaptureError("depth", f"depth is {seen}, and camera.json says {camera.depth}: {grows}")
+    offset_m = by_kind[0][0]
+    if abs(offset_m) > NO_SENSOR_M:
+        words = f"depth is off by {1000 * offset_m:+.0f} mm at every distance, which no sensor is"
+        raise CaptureError("depth", f"{words}: export it again without an offset (0 is no depth)")
+
+
+def _depth_of(seen: Observation, T: Pose) -> Array:
+    """[N, 3]: measured z of corners, that of the board's plane on the same rays, and the rays' lengths at z = 1."""
+    corners = seen.corners
+    rays = np.column_stack([corners.rays, np.ones(len(corners.rays))])
+    whole = np.column_stack([corners.depth_m, -T[2, 3] / (rays @ T[2, :3]), np.linalg.norm(rays, axis=1)])
+    return whole[(corners.depth_m > 0) & (whole[:, 1] > 0)]
+
+
+def _affine(x: Array, y: Array) -> tuple[float, float]:
+    """(offset, median of the absolute residuals) of a robust line through points (x, y), each [N]."""
+    weight, basis = np.ones(len(x)), np.column_stack([np.ones(len(x)), x])
+    residual, line = y, np.zeros(2)
+    for _ in range(10):
+        line = np.linalg.lstsq(basis * weight[:, None], y * weight, rcond=None)[0]
+        residual = np.abs(y - basis @ line)
+        weight = 1.0 / np.sqrt(np.maximum(residual, 1e-4 + 0.1 * np.median(residual)))
+    return float(line[0]), float(np.median(residual))
 
 
 def observe_view(

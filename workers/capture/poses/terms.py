@@ -208,7 +208,7 @@ ROBUST = 3.0
 
 @dataclass(frozen=True, eq=False)
 class CornerTerm:
-    """Corners of all views, those of a marker together: view [K] index, board [K, 3] nominal metres, rays [K, 2]; sigma in pixels.
+    """Corners of all views, those of a marker together: view [K] index, board [K, 3] nominal metres, rays [K, 2]; sigma_px.
 
     With `seen` (their pixels [K, 2], centres at +0.5, and the camera of the rays) its intrinsics can be estimated as well.
     """
