@@ -192,21 +192,26 @@ def test_a_pose_given_by_hand_is_kept_to_the_bit(capture):
     assert found.views[3].reasons[-1] == "as told" and median_errors(found, truth)[0] < 0.5
 
 
-def test_an_object_that_moved_is_noted_and_the_smaller_part_flagged(capture):
+def test_of_an_object_that_moved_the_largest_group_of_views_is_used_and_no_group_of_two(capture):
     truth, evidence = capture
     still = estimate_joint(evidence)
     assert not any("moved" in note for note in still.notes) and len(still.used) == len(truth)
-    parts = []
-    for seen, T in zip(evidence.observations, truth, strict=True):
-        patches = seen.object_patches
-        if seen.number >= 7:  # the object, not the board, 3 cm farther along x and 1 cm along y
-            ray_z = patches.ray_z + T[:3, :3].T @ np.array([0.03, 0.01, 0])
-            patches = dataclasses.replace(patches, ray_z=ray_z, ray=ray_z / ray_z[:, 2:])
-        parts.append(dataclasses.replace(seen, object_patches=patches))
-    found = estimate_joint(dataclasses.replace(evidence, observations=tuple(parts)))
-    assert "the object moved on the board after view 6" in found.notes[0]
+
+    def shifted(places_m):
+        """The object, not the board, elsewhere along x and y in each view."""
+        parts = []
+        for seen, T, place_m in zip(evidence.observations, truth, places_m, strict=True):
+            ray_z = seen.object_patches.ray_z + T[:3, :3].T @ np.array([place_m, place_m / 3, 0])
+            patches = dataclasses.replace(seen.object_patches, ray_z=ray_z, ray=ray_z / ray_z[:, 2:])
+            parts.append(dataclasses.replace(seen, object_patches=patches))
+        return estimate_joint(dataclasses.replace(evidence, observations=tuple(parts)))
+
+    found = shifted([0.0] * 7 + [0.03] * 3)
+    assert "stands still within each of: views 0, 1, 2, 3, 4, 5, 6; views 7, 8, 9. The first" in found.notes[0]
     assert [view.status for view in found.views] == ["used"] * 7 + ["flagged"] * 3
     assert median_errors(found, truth)[0] < 0.5
+    everywhere = shifted([-0.06, -0.06, -0.03, -0.03, 0.0, 0.0, 0.03, 0.03, 0.06, 0.06])
+    assert not everywhere.used and "No group is large enough to be used" in everywhere.notes[0]
 
 
 def test_a_view_that_does_not_fit_is_flagged_and_takes_no_part(capture):

@@ -5,7 +5,7 @@ import pytest
 
 from schemas.job.captures import Estimation
 from tests.workers.capture.drawn import BOX, HALF, KINECT, LENS, Virtual, errors, hand_held, make, observe
-from workers.capture.poses.estimates import moved_after
+from workers.capture.poses.estimates import object_groups
 from workers.capture.poses.joint import (
     FLOOR_M,
     INFLATION_OF_FEW,
@@ -219,13 +219,32 @@ def test_pairs_are_of_two_views_near_each_other_and_on_one_face(around):
     assert match_patches(no_patches(), np.zeros(0, np.int64), poses, Shared()).pairs.shape == (0, 2)
 
 
-def test_a_move_of_the_object_is_found_with_its_view_and_size(around):
-    truth, patches, view = around
-    for shift_m in ((0.03, 0.01, 0), (-0.02, 0.02, 0)):
-        for first in (4, 7, 10):
-            poses = np.stack([(translation(*shift_m) if n >= first else np.eye(4)) @ T for n, T in enumerate(truth)])
-            last, apart_m = moved_after(patches, view, poses, Shared())
-            assert abs(last - (first - 1)) <= 5  # views between that see other faces cannot tell on which side they are
-            assert 0.6 * np.linalg.norm(shift_m) < apart_m < 1.2 * np.linalg.norm(shift_m)
-    assert moved_after(patches, view, truth, Shared()) is None
-    assert moved_after(no_patches(), np.zeros(0, np.int64), truth, Shared()) is None
+STOOD = {
+    "still": [range(14)],
+    "once": [range(9), range(9, 14)],
+    "back and forth": [[0, 1, 2, 3, 7, 8, 9, 10, 11, 12, 13], [4, 5, 6]],
+    "twice": [range(6), range(6, 11), range(11, 14)],
+    "one view": [[0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11, 12, 13], [7]],
+}
+
+
+@pytest.mark.parametrize("how", STOOD)
+def test_views_are_grouped_by_where_the_object_stood(how):
+    for seed in range(3):
+        truth, evidence = make(Virtual(views=14, k=HALF, seed=seed))
+        shifts = [translation(0, 0, 0), translation(0.03, 0.01, 0), translation(-0.02, 0.025, 0)]
+        place = [next(n for n, group in enumerate(STOOD[how]) if number in group) for number in range(14)]
+        poses = np.stack([shifts[n] @ T for n, T in zip(place, truth, strict=True)])
+        found = object_groups(evidence.observations, poses, Shared(), 0.001, np.zeros(14))
+        assert found == [list(group) for group in STOOD[how]], seed
+
+
+def test_views_without_depth_or_too_unsure_of_their_poses_are_not_said_to_see_another_place(around):
+    truth, _, _ = around
+    seen = [observe(T, np.random.default_rng(0)) for T in truth]
+    assert object_groups(seen, truth, Shared(), 0.001, np.zeros(14)) == [list(range(14))]
+    _, evidence = make(Virtual(views=14, k=HALF))
+    poses = np.stack([translation(0.01 * (n >= 7), 0, 0) @ T for n, T in enumerate(truth)])
+    for unsure_m, groups in ((0.0, 2), (0.01, 1)):
+        unsure = np.where(np.arange(14) >= 7, unsure_m, 0.0)
+        assert len(object_groups(evidence.observations, poses, Shared(), 0.001, unsure)) == groups

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import re
+import shutil
 import time
 
 import cv2
@@ -16,11 +17,11 @@ from schemas.base import frozen_array
 from schemas.capture import CaptureCamera, CaptureEstimate, DepthCorrection, Estimates, ViewEstimate
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CaptureError, OutputError
-from schemas.job.captures import Board, Captures, Estimation, Fusion, KinectDepthNoise
+from schemas.job.captures import Board, Captures, Estimation, Fusion, KinectDepthNoise, Simulate
 from schemas.scene.shape import Mesh
 from tests.conftest import SHARED_DATA
 from tests.workers.capture.drawn import KINECT, errors, median_errors, write_capture
-from tests.workers.capture.simulated import CAPTURES, VIEWS, box, copy_of, made, processed, true_estimates
+from tests.workers.capture.simulated import CAPTURES, VIEWS, asset_of, box, copy_of, made, processed, true_estimates
 from workers.capture.board import frame_in_board
 from workers.capture.folder import open_folder, pose_text, read_pose, read_truth, read_view, write_pose
 from workers.capture.process import SCHEMA, pose_table, process_folder
@@ -46,9 +47,13 @@ from workers.capture.score import (
     score_surface,
     true_view,
 )
+from workers.capture.simulate import simulate
+from workers.capture.simulate.photograph import place_object
+from workers.capture.simulate.simulate import plan_path
 from workers.capture.views import CaptureViews, read_result, write_mirrors, write_synthesized
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import half_turn, invert, pose, rotation_about, transform, translation
+from workers.scene.chance import SceneChance
 
 CORRECTION = pose(rotation_about(np.array([0.0, 0, 1]), 0.02), np.array([0.01, 0.0, 0.005]))
 
@@ -225,6 +230,69 @@ def test_depth_that_no_sensor_measures_is_named_with_the_key_to_change(seed, tmp
         path := copy_of(kept, tmp_path / "usual"), lambda z, _: 1.03 * z - 15
     )  # a print and a sensor as they may be
     assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
+
+
+# ---------------------------------------------------------------------------------------------- an object that moved
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize(("category", "seed"), [("mug", 21), ("can", 22), ("box", 23)])
+def test_photographs_of_an_object_that_moved_are_told_from_those_of_the_largest_group(
+    category, seed, tmp_path, monkeypatch
+):
+    turned = pose(rotation_about(np.array([0.0, 0, 1]), np.pi), np.zeros(3))
+    places = {"first": np.eye(4), "shifted": translation(0.03, 0.01, 0), "turned": turned}
+    settings = Simulate(views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise())
+    paths = tmp_path / "mixed"
+    for name, moved in places.items():
+        monkeypatch.setattr(
+            simulate, "place_object", lambda asset, rng, T=moved: frozen_array(T @ place_object(asset, rng))
+        )
+        monkeypatch.setattr(simulate, "plan_path", lambda s, _, rng: plan_path(s, np.array([0, 0, 0.05]), rng))
+        simulate.simulate_capture(settings, Board(), asset_of(category, seed), SceneChance(seed, 0), tmp_path / name)
+    for name, numbers, expected in (
+        ("shifted", (3, 4, 8), [3, 4, 8]),
+        ("turned", (5,), [5] if category == "mug" else []),
+    ):
+        shutil.rmtree(paths, ignore_errors=True)
+        shutil.copytree(tmp_path / "first", paths)
+        for number in numbers:
+            for kind in ("rgb", "depth"):
+                shutil.copy(tmp_path / name / f"{kind}_{number:05d}.png", paths)
+        found = estimate_poses(opened(paths), Estimation(compare=False)).estimate
+        assert [view.number for view in found.views if view.status != "used"] == expected, found.notes[0]
+
+
+def turn(path, number):
+    """Both images of a view turned by 180 degrees, as a file manager does."""
+    for kind in ("rgb", "depth"):
+        file = str(path / f"{kind}_{number:05d}.png")
+        cv2.imwrite(file, cv2.imread(file, cv2.IMREAD_UNCHANGED)[::-1, ::-1])
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_an_image_that_is_turned_is_refused_and_spoils_nothing_else(seed, tmp_path):
+    kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise())
+    path, truth = copy_of(kept.folder.path, tmp_path), read_truth(kept.folder.path).T_board_cam
+    turn(path, 4)
+    found = estimate_poses(opened(path), Estimation()).estimate
+    assert found.views[4].status == "refused" and "turned by 180 degrees" in found.views[4].reasons[0]
+    assert len(found.used) == VIEWS - 1 and not any("camera.json" in note or "moved" in note for note in found.notes)
+    assert median_errors(found, truth)[0] < 0.3
+    turn(path, 4)
+    assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
+
+
+@pytest.mark.shared_data
+def test_views_far_apart_of_an_object_that_never_moved_are_all_used(tmp_path):
+    """The mug of ../shared/data/captures: five views, and every second photograph without depth."""
+    found = estimate_poses(opened(SHARED_DATA / "captures" / "m_five"), Estimation(compare=False)).estimate
+    assert len(found.used) == 5 and not any("moved" in note for note in found.notes)
+    path = copy_of(SHARED_DATA / "captures" / "m_ref", tmp_path)
+    for number in range(0, 20, 4):
+        (path / f"depth_{number:05d}.png").unlink()
+    found = estimate_poses(opened(path), Estimation(compare=False)).estimate
+    assert len(found.used) == 10 and not any("moved" in note for note in found.notes)
 
 
 # ---------------------------------------------------------------------------------------------- manual corrections

@@ -265,9 +265,10 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """The solution, the noise of depth that it was weighed with (sigma at 1 m, metres; inflation), and the pairs."""
+    """The solution, that without the object, the noise of depth that it was weighed with (sigma at 1 m), and the pairs."""
 
     solution: Solution
+    by_board: Solution
     covariance: Array
     prior: Array
     board: BoardTerm | None
@@ -291,7 +292,7 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
         board = _measured_board(board, views, first)
     terms: list[Term] = [corners, *([board] if board else [])]
     solution = minimise(Problem(terms, prior, views.fixed), views.poses, shared, spec.max_iterations)
-    surface, iterations, alike = None, solution.iterations, 1.0
+    by_board, surface, iterations, alike = solution, None, solution.iterations, 1.0
     for _ in range(ROUNDS if len(on_object) else 0):
         if iterations >= spec.max_iterations:
             break
@@ -308,7 +309,7 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
         solution = minimise(problem, before.poses, before.shared, spec.max_iterations - iterations)
         iterations += solution.iterations
     solution = dataclasses.replace(solution, iterations=iterations)
-    return Joint(solution, solution.covariance(), prior, board, surface)
+    return Joint(solution, by_board, solution.covariance(), prior, board, surface)
 
 
 def gather(patches: list[Patches]) -> tuple[Patches, NDArray[np.int64]]:

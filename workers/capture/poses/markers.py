@@ -5,6 +5,7 @@ A pose is changed from the right, in camera axes: T_board_cam <- T_board_cam exp
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -28,6 +29,7 @@ from workers.capture.poses.observation import (
     pixels_of_points,
 )
 from workers.geometry.frames import angle_between, invert, pose, rotation_about, transform
+from workers.geometry.lens import rays_of_pixels
 
 
 def exponential(rotation_vector: Array) -> Array:
@@ -213,6 +215,36 @@ def planar_poses(corners: Corners) -> list[Pose]:
     return poses
 
 
+TURNED = 25.0
+"""A turned image is told by so much of chi-square: five sigma."""
+ILL_FITTING = 2.0
+"""Only views whose corners fit so many times worse than those of the median view are looked at."""
+
+
+def refuse_turned(
+    observations: Sequence[Observation], found: Sequence[MarkerPose], camera: CaptureCamera, corner_px: float
+) -> list[MarkerPose]:
+    """The poses, without those of views whose corners fit better where the image is turned by 180 degrees.
+
+    The board looks turned as well, and a pose is found: the principal point and the lens are then those of another place.
+    """
+    spreads = [np.inf if one.fit is None else spread(one.fit.residuals, FLOOR_PX) for one in found]
+    usual = float(np.median([value for value in spreads if np.isfinite(value)] or [np.inf]))
+    k, focal, told = camera.intrinsics, focal_lengths(camera), list(found)
+    for place, (seen, one, value) in enumerate(zip(observations, found, spreads, strict=True)):
+        if one.fit is None or value < ILL_FITTING * usual:
+            continue
+        corners = seen.corners
+        rays = rays_of_pixels(np.array([k.width, k.height]) - corners.pixels, k, camera.lens)
+        turned = one.fit.T_board_cam @ pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+        if np.isfinite(rays).all():
+            better = one.fit.cost - fit_pose(turned, corners.board, rays, focal, FLOOR_PX).cost
+            if better > TURNED * corner_px**2:
+                reason = "its image is turned by 180 degrees against the others': turn rgb_ and depth_ back"
+                told[place] = MarkerPose(one.number, None, reason=reason)
+    return told
+
+
 def focal_lengths(camera: CaptureCamera) -> Array:
     """[2] float64, pixels."""
     return np.array([camera.intrinsics.fx, camera.intrinsics.fy])
@@ -339,6 +371,7 @@ class Evidence(Setup):
     def of(setup: Setup, observations: list[Observation], markers: list[MarkerPose]) -> "Evidence":
         """With the sigma of a corner measured over all views."""
         corner_px = measured_corner_px(markers, setup.spec)
+        markers = refuse_turned(observations, markers, setup.camera, corner_px)
         return Evidence(setup.camera, setup.board, setup.spec, tuple(observations), tuple(markers), corner_px)
 
 
