@@ -95,6 +95,31 @@ class MotionBlur(Frozen):
     """Speed at which the camera turns."""
 
 
+class Sharpen(Frozen):
+    """Sharpening in the camera: an unsharp mask on encoded values."""
+
+    amount: NonNegative = 1.0
+    """Share of the difference from the blurred image that is added."""
+    radius_px: Positive = 1.0
+    """Standard deviation of that blur."""
+
+
+class ToneCurve(Frozen):
+    """What the camera stores in place of sRGB."""
+
+    linear: bool = False
+    """Codes are linear light."""
+    contrast: Share = 0.3
+    """Steepening of the middle of an S-curve through black, middle grey and white."""
+
+
+class Jpeg(Frozen):
+    """Loss of a JPEG file; what it decodes to is stored."""
+
+    quality: Annotated[int, Field(ge=1, le=100)] = 85
+    """As in libjpeg."""
+
+
 class HiddenMarkers(Frozen):
     """Patches of paper that cover markers in part."""
 
@@ -136,6 +161,12 @@ class Simulate(Frozen):
     """Movement of the camera while it exposes."""
     exposure: Exposure | None = None
     """Exposure of every view."""
+    tone_curve: ToneCurve | None = None
+    """Tone curve of the camera; nothing: sRGB."""
+    sharpen: Sharpen | None = None
+    """Sharpening in the camera."""
+    jpeg: Jpeg | None = None
+    """Photographs that were JPEG files."""
     distortion: Distortion | None = None
     """Lens of the colour camera; nothing: a pinhole."""
     hidden_markers: HiddenMarkers | None = None

@@ -22,8 +22,10 @@ from tests.workers.capture.drawn import (
     make,
     median_errors,
     observe,
+    project,
     with_corner_depth,
 )
+from workers.capture.board import marker_corners
 from workers.capture.poses.estimates import (
     estimate_article,
     estimate_joint,
@@ -226,6 +228,29 @@ def test_a_view_that_does_not_fit_is_flagged_and_takes_no_part(capture):
     off = estimate_joint(changed(evidence, 5, board_patches=dataclasses.replace(patches, ray_z=patches.ray_z * 1.1)))
     assert off.views[5].status == "flagged" and "off the board, after the correction" in off.views[5].reasons[-1]
     assert errors(off.views[5].T_board_cam, truth[5])[0] < 1.0
+
+
+# ---------------------------------------------------------------------------------------------- what a camera does to edges
+
+
+def test_squares_that_all_look_larger_do_not_bring_the_cameras_nearer():
+    """Ink that spreads by 0.3 mm, by OpenCV's projection of a board of larger squares."""
+    nominal, printed = marker_corners(Board()), marker_corners(Board(marker_m=0.0603, gap_m=0.0197))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = hand_held(rng, 8)
+        seen = []
+        for number, T in enumerate(truth):
+            one = observe(T, rng, number=number, corner_px=0.05)
+            ids = one.corners.markers[::4]
+            pixels = project(printed[ids].reshape(-1, 3), T, PINHOLE) + rng.normal(0, 0.05, (4 * len(ids), 2))
+            rays, board = rays_of_pixels(pixels, KINECT, PINHOLE.lens), nominal[ids].reshape(-1, 3)
+            corners = dataclasses.replace(one.corners, board=board, pixels=pixels, rays=rays)
+            seen.append(dataclasses.replace(one, corners=corners))
+        evidence = evidence_of(seen)
+        found, alone = estimate_joint(evidence), estimate_markers(evidence)
+        assert median_errors(found, truth)[0] < 0.1 and median_errors(alone, truth)[0] > 0.2
+        assert found.camera is None
 
 
 # ---------------------------------------------------------------------------------------------- the camera

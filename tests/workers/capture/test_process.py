@@ -48,9 +48,11 @@ from workers.capture.score import (
     true_view,
 )
 from workers.capture.simulate import simulate
+from workers.capture.simulate.camera import develop
 from workers.capture.simulate.photograph import place_object
 from workers.capture.simulate.simulate import plan_path
 from workers.capture.views import CaptureViews, read_result, write_mirrors, write_synthesized
+from workers.geometry.colour import decode_codes
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import half_turn, invert, pose, rotation_about, transform, translation
 from workers.scene.chance import SceneChance
@@ -183,6 +185,39 @@ def test_a_wrong_camera_of_an_independent_capture_is_told(file, number, right, t
             1000 * np.sqrt(np.trace(view.covariance[:3, :3])),
         )
         assert mm < 1.25 * sigma_mm
+
+
+# ---------------------------------------------------------------------------------------------- what a camera does to edges
+
+EDGES = {
+    "sharpen": {"sharpen": {}},
+    "tone curve": {"tone_curve": {}},
+    "jpeg": {"jpeg": {}},
+    "linear": {"tone_curve": {"linear": True, "contrast": 0.0}},
+}
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", EDGES)
+def test_what_a_camera_does_to_edges_moves_no_pose_of_an_independent_capture(name, tmp_path, record_figure):
+    """The mug of ../shared/data/captures, its photographs developed anew; without, its poses are within 0.03 mm."""
+    path, truth = copy_of(SHARED_DATA / "captures" / "m_ref", tmp_path), np.load(SHARED_DATA / "captures/mug.truth.npy")
+    for asked, bound_mm in (({}, 0.03), (EDGES[name], 0.1)):
+        for file in path.glob("rgb_*.png"):
+            rgb = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+            cv2.imwrite(str(file), develop(decode_codes(rgb), Simulate(**asked))[..., ::-1])
+        mm, degrees = median_errors(estimate_poses(opened(path), Estimation(compare=False)).estimate, truth)
+        record_figure(f"poses of the shared mug, {name if asked else 'as it is'}", "mm", mm, bound_mm)
+        assert mm < bound_mm and degrees < 0.006
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_sharpening_moves_the_cameras_of_single_views_and_not_of_all_together(seed):
+    kept = made(seed, views=VIEWS, image_scale=0.5, depth_noise=KinectDepthNoise(), sharpen={})
+    found = estimate_poses(opened(kept.folder.path), Estimation()).by_name
+    joint, markers = (median_errors(found[name], kept.truth.T_board_cam)[0] for name in ("joint", "markers"))
+    assert joint < 0.25 * markers and found["joint"].camera is None
 
 
 # ---------------------------------------------------------------------------------------------- what depth measures

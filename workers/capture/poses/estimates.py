@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, CaptureEstimate, DepthCorrection, ViewEstimate
 from schemas.job.captures import Board, Estimation
-from workers.capture.poses.joint import CameraFit, Joint, Views, fit_camera, gather, solve_jointly
+from workers.capture.poses.joint import CameraFit, Joint, Views, fit_camera, gather, measure_corners, solve_jointly
 from workers.capture.poses.markers import (
     AMBIGUOUS,
     Evidence,
@@ -350,7 +350,7 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     if not starts:
         views = [_outside(n, evidence, Shared()) for n in range(len(evidence.observations))]
         return CaptureEstimate("joint", tuple(views), notes=("no view has markers that fit the board",))
-    problem = _problem(starts, evidence)
+    problem = measure_corners(_problem(starts, evidence), evidence.spec)
     joint = solve_jointly(problem, evidence.spec)
     groups = _groups(problem, joint, list(range(len(starts))))
     if len(groups) == 1:

@@ -18,13 +18,14 @@ from scipy.stats import f as variance_ratio
 from schemas.base import Array
 from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
-from workers.capture.poses.markers import FLOOR_PX, focal_lengths, motion_between, moved, spread
+from workers.capture.poses.markers import FLOOR_PX, corner_sigma, focal_lengths, motion_between, moved, spread
 from workers.capture.poses.observation import Observation, Patches
 from workers.capture.poses.terms import (
     CAMERA,
     GROW_M,
     GROW_PX,
     GROWTH_M,
+    GROWTH_PX,
     POSE,
     SHARED,
     BoardTerm,
@@ -261,6 +262,20 @@ class Views:
         """[V]: views by which the noise of depth is measured."""
         many = np.array([o.markers >= SURE_MARKERS for o in self.observations])
         return many if many.sum() >= 4 else np.ones(len(many), bool)
+
+
+def measure_corners(views: Views, spec: Estimation) -> Views:
+    """The views with the poses and the sigma of a corner that are left once the growth of the printed squares is estimated.
+
+    Sharpening, tone curves and spread ink move all edges of a marker alike: a view by itself takes that for a shorter distance.
+    """
+    corners, prior = views.corner_term(), np.zeros(SHARED)
+    prior[[GROWTH_M, GROWTH_PX]] = GROW_M, GROW_PX
+    found = minimise(Problem([corners], prior, views.fixed), views.poses, Shared(), spec.max_iterations)
+    residuals = views.corner_px * corners.rows(found.poses, found.shared).residual
+    corner_px = corner_sigma(residuals, len(residuals) - POSE * len(views.poses) - 2, spec)
+    covariance = views.covariance * (corner_px / views.corner_px) ** 2
+    return dataclasses.replace(views, poses=found.poses, covariance=covariance, corner_px=corner_px)
 
 
 @dataclass(frozen=True, eq=False)

@@ -257,7 +257,11 @@ def measured_corner_px(poses: list[MarkerPose], spec: Estimation) -> float:
     """
     fits = [found.fit for found in poses if found.fit is not None and len(found.fit.residuals) > 3]
     residuals = np.concatenate([fit.residuals.ravel() for fit in fits]) if fits else np.zeros(0)
-    free = len(residuals) - 6 * len(fits)
+    return corner_sigma(residuals, len(residuals) - 6 * len(fits), spec)
+
+
+def corner_sigma(residuals: Array, free: int, spec: Estimation) -> float:
+    """Standard deviation, pixels, by all residuals [N], of which `free` are left by what was fitted, and by the expected one."""
     if free <= 0:
         return spec.corner_px
     variance = (1.4826 * float(np.median(np.abs(residuals)))) ** 2 * len(residuals) / free

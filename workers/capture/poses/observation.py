@@ -13,6 +13,7 @@ from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board, Estimation
 from workers.capture.board import marker_corners
+from workers.capture.detect import unbend_corners
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import invert, transform
 from workers.geometry.lens import project_points, rays_of_pixels
@@ -94,6 +95,8 @@ class Setup:
 def corners_of(detection: Detection, board: Board, camera: CaptureCamera) -> Corners:
     """The corners of the detected markers; a marker where the lens cannot be inverted is left out. No depth yet."""
     pixels = detection.corners_px.reshape(-1, 2)
+    if camera.has_lens:
+        pixels = unbend_corners(detection.corners_px, camera).reshape(-1, 2)
     rays = rays_of_pixels(pixels, camera.intrinsics, camera.lens)
     whole = np.repeat(np.isfinite(rays).all(axis=1).reshape(-1, 4).all(axis=1), 4)
     points = marker_corners(board)[detection.ids - board.first_id].reshape(-1, 3)
