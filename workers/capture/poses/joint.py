@@ -268,12 +268,15 @@ def measure_corners(views: Views, spec: Estimation) -> Views:
     """The views with the poses and the sigma of a corner that are left once the growth of the printed squares is estimated.
 
     Sharpening, tone curves and spread ink move all edges of a marker alike: a view by itself takes that for a shorter distance.
+    The sigma is twice that of the mean of a marker's corners: the slope of a refined edge moves its two corners against one
+    another, which makes corners noisy and poses not.
     """
     corners, prior = views.corner_term(), np.zeros(SHARED)
     prior[[GROWTH_M, GROWTH_PX]] = GROW_M, GROW_PX
     found = minimise(Problem([corners], prior, views.fixed), views.poses, Shared(), spec.max_iterations)
     residuals = views.corner_px * corners.rows(found.poses, found.shared).residual
-    corner_px = corner_sigma(residuals, len(residuals) - POSE * len(views.poses) - 2, spec)
+    of_markers = 2.0 * residuals.reshape(-1, 4, 2).mean(axis=1).ravel()
+    corner_px = corner_sigma(of_markers, len(of_markers) - POSE * len(views.poses) - 2, spec)
     covariance = views.covariance * (corner_px / views.corner_px) ** 2
     return dataclasses.replace(views, poses=found.poses, covariance=covariance, corner_px=corner_px)
 

@@ -162,7 +162,7 @@ AMBIGUOUS = 9.0
 """The two poses of a planar target are told apart by at least this difference of their chi-square: three sigma."""
 SAME_RAD = 0.02
 """Two poses that differ by less than this are one."""
-PRIOR_RESIDUALS = 50
+PRIOR_RESIDUALS = 2
 """The expected sigma of a corner counts as much as so many measured residuals."""
 
 
@@ -253,7 +253,7 @@ def focal_lengths(camera: CaptureCamera) -> Array:
 def measured_corner_px(poses: list[MarkerPose], spec: Estimation) -> float:
     """Standard deviation of a detected corner in this capture, pixels, by the residuals of all views.
 
-    The expected one, `corner_px`, counts as much as 50 residuals.
+    The expected one, `corner_px`, counts as much as PRIOR_RESIDUALS.
     """
     fits = [found.fit for found in poses if found.fit is not None and len(found.fit.residuals) > 3]
     residuals = np.concatenate([fit.residuals.ravel() for fit in fits]) if fits else np.zeros(0)
