@@ -217,6 +217,8 @@ def planar_poses(corners: Corners) -> list[Pose]:
 
 TURNED = 25.0
 """A turned image is told by so much of chi-square: five sigma."""
+WELL_FITTING = 0.5
+"""And by at most this share of the misfit being left: a wrong lens fits a little better one way or the other."""
 ILL_FITTING = 2.0
 """Only views whose corners fit so many times worse than those of the median view are looked at."""
 
@@ -238,8 +240,8 @@ def refuse_turned(
         rays = rays_of_pixels(np.array([k.width, k.height]) - corners.pixels, k, camera.lens)
         turned = one.fit.T_board_cam @ pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
         if np.isfinite(rays).all():
-            better = one.fit.cost - fit_pose(turned, corners.board, rays, focal, FLOOR_PX).cost
-            if better > TURNED * corner_px**2:
+            cost = fit_pose(turned, corners.board, rays, focal, FLOOR_PX).cost
+            if one.fit.cost - cost > TURNED * corner_px**2 and cost < WELL_FITTING * one.fit.cost:
                 reason = "its image is turned by 180 degrees against the others': turn rgb_ and depth_ back"
                 told[place] = MarkerPose(one.number, None, reason=reason)
     return told
@@ -330,10 +332,12 @@ def _depth_of(seen: Observation, T: Pose) -> Array:
 
 def _affine(x: Array, y: Array) -> tuple[float, float]:
     """(offset, median of the absolute residuals) of a robust line through points (x, y), each [N]."""
-    weight, basis = np.ones(len(x)), np.column_stack([np.ones(len(x)), x])
-    residual, line = y, np.zeros(2)
+    weight: Array = np.ones(len(x))
+    basis = np.column_stack([np.ones(len(x)), x])
+    residual: Array = y
+    line: Array = np.zeros(2)
     for _ in range(10):
-        line = np.linalg.lstsq(basis * weight[:, None], y * weight, rcond=None)[0]
+        line = np.asarray(np.linalg.lstsq(basis * weight[:, None], y * weight, rcond=None)[0], np.float64)
         residual = np.abs(y - basis @ line)
         weight = 1.0 / np.sqrt(np.maximum(residual, 1e-4 + 0.1 * np.median(residual)))
     return float(line[0]), float(np.median(residual))
