@@ -367,6 +367,9 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
 
 
 def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
+    """The views among these by where the object stands; poses that were given by hand are nobody's to doubt."""
+    if problem.fixed.any():
+        return [among]
     term, sigma_m = joint.surface, 0.0
     if term is not None:
         z = term.patches.ray_z[term.pairs, 2]
@@ -377,7 +380,8 @@ def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
     own = blocks[range(len(solution.poses)), :, range(len(solution.poses))]
     lever = np.array([np.linalg.norm(T[:3, 3]) ** 2 for T in solution.poses])
     unsure_m = np.sqrt(np.trace(own[:, :3, :3], axis1=1, axis2=2) + lever * np.trace(own[:, 3:, 3:], axis1=1, axis2=2))
-    return object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
+    groups = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
+    return [[among[n] for n in group] for group in groups]
 
 
 def _problem(starts: list[Start], evidence: Evidence) -> Views:
@@ -454,7 +458,7 @@ def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidenc
         if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:
             reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
             view = dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
-        views[start.index] = view if asked is None else _less_certain(view, asked, place)
+        views[start.index] = view if asked is None or start.fixed else _less_certain(view, asked, place)
     for index in set(range(len(evidence.observations))) - set(views):
         views[index] = _outside(index, evidence, shared)
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.

@@ -273,12 +273,13 @@ def measure_corners(views: Views, spec: Estimation) -> Views:
     """
     corners, prior = views.corner_term(), np.zeros(SHARED)
     prior[[GROWTH_M, GROWTH_PX]] = GROW_M, GROW_PX
-    found = minimise(Problem([corners], prior, views.fixed), views.poses, Shared(), spec.max_iterations)
+    found = minimise(Problem([corners], prior, np.zeros_like(views.fixed)), views.poses, Shared(), spec.max_iterations)
     residuals = views.corner_px * corners.rows(found.poses, found.shared).residual
     of_markers = 2.0 * residuals.reshape(-1, 4, 2).mean(axis=1).ravel()
     corner_px = corner_sigma(of_markers, len(of_markers) - POSE * len(views.poses) - 2, spec)
     covariance = views.covariance * (corner_px / views.corner_px) ** 2
-    return dataclasses.replace(views, poses=found.poses, covariance=covariance, corner_px=corner_px)
+    poses = np.where(views.fixed[:, None, None], views.poses, found.poses)
+    return dataclasses.replace(views, poses=poses, covariance=covariance, corner_px=corner_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -433,13 +434,14 @@ def fit_camera(views: Views, found: Solution, most: int) -> CameraFit | None:
     prior[GROWTH_M:] = [GROW_M, GROW_PX, *FREE]
     pixels = np.concatenate([o.corners.pixels for o in views.observations])
     corners = dataclasses.replace(corners, seen=(pixels, views.camera))
-    free = minimise(Problem([corners], prior, views.fixed), found.poses, found.shared, most)
+    loose = np.zeros(len(views.poses), bool)  # a pose that was given by hand is no measure of the camera
+    free = minimise(Problem([corners], prior, loose), found.poses, found.shared, most)
     # A wrong camera makes corners look noisy: what is an outlier is known once it is right.
     sigma_px = spread(corners.sigma_px * corners.rows(free.poses, free.shared).residual.reshape(-1, 2), FLOOR_PX)
     corners = dataclasses.replace(corners, sigma_px=sigma_px)
-    free = minimise(Problem([corners], prior, views.fixed), free.poses, free.shared, most)
+    free = minimise(Problem([corners], prior, loose), free.poses, free.shared, most)
     without = dataclasses.replace(corners, seen=None)
-    held = minimise(Problem([without], held_prior, views.fixed), found.poses, found.shared, most)
+    held = minimise(Problem([without], held_prior, loose), found.poses, found.shared, most)
     rows, count = corners.rows(free.poses, free.shared), len(views.poses)
     degrees = len(rows.residual) - POSE * count - size - 2
     if degrees < size or count < 2:
@@ -450,6 +452,7 @@ def fit_camera(views: Views, found: Solution, most: int) -> CameraFit | None:
     ratio = (without.rows(held.poses, held.shared).cost - rows.cost) / (size * variance)
     ratio /= max(1.0, _scatter(rows, count, variance))
     motions = np.stack([motion_between(a, b) for a, b in zip(found.poses, free.poses, strict=True)])
+    motions[views.fixed] = 0.0
     by_camera = covariance[:-SHARED, -len(FREE) :].reshape(count, POSE, size)
     return CameraFit(
         corrected_camera(views.camera, numbers),
