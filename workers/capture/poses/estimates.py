@@ -352,9 +352,12 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
         return CaptureEstimate("joint", tuple(views), notes=("no view has markers that fit the board",))
     problem = measure_corners(_problem(starts, evidence), evidence.spec)
     joint = solve_jointly(problem, evidence.spec)
-    groups = _groups(problem, joint, list(range(len(starts))))
-    if len(groups) == 1:
-        return _result(starts, problem, joint, evidence)
+    fitted = fit_camera(problem, joint.solution, evidence.spec.max_iterations)
+    # Poses of another camera see the object elsewhere although it rests.
+    doubtful = fitted is not None and fitted.significant and camera_note(fitted, evidence.camera, joint.solution.poses)
+    groups = [] if doubtful else _groups(problem, joint, list(range(len(starts))))
+    if len(groups) < 2:
+        return _result(starts, problem, joint, fitted, evidence)
     elsewhere = {number for group in groups[1:] for number in group}
     still = tuple(
         dataclasses.replace(o, object_patches=no_patches()) if n in elsewhere else o
@@ -363,7 +366,8 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     problem = dataclasses.replace(problem, observations=still)
     joint = solve_jointly(problem, evidence.spec)
     numbers = [[problem.observations[n].number for n in group] for group in groups]
-    return _mark_moved(_result(starts, problem, joint, evidence), numbers, len(_groups(problem, joint, groups[0])) == 1)
+    settled = len(_groups(problem, joint, groups[0])) == 1
+    return _mark_moved(_result(starts, problem, joint, fitted, evidence), numbers, settled)
 
 
 def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
@@ -438,8 +442,10 @@ def _outside(index: int, evidence: Evidence, shared: Shared) -> ViewEstimate:
     return judge(observation, judged(found, evidence.corner_px), evidence, shared.correction(()))
 
 
-def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidence) -> CaptureEstimate:
-    solution, fitted = joint.solution, fit_camera(problem, joint.solution, evidence.spec.max_iterations)
+def _result(
+    starts: list[Start], problem: Views, joint: Joint, fitted: CameraFit | None, evidence: Evidence
+) -> CaptureEstimate:
+    solution = joint.solution
     asked = fitted if fitted is not None and (fitted.significant or evidence.spec.calibrate) else None
     misfit = fitted is not None and fitted.significant
     told = camera_note(fitted, evidence.camera, solution.poses) if fitted is not None and misfit else ""
