@@ -32,12 +32,14 @@ class CaptureCamera:
     """The colour camera of a capture: a pinhole with pixel centres at +0.5, and the lens of its stored images.
 
     `lens` holds OpenCV's rational model in OpenCV's order (k1, k2, p1, p2, k3, k4, k5, k6), [8] float64, all 0 for a
-    pinhole. Depth images have `depth_units_per_m` units a metre and are registered to this camera.
+    pinhole. Depth images have `depth_units_per_m` units a metre and are registered to this camera; `depth` is what their files
+    measure: z along the optical axis, or the length of the ray.
     """
 
     intrinsics: Intrinsics
     lens: Array
     depth_units_per_m: float = 1000.0
+    depth: Literal["z", "ray"] = "z"
 
     @property
     def has_lens(self) -> bool:
@@ -180,7 +182,8 @@ class CaptureEstimate:
     """One of the three estimates of a capture: every view in order of number, and what all views share.
 
     `print_scale`: true size of the print over the size in board.json, 1 unless estimated. `notes`: what the user must know,
-    for example that print and depth disagree about the scale. `seconds` of processor time, by stage.
+    for example that print and depth disagree about the scale. `camera`: what the markers say where camera.json does not fit
+    them. `seconds` of processor time, by stage.
     """
 
     estimate: Estimate
@@ -190,6 +193,7 @@ class CaptureEstimate:
     iterations: int = 0
     converged: bool = True
     notes: tuple[str, ...] = ()
+    camera: CaptureCamera | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property

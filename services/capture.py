@@ -208,8 +208,15 @@ def _make_empty(out: Path) -> Path:
 
 
 def process(options: argparse.Namespace) -> int:
-    """Processes options.folder; reads `estimate`, `changes` (--set) and `json`. Returns 0. Raises JobError, CaptureError."""
-    captures = capture_settings(options.changes, {"captures.estimation.estimate": options.estimate})
+    """Processes options.folder; reads `estimate`, `calibrate`, `changes` (--set) and `json`. Returns 0.
+
+    Raises JobError, CaptureError.
+    """
+    keys = {
+        "captures.estimation.estimate": options.estimate,
+        "captures.estimation.calibrate": options.calibrate or None,
+    }
+    captures = capture_settings(options.changes, keys)
     from workers.capture.process import process_folder
 
     done = process_folder(options.folder, captures)

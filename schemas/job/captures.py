@@ -180,6 +180,31 @@ class MotionBlur(Frozen):
     """Speed at which the camera turns."""
 
 
+class Sharpen(Frozen):
+    """Sharpening in the camera: an unsharp mask on encoded values."""
+
+    amount: NonNegative = 1.0
+    """Share of the difference from the blurred image that is added."""
+    radius_px: Positive = 1.0
+    """Standard deviation of that blur."""
+
+
+class ToneCurve(Frozen):
+    """What the camera stores in place of sRGB."""
+
+    linear: bool = False
+    """Codes are linear light."""
+    contrast: Share = 0.3
+    """Steepening of the middle of an S-curve through black, middle grey and white."""
+
+
+class Jpeg(Frozen):
+    """Loss of a JPEG file; what it decodes to is stored."""
+
+    quality: Annotated[int, Field(ge=1, le=100)] = 85
+    """As in libjpeg."""
+
+
 class HiddenMarkers(Frozen):
     """Patches of paper that cover markers in part."""
 
@@ -221,6 +246,12 @@ class Simulate(Frozen):
     """Movement of the camera while it exposes."""
     exposure: Exposure | None = None
     """Exposure of every view."""
+    tone_curve: ToneCurve | None = None
+    """Tone curve of the camera; nothing: sRGB."""
+    sharpen: Sharpen | None = None
+    """Sharpening in the camera."""
+    jpeg: Jpeg | None = None
+    """Photographs that were JPEG files."""
     distortion: Distortion | None = None
     """Lens of the colour camera; nothing: a pinhole."""
     hidden_markers: HiddenMarkers | None = None
@@ -248,6 +279,8 @@ class Estimation(Frozen):
     """Standard deviation of a detected corner, which weighs corners against depth."""
     depth_sigma_m: Positive = 0.003
     """Standard deviation of depth at 1 m, which grows with the square of the distance; measured anew from the capture."""
+    calibrate: bool = False
+    """Take the camera from the markers of all views where camera.json does not fit them."""
     trust: Literal["print", "depth"] = "print"
     """What is metric truth where the print and the depth disagree about the scale."""
 

@@ -76,6 +76,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             ("markers", "article", "joint"),
             "what the cloud is made with (default: captures.estimation.estimate, joint); all three are reported",
         ),
+        flag("--calibrate", "take the camera from the markers where camera.json does not fit them"),
         SET,
         handler="capture:process",
     ),

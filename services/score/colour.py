@@ -73,8 +73,7 @@ def _similarities(a: Array, b: Array, weights: Array) -> tuple[float, float]:
 def _similarity_maps(a: Array, b: Array) -> tuple[Array, Array]:
     """(luminance, contrast times structure), both [H, W, 3], of the windows about each pixel."""
     mean_a, mean_b, square_a, square_b, both = (
-        cv2.GaussianBlur(image, (2 * RADIUS_PX + 1,) * 2, SIGMA_PX)
-        for image in (a, b, a * a, b * b, a * b)
+        cv2.GaussianBlur(image, (2 * RADIUS_PX + 1,) * 2, SIGMA_PX) for image in (a, b, a * a, b * b, a * b)
     )
     variance_a, variance_b, covariance = square_a - mean_a**2, square_b - mean_b**2, both - mean_a * mean_b
     luminance = (2.0 * (mean_a * mean_b) + C1) / (mean_a**2 + mean_b**2 + C1)

@@ -90,7 +90,7 @@ def _process(context: WorkerContext, scene_id: int, scratch: Path, setting: Sett
     captures, whole = require_captures(worker.job), _simulated(context, worker, scene_id, scratch)
     folder = fewer_views(whole, captures.simulate.views)
     with watch.stage("read"):
-        given = given_files(folder)
+        given = given_files(folder, captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
     views = TimedViews(given, estimates.estimate, captures, merged.body)
     truth, surface = read_whole_truth(folder), merged.surface

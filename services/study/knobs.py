@@ -38,9 +38,11 @@ FREE: Mapping[str, str] = {
     "captures.simulate.distance_m captures.simulate.inclination_rad captures.simulate.roll_deg": "where views are",
     "captures.simulate.tier captures.simulate.depth_noise captures.simulate.rgb_noise captures.simulate.motion_blur "
     "captures.simulate.exposure captures.simulate.distortion captures.simulate.hidden_markers captures.simulate.print_scale "
-    "captures.simulate.registration_error": "the simulated camera, which a real one has anyway",
+    "captures.simulate.registration_error captures.simulate.tone_curve captures.simulate.sharpen "
+    "captures.simulate.jpeg": "the simulated camera, which a real one has anyway",
     "captures.estimation.compare captures.estimation.min_markers captures.estimation.max_reprojection_px "
-    "captures.estimation.corner_px captures.estimation.depth_sigma_m captures.estimation.trust": "no time",
+    "captures.estimation.corner_px captures.estimation.depth_sigma_m captures.estimation.trust "
+    "captures.estimation.calibrate": "no time",
     "captures.fusion.max_edge_deg captures.fusion.board_clearance_m captures.fusion.min_views "
     "captures.synthesis.fill_px": "no time",
 }

@@ -73,7 +73,7 @@ SMALLER = {
 PAGES = {
     "README.md": pytest.mark.minute,
     "docs/benchmark.md": pytest.mark.slow,
-    "docs/captures.md": pytest.mark.minute,
+    "docs/captures.md": pytest.mark.slow,
     "docs/commands.md": pytest.mark.slow,
     "docs/export.md": pytest.mark.slow,
     "docs/measured.md": pytest.mark.minute,

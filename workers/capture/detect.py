@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.capture import Detection
+from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
 from workers.capture.board import PREDEFINED, Geometry, board_geometry, id_words
 from workers.geometry.colour import SRGB_STEPS
+from workers.geometry.lens import project_points, rays_of_pixels
 
 SAMPLES = 24
 """Profiles across one edge."""
@@ -106,6 +107,28 @@ def _intersections(lines: Array) -> Array:
     det = a * e - b * d
     det = np.where(np.abs(det) < 1e-6, np.nan, det)
     return np.stack([(c * e - b * f) / det, (a * f - c * d) / det], axis=2)
+
+
+def unbend_corners(corners_px: Array, camera: CaptureCamera) -> Array:
+    """[M, 4, 2]: refined corners [M, 4, 2], centres at +0.5, without what a lens that bends their edges does to them.
+
+    Where two lines through curved edges meet is not where the edges do; the difference is that of straight edges drawn
+    through the same lens. nan where the lens has no ray.
+    """
+    rays = rays_of_pixels(corners_px.reshape(-1, 2), camera.intrinsics, camera.lens).reshape(-1, 4, 2)
+    place = np.linspace(MARGIN, 1 - MARGIN, SAMPLES)[:, None]
+    edges = rays[:, :, None] * (1 - place) + np.roll(rays, -1, axis=1)[:, :, None] * place
+    points = np.concatenate([edges, np.ones((*edges.shape[:3], 1))], axis=3).reshape(-1, 3)
+    drawn = project_points(points, camera.intrinsics, camera.lens).reshape(edges.shape)
+    middle = drawn.mean(axis=2)
+    along = drawn[:, :, -1] - drawn[:, :, 0]
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=2)
+    x, y = (((drawn - middle[:, :, None]) * axis[:, :, None]).sum(axis=3) for axis in (along, normal))
+    normal = normal - ((x * y).sum(axis=2) / (x * x).sum(axis=2))[..., None] * along
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    met = _intersections(np.concatenate([normal, (normal * middle).sum(axis=2, keepdims=True)], axis=2))
+    return np.asarray(2 * corners_px - met, np.float64)
 
 
 MIN_PERIMETER = 0.01

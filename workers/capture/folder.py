@@ -7,7 +7,8 @@
 
 Depth and masks may be missing, in some views or in all. camera.json has width, height, fx, fy, cx, cy, `pixel_centre`
 ("0" as in OpenCV and the Azure Kinect's calibration, or "0.5" from the image's edge), `distortion` (OpenCV's order, up
-to 14 numbers, or 4 with `lens_model` "fisheye"), `depth_units_per_m`, and `depth_camera` where depth is not registered.
+to 14 numbers, or 4 with `lens_model` "fisheye"), `depth_units_per_m`, `depth` ("z", or "ray" for distances
+along the ray), and `depth_camera` where depth is not registered.
 camera_00000.json has fx, fy, cx and cy of one view, where they change. board.json is the job file's branch `captures.board`.
 
 What is read has one camera: pictures of other intrinsics are resampled, lenses beyond eight numbers are taken out, and depth
@@ -33,6 +34,7 @@ from schemas.job.captures import Board, BoardFrame
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
 from workers.capture.pictures import PictureError, change_camera, decode_depth, pinhole_maps, remap
+from workers.geometry.lens import pixel_rays
 from workers.geometry.zbuffer import register_depth
 from workers.store.images import encode_mask, encode_png
 
@@ -91,6 +93,8 @@ class CameraFile(Frozen):
     distortion: Annotated[list[float], Field(max_length=14)] = Field(default_factory=list)
     lens_model: Literal["opencv", "fisheye"] = "opencv"
     depth_units_per_m: Positive = 1000.0
+    depth: Literal["z", "ray"] = "z"
+    """What a pixel of depth measures: z along the optical axis, or the distance along its ray."""
     depth_camera: DepthFile | None = None
     """The camera of depth that is not registered to colour; its principal point counts as the colour camera's."""
 
@@ -144,7 +148,7 @@ def open_folder(path: Path) -> CaptureFolder:
         if (path / CAPTURE_FILE).exists()
         else CaptureFile(name=derive_name(path.resolve().name))
     )
-    return CaptureFolder(path, about, _camera(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers), spec)
+    return CaptureFolder(path, about, camera_of(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers), spec)
 
 
 def derive_name(words: str) -> str:
@@ -217,21 +221,35 @@ def _read_depth(folder: CaptureFolder, number: int, own: Intrinsics) -> NDArray[
     if path is None:
         return None
     if path.suffix == ".png" and spec is None:
-        return _as_read(folder, _checked(folder, path, _decoded(path, cv2.IMREAD_UNCHANGED), np.uint16, 2), own, False)
+        units = _as_read(folder, _checked(folder, path, _decoded(path, cv2.IMREAD_UNCHANGED), np.uint16, 2), own, False)
+        return depth_along_axis(units, folder.camera) if folder.camera.depth == "ray" else units
     size = (folder.stored.width, folder.stored.height) if spec is None else (spec.width, spec.height)
     try:
         depth_m = decode_depth(path.read_bytes(), size, folder.stored.depth_units_per_m)
     except PictureError as error:
         raise CaptureError("unreadable", f"{path} {error}") from error
+    by_ray = folder.camera.depth == "ray"
     if spec is None:
         depth_m = _as_read(folder, depth_m, own, between=False)
+        depth_m = _over_ray_length(depth_m, folder.camera.intrinsics, folder.camera.lens) if by_ray else depth_m
     else:
         camera = DepthCamera(
             _intrinsics(folder.stored, spec), _eight(spec.distortion), frozen_array(np.array(spec.T_color_depth))
         )
+        depth_m = _over_ray_length(depth_m, camera.intrinsics, camera.lens) if by_ray else depth_m
         depth_m = register_depth(depth_m, camera, folder.camera.intrinsics, folder.camera.lens)
     units = np.rint(depth_m * folder.camera.depth_units_per_m)
     return np.where(units < 65536.0, units, 0.0).astype(np.uint16)  # depth beyond what 16 bits hold is none
+
+
+def depth_along_axis(along_ray: NDArray[np.uint16], camera: CaptureCamera) -> NDArray[np.uint16]:
+    """[H, W] z of distances along the ray [H, W], in the same units; 0 where the lens has no ray."""
+    return np.rint(_over_ray_length(along_ray, camera.intrinsics, camera.lens)).astype(np.uint16)
+
+
+def _over_ray_length(along_ray: NDArray, k: Intrinsics, lens: Array) -> Array:
+    rays = pixel_rays(k, lens)
+    return np.nan_to_num(along_ray / np.sqrt(1.0 + (rays**2).sum(axis=2)))
 
 
 def write_view(path: Path, view: CapturedView) -> None:
@@ -245,17 +263,22 @@ def write_view(path: Path, view: CapturedView) -> None:
 
 def write_description(path: Path, about: CaptureFile, camera: CaptureCamera, board: Board) -> None:
     """Writes camera.json, board.json and capture.json; the principal point with pixel centres at 0, as the Kinect has it."""
+    for name, model in ((CAMERA_FILE, describe_camera(camera)), (BOARD_FILE, board), (CAPTURE_FILE, about)):
+        (path / name).write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def describe_camera(camera: CaptureCamera) -> CameraFile:
+    """What camera.json says of a camera."""
     k = camera.intrinsics
-    spec = CameraFile(
+    return CameraFile(
         **k.model_dump(include={"width", "height", "fx", "fy"}),
         cx=k.cx_opencv,
         cy=k.cy_opencv,
         pixel_centre="0",
         distortion=[float(x) for x in camera.lens] if camera.has_lens else [],
         depth_units_per_m=camera.depth_units_per_m,
+        depth=camera.depth,
     )
-    for name, model in ((CAMERA_FILE, spec), (BOARD_FILE, board), (CAPTURE_FILE, about)):
-        (path / name).write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
 def read_pose(path: Path) -> Pose | None:
@@ -290,9 +313,10 @@ def _is_rigid(T: Pose) -> bool:
     )
 
 
-def _camera(spec: CameraFile) -> CaptureCamera:
+def camera_of(spec: CameraFile) -> CaptureCamera:
+    """The camera that camera.json describes, as its pictures are read."""
     lens = _eight([] if _is_taken_out(spec) else spec.distortion)
-    return CaptureCamera(_intrinsics(spec, spec), lens, spec.depth_units_per_m)
+    return CaptureCamera(_intrinsics(spec, spec), lens, spec.depth_units_per_m, spec.depth)
 
 
 def _is_taken_out(spec: CameraFile) -> bool:

@@ -115,7 +115,7 @@ def _asset(
 def process_capture(folder: CaptureFolder, captures: Captures, watch: Stopwatch) -> ProcessedCapture:
     """Estimate, merge, score where there is truth. Raises CaptureError where the capture cannot be used."""
     with watch.stage("read"):
-        given = given_files(folder)
+        given = given_files(folder, captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
     views = CaptureViews(given, estimates.estimate, captures, merged.body)
     with watch.stage("score"):

@@ -15,7 +15,7 @@ from schemas.dataset.codec import Row, camera_columns
 from schemas.job.captures import Captures
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.capture.folder import CaptureFolder, open_folder, pose_text
+from workers.capture.folder import CaptureFolder, describe_camera, open_folder, pose_text
 from workers.capture.reconstruct import Given, Merged, ProcessorClock, corrections_of, estimate_surface, given_files
 from workers.capture.results import CLOUD_FILE, MESH_FILE, POSES_FILE, cloud_ply, mesh_ply, write_results
 from workers.capture.surface.object_mask import silhouette
@@ -120,9 +120,9 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     the capture cannot be used; nothing is written then.
     """
     watch = ProcessorClock()
-    folder = open_folder(path)
     with watch.stage("read"):
-        given = given_files(folder)
+        folder = open_folder(path)
+        given = given_files(folder, captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
     with watch.stage("masks"):
         files = {**_pose_files(given, estimates), **_mask_files(given, estimates.estimate, merged.body)}
@@ -130,10 +130,12 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     with watch.stage("encode"):
         files[CLOUD_FILE] = cloud_ply(surface.points, surface.normals, surface.colors, surface.views)
         files[MESH_FILE] = mesh_ply(surface.vertices, surface.faces, surface.vertex_colors)
-        files[POSES_FILE] = pose_table(estimates, folder.camera)
+        files[POSES_FILE] = pose_table(estimates, given.folder.camera)
     seconds = {name: round(s, 3) for name, s in _all_seconds(estimates, watch).items()}
     masks = [f"mask_{number:05d}.png" for number in folder.numbers if given.has_mask(number)]
-    stayed = write_results(path, files, _record(captures, estimates, merged) | {"seconds": seconds})
+    stayed = write_results(
+        path, files, _record(captures, estimates, merged, given.folder.camera) | {"seconds": seconds}
+    )
     return ProcessedFolder(folder, estimates, merged, seconds, tuple(sorted([*stayed, *masks])))
 
 
@@ -165,12 +167,13 @@ def _all_seconds(estimates: Estimates, watch: ProcessorClock) -> dict[str, float
     return {**own, **rest, "total": sum(watch.seconds.values())}
 
 
-def _record(captures: Captures, estimates: Estimates, merged: Merged) -> dict[str, Any]:
+def _record(captures: Captures, estimates: Estimates, merged: Merged, camera: CaptureCamera) -> dict[str, Any]:
     """process.json without the seconds and the files."""
     chosen, region = estimates.estimate, merged.region
     depth = chosen.depth
     return {
         "settings": captures.model_dump(mode="json", include={"estimation", "fusion", "synthesis"}),
+        "camera": describe_camera(camera).model_dump(mode="json"),
         "estimate": chosen.estimate,
         "views": [
             {"number": view.number, "status": view.status, "reasons": list(view.reasons)} for view in chosen.views
@@ -187,6 +190,7 @@ def _record(captures: Captures, estimates: Estimates, merged: Merged) -> dict[st
             "spread_m": region.spread_m,
             "clearance_m": region.clearance_m,
         },
+        "hidden_by_clearance": merged.hidden_share,
         "cloud_points": len(merged.surface.points),
         "mesh_faces": len(merged.surface.faces),
         "notes": list(chosen.notes),

@@ -19,8 +19,8 @@ from schemas.scene.shape import Mesh
 from workers.capture.board import frame_in_board, open_dictionary
 from workers.capture.detect import detect_markers, other_dictionaries
 from workers.capture.folder import CaptureFolder, read_pose, read_view
-from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
-from workers.capture.poses.markers import Evidence, MarkerPose, observe_view
+from workers.capture.poses.estimates import compare_cameras, estimate_article, estimate_joint, estimate_markers
+from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, observe_view
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.results import own_files
 from workers.capture.surface.fusion import fuse_views
@@ -44,6 +44,8 @@ class Given:
 
     folder: CaptureFolder
     ours: frozenset[str]
+    notes: tuple[str, ...] = ()
+    """What was changed before anything was estimated."""
 
     def pose(self, prefix: str, number: int) -> Pose | None:
         """[4, 4] of the user's file `prefix`_00000.txt in our board frame, None where there is none or it is ours.
@@ -63,9 +65,19 @@ class Given:
         return name not in self.ours and (self.folder.path / name).exists()
 
 
-def given_files(folder: CaptureFolder) -> Given:
-    """What the user gave. Raises CaptureError where process.json cannot be read."""
-    return Given(folder, own_files(folder.path))
+def given_files(folder: CaptureFolder, spec: Estimation | None = None) -> Given:
+    """What the user gave; with `calibrate` the camera is the markers' where camera.json does not fit them.
+
+    Raises CaptureError where process.json or an image cannot be read.
+    """
+    given = Given(folder, own_files(folder.path))
+    if spec is None or not spec.calibrate:
+        return given
+    camera = estimate_joint(_observe(given, spec, ProcessorClock())[1]).camera
+    if camera is None:
+        return given
+    note = f"the camera is the markers' in place of camera.json's: {compare_cameras(camera, folder.camera)}"
+    return replace(given, folder=replace(folder, camera=camera), notes=(note,))
 
 
 def board_poses(given: Given, estimates: Estimates) -> dict[int, Pose]:
@@ -221,6 +233,7 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     given_poses = any(seen.manual_T_board_cam is not None for seen in evidence.observations)
     if not given_poses and not any(len(found.ids) for found in detections):
         raise CaptureError("markers", _no_markers(folder))
+    check_depth(evidence)
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):
         own = ProcessorClock()
@@ -296,7 +309,7 @@ def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tupl
     with watch.stage("estimate"):
         estimates = correct_manually(given, estimate_poses(given, captures.estimation))
     merged = reconstruct(given, estimates.estimate, captures.fusion, watch)
-    return with_notes(estimates, merged.notes), merged
+    return with_notes(estimates, (*given.notes, *merged.notes)), merged
 
 
 def with_notes(estimates: Estimates, notes: tuple[str, ...]) -> Estimates:

@@ -2,7 +2,7 @@
 
 import json
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from schemas.job.captures import Captures
 from schemas.job.views import Mirror
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.capture.folder import CaptureFolder, open_folder, read_pose, write_pose
+from workers.capture.folder import CameraFile, CaptureFolder, camera_of, open_folder, read_pose, write_pose
 from workers.capture.reconstruct import Given, given_files, read_posed
 from workers.capture.results import PROCESS_FILE, read_cloud, read_mesh, read_record
 from workers.capture.surface.object_mask import Ground, down_to_board, silhouette
@@ -114,6 +114,8 @@ def read_result(path: Path) -> StoredResult:
         raise CaptureError("not_processed", f"{path} was not processed: run `verso capture process {path}`")
     try:
         captures = Captures.model_validate(record["settings"])
+        if captures.estimation.calibrate:
+            folder = replace(folder, camera=camera_of(CameraFile.model_validate(record["camera"])))
         estimate = _estimate(path, record)
         ground = Ground(tuple(record["board_as_measured"]["plane"]), float(record["board_as_measured"]["clearance_m"]))
     except (KeyError, TypeError, ValueError) as error:

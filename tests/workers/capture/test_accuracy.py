@@ -12,14 +12,15 @@ import pytest
 
 from schemas.base import frozen_array
 from schemas.capture import Estimates
-from schemas.job.captures import Board, Captures, KinectDepthNoise, RegistrationError, Simulate
+from schemas.job.captures import Board, Captures, Estimation, KinectDepthNoise, RegistrationError, Simulate
 from schemas.job.views import RgbNoise
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
-from tests.workers.capture.simulated import asset_of
+from tests.workers.capture.simulated import asset_of, made
 from workers.capture.folder import open_folder, read_truth
 from workers.capture.make_capture import process_capture
-from workers.capture.reconstruct import ProcessorClock
+from workers.capture.poses.markers import motion_between
+from workers.capture.reconstruct import ProcessorClock, estimate_poses, given_files
 from workers.capture.score import compare_poses
 from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth, place_object
 from workers.capture.simulate.simulate import simulate_capture
@@ -117,6 +118,23 @@ def test_a_capture_is_as_exact_as_promised(category, number, tmp_path, record_fi
         record_figure(f"{category} {number}, {what}: article over joint", "passed", better, 3.0)
         missed += [] if better >= 3.0 else [(what, better, 3.0)]
     assert not missed, missed
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_over_two_hundred_views_poses_err_by_as_much_as_their_sigma_says(record_figure):
+    squares = []
+    for seed in range(40, 50):
+        capture = made(seed, views=20, image_scale=0.5, depth_noise=KinectDepthNoise(), rgb_noise=RgbNoise())
+        found = estimate_poses(given_files(capture.folder), Estimation(compare=False)).estimate
+        for view in found.used:
+            off = motion_between(view.T_board_cam, capture.truth.T_board_cam[view.number])
+            squares.append(off[:3] ** 2 / np.diag(view.covariance)[:3])
+    ratio = float(np.sqrt(np.mean(squares)))
+    record_figure(
+        "rms of error over sigma, camera position", "passed" if 0.8 <= ratio <= 1.25 else "missed", ratio, 1.25
+    )
+    assert 0.8 <= ratio <= 1.25 and len(squares) >= 190
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from tests.workers.capture.drawn import HALF, KINECT, errors, hand_held, photogr
 from tests.workers.capture.simulated import asset_of
 from workers.capture.board import board_geometry, frame_in_board, marker_corners, open_dictionary
 from workers.capture.board_kinds import KINDS, BoardSizes
-from workers.capture.detect import detect_markers, refine_corners
+from workers.capture.detect import detect_markers, refine_corners, unbend_corners
 from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
@@ -172,6 +172,34 @@ def test_poses_from_any_board_are_a_tenth_of_a_millimetre_off(kind, record_figur
         record_figure(f"{kind}: camera {what}, median of 6 views", unit, median[n], bounds[0])
         record_figure(f"{kind}: camera {what}, the worst of 6 views", unit, worst[n], bounds[1])
         assert median[n] <= bounds[0] and worst[n] <= bounds[1], what
+
+
+def test_corners_of_edges_that_a_lens_bends_are_where_the_lens_draws_them():
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        T = hand_held(rng, 1)[0]
+        camera = CaptureCamera(KINECT, np.array([0.33, -2.49, -1.6e-4, -1.3e-4, 1.45, 0.21, -2.3, 1.38]))
+        corners = marker_corners(BOARD)
+        true = pixels_of_points(corners.reshape(-1, 3), T, camera).reshape(-1, 4, 2)
+        lines = []
+        for quad in corners:  # straight lines by numpy through what the middle of each bent edge looks like
+            for a, b in zip(quad, np.roll(quad, -1, axis=0), strict=True):
+                x, y = pixels_of_points(a + np.linspace(0.12, 0.88, 24)[:, None] * (b - a), T, camera).T
+                steep = np.ptp(y) > np.ptp(x)
+                slope, start = np.polyfit(y, x, 1) if steep else np.polyfit(x, y, 1)
+                lines.append([1.0, -slope, start] if steep else [-slope, 1.0, start])
+        lines = np.array(lines).reshape(-1, 4, 3)
+        before = np.roll(lines, 1, axis=1)
+        met = np.linalg.solve(
+            np.stack([before[..., :2], lines[..., :2]], 2), np.stack([before[..., 2:], lines[..., 2:]], 2)
+        )
+        met, inside = (
+            met[..., 0],
+            np.isfinite(true).all(axis=(1, 2)) & (np.abs(true - [960, 540]) < [960, 540]).all(axis=(1, 2)),
+        )
+        found = unbend_corners(met[inside], camera)
+        off, left = (np.abs(place - true[inside]).max() for place in (met[inside], found))
+        assert left < 0.05 * off and off > 0.005
 
 
 # ------------------------------------------------- a real camera, a real print, an older dictionary and board

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from schemas.job.captures import Board, Estimation
 from tests.workers.capture.drawn import (
     HALF,
+    KINECT,
     LENS,
     PINHOLE,
     DepthErrors,
@@ -21,8 +22,10 @@ from tests.workers.capture.drawn import (
     make,
     median_errors,
     observe,
+    project,
     with_corner_depth,
 )
+from workers.capture.board import marker_corners
 from workers.capture.poses.estimates import (
     estimate_article,
     estimate_joint,
@@ -32,7 +35,8 @@ from workers.capture.poses.estimates import (
     right_jacobian,
 )
 from workers.capture.poses.markers import Evidence, fit_markers, moved
-from workers.capture.poses.observation import no_patches
+from workers.capture.poses.observation import Setup, no_patches
+from workers.geometry.lens import rays_of_pixels
 
 # ---------------------------------------------------------------------------------------------- markers
 
@@ -190,21 +194,26 @@ def test_a_pose_given_by_hand_is_kept_to_the_bit(capture):
     assert found.views[3].reasons[-1] == "as told" and median_errors(found, truth)[0] < 0.5
 
 
-def test_an_object_that_moved_is_noted_and_the_smaller_part_flagged(capture):
+def test_of_an_object_that_moved_the_largest_group_of_views_is_used_and_no_group_of_two(capture):
     truth, evidence = capture
     still = estimate_joint(evidence)
     assert not any("moved" in note for note in still.notes) and len(still.used) == len(truth)
-    parts = []
-    for seen, T in zip(evidence.observations, truth, strict=True):
-        patches = seen.object_patches
-        if seen.number >= 7:  # the object, not the board, 3 cm farther along x and 1 cm along y
-            ray_z = patches.ray_z + T[:3, :3].T @ np.array([0.03, 0.01, 0])
-            patches = dataclasses.replace(patches, ray_z=ray_z, ray=ray_z / ray_z[:, 2:])
-        parts.append(dataclasses.replace(seen, object_patches=patches))
-    found = estimate_joint(dataclasses.replace(evidence, observations=tuple(parts)))
-    assert "the object moved on the board after view 6" in found.notes[0]
+
+    def shifted(places_m):
+        """The object, not the board, elsewhere along x and y in each view."""
+        parts = []
+        for seen, T, place_m in zip(evidence.observations, truth, places_m, strict=True):
+            ray_z = seen.object_patches.ray_z + T[:3, :3].T @ np.array([place_m, place_m / 3, 0])
+            patches = dataclasses.replace(seen.object_patches, ray_z=ray_z, ray=ray_z / ray_z[:, 2:])
+            parts.append(dataclasses.replace(seen, object_patches=patches))
+        return estimate_joint(dataclasses.replace(evidence, observations=tuple(parts)))
+
+    found = shifted([0.0] * 7 + [0.03] * 3)
+    assert "stands still within each of: views 0, 1, 2, 3, 4, 5, 6; views 7, 8, 9. The first" in found.notes[0]
     assert [view.status for view in found.views] == ["used"] * 7 + ["flagged"] * 3
     assert median_errors(found, truth)[0] < 0.5
+    everywhere = shifted([-0.06, -0.06, -0.03, -0.03, 0.0, 0.0, 0.03, 0.03, 0.06, 0.06])
+    assert not everywhere.used and "No group is large enough to be used" in everywhere.notes[0]
 
 
 def test_a_view_that_does_not_fit_is_flagged_and_takes_no_part(capture):
@@ -219,6 +228,104 @@ def test_a_view_that_does_not_fit_is_flagged_and_takes_no_part(capture):
     off = estimate_joint(changed(evidence, 5, board_patches=dataclasses.replace(patches, ray_z=patches.ray_z * 1.1)))
     assert off.views[5].status == "flagged" and "off the board, after the correction" in off.views[5].reasons[-1]
     assert errors(off.views[5].T_board_cam, truth[5])[0] < 1.0
+
+
+# ---------------------------------------------------------------------------------------------- what a camera does to edges
+
+
+def test_squares_that_all_look_larger_do_not_bring_the_cameras_nearer():
+    """Ink that spreads by 0.3 mm, by OpenCV's projection of a board of larger squares."""
+    nominal, printed = marker_corners(Board()), marker_corners(Board(marker_m=0.0603, gap_m=0.0197))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = hand_held(rng, 8)
+        seen = []
+        for number, T in enumerate(truth):
+            one = observe(T, rng, number=number, corner_px=0.05)
+            ids = one.corners.markers[::4]
+            pixels = project(printed[ids].reshape(-1, 3), T, PINHOLE) + rng.normal(0, 0.05, (4 * len(ids), 2))
+            rays, board = rays_of_pixels(pixels, KINECT, PINHOLE.lens), nominal[ids].reshape(-1, 3)
+            corners = dataclasses.replace(one.corners, board=board, pixels=pixels, rays=rays)
+            seen.append(dataclasses.replace(one, corners=corners))
+        evidence = evidence_of(seen)
+        found, alone = estimate_joint(evidence), estimate_markers(evidence)
+        assert median_errors(found, truth)[0] < 0.1 and median_errors(alone, truth)[0] > 0.2
+        assert found.camera is None
+
+
+# ---------------------------------------------------------------------------------------------- the camera
+
+
+def seen_as(given, true, truth, rng, corner_px=0.1):
+    """Evidence of the corners that the true camera sees, read with the camera that was given."""
+    seen = []
+    for number, T in enumerate(truth):
+        one = observe(T, rng, number=number, camera=true, corner_px=corner_px)
+        rays = rays_of_pixels(one.corners.pixels, given.intrinsics, given.lens)
+        seen.append(dataclasses.replace(one, corners=dataclasses.replace(one.corners, rays=rays)))
+    setup = Setup(given, Board(), Estimation(corner_px=corner_px))
+    return Evidence.of(setup, seen, [fit_markers(o, given, setup.spec) for o in seen])
+
+
+def with_numbers(camera, **numbers):
+    return dataclasses.replace(camera, intrinsics=camera.intrinsics.model_copy(update=numbers))
+
+
+LONG = with_numbers(PINHOLE, fx=1.01 * KINECT.fx, fy=1.01 * KINECT.fy)
+WRONG = {
+    "fx": (LONG, PINHOLE, KINECT.fx, 5.0),
+    "cx": (with_numbers(PINHOLE, cx=KINECT.cx + 15), PINHOLE, KINECT.cx_opencv, 5.0),
+    "k1": (PINHOLE, dataclasses.replace(LENS, lens=LENS.lens * np.eye(8)[0]), 0.08, 0.01),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("corner_px", [0.05, 0.2])
+def test_a_camera_that_is_not_this_one_is_told_with_the_right_number_and_its_error_is_in_the_sigma(name, corner_px):
+    (given, true, right, within), off_mm, sigma_mm = WRONG[name], [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = hand_held(rng, 10)
+        found = estimate_joint(seen_as(given, true, truth, rng, corner_px))
+        assert found.notes[0].startswith("camera.json does not fit: the markers say ")
+        said = re.search(rf"{name} = ([0-9.]+) \([0-9.]+ given\)", found.notes[0])
+        assert said and abs(float(said[1]) - right) < within and len(found.used) == 10
+        for view, T in zip(found.views, truth, strict=True):
+            off_mm.append(errors(view.T_board_cam, T)[0])
+            sigma_mm.append(1000 * np.sqrt(np.trace(view.covariance[:3, :3])))
+    assert 0.75 < np.sqrt(np.mean(np.square(off_mm)) / np.mean(np.square(sigma_mm))) < 1.25
+
+
+def test_the_right_camera_is_never_blamed_nor_any_by_views_that_cannot_tell():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        views = (3, 5, 10, 20)[seed % 4]
+        found = estimate_joint(seen_as(LENS, LENS, hand_held(rng, views), rng))
+        assert found.camera is None and not any("camera.json" in note for note in found.notes)
+        alike = [moved(T0, rng.normal(0, 0.002, 6)) for T0 in hand_held(rng, 1) * 3]
+        found = estimate_joint(seen_as(LONG, PINHOLE, alike, rng, 0.2))
+        assert found.camera is None and not re.search("f[xy] = ", found.notes[0])
+
+
+def test_a_focal_length_is_told_before_the_print_is_blamed_for_it():
+    _, evidence = make(Virtual(views=10))
+    k = evidence.camera.intrinsics
+    given = with_numbers(evidence.camera, fx=1.03 * k.fx, fy=1.03 * k.fy)
+    squeezed = np.array([1 / 1.03, 1 / 1.03, 1.0])  # what pixels mean to the other camera
+
+    def read(seen):
+        patches = [
+            dataclasses.replace(p, ray_z=p.ray_z * squeezed, ray=p.ray * squeezed)
+            for p in (seen.board_patches, seen.object_patches)
+        ]
+        corners = dataclasses.replace(seen.corners, rays=seen.corners.rays / 1.03)
+        return dataclasses.replace(seen, corners=corners, board_patches=patches[0], object_patches=patches[1])
+
+    seen = [read(o) for o in evidence.observations]
+    setup = Setup(given, evidence.board, evidence.spec)
+    found = estimate_joint(Evidence.of(setup, seen, [fit_markers(o, given, setup.spec) for o in seen]))
+    assert abs(1 / found.depth.scale - 1) > 0.01 and found.notes[0].startswith("camera.json does not fit")
+    assert not any("print" in note for note in found.notes)
 
 
 def test_a_print_of_another_size_is_told_unless_scales_agree_and_the_ruler_asked_for_unless_measured():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.job.captures import Estimation
-from tests.workers.capture.drawn import BOX, HALF, KINECT, Virtual, errors, hand_held, make, observe
-from workers.capture.poses.estimates import moved_after
+from tests.workers.capture.drawn import BOX, HALF, KINECT, LENS, Virtual, errors, hand_held, make, observe
+from workers.capture.poses.estimates import object_groups
 from workers.capture.poses.joint import (
     FLOOR_M,
     INFLATION_OF_FEW,
@@ -29,12 +29,14 @@ from workers.capture.poses.terms import (
     ObjectTerm,
     Shared,
     identified,
+    outward_motion,
     prior_sigma,
 )
-from workers.geometry.frames import translation
+from workers.geometry.frames import translation, uniform_rotation
 
 RNG = np.random.default_rng(0)
-STEP = np.array([0.01, -0.02, 0.01, 0.02, -0.01, 0.03, -0.02, 0.01, 0.005])
+STEP = np.array([0.01, -0.02, 0.01, 0.02, -0.01, 0.03, -0.02, 0.01, 0.005, 2e-4, 0.1, 0.01, 0.02, -0.01, 0.01, 0.02])
+SIZE = len(STEP)
 SHARED = Shared().moved(STEP)
 POSES = np.stack(hand_held(RNG, 3))
 VIEW = RNG.integers(0, 3, 12)
@@ -42,10 +44,13 @@ RAY = np.column_stack([RNG.uniform(-0.3, 0.3, (12, 2)), np.ones(12)])
 PATCHES = Patches(RAY * RNG.uniform(0.5, 1.2, (12, 1)), RAY, -RAY, np.full(12, 9), np.full(12, 0.001))
 PAIRS = np.array([[0, 1], [2, 5], [3, 9]])
 PAIRS = PAIRS[VIEW[PAIRS[:, 0]] != VIEW[PAIRS[:, 1]]]
-FLAT = np.column_stack([RNG.uniform(-0.2, 0.2, (12, 2)), np.zeros(12)])
+SEEN = [observe(T, RNG, camera=LENS, ids=range(n, 35, 9)).corners for n, T in enumerate(POSES)]
+PIXELS, FLAT, RAYS = (np.concatenate([getattr(c, name) for c in SEEN]) for name in ("pixels", "board", "rays"))
 NORMAL = np.tile(np.array([[0.6, 0, 0.8]]), (len(PAIRS), 1))
 TERMS = {
-    "corners": CornerTerm(VIEW, FLAT, RAY[:, :2], np.array([900.0, 910]), 0.2),
+    "corners": CornerTerm(
+        np.repeat(range(3), [len(c.board) for c in SEEN]), FLAT, RAYS, np.array([912.37, 912.25]), 0.2, (PIXELS, LENS)
+    ),
     "board": BoardTerm(VIEW, PATCHES, np.full(12, 0.1), np.full(12, 2.0)),
     "object": ObjectTerm(VIEW, PATCHES, PAIRS, NORMAL, np.full(len(PAIRS), 0.1), np.ones(len(PAIRS))),
 }
@@ -59,7 +64,7 @@ def test_derivatives_of_each_term_equal_finite_differences(name):
     term = TERMS[name]
     rows = term.rows(POSES, SHARED)
     assert len(PAIRS) >= 2
-    for axis, step in enumerate(1e-6 * np.eye(9)):
+    for axis, step in enumerate(1e-6 * np.eye(SIZE)):
         change = term.rows(POSES, SHARED.moved(step)).residual - term.rows(POSES, SHARED.moved(-step)).residual
         assert rows.by_shared[:, axis] == pytest.approx(change / 2e-6, rel=1e-4, abs=1e-3)
     for number in range(3):
@@ -73,6 +78,18 @@ def test_derivatives_of_each_term_equal_finite_differences(name):
             assert own == pytest.approx(change / 2e-6, rel=1e-4, abs=2e-2)
 
 
+def test_sides_grow_in_the_plane_of_their_marker_wherever_it_stands_and_corners_of_a_chessboard_stay():
+    rng = np.random.default_rng(3)
+    flat = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    for _ in range(20):
+        R, place, side = uniform_rotation(rng), rng.normal(size=3), rng.uniform(0.01, 0.1)
+        small, large = (place + 0.5 * length * flat @ R.T for length in (side, side + 0.002))
+        corners = np.concatenate([small, rng.normal(size=(3, 3))])
+        moved = outward_motion(corners, np.arange(7) < 4)
+        np.testing.assert_allclose(corners[:4] + 0.002 * moved[:4], large, atol=1e-12)
+        assert not moved[4:].any()
+
+
 def test_a_smaller_world_does_not_fit_better():
     """Depth and poses scaled alike leave residuals over sigma as they are: noise shrinks with the world."""
     small = POSES.copy()
@@ -84,7 +101,7 @@ def test_a_smaller_world_does_not_fit_better():
 
 def test_shared_parameters_are_what_was_added_and_what_others_are_told():
     exact = SHARED.derivative(PATCHES)
-    for axis, step in enumerate(1e-6 * np.eye(9)):
+    for axis, step in enumerate(1e-6 * np.eye(SIZE)):
         change = SHARED.moved(step).corrected(PATCHES) - SHARED.moved(-step).corrected(PATCHES)
         assert exact[:, :, axis] == pytest.approx(change / 2e-6, abs=1e-7)
     depth = SHARED.correction(("offset_m",))
@@ -97,8 +114,8 @@ def test_priors_hold_what_is_believed_and_tell_what_is_identified():
     by_print, by_depth = (prior_sigma(Estimation(trust=t), True) for t in ("print", "depth"))
     assert by_print[NAMES.index("print_scale")] == 0 and by_depth[NAMES.index("print_scale")] > 0.1
     assert by_depth[NAMES.index("scale")] == 0.001  # the specification of the camera
-    assert not prior_sigma(Estimation(), False).any()
-    assert identified(np.where(np.arange(9) == 2, 0.1, 0.9) * by_print, by_print) == ("shift_x_m",)
+    assert not prior_sigma(Estimation(), False)[:9].any()
+    assert identified(np.where(np.arange(SIZE) == 2, 0.1, 0.9) * by_print, by_print) == ("shift_x_m",)
     assert identified(by_print, by_print) == ()
 
 
@@ -111,7 +128,7 @@ def corner_problem(truth, rng, corner_px=0.2, prior=None, fixed=None):
     board, rays = (np.concatenate([getattr(c, name) for c in seen]) for name in ("board", "rays"))
     term = CornerTerm(view, board, rays, np.array([KINECT.fx, KINECT.fy]), max(corner_px, 0.1))
     free = np.zeros(len(truth), bool) if fixed is None else np.array(fixed)
-    return Problem([term], np.zeros(9) if prior is None else prior, free)
+    return Problem([term], np.zeros(SIZE) if prior is None else prior, free)
 
 
 def test_without_noise_every_pose_is_the_true_one_in_few_iterations():
@@ -132,7 +149,7 @@ def test_a_fixed_pose_stays_and_a_parameter_without_data_stays_at_its_prior():
     prior = prior_sigma(Estimation(), True)
     found = minimise(corner_problem(truth, rng, 0.2, prior, [False, True, False]), start, Shared(), 50)
     assert np.abs(found.poses[1] - start[1]).max() < 1e-14
-    assert np.abs(found.shared.deviation()).max() < 1e-9
+    assert np.abs(found.shared.deviation()[:9]).max() < 1e-9  # of depth; corners tell the growth of a side
     sigma = np.sqrt(np.diag(found.covariance()))
     assert not sigma[6:12].any()
     assert sigma[18 + NAMES.index("offset_m")] == pytest.approx(prior[0], rel=1e-3)
@@ -215,13 +232,32 @@ def test_pairs_are_of_two_views_near_each_other_and_on_one_face(around):
     assert match_patches(no_patches(), np.zeros(0, np.int64), poses, Shared()).pairs.shape == (0, 2)
 
 
-def test_a_move_of_the_object_is_found_with_its_view_and_size(around):
-    truth, patches, view = around
-    for shift_m in ((0.03, 0.01, 0), (-0.02, 0.02, 0)):
-        for first in (4, 7, 10):
-            poses = np.stack([(translation(*shift_m) if n >= first else np.eye(4)) @ T for n, T in enumerate(truth)])
-            last, apart_m = moved_after(patches, view, poses, Shared())
-            assert abs(last - (first - 1)) <= 5  # views between that see other faces cannot tell on which side they are
-            assert 0.6 * np.linalg.norm(shift_m) < apart_m < 1.2 * np.linalg.norm(shift_m)
-    assert moved_after(patches, view, truth, Shared()) is None
-    assert moved_after(no_patches(), np.zeros(0, np.int64), truth, Shared()) is None
+STOOD = {
+    "still": [range(14)],
+    "once": [range(9), range(9, 14)],
+    "back and forth": [[0, 1, 2, 3, 7, 8, 9, 10, 11, 12, 13], [4, 5, 6]],
+    "twice": [range(6), range(6, 11), range(11, 14)],
+    "one view": [[0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11, 12, 13], [7]],
+}
+
+
+@pytest.mark.parametrize("how", STOOD)
+def test_views_are_grouped_by_where_the_object_stood(how):
+    for seed in range(3):
+        truth, evidence = make(Virtual(views=14, k=HALF, seed=seed))
+        shifts = [translation(0, 0, 0), translation(0.03, 0.01, 0), translation(-0.02, 0.025, 0)]
+        place = [next(n for n, group in enumerate(STOOD[how]) if number in group) for number in range(14)]
+        poses = np.stack([shifts[n] @ T for n, T in zip(place, truth, strict=True)])
+        found = object_groups(evidence.observations, poses, Shared(), 0.001, np.zeros(14))
+        assert found == [list(group) for group in STOOD[how]], seed
+
+
+def test_views_without_depth_or_too_unsure_of_their_poses_are_not_said_to_see_another_place(around):
+    truth, _, _ = around
+    seen = [observe(T, np.random.default_rng(0)) for T in truth]
+    assert object_groups(seen, truth, Shared(), 0.001, np.zeros(14)) == [list(range(14))]
+    _, evidence = make(Virtual(views=14, k=HALF))
+    poses = np.stack([translation(0.01 * (n >= 7), 0, 0) @ T for n, T in enumerate(truth)])
+    for unsure_m, groups in ((0.0, 2), (0.01, 1)):
+        unsure = np.where(np.arange(14) >= 7, unsure_m, 0.0)
+        assert len(object_groups(evidence.observations, poses, Shared(), 0.001, unsure)) == groups

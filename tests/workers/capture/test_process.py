@@ -3,6 +3,8 @@
 import dataclasses
 import io
 import json
+import re
+import shutil
 import time
 
 import cv2
@@ -15,10 +17,11 @@ from schemas.base import frozen_array
 from schemas.capture import CaptureCamera, CaptureEstimate, DepthCorrection, Estimates, ViewEstimate
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CaptureError, OutputError
-from schemas.job.captures import Board, Captures, Estimation, Fusion
+from schemas.job.captures import Board, Captures, Estimation, Fusion, KinectDepthNoise, Simulate
 from schemas.scene.shape import Mesh
-from tests.workers.capture.drawn import KINECT, errors, write_capture
-from tests.workers.capture.simulated import CAPTURES, VIEWS, box, copy_of, processed, true_estimates
+from tests.conftest import SHARED_DATA
+from tests.workers.capture.drawn import KINECT, errors, median_errors, write_capture
+from tests.workers.capture.simulated import CAPTURES, VIEWS, asset_of, box, copy_of, made, processed, true_estimates
 from workers.capture.board import frame_in_board
 from workers.capture.folder import open_folder, pose_text, read_pose, read_truth, read_view, write_pose
 from workers.capture.process import SCHEMA, pose_table, process_folder
@@ -44,9 +47,15 @@ from workers.capture.score import (
     score_surface,
     true_view,
 )
+from workers.capture.simulate import simulate
+from workers.capture.simulate.camera import develop
+from workers.capture.simulate.photograph import place_object
+from workers.capture.simulate.simulate import plan_path
 from workers.capture.views import CaptureViews, read_result, write_mirrors, write_synthesized
+from workers.geometry.colour import decode_codes
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import half_turn, invert, pose, rotation_about, transform, translation
+from workers.scene.chance import SceneChance
 
 CORRECTION = pose(rotation_about(np.array([0.0, 0, 1]), 0.02), np.array([0.01, 0.0, 0.005]))
 
@@ -118,6 +127,207 @@ def test_a_board_pose_serves_where_no_marker_is_seen_and_our_own_files_of_an_ear
     write_pose(copy / "correction_00003.txt", CORRECTION)
     with pytest.raises(CaptureError, match="corrects nothing"):
         estimate_poses(opened(copy), Estimation())
+
+
+# ---------------------------------------------------------------------------------------------- the camera
+
+
+def rewrite(path, **numbers):
+    """camera.json with other numbers."""
+    spec = json.loads((path / "camera.json").read_bytes())
+    (path / "camera.json").write_text(json.dumps(spec | {k: v(spec.get(k)) for k, v in numbers.items()}))
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_the_markers_tell_a_focal_length_that_is_wrong_and_replace_it_on_request(seed, tmp_path):
+    path = copy_of(made(seed, views=VIEWS, image_scale=0.35).folder.path, tmp_path)
+    right, truth = open_folder(path).camera, read_truth(path)
+    rewrite(path, fx=lambda fx: 1.01 * fx, fy=lambda fy: 1.01 * fy)
+
+    def off_mm(spec):
+        found = estimate_poses(given_files(open_folder(path), spec), spec).estimate
+        return found, median_errors(found, truth.T_board_cam)[0]
+
+    found, before = off_mm(Estimation(compare=False))
+    assert found.notes[0].startswith("camera.json does not fit") and before > 4
+    said = [float(number) for number in re.findall(r"f[xy] = ([0-9.]+) ", found.notes[0])]
+    assert said == pytest.approx([right.intrinsics.fx, right.intrinsics.fy], rel=0.006)
+    calibrated, after = off_mm(Estimation(compare=False, calibrate=True))
+    assert after < 0.3 * before and "camera.json does not fit" not in calibrated.notes[0]
+
+
+def test_a_folder_that_was_processed_with_the_markers_camera_is_read_back_with_it(tmp_path):
+    path = copy_of(box(), tmp_path)
+    rewrite(path, cx=lambda cx: cx + 8)
+    quick = Captures(estimation=Estimation(compare=False, calibrate=True), fusion=Fusion(voxel_m=0.004))
+    done = process_folder(path, quick)
+    assert any("the camera is the markers' in place of camera.json's: fx = " in note for note in done.notes)
+    right, read = open_folder(box()).camera.intrinsics, read_result(path).folder.camera.intrinsics
+    assert abs(read.cx - right.cx) < 0.8 and open_folder(path).camera.intrinsics.cx == pytest.approx(right.cx + 8)
+    assert done.estimates.estimate.views[0].T_board_cam == pytest.approx(read_truth(path).T_board_cam[0], abs=5e-3)
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize(
+    ("file", "number", "right"), [("fx_plus_1pc", "fx", 611.8), ("no_lens", "k1", None), ("cx_plus_15", "cx", 639.3)]
+)
+def test_a_wrong_camera_of_an_independent_capture_is_told(file, number, right, tmp_path):
+    """The mug of ../shared/data/captures, drawn by a ray caster that is not ours."""
+    path, truth = copy_of(SHARED_DATA / "captures" / "m_ref", tmp_path), np.load(SHARED_DATA / "captures/mug.truth.npy")
+    (path / "camera.json").write_bytes((SHARED_DATA / "captures" / "wrong_camera" / f"{file}.json").read_bytes())
+    found = estimate_poses(opened(path), Estimation(compare=False)).estimate
+    said = re.search(rf"{number} = ([0-9.]+) \(", found.notes[0])
+    assert found.notes[0].startswith("camera.json does not fit") and said
+    assert right is None or float(said[1]) == pytest.approx(right, abs=0.2)
+    for view in found.views:
+        mm, sigma_mm = (
+            errors(view.T_board_cam, truth[view.number])[0],
+            1000 * np.sqrt(np.trace(view.covariance[:3, :3])),
+        )
+        assert mm < 1.25 * sigma_mm
+
+
+# ---------------------------------------------------------------------------------------------- what a camera does to edges
+
+EDGES = {
+    "sharpen": {"sharpen": {}},
+    "tone curve": {"tone_curve": {}},
+    "jpeg": {"jpeg": {}},
+    "linear": {"tone_curve": {"linear": True, "contrast": 0.0}},
+}
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", EDGES)
+def test_what_a_camera_does_to_edges_moves_no_pose_of_an_independent_capture(name, tmp_path, record_figure):
+    """The mug of ../shared/data/captures, its photographs developed anew; without, its poses are within 0.03 mm."""
+    path, truth = copy_of(SHARED_DATA / "captures" / "m_ref", tmp_path), np.load(SHARED_DATA / "captures/mug.truth.npy")
+    for asked, bound_mm in (({}, 0.03), (EDGES[name], 0.1)):
+        for file in path.glob("rgb_*.png"):
+            rgb = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+            cv2.imwrite(str(file), develop(decode_codes(rgb), Simulate(**asked))[..., ::-1])
+        mm, degrees = median_errors(estimate_poses(opened(path), Estimation(compare=False)).estimate, truth)
+        record_figure(f"poses of the shared mug, {name if asked else 'as it is'}", "mm", mm, bound_mm)
+        assert mm < bound_mm and degrees < 0.006
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_sharpening_moves_the_cameras_of_single_views_and_not_of_all_together(seed):
+    kept = made(seed, views=VIEWS, image_scale=0.5, depth_noise=KinectDepthNoise(), sharpen={})
+    found = estimate_poses(opened(kept.folder.path), Estimation()).by_name
+    joint, markers = (median_errors(found[name], kept.truth.T_board_cam)[0] for name in ("joint", "markers"))
+    assert joint < 0.25 * markers and found["joint"].camera is None
+
+
+# ---------------------------------------------------------------------------------------------- what depth measures
+
+
+def remeasure(path, change):
+    """Every depth image with `change`(z, length of the pixel's ray at z = 1) in place of its z."""
+    k = open_folder(path).camera.intrinsics
+    rows, columns = np.mgrid[: k.height, : k.width] + 0.5
+    length = np.sqrt(1 + ((columns - k.cx) / k.fx) ** 2 + ((rows - k.cy) / k.fy) ** 2)
+    for file in path.glob("depth_*.png"):
+        z = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(file), np.where(z > 0, np.rint(change(z.astype(float), length)), 0).astype(np.uint16))
+
+
+DEPTH = {
+    "ray": (lambda z, length: z * length, {}, r'is the distance along the ray, and .* says z: .* write "depth": "ray"'),
+    "z said to be ray": (lambda z, length: z, {"depth": "ray"}, r'is z along the optical axis, .* write "depth": "z"'),
+    "tenths of millimetres": (
+        lambda z, length: 10 * z,
+        {},
+        r"depth_units_per_m in camera\.json is 1000, and 10000 would fit",
+    ),
+    "metres": (lambda z, length: z, {"depth_units_per_m": 1.0}, r"is 1000 times .* is 1, and 1000 would fit"),
+    "100 mm off": (lambda z, length: z + 100, {}, r"depth is off by \+(9|10)\d mm at every distance"),
+}
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_depth_that_no_sensor_measures_is_named_with_the_key_to_change(seed, tmp_path):
+    kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise()).folder.path
+    for name, (change, said, words) in DEPTH.items():
+        path = copy_of(kept, tmp_path / name)
+        remeasure(path, change)
+        rewrite(path, **{key: lambda _, value=value: value for key, value in said.items()})
+        with pytest.raises(CaptureError, match=words):
+            estimate_poses(opened(path), Estimation())
+        (path / "camera.json").write_bytes((kept / "camera.json").read_bytes())
+        if name == "ray":  # read as what it is, it is what it was
+            rewrite(path, depth=lambda _: "ray")
+            mended, before = (read_view(open_folder(p), 4).depth.astype(int) for p in (path, kept))
+            assert np.abs(mended - before).max() <= 1
+            assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
+    remeasure(
+        path := copy_of(kept, tmp_path / "usual"), lambda z, _: 1.03 * z - 15
+    )  # a print and a sensor as they may be
+    assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
+
+
+# ---------------------------------------------------------------------------------------------- an object that moved
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize(("category", "seed"), [("mug", 21), ("can", 22), ("box", 23)])
+def test_photographs_of_an_object_that_moved_are_told_from_those_of_the_largest_group(
+    category, seed, tmp_path, monkeypatch
+):
+    turned = pose(rotation_about(np.array([0.0, 0, 1]), np.pi), np.zeros(3))
+    places = {"first": np.eye(4), "shifted": translation(0.03, 0.01, 0), "turned": turned}
+    settings = Simulate(views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise())
+    paths = tmp_path / "mixed"
+    for name, moved in places.items():
+        monkeypatch.setattr(
+            simulate, "place_object", lambda asset, rng, T=moved: frozen_array(T @ place_object(asset, rng))
+        )
+        monkeypatch.setattr(simulate, "plan_path", lambda s, _, rng: plan_path(s, np.array([0, 0, 0.05]), rng))
+        simulate.simulate_capture(settings, Board(), asset_of(category, seed), SceneChance(seed, 0), tmp_path / name)
+    for name, numbers, expected in (
+        ("shifted", (3, 4, 8), [3, 4, 8]),
+        ("turned", (5,), [5] if category == "mug" else []),
+    ):
+        shutil.rmtree(paths, ignore_errors=True)
+        shutil.copytree(tmp_path / "first", paths)
+        for number in numbers:
+            for kind in ("rgb", "depth"):
+                shutil.copy(tmp_path / name / f"{kind}_{number:05d}.png", paths)
+        found = estimate_poses(opened(paths), Estimation(compare=False)).estimate
+        assert [view.number for view in found.views if view.status != "used"] == expected, found.notes[0]
+
+
+def turn(path, number):
+    """Both images of a view turned by 180 degrees, as a file manager does."""
+    for kind in ("rgb", "depth"):
+        file = str(path / f"{kind}_{number:05d}.png")
+        cv2.imwrite(file, cv2.imread(file, cv2.IMREAD_UNCHANGED)[::-1, ::-1])
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_an_image_that_is_turned_is_refused_and_spoils_nothing_else(seed, tmp_path):
+    kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise())
+    path, truth = copy_of(kept.folder.path, tmp_path), read_truth(kept.folder.path).T_board_cam
+    turn(path, 4)
+    found = estimate_poses(opened(path), Estimation()).estimate
+    assert found.views[4].status == "refused" and "turned by 180 degrees" in found.views[4].reasons[0]
+    assert len(found.used) == VIEWS - 1 and not any("camera.json" in note or "moved" in note for note in found.notes)
+    assert median_errors(found, truth)[0] < 0.3
+    turn(path, 4)
+    assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
+
+
+@pytest.mark.shared_data
+def test_views_far_apart_of_an_object_that_never_moved_are_all_used(tmp_path):
+    """The mug of ../shared/data/captures: five views, and every second photograph without depth."""
+    found = estimate_poses(opened(SHARED_DATA / "captures" / "m_five"), Estimation(compare=False)).estimate
+    assert len(found.used) == 5 and not any("moved" in note for note in found.notes)
+    path = copy_of(SHARED_DATA / "captures" / "m_ref", tmp_path)
+    for number in range(0, 20, 4):
+        (path / f"depth_{number:05d}.png").unlink()
+    found = estimate_poses(opened(path), Estimation(compare=False)).estimate
+    assert len(found.used) == 10 and not any("moved" in note for note in found.notes)
 
 
 # ---------------------------------------------------------------------------------------------- manual corrections

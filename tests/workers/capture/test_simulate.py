@@ -35,6 +35,7 @@ from workers.capture.simulate.camera import (
     add_bent_light,
     add_light,
     cover_markers,
+    develop,
     draw_motion,
     kinect_noise,
     make_samples,
@@ -49,7 +50,7 @@ from workers.capture.simulate.simulate import (
     planned_settings,
     simulate_capture,
 )
-from workers.geometry.colour import SRGB_STEPS, decode_codes, decode_srgb
+from workers.geometry.colour import SRGB_STEPS, decode_codes, decode_srgb, encode_codes, encode_srgb
 from workers.geometry.frames import angle_between, invert, pose, transform, uniform_rotation
 from workers.geometry.lens import opencv_lens, opencv_matrix
 from workers.geometry.raycast import cast_view
@@ -64,6 +65,9 @@ ON = {
     "motion_blur": ({}, {"rgb"}),
     "distortion": ({"k1": 0.5}, {"rgb", "depth", "truth/mask", "camera.json"}),
     "exposure": ({"stops": [-1.0, -1.0]}, {"rgb"}),
+    "tone_curve": ({}, {"rgb"}),
+    "sharpen": ({}, {"rgb"}),
+    "jpeg": ({}, {"rgb"}),
     "rgb_noise": ({}, {"rgb"}),
     "depth_noise": ({}, {"depth"}),
     "registration_error": ({}, {"depth"}),
@@ -92,6 +96,32 @@ def test_what_is_asked_for_runs_and_everything_else_says_why_not():
         planned = planned_settings(simulate, plan_capture(simulate).without(name))
         assert [effect for effect in CAPTURE_EFFECTS if getattr(planned, effect) is None] == [name]
     assert planned_settings(simulate, plan_capture(simulate)) == simulate
+
+
+def test_a_camera_stores_light_by_its_curve_and_sharpens_and_compresses_what_it_stores():
+    step = np.where(np.arange(64) < 29, 0.05, 0.4)
+    light = np.repeat(np.tile(step, (64, 1))[..., None], 3, axis=2)
+
+    def stored(**asked):
+        return develop(light, Simulate(**asked)).astype(int)
+
+    assert np.array_equal(stored(), encode_codes(light))
+    assert np.array_equal(stored(tone_curve={"linear": True, "contrast": 0}), np.rint(255 * light))
+    dark, grey = 255 * encode_srgb(step[[0, -1]])
+    curve = stored(tone_curve={"contrast": 1.0})
+    for code, before in ((curve[0, 0, 0], dark), (curve[0, -1, 0], grey)):
+        assert code == pytest.approx(before - 255 * np.sin(2 * np.pi * before / 255) / (2 * np.pi), abs=0.51)
+    sharp = stored(sharpen={"amount": 1.0, "radius_px": 2.0})[32, :, 1]
+    assert sharp[[5, -5]] == pytest.approx([dark, grey], abs=0.51)  # far from the edge nothing changes
+    # Half a pixel before a step, the blurred one has risen by the share of a normal law beyond a quarter of a sigma.
+    beyond = 0.5 * math.erfc(0.25 / math.sqrt(2))
+    assert sharp[28] - dark == pytest.approx(-beyond * (grey - dark), abs=2)
+    assert (
+        0
+        < np.abs(stored(jpeg={"quality": 85}) - stored()).max()
+        < 30
+        < np.abs(stored(jpeg={"quality": 1}) - stored()).max()
+    )
 
 
 # ---------------------------------------------------------------------------------------------- where the camera is

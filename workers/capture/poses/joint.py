@@ -13,18 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky
 from scipy.spatial import cKDTree
+from scipy.stats import f as variance_ratio
 
 from schemas.base import Array
+from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
-from workers.capture.poses.markers import moved
+from workers.capture.poses.markers import FLOOR_PX, corner_sigma, focal_lengths, motion_between, moved, spread
 from workers.capture.poses.observation import Observation, Patches
 from workers.capture.poses.terms import (
+    CAMERA,
+    GROW_M,
+    GROW_PX,
+    GROWTH_M,
+    GROWTH_PX,
     POSE,
     SHARED,
     BoardTerm,
     CornerTerm,
     ObjectTerm,
+    Rows,
     Shared,
+    corrected_camera,
     normal_equations,
     prior_sigma,
 )
@@ -144,7 +153,7 @@ Term = CornerTerm | BoardTerm | ObjectTerm
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The terms; prior [9] sigma of the shared parameters, 0 for those that are fixed; fixed [V] poses that do not move."""
+    """The terms; prior [S] sigma of the shared parameters, 0 for those that are fixed; fixed [V] poses that do not move."""
 
     terms: Sequence[Term]
     prior: Array
@@ -153,7 +162,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """poses [V, 4, 4], the shared parameters, and the covariance [D, D], D = 6 V + 9, zero where nothing moves."""
+    """poses [V, 4, 4], the shared parameters, and the covariance [D, D], D = 6 V + S, zero where nothing moves."""
 
     poses: Array
     shared: Shared
@@ -239,15 +248,16 @@ class Views:
     poses: Array
     covariance: Array
     fixed: NDArray[np.bool_]
-    focal: Array
+    camera: CaptureCamera
     corner_px: float
 
     def corner_term(self) -> CornerTerm:
-        """All corners."""
+        """All corners, with the camera held."""
         corners = [o.corners for o in self.observations]
         view = np.repeat(np.arange(len(corners)), [len(c.board) for c in corners])
         board, rays = np.concatenate([c.board for c in corners]), np.concatenate([c.rays for c in corners])
-        return CornerTerm(view, board, rays, self.focal, self.corner_px)
+        square = np.concatenate([c.markers for c in corners]) >= 0
+        return CornerTerm(view, board, rays, focal_lengths(self.camera), self.corner_px, square)
 
     def sure(self) -> NDArray[np.bool_]:
         """[V]: views by which the noise of depth is measured."""
@@ -255,11 +265,30 @@ class Views:
         return many if many.sum() >= 4 else np.ones(len(many), bool)
 
 
+def measure_corners(views: Views, spec: Estimation) -> Views:
+    """The views with the poses and the sigma of a corner that are left once the growth of the printed squares is estimated.
+
+    Sharpening, tone curves and spread ink move all edges of a marker alike: a view by itself takes that for a shorter distance.
+    The sigma is twice that of the mean of a marker's corners: the slope of a refined edge moves its two corners against one
+    another, which makes corners noisy and poses not.
+    """
+    corners, prior = views.corner_term(), np.zeros(SHARED)
+    prior[[GROWTH_M, GROWTH_PX]] = GROW_M, GROW_PX
+    found = minimise(Problem([corners], prior, np.zeros_like(views.fixed)), views.poses, Shared(), spec.max_iterations)
+    residuals = views.corner_px * corners.rows(found.poses, found.shared).residual.reshape(-1, 2)
+    of_markers = 2.0 * residuals[corners.square].reshape(-1, 4, 2).mean(axis=1).ravel()
+    corner_px = corner_sigma(of_markers, len(of_markers) - POSE * len(views.poses) - 2, spec)
+    covariance = views.covariance * (corner_px / views.corner_px) ** 2
+    poses = np.where(views.fixed[:, None, None], views.poses, found.poses)
+    return dataclasses.replace(views, poses=poses, covariance=covariance, corner_px=corner_px)
+
+
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """The solution, the noise of depth that it was weighed with (sigma at 1 m, metres; inflation), and the pairs."""
+    """The solution, that without the object, the noise of depth that it was weighed with (sigma at 1 m), and the pairs."""
 
     solution: Solution
+    by_board: Solution
     covariance: Array
     prior: Array
     board: BoardTerm | None
@@ -283,7 +312,7 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
         board = _measured_board(board, views, first)
     terms: list[Term] = [corners, *([board] if board else [])]
     solution = minimise(Problem(terms, prior, views.fixed), views.poses, shared, spec.max_iterations)
-    surface, iterations, alike = None, solution.iterations, 1.0
+    by_board, surface, iterations, alike = solution, None, solution.iterations, 1.0
     for _ in range(ROUNDS if len(on_object) else 0):
         if iterations >= spec.max_iterations:
             break
@@ -300,7 +329,7 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
         solution = minimise(problem, before.poses, before.shared, spec.max_iterations - iterations)
         iterations += solution.iterations
     solution = dataclasses.replace(solution, iterations=iterations)
-    return Joint(solution, solution.covariance(), prior, board, surface)
+    return Joint(solution, by_board, solution.covariance(), prior, board, surface)
 
 
 def gather(patches: list[Patches]) -> tuple[Patches, NDArray[np.int64]]:
@@ -357,3 +386,97 @@ def _measured_object(
     own = covariance[range(len(views.poses)), :, range(len(views.poses))]
     factor = inflation(np.tile(rows.residual[chosen], 2), by, both, own)
     return dataclasses.replace(term, sigma_m=sigma_m), factor
+
+
+LEVEL = 1e-3
+"""Level of the F test by which the markers ask for another camera than camera.json's: one capture in a thousand is wronged."""
+FREE = np.array([0.1, 0.1, 0.1, 0.1, 1.0])
+"""Sigma of fx, fy, cx, cy (shares of the focal length) and k1 beforehand: wide, so that only what is not seen stays put."""
+
+WEAK = 1e-3
+"""Of what one view tells of the camera, directions with less than this share of the strongest are left aside."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFit:
+    """What the markers of all views say of the camera.
+
+    numbers [5]: corrections of fx, fy, cx, cy and k1 as in `Shared`, with their sigma [5]; motion [V, 6]: by how much the
+    poses move with them; covariance [V, 6, 6]: of what they do to each pose; significant: whether the corners ask for another
+    camera than camera.json's.
+    """
+
+    camera: CaptureCamera
+    numbers: Array
+    sigma: Array
+    motion: Array
+    covariance: Array
+    significant: bool
+
+    def shift_m(self) -> Array:
+        """[V]: by how much each camera's place moves."""
+        return np.linalg.norm(self.motion[:, :3], axis=1)
+
+    def is_known(self) -> bool:
+        """Whether the poses are nearer to the truth with this camera, by its own uncertainty."""
+        unsure_m = np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
+        return self.significant and bool(np.median(self.shift_m()) > np.median(unsure_m))
+
+
+def fit_camera(views: Views, found: Solution, most: int) -> CameraFit | None:
+    """The camera by the corners of all views, begun at their poses; None where there are fewer corners than unknowns.
+
+    An F test of the robust cost with and without another camera. What corners of one view have in common (blur, a bent board)
+    looks like another camera: where the views' own gradients scatter by more than independent corners make them, that is the
+    noise, with as many degrees of freedom as views and numbers have.
+    """
+    corners, size, held_prior, prior = views.corner_term(), len(FREE), np.zeros(SHARED), np.zeros(SHARED)
+    held_prior[GROWTH_M:] = [GROW_M, GROW_PX, *np.zeros(size)]
+    prior[GROWTH_M:] = [GROW_M, GROW_PX, *FREE]
+    pixels = np.concatenate([o.corners.pixels for o in views.observations])
+    corners = dataclasses.replace(corners, seen=(pixels, views.camera))
+    loose = np.zeros(len(views.poses), bool)  # a pose that was given by hand is no measure of the camera
+    free = minimise(Problem([corners], prior, loose), found.poses, found.shared, most)
+    # A wrong camera makes corners look noisy: what is an outlier is known once it is right.
+    sigma_px = spread(corners.sigma_px * corners.rows(free.poses, free.shared).residual.reshape(-1, 2), FLOOR_PX)
+    corners = dataclasses.replace(corners, sigma_px=sigma_px)
+    free = minimise(Problem([corners], prior, loose), free.poses, free.shared, most)
+    without = dataclasses.replace(corners, seen=None)
+    held = minimise(Problem([without], held_prior, loose), found.poses, found.shared, most)
+    rows, count = corners.rows(free.poses, free.shared), len(views.poses)
+    degrees = len(rows.residual) - POSE * count - size - 2
+    if degrees < size or count < 2:
+        return None
+    variance = rows.cost / degrees
+    covariance = variance * free.covariance()
+    shared, numbers = covariance[-len(FREE) :, -len(FREE) :], np.array(free.shared.camera)
+    ratio = (without.rows(held.poses, held.shared).cost - rows.cost) / (size * variance)
+    ratio /= max(1.0, _scatter(rows, count, variance))
+    motions = np.stack([motion_between(a, b) for a, b in zip(found.poses, free.poses, strict=True)])
+    motions[views.fixed] = 0.0
+    by_camera = covariance[:-SHARED, -len(FREE) :].reshape(count, POSE, size)
+    return CameraFit(
+        corrected_camera(views.camera, numbers),
+        numbers,
+        np.sqrt(np.diag(shared)),
+        motions,
+        np.einsum("vij,jk,vlk->vil", by_camera, np.linalg.inv(shared), by_camera),
+        bool(variance_ratio.sf(ratio, size, size * (count - 1)) < LEVEL),
+    )
+
+
+def _scatter(rows: Rows, views: int, variance: float) -> float:
+    """Mean, over the views, of what their gradients by the camera come to over what independent corners make them."""
+    ratios = []
+    for number in range(views):
+        own = rows.first == number
+        J, by, weight = rows.by_first[own], rows.by_shared[own][:, CAMERA], rows.weight[own][:, None]
+        if len(J) <= POSE:
+            continue
+        # The view's own pose takes up what it can.
+        by = by - J @ np.linalg.pinv((weight * J).T @ J, hermitian=True) @ ((weight * J).T @ by)
+        strength, directions = np.linalg.eigh((weight * by).T @ by)
+        kept = strength > WEAK * strength[-1]
+        along = directions[:, kept].T @ ((weight * by).T @ rows.residual[own])
+        ratios.append(float((along**2 / strength[kept]).mean()) / variance)
+    return float(np.mean(ratios)) if ratios else 1.0

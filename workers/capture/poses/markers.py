@@ -5,6 +5,7 @@ A pose is changed from the right, in camera axes: T_board_cam <- T_board_cam exp
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, DepthCorrection, Detection, ViewEstimate, ViewStatus
+from schemas.errors import CaptureError
 from schemas.job.captures import Estimation
 from workers.capture.poses.observation import (
     Corners,
@@ -27,6 +29,7 @@ from workers.capture.poses.observation import (
     pixels_of_points,
 )
 from workers.geometry.frames import angle_between, invert, pose, rotation_about, transform
+from workers.geometry.lens import rays_of_pixels
 
 
 def exponential(rotation_vector: Array) -> Array:
@@ -56,6 +59,12 @@ def moved(T: Pose, motion: Array) -> Pose:
     R = T[:3, :3] @ exponential(motion[3:])
     U, _, V = np.linalg.svd(R)
     return pose(U @ V, T[:3, 3] + T[:3, :3] @ motion[:3])
+
+
+def motion_between(T: Pose, other: Pose) -> Array:
+    """[6]: the small motion (metres, then radians) in the axes of T that takes T to the other."""
+    step = invert(T) @ other
+    return np.concatenate([step[:3, 3], logarithm(step[:3, :3])])
 
 
 CAUCHY = 3.0
@@ -153,7 +162,7 @@ AMBIGUOUS = 9.0
 """The two poses of a planar target are told apart by at least this difference of their chi-square: three sigma."""
 SAME_RAD = 0.02
 """Two poses that differ by less than this are one."""
-PRIOR_RESIDUALS = 50
+PRIOR_RESIDUALS = 2
 """The expected sigma of a corner counts as much as so many measured residuals."""
 
 
@@ -223,6 +232,38 @@ def first_poses(corners: Corners) -> list[Pose]:
     return poses
 
 
+TURNED = 25.0
+"""A turned image is told by so much of chi-square: five sigma."""
+WELL_FITTING = 0.5
+"""And by at most this share of the misfit being left: a wrong lens fits a little better one way or the other."""
+ILL_FITTING = 2.0
+"""Only views whose corners fit so many times worse than those of the median view are looked at."""
+
+
+def refuse_turned(
+    observations: Sequence[Observation], found: Sequence[MarkerPose], camera: CaptureCamera, corner_px: float
+) -> list[MarkerPose]:
+    """The poses, without those of views whose corners fit better where the image is turned by 180 degrees.
+
+    The board looks turned as well, and a pose is found: the principal point and the lens are then those of another place.
+    """
+    spreads = [np.inf if one.fit is None else spread(one.fit.residuals, FLOOR_PX) for one in found]
+    usual = float(np.median([value for value in spreads if np.isfinite(value)] or [np.inf]))
+    k, focal, told = camera.intrinsics, focal_lengths(camera), list(found)
+    for place, (seen, one, value) in enumerate(zip(observations, found, spreads, strict=True)):
+        if one.fit is None or value < ILL_FITTING * usual:
+            continue
+        corners = seen.corners
+        rays = rays_of_pixels(np.array([k.width, k.height]) - corners.pixels, k, camera.lens)
+        turned = one.fit.T_board_cam @ pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+        if np.isfinite(rays).all():
+            cost = fit_pose(turned, corners.board, rays, focal, FLOOR_PX).cost
+            if one.fit.cost - cost > TURNED * corner_px**2 and cost < WELL_FITTING * one.fit.cost:
+                reason = "its image is turned by 180 degrees against the others': turn rgb_ and depth_ back"
+                told[place] = MarkerPose(one.number, None, reason=reason)
+    return told
+
+
 def focal_lengths(camera: CaptureCamera) -> Array:
     """[2] float64, pixels."""
     return np.array([camera.intrinsics.fx, camera.intrinsics.fy])
@@ -231,11 +272,15 @@ def focal_lengths(camera: CaptureCamera) -> Array:
 def measured_corner_px(poses: list[MarkerPose], spec: Estimation) -> float:
     """Standard deviation of a detected corner in this capture, pixels, by the residuals of all views.
 
-    The expected one, `corner_px`, counts as much as 50 residuals.
+    The expected one, `corner_px`, counts as much as PRIOR_RESIDUALS.
     """
     fits = [found.fit for found in poses if found.fit is not None and len(found.fit.residuals) > 3]
     residuals = np.concatenate([fit.residuals.ravel() for fit in fits]) if fits else np.zeros(0)
-    free = len(residuals) - 6 * len(fits)
+    return corner_sigma(residuals, len(residuals) - 6 * len(fits), spec)
+
+
+def corner_sigma(residuals: Array, free: int, spec: Estimation) -> float:
+    """Standard deviation, pixels, by all residuals [N], of which `free` are left by what was fitted, and by the expected one."""
     if free <= 0:
         return spec.corner_px
     variance = (1.4826 * float(np.median(np.abs(residuals)))) ** 2 * len(residuals) / free
@@ -248,6 +293,71 @@ def is_ambiguous(found: MarkerPose, corner_px: float) -> bool:
     if found.fit is None or found.rival is None:
         return False
     return found.rival.cost - found.fit.cost < AMBIGUOUS * corner_px**2
+
+
+MANY = 40
+"""So many corners with depth, in views with a pose from markers, tell what depth measures."""
+NO_PRINT = 1.25
+"""Depth of a scale beyond this is in other units: no print is wrong by as much."""
+NO_SENSOR_M = 0.05
+"""Nor has a sensor such an offset: specifications are near 0.01."""
+CLEARLY = 0.5
+"""Depth along the ray leaves at most this share of the spread that depth along the axis leaves."""
+UNITS = (1.0, 100.0, 256.0, 1000.0, 4000.0, 5000.0, 8000.0, 10_000.0, 65_535.0)
+"""Of depth images that are in use, a metre; one of them is named where it fits to a tenth."""
+
+
+def check_depth(evidence: "Evidence") -> None:
+    """Raises CaptureError where depth at the markers is what no sensor measures, with the key of camera.json to change.
+
+    Units, an offset, and distances along the ray in place of z: these grow with the angle to the axis as sqrt(1 + x^2 + y^2).
+    """
+    parts = [
+        _depth_of(o, f.fit.T_board_cam) for o, f in zip(evidence.observations, evidence.markers, strict=True) if f.fit
+    ]
+    z, true_z, length = np.concatenate(parts or [np.zeros((0, 3))]).T
+    if len(z) < MANY:
+        return
+    camera, scale = evidence.camera, float(np.median(z / true_z))
+    if not 1 / NO_PRINT < scale < NO_PRINT:
+        fits = camera.depth_units_per_m * scale
+        fits = next((known for known in UNITS if abs(known / fits - 1) < 0.1), float(f"{fits:.3g}"))
+        given = f"depth_units_per_m in camera.json is {camera.depth_units_per_m:g}"
+        raise CaptureError(
+            "depth", f"depth is {float(f'{scale:.3g}'):g} times what the markers say: {given}, and {fits:g} would fit"
+        )
+    # Scale and offset are left open: a print of another size and a sensor's own error are no matter of the ray.
+    by_kind = {power: _affine(true_z * length**power, z) for power in (-1, 0, 1)}
+    best = min(by_kind, key=lambda power: by_kind[power][1])
+    if best and by_kind[best][1] < CLEARLY * by_kind[0][1]:
+        seen, word = ("the distance along the ray", "ray") if best > 0 else ("z along the optical axis", "z")
+        grows = f'its error grows with the angle to the optical axis; write "depth": "{word}" into camera.json'
+        raise CaptureError("depth", f"depth is {seen}, and camera.json says {camera.depth}: {grows}")
+    offset_m = by_kind[0][0]
+    if abs(offset_m) > NO_SENSOR_M:
+        words = f"depth is off by {1000 * offset_m:+.0f} mm at every distance, which no sensor is"
+        raise CaptureError("depth", f"{words}: export it again without an offset (0 is no depth)")
+
+
+def _depth_of(seen: Observation, T: Pose) -> Array:
+    """[N, 3]: measured z of corners, that of the board's plane on the same rays, and the rays' lengths at z = 1."""
+    corners = seen.corners
+    rays = np.column_stack([corners.rays, np.ones(len(corners.rays))])
+    whole = np.column_stack([corners.depth_m, -T[2, 3] / (rays @ T[2, :3]), np.linalg.norm(rays, axis=1)])
+    return whole[(corners.depth_m > 0) & (whole[:, 1] > 0)]
+
+
+def _affine(x: Array, y: Array) -> tuple[float, float]:
+    """(offset, median of the absolute residuals) of a robust line through points (x, y), each [N]."""
+    weight: Array = np.ones(len(x))
+    basis = np.column_stack([np.ones(len(x)), x])
+    residual: Array = y
+    line: Array = np.zeros(2)
+    for _ in range(10):
+        line = np.asarray(np.linalg.lstsq(basis * weight[:, None], y * weight, rcond=None)[0], np.float64)
+        residual = np.abs(y - basis @ line)
+        weight = 1.0 / np.sqrt(np.maximum(residual, 1e-4 + 0.1 * np.median(residual)))
+    return float(line[0]), float(np.median(residual))
 
 
 def observe_view(
@@ -286,6 +396,7 @@ class Evidence(Setup):
     def of(setup: Setup, observations: list[Observation], markers: list[MarkerPose]) -> "Evidence":
         """With the sigma of a corner measured over all views."""
         corner_px = measured_corner_px(markers, setup.spec)
+        markers = refuse_turned(observations, markers, setup.camera, corner_px)
         return Evidence(setup.camera, setup.board, setup.spec, tuple(observations), tuple(markers), corner_px)
 
 

@@ -13,6 +13,7 @@ from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board, Estimation
 from workers.capture.board import TOUCHING_M, Geometry, board_geometry
+from workers.capture.detect import unbend_corners
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import invert, transform
 from workers.geometry.lens import project_points, rays_of_pixels
@@ -94,7 +95,8 @@ class Setup:
 def corners_of(detection: Detection, board: Board, camera: CaptureCamera) -> Corners:
     """The corners of the detected markers; a marker where the lens cannot be inverted is left out. No depth yet."""
     geometry = board_geometry(board)
-    pixels = np.concatenate([detection.corners_px.reshape(-1, 2), detection.chess_px])
+    quads_px = unbend_corners(detection.corners_px, camera) if camera.has_lens else detection.corners_px
+    pixels = np.concatenate([quads_px.reshape(-1, 2), detection.chess_px])
     points = np.concatenate(
         [geometry.corners[geometry.index(detection.ids)].reshape(-1, 3), geometry.chess[detection.chess]]
     )

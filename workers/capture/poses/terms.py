@@ -5,6 +5,7 @@ the shared parameters. The sigma of depth grows with its scale: otherwise a smal
 always fit better.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose, frozen_array
-from schemas.capture import DepthCorrection
+from schemas.capture import CaptureCamera, DepthCorrection
 from schemas.job.captures import Estimation
 from workers.capture.poses.markers import cross_matrix, derivative_of_projection, exponential, logarithm
 from workers.capture.poses.observation import Patches
 from workers.geometry.frames import pose
+from workers.geometry.lens import rays_of_pixels
 
 NAMES = (
     "offset_m",
@@ -29,10 +31,23 @@ NAMES = (
     "turn_y_rad",
     "turn_z_rad",
     "print_scale",
+    "growth_m",
+    "growth_px",
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "k1",
 )
-"""The shared parameters in the order in which they stand in every array of nine."""
+"""The shared parameters in the order in which they stand in every array of S = 16 numbers.
+
+A printed square may look larger than it is: by `growth_m` where ink spreads, by `growth_px` where the camera sharpens. The last
+five correct camera.json: all but k1 are shares of its fx and fy.
+"""
 DEPTH_SCALE = NAMES.index("scale")
 PRINT_SCALE = NAMES.index("print_scale")
+GROWTH_M, GROWTH_PX = NAMES.index("growth_m"), NAMES.index("growth_px")
+CAMERA = slice(NAMES.index("fx"), NAMES.index("k1") + 1)
 
 OFFSET_M = 0.011
 SCALE = 0.001
@@ -45,6 +60,10 @@ TURN_RAD = math.radians(0.5)
 """Registration: users report up to 1 to 2 cm between markers and depth."""
 PRINT = 0.5
 """Nothing is known of the print's size where depth is metric truth."""
+GROW_M = 0.0005
+"""Growth of a side: ink spreads by a few tenths of a millimetre."""
+GROW_PX = 0.3
+"""Sharpening, tone curves and noise reduction move an edge by up to a few tenths of a pixel."""
 IDENTIFIED = 0.5
 """A parameter is identified by a capture that leaves it less than this share of its prior sigma."""
 
@@ -57,6 +76,9 @@ class Shared:
     scale: float = 1.0
     T_cam_depth: Pose = field(default_factory=lambda: frozen_array(np.eye(4)))
     print_scale: float = 1.0
+    growth_m: float = 0.0
+    growth_px: float = 0.0
+    camera: tuple[float, ...] = (0.0,) * 5
 
     def corrected(self, patches: Patches) -> Array:
         """[P, 3] metres, camera axes: the middles of patches after the correction."""
@@ -64,7 +86,7 @@ class Shared:
         return raw @ self.T_cam_depth[:3, :3].T + self.T_cam_depth[:3, 3]
 
     def derivative(self, patches: Patches) -> Array:
-        """[P, 3, 9]: of `corrected` by the parameters; those of registration are a shift and a turn of what is corrected."""
+        """[P, 3, S]: of `corrected` by the parameters; those of registration are a shift and a turn of what is corrected."""
         R = self.T_cam_depth[:3, :3]
         turned = (self.scale * patches.ray_z + self.offset_m * patches.ray) @ R.T
         by = np.zeros((len(patches), 3, len(NAMES)))
@@ -75,17 +97,21 @@ class Shared:
         return by
 
     def moved(self, step: Array) -> "Shared":
-        """The parameters after a step [9]."""
+        """The parameters after a step [S]."""
         R = exponential(step[5:8]) @ self.T_cam_depth[:3, :3]
         U, _, V = np.linalg.svd(R)
         T = frozen_array(pose(U @ V, self.T_cam_depth[:3, 3] + step[2:5]))
-        return Shared(self.offset_m + float(step[0]), self.scale + float(step[1]), T, self.print_scale + float(step[8]))
+        plain = np.array([self.offset_m, self.scale, self.print_scale, self.growth_m, self.growth_px, *self.camera])
+        offset_m, scale, print_scale, growth_m, growth_px, *camera = (
+            plain + step[[0, 1, *range(8, len(step))]]
+        ).tolist()
+        return Shared(offset_m, scale, T, print_scale, growth_m, growth_px, tuple(camera))
 
     def deviation(self) -> Array:
-        """[9]: how far each parameter is from its expected value."""
+        """[S]: how far each parameter is from its expected value."""
         turn = logarithm(self.T_cam_depth[:3, :3])
         parts = [self.offset_m, self.scale - 1, *self.T_cam_depth[:3, 3], *turn, self.print_scale - 1]
-        return np.array(parts, dtype=np.float64)
+        return np.array([*parts, self.growth_m, self.growth_px, *self.camera], dtype=np.float64)
 
     def correction(self, identified: tuple[str, ...]) -> DepthCorrection:
         """What the other stages are told."""
@@ -93,12 +119,11 @@ class Shared:
 
 
 def prior_sigma(spec: Estimation, has_depth: bool) -> Array:
-    """[9]: how far each parameter may be from its expected value, one sigma; 0 for those that are not estimated."""
-    if not has_depth:
-        return np.zeros(len(NAMES))
+    """[S]: how far each parameter may be from its expected value, one sigma; 0 for those that are not estimated."""
     trusts_print = spec.trust == "print"
     scale, print_ = (SCALE_BY_PRINT, 0.0) if trusts_print else (SCALE, PRINT)
-    return np.array([OFFSET_M, scale, *[SHIFT_M] * 3, *[TURN_RAD] * 3, print_])
+    of_depth = np.array([OFFSET_M, scale, *[SHIFT_M] * 3, *[TURN_RAD] * 3, print_]) * has_depth
+    return np.concatenate([of_depth, [GROW_M, GROW_PX], np.zeros(CAMERA.stop - CAMERA.start)])
 
 
 def identified(sigma: Array, prior: Array) -> tuple[str, ...]:
@@ -114,7 +139,7 @@ SHARED = len(NAMES)
 class Rows:
     """N residuals in standard deviations, each of one view or, with `second`, of two.
 
-    first, second [N]: index of the view; by_first, by_second [N, 6] derivatives by small motions; by_shared [N, 9]; weight [N]:
+    first, second [N]: index of the view; by_first, by_second [N, 6] derivatives by small motions; by_shared [N, S]; weight [N]:
     robust weight over the inflation of the term's variance; cost: robust, of all rows.
     """
 
@@ -129,7 +154,7 @@ class Rows:
 
 
 def normal_equations(terms: Sequence[Rows], views: int) -> tuple[Array, Array]:
-    """(J^T W J [D, D], J^T W r [D]), D = 6 V + 9, the shared parameters last."""
+    """(J^T W J [D, D], J^T W r [D]), D = 6 V + S, the shared parameters last."""
     size = POSE * views + SHARED
     blocks = np.zeros((views, POSE, views, POSE))
     mixed = np.zeros((views, POSE, SHARED))
@@ -183,30 +208,88 @@ ROBUST = 3.0
 
 @dataclass(frozen=True, eq=False)
 class CornerTerm:
-    """Corners of all views: view [K] index, board [K, 3] nominal metres, rays [K, 2]; sigma in pixels."""
+    """Corners of all views, those of a marker together: view [K] index, board [K, 3] nominal metres, rays [K, 2]; sigma_px.
+
+    square [K]: which are of a marker; the others, of a chessboard, have no side that grows; None: all are. With `seen`
+    (their pixels [K, 2], centres at +0.5, and the camera of the rays) its intrinsics can be estimated as well.
+    """
 
     view: NDArray[np.int64]
     board: Array
     rays: Array
     focal: Array
     sigma_px: float
+    square: NDArray[np.bool_] | None = None
+    seen: tuple[Array, CaptureCamera] | None = None
 
     def rows(self, poses: Array, shared: Shared) -> Rows:
         """Two rows a corner."""
         R, t = poses[self.view, :3, :3], poses[self.view, :3, 3]
-        p = np.einsum("kji,kj->ki", R, shared.print_scale * self.board - t)
+        outwards = outward_motion(self.board, self.square)
+        p = np.einsum("kji,kj->ki", R, shared.print_scale * self.board + shared.growth_m * outwards - t)
         z = np.maximum(p[:, 2], 1e-3)
         x, y = p[:, 0] / z, p[:, 1] / z
-        residual = self.focal * (np.stack([x, y], axis=1) - self.rays) / self.sigma_px
-        by_point = derivative_of_projection(x, y, z, self.focal) / self.sigma_px
+        rays, by_camera = self._rays(shared)
+        grown, off = outward_motion(self.focal * self.rays, self.square), np.stack([x, y], axis=1) - rays
+        focal = self.focal * (1.0 + np.array(shared.camera[:2]))  # else a longer one would make noise smaller
+        residual = (focal * off + shared.growth_px * grown) / self.sigma_px
+        by_point = derivative_of_projection(x, y, z, focal) / self.sigma_px
         by_pose = np.concatenate([-by_point, by_point @ cross_matrix(p)], axis=2)
         by_shared = np.zeros((len(p), 2, SHARED))
         by_shared[:, :, PRINT_SCALE] = np.einsum("kij,kj->ki", by_point, np.einsum("kji,kj->ki", R, self.board))
+        by_shared[:, :, GROWTH_M] = np.einsum("kij,kj->ki", by_point, np.einsum("kji,kj->ki", R, outwards))
+        by_shared[:, :, GROWTH_PX] = grown / self.sigma_px
+        by_shared[:, :, CAMERA] = -(focal / self.sigma_px)[:, None] * by_camera
+        by_shared[:, :, CAMERA][:, [0, 1], [0, 1]] += self.focal * off / self.sigma_px
         weight, cost = robust((residual**2).sum(axis=1))
         return Rows(
             residual.ravel(), np.repeat(self.view, 2), by_pose.reshape(-1, POSE), by_shared.reshape(-1, SHARED),
             np.repeat(weight, 2), cost,
         )  # fmt: skip
+
+    def _rays(self, shared: Shared) -> tuple[Array, Array]:
+        """([K, 2] rays, [K, 2, 5] their derivatives by the numbers of the camera; 0 where those are not estimated)."""
+        if self.seen is None:
+            return self.rays, np.zeros((len(self.rays), 2, len(shared.camera)))
+        pixels, camera = self.seen
+        now = np.array(shared.camera)
+
+        def rays(numbers: Array) -> Array:
+            changed = corrected_camera(camera, numbers)
+            return rays_of_pixels(pixels, changed.intrinsics, changed.lens)
+
+        steps = DIFFERENCE * np.eye(len(now))
+        by = [(rays(now + step) - rays(now - step)) / (2 * DIFFERENCE) for step in steps]
+        return rays(now), np.stack(by, axis=2)
+
+
+DIFFERENCE = 1e-5
+"""Step of the numbers of a camera by which rays are differentiated: rays are exact to 1e-11."""
+
+
+def corrected_camera(camera: CaptureCamera, numbers: Sequence[float] | Array) -> CaptureCamera:
+    """The camera after the corrections (fx, fy, cx, cy, k1) of `Shared`."""
+    k, (fx, fy, cx, cy, k1) = camera.intrinsics, (float(number) for number in numbers)
+    update = {"fx": k.fx * (1 + fx), "fy": k.fy * (1 + fy), "cx": k.cx + k.fx * cx, "cy": k.cy + k.fy * cy}
+    lens = frozen_array(camera.lens + k1 * np.eye(8)[0])
+    return dataclasses.replace(camera, intrinsics=k.model_copy(update=update), lens=lens)
+
+
+def outward_motion(corners: Array, square: NDArray[np.bool_] | None = None) -> Array:
+    """[K, D]: how corners [K, D] of quads, of which each is in a plane, move where each side of a quad gets longer by 1.
+
+    Each edge moves outwards by a half, along its normal; a corner stays where its two edges meet. square [K]: as in CornerTerm.
+    """
+    own = np.ones(len(corners), np.bool_) if square is None else square
+    quads = corners[own].reshape(-1, 4, corners.shape[1])
+    along = np.roll(quads, -1, axis=1) - quads
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    before = np.roll(along, 1, axis=1)
+    # n1 d = n2 d = 1/2 with normals across the unit directions a and b: d = (a - b) / (2 |a x b|), outwards for either sense.
+    sine = np.sqrt(1.0 - (before * along).sum(axis=2, keepdims=True) ** 2)
+    moved = np.zeros_like(corners)
+    moved[own] = ((before - along) / (2.0 * sine)).reshape(-1, corners.shape[1])
+    return moved
 
 
 @dataclass(frozen=True, eq=False)

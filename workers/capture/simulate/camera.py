@@ -12,16 +12,18 @@ far inside those bounds; what scenes have (schemas/job/views.py) is the upper bo
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import CaptureError
-from schemas.job.captures import Board, HiddenMarkers, KinectDepthNoise, MotionBlur
+from schemas.job.captures import Board, HiddenMarkers, KinectDepthNoise, MotionBlur, Simulate
 from schemas.job.views import DepthNoise, Distortion
 from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Intrinsics
 from workers.capture.board import marker_corners
+from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import pose, rotation_about
 from workers.geometry.jit import compiled
 from workers.geometry.lens import undistort
@@ -92,6 +94,23 @@ def draw_motion(blur: MotionBlur, rng: np.random.Generator) -> Motion:
 def pose_at(T_world_cam: Pose, motion: Motion, moment: float) -> Pose:
     """[4, 4]: the camera's pose at a moment, -0.5 to 0.5, of the exposure; T_world_cam is that of its middle."""
     return T_world_cam @ pose(rotation_about(motion.axis, moment * motion.turn_rad), moment * motion.way)
+
+
+def develop(light: Array, simulate: Simulate) -> NDArray[np.uint8]:
+    """[H, W, 3] as the camera stores linear light [H, W, 3]: tone curve, then sharpening, then JPEG; sRGB without any."""
+    tone, sharpen, jpeg = simulate.tone_curve, simulate.sharpen, simulate.jpeg
+    codes = encode_codes(light)
+    if tone is not None or sharpen is not None:
+        value = np.clip(light, 0.0, 1.0) if tone is not None and tone.linear else encode_srgb(light)
+        if tone is not None:
+            value = value - tone.contrast * np.sin(2 * math.pi * value) / (2 * math.pi)
+        if sharpen is not None:
+            value = value + sharpen.amount * (value - cv2.GaussianBlur(value, (0, 0), sharpen.radius_px))
+        codes = np.rint(255 * np.clip(value, 0.0, 1.0)).astype(np.uint8)
+    if jpeg is not None:
+        _, data = cv2.imencode(".jpg", np.ascontiguousarray(codes[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, jpeg.quality])
+        codes = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
+    return codes
 
 
 AXIAL_M, AXIAL_PER_M = 0.0008, 0.0005

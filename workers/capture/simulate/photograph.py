@@ -32,13 +32,14 @@ from workers.capture.simulate.camera import (
     add_bent_light,
     add_light,
     cover_markers,
+    develop,
     draw_motion,
     kinect_noise,
     make_samples,
     pinhole_lookup,
     pose_at,
 )
-from workers.geometry.colour import SRGB_STEPS, encode_codes
+from workers.geometry.colour import SRGB_STEPS
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.lens import opencv_lens
 from workers.geometry.zbuffer import register_depth
@@ -299,7 +300,7 @@ def build_studio(simulate: Simulate, board: Board, thing: Placed, effects: Effec
 def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[CapturedView, NDArray[np.bool_]]:
     """One view as it is stored, and the object's true pixels [H, W] bool."""
     T_world_cam = studio.T_world_board @ T_board_cam
-    rgb = encode_codes(sense_light(studio, number, take_light(studio, number, T_world_cam)))
+    rgb = develop(sense_light(studio, number, take_light(studio, number, T_world_cam)), studio.simulate)
     depth_m = measure_depth(studio, number, T_world_cam)
     depth = np.rint(np.clip(depth_m * DEPTH_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
     return CapturedView(number, rgb, depth, None), mark_object(studio, T_world_cam)
