@@ -456,7 +456,7 @@ def _result(
         block = slice(POSE * place, POSE * (place + 1))
         pose = Judged(
             solution.poses[place],
-            joint.covariance[block, block],
+            joint.covariance[block, block] * problem.widening(place, max(evidence.corner_px, evidence.spec.corner_px)),
             ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
             (evidence.observations[start.index].given_by,) if start.fixed else (),
         )

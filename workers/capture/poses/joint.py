@@ -259,6 +259,11 @@ class Views:
         square = np.concatenate([c.markers for c in corners]) >= 0
         return CornerTerm(view, board, rays, focal_lengths(self.camera), self.corner_px, square)
 
+    def widening(self, place: int, single_px: float) -> float:
+        """Factor of a view's covariance: whole markers are less noisy than corners (single_px); one marker has but its four."""
+        single = (single_px / self.corner_px) ** 2
+        return 1.0 + max(0.0, single - 1.0) / max(1, self.observations[place].markers) ** 2
+
     def sure(self) -> NDArray[np.bool_]:
         """[V]: views by which the noise of depth is measured."""
         many = np.array([o.markers >= SURE_MARKERS for o in self.observations])

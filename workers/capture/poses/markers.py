@@ -313,7 +313,10 @@ def check_depth(evidence: "Evidence") -> None:
     Units, an offset, and distances along the ray in place of z: these grow with the angle to the axis as sqrt(1 + x^2 + y^2).
     """
     parts = [
-        _depth_of(o, f.fit.T_board_cam) for o, f in zip(evidence.observations, evidence.markers, strict=True) if f.fit
+        _depth_of(o, f.fit.T_board_cam)
+        for o, f in zip(evidence.observations, evidence.markers, strict=True)
+        if f.fit
+        and _fits(o, f.fit.T_board_cam, evidence)  # else the markers tell no distance, as those of another board
     ]
     z, true_z, length = np.concatenate(parts or [np.zeros((0, 3))]).T
     if len(z) < MANY:
@@ -337,6 +340,11 @@ def check_depth(evidence: "Evidence") -> None:
     if abs(offset_m) > NO_SENSOR_M:
         words = f"depth is off by {1000 * offset_m:+.0f} mm at every distance, which no sensor is"
         raise CaptureError("depth", f"{words}: export it again without an offset (0 is no depth)")
+
+
+def _fits(seen: Observation, T: Pose, evidence: "Evidence") -> bool:
+    off_px = median_reprojection(seen, T, evidence.camera, 1.0)
+    return off_px is not None and off_px <= evidence.spec.max_reprojection_px
 
 
 def _depth_of(seen: Observation, T: Pose) -> Array:
