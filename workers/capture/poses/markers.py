@@ -348,10 +348,10 @@ def _fits(seen: Observation, T: Pose, evidence: "Evidence") -> bool:
 
 
 def _depth_of(seen: Observation, T: Pose) -> Array:
-    """[N, 3]: measured z of corners, that of the board's plane on the same rays, and the rays' lengths at z = 1."""
+    """[N, 3]: measured z of corners, z of their places on the board, and the lengths at z = 1 of their rays."""
     corners = seen.corners
-    rays = np.column_stack([corners.rays, np.ones(len(corners.rays))])
-    whole = np.column_stack([corners.depth_m, -T[2, 3] / (rays @ T[2, :3]), np.linalg.norm(rays, axis=1)])
+    true_z, length = transform(invert(T), corners.board)[:, 2], np.sqrt(1.0 + (corners.rays**2).sum(axis=1))
+    whole = np.column_stack([corners.depth_m, true_z, length])
     return whole[(corners.depth_m > 0) & (whole[:, 1] > 0)]
 
 
