@@ -49,7 +49,12 @@ PIXELS, FLAT, RAYS = (np.concatenate([getattr(c, name) for c in SEEN]) for name 
 NORMAL = np.tile(np.array([[0.6, 0, 0.8]]), (len(PAIRS), 1))
 TERMS = {
     "corners": CornerTerm(
-        np.repeat(range(3), [len(c.board) for c in SEEN]), FLAT, RAYS, np.array([912.37, 912.25]), 0.2, seen=(PIXELS, LENS)
+        np.repeat(range(3), [len(c.board) for c in SEEN]),
+        FLAT,
+        RAYS,
+        np.array([912.37, 912.25]),
+        0.2,
+        seen=(PIXELS, LENS),
     ),
     "board": BoardTerm(VIEW, PATCHES, np.full(12, 0.1), np.full(12, 2.0)),
     "object": ObjectTerm(VIEW, PATCHES, PAIRS, NORMAL, np.full(len(PAIRS), 0.1), np.ones(len(PAIRS))),

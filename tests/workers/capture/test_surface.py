@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from schemas.base import frozen_array
 from schemas.capture import Reconstruction
 from schemas.errors import CaptureError
-from schemas.job.captures import Estimation, Fusion
+from schemas.job.captures import Board, Estimation, Fusion
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera, Intrinsics
 from tests.conftest import SHARED_DATA
@@ -462,3 +462,17 @@ def test_the_mug_of_an_independent_caster_is_whole_and_its_rim_is_not_frayed(nam
     record_figure(f"{name}: completeness", "share", errors.completeness)
     record_figure(f"{name}: white of the board", "share of the lowest 6 mm", white, 0.01)
     assert rim_mm < 1.0 and white < 0.01 and errors.completeness > complete and errors.cloud_p95_mm < 1.2
+
+
+def test_what_carries_markers_out_of_the_plane_is_not_taken_for_the_object():
+    """A cube of 12 cm with a marker on its top and one side, beside an object a tenth as large."""
+    low, high = np.array([0.06, -0.06, 0.0]), np.array([0.18, 0.06, 0.12])
+    small = (np.array([-0.12, -0.03, 0.0]), np.array([-0.06, 0.03, 0.04]))
+    views = capture(Thing(sphere=None, boxes=[small, (low, high)]), count=12, sigma_m=0.001, seed=5)
+    top = [[0.07, 0.05, 0.12], [0.17, 0.05, 0.12], [0.17, -0.05, 0.12], [0.07, -0.05, 0.12]]
+    side = [[0.07, -0.06, 0.11], [0.17, -0.06, 0.11], [0.17, -0.06, 0.01], [0.07, -0.06, 0.01]]
+    board = Board.model_validate({"markers": [{"id": 0, "corners": top}, {"id": 1, "corners": side}]})
+    middles = np.array([[-0.09, 0.0, 0.02], [0.12, 0.0, 0.06]])
+    assert find_object(views, BOARD, Fusion()).holds(middles).tolist() == [False, True]
+    region = find_object(views, board, Fusion())
+    assert region.holds(middles).tolist() == [True, False] and "out of the board's plane" in " ".join(region.notes)

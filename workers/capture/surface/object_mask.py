@@ -18,6 +18,7 @@ from schemas.errors import CaptureError
 from schemas.job.captures import Board, Fusion
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
+from workers.capture.board import TOUCHING_M, board_geometry
 from workers.capture.surface.posed_view import PosedView
 from workers.geometry.jit import compiled
 from workers.geometry.zbuffer import draw_depth
@@ -50,6 +51,9 @@ LIFTED = 2.0
 
 LEAST_CELLS = 6
 """A smaller thing, 1 cm^2, is noise."""
+
+STAND_M = 0.03
+"""What carries markers out of the board's plane, such as a cube of tags, reaches beyond them by less."""
 
 BRIDGE_CELLS = 2
 """Parts of one object are as near to one another as this."""
@@ -192,7 +196,8 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
     plane, spread = _board_plane(grid[known], height[known])
     above = height - (grid @ np.array(plane[:2]) + plane[2])
     clearance = max(spec.board_clearance_m, 4.0 * spread)
-    found = known & (above > clearance)
+    stands = _stands(board, -half, (int(cells[0]), int(cells[1])))
+    found = known & (above > clearance) & ~stands
     footprint, others = _largest(found, np.where(found, above, 0.0))
     if footprint is None:
         highest = float(above[known].max())
@@ -206,10 +211,25 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
         notes.append(
             f"the board's surface is uneven by {spread * 1e3:.2f} mm, so the clearance is {clearance * 1e3:.1f} mm"
         )
+    if stands.any():
+        notes.append(
+            f"what stands within {STAND_M * 1e3:g} mm of markers out of the board's plane is no part of the object"
+        )
     floor_m = min(max(FLOOR_M, 4.0 * spread), clearance)
-    floor = _floor(footprint, known & (above > floor_m), known & (above <= floor_m))
+    floor = _floor(footprint, known & (above > floor_m) & ~stands, known & (above <= floor_m))
     ground = (plane, spread, clearance, floor_m)
     return _region(footprint, floor, tall_bins, -half, ground, tuple(notes))
+
+
+def _stands(board: Board, corner: Array, cells: tuple[int, int]) -> NDArray[np.bool_]:
+    """[cells in x, cells in y]: those within `STAND_M` of the ground below markers that are out of the board's plane."""
+    found = np.zeros(cells, np.uint8)
+    places = board_geometry(board).corners
+    for quad in places[np.abs(places[:, :, 2]).max(axis=1) > TOUCHING_M]:
+        hull = cv2.convexHull(np.floor((quad[:, :2] - corner) / CELL_M).astype(np.int32))
+        cv2.fillConvexPoly(found, np.ascontiguousarray(hull[:, :, ::-1]), 1)  # OpenCV's x is the second axis
+    size = 2 * round(STAND_M / CELL_M) + 1
+    return np.asarray(cv2.dilate(found, np.ones((size, size), np.uint8)) > 0)
 
 
 @compiled
