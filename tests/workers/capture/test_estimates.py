@@ -296,6 +296,7 @@ def test_a_camera_that_is_not_this_one_is_told_with_the_right_number_and_its_err
     assert 0.75 < np.sqrt(np.mean(np.square(off_mm)) / np.mean(np.square(sigma_mm))) < 1.25
 
 
+@pytest.mark.minute
 def test_the_right_camera_is_never_blamed_nor_any_by_views_that_cannot_tell():
     for seed in range(20):
         rng = np.random.default_rng(seed)
