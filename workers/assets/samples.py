@@ -4,6 +4,7 @@ They are drawn from the digest of the asset's source, so that every scene and ev
 """
 
 import io
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -71,9 +72,16 @@ UNITED = "samples: too many bodies to unite; where they overlap, walls inside co
 
 
 def encode_samples(arrays: Mapping[str, NDArray]) -> bytes:
-    """What numpy.load reads: uncompressed, with a fixed date, so that the bytes are those of the arrays."""
+    """What numpy.load reads: uncompressed, with a fixed date, so that the bytes are those of the arrays.
+
+    Not by numpy.savez: how it marks members as large depends on the patch version of Python.
+    """
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **arrays)
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue())
     return stream.getvalue()
 
 
