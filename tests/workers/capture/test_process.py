@@ -59,6 +59,8 @@ from workers.scene.chance import SceneChance
 
 CORRECTION = pose(rotation_about(np.array([0.0, 0, 1]), 0.02), np.array([0.01, 0.0, 0.005]))
 
+SEEDS = [11, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (12, 13))]
+
 
 def opened(path):
     return given_files(open_folder(path))
@@ -138,7 +140,7 @@ def rewrite(path, **numbers):
     (path / "camera.json").write_text(json.dumps(spec | {k: v(spec.get(k)) for k, v in numbers.items()}))
 
 
-@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_the_markers_tell_a_focal_length_that_is_wrong_and_replace_it_on_request(seed, tmp_path):
     path = copy_of(made(seed, views=VIEWS, image_scale=0.35).folder.path, tmp_path)
     right, truth = open_folder(path).camera, read_truth(path)
@@ -198,7 +200,7 @@ EDGES = {
 
 
 @pytest.mark.shared_data
-@pytest.mark.parametrize("name", EDGES)
+@pytest.mark.parametrize("name", ["sharpen", *(pytest.param(n, marks=pytest.mark.slow) for n in [*EDGES][1:])])
 def test_what_a_camera_does_to_edges_moves_no_pose_of_an_independent_capture(name, tmp_path, record_figure):
     """The mug of ../shared/data/captures, its photographs developed anew; without, its poses are within 0.03 mm."""
     path, truth = copy_of(SHARED_DATA / "captures" / "m_ref", tmp_path), np.load(SHARED_DATA / "captures/mug.truth.npy")
@@ -212,7 +214,7 @@ def test_what_a_camera_does_to_edges_moves_no_pose_of_an_independent_capture(nam
 
 
 @pytest.mark.minute
-@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_sharpening_moves_the_cameras_of_single_views_and_not_of_all_together(seed):
     kept = made(seed, views=VIEWS, image_scale=0.5, depth_noise=KinectDepthNoise(), sharpen={})
     found = estimate_poses(opened(kept.folder.path), Estimation()).by_name
@@ -246,7 +248,7 @@ DEPTH = {
 }
 
 
-@pytest.mark.parametrize("seed", [11, *(pytest.param(seed, marks=pytest.mark.minute) for seed in (12, 13))])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_depth_that_no_sensor_measures_is_named_with_the_key_to_change(seed, tmp_path):
     kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise()).folder.path
     for name, (change, said, words) in DEPTH.items():
@@ -271,7 +273,10 @@ def test_depth_that_no_sensor_measures_is_named_with_the_key_to_change(seed, tmp
 
 
 @pytest.mark.minute
-@pytest.mark.parametrize(("category", "seed"), [("mug", 21), ("can", 22), ("box", 23)])
+@pytest.mark.parametrize(
+    ("category", "seed"),
+    [("mug", 21), *(pytest.param(*one, marks=pytest.mark.slow) for one in (("can", 22), ("box", 23)))],
+)
 def test_photographs_of_an_object_that_moved_are_told_from_those_of_the_largest_group(
     category, seed, tmp_path, monkeypatch
 ):
@@ -305,7 +310,7 @@ def turn(path, number):
         cv2.imwrite(file, cv2.imread(file, cv2.IMREAD_UNCHANGED)[::-1, ::-1])
 
 
-@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_an_image_that_is_turned_is_refused_and_spoils_nothing_else(seed, tmp_path):
     kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise())
     path, truth = copy_of(kept.folder.path, tmp_path), read_truth(kept.folder.path).T_board_cam
