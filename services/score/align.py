@@ -13,9 +13,9 @@ from trimesh.registration import procrustes
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import Mesh
+from services.score.shape import draw_points, with_area
 from workers.geometry.distance import distance_to_mesh
-from workers.geometry.frames import invert, transform
-from workers.geometry.mesh import face_areas
+from workers.geometry.frames import transform
 
 Alignment = Literal["none", "scale", "similarity"]
 ALIGNMENTS: Final[tuple[Alignment, ...]] = get_args(Alignment)
@@ -62,7 +62,7 @@ def align_shape(predicted: Mesh | Array, true: Mesh, how: Alignment, seed: int =
     if how == "similarity":
         T[:3, 3] = true_centre - T[:3, :3] @ centre
     for _ in range(ROUNDS):
-        back = _nearest(transform(invert_similarity(T), there), predicted)
+        back = _nearest(transform(np.linalg.inv(T), there), predicted)
         here, target = np.concatenate([drawn, back]), np.concatenate([_nearest(transform(T, drawn), true), there])
         step = _fit(here, target, how)
         moved = np.abs(transform(step, drawn) - transform(T, drawn)).max()
@@ -71,14 +71,6 @@ def align_shape(predicted: Mesh | Array, true: Mesh, how: Alignment, seed: int =
             break
     placed = transform(T, points)
     return (Mesh(placed, predicted.faces) if isinstance(predicted, Mesh) else placed), T
-
-
-def invert_similarity(T: Pose) -> Pose:
-    """The inverse of a rotation, factor and translation [4, 4]."""
-    factor = np.cbrt(np.linalg.det(T[:3, :3]))
-    back = invert(np.block([[T[:3, :3] / factor, T[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]]))
-    back[:3] /= factor
-    return back
 
 
 def _fit(here: Array, target: Array, how: Alignment) -> Pose:
@@ -92,17 +84,16 @@ def _draw(shape: Mesh | Array, rng: np.random.Generator) -> Array:
     if not isinstance(shape, Mesh):
         points = np.asarray(shape, np.float64)
         return points[rng.choice(len(points), min(POINTS, len(points)), replace=False)]
-    mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
-    return np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[0])
+    return draw_points(shape, rng, POINTS)[0]
 
 
 def _nearest(points: Array, shape: Mesh | Array) -> Array:
     """[N, 3]: the nearest point of a surface, or of a cloud, to each of points [N, 3]."""
     if not isinstance(shape, Mesh):
         return np.asarray(shape, np.float64)[cKDTree(shape).query(points)[1]]
-    faces = shape.faces[face_areas(shape.vertices, shape.faces) > 0.0]
-    face = distance_to_mesh(points, Mesh(shape.vertices, faces))[1]
-    return np.asarray(trimesh.triangles.closest_point(np.asarray(shape.vertices)[faces[face]], points))
+    solid = with_area(shape)
+    corners = np.asarray(solid.vertices)[solid.faces[distance_to_mesh(points, solid)[1]]]
+    return np.asarray(trimesh.triangles.closest_point(corners, points))
 
 
 def box_of(points: Array) -> tuple[Array, float]:

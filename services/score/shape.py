@@ -60,10 +60,10 @@ def score_shape(
     scores |= {name: None for name in scores if name.startswith(("iou", "normal"))}
     if not (_is_usable(predicted) and _is_usable(true) and 0.0 < diagonal_m < math.inf):
         return scores
-    points, normals = _draw(true, np.random.default_rng([seed, 0]), samples)
+    points, normals = draw_points(true, np.random.default_rng([seed, 0]), samples)
     found: dict[str, Estimate | None] = {}
     if isinstance(predicted, Mesh):
-        own, own_normals = _draw(predicted, np.random.default_rng([seed, 1]), samples)
+        own, own_normals = draw_points(predicted, np.random.default_rng([seed, 1]), samples)
         there, met = _nearest(own, true)
         back, met_back = _nearest(points, predicted)
         dots = [np.abs((a * b).sum(axis=1)) for a, b in ((own_normals, met), (normals, met_back))]
@@ -136,7 +136,7 @@ def _is_usable(shape: Mesh | Array) -> bool:
     return bool(known and face_areas(points, shape.faces).any())
 
 
-def _draw(mesh: Mesh, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+def draw_points(mesh: Mesh, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
     """(points [N, 3], unit normals of their faces [N, 3]), uniform by area."""
     points, face = trimesh.sample.sample_surface(
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), count, seed=rng
@@ -146,9 +146,14 @@ def _draw(mesh: Mesh, rng: np.random.Generator, count: int) -> tuple[Array, Arra
 
 def _nearest(points: Array, mesh: Mesh) -> tuple[Array, Array]:
     """(distances [N] of points [N, 3] to a mesh, unit normals of the nearest faces [N, 3])."""
-    with_area = Mesh(mesh.vertices, mesh.faces[face_areas(mesh.vertices, mesh.faces) > 0.0])
-    distance, face = distance_to_mesh(points, with_area)
-    return distance, _normals(with_area)[face]
+    solid = with_area(mesh)
+    distance, face = distance_to_mesh(points, solid)
+    return distance, _normals(solid)[face]
+
+
+def with_area(mesh: Mesh) -> Mesh:
+    """The mesh without faces that have no area: they have no normal, and nothing is nearest to them alone."""
+    return Mesh(mesh.vertices, mesh.faces[face_areas(mesh.vertices, mesh.faces) > 0.0])
 
 
 def _normals(mesh: Mesh) -> Array:

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from schemas.base import Array, frozen_array
 from schemas.errors import InputError
 from schemas.job.captures import Board
-from workers.geometry.frames import pose, transform
+from workers.geometry.frames import pose, rotation_from_quaternion, transform
 
 SHEET_M = 0.03
 """White around all that is printed: ruler and text stand there."""
@@ -244,14 +244,7 @@ def _pose_of_tag(tag: dict[str, Any]) -> Iterator[Array]:
     w, x, y, z = (float(tag.get(name, name == "qw")) for name in ("qw", "qx", "qy", "qz"))
     if not np.isclose(w * w + x * x + y * y + z * z, 1.0, atol=1e-3):
         raise ValueError(f"the quaternion of tag {tag['id']} has not length 1")
-    w, x, y, z = np.array([w, x, y, z]) / np.sqrt(w * w + x * x + y * y + z * z)
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    R = rotation_from_quaternion(np.array([x, y, z, w]))
     T = pose(R, np.array([float(tag.get(name, 0.0)) for name in "xyz"]))
     half = 0.5 * float(tag["size"])
     yield from transform(T, half * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]))

@@ -21,7 +21,7 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
-from workers.geometry.frames import invert, pose
+from workers.geometry.frames import invert, pose, rotation_from_quaternion
 
 HEAD = b"#ROSBAG V2.0\n"
 MOST_BYTES = 512_000_000
@@ -271,21 +271,14 @@ def _look_at(message: _Message, found: _Contents, infos: dict[str, _Info], trans
         infos[topic.removesuffix("/camera_info").removesuffix("/info")] = _info(message.data)
     elif kind == "geometry_msgs/Transform" and "/tf/" in topic:
         x, y, z, qx, qy, qz, qw = _Bytes(message.data).values("7d")
-        q = np.array([qw, qx, qy, qz])
+        q = np.array([qx, qy, qz, qw])
         if not np.isfinite([x, y, z, *q]).all() or not 0.99 < np.linalg.norm(q) < 1.01:
             raise _Cut("a transform that is none")
-        transforms[topic] = pose(_rotation(q / np.linalg.norm(q)), np.array([x, y, z]))
+        transforms[topic] = pose(rotation_from_quaternion(q), np.array([x, y, z]))
     elif topic.replace("_", " ").endswith("/option/Depth Units/value") and kind == "std_msgs/Float32":
         (metres,) = _Bytes(message.data).values("f")
         if 1e-6 <= metres <= 0.01:
             found.units_per_m = round(1.0 / metres, 3)
-
-
-def _rotation(q: Array) -> Array:
-    """[3, 3] of a unit quaternion w, x, y, z."""
-    w, v = q[0], q[1:]
-    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
 
 
 def _check(path: Path, found: _Contents) -> None:
