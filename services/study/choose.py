@@ -79,8 +79,8 @@ def as_cheap(row: Row, other: Row) -> bool:
 def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None) -> Row:
     """The cheapest setting all of whose errors meet the targets. Raises InputError, TargetError.
 
-    What a user asks for, without `bounds`, is met with the upper ends of the intervals; where no setting does, and for
-    default targets, with the values (`value <= target`).
+    What a user asks for, without `bounds`, is met with bounds for scenes at large (`Figure.bound`). Where no setting does, by
+    values (`value <= target`) of settings whose bounds are nearest to the targets. Default targets are met by values.
 
     An error that a setting did not measure is the job's own (`error_of`). Unless failed scenes are a target themselves, a
     setting that fails `MORE_FAILED` more of them than the job is left out. `bounds` are further targets that the message
@@ -95,8 +95,21 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
     able = [row for row in candidates(rows, targets) if meets(row, {**(bounds or {}), **targets}, rows)]
     if not able:
         raise TargetError(describe_miss(rows, targets))
-    sure = [row for row in able if meets(row, targets, rows, upper=True)] if bounds is None else []
-    return cheapest(sure or able, rows)
+    if bounds is not None:
+        return cheapest(able, rows)
+    excess = {row.setting.name: _excess(row, targets, rows) for row in able}
+    most = max(1.0, min(excess.values()) * AS_CHEAP)
+    return cheapest([row for row in able if excess[row.setting.name] <= most], rows)
+
+
+def _excess(row: Row, targets: Targets, rows: Sequence[Row]) -> float:
+    """How many times its target the bound of a setting's worst error is; 1 where all are met. What is negligible is met."""
+    worst = 1.0
+    for name, target in targets.items():
+        figure = error_of(row, name, rows)
+        if figure is not None and figure.bound > target:
+            worst = max(worst, figure.bound / max(target, NEGLIGIBLE[ERRORS[name].unit]))
+    return worst
 
 
 def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
@@ -127,13 +140,10 @@ def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
     return [row for row in same if "failed_share" in targets or row.failed_share <= most]
 
 
-def meets(row: Row, targets: Targets, rows: Sequence[Row], upper: bool = False) -> bool:
-    """Whether all errors, or the upper ends of their intervals, are at most their targets; what was never measured is not."""
+def meets(row: Row, targets: Targets, rows: Sequence[Row]) -> bool:
+    """Whether all errors are at most their targets; what was never measured is not."""
     found = {name: error_of(row, name, rows) for name in targets}
-    return all(
-        figure is not None and (max(figure.value, figure.high) if upper else figure.value) <= targets[name]
-        for name, figure in found.items()
-    )
+    return all(figure is not None and figure.value <= targets[name] for name, figure in found.items())
 
 
 def check_targets(rows: Sequence[Row], targets: Targets) -> None:
@@ -297,7 +307,18 @@ def answer(study: Study, targets: Targets | None = None) -> str:
         after = f"{better.setting.name} is better and costs as much"
     else:
         after = f"the next better, {better.setting.name}, costs {times(better.ratio / chosen.ratio)} as much"
-    return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}."
+    return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}.{_doubt(chosen, targets or {}, study.rows)}"
+
+
+def _doubt(row: Row, targets: Targets, rows: Sequence[Row]) -> str:
+    """A sentence on the targets that other scenes may miss; empty where all are sure."""
+    found = {name: error_of(row, name, rows) for name in targets}
+    open_ = [
+        f"{short(name)} up to {amount(name, figure.bound) if math.isfinite(figure.bound) else 'any'} (from {figure.scenes})"
+        for name, figure in found.items()
+        if figure is not None and figure.bound > targets[name]
+    ]
+    return f" It is not sure to 95 %: scenes that were not measured may have {listed(open_)}." if open_ else ""
 
 
 def recommend(rows: Sequence[Row], targets: Targets | None = None) -> Row:

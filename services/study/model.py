@@ -68,13 +68,24 @@ OWN = Setting()
 
 @dataclass(frozen=True)
 class Figure:
-    """An error of a setting: its value, its 95 % confidence interval by bootstrap over scenes, and their number."""
+    """An error of a setting: its value, its 95 % interval by bootstrap over these scenes, and their number.
+
+    The bootstrap knows no scene worse than the worst of its own, so that its upper end tells settings of the same scenes
+    apart, and says little of other scenes: `most` is the bound for those (services/study/table.py), None where there is no
+    better one than `high`.
+    """
 
     value: float
     low: float
     high: float
     median: float
     scenes: int
+    most: float | None = None
+
+    @property
+    def bound(self) -> float:
+        """What the error of as many scenes as one likes is at most, with 95 % confidence."""
+        return max(self.value, self.high if self.most is None else self.most)
 
 
 @dataclass(frozen=True)

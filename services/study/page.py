@@ -71,14 +71,14 @@ def _names(row: Row) -> dict[str, str]:
 def _wide(row: Row) -> dict[str, Any]:
     line: dict[str, Any] = {**_names(row), "changes": json.dumps(dict(row.setting.changes)), "notes": list(row.notes)}
     for name, figure in row.errors.items():
-        line |= {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.high}
+        line |= {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.bound}
     return line | {name: getattr(row, name) for name in _COST}
 
 
 def _long(row: Row) -> list[dict[str, Any]]:
     setting = {**_names(row), "ms": row.ms, "ratio": row.ratio}
     return [
-        {**asdict(figure), **setting, "amount": figure.value, "error": name}
+        {**asdict(figure), **setting, "high": figure.bound, "amount": figure.value, "error": name}
         | {"unit": ERRORS[name].unit, "group": ERRORS[name].group}
         for name, figure in row.errors.items()
     ]
@@ -299,5 +299,5 @@ def _figure(name: str, row: Row, own: Row, best: Sequence[Row]) -> str:
     mine = own.errors.get(name, figure)
     side, mark = ("better", "▼ ") if figure.high < mine.low else ("worse", "▲ ") if figure.low > mine.high else ("", "")
     classes = " ".join(filter(None, [side, "front" if row in best else ""]))
-    value, low, high = (number(shown(name, one)) for one in (figure.value, figure.low, figure.high))
+    value, low, high = (number(shown(name, one)) for one in (figure.value, figure.low, figure.bound))
     return f'<td class="{classes}">{mark}{value}<small>{low} – {high}</small></td>'

@@ -294,7 +294,7 @@ def _draw_rows(axes: Axes, rows: Sequence[Row], error: str, title: str, mark: Ma
     """Markers of settings with the intervals of their errors, and an entry of the legend."""
     if rows:
         x, y = zip(*(_place_of(row, error) for row in rows), strict=True)
-        ends = [(shown(error, row.errors[error].low), shown(error, row.errors[error].high)) for row in rows]
+        ends = [(shown(error, row.errors[error].low), shown(error, row.errors[error].bound)) for row in rows]
         low, high = zip(*ends, strict=True)
         axes.vlines(x, low, high, color=mark["color"], lw=0.8, alpha=0.55, label="95 % interval over scenes")
         axes.plot(x, y, label=title, clip_on=False, **{"ls": "", **mark})
@@ -311,7 +311,7 @@ def _set_axes(axes: Axes, ms: Sequence[float], rows: Sequence[Row], error: str) 
     Intervals are held as far as they reach no further than `REACH` times.
     """
     figures = [row.errors[error] for row in rows]
-    ends = [end for one in figures for end in (max(one.low, one.value / REACH), min(one.high, one.value * REACH))]
+    ends = [end for one in figures for end in (max(one.low, one.value / REACH), min(one.bound, one.value * REACH))]
     values = [one.value for one in figures] + [end for end in ends if end > 0.0]
     _set_scale(axes, "x", ms)
     _set_scale(axes, "y", [shown(error, value) for value in values])

@@ -101,10 +101,17 @@ def test_the_choice_stays_when_measured_times_come_back_a_little_off():
     assert chosen == {"size=1280, pivot_depth=nearest"}
 
 
-def test_the_upper_ends_of_intervals_decide_where_one_meets_the_targets():
+def test_bounds_for_other_scenes_decide_and_where_none_meets_the_targets_the_nearest():
     near, sure = row("step=60", 0.4, depth_mm=0.098), row("step=120", 0.7, depth_mm=0.05)  # to 0.1078 and to 0.055
     assert choose([OWN, near, sure], {"depth_mm": 0.1}) is sure
-    assert choose([OWN, near], {"depth_mm": 0.1}) is near  # nothing is surely below, this one is
+    assert choose([OWN, near], {"depth_mm": 0.1}) is near  # nothing is surely below
+    few = dataclasses.replace(near, errors={"depth_mm": dataclasses.replace(near.errors["depth_mm"], most=0.5)})
+    assert choose([OWN, few, sure], {"depth_mm": 0.1}) is sure
+    assert choose([OWN, few], {"depth_mm": 0.1}) is OWN  # to 0.11: few scenes may be far off
+    assert choose([OWN, few], {"depth_mm": 0.1}, bounds={}) is few  # targets that nobody asked for are met by values
+    told = "It is not sure to 95 %: scenes that were not measured may have depth of objects up to 0.11 mm (from 48)."
+    assert answer(study(OWN, few), {"depth_mm": 0.1}).endswith(told)
+    assert "not sure" not in answer(study(OWN, few, sure), {"depth_mm": 0.1})
 
 
 def test_another_world_is_never_recommended():

@@ -17,6 +17,7 @@ from services.study.table import (
     apart,
     figure_over_scenes,
     figures_of,
+    greatest_percentile,
     share,
     unit_name,
     verdict,
@@ -35,6 +36,35 @@ def test_an_error_is_the_95th_percentile_of_the_scenes_and_lies_in_its_interval(
     figure = figure_over_scenes([float(k) for k in range(101)])
     assert (figure.value, figure.median, figure.scenes) == (95.0, 50.0, 101)
     assert 85.0 < figure.low < 95.0 < figure.high <= 100.0
+
+
+@pytest.mark.parametrize("count", [4, 6, 16, 58, 59, 200])
+@pytest.mark.parametrize(
+    ("draw", "truth", "least"),
+    [
+        (lambda rng, size: np.exp(0.7 * rng.normal(size=size)), math.exp(0.7 * 1.6448536), 0.95),  # exact
+        (lambda rng, size: rng.uniform(1.0, 2.0, size), 1.95, 0.95),
+        (lambda rng, size: rng.exponential(size=size), math.log(20.0), 0.95),
+        (lambda rng, size: rng.normal(5.0, 1.0, size=size), 5.0 + 1.6448536, 0.85),  # a tail that the logarithm cuts
+    ],
+    ids=["lognormal", "uniform", "exponential", "normal"],
+)
+def test_the_bound_of_few_scenes_covers_the_percentile_of_all_and_the_bootstrap_does_not(count, draw, truth, least):
+    """Covered shares of 2,000 samples, where the true percentile is known by its formula; 0.017 are 3.5 standard errors."""
+    rng = np.random.default_rng(count)
+    samples = draw(rng, (2000, count))
+    assert np.mean([greatest_percentile(one) >= truth for one in samples]) >= least - 0.017
+    if count <= 16:
+        assert np.mean([figure_over_scenes(one).high >= truth for one in samples[:200]]) < 0.7
+
+
+def test_the_bound_of_scenes_that_are_alike_or_single_or_nothing():
+    assert greatest_percentile(np.full(6, 0.3)) == pytest.approx(0.3, abs=1e-12)
+    assert greatest_percentile(np.array([0.0, 1e-9, 0.0]), least=0.02) == pytest.approx(0.02, abs=1e-12)
+    assert greatest_percentile(np.array([0.3])) == math.inf
+    assert figure_over_scenes([0.3]).bound == math.inf and figure_over_scenes([0.0] * 60).bound == 0.0
+    assert share([0.0] * 6, [8.0] * 6, counted=True).bound == pytest.approx(1.0 - 0.05 ** (1 / 48))  # none of 48
+    assert share([0.0] * 6, [8.0] * 6).bound == 0.0  # seconds are not counted
 
 
 def test_the_distance_of_two_distributions_is_their_shift():
