@@ -73,8 +73,9 @@ def greatest_percentile(values: Array, least: float = 0.0) -> float:
 
     Of 59 scenes and more it is an order statistic, whatever the distribution: the exact interval of `verdict`. Fewer bound
     nothing without a distribution; theirs is taken to be lognormal, for which the tolerance bound is exact (Hahn and Meeker
-    1991, 4.6). Of the project's errors it covers some 93 % (docs/measured.md) where the bootstrap covers 20 to 60. Figures up
-    to `least`, above 0, count as `least`: the logarithm of rounding is no spread. Infinite for one scene.
+    1991, 4.6). Of 20 errors of piles of eight it covered 82 to 100 % of samples of 4 to 16 scenes out of 200, and the
+    bootstrap 14 to 61. Figures up to `least`, above 0, count as `least`: the logarithm of rounding is no spread. Infinite for
+    one scene.
     """
     count, ordered = len(values), np.sort(values)
     if (above := _most_above(count)) is not None:

@@ -7,6 +7,7 @@ import os
 import cv2
 import lzfse
 import numpy as np
+import OpenEXR
 import pytest
 import trimesh
 
@@ -391,6 +392,12 @@ def test_a_view_with_intrinsics_of_its_own_is_read_as_the_others(tmp_path):
 def test_depth_of_any_encoding_and_colour_as_jpeg_are_read(tmp_path):
     path = tmp_path / "capture"
     path.mkdir()
+
+    def exr(**channels: np.ndarray) -> bytes:
+        head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(head, channels).write(str(tmp_path / "written.exr"))
+        return (tmp_path / "written.exr").read_bytes()
+
     metres = np.round(0.5 + 2 * RNG.random((WIDE.height, WIDE.width)), 3)
     metres[RNG.random(metres.shape) < 0.2] = 0
     ramp = np.repeat(np.linspace(20, 200, WIDE.width).astype(np.uint8)[None, :, None], WIDE.height, 0).repeat(3, 2)
@@ -408,6 +415,8 @@ def test_depth_of_any_encoding_and_colour_as_jpeg_are_read(tmp_path):
         ("npy", whole_numbers.getvalue()),
         ("tif", cv2.imencode(".tiff", single)[1].tobytes()),
         ("tiff", cv2.imencode(".tiff", units)[1].tobytes()),
+        ("exr", exr(V=single)),
+        ("exr", exr(Z=with_nan, R=0 * single, G=0 * single, B=0 * single)),
         ("depth", single.tobytes()),
         ("depth", units.tobytes()),
         ("depth", lzfse.compress(single.tobytes())),
@@ -430,7 +439,15 @@ def test_depth_of_any_encoding_and_colour_as_jpeg_are_read(tmp_path):
     objects = io.BytesIO()
     np.save(objects, np.full((WIDE.height, WIDE.width), None), allow_pickle=True)
     for ending, data, told in (
-        ("exr", b"v/1\x01" + bytes(100), "is OpenEXR, which is not read here: save depth as float TIFF"),
+        ("exr", b"v/1\x01" + bytes(100), "is OpenEXR, and cut or altered"),
+        ("exr", exr(Z=single)[:-9], "is OpenEXR, and cut or altered"),
+        ("exr", exr(Z=single[:50]), f"is 160 x 50, and its camera has {size}"),
+        (
+            "exr",
+            exr(R=single, G=single, B=single),
+            "has the channels B, G, R: depth is one channel, or the one named Z",
+        ),
+        ("exr", exr(Z=single.astype(np.uint32)), "is uint32 with 1 channels"),
         ("npy", bomb, "holds .99999999, 9999. of float64"),
         ("npy", objects.getvalue(), "of object"),
         ("npy", written.getvalue()[:200], f"its camera has {size}"),
