@@ -15,6 +15,9 @@ Targets = Mapping[str, float]
 AS_CHEAP = 1.05
 """Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %."""
 
+FEWEST_SCENES = 4
+"""Fewer scenes recommend nothing: a setting that is better in one or two is so by chance."""
+
 MORE_FAILED = 0.01
 """A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
 
@@ -134,10 +137,20 @@ def relative_error(row: Row, rows: Sequence[Row]) -> float:
 
 
 def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
-    """The settings that may be chosen: those that do not fail too many scenes, and make the same world (`OTHER_WORLD`)."""
+    """The settings that may be chosen.
+
+    The job itself, and those that were measured in a few scenes at least, make the same world (`OTHER_WORLD`) and do not
+    fail too many scenes.
+    """
     most = own_row(rows).failed_share + MORE_FAILED
     same = [row for row in rows if not OTHER_WORLD & set(dict(row.setting.parts))]
+    same = [row for row in same if not row.setting.parts or _scenes(row) >= FEWEST_SCENES]
     return [row for row in same if "failed_share" in targets or row.failed_share <= most]
+
+
+def _scenes(row: Row) -> float:
+    """The fewest scenes of a setting's errors; infinite where it measured none."""
+    return min((figure.scenes for figure in row.errors.values()), default=math.inf)
 
 
 def meets(row: Row, targets: Targets, rows: Sequence[Row]) -> bool:
@@ -300,6 +313,7 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
     given_up = [] if bounds else worse_than(chosen, own, study.rows)
     loss = f", and gives up {listed(given_up)}" if given_up else ""
+    unproved = " It is not proved: the budget left no time for fresh scenes." if asked and not study.proofs else ""
     better = next_better(study.rows, chosen, {**bounds, **asked})
     if better is None:
         after = "nothing that was measured is better"
@@ -307,7 +321,7 @@ def answer(study: Study, targets: Targets | None = None) -> str:
         after = f"{better.setting.name} is better and costs as much"
     else:
         after = f"the next better, {better.setting.name}, costs {times(better.ratio / chosen.ratio)} as much"
-    return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}.{_doubt(chosen, targets or {}, study.rows)}"
+    return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}.{_doubt(chosen, targets or {}, study.rows)}{unproved}"
 
 
 def _doubt(row: Row, targets: Targets, rows: Sequence[Row]) -> str:

@@ -111,7 +111,19 @@ def test_bounds_for_other_scenes_decide_and_where_none_meets_the_targets_the_nea
     assert choose([OWN, few], {"depth_mm": 0.1}, bounds={}) is few  # targets that nobody asked for are met by values
     told = "It is not sure to 95 %: scenes that were not measured may have depth of objects up to 0.11 mm (from 48)."
     assert answer(study(OWN, few), {"depth_mm": 0.1}).endswith(told)
-    assert "not sure" not in answer(study(OWN, few, sure), {"depth_mm": 0.1})
+    assert "is not" not in answer(study(OWN, few, sure), {"depth_mm": 0.1})
+    unproved = dataclasses.replace(study(OWN, sure), proofs=())
+    assert answer(unproved, {"depth_mm": 0.1}).endswith("It is not proved: the budget left no time for fresh scenes.")
+
+
+def test_a_setting_that_few_scenes_measured_is_not_recommended():
+    fast = row("step=60", 0.5, depth_mm=0.01)
+    for scenes, chosen in ((3, "the job"), (4, "step=60")):
+        few = dataclasses.replace(
+            fast, errors={"depth_mm": dataclasses.replace(fast.errors["depth_mm"], scenes=scenes)}
+        )
+        assert choose([OWN, few], {"depth_mm": 0.2}).setting.name == chosen
+        assert recommend([OWN, few]).setting.name == chosen
 
 
 def test_another_world_is_never_recommended():
