@@ -60,12 +60,15 @@ def _figure(samples: Array, value: float, median: float, scenes: int, most: floa
     return Figure(value, float(low), float(high), median, scenes, most)
 
 
-def figure_over_scenes(figures: Sequence[float], least: float = 0.0) -> Figure:
-    """The 95th percentile of one figure a scene, of at least one; figures up to `least` count as `least` in its bound."""
+def figure_over_scenes(figures: Sequence[float], least: float = 0.0, most: float = math.inf) -> Figure:
+    """The 95th percentile of one figure a scene, of at least one.
+
+    In its bound figures up to `least` count as `least`, and it is at most `most`, as shares are at most 1.
+    """
     values = np.asarray(figures, float)
     samples = np.percentile(values[_resampled(len(values))], PERCENTILE, axis=1)
     value, median = float(np.percentile(values, PERCENTILE)), float(np.median(values))
-    return _figure(samples, value, median, len(values), greatest_percentile(values, least))
+    return _figure(samples, value, median, len(values), min(most, greatest_percentile(values, least)))
 
 
 def greatest_percentile(values: Array, least: float = 0.0) -> float:
@@ -152,7 +155,8 @@ def figures_of(answers: Answers, references: Sequence[Answers] = ()) -> dict[str
     found: dict[str, Figure] = {}
     for name in ERRORS:
         if values := [one["errors"][name] for one in some.values() if name in one["errors"]]:
-            found[name] = figure_over_scenes(values, NEGLIGIBLE[ERRORS[name].unit])
+            unit = ERRORS[name].unit
+            found[name] = figure_over_scenes(values, NEGLIGIBLE[unit], math.inf if unit else 1.0)
     if answers:
         found["failed_share"] = share(["failed" in one for one in answers.values()], counted=True)
     if counted := [one for one in answers.values() if "lost" in one]:

@@ -65,6 +65,7 @@ def test_the_bound_of_scenes_that_are_alike_or_single_or_nothing():
     assert figure_over_scenes([0.3]).bound == math.inf and figure_over_scenes([0.0] * 60).bound == 0.0
     assert share([0.0] * 6, [8.0] * 6, counted=True).bound == pytest.approx(1.0 - 0.05 ** (1 / 48))  # none of 48
     assert share([0.0] * 6, [8.0] * 6).bound == 0.0  # seconds are not counted
+    assert figure_over_scenes([0.01, 0.9, 0.4], most=1.0).bound == 1.0
 
 
 def test_the_distance_of_two_distributions_is_their_shift():
