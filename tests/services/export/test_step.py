@@ -23,8 +23,8 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics
 from services.cli.main import main
-from services.dataset import splits
-from services.dataset.splits import Splits, collect_ids, split_by_category
+from services.dataset import dataset as splits
+from services.dataset.dataset import Splits, collect_ids, split_by_category
 from services.export.folder import ExportFolder, Register, Rounds
 from services.export.shapes import Shapes, color_vertices, covered
 from services.export.source import iter_ranges, scenes_of

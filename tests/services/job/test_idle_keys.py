@@ -1,7 +1,6 @@
 """Keys that cannot act are told with the key that switches them off, and none is told that acts."""
 
-from services.job.idle_keys import NEEDS, describe_idle
-from services.job.job_file import validate_job
+from services.job.job_file import NEEDS, describe_idle, validate_job
 
 OFF = {
     "render.tier": ("flat", {"render": {"rgb": False}}, "render.rgb is false"),

@@ -20,8 +20,8 @@ from schemas.errors import MachineError, RunError
 from services.cli import rows
 from services.cli.main import main
 from services.job.job_file import load_job
-from services.queue import own_ray as module
-from services.queue.own_ray import LogsHere, OwnDrivers, answers, own_ray
+from services.queue import drivers as module
+from services.queue.drivers import LogsHere, OwnDrivers, answers, own_ray
 from services.queue.queue import open_queue
 from services.queue.supervise import Driver, Rules, supervise_here
 from services.run.ray_cluster import private_folder

@@ -10,8 +10,8 @@ from services.queue.queue import RESTARTS, JobView, Queue, apply, fold, make_que
 from tests.kit.faults import in_threads
 from tests.kit.queue_world import ids, queue_of, request_of
 from tests.kit.s3_server import Bucket, s3_server
-from workers.store.events import event_path
 from workers.store.objects import ObjectStore
+from workers.store.store import event_path
 
 A, B = ids(2)
 

@@ -11,11 +11,9 @@ from scipy.spatial.transform import Rotation
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from schemas.scene.shape import Mesh
-from services.score.align import align_depth, align_shape
-from services.score.colour import score_colour
-from services.score.depth import score_depth
+from services.score.images import align_depth, score_colour, score_depth
 from services.score.pose import score_pose, symmetries_of
-from services.score.shape import score_shape, score_volume
+from services.score.shape import align_shape, score_shape, score_volume
 from workers.geometry.frames import transform
 
 CASES = 100
