@@ -63,9 +63,9 @@ class Killed(BaseException):
 @pytest.mark.parametrize(
     ("points", "name"),
     [
-        # A file for each thing, shards, and a register
+        # A file for each thing, shards, a register, and models beside one: every way to keep what was begun
         *((1, name) for name in ("mirror-recon", "webdataset", "occnet")),
-        *(pytest.param(6, name, marks=pytest.mark.minute) for name in FORMATS),
+        *(pytest.param(6, name, marks=pytest.mark.minute) for name in ("mirror-recon", "webdataset", "occnet", "bop")),
         *(pytest.param(24, name, marks=pytest.mark.slow) for name in FORMATS),
     ],
 )

@@ -174,9 +174,9 @@ ENDS = ([signal.SIGKILL] * 3, [signal.SIGINT], [signal.SIGHUP])
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("ends", [ENDS[:1], pytest.param(ENDS[1:], marks=pytest.mark.slow)], ids=["a kill", "the rest"])
 def test_submit_and_supervise_are_the_whole_queue_of_one_machine_and_every_end_leaves_nothing(ends, tmp_path):
-    _, digest = run_here(load_job(TABLETOP, ["scenes=16"]), tmp_path / "alone")
+    _, digest = run_here(load_job(TABLETOP, ["scenes=4"]), tmp_path / "alone")
     machine, before = Machine(tmp_path), folders()
-    short, long = machine.submit(tmp_path / "short", 16), machine.submit(tmp_path / "long", 4000)
+    short, long = machine.submit(tmp_path / "short", 4), machine.submit(tmp_path / "long", 4000)
     read, log = open_queue(machine.queue).read, machine.log
     supervisor = machine.supervisor()
     try:
