@@ -40,13 +40,6 @@ def test_a_job_and_its_events_are_read_as_they_were_stored_and_none_that_does_no
         queue.read(B)
 
 
-def test_of_many_writers_at_once_one_decides(queue):
-    won = []
-    in_threads(*[lambda: won.append(Queue(queue.store).append(A, "started", 1))] * 8)
-    assert len([view for view in won if view is not None]) == 1
-    assert queue.read(A).events == 1
-
-
 def test_the_share_is_what_was_said_last_and_logs_are_kept_once_from_their_end(queue):
     assert queue.share() == 1
     queue.put_share(3)
