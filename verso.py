@@ -13,8 +13,7 @@ from services.dataset.correspondence import Correspondence
 from services.dataset.dataset import Dataset
 from services.dataset.dataset import open_dataset as open
 from services.dataset.pair import Pair
-from services.dataset.points import Box, Cloud
-from services.dataset.view import Pixels, View
+from services.dataset.view import Box, Cloud, Pixels, View
 
 __all__ = [
     "Box",

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.dataset.pair import Pair
-from services.dataset.points import pick
-from services.dataset.view import Pixels
+from services.dataset.view import Pixels, pick
 
 SCALE_M = 0.1
 """The unit of the network's frame: objects are some units large, so that a network's inputs are about 1."""

@@ -16,8 +16,7 @@ from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknow
 from schemas.job.captures import Captures, with_capture_keys
 from schemas.job.keys import with_defaults
 from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
-from schemas.job.targets import Targets
-from schemas.job.views import Cameras, Images, Render, SensorEffects
+from schemas.job.views import Cameras, Images, Render, SensorEffects, Targets
 
 RangeSize = Annotated[int, Field(ge=1, le=100_000)]
 """A worker keeps the rows of a whole range, some kilobytes a scene."""

@@ -1,4 +1,7 @@
-"""The branches of a job that shape its images: `cameras`, `images`, `render` and `sensor`."""
+"""The branches of a job that shape its images: `cameras`, `images`, `render`, `sensor` and `targets`.
+
+Targets are what networks are trained on beside the images of the article, by view and by shape.
+"""
 
 import math
 from typing import Annotated, Literal
@@ -242,3 +245,32 @@ class SensorEffects(Frozen):
     def changes_rgb(self) -> bool:
         """Whether any effect on RGB is on."""
         return any(effect is not None for effect in (self.distortion, self.rgb_noise, self.exposure))
+
+
+ViewTarget = Literal["normals", "coordinates", "albedo", "amodal", "layers"]
+ShapeTarget = Literal["surface", "volume"]
+
+MOST_LAYERS = 16
+"""Surfaces along a pixel's ray that are stored at most; one of the images `back` shows the last of however many there are."""
+
+
+class Targets(Frozen):
+    """Images of drawn views, and samples of shapes; none by default. Sensor effects never change them."""
+
+    views: tuple[ViewTarget, ...] = ()
+    """Image targets of input, aligned and mirror views: normals, coordinates, albedo, amodal, layers."""
+    smooth: bool = False
+    """Whether `normals` are shading normals, interpolated between vertices, in place of those of the faces."""
+    layers: Annotated[int, Field(ge=1, le=MOST_LAYERS)] = 4
+    """Surfaces along a pixel's ray that `layers` stores, from the front, beside the last one."""
+    shape: tuple[ShapeTarget, ...] = ()
+    """Samples of each shape in assets/<category>/<instance>.npz: surface, volume."""
+    points: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
+    """Number of points of each of them."""
+
+    @field_validator("views", "shape")
+    @classmethod
+    def _once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError(f"names a target twice: {', '.join(names)}")
+        return names

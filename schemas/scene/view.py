@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Frozen, Pose
-from schemas.job.targets import MOST_LAYERS, ViewTarget
-from schemas.job.views import Patch, Sensor
+from schemas.job.views import MOST_LAYERS, Patch, Sensor, ViewTarget
 
 Role = str
 """The name of a view's place in its pair."""

@@ -13,7 +13,7 @@ import numpy as np
 from schemas.base import Array
 from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
-from schemas.job.targets import ViewTarget
+from schemas.job.views import ViewTarget
 from services.bench.figures import Spread, describe_head, describe_machine, format_spread, pinned
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for

@@ -102,7 +102,7 @@ def cancel(options: argparse.Namespace) -> int:
 
 def supervise(options: argparse.Namespace) -> int:
     """`verso supervise`."""
-    from services.queue.own_ray import answers, own_ray
+    from services.queue.drivers import answers, own_ray
     from services.queue.supervise import Rules, supervise, supervise_here
 
     queue = make_queue(_place(options))
@@ -151,8 +151,7 @@ def _place(options: argparse.Namespace) -> str:
 
 
 def _drivers(options: argparse.Namespace) -> "Drivers":
-    from services.queue.drivers import RayDrivers
-    from services.queue.own_ray import LogsHere
+    from services.queue.drivers import LogsHere, RayDrivers
 
     return LogsHere(rows.DASHBOARD) if options.address is None else RayDrivers(options.address)
 

@@ -1,11 +1,13 @@
 """A dataset opened in Python: its tables as pyarrow datasets, and its pairs one after the other.
 
 A choice of pairs is one expression over one Arrow table a range, which has the columns of scenes, views and assets. `verso.open`
-is the door to this file.
+is the door to this file. Splits of instances have shares that hold within each category.
 """
 
+import hashlib
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -18,11 +20,11 @@ from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import InputError, did_you_mean
+from schemas.job.assets import SplitShares
 from schemas.job.job import Job
 from schemas.scene.view import ROLES
 from services.dataset.pair import Pair, read_pair
 from services.dataset.shapes import RangeFiles, StoredFiles
-from services.dataset.splits import Splits, collect_ids, split_by_category
 from services.dataset.view import Files
 from services.job.record import read_success, require_job
 from services.read.dataset_reader import find_records
@@ -30,6 +32,56 @@ from services.read.stored_tables import StoredTables
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
+
+MOST_INSTANCES = 10_000
+"""Instances of a category that are put in order; of more, the column of `assets` has the shares within 1 %."""
+
+
+@dataclass(frozen=True)
+class Splits:
+    """The splits of a dataset's instances."""
+
+    by_id: Mapping[str, str]
+    """train, val or test; of instances that are not here, the column of `assets` holds."""
+    held_out: frozenset[str] = frozenset()
+    """Categories that are all in test."""
+
+    def of(self, asset: Row) -> str:
+        """The split of a row of `assets`."""
+        if asset["category"] in self.held_out:
+            return "test"
+        return self.by_id.get(asset["instance_id"], asset["split"])
+
+
+def collect_ids(batches: Iterable[Iterable[Row]]) -> dict[str, set[str] | None]:
+    """The instance ids of each category in rows of `assets`; None where there are more than `MOST_INSTANCES`."""
+    found: dict[str, set[str] | None] = {}
+    for row in (row for rows in batches for row in rows):
+        ids = found.setdefault(row["category"], set())
+        if ids is not None:
+            ids.add(row["instance_id"])
+            if len(ids) > MOST_INSTANCES:
+                found[row["category"]] = None
+    return found
+
+
+def split_by_category(instances: Mapping[str, Collection[str] | None], shares: SplitShares) -> dict[str, str]:
+    """The split of every instance; `instances`: ids by category, as `collect_ids` has them.
+
+    A category's instances stand in the order of their ids' hashes, as in `assets.split`, and are cut where the shares say;
+    as long as there are enough, train has one, then test, then val. The same ids give the same splits.
+    """
+    found: dict[str, str] = {}
+    for names in instances.values():
+        order = sorted(names or (), key=lambda name: hashlib.sha256(name.encode()).digest())
+        room = len(order) - (shares.train > 0)
+        test = max(min(max(round(len(order) * shares.test), shares.test > 0), room), 0)
+        val = max(min(max(round(len(order) * shares.val), shares.val > 0), room - test), 0)
+        train = len(order) - val - test if shares.train else 0
+        kinds = ["train"] * train + ["val"] * (len(order) - train - test) + ["test"] * test
+        found |= dict(zip(order, kinds, strict=True))
+    return found
+
 
 PAIR_TABLES = ("scenes", "views", "assets")
 """The tables that a choice of pairs reads."""

@@ -15,8 +15,7 @@ from schemas.errors import InputError
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import ROLES, Role
 from services.dataset.correspondence import Correspondence, correspond
-from services.dataset.points import Frame, pick, sample_mesh
-from services.dataset.view import Files, View, read_mesh, read_view
+from services.dataset.view import Files, Frame, View, pick, read_mesh, read_view, sample_mesh
 from workers.geometry.frames import invert, transform
 
 if TYPE_CHECKING:

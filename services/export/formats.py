@@ -20,7 +20,7 @@ from schemas.dataset.layout import asset_path
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError, InputError
 from schemas.job.job import Job
-from schemas.job.targets import ShapeTarget, ViewTarget
+from schemas.job.views import ShapeTarget, ViewTarget
 from services.export.folder import ExportFolder, Register, Rounds
 from services.export.source import ExportPair, ExportScene
 from services.job.record import JobRecord

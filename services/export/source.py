@@ -18,7 +18,7 @@ from schemas.errors import CorruptError, InputError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
-from services.dataset.splits import Splits, collect_ids, split_by_category
+from services.dataset.dataset import Splits, collect_ids, split_by_category
 from services.read.dataset_reader import ReadFile, StoredRange, decode_samples, file_reader, read_image, read_stored
 from services.read.stored_tables import patch_paths, view_paths
 from workers.store.commit import read_committed, split_code

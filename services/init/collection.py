@@ -10,8 +10,7 @@ from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError, plain_line
 from schemas.job.assets import Assets, FolderSource, MeshLimits
-from services.init.copies import find_copies
-from services.init.found import COPY, PART, Item, LeftOut, Reading
+from services.init.copies import COPY, PART, Item, LeftOut, Reading, find_copies
 from workers.assets.external.formats import FORMATS
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.placement import read_measured

@@ -19,8 +19,7 @@ from schemas.job.job import Job
 from schemas.scene.shape import Asset
 from services.init.categories import BY_FILE, BY_FOLDER, BY_PARENT, is_category, map_categories, name_categories
 from services.init.collection import SUFFIXES, read_folder, walk_folder
-from services.init.copies import find_doubles
-from services.init.found import COPY, PART, Item, LeftOut, Reading
+from services.init.copies import COPY, PART, Item, LeftOut, Reading, find_doubles
 from services.init.guess import Group, Guess, guess_groups, guess_ups, length, plain_axis
 from services.init.shown import Shown, draw_left_out, draw_sheet, draw_table, plural, show_items
 from services.job.bounded_yaml import parse_yaml

@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 from statistics import median
 
 from schemas.job.assets import UpAxis, matches
-from services.init.found import Item
+from services.init.copies import Item
 from workers.assets.external.urdf import POSED
 
 METRIC = frozenset({".glb", ".gltf", ".dae", *POSED})

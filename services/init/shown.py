@@ -16,7 +16,7 @@ from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics
-from services.init.found import Item, LeftOut
+from services.init.copies import Item, LeftOut
 from services.init.guess import ON_TABLE_M, length
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import AnySource, Catalogue, InstanceRef

@@ -107,7 +107,7 @@ def _joined(block: Sequence[_RangeRead]) -> Block:
             files += [(records[0], entry) for records, rows in parts for entry in _shapes(rows)]
         name = f"a table `{table}` of the ranges from scene {ranges[0][0].span.start}"
         tables[table] = _concatenated(table, [rows for _, rows in parts], name)
-        _check_spans(table, tables[table], parts)
+        _check_spans(tables[table], parts)
     _check_scenes([records[0].span for records in ranges], tables)
     return Block(ranges, files, tables)
 
@@ -140,7 +140,7 @@ def _concatenated(table: str, parts: Sequence[pa.Table], name: str) -> pa.Table:
     return conform(table, pa.concat_tables(parts), name).combine_chunks()
 
 
-def _check_spans(table: str, rows: pa.Table, parts: Sequence[tuple[Range, pa.Table]]) -> None:
+def _check_spans(rows: pa.Table, parts: Sequence[tuple[Range, pa.Table]]) -> None:
     """Raises CorruptError where a row is of a scene outside its range."""
     if "scene_id" not in rows.column_names or not parts:
         return

@@ -25,9 +25,8 @@ from schemas.queue import (
     log_path,
     request_path,
 )
-from workers.store.events import Events
 from workers.store.local import open_store
-from workers.store.store import Store, retry_if_swept
+from workers.store.store import Events, Store, retry_if_swept
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
 """waiting: for its output folder. lost: drivers died more often than they are started again."""

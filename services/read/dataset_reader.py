@@ -15,7 +15,7 @@ from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
 from workers.store.commit import code_of, list_codes, split_code
 from workers.store.images import decode_png
-from workers.store.ledger import iter_committed, list_commits, range_rows, read_range
+from workers.store.ledger import list_commits, range_rows, read_range
 from workers.store.store import Store
 from workers.store.tars import read_tar
 
@@ -46,14 +46,8 @@ class StoredRange:
             yield pair, [row for row in objects if row["pose_id"] in ids]
 
 
-def iter_stored(store: Store) -> Iterator[StoredRange]:
-    """Every committed range in order. Raises CorruptError where a table does not match its commit."""
-    for records in iter_committed(store):
-        yield read_stored(store, records)
-
-
 def read_stored(store: Store, records: Sequence[CommitRecord]) -> StoredRange:
-    """One committed range with its retries. Raises as `iter_stored`."""
+    """One committed range with its retries. Raises CorruptError where a table does not match its commit."""
     rows = {table: range_rows(store, records, table).to_pylist() for table in DETERMINISTIC_TABLES}
     return StoredRange(records[0].span.start, records[0].span.stop, tuple(records), rows)
 

@@ -22,7 +22,7 @@ from services.run.lock import Lock
 from services.run.progress import say
 from services.run.worker_entry import WorkerTerms, enter_shard, refusal_of, worker_environment
 from workers.assets.catalogue import Catalogue
-from workers.shard.code import code_digest
+from workers.source import code_digest
 from workers.store.store import Store
 
 EnterShard = Callable[[WorkerTerms, bytes, bytes], ShardReport]

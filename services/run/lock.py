@@ -18,8 +18,7 @@ from pathlib import Path
 from schemas.dataset.layout import LOCK_CLAIMS, LOCK_FILE
 from schemas.errors import CorruptError, InUseError, MachineError, RunError, VersoError
 from services.run.machine import read_process
-from workers.store.events import Events
-from workers.store.store import Store
+from workers.store.store import Events, Store
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.dataset.shard import JobChange, ShardOrder
 from schemas.errors import FingerprintError, plural
 from schemas.job.job import Job
-from services.job.idle_keys import describe_idle
+from services.job.job_file import describe_idle
 from services.job.record import JobRecord, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import write_card
 from services.merge.merge import MergeResult, merge
@@ -27,8 +27,8 @@ from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_s
 from services.run.ray_cluster import Slots, nodes_here, open_ray, share_gpus, share_slots
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
-from workers.geometry.loops import are_kept
 from workers.render.tiers import require_tier
+from workers.source import are_kept
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
 from workers.store.local import open_store

@@ -93,7 +93,7 @@ def see(names: Iterable[str], proof: str, token: str) -> Sight:
     """This process's node; `proof` is empty where the output is no folder."""
     code = no_code = ""
     try:
-        from workers.shard.code import code_digest
+        from workers.source import code_digest
 
         code = code_digest()
     except ImportError as error:

@@ -28,12 +28,10 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.dataset.correspondence import carry
 from services.dataset.pair import Pair
 from services.dataset.view import View
-from services.score.align import Alignment, align_depth, align_shape, box_of
-from services.score.colour import score_colour
-from services.score.depth import score_depth
+from services.score.images import Alignment, align_depth, score_colour, score_depth
 from services.score.pose import score_pose, symmetries_of
 from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
-from services.score.shape import score_shape, score_volume
+from services.score.shape import align_shape, box_of, score_shape, score_volume
 from workers.geometry.frames import invert, transform
 
 PredictedFrame = Literal["object", "camera", "input", "world"]

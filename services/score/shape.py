@@ -1,22 +1,26 @@
-"""Errors of a predicted shape: a mesh, a cloud, or values at points of space. Pure.
+"""Errors of a predicted shape: a mesh, a cloud, or values at points of space; and its alignment with the truth. Pure.
 
 Points are drawn uniformly by area; their distances to the other surface are exact. So sampling adds an error but no bias.
 """
 
 import math
+from typing import Final
 
 import manifold3d
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from trimesh.registration import procrustes
 
-from schemas.base import Array
+from schemas.base import Array, Pose
 from schemas.scene.shape import Mesh
+from services.score.images import Alignment
 from workers.assets.external.mesh import is_solid, merge_points
 from workers.assets.mass import unite_bodies
 from workers.assets.winding import winding_numbers
 from workers.geometry.distance import distance_to_mesh
+from workers.geometry.frames import transform
 from workers.geometry.mesh import face_areas, face_normals, solid_of, weld
 
 ERRORS = 3.0
@@ -211,3 +215,71 @@ def score_volume(predicted: NDArray, true: NDArray, is_distance: bool) -> dict[s
         "accuracy": float(((within == inside) & known).mean()) if len(truth) else math.nan,
         "distance_mae_m": None if not is_distance else float(error.mean()) if len(error) else math.nan,
     }
+
+
+POINTS: Final = 2_000
+"""Drawn on each surface to align them."""
+
+ROUNDS: Final = 200
+SETTLED: Final = 1e-7
+"""Iteration ends where no point moves by more than this share of the true diagonal."""
+
+
+def align_shape(predicted: Mesh | Array, true: Mesh, how: Alignment, seed: int = 0) -> tuple[Mesh | Array, Pose]:
+    """The mesh or cloud [N, 3] moved by T [4, 4], and T, which has the factor in it. true: metres, in the frame of both.
+
+    Iterated closest points (Besl and McKay 1992), of points of either surface and the nearest of the other, because one way
+    alone shrinks a shape to a point; each round has the least squares of Umeyama (1991), for `scale` the factor about the
+    frame's origin alone. It begins with the ratio of the boxes' diagonals and, for `similarity`, their centres.
+    """
+    points = np.asarray(predicted.vertices if isinstance(predicted, Mesh) else predicted, np.float64)
+    if how == "none":
+        return predicted, np.eye(4)
+    rng = np.random.default_rng([seed, 3])
+    drawn, there = _draw(predicted, rng), _draw(true, rng)
+    (centre, size), (true_centre, true_size) = box_of(points), box_of(np.asarray(true.vertices))
+    T = np.diag([true_size / size] * 3 + [1.0])
+    if how == "similarity":
+        T[:3, 3] = true_centre - T[:3, :3] @ centre
+    for _ in range(ROUNDS):
+        back = _nearest_points(transform(np.linalg.inv(T), there), predicted)
+        here, target = (
+            np.concatenate([drawn, back]),
+            np.concatenate([_nearest_points(transform(T, drawn), true), there]),
+        )
+        step = _fit(here, target, how)
+        moved = np.abs(transform(step, drawn) - transform(T, drawn)).max()
+        T = step
+        if moved < SETTLED * true_size:
+            break
+    placed = transform(T, points)
+    return (Mesh(placed, predicted.faces) if isinstance(predicted, Mesh) else placed), T
+
+
+def _fit(here: Array, target: Array, how: Alignment) -> Pose:
+    """[4, 4] of the least squares from points here [N, 3] to target [N, 3]."""
+    if how == "scale":
+        return np.diag([float((here * target).sum() / (here * here).sum())] * 3 + [1.0])
+    return np.asarray(procrustes(here, target, reflection=False)[0])
+
+
+def _draw(shape: Mesh | Array, rng: np.random.Generator) -> Array:
+    if not isinstance(shape, Mesh):
+        points = np.asarray(shape, np.float64)
+        return points[rng.choice(len(points), min(POINTS, len(points)), replace=False)]
+    return draw_points(shape, rng, POINTS)[0]
+
+
+def _nearest_points(points: Array, shape: Mesh | Array) -> Array:
+    """[N, 3]: the nearest point of a surface, or of a cloud, to each of points [N, 3]."""
+    if not isinstance(shape, Mesh):
+        return np.asarray(shape, np.float64)[cKDTree(shape).query(points)[1]]
+    solid = with_area(shape)
+    corners = np.asarray(solid.vertices)[solid.faces[distance_to_mesh(points, solid)[1]]]
+    return np.asarray(trimesh.triangles.closest_point(corners, points))
+
+
+def box_of(points: Array) -> tuple[Array, float]:
+    """The middle [3] and the diagonal of a box about points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2.0, float(np.linalg.norm(high - low))

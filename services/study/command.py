@@ -32,7 +32,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier
 from workers.scene.context import open_worker
-from workers.shard.code import code_digest
+from workers.source import code_digest
 
 BUSY = 0.05
 """A study says so where other processes took more than this share of the machine's processor time while it measured."""

@@ -13,7 +13,7 @@ from schemas.errors import InputError, did_you_mean
 from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job, kind_of
 from schemas.job.keys import set_key
-from schemas.job.targets import ViewTarget
+from schemas.job.views import ViewTarget
 from services.job.job_file import describe_fault
 from services.study.model import OWN, Changes, Knob, Setting, Value
 

@@ -27,9 +27,8 @@ from services.study.model import OWN, Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.bullet import GRAVITY_M_S2, World, open_world
 from workers.physics.fall import FINEST
-from workers.physics.recheck import recheck_scene
 from workers.physics.rigid_body import Body
-from workers.physics.settle import Rest
+from workers.physics.settle import Rest, recheck_scene
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Laid, lay_scene, plan_with_effects

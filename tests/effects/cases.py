@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
-from schemas.job.targets import ViewTarget
+from schemas.job.views import ViewTarget
 from tests.effects.scenes import ABOVE_THE_HORIZON, Setting, with_holes, without_textures
 
 TARGETS: tuple[str, ...] = get_args(ViewTarget)

@@ -25,8 +25,8 @@ from tests.judge.table import STILL_DEG, STILL_MM
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.physics.fall import FINEST
-from workers.physics.recheck import RECHECK_RATE, RECHECK_S, moved_by, release_again
-from workers.physics.settle import settle_scene
+from workers.physics.release import moved_by, release_again
+from workers.physics.settle import RECHECK_RATE, RECHECK_S, settle_scene
 from workers.scene.chance import SceneChance
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.plan import plan_scene

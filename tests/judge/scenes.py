@@ -19,8 +19,7 @@ from workers.physics import settle
 from workers.physics.effects import called_for
 from workers.physics.fall import FINEST
 from workers.physics.pour import NOTHING_MORE, Pouring
-from workers.physics.recheck import recheck_scene
-from workers.physics.settle import settle_scene
+from workers.physics.settle import recheck_scene, settle_scene
 
 PARTS = ("release", "rest")
 """The parts of `workers.physics.settle` whose time is taken: what moves the objects, and what brings them to rest."""

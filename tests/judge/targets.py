@@ -20,7 +20,7 @@ import yaml
 
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.job.targets import ViewTarget
+from schemas.job.views import ViewTarget
 from schemas.scene.scene import SceneOutput
 from services.read.independent.derive import StoredPair
 from services.read.independent.poses import check_pair

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from schemas.base import Range
-from schemas.job.targets import Targets
+from schemas.job.views import Targets
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from services.job.job_file import validate_job

@@ -17,7 +17,7 @@ import yaml
 from schemas.base import Array
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.job.targets import ViewTarget
+from schemas.job.views import ViewTarget
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import View
 from tests.judge.targets import context_of

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.job.targets import ShapeTarget, Targets
+from schemas.job.views import ShapeTarget, Targets
 from schemas.scene.shape import Asset, Mesh, Part, Shape
 from workers.assets.external.mesh import merge_points
 from workers.assets.mass import unite_bodies

@@ -23,7 +23,7 @@ import numba
 from numba.core import config, event
 
 from schemas.environment import cache_folder
-from workers.geometry.loops import MADE_WITH_THE_CODE, folder_name
+from workers.source import MADE_WITH_THE_CODE, folder_name
 
 Loop = TypeVar("Loop", bound=Callable[..., object])
 

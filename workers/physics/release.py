@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array, Pose
 from schemas.job.physics import Physics, Rest
-from schemas.scene.scene import EffectPlan, ObjectStart, Table
-from workers.geometry.frames import transform
+from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, Table
+from workers.geometry.frames import motion_between, transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.contact_surface import faces_within, skin_of
 from workers.physics.contacts import contacts_within
@@ -39,7 +39,7 @@ from workers.physics.fall import (
     stays_standing,
     strays,
 )
-from workers.physics.placement import Placement, farthest_m
+from workers.physics.placement import Placement, farthest_m, forms_of, place
 from workers.physics.pour import AT_ONCE, NOTHING_MORE, Pouring
 from workers.physics.rigid_body import build_body, choose_collision_shape, make_body
 from workers.physics.support import SAME_LEVEL_M, inside_margin, split_by_side
@@ -381,3 +381,29 @@ def _skins(placement: Placement, poses: Sequence[Pose], near_m: float, level_m: 
         skin = skin_of(surfaces[number], np.flatnonzero(near[number]), SKIN_M)
         skins.append((*skin, *(corner + SPIKE @ T[:3, :3] for corner in low)))
     return skins
+
+
+def release_again(
+    plan: ScenePlan,
+    settled: Sequence[Settled],
+    physics: Physics,
+    effects: EffectPlan,
+    seconds: float,
+    level_rate: float = FINEST,
+) -> tuple[Pose, ...]:
+    """`T_world_obj` [4, 4] of every object this long after its release from where it rests, or once one moved by `FAR_M`.
+
+    With the effects of the plan, without correction. Nothing counts as resting before the end. In the finest steps, and a single
+    object on level ground in `level_rate` times as many a second as the settings say.
+    """
+    calm = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
+    physics = physics.model_copy(update={"max_settle_s": seconds, "rest": calm})
+    starts, poses = plan.objects, [each.T_world_obj for each in settled]
+    placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
+    return let_go(Drop(starts, plan.table, physics, effects), placement, poses, level_rate=level_rate)
+
+
+def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
+    """(mm that the farthest point of an object moves between two poses, degrees that it turns)."""
+    moved_m, turned_rad = motion_between(start.hull.vertices, before, after)
+    return moved_m * 1e3, math.degrees(turned_rad)

@@ -16,8 +16,7 @@ from schemas.base import Array
 from schemas.dataset.layout import SWITCHES, PixelKind, is_stored
 from schemas.job.captures import Simulate
 from schemas.job.job import Check, Job
-from schemas.job.targets import ViewTarget
-from schemas.job.views import SensorEffects, Tier
+from schemas.job.views import SensorEffects, Tier, ViewTarget
 from schemas.scene.scene import EffectKind, EffectPlan, ScenePlan
 from schemas.scene.shape import Part
 from schemas.scene.view import VIEW_ROLES, Camera, Role

@@ -9,8 +9,7 @@ from schemas.base import frozen_array
 from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settled
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Pair
-from workers.physics.recheck import recheck_scene
-from workers.physics.settle import Rest, settle_scene
+from workers.physics.settle import Rest, recheck_scene, settle_scene
 from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene, plan_effects

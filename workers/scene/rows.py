@@ -12,8 +12,7 @@ from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_
 from schemas.dataset.layout import IMAGES, asset_path, image_path, patch_index, patch_path, samples_path
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.job.targets import Targets
-from schemas.job.views import Images, Patch
+from schemas.job.views import Images, Patch, Targets
 from schemas.scene.scene import EncodedFile, Placed, SceneOutput, encoded_file
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Shape
 from schemas.scene.view import MODALITIES, ObjectLabel, Pair, PixelKind, View, crop_box

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.job.job import Job
-from schemas.job.targets import Targets
-from schemas.job.views import Images
+from schemas.job.views import Images, Targets
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Material, Mesh, Part, Shape
 from schemas.scene.view import FULL, LAYERS, Camera, PixelKind

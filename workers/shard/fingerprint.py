@@ -24,7 +24,7 @@ from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import make_scene
 from workers.scene.rows import record_scene
-from workers.shard.code import code_digest
+from workers.source import code_digest
 
 CANARY = Job(name="canary", seed=7, scenes=1)
 """Changed with the schema version only: a new canary makes every stored fingerprint foreign."""

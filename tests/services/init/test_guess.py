@@ -7,8 +7,7 @@ from schemas.job.assets import FolderSource
 from services.init.categories import is_category, map_categories, name_categories
 from services.init.collection import SUFFIXES
 from services.init.command import describe_guess, make_guess, write_job
-from services.init.copies import find_copies, find_doubles
-from services.init.found import Item, Reading
+from services.init.copies import Item, Reading, find_copies, find_doubles
 from services.init.guess import Guess, guess_groups, guess_ups, plain_axis
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import validate_job

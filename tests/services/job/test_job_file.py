@@ -1,5 +1,6 @@
 """From a job file to a `Job`: every fault by file, key, value and what is allowed, in a short line, at a bounded cost."""
 
+import copy
 import random
 import re
 import time
@@ -15,8 +16,9 @@ from hypothesis import strategies as st
 from schemas.errors import JobError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
+from schemas.job.keys import set_key
 from services.cli.main import main
-from services.job.job_file import load_job, pack_job, validate_job
+from services.job.job_file import NEEDS, describe_idle, load_job, pack_job, validate_job
 from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
 from services.job.reference import allowed_keys, describe_allowed, list_keys, write_doc
 from services.run import dry_run
@@ -317,3 +319,57 @@ def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path,
     assert sorted(tmp_path.iterdir()) == [path]
     assert peak_mb() - before < MOST_MB
     assert outcomes["job"] > 2 and outcomes["refused"] > len(numbers) // 3  # the mutations reach both
+
+
+# ------------------------------------------------------------------------------------------------ keys that cannot act
+
+OFF = {
+    "render.tier": ("flat", {"render": {"rgb": False}}, "render.rgb is false"),
+    "render.samples": (4, {"render": {"tier": "flat"}}, "render.tier is not raster"),
+    "render.path_samples": (64, {}, "render.tier is not pathtraced"),
+    "render.path_bounces": (2, {}, "render.tier is not pathtraced"),
+    "cameras.mirror.T_z_m": (0.8, {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled is false"),
+    "cameras.mirror.pivot_depth": ("median", {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled"),
+    "cameras.mirror.percentile": (9.0, {"cameras": {"mirror": {"pivot_depth": "median"}}}, "pivot_depth is not"),
+    "cameras.depth.offset_m": ([0.0, 0.0, 0.0], {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled"),
+    "images.projection.splat": (3, {"images": {"projection": {"enabled": False}}}, "projection.enabled is false"),
+    "images.projection.hidden_point_removal": (
+        True,
+        {"images": {"projection": {"enabled": False}}},
+        "projection.enabled",
+    ),
+    "start.arrange": ("pile", {}, "objects_per_scene is 1"),
+    "start.pile_offset_m": ([-0.1, 0.1], {"objects_per_scene": 3}, "start.arrange is spread"),
+    "physics.concavity": (0.1, {"physics": {"collision": "hull"}}, "makes no convex parts"),
+}
+ON = {
+    "render": {"tier": "pathtraced", "path_samples": 4, "path_bounces": 2},
+    "cameras": {"mirror": {"T_z_m": 0.8, "percentile": 9.0}, "depth": {"offset_m": [0.0, 0.0, 0.0]}},
+    "images": {"projection": {"splat": 3, "hidden_point_removal": True}},
+    "objects_per_scene": 3,
+    "start": {"arrange": "pile", "pile_offset_m": [-0.1, 0.1]},
+    "physics": {"concavity": 0.1},
+}
+
+
+def job_of(key="", value=None, changes=None):
+    """A job with changes, and a key set to a value."""
+    tree = copy.deepcopy({"verso": 1, "name": "t", **(changes or {})})
+    if key:
+        set_key(tree, key, value)
+    if tree.get("cameras", {}).get("mirror", {}).get("enabled") is False:
+        tree.setdefault("images", {}).setdefault("projection", {"enabled": False})
+    return validate_job(tree, "t")
+
+
+def test_each_key_that_cannot_act_is_told_with_its_reason():
+    assert OFF.keys() == NEEDS.keys()
+    for key, (value, changes, why) in OFF.items():
+        (line,) = describe_idle(job_of(key, value, changes))
+        assert line.startswith(f"{key} is ") and why in line, (key, line)
+
+
+def test_nothing_is_told_of_keys_that_act_or_are_at_their_defaults():
+    assert describe_idle(job_of()) == describe_idle(job_of(changes=ON)) == []
+    assert describe_idle(job_of("render.samples", 4)) == []
+    assert describe_idle(job_of(changes={"render": {"rgb": False}})) == []

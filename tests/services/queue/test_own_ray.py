@@ -20,8 +20,8 @@ from schemas.errors import MachineError, RunError
 from services.cli import rows
 from services.cli.main import main
 from services.job.job_file import load_job
-from services.queue import own_ray as module
-from services.queue.own_ray import LogsHere, OwnDrivers, answers, own_ray
+from services.queue import drivers as module
+from services.queue.drivers import LogsHere, OwnDrivers, answers, own_ray
 from services.queue.queue import open_queue
 from services.queue.supervise import Driver, Rules, supervise_here
 from services.run.ray_cluster import private_folder
@@ -174,9 +174,9 @@ ENDS = ([signal.SIGKILL] * 3, [signal.SIGINT], [signal.SIGHUP])
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("ends", [ENDS[:1], pytest.param(ENDS[1:], marks=pytest.mark.slow)], ids=["a kill", "the rest"])
 def test_submit_and_supervise_are_the_whole_queue_of_one_machine_and_every_end_leaves_nothing(ends, tmp_path):
-    _, digest = run_here(load_job(TABLETOP, ["scenes=16"]), tmp_path / "alone")
+    _, digest = run_here(load_job(TABLETOP, ["scenes=4"]), tmp_path / "alone")
     machine, before = Machine(tmp_path), folders()
-    short, long = machine.submit(tmp_path / "short", 16), machine.submit(tmp_path / "long", 4000)
+    short, long = machine.submit(tmp_path / "short", 4), machine.submit(tmp_path / "long", 4000)
     read, log = open_queue(machine.queue).read, machine.log
     supervisor = machine.supervisor()
     try:

@@ -10,8 +10,8 @@ from services.queue.queue import RESTARTS, JobView, Queue, apply, fold, make_que
 from tests.kit.faults import in_threads
 from tests.kit.queue_world import ids, queue_of, request_of
 from tests.kit.s3_server import Bucket, s3_server
-from workers.store.events import event_path
 from workers.store.objects import ObjectStore
+from workers.store.store import event_path
 
 A, B = ids(2)
 
@@ -38,13 +38,6 @@ def test_a_job_and_its_events_are_read_as_they_were_stored_and_none_that_does_no
     assert (fresh.state, fresh.attempt, fresh.deaths, fresh.events) == ("running", 2, 1, 4)
     with pytest.raises(InputError, match=f"^[^\n]* has no job {B}: `verso jobs` lists[^\n]*$"):
         queue.read(B)
-
-
-def test_of_many_writers_at_once_one_decides(queue):
-    won = []
-    in_threads(*[lambda: won.append(Queue(queue.store).append(A, "started", 1))] * 8)
-    assert len([view for view in won if view is not None]) == 1
-    assert queue.read(A).events == 1
 
 
 def test_the_share_is_what_was_said_last_and_logs_are_kept_once_from_their_end(queue):

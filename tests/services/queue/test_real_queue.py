@@ -21,7 +21,7 @@ from tests.kit.killed_runs import processes_with
 from tests.kit.ray_head import ROOT, RayHead, ray_head
 
 TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
-SCENES, MANY = 16, 4000
+SCENES, MANY = 4, 4000
 SLOWLY = [*("--set", "run.range_size=1"), *("--set", "run.shard_size=1"), *("--set", "run.workers=1")]
 """Commits come one by one, and of many scenes there is always one to come."""
 HOSTILE = "o $(touch x) `touch x`; touch x 'y' \"z\""

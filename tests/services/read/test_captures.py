@@ -74,23 +74,6 @@ def test_a_lost_image_and_a_lost_shape_are_named_and_made_again(copy):
     assert (len(found.done), found.left, found.verdict.faults) == (2, [], [])
 
 
-def test_a_run_that_was_cut_off_between_captures_goes_on_to_the_same_digest(virtual, tmp_path, monkeypatch):
-    usual = make_capture.process_capture
-
-    def cut_off(folder, captures, watch):
-        if folder.about.name == "mug-1":
-            raise KeyboardInterrupt
-        return usual(folder, captures, watch)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(make_capture, "process_capture", cut_off)
-        with pytest.raises(KeyboardInterrupt):
-            run_here(captures_job(), tmp_path)
-    assert len(list(tmp_path.glob("manifest/_commits/*.json"))) == 1
-    _, digest = run_here(captures_job(), tmp_path)
-    assert digest == json.loads((virtual / "_SUCCESS").read_text())["digest"]
-
-
 def test_sql_status_and_the_card_tell_of_captures(virtual):
     store = LocalStore(virtual)
     sql = "select scene_id, source, capture.pose_mm as mm, penetration_mm from scenes"

@@ -17,7 +17,7 @@ from services.cli.main import main
 from services.job.record import encode_job, record_job
 from services.merge.merge import merge
 from services.read.columns_page import describe_columns, list_columns, write_page
-from services.read.dataset_reader import choose_evenly, choose_scenes, file_reader, find_scene, iter_stored, read_image
+from services.read.dataset_reader import choose_evenly, choose_scenes, file_reader, find_scene, read_image
 from services.read.query import query
 from services.read.scene_geometry import posed_scene
 from services.read.status import read_status
@@ -63,12 +63,11 @@ def test_a_scene_is_found_with_its_pairs_and_every_image_is_read_from_either_lay
         assert {row["region_id"] for row in objects} == {2, 3}
     with pytest.raises(InputError, match="scene 2 is not in"):
         find_scene(store, 2)
-    for stored in iter_stored(store):
-        read = file_reader(store.read, stored)
-        paths = [file["path"] for row in stored.rows["views"] for file in row["files"]]
-        assert len(paths) >= 4 * 11 and all(read_image(read, path).size for path in paths)
-        with pytest.raises(CorruptError, match="mug/RGB99999"):
-            read("mug/RGB99999.png")
+    read = file_reader(store.read, stored)
+    paths = [file["path"] for row in stored.rows["views"] for file in row["files"]]
+    assert len(paths) >= 4 * 11 and all(read_image(read, path).size for path in paths)
+    with pytest.raises(CorruptError, match="mug/RGB99999"):
+        read("mug/RGB99999.png")
     with pytest.raises(CorruptError, match=r"a\.png"):
         read_image(lambda _: b"no png", "a.png")
 

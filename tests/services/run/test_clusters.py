@@ -1,7 +1,5 @@
-"""Clusters of a real Ray that know nothing of this project's environment: the same bytes, and what each node is asked first."""
+"""Clusters of a real Ray that know nothing of this project's environment: what each node is asked first."""
 
-import json
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,15 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from schemas.dataset.layout import FINGERPRINT_FILE
-from schemas.dataset.shard import Fingerprint
-from services.run.worker_entry import processor_flags
 from tests.kit.ray_head import ROOT, BareCluster, another_node, bare_cluster
 
 pytestmark = [pytest.mark.ray, pytest.mark.minute]
 
 JOB = "name: shapes\nseed: 2024\nscenes: 8\ncategories: [box, can]\nrun: {range_size: 2}\n"
-"""Boxes and cans are where numpy's and OpenBLAS's instruction sets were seen to change bits."""
 
 
 @pytest.fixture(scope="module")
@@ -31,46 +25,6 @@ def job(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("job") / "shapes.yaml"
     file.write_text(JOB)
     return file
-
-
-def digest_of(done) -> str:
-    assert done.returncode == 0, done.stderr
-    return re.findall(r"dataset digest (\w{64})", done.stdout)[0]
-
-
-@pytest.fixture(scope="module")
-def private(job, cluster) -> str:
-    """The digest of a run without a cluster."""
-    return digest_of(cluster.verso("run", str(job), "--out", str(job.parent / "private")))
-
-
-@pytest.mark.slow
-def test_a_cluster_started_in_a_bare_shell_makes_the_same_bytes(cluster, job, private):
-    out = job.parent / "cluster"
-    assert digest_of(cluster.verso("run", str(job), "--out", str(out), "--address", cluster.address)) == private
-    written = Fingerprint.model_validate_json((out / FINGERPRINT_FILE).read_text())
-    records = (out / "manifest" / "_commits").glob("*.json")
-    assert {json.loads(record.read_text())["terms"]["fingerprint"] for record in records} == {written.digest}
-
-
-@pytest.mark.slow
-def test_a_driver_that_sees_no_avx512_makes_the_same_bytes(cluster, job, private):
-    """It is hidden from the C library. numpy, OpenBLAS and Mesa ask the processor itself, and are told by our variables."""
-    hidden = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX512DQ,-AVX512CD"
-    words = ("run", str(job), "--out", str(job.parent / "hidden"), "--address", cluster.address)
-    assert digest_of(cluster.verso(*words, GLIBC_TUNABLES=hidden)) == private
-
-
-@pytest.mark.slow
-def test_a_driver_whose_c_library_rounds_otherwise_is_told_both_stacks(cluster, job):
-    if "fma" not in processor_flags():
-        pytest.skip("this processor has no fused multiplication")
-    words = ("run", str(job), "--out", str(job.parent / "other"), "--address", cluster.address)
-    done = cluster.verso(*words, GLIBC_TUNABLES="glibc.cpu.hwcaps=-FMA,-AVX2")
-    assert done.returncode == 1
-    (told,) = (line for line in done.stderr.splitlines() if line.startswith("verso: "))
-    assert "maths: " in told and "the dataset's is " in told and "unset GLIBC_TUNABLES" in told
-    assert not list((job.parent / "other").glob("manifest/_commits/*"))
 
 
 PROBE = """

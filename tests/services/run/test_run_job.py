@@ -66,7 +66,6 @@ def test_workers_shards_ranges_and_an_extension_do_not_change_the_dataset(made, 
 def test_scenes_of_several_objects_are_one_dataset_too_and_the_one_made_without_ray(cluster, tmp_path):
     changes = {"objects_per_scene": [2, 4], "scenes": 4, "categories": ["box", "camera", "bottle"]}
     digests = {
-        make(tmp_path / "whole", 1, **changes, run={"shard_size": 4, "range_size": 4}).digest,
         make(tmp_path / "split", **changes, run={"shard_size": 1, "range_size": 2}).digest,
         make_dataset(tmp_path / "plain", **overlaid(SMALL, changes))[1],
     }

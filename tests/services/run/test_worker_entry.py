@@ -37,8 +37,8 @@ from services.run.worker_entry import (
 )
 from workers.assets.catalogue import Catalogue
 from workers.render.raster.gbuffer import shared_renderer
-from workers.shard.code import code_digest
 from workers.shard.fingerprint import take_fingerprint
+from workers.source import code_digest
 from workers.store.local import LocalStore
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from schemas.scene.shape import Mesh
-from services.score.align import align_depth, align_shape
-from services.score.colour import score_colour
-from services.score.depth import score_depth
+from services.score.images import align_depth, score_colour, score_depth
 from services.score.pose import score_pose, symmetries_of
-from services.score.shape import score_shape, score_volume
+from services.score.shape import align_shape, score_shape, score_volume
 from workers.geometry.frames import transform
 
 CASES = 100
+cases_each = pytest.mark.parametrize("cases", [25, pytest.param(CASES, marks=pytest.mark.slow)])
+"""Of what agrees case by case; shares of many cases need them all."""
 EXACT = 1e-6
 K = np.array([[525.0, 0.0, 320.0], [0.0, 520.0, 240.0], [0.0, 0.0, 1.0]])
 
@@ -77,10 +77,11 @@ def noisy_images(rng, low, high):
     return np.clip(predicted, 0, 255).astype(np.uint8), true.astype(np.uint8)
 
 
-def test_colour_agrees_with_skimage_and_with_the_package_of_flip():
+@cases_each
+def test_colour_agrees_with_skimage_and_with_the_package_of_flip(cases):
     rng = np.random.default_rng(2)
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    for _ in range(CASES):
+    for _ in range(cases):
         predicted, true = noisy_images(rng, 11, 60)
         ours = score_colour(predicted, true)
         mean, similarity = structural_similarity(true, predicted, full=True, data_range=255, channel_axis=2, **window)
@@ -97,9 +98,10 @@ def test_colour_agrees_with_skimage_and_with_the_package_of_flip():
         assert masked["flip"] is None and math.isnan(ours["ms_ssim"])
 
 
-def test_ms_ssim_is_the_published_product_of_five_scales():
+@cases_each
+def test_ms_ssim_is_the_published_product_of_five_scales(cases):
     rng = np.random.default_rng(3)
-    for _ in range(CASES):
+    for _ in range(cases):
         predicted, true = noisy_images(rng, 176, 200)
         agree(score_colour(predicted, true)["ms_ssim"], ms_ssim_by_hand(predicted.astype(float), true.astype(float)))
 
@@ -124,9 +126,10 @@ def ms_ssim_by_hand(a, b):
 # ---------------------------------------------------------------------------------------------- poses and volumes
 
 
-def test_pose_errors_are_those_of_the_bop_toolkit():
+@cases_each
+def test_pose_errors_are_those_of_the_bop_toolkit(cases):
     rng = np.random.default_rng(4)
-    for case in range(CASES):
+    for case in range(cases):
         points, symmetries = rng.normal(size=(40, 3)) * 0.05, [rigid(rng, 2.0, 0.01) for _ in range(case % 4)]
         true = rigid(rng, 2.0, 0.1)
         true[2, 3] += 1.5
@@ -299,9 +302,10 @@ def test_boxes_differ_as_their_geometry_says_within_the_stated_sampling_error():
     assert np.mean(np.array(off) > 1.0) < 0.01 and np.max(off) < 1.5
 
 
-def test_the_common_volume_of_closed_boxes_is_exact_however_they_are_wound_or_cut_up():
+@cases_each
+def test_the_common_volume_of_closed_boxes_is_exact_however_they_are_wound_or_cut_up(cases):
     rng = np.random.default_rng(8)
-    for case in range(CASES):
+    for case in range(cases):
         (a, b), shift, T = rng.uniform(0.02, 0.06, (2, 3)), rng.normal(size=3) * 0.01, rigid(rng, 2.0, 0.1)
         box = mesh_of(trimesh.creation.box(2 * a, np.vstack([np.c_[np.eye(3), shift], [0, 0, 0, 1]])), T)
         if case % 3 == 1:

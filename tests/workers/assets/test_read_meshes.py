@@ -33,7 +33,7 @@ from tests.workers.assets.oracles import (
 )
 from workers.assets.builtin.make import make_asset
 from workers.assets.external.formats import list_mesh_files, load_shape
-from workers.assets.external.mesh import DEFAULT, is_solid
+from workers.assets.external.mesh import is_solid
 from workers.assets.external.reader import pack_asset, unpack_asset
 from workers.assets.external.urdf import load_posed
 from workers.assets.glb import asset_glb, split_glb
@@ -52,19 +52,6 @@ def only_part(path, **limits):
     (part,) = loaded.shape.parts
     assert set(loaded.notes) <= {NORMALS}
     return part
-
-
-def test_every_format_gives_the_same_geometry(tmp_path):
-    mesh = trimesh.creation.icosphere(2, 0.1)
-    for suffix in ("obj", "stl", "ply", "glb", "gltf"):
-        if suffix == "gltf":
-            for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh)).items():
-                write(tmp_path / name.replace("model", "ball"), data)
-        else:
-            mesh.export(tmp_path / f"ball.{suffix}")
-        shape = load(tmp_path / f"ball.{suffix}", max_faces=len(mesh.faces)).shape
-        assert is_solid(shape.vertices, shape.faces) and len(shape.faces) == len(mesh.faces), suffix
-        assert welded(shape).volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
 def test_every_geometry_of_a_scene_stands_where_its_node_puts_it_and_mirrored_ones_face_outwards(tmp_path):
@@ -227,21 +214,6 @@ def test_an_mtl_gives_colour_roughness_and_opacity(tmp_path):
     assert found["dull"].roughness == pytest.approx((2 / 4) ** 0.25)
     assert found["shiny"].roughness < 0.3 and found["clear"].base_color[3] == 1.0
     assert found["red"].base_color == pytest.approx((0.5, 0.0, 0.0, 1.0), abs=0.005)
-
-
-def test_colours_of_vertices_and_of_faces_are_kept_and_a_bare_mesh_has_the_default(tmp_path):
-    mesh = trimesh.creation.box((1, 1, 1))
-    assert only_part(write(tmp_path / "a.stl", exported(mesh, "stl"))).material is DEFAULT
-    mesh.visual.vertex_colors = np.tile([255, 0, 128, 255], (8, 1)).astype(np.uint8)
-    for name in ("a.ply", "a.glb"):
-        part = only_part(write(tmp_path / name, exported(mesh, name[2:])))
-        assert part.colors.shape == (8, 4) and part.material.base_color == (1.0, 1.0, 1.0, 1.0)
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    header = f"element vertex 3\n{axes}element face 1\nproperty list uchar int vertex_indices\n{colours}end_header\n"
-    text = f"ply\nformat ascii 1.0\n{header}0 0 0\n1 0 0\n0 1 0\n3 0 1 2 10 20 30\n"
-    part = only_part(write(tmp_path / "a.ply", text))
-    assert part.colors.tolist() == [[10, 20, 30, 255]] * 3, "a face's corners have its colour"
 
 
 # ------------------------------------------------------------------------------------------------ URDF

@@ -12,7 +12,7 @@ import trimesh
 from scipy.stats import chisquare
 
 from schemas.job.assets import CATEGORIES, ProceduralSource
-from schemas.job.targets import Targets
+from schemas.job.views import Targets
 from schemas.scene.shape import Asset, Material, Mesh, Part, Shape
 from tests.judge.nearest import distances_to_faces
 from tests.judge.nearest import winding_numbers as exact_winding_numbers

@@ -1,7 +1,5 @@
 """Sources of files: folders with a map, pybullet_data, and ShapeNetCore in two layouts made up here."""
 
-from pathlib import Path
-
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -28,7 +26,6 @@ from workers.assets.external.verdicts import Verdicts, check_listing
 from workers.scene.rows import asset_row
 
 LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
-SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "meshes"
 TALL = CUBE.replace("v 0 1", "v 0 3").replace("v 1 1", "v 1 3")  # 1 x 3 x 1: +Y is up
 
 
@@ -180,16 +177,6 @@ def test_folders_are_relative_to_the_job_file_and_pybullet_data_is_the_package_w
     mug = loaded(settings, tmp_path)
     assert mug.extents_m[2] == pytest.approx(0.1, abs=1e-3)
     assert mug.shape.parts[0].material.base_color == (1.0, 0.2, 0.2, 1.0)
-
-
-@pytest.mark.shared_data
-def test_scanned_things_load_through_their_urdfs():
-    settings = source(category_map={"*/model.urdf": "mug"})
-    listing, found = listed(settings, SHARED)
-    assert len(found["mug"]) == 5 and {entry.licence for entry in listing.entries["mug"]} == {"see LICENSE"}
-    for number in range(5):
-        asset = loaded(settings, SHARED, number=number)
-        assert asset.watertight and 2e-5 < asset.volume_m3 < 3e-3
 
 
 # ------------------------------------------------------------------------------------------------ ShapeNetCore

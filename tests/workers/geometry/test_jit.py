@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.geometry import jit, loops
+from workers import source
+from workers.geometry import jit
 from workers.geometry.frames import add_up
-from workers.geometry.loops import are_kept, folder_name
+from workers.source import are_kept, folder_name
 
 ROOT = Path(__file__).resolve().parents[3]
 HEAD = """
@@ -103,15 +104,15 @@ def test_whether_loops_are_kept_is_known_without_numba_by_what_is_there_of_every
     (tmp_path / "workers").mkdir()
     for name, text in texts.items():
         (tmp_path / "workers" / f"{name}.py").write_text(text)
-    monkeypatch.setattr(loops, "ROOT", tmp_path)
-    monkeypatch.setattr(loops, "folder_name", lambda: "loops-0")
+    monkeypatch.setattr(source, "ROOT", tmp_path)
+    monkeypatch.setattr(source, "folder_name", lambda: "loops-0")
     kept = tmp_path / "cache" / "loops-0"
     kept.mkdir(parents=True)
     for module, told in (("workers.a", False), ("workers.b", True)):
         assert not are_kept(str(tmp_path / "cache"))
         (kept / f"{module}-1a2b3c4d.kept").touch()
         assert are_kept(str(tmp_path / "cache")) is told
-    ask = "import sys; from workers.geometry.loops import are_kept; are_kept(None); print('numba' in sys.modules)"
+    ask = "import sys; from workers.source import are_kept; are_kept(None); print('numba' in sys.modules)"
     assert said(start(tmp_path, ask)) == ["False"]
 
 

@@ -63,14 +63,6 @@ def test_turns_agree_with_scipy():
             assert back.as_matrix() == pytest.approx(turn.as_matrix(), abs=1e-12)
 
 
-def test_an_inverse_undoes_its_transform():
-    rng = np.random.default_rng(1)
-    T = pose(uniform_rotation(rng), rng.standard_normal(3))
-    points = rng.standard_normal((20, 3))
-    assert transform(invert(T), transform(T, points)) == pytest.approx(points, abs=1e-14)
-    assert transform(T, points) == pytest.approx((T @ np.c_[points, np.ones(20)].T).T[:, :3], abs=1e-14)
-
-
 def test_uniform_rotations_have_no_favourite_direction():
     rng = np.random.default_rng(2)
     images = np.stack([uniform_rotation(rng)[:, 0] for _ in range(4000)])

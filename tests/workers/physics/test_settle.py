@@ -36,7 +36,6 @@ from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, Outcome, fall
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.pour import NOTHING_MORE, Pouring, points_of
-from workers.physics.recheck import RECHECK_RATE, RECHECK_S, release_again
 from workers.physics.release import (
     DOUBTFUL_RISE,
     FAR_M,
@@ -52,8 +51,9 @@ from workers.physics.release import (
     hold,
     let_go,
     release,
+    release_again,
 )
-from workers.physics.settle import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
+from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_RATE, RECHECK_S, Rest, settle_scene
 
 TABLE = level()
 TOP = TABLE.top.height_m

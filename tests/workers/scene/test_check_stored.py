@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.job.record import require_job
-from services.read.dataset_reader import file_reader, iter_stored, read_image
+from services.read.dataset_reader import file_reader, find_scene, read_image
 from tests.datasets import make_dataset
 from workers.scene.check_stored import check_stored_pair, check_stored_scene
 
@@ -15,7 +15,7 @@ from workers.scene.check_stored import check_stored_pair, check_stored_scene
 def stored(tmp_path_factory):
     """(job, row of scenes, rows of views by role, rows of objects, images by path) of one pair with two objects."""
     store, _ = make_dataset(tmp_path_factory.mktemp("pair"), scenes=1, objects_per_scene=2)
-    (found,) = iter_stored(store)
+    found = find_scene(store, 0)
     ((views, objects),) = found.pairs(0)
     read = file_reader(store.read, found)
     images = {file["path"]: read_image(read, file["path"]) for view in views.values() for file in view["files"]}

@@ -6,7 +6,7 @@ import trimesh
 
 from schemas.base import frozen_array
 from schemas.job.job import Job
-from schemas.job.targets import Targets
+from schemas.job.views import Targets
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics

@@ -27,7 +27,6 @@ from workers.physics.bullet import World
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard import fingerprint
 from workers.shard import run_shard as module
-from workers.shard.code import SOURCE_PACKAGES, code_digest
 from workers.shard.fingerprint import (
     TIER_LIBRARIES,
     binaries_digest,
@@ -37,6 +36,7 @@ from workers.shard.fingerprint import (
     take_fingerprint,
 )
 from workers.shard.run_shard import describe, explain, keep_traceback
+from workers.source import SOURCE_PACKAGES, code_digest
 from workers.store.attempt import Attempt, blamed_scene, staged_attempts
 from workers.store.commit import read_record
 from workers.store.ledger import range_rows
@@ -282,7 +282,7 @@ def test_a_c_library_that_multiplies_and_adds_in_two_steps_is_another_stack_and_
 def test_a_copy_of_the_code_has_the_same_digest_and_a_changed_line_another(tmp_path):
     for package in SOURCE_PACKAGES:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    ask = "from workers.shard.code import code_digest; print(code_digest(), 'numpy' in sys.modules)"
+    ask = "from workers.source import code_digest; print(code_digest(), 'numpy' in sys.modules)"
     assert asked(ask, tmp_path) == [code_digest(), "False"]
     with (tmp_path / "workers" / "scene" / "plan.py").open("a") as file:
         file.write("# changed\n")

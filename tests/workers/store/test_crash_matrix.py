@@ -39,9 +39,9 @@ from workers.store import ledger
 from workers.store import store as store_module
 from workers.store.attempt import sweep
 from workers.store.commit import publish
-from workers.store.events import Events
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
+from workers.store.store import Events
 
 NEVER = 10**9
 TWO = pytest.param(False, marks=pytest.mark.minute, id="two")

@@ -26,11 +26,10 @@ from tests.kit.stored_images import iter_records, read_images
 from tests.made_up_scenes import attempt_at, scene, terms
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, sweep
 from workers.store.commit import read_record
-from workers.store.events import Events
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore, open_store
 from workers.store.objects import ObjectStore
-from workers.store.store import Store, is_live, map_ahead, retry_if_swept, stat_all
+from workers.store.store import Events, Store, is_live, map_ahead, retry_if_swept, stat_all
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

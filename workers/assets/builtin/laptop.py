@@ -33,7 +33,7 @@ def make_laptop(rng: np.random.Generator) -> Model:
     axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     opened = lid.placed(axes, hinge)
     barrel = _hinge(width * rng.uniform(0.55, 0.8), 0.5 * thick, hinge)
-    return Model(union([base, opened, barrel]), _surfaces(rng, (width, depth), thick, hinge, axes))
+    return Model(union([base, opened, barrel]), _surfaces(rng, (width, depth), hinge, axes))
 
 
 def _base(rng: np.random.Generator, size: tuple[float, float], thick: float, radius: float) -> Solid:
@@ -68,9 +68,7 @@ def _hinge(length: float, radius: float, at: Array) -> Solid:
     return barrel.placed(axes, at)
 
 
-def _surfaces(
-    rng: np.random.Generator, size: tuple[float, float], thick: float, hinge: Array, axes: Array
-) -> tuple[Surface, ...]:
+def _surfaces(rng: np.random.Generator, size: tuple[float, float], hinge: Array, axes: Array) -> tuple[Surface, ...]:
     width, depth = size
     greys = ((0.76, 0.77, 0.78), (0.62, 0.63, 0.65), (0.34, 0.35, 0.37), (0.12, 0.12, 0.13))
     if chance(rng, 0.88):

@@ -143,12 +143,10 @@ class _File:
         for primitive in mesh:
             filled = primitive.find("p") is not None or primitive.find("ph") is not None
             if filled and primitive.tag not in _NO_FACES:
-                yield from self._mesh(mesh, primitive, bound, matrix)
+                yield from self._mesh(primitive, bound, matrix)
 
-    def _mesh(
-        self, mesh: Element, primitive: Element, bound: Mapping[str | None, Element], matrix: Pose
-    ) -> Iterator[RawMesh]:
-        inputs = self._inputs(mesh, primitive)
+    def _mesh(self, primitive: Element, bound: Mapping[str | None, Element], matrix: Pose) -> Iterator[RawMesh]:
+        inputs = self._inputs(primitive)
         width = 1 + max(offset for _, _, offset, _ in inputs)
         offset, points = next((at, values) for kind, _, at, values in inputs if kind == "POSITION")
         corners = _corners(self.path, primitive, width, offset, points[:, :3])
@@ -178,7 +176,7 @@ class _File:
         shaded = None if normals is None else rows[id(normals[1])][:, :3]
         yield RawMesh(rows[id(used[0][1])], faces, shaded, visual, matrix)
 
-    def _inputs(self, mesh: Element, primitive: Element) -> list[tuple[str, int, int, Array]]:
+    def _inputs(self, primitive: Element) -> list[tuple[str, int, int, Array]]:
         """(what, number of its set, place in a corner, values [N, stride]) of each array that a primitive reads."""
         found = []
         for one in primitive.iterfind("input"):

@@ -223,7 +223,7 @@ class _File:
             return MeshVisual(replace(look.material, texture=None), None, colors)
         return self.materials.visual(look, uv, colors)
 
-    def _image(self, image: dict[str, Any], name: str) -> bytes:
+    def _image(self, image: dict[str, Any]) -> bytes:
         """The bytes of a picture; FileNotFoundError where it is missing or refused, which is noted."""
         uri = image.get("uri")
         return _read(uri, self.resolver) if isinstance(uri, str) else self._view(image["bufferView"]).tobytes()

@@ -49,7 +49,7 @@ class Look:
 class Materials:
     """The materials of a file, each made once."""
 
-    def __init__(self, tree: Tree, resolver: FolderResolver, read_image: Callable[[Tree, str], bytes]) -> None:
+    def __init__(self, tree: Tree, resolver: FolderResolver, read_image: Callable[[Tree], bytes]) -> None:
         self._tree, self._resolver, self._read_image = tree, resolver, read_image
         self._pictures: dict[int, NDArray[np.uint8] | None] = {}
         self._looks: dict[int, Look] = {}
@@ -171,7 +171,7 @@ class Materials:
         uri = image.get("uri")
         name = uri if isinstance(uri, str) and not uri.startswith("data:") else f"image {number}"
         try:
-            data = self._read_image(image, name)
+            data = self._read_image(image)
         except FileNotFoundError:
             return None  # the resolver has noted it
         if (why := self._resolver.budget.take_image(data)) is not None:

@@ -1,12 +1,30 @@
-"""Where compiled loops are kept and whether they are there: what is known without numba, which takes half a second to load."""
+"""What the project's own source is: its digest, and the folder of the loops compiled from it.
+
+Loads nothing heavy: a node tells the digest first of all, and numba alone takes half a second to load.
+"""
 
 import hashlib
 import re
+from functools import cache
 from pathlib import Path
 
 from schemas.environment import cache_folder
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
+
+SOURCE_PACKAGES = ("schemas", "workers")
+"""Packages of the project that the bytes depend on: not the services that drive it."""
+
+
+@cache
+def code_digest() -> str:
+    """SHA-256, hex, of the source files that the bytes depend on, by path."""
+    digest = hashlib.sha256()
+    for path in sorted(path for package in SOURCE_PACKAGES for path in (ROOT / package).rglob("*.py")):
+        digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0")
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
 
 MADE_WITH_THE_CODE = ROOT / ".loops"
 """Where an image has loops that were compiled when it was built. It may be read-only: they are copied from there."""
