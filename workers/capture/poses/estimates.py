@@ -215,7 +215,7 @@ def _less_certain(view: ViewEstimate, fitted: CameraFit, place: int) -> ViewEsti
 
 def noise_notes(joint: Joint, views: Views) -> list[str]:
     """The sigmas that the terms were weighed with."""
-    notes = [f"sigma of a corner: {views.corner_px:.3f} px"]
+    notes = [f"sigma of a corner: {views.sigma_px[0]:.3f} px"]
     if joint.board is not None:
         growth = joint.board.patches.ray_z[:, 2] ** 2
         notes.append(f"depth of the board: {_weights(joint.board, joint.board.view, growth)}")
@@ -352,7 +352,7 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
         return CaptureEstimate("joint", tuple(views), notes=("no view has markers that fit the board",))
     problem = measure_corners(_problem(starts, evidence), evidence.spec)
     joint = solve_jointly(problem, evidence.spec)
-    fitted = fit_camera(problem, joint.solution, evidence.spec.max_iterations)
+    fitted = fit_camera(problem, joint.solution, evidence.spec)
     # Poses of another camera see the object elsewhere although it rests.
     doubtful = fitted is not None and fitted.significant and camera_note(fitted, evidence.camera, joint.solution.poses)
     groups = [] if doubtful else _groups(problem, joint, list(range(len(starts))))
@@ -380,8 +380,7 @@ def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
         sigma_m = float(np.median(term.sigma_m / np.hypot(z[:, 0] ** 2, z[:, 1] ** 2)))
     # An object that moved pulls the poses after it: those by the board alone do not know of it.
     solution, seen = joint.by_board, [problem.observations[n] for n in among]
-    blocks = solution.covariance()[:-SHARED, :-SHARED].reshape(len(solution.poses), POSE, -1, POSE)
-    own = blocks[range(len(solution.poses)), :, range(len(solution.poses))]
+    own = solution.of_views()
     lever = np.array([np.linalg.norm(T[:3, 3]) ** 2 for T in solution.poses])
     unsure_m = np.sqrt(np.trace(own[:, :3, :3], axis1=1, axis2=2) + lever * np.trace(own[:, 3:, 3:], axis1=1, axis2=2))
     groups = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
@@ -395,7 +394,7 @@ def _problem(starts: list[Start], evidence: Evidence) -> Views:
         np.stack([start.covariance for start in starts]),
         np.array([start.fixed for start in starts]),
         evidence.camera,
-        evidence.corner_px,
+        np.full(4, evidence.corner_px),
     )
 
 
@@ -451,14 +450,15 @@ def _result(
     told = camera_note(fitted, evidence.camera, solution.poses) if fitted is not None and misfit else ""
     shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
     correction = shared.correction(identified(sigma, joint.prior))
-    views = {}
+    views, wider = {}, problem.corner_term().misfit(solution.poses, solution.shared)
     for place, start in enumerate(starts):
         block = slice(POSE * place, POSE * (place + 1))
         pose = Judged(
             solution.poses[place],
-            joint.covariance[block, block] * problem.widening(place, max(evidence.corner_px, evidence.spec.corner_px)),
+            joint.covariance[block, block] * wider[place],
             ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
             (evidence.observations[start.index].given_by,) if start.fixed else (),
+            by_corners=False,
         )
         view = judge(evidence.observations[start.index], pose, evidence, correction, shared.print_scale)
         if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:

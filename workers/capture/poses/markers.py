@@ -276,14 +276,14 @@ def measured_corner_px(poses: list[MarkerPose], spec: Estimation) -> float:
     """
     fits = [found.fit for found in poses if found.fit is not None and len(found.fit.residuals) > 3]
     residuals = np.concatenate([fit.residuals.ravel() for fit in fits]) if fits else np.zeros(0)
-    return corner_sigma(residuals, len(residuals) - 6 * len(fits), spec)
-
-
-def corner_sigma(residuals: Array, free: int, spec: Estimation) -> float:
-    """Standard deviation, pixels, by all residuals [N], of which `free` are left by what was fitted, and by the expected one."""
+    free = len(residuals) - 6 * len(fits)
     if free <= 0:
         return spec.corner_px
-    variance = (1.4826 * float(np.median(np.abs(residuals)))) ** 2 * len(residuals) / free
+    return corner_sigma((1.4826 * float(np.median(np.abs(residuals)))) ** 2 * len(residuals) / free, free, spec)
+
+
+def corner_sigma(variance: float, free: float, spec: Estimation) -> float:
+    """Standard deviation, pixels, by the variance of residuals, `free` of them left by what was fitted, and by the expected."""
     mixed = (free * variance + PRIOR_RESIDUALS * spec.corner_px**2) / (free + PRIOR_RESIDUALS)
     return max(FLOOR_PX, float(np.sqrt(mixed)))
 
