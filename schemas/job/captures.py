@@ -180,6 +180,17 @@ class MotionBlur(Frozen):
     """Speed at which the camera turns."""
 
 
+class RollingShutter(Frozen):
+    """Rows that are read one after the other while the camera moves; a view's pose is that of its middle row."""
+
+    readout_s: Positive = 0.02
+    """From the first row to the last."""
+    speed_m_s: NonNegative = 0.15
+    """As of `motion_blur`."""
+    turn_deg_s: NonNegative = 8.0
+    """As of `motion_blur`."""
+
+
 class Sharpen(Frozen):
     """Sharpening in the camera: an unsharp mask on encoded values."""
 
@@ -244,6 +255,8 @@ class Simulate(Frozen):
     """Shot noise and read noise of RGB."""
     motion_blur: MotionBlur | None = None
     """Movement of the camera while it exposes."""
+    rolling_shutter: RollingShutter | None = None
+    """Rows read in turn."""
     exposure: Exposure | None = None
     """Exposure of every view."""
     tone_curve: ToneCurve | None = None
