@@ -274,6 +274,11 @@ class Simulate(Frozen):
     registration_error: RegistrationError | None = None
     """Error of the depth camera's assumed pose."""
 
+    @model_serializer(mode="wrap")
+    def _leave_out_later(self, dump: Dump) -> dict[str, Any]:
+        """Without a rolling shutter, settings are written, and digested, as they were before there was one."""
+        return left_out(dump(self), rolling_shutter=None)
+
 
 class Estimation(Frozen):
     """How the camera poses are estimated."""

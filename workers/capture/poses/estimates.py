@@ -16,6 +16,7 @@ from schemas.job.captures import Board, Estimation
 from workers.capture.poses.joint import CameraFit, Joint, Views, fit_camera, gather, measure_corners, solve_jointly
 from workers.capture.poses.markers import (
     AMBIGUOUS,
+    MATERIAL,
     Evidence,
     Fit,
     Judged,
@@ -174,10 +175,6 @@ def scale_note(joint: Joint, board: Board, spec: Estimation) -> str:
     )
 
 
-MATERIAL = 5e-4
-"""Another camera is told of where it moves a pose by more than this share of its distance: a calibration is no better."""
-
-
 def camera_note(fitted: CameraFit, camera: CaptureCamera, poses: Array) -> str:
     """That camera.json does not fit, with what the markers say instead; empty where it hardly matters to any pose."""
     moved_by = fitted.shift_m()
@@ -205,12 +202,11 @@ def compare_cameras(found: CaptureCamera, given: CaptureCamera, chosen: NDArray[
     return ", ".join(word for n, word in enumerate(words) if chosen is None or chosen[n])
 
 
-def _less_certain(view: ViewEstimate, fitted: CameraFit, place: int) -> ViewEstimate:
-    """The view with the uncertainty of the camera in its covariance, whether it is used or not."""
+def _less_certain(view: ViewEstimate, motion: Array, covariance: Array) -> ViewEstimate:
+    """The view with a motion [6] that it may need, and the covariance [6, 6] of that, in its own, whether it is used or not."""
     if view.covariance is None:
         return view
-    by_camera = np.outer(fitted.motion[place], fitted.motion[place]) + fitted.covariance[place]
-    return dataclasses.replace(view, covariance=view.covariance + by_camera)
+    return dataclasses.replace(view, covariance=view.covariance + np.outer(motion, motion) + covariance)
 
 
 def noise_notes(joint: Joint, views: Views) -> list[str]:
@@ -355,7 +351,7 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     fitted = fit_camera(problem, joint.solution, evidence.spec)
     # Poses of another camera see the object elsewhere although it rests.
     doubtful = fitted is not None and fitted.significant and camera_note(fitted, evidence.camera, joint.solution.poses)
-    groups = [] if doubtful else _groups(problem, joint, list(range(len(starts))))
+    groups = [] if doubtful or problem.rolling(joint.solution) else _groups(problem, joint, list(range(len(starts))))
     if len(groups) < 2:
         return _result(starts, problem, joint, fitted, evidence)
     elsewhere = {number for group in groups[1:] for number in group}
@@ -445,9 +441,10 @@ def _result(
     starts: list[Start], problem: Views, joint: Joint, fitted: CameraFit | None, evidence: Evidence
 ) -> CaptureEstimate:
     solution = joint.solution
-    asked = fitted if fitted is not None and (fitted.significant or evidence.spec.calibrate) else None
     misfit = fitted is not None and fitted.significant
     told = camera_note(fitted, evidence.camera, solution.poses) if fitted is not None and misfit else ""
+    rolled = None if told else problem.rolling(solution)
+    asked = rolled or (fitted if misfit or evidence.spec.calibrate else None)
     shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
     correction = shared.correction(identified(sigma, joint.prior))
     views, wider = {}, problem.corner_term().misfit(solution.poses, solution.shared)
@@ -464,10 +461,13 @@ def _result(
         if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:
             reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
             view = dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
-        views[start.index] = view if asked is None or start.fixed else _less_certain(view, asked, place)
+        if asked is not None and not start.fixed:
+            view = _less_certain(view, asked.motion[place], asked.covariance[place])
+        views[start.index] = view
     for index in set(range(len(evidence.observations))) - set(views):
         views[index] = _outside(index, evidence, shared)
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
+    told = rolled.note if rolled is not None else told
     notes = [told or scale_note(joint, evidence.board, evidence.spec), *noise_notes(joint, problem)]
     return CaptureEstimate(
         "joint",

@@ -26,12 +26,14 @@ from workers.capture.poses.terms import (
     GROW_PX,
     GROWTH_M,
     GROWTH_PX,
+    LEVEL,
     MAD,
     POSE,
     SHARED,
     BoardTerm,
     CornerTerm,
     ObjectTerm,
+    Rolling,
     Rows,
     Shared,
     corrected_camera,
@@ -262,6 +264,10 @@ class Views:
         square = np.concatenate([c.markers for c in corners]) >= 0
         return CornerTerm(view, board, rays, focal_lengths(self.camera), self.sigma_px, square)
 
+    def rolling(self, found: Solution) -> Rolling | None:
+        """What a rolling shutter does to the poses, where the corners ask for one."""
+        return self.corner_term().rolling(found.poses, found.shared, self.camera.intrinsics.height)
+
     def sure(self) -> NDArray[np.bool_]:
         """[V]: views by which the noise of depth is measured."""
         many = np.array([o.markers >= SURE_MARKERS for o in self.observations])
@@ -393,8 +399,6 @@ def _measured_object(
     return dataclasses.replace(term, sigma_m=sigma_m), factor
 
 
-LEVEL = 1e-3
-"""Level of the F test by which the markers ask for another camera than camera.json's: one capture in a thousand is wronged."""
 FREE = np.array([0.1, 0.1, 0.1, 0.1, 1.0])
 """Sigma of fx, fy, cx, cy (shares of the focal length) and k1 beforehand: wide, so that only what is not seen stays put."""
 

@@ -408,6 +408,8 @@ class Evidence(Setup):
         return Evidence(setup.camera, setup.board, setup.spec, tuple(observations), tuple(markers), corner_px)
 
 
+MATERIAL = 5e-4
+"""What moves a pose by more than this share of its distance is told: a calibration is no better."""
 MAX_SIGMA_M = 0.005
 MAX_SIGMA_RAD = math.radians(1.0)
 """A pose that is less certain than this spoils a cloud; its view is flagged."""

@@ -13,11 +13,19 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as variance_ratio
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.capture import CaptureCamera, DepthCorrection
 from schemas.job.captures import Estimation
-from workers.capture.poses.markers import corner_sigma, cross_matrix, derivative_of_projection, exponential, logarithm
+from workers.capture.poses.markers import (
+    MATERIAL,
+    corner_sigma,
+    cross_matrix,
+    derivative_of_projection,
+    exponential,
+    logarithm,
+)
 from workers.capture.poses.observation import Patches
 from workers.geometry.frames import pose
 from workers.geometry.lens import rays_of_pixels
@@ -213,6 +221,30 @@ MODES = (2, 1, 5)
 """How many of the eight coordinates of a marker's corners are its place, the growth of its sides, and the rest: its shape."""
 
 
+LEVEL = 1e-3
+"""Level of the F tests by which markers ask for another camera than camera.json's: one capture in a thousand is wronged."""
+SWEPT = 0.005
+"""Sigma of the motion of a hand while an image is read, metres and radians: 0.15 m/s and 9 degrees/s for 1/30 s. A step across
+the rows and a turn that undoes it look alike on a board (Albl et al. 2016): of the two, the markers tell only the sum."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rolling:
+    """By how much poses would move, motion [V, 6], if rows were read in turn; covariance [V, 6, 6] of the poses then."""
+
+    motion: Array
+    covariance: Array
+
+    @property
+    def note(self) -> str:
+        """What the user is told."""
+        mm = 1000 * float(np.median(np.linalg.norm(self.motion[:, :3], axis=1)))
+        return (
+            f"the corners lie as if the camera moved while the rows of an image were read, which moves the poses by {mm:.1f} mm: "
+            "hold it still for each photograph, or use a global shutter"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class CornerTerm:
     """Corners of all views, those of a marker together: view [K] index, board [K, 3] nominal metres, rays [K, 2].
@@ -314,6 +346,34 @@ class CornerTerm:
             if len(own) > POSE:
                 ratio[number] = (MAD * float(np.median(own))) ** 2 * len(own) / (len(own) - POSE)
         return np.maximum(ratio, 1.0)
+
+    def rolling(self, poses: Array, shared: Shared, height: int) -> "Rolling | None":
+        """What a rolling shutter does to each pose; None where corners do not ask for it, or it moves the poses by too little.
+
+        Each view may have moved evenly from its first row to its last of `height`, which one step of Gauss and Newton finds
+        beside its pose. All corners count alike: what rows do to markers is noise to their modes. An F test over all views.
+        """
+        rows = dataclasses.replace(self, sigma_px=np.full(4, self.sigma_px[0])).rows(poses, shared)
+        share, prior = np.repeat(self.focal[1] * self.rays[:, 1] / height, 2), np.repeat([0.0, SWEPT**-2], POSE)
+        motion, covariance, gain, left = np.zeros((len(poses), POSE)), np.zeros((len(poses), POSE, POSE)), 0.0, 0.0
+        for number in range(len(poses)):
+            own = rows.first == number
+            root = np.sqrt(rows.weight[own])
+            both = root[:, None] * np.concatenate([rows.by_first[own], share[own, None] * rows.by_first[own]], axis=1)
+            residual, inverse = (
+                root * rows.residual[own],
+                np.linalg.pinv(both.T @ both + np.diag(prior), hermitian=True),
+            )
+            step = -inverse @ (both.T @ residual)
+            motion[number], covariance[number] = step[:POSE], inverse[:POSE, :POSE]
+            gain, left = gain - float(step @ (both.T @ residual)), left + float(residual @ residual)
+        degrees = POSE * len(poses), len(rows.residual) - 2 * POSE * len(poses)
+        shift = np.linalg.norm(motion[:, :3], axis=1) / np.linalg.norm(poses[:, :3, 3], axis=1)
+        if min(degrees) <= 0 or float(np.median(shift)) < MATERIAL:
+            return None
+        variance = (left - gain) / degrees[1]
+        sure = variance_ratio.sf(gain / (degrees[0] * variance), *degrees) < LEVEL
+        return Rolling(motion, variance * covariance) if sure else None
 
     def _rays(self, shared: Shared) -> tuple[Array, Array]:
         """([K, 2] rays, [K, 2, 5] their derivatives by the numbers of the camera; 0 where those are not estimated)."""
