@@ -28,9 +28,9 @@ MARGIN = 0.12
 MAX_HALF_PX = 4.0
 MIN_HALF_PX = 1.5
 """Limits of half a profile's length."""
-BLURS = 2.5
-"""And it is at most so many times the blur of the image's edges. What lies beyond an edge - sharpening's halo, noise, the next
-edge - moves the centroid, the more so the longer the profile: all the same, one growth of the sides takes it up."""
+BLURS, SHARP_HALF_PX = 5.0, 1.8
+"""And it is at most so many times the blur of the image's edges, of which sharpening leaves none. What lies beyond an edge -
+sharpening's halo, noise, the next edge - moves the centroid, the more so the longer the profile."""
 ROUNDS = 3
 MAX_SHIFT = 1.0
 """A corner that moves by more than this many halves of a profile is kept as it was: the edge is not what it seemed."""
@@ -52,7 +52,7 @@ def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: float) -> A
     half_px = np.clip(0.5 * sides / bits, MIN_HALF_PX, MAX_HALF_PX)
     for turn in range(ROUNDS):
         lines, blur_px = _edge_lines(light, refined, half_px, only_rising=turn == 0)
-        half_px = np.minimum(half_px, max(MIN_HALF_PX, BLURS * blur_px))
+        half_px = np.minimum(half_px, max(SHARP_HALF_PX, BLURS * blur_px))
         met = _intersections(lines)
         near = np.linalg.norm(met - refined, axis=2) <= MAX_SHIFT * half_px[:, None]
         refined = np.where(near[..., None] & np.isfinite(met), met, refined)

@@ -226,6 +226,8 @@ LEVEL = 1e-3
 SWEPT = 0.005
 """Sigma of the motion of a hand while an image is read, metres and radians: 0.15 m/s and 9 degrees/s for 1/30 s. A step across
 the rows and a turn that undoes it look alike on a board (Albl et al. 2016): of the two, the markers tell only the sum."""
+EXPLAINED = 0.2
+"""Motion that explains a smaller share of the misfit is no finding: noise of a lens or of hidden markers is alike nearby."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +374,7 @@ class CornerTerm:
         if min(degrees) <= 0 or float(np.median(shift)) < MATERIAL:
             return None
         variance = (left - gain) / degrees[1]
-        sure = variance_ratio.sf(gain / (degrees[0] * variance), *degrees) < LEVEL
+        sure = gain > EXPLAINED * left and variance_ratio.sf(gain / (degrees[0] * variance), *degrees) < LEVEL
         return Rolling(motion, variance * covariance) if sure else None
 
     def _rays(self, shared: Shared) -> tuple[Array, Array]:
