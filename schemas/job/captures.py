@@ -177,14 +177,14 @@ class MotionBlur(Frozen):
     speed_m_s: NonNegative = 0.15
     """Speed of the camera."""
     turn_deg_s: NonNegative = 8.0
-    """Speed at which the camera turns."""
+    """And its turning."""
 
 
 class RollingShutter(Frozen):
     """Rows that are read one after the other while the camera moves; a view's pose is that of its middle row."""
 
     readout_s: Positive = 0.02
-    """From the first row to the last."""
+    """First row to last."""
     speed_m_s: NonNegative = 0.15
     """As of `motion_blur`."""
     turn_deg_s: NonNegative = 8.0

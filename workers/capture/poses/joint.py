@@ -401,6 +401,8 @@ def _measured_object(
 
 FREE = np.array([0.1, 0.1, 0.1, 0.1, 1.0])
 """Sigma of fx, fy, cx, cy (shares of the focal length) and k1 beforehand: wide, so that only what is not seen stays put."""
+ALIKE_PX = 0.01
+"""By so much markers may be displaced alike in all views, by what is printed beside them: no camera is blamed for it."""
 
 WEAK = 1e-3
 """Of what one view tells of the camera, directions with less than this share of the strongest are left aside."""
@@ -459,8 +461,9 @@ def fit_camera(views: Views, found: Solution, spec: Estimation) -> CameraFit | N
     variance = rows.cost / degrees
     covariance = variance * free.covariance()
     shared, numbers = covariance[-len(FREE) :, -len(FREE) :], np.array(free.shared.camera)
-    ratio = (without.rows(held.poses, held.shared).cost - rows.cost) / (size * variance)
-    ratio /= max(1.0, _scatter(rows, count, variance))
+    alike = 0.25 * len(rows.residual) * (ALIKE_PX / corners.sigma_px[0]) ** 2  # two of a marker's eight are its place
+    usual = size * variance * max(1.0, _scatter(rows, count, variance)) + alike
+    ratio = (without.rows(held.poses, held.shared).cost - rows.cost) / usual
     motions = np.stack([motion_between(a, b) for a, b in zip(found.poses, free.poses, strict=True)])
     motions[views.fixed] = 0.0
     by_camera = covariance[:-SHARED, -len(FREE) :].reshape(count, POSE, size)
