@@ -177,7 +177,18 @@ class MotionBlur(Frozen):
     speed_m_s: NonNegative = 0.15
     """Speed of the camera."""
     turn_deg_s: NonNegative = 8.0
-    """Speed at which the camera turns."""
+    """And its turning."""
+
+
+class RollingShutter(Frozen):
+    """Rows that are read one after the other while the camera moves; a view's pose is that of its middle row."""
+
+    readout_s: Positive = 0.02
+    """First row to last."""
+    speed_m_s: NonNegative = 0.15
+    """As of `motion_blur`."""
+    turn_deg_s: NonNegative = 8.0
+    """As of `motion_blur`."""
 
 
 class Sharpen(Frozen):
@@ -244,6 +255,8 @@ class Simulate(Frozen):
     """Shot noise and read noise of RGB."""
     motion_blur: MotionBlur | None = None
     """Movement of the camera while it exposes."""
+    rolling_shutter: RollingShutter | None = None
+    """Rows read in turn."""
     exposure: Exposure | None = None
     """Exposure of every view."""
     tone_curve: ToneCurve | None = None
@@ -260,6 +273,11 @@ class Simulate(Frozen):
     """True size of the print over its nominal size."""
     registration_error: RegistrationError | None = None
     """Error of the depth camera's assumed pose."""
+
+    @model_serializer(mode="wrap")
+    def _leave_out_later(self, dump: Dump) -> dict[str, Any]:
+        """Without a rolling shutter, settings are written, and digested, as they were before there was one."""
+        return left_out(dump(self), rolling_shutter=None)
 
 
 class Estimation(Frozen):

@@ -39,7 +39,7 @@ FREE: Mapping[str, str] = {
     "captures.simulate.tier captures.simulate.depth_noise captures.simulate.rgb_noise captures.simulate.motion_blur "
     "captures.simulate.exposure captures.simulate.distortion captures.simulate.hidden_markers captures.simulate.print_scale "
     "captures.simulate.registration_error captures.simulate.tone_curve captures.simulate.sharpen "
-    "captures.simulate.jpeg": "the simulated camera, which a real one has anyway",
+    "captures.simulate.rolling_shutter captures.simulate.jpeg": "the simulated camera, which a real one has anyway",
     "captures.estimation.compare captures.estimation.min_markers captures.estimation.max_reprojection_px "
     "captures.estimation.corner_px captures.estimation.depth_sigma_m captures.estimation.trust "
     "captures.estimation.calibrate": "no time",

@@ -86,7 +86,12 @@ def corner_errors(view, camera, T, board=None):
 
     The edges are found in linear light; what a drawn square leaves is held by a test of its own. Hidden squares are left out.
     """
-    true = project(marker_corners(board or Board()).reshape(-1, 3), T, camera).reshape(-1, 4, 2) - 0.5
+    return corner_errors_at(view, camera, project(marker_corners(board or Board()).reshape(-1, 3), T, camera))
+
+
+def corner_errors_at(view, camera, places):
+    """The same, of corners [N, 2] that lie at places of their own."""
+    true = places.reshape(-1, 4, 2) - 0.5
     inside = ((true > 8) & (true < [camera.intrinsics.width - 8, camera.intrinsics.height - 8])).all(axis=(1, 2))
     true = true[inside]
     found = refine_corners(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), true, 6)

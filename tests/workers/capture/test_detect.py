@@ -6,6 +6,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from schemas.capture import CaptureCamera
 from schemas.job.captures import Board, Estimation, Simulate
@@ -13,8 +14,8 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Intrinsics
 from tests.conftest import SHARED_DATA
-from tests.workers.capture.drawn import HALF, KINECT, errors, hand_held, photograph, printed, true_corners
-from tests.workers.capture.simulated import asset_of
+from tests.workers.capture.drawn import HALF, KINECT, errors, hand_held, photograph, printed, project, true_corners
+from tests.workers.capture.simulated import asset_of, corner_errors_at, take_one
 from workers.capture.board import board_geometry, frame_in_board, marker_corners, open_dictionary
 from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.detect import detect_markers, refine_corners, unbend_corners
@@ -269,3 +270,26 @@ def test_the_axes_stand_on_the_print_in_the_picture(estimated):
     T_cam_theirs[:3, :3], T_cam_theirs[:3, 3] = cv2.Rodrigues(rotation)[0], position.ravel()
     ours = frame_in_board(REAL, "opencv") @ np.linalg.inv(T_cam_theirs)
     assert np.linalg.norm(ours[:3, 3] - T[:3, 3]) < 0.004  # they have no robust loss
+
+
+# ---------------------------------------------------------------------------------------------- rows read in turn
+
+NEAR = {"views": 1, "image_scale": 0.5, "distance_m": [0.4, 0.45]}
+
+
+@pytest.mark.parametrize("settings", [{}, {"distortion": {"k1": 0.08, "k2": -0.05}}, {"motion_blur": {}}])
+def test_each_row_is_seen_from_where_the_camera_is_when_it_is_read(settings):
+    """Corners by OpenCV from the pose of their own row, which a few steps find; from the middle row's they are off by pixels."""
+    rolling = {"readout_s": 0.05, "speed_m_s": 0.3, "turn_deg_s": 20.0}
+    view, camera, T = take_one(**NEAR, **settings, rolling_shutter=rolling)
+    (way, axis), points = SceneChance(11, 0).stream(Stream.MOTION, 0).standard_normal((2, 3)), marker_corners(Board())
+    way, axis, points = way / np.linalg.norm(way), axis / np.linalg.norm(axis), points.reshape(-1, 3)
+    true = middle = project(points, T, camera)
+    for _ in range(8):
+        time_s = 0.05 * (true[:, 1] / camera.intrinsics.height - 0.5)
+        turns = Rotation.from_rotvec(np.radians(20.0) * time_s[:, None] * axis).as_matrix()
+        poses = [T @ pose(R, 0.3 * t * way) for R, t in zip(turns, time_s, strict=True)]
+        true = np.concatenate([project(p[None], own, camera) for p, own in zip(points, poses, strict=True)])
+    errors, off = (corner_errors_at(view, camera, places)[0] for places in (true, middle))
+    assert len(errors) >= 40 and np.median(np.abs(errors)) < 0.05 and np.abs(errors.mean(axis=0)).max() < 0.03
+    assert np.abs(true - middle).max() > 2.0 and len(off) < 0.5 * len(errors)

@@ -63,6 +63,7 @@ ON = {
     "hidden_markers": ({"share": 0.5}, {"rgb", "depth", "truth/held_out/rgb", "truth/held_out/depth"}),
     "print_scale": (1.02, {"rgb", "depth", "truth/held_out/rgb", "truth/held_out/depth"}),
     "motion_blur": ({}, {"rgb"}),
+    "rolling_shutter": ({}, {"rgb"}),
     "distortion": ({"k1": 0.5}, {"rgb", "depth", "truth/mask", "camera.json"}),
     "exposure": ({"stops": [-1.0, -1.0]}, {"rgb"}),
     "tone_curve": ({}, {"rgb"}),

@@ -16,6 +16,7 @@ from schemas.job.captures import Board, Estimation
 from workers.capture.poses.joint import CameraFit, Joint, Views, fit_camera, gather, measure_corners, solve_jointly
 from workers.capture.poses.markers import (
     AMBIGUOUS,
+    MATERIAL,
     Evidence,
     Fit,
     Judged,
@@ -174,10 +175,6 @@ def scale_note(joint: Joint, board: Board, spec: Estimation) -> str:
     )
 
 
-MATERIAL = 5e-4
-"""Another camera is told of where it moves a pose by more than this share of its distance: a calibration is no better."""
-
-
 def camera_note(fitted: CameraFit, camera: CaptureCamera, poses: Array) -> str:
     """That camera.json does not fit, with what the markers say instead; empty where it hardly matters to any pose."""
     moved_by = fitted.shift_m()
@@ -205,17 +202,16 @@ def compare_cameras(found: CaptureCamera, given: CaptureCamera, chosen: NDArray[
     return ", ".join(word for n, word in enumerate(words) if chosen is None or chosen[n])
 
 
-def _less_certain(view: ViewEstimate, fitted: CameraFit, place: int) -> ViewEstimate:
-    """The view with the uncertainty of the camera in its covariance, whether it is used or not."""
+def _less_certain(view: ViewEstimate, motion: Array, covariance: Array) -> ViewEstimate:
+    """The view with a motion [6] that it may need, and the covariance [6, 6] of that, in its own, whether it is used or not."""
     if view.covariance is None:
         return view
-    by_camera = np.outer(fitted.motion[place], fitted.motion[place]) + fitted.covariance[place]
-    return dataclasses.replace(view, covariance=view.covariance + by_camera)
+    return dataclasses.replace(view, covariance=view.covariance + np.outer(motion, motion) + covariance)
 
 
 def noise_notes(joint: Joint, views: Views) -> list[str]:
     """The sigmas that the terms were weighed with."""
-    notes = [f"sigma of a corner: {views.corner_px:.3f} px"]
+    notes = [f"sigma of a corner: {views.sigma_px[0]:.3f} px"]
     if joint.board is not None:
         growth = joint.board.patches.ray_z[:, 2] ** 2
         notes.append(f"depth of the board: {_weights(joint.board, joint.board.view, growth)}")
@@ -352,10 +348,10 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
         return CaptureEstimate("joint", tuple(views), notes=("no view has markers that fit the board",))
     problem = measure_corners(_problem(starts, evidence), evidence.spec)
     joint = solve_jointly(problem, evidence.spec)
-    fitted = fit_camera(problem, joint.solution, evidence.spec.max_iterations)
+    fitted = fit_camera(problem, joint.solution, evidence.spec)
     # Poses of another camera see the object elsewhere although it rests.
     doubtful = fitted is not None and fitted.significant and camera_note(fitted, evidence.camera, joint.solution.poses)
-    groups = [] if doubtful else _groups(problem, joint, list(range(len(starts))))
+    groups = [] if doubtful or problem.rolling(joint.solution) else _groups(problem, joint, list(range(len(starts))))
     if len(groups) < 2:
         return _result(starts, problem, joint, fitted, evidence)
     elsewhere = {number for group in groups[1:] for number in group}
@@ -380,8 +376,7 @@ def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
         sigma_m = float(np.median(term.sigma_m / np.hypot(z[:, 0] ** 2, z[:, 1] ** 2)))
     # An object that moved pulls the poses after it: those by the board alone do not know of it.
     solution, seen = joint.by_board, [problem.observations[n] for n in among]
-    blocks = solution.covariance()[:-SHARED, :-SHARED].reshape(len(solution.poses), POSE, -1, POSE)
-    own = blocks[range(len(solution.poses)), :, range(len(solution.poses))]
+    own = solution.of_views()
     lever = np.array([np.linalg.norm(T[:3, 3]) ** 2 for T in solution.poses])
     unsure_m = np.sqrt(np.trace(own[:, :3, :3], axis1=1, axis2=2) + lever * np.trace(own[:, 3:, 3:], axis1=1, axis2=2))
     groups = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
@@ -395,7 +390,7 @@ def _problem(starts: list[Start], evidence: Evidence) -> Views:
         np.stack([start.covariance for start in starts]),
         np.array([start.fixed for start in starts]),
         evidence.camera,
-        evidence.corner_px,
+        np.full(4, evidence.corner_px),
     )
 
 
@@ -446,28 +441,33 @@ def _result(
     starts: list[Start], problem: Views, joint: Joint, fitted: CameraFit | None, evidence: Evidence
 ) -> CaptureEstimate:
     solution = joint.solution
-    asked = fitted if fitted is not None and (fitted.significant or evidence.spec.calibrate) else None
     misfit = fitted is not None and fitted.significant
     told = camera_note(fitted, evidence.camera, solution.poses) if fitted is not None and misfit else ""
+    rolled = None if told else problem.rolling(solution)
+    asked = rolled or (fitted if misfit or evidence.spec.calibrate else None)
     shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
     correction = shared.correction(identified(sigma, joint.prior))
-    views = {}
+    views, wider = {}, problem.corner_term().misfit(solution.poses, solution.shared)
     for place, start in enumerate(starts):
         block = slice(POSE * place, POSE * (place + 1))
         pose = Judged(
             solution.poses[place],
-            joint.covariance[block, block] * problem.widening(place, max(evidence.corner_px, evidence.spec.corner_px)),
+            joint.covariance[block, block] * wider[place],
             ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
             (evidence.observations[start.index].given_by,) if start.fixed else (),
+            by_corners=False,
         )
         view = judge(evidence.observations[start.index], pose, evidence, correction, shared.print_scale)
         if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:
             reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
             view = dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
-        views[start.index] = view if asked is None or start.fixed else _less_certain(view, asked, place)
+        if asked is not None and not start.fixed:
+            view = _less_certain(view, asked.motion[place], asked.covariance[place])
+        views[start.index] = view
     for index in set(range(len(evidence.observations))) - set(views):
         views[index] = _outside(index, evidence, shared)
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
+    told = rolled.note if rolled is not None else told
     notes = [told or scale_note(joint, evidence.board, evidence.spec), *noise_notes(joint, problem)]
     return CaptureEstimate(
         "joint",

@@ -18,7 +18,7 @@ from scipy.stats import f as variance_ratio
 from schemas.base import Array
 from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
-from workers.capture.poses.markers import FLOOR_PX, corner_sigma, focal_lengths, motion_between, moved, spread
+from workers.capture.poses.markers import focal_lengths, motion_between, moved
 from workers.capture.poses.observation import Observation, Patches
 from workers.capture.poses.terms import (
     CAMERA,
@@ -26,15 +26,20 @@ from workers.capture.poses.terms import (
     GROW_PX,
     GROWTH_M,
     GROWTH_PX,
+    LEVEL,
+    MAD,
     POSE,
     SHARED,
     BoardTerm,
     CornerTerm,
     ObjectTerm,
+    Rolling,
     Rows,
     Shared,
     corrected_camera,
+    median_of_chi_square,
     normal_equations,
+    pose_halves,
     prior_sigma,
 )
 from workers.geometry.frames import add_up
@@ -91,7 +96,6 @@ def _smoothed(normals: Array, neighbour: NDArray[np.intp], chosen: NDArray[np.bo
     return np.where(length > 0.5, total / np.maximum(length, 1e-9), normals)
 
 
-MAD = 1.4826
 FLOOR_M = 2e-4
 """No patch is taken to be better than this at 1 m: stored depth has a step of 1 mm, and its errors are not all seen."""
 FEW_VIEWS = 4
@@ -127,15 +131,10 @@ def inflation(residual: Array, by_view: Array, view: NDArray[np.int64], pose_cov
         along = directions[:, kept].T @ (J.T @ (weighted * r))
         misfit = float((along**2 / strength[kept]).sum())
         known = float(np.trace(J.T @ J @ pose_covariance[number]))
-        ratios.append((misfit - known) / (rank * _median_of_chi_square(rank)))
+        ratios.append((misfit - known) / (rank * median_of_chi_square(rank)))
     if len(ratios) < FEW_VIEWS:
         return INFLATION_OF_FEW
     return max(1.0, float(np.median(ratios))) ** 2
-
-
-def _median_of_chi_square(degrees: int) -> float:
-    """Median over mean of a chi-square distribution (Wilson and Hilferty 1931)."""
-    return (1 - 2 / (9 * degrees)) ** 3
 
 
 def row_inflation(factor: float, sigma_m: Array, *views: NDArray[np.int64]) -> Array:
@@ -169,6 +168,12 @@ class Solution:
     matrix: Array
     iterations: int
     converged: bool
+
+    def of_views(self) -> Array:
+        """[V, 6, 6]: the covariance of each pose."""
+        count = len(self.poses)
+        blocks = self.covariance()[:-SHARED, :-SHARED].reshape(count, POSE, count, POSE)
+        return blocks[range(count), :, range(count)]
 
     def covariance(self) -> Array:
         """[D, D]: the inverse of the normal equations at the solution."""
@@ -249,7 +254,7 @@ class Views:
     covariance: Array
     fixed: NDArray[np.bool_]
     camera: CaptureCamera
-    corner_px: float
+    sigma_px: Array
 
     def corner_term(self) -> CornerTerm:
         """All corners, with the camera held."""
@@ -257,12 +262,11 @@ class Views:
         view = np.repeat(np.arange(len(corners)), [len(c.board) for c in corners])
         board, rays = np.concatenate([c.board for c in corners]), np.concatenate([c.rays for c in corners])
         square = np.concatenate([c.markers for c in corners]) >= 0
-        return CornerTerm(view, board, rays, focal_lengths(self.camera), self.corner_px, square)
+        return CornerTerm(view, board, rays, focal_lengths(self.camera), self.sigma_px, square)
 
-    def widening(self, place: int, single_px: float) -> float:
-        """Factor of a view's covariance: whole markers are less noisy than corners (single_px); one marker has but its four."""
-        single = (single_px / self.corner_px) ** 2
-        return 1.0 + max(0.0, single - 1.0) / max(1, self.observations[place].markers) ** 2
+    def rolling(self, found: Solution) -> Rolling | None:
+        """What a rolling shutter does to the poses, where the corners ask for one."""
+        return self.corner_term().rolling(found.poses, found.shared, self.camera.intrinsics.height)
 
     def sure(self) -> NDArray[np.bool_]:
         """[V]: views by which the noise of depth is measured."""
@@ -270,22 +274,26 @@ class Views:
         return many if many.sum() >= 4 else np.ones(len(many), bool)
 
 
+NOISE_ROUNDS = 3
+"""How often poses and the noise of corners are found one by the other: the second round changes sigma by a few percent."""
+
+
 def measure_corners(views: Views, spec: Estimation) -> Views:
-    """The views with the poses and the sigma of a corner that are left once the growth of the printed squares is estimated.
+    """The views with the poses and the noise of corners that are left once the growth of the printed squares is estimated.
 
     Sharpening, tone curves and spread ink move all edges of a marker alike: a view by itself takes that for a shorter distance.
-    The sigma is twice that of the mean of a marker's corners: the slope of a refined edge moves its two corners against one
-    another, which makes corners noisy and poses not.
     """
-    corners, prior = views.corner_term(), np.zeros(SHARED)
+    corners, prior, poses, shared = views.corner_term(), np.zeros(SHARED), views.poses, Shared()
     prior[[GROWTH_M, GROWTH_PX]] = GROW_M, GROW_PX
-    found = minimise(Problem([corners], prior, np.zeros_like(views.fixed)), views.poses, Shared(), spec.max_iterations)
-    residuals = views.corner_px * corners.rows(found.poses, found.shared).residual.reshape(-1, 2)
-    of_markers = 2.0 * residuals[corners.square].reshape(-1, 4, 2).mean(axis=1).ravel()
-    corner_px = corner_sigma(of_markers, len(of_markers) - POSE * len(views.poses) - 2, spec)
-    covariance = views.covariance * (corner_px / views.corner_px) ** 2
-    poses = np.where(views.fixed[:, None, None], views.poses, found.poses)
-    return dataclasses.replace(views, poses=poses, covariance=covariance, corner_px=corner_px)
+    free = np.zeros_like(views.fixed)
+    for _ in range(NOISE_ROUNDS):
+        found = minimise(Problem([corners], prior, free), poses, shared, spec.max_iterations)
+        poses, shared = found.poses, found.shared
+        corners = corners.measured(poses, shared, spec)
+    halves = pose_halves(corners.rows(poses, shared), len(poses))
+    covariance = halves @ halves.transpose(0, 2, 1)
+    poses = np.where(views.fixed[:, None, None], views.poses, poses)
+    return dataclasses.replace(views, poses=poses, covariance=covariance, sigma_px=corners.sigma_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,16 +395,14 @@ def _measured_object(
     assert rows.second is not None and rows.by_second is not None
     both = np.concatenate([rows.first[chosen], rows.second[chosen]])
     by = np.concatenate([rows.by_first[chosen], rows.by_second[chosen]])
-    covariance = found.covariance()[:-SHARED, :-SHARED].reshape(len(views.poses), POSE, -1, POSE)
-    own = covariance[range(len(views.poses)), :, range(len(views.poses))]
-    factor = inflation(np.tile(rows.residual[chosen], 2), by, both, own)
+    factor = inflation(np.tile(rows.residual[chosen], 2), by, both, found.of_views())
     return dataclasses.replace(term, sigma_m=sigma_m), factor
 
 
-LEVEL = 1e-3
-"""Level of the F test by which the markers ask for another camera than camera.json's: one capture in a thousand is wronged."""
 FREE = np.array([0.1, 0.1, 0.1, 0.1, 1.0])
 """Sigma of fx, fy, cx, cy (shares of the focal length) and k1 beforehand: wide, so that only what is not seen stays put."""
+ALIKE_PX = 0.01
+"""By so much markers may be displaced alike in all views, by what is printed beside them: no camera is blamed for it."""
 
 WEAK = 1e-3
 """Of what one view tells of the camera, directions with less than this share of the strongest are left aside."""
@@ -428,7 +434,7 @@ class CameraFit:
         return self.significant and bool(np.median(self.shift_m()) > np.median(unsure_m))
 
 
-def fit_camera(views: Views, found: Solution, most: int) -> CameraFit | None:
+def fit_camera(views: Views, found: Solution, spec: Estimation) -> CameraFit | None:
     """The camera by the corners of all views, begun at their poses; None where there are fewer corners than unknowns.
 
     An F test of the robust cost with and without another camera. What corners of one view have in common (blur, a bent board)
@@ -441,10 +447,10 @@ def fit_camera(views: Views, found: Solution, most: int) -> CameraFit | None:
     pixels = np.concatenate([o.corners.pixels for o in views.observations])
     corners = dataclasses.replace(corners, seen=(pixels, views.camera))
     loose = np.zeros(len(views.poses), bool)  # a pose that was given by hand is no measure of the camera
+    most = spec.max_iterations
     free = minimise(Problem([corners], prior, loose), found.poses, found.shared, most)
     # A wrong camera makes corners look noisy: what is an outlier is known once it is right.
-    sigma_px = spread(corners.sigma_px * corners.rows(free.poses, free.shared).residual.reshape(-1, 2), FLOOR_PX)
-    corners = dataclasses.replace(corners, sigma_px=sigma_px)
+    corners = corners.measured(free.poses, free.shared, spec)
     free = minimise(Problem([corners], prior, loose), free.poses, free.shared, most)
     without = dataclasses.replace(corners, seen=None)
     held = minimise(Problem([without], held_prior, loose), found.poses, found.shared, most)
@@ -455,8 +461,9 @@ def fit_camera(views: Views, found: Solution, most: int) -> CameraFit | None:
     variance = rows.cost / degrees
     covariance = variance * free.covariance()
     shared, numbers = covariance[-len(FREE) :, -len(FREE) :], np.array(free.shared.camera)
-    ratio = (without.rows(held.poses, held.shared).cost - rows.cost) / (size * variance)
-    ratio /= max(1.0, _scatter(rows, count, variance))
+    alike = 0.25 * len(rows.residual) * (ALIKE_PX / corners.sigma_px[0]) ** 2  # two of a marker's eight are its place
+    usual = size * variance * max(1.0, _scatter(rows, count, variance)) + alike
+    ratio = (without.rows(held.poses, held.shared).cost - rows.cost) / usual
     motions = np.stack([motion_between(a, b) for a, b in zip(found.poses, free.poses, strict=True)])
     motions[views.fixed] = 0.0
     by_camera = covariance[:-SHARED, -len(FREE) :].reshape(count, POSE, size)

@@ -276,14 +276,14 @@ def measured_corner_px(poses: list[MarkerPose], spec: Estimation) -> float:
     """
     fits = [found.fit for found in poses if found.fit is not None and len(found.fit.residuals) > 3]
     residuals = np.concatenate([fit.residuals.ravel() for fit in fits]) if fits else np.zeros(0)
-    return corner_sigma(residuals, len(residuals) - 6 * len(fits), spec)
-
-
-def corner_sigma(residuals: Array, free: int, spec: Estimation) -> float:
-    """Standard deviation, pixels, by all residuals [N], of which `free` are left by what was fitted, and by the expected one."""
+    free = len(residuals) - 6 * len(fits)
     if free <= 0:
         return spec.corner_px
-    variance = (1.4826 * float(np.median(np.abs(residuals)))) ** 2 * len(residuals) / free
+    return corner_sigma((1.4826 * float(np.median(np.abs(residuals)))) ** 2 * len(residuals) / free, free, spec)
+
+
+def corner_sigma(variance: float, free: float, spec: Estimation) -> float:
+    """Standard deviation, pixels, by the variance of residuals, `free` of them left by what was fitted, and by the expected."""
     mixed = (free * variance + PRIOR_RESIDUALS * spec.corner_px**2) / (free + PRIOR_RESIDUALS)
     return max(FLOOR_PX, float(np.sqrt(mixed)))
 
@@ -408,6 +408,8 @@ class Evidence(Setup):
         return Evidence(setup.camera, setup.board, setup.spec, tuple(observations), tuple(markers), corner_px)
 
 
+MATERIAL = 5e-4
+"""What moves a pose by more than this share of its distance is told: a calibration is no better."""
 MAX_SIGMA_M = 0.005
 MAX_SIGMA_RAD = math.radians(1.0)
 """A pose that is less certain than this spoils a cloud; its view is flagged."""

@@ -9,6 +9,7 @@ a surface and what is behind it. Kurillo et al. 2022 (Sensors 22(7):2469) see th
 far inside those bounds; what scenes have (schemas/job/views.py) is the upper bound.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import CaptureError
-from schemas.job.captures import Board, HiddenMarkers, KinectDepthNoise, MotionBlur, Simulate
+from schemas.job.captures import Board, HiddenMarkers, KinectDepthNoise, MotionBlur, RollingShutter, Simulate
 from schemas.job.views import DepthNoise, Distortion
 from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Intrinsics
@@ -84,16 +85,36 @@ class Motion:
 AT_REST = Motion(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
 
-def draw_motion(blur: MotionBlur, rng: np.random.Generator) -> Motion:
-    """A motion with the speeds of `blur`, in a uniform direction and about a uniform axis."""
+def draw_motion(moving: MotionBlur | RollingShutter, rng: np.random.Generator) -> Motion:
+    """A motion with the speeds of `moving` in its exposure or readout, in a uniform direction and about a uniform axis."""
     direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    turn_rad = math.radians(blur.turn_deg_s) * blur.exposure_s
-    return Motion(blur.speed_m_s * blur.exposure_s * direction, axis, turn_rad)
+    time_s = moving.exposure_s if isinstance(moving, MotionBlur) else moving.readout_s
+    return Motion(moving.speed_m_s * time_s * direction, axis, math.radians(moving.turn_deg_s) * time_s)
 
 
 def pose_at(T_world_cam: Pose, motion: Motion, moment: float) -> Pose:
     """[4, 4]: the camera's pose at a moment, -0.5 to 0.5, of the exposure; T_world_cam is that of its middle."""
     return T_world_cam @ pose(rotation_about(motion.axis, moment * motion.turn_rad), moment * motion.way)
+
+
+BANDS = 16
+"""Bands of rows that are drawn from one pose each, where the camera moves while its rows are read."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows [first, stop) and the moment of their middle, in [-0.5, 0.5] of the readout."""
+
+    first: int
+    stop: int
+    moment: float
+
+
+def bands_of(height: int, number: int, samples: int) -> tuple[Band, ...]:
+    """The bands of one of so many samples: each has other bounds, so that the mean moment of a row is right to 1/18 of a band."""
+    bounds = (np.arange(BANDS + 2) - (number + 0.5) / samples) / BANDS
+    rows = np.unique(np.clip(np.rint(height * bounds), 0, height).astype(int)).tolist()
+    return tuple(Band(a, b, (a + b) / (2 * height) - 0.5) for a, b in itertools.pairwise(rows))
 
 
 def develop(light: Array, simulate: Simulate) -> NDArray[np.uint8]:

@@ -28,9 +28,11 @@ from workers.capture.simulate.camera import (
     AT_REST,
     CENTRE,
     STEP_M,
+    Band,
     Sample,
     add_bent_light,
     add_light,
+    bands_of,
     cover_markers,
     develop,
     draw_motion,
@@ -307,28 +309,41 @@ def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[Captured
 
 
 def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
-    """[H, W, 3]: linear light of one exposure, whose middle is at the pose T_world_cam."""
-    k, blur, motion = studio.rig.color, studio.simulate.motion_blur, AT_REST
-    if blur is not None:
-        motion = draw_motion(blur, studio.chance.stream(Stream.MOTION, number))
+    """[H, W, 3]: linear light of one exposure; T_world_cam is the pose at its middle, and of its middle row."""
+    k, simulate = studio.rig.color, studio.simulate
+    blur, rolling = (
+        AT_REST if moving is None else draw_motion(moving, studio.chance.stream(Stream.MOTION, number))
+        for moving in (simulate.motion_blur, simulate.rolling_shutter)
+    )
     samples, render = plan_pictures(studio)
     total, light_of = np.zeros((k.height, k.width, 3)), SRGB_STEPS / len(samples)
     rng = studio.chance.stream(Stream.PATHS, number)
-    for sample in samples:
-        drawn_at, k = point_drawn(sample, studio), studio.drawn_color
-        # The camera whose pixel centres lie at the sample's point of each pixel.
-        k = k.model_copy(update={"cx": k.cx - drawn_at.right_px, "cy": k.cy - drawn_at.down_px})
-        camera = Camera(k, pose_at(T_world_cam, motion, sample.moment))
-        drawn = draw_view(
-            shared_renderer(), studio.things, studio.appearance, camera, render, lambda: rng, studio.effects
-        )
-        assert drawn.rgb is not None
-        if studio.lookup is None:
-            add_light(total, drawn.rgb, light_of)
-        else:
-            offsets = (sample.right_px, sample.down_px, drawn_at.right_px, drawn_at.down_px)
-            add_bent_light(total, drawn.rgb, light_of, studio.lookup, offsets)
+    for place, sample in enumerate(samples):
+        whole, drawn_at = (Band(0, k.height, 0.0),), point_drawn(sample, studio)
+        for band in whole if rolling is AT_REST else bands_of(k.height, place, len(samples)):
+            T = pose_at(pose_at(T_world_cam, rolling, band.moment), blur, sample.moment)
+            rgb, rows = draw_picture(studio, drawn_at, band, T, render, rng), slice(band.first, band.stop)
+            if studio.lookup is None:
+                add_light(total[rows], rgb, light_of)
+            else:
+                (u, v), offsets = studio.lookup, (sample.right_px, sample.down_px, drawn_at.right_px, drawn_at.down_px)
+                add_bent_light(total[rows], rgb, light_of, (u[rows], v[rows]), offsets)
     return total
+
+
+def draw_picture(
+    studio: Studio, drawn_at: Sample, band: Band, T_world_cam: Pose, render: Render, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """[h, w, 3]: a pinhole's rows of the band alone, or all of the wider picture that a lens bends."""
+    k = studio.drawn_color
+    # The camera whose pixel centres lie at the sample's point of each pixel.
+    update = {"cx": k.cx - drawn_at.right_px, "cy": k.cy - drawn_at.down_px}
+    if studio.lookup is None:
+        update |= {"cy": update["cy"] - band.first, "height": band.stop - band.first}
+    camera = Camera(k.model_copy(update=update), T_world_cam)
+    drawn = draw_view(shared_renderer(), studio.things, studio.appearance, camera, render, lambda: rng, studio.effects)
+    assert drawn.rgb is not None
+    return drawn.rgb
 
 
 def mark_object(studio: Studio, T_world_cam: Pose) -> NDArray[np.bool_]:
@@ -351,7 +366,7 @@ def plan_pictures(studio: Studio) -> tuple[tuple[Sample, ...], Render]:
     render = Render(tier=studio.simulate.tier)
     if render.tier != "pathtraced":
         return make_samples(), render
-    if studio.simulate.motion_blur is None:
+    if studio.simulate.motion_blur is None and studio.simulate.rolling_shutter is None:
         return (CENTRE,), render
     return make_samples(), render.model_copy(update={"path_samples": TRACED_SAMPLES_MOVING})
 
