@@ -135,7 +135,7 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
 
 STUDY_COMMANDS: Final[dict[str, Command]] = {
     "bench": command(
-        "time by stage on one core, beside a straightforward script and a lower bound",
+        "time by stage, beside a straightforward script and a lower bound; or poses (`captures`)",
         "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
         path(
             "job",
