@@ -23,6 +23,9 @@ from workers.store.file_system import file_system_of
 PACKAGES = {"flip_evaluator": "flip-evaluator", "isal": "isal", "matplotlib": "matplotlib"}
 """Names on the index by the names that are imported."""
 
+SCENES = 80
+"""Scenes that each side makes unless told."""
+
 
 def require_extra(command: str) -> None:
     """Raises MachineError, with the remedy, where a package of the extra is not installed."""
@@ -35,13 +38,12 @@ def require_extra(command: str) -> None:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Measure what the options ask for and print it; returns 0. Raises VersoError where a side cannot run."""
+    """Measure what the options ask for and print it; 1 where captures miss their bar. Raises VersoError if a side cannot run."""
     require_extra("bench")
+    if options.job == Path("captures"):
+        return _compare_captures(options)
     if options.job is None:
-        tree: dict[str, Any] = {"name": "bench"}
-        for change in options.changes:
-            change_key(tree, change)
-        job, job_folder = validate_job(tree, "the default job"), Path()
+        job, job_folder = _own_job({"name": "bench"}, options.changes), Path()
     else:
         job, job_folder = load_job(options.job, options.changes), options.job.parent
     if options.effects is not None:
@@ -60,8 +62,23 @@ def main(options: argparse.Namespace) -> int:
         return _print(options, job, _measure_all(options, job, job_folder, folder), describe)
 
 
+def _own_job(tree: dict[str, Any], changes: Sequence[str]) -> Job:
+    for change in changes:
+        change_key(tree, change)
+    return validate_job(tree, "the default job")
+
+
+def _compare_captures(options: argparse.Namespace) -> int:
+    from services.bench import captures  # loads what processes them
+
+    job = _own_job(captures.job_tree(), options.changes)
+    with bench_folder(options.folder) as folder:
+        found = captures.measure_captures(job, folder, options.scenes or captures.COUNT)
+        return _print(options, job, found, captures.describe)
+
+
 def _measure_all(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> dict[str, Any]:
-    rounds = summarise(measure(job, job_folder, folder, options.scenes))
+    rounds = summarise(measure(job, job_folder, folder, options.scenes or SCENES))
     memory = options.memory and measure_memory(job, job_folder, folder / "memory", options.memory)
     scaling = None
     if options.workers is not None:
@@ -74,12 +91,12 @@ def _measure_all(options: argparse.Namespace, job: Job, job_folder: Path, folder
 def _print(
     options: argparse.Namespace, job: Job, found: dict[str, Any], describe: Callable[[dict[str, Any]], list[str]]
 ) -> int:
-    """The figures as text and, where asked for, as one line of JSON; returns 0."""
+    """The figures as text and, where asked for, as one line of JSON; returns 0, or 1 where they are not `ok`."""
     figures = {"ok": True, "command": shlex.join(["verso", *sys.argv[1:]]), "job": job.name, **found}
     print("\n".join(describe(figures)), flush=True)
     if options.json:
         print(json.dumps(figures))
-    return 0
+    return 0 if figures["ok"] else 1
 
 
 def refuse_unmatched(job: Job) -> None:

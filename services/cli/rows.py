@@ -135,10 +135,15 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
 
 STUDY_COMMANDS: Final[dict[str, Command]] = {
     "bench": command(
-        "time by stage on one core, beside a straightforward script and a lower bound",
+        "time by stage, beside a straightforward script and a lower bound; or poses (`captures`)",
         "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
-        path("job", "JOB.yaml", "default: a job of built-in shapes", nargs="?"),
-        number("--scenes", "how many scenes each side makes", 80),
+        path(
+            "job",
+            "JOB.yaml",
+            "default: a job of built-in shapes; `captures`: poses of simulated captures beside those of OpenCV",
+            nargs="?",
+        ),
+        number("--scenes", "how many scenes each side makes (default: 80), or captures (12)"),
         path("--folder", "DIR", "on the disk to measure (default: data)", default=Path("data")),
         number("--memory", "also watch one worker's memory over N scenes"),
         number("--workers", "also compare N workers with one, beside N plain processes"),

@@ -28,9 +28,9 @@ MARGIN = 0.12
 MAX_HALF_PX = 4.0
 MIN_HALF_PX = 1.5
 """Limits of half a profile's length."""
-BLURS, SHARP_HALF_PX = 5.0, 1.8
-"""And it is at most so many times the blur of the image's edges, of which sharpening leaves none. What lies beyond an edge -
-sharpening's halo, noise, the next edge - moves the centroid, the more so the longer the profile."""
+WINDOW = np.cos(0.5 * np.pi * np.linspace(-1, 1, 2 * STEPS - 1)[1::2]) ** 2
+"""Weight of the gradient between two places of a profile, once the edge is in its middle. Light that changes beside one edge, as
+where a cube stands on a table, moves the centroid by its distance: it moved edges by up to 0.2 px."""
 ROUNDS = 3
 MAX_SHIFT = 1.0
 """A corner that moves by more than this many halves of a profile is kept as it was: the edge is not what it seemed."""
@@ -51,16 +51,15 @@ def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: float) -> A
     sides = np.linalg.norm(np.roll(refined, -1, axis=1) - refined, axis=2).min(axis=1)
     half_px = np.clip(0.5 * sides / bits, MIN_HALF_PX, MAX_HALF_PX)
     for turn in range(ROUNDS):
-        lines, blur_px = _edge_lines(light, refined, half_px, only_rising=turn == 0)
-        half_px = np.minimum(half_px, max(SHARP_HALF_PX, BLURS * blur_px))
+        lines = _edge_lines(light, refined, half_px, only_rising=turn == 0)
         met = _intersections(lines)
         near = np.linalg.norm(met - refined, axis=2) <= MAX_SHIFT * half_px[:, None]
         refined = np.where(near[..., None] & np.isfinite(met), met, refined)
     return refined
 
 
-def _edge_lines(light: NDArray[np.float32], corners: Array, half_px: Array, only_rising: bool) -> tuple[Array, float]:
-    """([M, 4, 3]: line a x + b y = c with unit (a, b), from each corner to the next; blur of the usual edge, pixels)."""
+def _edge_lines(light: NDArray[np.float32], corners: Array, half_px: Array, only_rising: bool) -> Array:
+    """[M, 4, 3]: line a x + b y = c with unit (a, b), from each corner to the next."""
     along = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(along, axis=2, keepdims=True)
     along = along / length
@@ -74,29 +73,25 @@ def _edge_lines(light: NDArray[np.float32], corners: Array, half_px: Array, only
     bright = profile.reshape(points.shape[:-1]).astype(np.float64)
     gradient = np.diff(bright, axis=3)
     between = 0.5 * (steps[:, 1:] + steps[:, :-1])[:, None, None]
-    blur_px = _blur(gradient, between)
     if (
         only_rising
-    ):  # what lies beyond the white of the gap must not count; noise, brighter outside, then moves the centroid
-        gradient = np.maximum(gradient, 0.0)
-    weight = np.maximum(gradient.sum(axis=3), 0.0)
-    offset = np.clip((gradient * between).sum(axis=3) / np.maximum(weight, 1e-9), -1e3, 1e3)
+    ):  # what lies beyond the white of the gap must not count; noise, brighter outside, moves the centroid then
+        weight, offset = _centroid(np.maximum(gradient, 0.0), between)
+    else:  # a halo moves all edges alike, and what it does to whole profiles is kept
+        weight, offset = _centroid(gradient * WINDOW, between)
+        offset = offset + np.median(_centroid(gradient, between)[1] - offset)
     weight = np.where(weight > 0.5 * np.median(weight, axis=2, keepdims=True), weight, 0.0)
     shift, slope = _robust_lines(place - 0.5 * length, offset, weight, half_px)
     normal = across - slope[..., None] * along
     normal /= np.linalg.norm(normal, axis=2, keepdims=True)
     middle = corners + 0.5 * length * along + shift[..., None] * across
-    return np.concatenate([normal, (normal * middle).sum(axis=2, keepdims=True)], axis=2), blur_px
+    return np.concatenate([normal, (normal * middle).sum(axis=2, keepdims=True)], axis=2)
 
 
-def _blur(gradient: Array, place: Array) -> float:
-    """Standard deviation, pixels, of the gradient across the median edge: gradient [M, 4, S, P] at place [M, 1, 1, P].
-
-    With its sign, so that noise adds nothing on average.
-    """
-    mass, first, second = ((gradient * place**power).sum(axis=(2, 3)) for power in range(3))
-    variance = second / np.maximum(mass, 1e-9) - (first / np.maximum(mass, 1e-9)) ** 2
-    return float(np.sqrt(max(0.0, np.median(variance))))
+def _centroid(gradient: Array, place: Array) -> tuple[Array, Array]:
+    """(sum of a gradient [..., P], at least 0, and its centroid among places [..., P])."""
+    total = np.maximum(gradient.sum(axis=-1), 0.0)
+    return total, np.clip((gradient * place).sum(axis=-1) / np.maximum(total, 1e-9), -1e3, 1e3)
 
 
 def _robust_lines(place: Array, offset: Array, weight: Array, half_px: Array) -> tuple[Array, Array]:

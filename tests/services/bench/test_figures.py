@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 from ray._common.utils import get_ray_address_file
 
+from schemas.capture import CaptureCamera, CapturedView
 from schemas.dataset.commit import Span
 from schemas.errors import MachineError, RunError
-from services.bench import command, effects, scaling
+from schemas.job.captures import Board
+from schemas.scene.shape import Mesh
+from services.bench import captures, command, effects, marker_script, scaling
 from services.bench.command import PACKAGES, require_extra
 from services.bench.effects import EVERYTHING, FORCED, PLAN, WHOLE, time_settling
 from services.bench.figures import (
@@ -47,6 +50,8 @@ from tests.effects.physics_scenes import facts_with
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.drops import drop, level
 from tests.services.run.test_coordinator import spans
+from tests.workers.capture.drawn import KINECT, errors, hand_held, photograph
+from workers.capture.folder import CaptureFile, write_description, write_view
 from workers.physics.effects import PREDICATES
 from workers.scene.effects import names_of_kind
 
@@ -280,3 +285,75 @@ def test_without_the_extra_both_commands_end_with_one_message_before_anything_is
         told = capsys.readouterr()
         assert told.err.count("\n") == 1 and "./verso extra study" in told.err
         assert json.loads(told.out)["kind"] == "MachineError" and list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------------------------------------- captures
+
+
+def test_the_script_finds_the_poses_of_drawn_photographs_in_the_frame_of_the_board(tmp_path):
+    rng = np.random.default_rng(7)
+    board = Board(columns=5, rows=4, first_id=3, width_m=0.5, ruler_m=0.1, measured_ruler_m=0.1)
+    true = hand_held(rng, 2)
+    for number, T in enumerate(true):
+        write_view(tmp_path, CapturedView(number, photograph(board, T, KINECT, rng), None, None))
+    write_description(tmp_path, CaptureFile(name="drawn"), CaptureCamera(KINECT, np.zeros(8)), board)
+    for refinement, most_mm in (("default", 3.0), ("SUBPIX", 2.0)):
+        poses = marker_script.estimate_poses(marker_script.read_photographs(tmp_path), refinement)
+        assert max(errors(poses[number], T)[0] for number, T in enumerate(true)) < most_mm
+        assert max(errors(poses[number], T)[1] for number, T in enumerate(true)) < 0.2
+    scaled = board.model_copy(update={"measured_ruler_m": 0.101})  # a print 1 % larger is as much farther away
+    write_description(tmp_path, CaptureFile(name="drawn"), CaptureCamera(KINECT, np.zeros(8)), scaled)
+    larger = marker_script.estimate_poses(marker_script.read_photographs(tmp_path), "SUBPIX")
+    assert np.allclose(larger[0][:3, 3], 1.01 * poses[0][:3, 3], atol=1e-6)
+
+
+def side_of(pose_mm, pose_deg=0.01, missing=0):
+    return {"pose_mm": pose_mm, "pose_deg": pose_deg, "missing": missing, "cloud": None, "seconds": 1.0}
+
+
+def test_the_stronger_script_is_the_rival_and_captures_miss_their_bar_by_the_median_or_by_one_that_is_worse():
+    def rows(*ours):
+        weak, strong = side_of(9.0), side_of(1.0, 0.02)
+        return [{"object": "mug", "ours": one, "default": weak, "SUBPIX": strong} for one in ours]
+
+    good = captures.summarise(rows(side_of(0.1), side_of(0.2), side_of(0.9)))
+    assert (good["rival"], good["ratio"], good["ratio_deg"], good["ok"]) == ("SUBPIX", 5.0, 2.0, True)
+    assert not captures.summarise(rows(side_of(0.1), side_of(0.21), side_of(0.9)))["ok"]
+    for worse in (side_of(1.1), side_of(0.1, 0.03)):
+        told = captures.summarise(rows(side_of(0.1), side_of(0.1), worse))
+        assert not told["ok"] and told["worse"] == [2]
+    figures = {
+        **told,
+        "machine": {"cpu": "x", "load_1min": 0.0},
+        "command": "verso",
+        "off": ["print_scale"],
+        "views": 3,
+    }
+    text = "\n".join(captures.describe(figures))
+    assert "below 1: mug" in text and "open3d" in text and "all effects but print_scale" in text
+
+
+def test_a_view_without_a_pose_counts_as_lost_and_points_by_their_distance_to_the_surface():
+    square = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    shifted = np.eye(4)
+    shifted[0, 3] = 0.002
+    true = {n: np.eye(4) for n in range(3)}
+    points = np.array([[0.3, 0.2, 0.001], [0.6, 0.7, -0.003], [0.5, 0.5, 0.002]])
+    found = captures.errors_of({0: shifted, 2: np.eye(4)}, points, 1.0, true, square)
+    assert found["pose_mm"] == pytest.approx(2.0) and found["missing"] == 1
+    assert found["cloud"]["median_mm"] == pytest.approx(2.0) and found["cloud"]["points"] == 3
+    lost = captures.errors_of({0: shifted}, None, 1.0, true, square)
+    assert lost["pose_mm"] == captures.NO_POSE_MM and lost["cloud"] is None
+
+
+@pytest.mark.minute
+def test_captures_are_compared_by_a_command_whose_code_says_whether_they_keep_their_bar(tmp_path, capsys):
+    small = ["captures.simulate.views=4", "captures.simulate.image_scale=0.4", "categories=[can]"]
+    words = [word for change in small for word in ("--set", change)]
+    code = main(["bench", "captures", "--scenes", "1", "--folder", str(tmp_path), "--json", *words])
+    *text, last = capsys.readouterr().out.splitlines()
+    told = json.loads(last)
+    (row,) = told["captures"]
+    assert code == (0 if told["ok"] else 1) and told["views"] == 4 and told["off"] == list(captures.WRONG_ON_PURPOSE)
+    assert 0 < row["ours"]["pose_mm"] < 10 and row["ratio"] == row["rival"]["pose_mm"] / row["ours"]["pose_mm"]
+    assert any(line.startswith("median ratio") for line in text) and not list(tmp_path.iterdir())
