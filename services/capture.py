@@ -49,7 +49,7 @@ def capture_settings(changes: Sequence[str] = (), keys: Mapping[str, Any] | None
 def board(options: argparse.Namespace) -> int:
     """Writes options.file (.pdf, .png, or .json alone), and a board.json beside it. Returns 0.
 
-    Reads `board`, `other`, `kind` with `size`, `marker`, `pitch` and `dictionary`, `tiles`, `dpi` and `json`.
+    Reads `board`, `other`, `solve`, `kind` with `size`, `marker`, `pitch` and `dictionary`, `tiles`, `dpi` and `json`.
     """
     from workers.capture.sheets import board_pdf, board_png, tiled_pdf
 
@@ -82,12 +82,14 @@ def board(options: argparse.Namespace) -> int:
 
 
 def _chosen_board(options: argparse.Namespace) -> Board:
-    """The board of the file --board, of another program's file --from, or of --kind. Raises InputError."""
+    """The board of the file --board, of another program's file --from, of photographs, or of --kind. Raises InputError."""
     sizes = {"size": options.size, "marker": options.marker, "pitch": options.pitch}
-    given = [name for name in ("board", "other", "kind") if getattr(options, name)]
-    names = {"board": "--board", "other": "--from", "kind": "--kind"}
+    names = {"board": "--board", "other": "--from", "solve": "--solve", "kind": "--kind"}
+    given = [name for name in names if getattr(options, name)]
     if len(given) > 1:
         raise InputError(f"{names[given[0]]} and {names[given[1]]} are two boards: give one of them")
+    if options.solve:
+        return _solved_board(options)
     if not options.kind:
         if stray := next((name for name, value in {**sizes, "dictionary": options.dictionary}.items() if value), None):
             raise InputError(f"--{stray} is of a board that --kind names: add --kind grid, charuco or aprilgrid")
@@ -105,6 +107,19 @@ def _chosen_board(options: argparse.Namespace) -> Board:
     columns, rows = options.size
     sizes_m = (options.marker, options.pitch)
     return KINDS[options.kind](BoardSizes(columns, rows, *sizes_m, options.dictionary or usual))
+
+
+def _solved_board(options: argparse.Namespace) -> Board:
+    """The places of tags in photographs. Raises InputError, CaptureError."""
+    from workers.capture.folder import open_folder
+    from workers.capture.poses.solve_board import describe, solve_board
+
+    if not options.marker or options.size or options.pitch:
+        raise InputError("--solve needs --marker, the side of every tag in metres, and no --size or --pitch")
+    dictionary = options.dictionary or Board().dictionary
+    found = solve_board(open_folder(options.solve, Board()), options.marker, dictionary)
+    print("\n".join(describe(found)))
+    return found.board
 
 
 def _describe_board(path: Path, spec: Board, data: bytes | None) -> tuple[Path, bool]:

@@ -36,6 +36,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         path(
             "--from", "FILE", "board of another program: Kalibr, apriltag_ros, ArUco's marker map, OpenCV", dest="other"
         ),
+        path("--solve", "DIR", "photographs, with camera.json, of tags that nobody measured: needs --marker"),
         choice("--kind", ("grid", "charuco", "charuco_old", "aprilgrid"), "what is made of the next four options"),
         option("--size", "8x6", "markers, of a charuco squares, across and up", read.read_size),
         option("--marker", "M", "side of a marker, metres", read.read_length),

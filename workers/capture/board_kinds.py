@@ -142,6 +142,11 @@ def _layout(
     )
 
 
+def board_of_markers(dictionary: str, ids: list[int], corners: Array, border_bits: int = 1) -> Board:
+    """The board of tags with these corners [N, 4, 3], board frame, metres."""
+    return _layout(dictionary, ids, corners, border_bits=border_bits)
+
+
 def _rounded(points: Array) -> list[Any]:
     """To a tenth of a micrometre, so that a file is readable; OpenCV's places are in single precision."""
     return (np.round(points, 7) + 0.0).tolist()  # no -0

@@ -137,8 +137,11 @@ class CaptureFolder:
         return next((name for name in names if name.exists()), None)
 
 
-def open_folder(path: Path) -> CaptureFolder:
-    """Reads what describes a capture; images are read one view at a time. Raises CaptureError that names file and remedy."""
+def open_folder(path: Path, board: Board | None = None) -> CaptureFolder:
+    """Reads what describes a capture; images are read one view at a time. Raises CaptureError that names file and remedy.
+
+    With a `board` there need be no board.json.
+    """
     if not path.is_dir():
         raise CaptureError("missing", f"{path} is no folder")
     numbers = _view_numbers(path)
@@ -148,7 +151,9 @@ def open_folder(path: Path) -> CaptureFolder:
         if (path / CAPTURE_FILE).exists()
         else CaptureFile(name=derive_name(path.resolve().name))
     )
-    return CaptureFolder(path, about, camera_of(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers), spec)
+    return CaptureFolder(
+        path, about, camera_of(spec), board or _read_json(path / BOARD_FILE, Board), tuple(numbers), spec
+    )
 
 
 def derive_name(words: str) -> str:

@@ -1,24 +1,28 @@
 """Markers and their corners in drawn pictures, and in the photograph of OpenCV's ArUco tutorial."""
 
 import itertools
+import re
 import time
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
-from schemas.capture import CaptureCamera
+from schemas.capture import CaptureCamera, CapturedView
 from schemas.job.captures import Board, Estimation, Simulate
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Intrinsics
+from services.cli.main import main
 from tests.conftest import SHARED_DATA
 from tests.workers.capture.drawn import HALF, KINECT, errors, hand_held, photograph, printed, project, true_corners
 from tests.workers.capture.simulated import asset_of, corner_errors_at, take_one
 from workers.capture.board import board_geometry, frame_in_board, marker_corners, open_dictionary
 from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.detect import detect_markers, refine_corners, unbend_corners
+from workers.capture.folder import CaptureFile, read_board, write_description, write_view
 from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
@@ -184,6 +188,42 @@ def test_poses_from_any_board_are_a_tenth_of_a_millimetre_off(kind, record_figur
         record_figure(f"{kind}: camera {what}, median of 6 views", unit, median[n], bounds[0])
         record_figure(f"{kind}: camera {what}, the worst of 6 views", unit, worst[n], bounds[1])
         assert median[n] <= bounds[0] and worst[n] <= bounds[1], what
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize("seed", [11, 14])
+def test_places_of_tags_that_nobody_measured_are_found_from_photographs(seed, tmp_path, capsys):
+    """Beside the places that the simulator drew them at, moved and turned as a whole; and each refusal names its remedy."""
+    board, simulate, chance, thing = scattered(), Simulate(views=8, rgb_noise={}), SceneChance(seed, 0), asset_of()
+    placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
+    studio = build_studio(simulate, board, placed, plan_capture(simulate), chance)
+    camera = CaptureCamera(studio.rig.color, np.zeros(8))
+    write_description(tmp_path, CaptureFile(name="x"), camera, board)
+    true_file = tmp_path / "board.json"
+    true_file.rename(tmp_path / "true.json")
+    for number, T in enumerate(plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))):
+        rgb = encode_codes(take_light(studio, number, studio.T_world_board @ T))
+        write_view(tmp_path, CapturedView(number, rgb, None, None))
+    words = ["capture", "board", str(true_file), "--solve", str(tmp_path)]
+    assert main(words) == 2 and "needs --marker" in capsys.readouterr().err
+    assert main([*words, "--marker", "0.05", "--dictionary", "DICT_6X6_50"]) == 1
+    assert "name the --dictionary of its tags" in capsys.readouterr().err
+    assert main([*words, "--marker", "0.05"]) == 0
+    told = re.search(r"12 markers in 8 photographs.*known to ([0-9.]+) mm", capsys.readouterr().out)
+    assert told and 0.02 < float(told[1]) < 0.3
+    solved = read_board(true_file)
+    assert [m.id for m in solved.markers] == sorted(m.id for m in board.markers)
+    true = {marker.id: marker.corners for marker in board.markers}
+    ours, theirs = (
+        np.array(quads).reshape(-1, 3) for quads in zip(*((m.corners, true[m.id]) for m in solved.markers), strict=True)
+    )
+    T, _, _ = trimesh.registration.procrustes(ours, theirs, reflection=False, scale=False)
+    assert np.linalg.norm(trimesh.transform_points(ours, T) - theirs, axis=1).max() < 0.00015
+    assert abs(T[2, 2]) > 0.99999 and T[2, 2] > 0 and abs(T[2, 3]) < 0.0003  # z out of the print, 0 on it
+    for number in range(2, 8):
+        (tmp_path / f"rgb_{number:05d}.png").unlink()
+    true_file.unlink()
+    assert main([*words, "--marker", "0.05"]) == 1 and "2 photographs show several tags" in capsys.readouterr().err
 
 
 def test_corners_of_edges_that_a_lens_bends_are_where_the_lens_draws_them():

@@ -448,11 +448,12 @@ def _result(
     shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
     correction = shared.correction(identified(sigma, joint.prior))
     views, wider = {}, problem.corner_term().misfit(solution.poses, solution.shared)
+    single_px = max(evidence.corner_px, evidence.spec.corner_px)
     for place, start in enumerate(starts):
         block = slice(POSE * place, POSE * (place + 1))
         pose = Judged(
             solution.poses[place],
-            joint.covariance[block, block] * wider[place],
+            joint.covariance[block, block] * max(wider[place], problem.widening(place, single_px)),
             ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
             (evidence.observations[start.index].given_by,) if start.fixed else (),
             by_corners=False,

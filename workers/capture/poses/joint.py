@@ -268,6 +268,11 @@ class Views:
         """What a rolling shutter does to the poses, where the corners ask for one."""
         return self.corner_term().rolling(found.poses, found.shared, self.camera.intrinsics.height)
 
+    def widening(self, place: int, single_px: float) -> float:
+        """Factor of a view's covariance: whole markers are less noisy than corners (single_px); one marker has but its four."""
+        single = (single_px / self.sigma_px[0]) ** 2
+        return float(1.0 + max(0.0, single - 1.0) / max(1, self.observations[place].markers) ** 2)
+
     def sure(self) -> NDArray[np.bool_]:
         """[V]: views by which the noise of depth is measured."""
         many = np.array([o.markers >= SURE_MARKERS for o in self.observations])
