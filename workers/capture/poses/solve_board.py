@@ -4,6 +4,7 @@ Where a tag stands beside another is first found from the views that show both: 
 almost alike (IPPE, Collins and Bartoli 2014), and of the pairs of them one alone is the same in every view.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.errors import CaptureError
@@ -20,6 +22,8 @@ from workers.capture.board import id_words, open_dictionary
 from workers.capture.board_kinds import board_of_markers
 from workers.capture.detect import find_markers, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
+from workers.capture.poses.markers import cross_matrix
+from workers.capture.poses.terms import outward_motion
 from workers.geometry.frames import invert, pose, transform
 from workers.geometry.lens import rays_of_pixels
 
@@ -126,10 +130,7 @@ def _join(seen: Seen, square: Array) -> tuple[dict[int, Pose], dict[int, Pose]]:
         for a, b in combinations(sorted(both), 2):
             pairs.setdefault((a, b), []).append([invert(Ta) @ Tb for Ta in both[a] for Tb in both[b]])
     joined = {pair: _most_alike(found, square) for pair, found in pairs.items()}
-    counts: dict[int, int] = {}
-    for tags in seen.values():
-        for n in tags:
-            counts[n] = counts.get(n, 0) + 1
+    counts = Counter(n for tags in seen.values() for n in tags)
     if not counts:
         return {}, {}
     places = {max(sorted(counts), key=lambda n: counts[n]): np.eye(4)}
@@ -183,8 +184,7 @@ def _adjust(
     at_view = np.array([list(views).index(view) for view, _ in pairs])
     at_tag = np.array([list(tags).index(n) for _, n in pairs])
     rays = np.array([seen[view][n] for view, n in pairs])
-    outward = rays - rays.mean(axis=1, keepdims=True)
-    outward /= np.linalg.norm(np.roll(rays, -1, axis=1) - rays, axis=2).mean(axis=1)[:, None, None]
+    outward = outward_motion(rays.reshape(-1, 2)).reshape(rays.shape)
     begun = np.array([*views.values(), *(tags[n] for n in free)])
 
     def at(x: Array) -> tuple[Array, Array]:
@@ -206,7 +206,7 @@ def _adjust(
     sigma = []
     for k in range(len(free)):
         block = slice(6 * (len(views) + k), 6 * (len(views) + k) + 6)
-        lever = np.array([np.hstack([-_cross(c), np.eye(3)]) for c in square])  # turn, then shift, in the tag's frame
+        lever = np.concatenate([-cross_matrix(square), np.tile(np.eye(3), (4, 1, 1))], axis=2)  # in the tag's frame
         sigma.append(np.sqrt(np.einsum("cij,jk,cik->c", lever, covariance[block, block], lever)))
     return dict(zip(tags, places, strict=True)), spread, np.array(sigma)
 
@@ -214,13 +214,8 @@ def _adjust(
 def _motions(x: Array) -> Array:
     """[N, 4, 4] small motions: turn, radians, and shift, metres [N, 6]."""
     moved = np.tile(np.eye(4), (len(x), 1, 1))
-    for one, T in zip(x, moved, strict=True):
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(one[:3])[0], one[3:]
+    moved[:, :3, :3], moved[:, :3, 3] = Rotation.from_rotvec(x[:, :3]).as_matrix(), x[:, 3:]
     return moved
-
-
-def _cross(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _in_plane(corners: Array, first: int, views: Mapping[int, Pose]) -> Array:
