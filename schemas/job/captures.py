@@ -308,7 +308,7 @@ class Fusion(Frozen):
 
     voxel_m: Annotated[float, Field(ge=0.0005, le=0.02)] = 0.002
     """Distance of the points of the cloud."""
-    max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 75.0
+    max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 84.0
     """Pixels beyond this angle of incidence are left out."""
     board_clearance_m: NonNegative = 0.003
     """What is nearer to the board's plane than this is the board's, but for floors; more where depth is uneven."""

@@ -155,7 +155,9 @@ def test_the_markers_tell_a_focal_length_that_is_wrong_and_replace_it_on_request
     said = [float(number) for number in re.findall(r"f[xy] = ([0-9.]+) ", found.notes[0])]
     assert said == pytest.approx([right.intrinsics.fx, right.intrinsics.fy], rel=0.006)
     calibrated, after = off_mm(Estimation(compare=False, calibrate=True))
-    assert after < 0.3 * before and "camera.json does not fit" not in calibrated.notes[0]
+    # Of ten seeds the median is 0.12 times the error before, and one is at 0.36, two of its sigmas: ten small views.
+    sigma_mm = np.median([1e3 * np.sqrt(np.trace(view.covariance[:3, :3])) for view in calibrated.used])
+    assert after < min(0.5 * before, 3.0 * sigma_mm) and "camera.json does not fit" not in calibrated.notes[0]
 
 
 def test_a_folder_that_was_processed_with_the_markers_camera_is_read_back_with_it(tmp_path):
