@@ -15,7 +15,7 @@ from schemas.capture import Estimates
 from schemas.job.captures import Board, Captures, Estimation, KinectDepthNoise, RegistrationError, Simulate
 from schemas.job.views import RgbNoise
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Mesh
 from tests.workers.capture.simulated import asset_of, made
 from workers.capture.folder import open_folder, read_truth
 from workers.capture.make_capture import process_capture
@@ -81,11 +81,13 @@ def pose_errors(path: Path, estimates: Estimates) -> dict:
 def assess(path: Path, record, what: str) -> tuple[dict, list]:
     """Process and score a capture and record its figures: pose errors by estimate, and (name, figure, bound) of the missed."""
     clock = ProcessorClock()
-    done = process_capture(open_folder(path), Captures(), clock)
-    poses, score, truth = pose_errors(path, done.estimates), done.score, read_whole_truth(done.folder)
+    folder = open_folder(path)
+    done = process_capture(folder, Captures(), clock)
+    poses, score, truth = pose_errors(path, done.estimates), done.score, read_whole_truth(folder)
     assert score is not None and truth is not None
-    views = CaptureViews(given_files(done.folder), done.estimates.estimate, Captures(), done.merged.body)
-    unmeasured = 1.0 - score_measured(done.merged.surface, views, truth).measured_of_visible
+    mesh = Mesh(done.surface.vertices, done.surface.faces)
+    views = CaptureViews(given_files(folder), done.estimates.estimate, Captures(), mesh)
+    unmeasured = 1.0 - score_measured(done.surface, views, truth).measured_of_visible
     figures = {
         "joint_mm": (poses["joint"][0], 0.5),
         "joint_deg": (poses["joint"][1], 0.05),
