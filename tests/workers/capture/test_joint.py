@@ -20,6 +20,7 @@ from tests.workers.capture.drawn import (
     observe,
     project,
 )
+from workers.capture.poses.corners import CornerTerm, outward_motion
 from workers.capture.poses.estimates import estimate_joint, object_groups
 from workers.capture.poses.joint import (
     FLOOR_M,
@@ -40,11 +41,9 @@ from workers.capture.poses.observation import Patches, no_patches
 from workers.capture.poses.terms import (
     NAMES,
     BoardTerm,
-    CornerTerm,
     ObjectTerm,
     Shared,
     identified,
-    outward_motion,
     prior_sigma,
 )
 from workers.geometry.frames import translation, uniform_rotation

@@ -11,12 +11,12 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from schemas.base import Array, Pose
-from schemas.capture import CaptureCamera, CaptureEstimate, DepthCorrection, ViewEstimate
+from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
 from schemas.job.captures import Board, Estimation
-from workers.capture.poses.joint import CameraFit, Joint, Views, fit_camera, gather, measure_corners, solve_jointly
+from workers.capture.poses.camera_fit import CameraFit, camera_note, fit_camera
+from workers.capture.poses.joint import Joint, Views, gather, measure_corners, solve_jointly
 from workers.capture.poses.markers import (
     AMBIGUOUS,
-    MATERIAL,
     Evidence,
     Fit,
     Judged,
@@ -29,7 +29,17 @@ from workers.capture.poses.markers import (
     moved,
 )
 from workers.capture.poses.observation import Corners, Observation, no_patches
-from workers.capture.poses.terms import NAMES, POSE, PRINT_SCALE, SHARED, BoardTerm, ObjectTerm, Shared, identified
+from workers.capture.poses.terms import (
+    NAMES,
+    POSE,
+    PRINT_SCALE,
+    SHARED,
+    SIGNIFICANT,
+    BoardTerm,
+    ObjectTerm,
+    Shared,
+    identified,
+)
 from workers.geometry.frames import invert, transform
 
 MIN_CORNERS = 4
@@ -149,7 +159,6 @@ def judged(found: MarkerPose, corner_px: float) -> Judged:
 
 SCALES_DIFFER = 0.01
 """Print and depth disagree: smaller differences may be errors of depth that change with distance, within specification."""
-SIGNIFICANT = 3.0
 
 
 def scale_note(joint: Joint, board: Board, spec: Estimation) -> str:
@@ -173,33 +182,6 @@ def scale_note(joint: Joint, board: Board, spec: Estimation) -> str:
         f"{start}. Which is right cannot be identified from the capture alone; {believed} was believed. "
         f"Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as measured_ruler_m"
     )
-
-
-def camera_note(fitted: CameraFit, camera: CaptureCamera, poses: Array) -> str:
-    """That camera.json does not fit, with what the markers say instead; empty where it hardly matters to any pose."""
-    moved_by = fitted.shift_m()
-    if float(np.max(moved_by / np.linalg.norm(poses[:, :3, 3], axis=1))) < MATERIAL:
-        return ""
-    sure = np.abs(fitted.numbers) > SIGNIFICANT * fitted.sigma
-    if not sure.any():
-        return (
-            "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is "
-            "wrong: calibrate the camera at this size of image, or take views from more sides"
-        )
-    return (
-        f"camera.json does not fit: the markers say {compare_cameras(fitted.camera, camera, sure)}, which moves the poses by "
-        f"{1000 * float(np.median(moved_by)):.1f} mm. Calibrate the camera at this size of image, or use --calibrate "
-        "(estimation.calibrate), which takes what the markers say"
-    )
-
-
-def compare_cameras(found: CaptureCamera, given: CaptureCamera, chosen: NDArray[np.bool_] | None = None) -> str:
-    """Numbers of two cameras in words, as camera.json has them with pixel_centre 0: all five, or those chosen."""
-    k, of = found.intrinsics, given.intrinsics
-    pairs = [(k.fx, of.fx), (k.fy, of.fy), (k.cx_opencv, of.cx_opencv), (k.cy_opencv, of.cy_opencv)]
-    words = [f"{name} = {a:.1f} ({b:.1f} given)" for name, (a, b) in zip(("fx", "fy", "cx", "cy"), pairs, strict=True)]
-    words.append(f"k1 = {found.lens[0]:.4f} ({given.lens[0]:.4f} given)")
-    return ", ".join(word for n, word in enumerate(words) if chosen is None or chosen[n])
 
 
 def _less_certain(view: ViewEstimate, motion: Array, covariance: Array) -> ViewEstimate:

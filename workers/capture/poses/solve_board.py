@@ -22,8 +22,8 @@ from workers.capture.board import id_words, open_dictionary
 from workers.capture.board_kinds import board_of_markers
 from workers.capture.detect import find_markers, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
+from workers.capture.poses.corners import outward_motion
 from workers.capture.poses.markers import cross_matrix
-from workers.capture.poses.terms import outward_motion
 from workers.geometry.frames import invert, pose, transform
 from workers.geometry.lens import rays_of_pixels
 
