@@ -59,7 +59,7 @@ def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: float) -> A
         met = _intersections(lines)
         shift = np.linalg.norm(met - refined, axis=2)
         near = shift <= largest
-        refined = np.where(near[..., None] & np.isfinite(met), met, refined)
+        refined = np.where(near[..., None], met, refined)  # no shift to where two lines do not meet is near
         # A corner that moves farther than in the round before is drawn to another edge.
         largest = np.where(near & (turn > 0), shift, largest)
     return refined
@@ -163,8 +163,7 @@ def detect_markers(
     gray, geometry, border = _gray(rgb), board_geometry(board), board.border_bits
     quads, ids = _quads(gray, dictionary, border)
     kept, dropped = _usable(ids, geometry.ids)
-    corners = np.array([quads[k][0] for k in kept], dtype=np.float64).reshape(-1, 4, 2)
-    corners = refine_corners(gray, corners, dictionary.markerSize + 2 * border)
+    corners = _refined(gray, [quads[k] for k in kept], dictionary, border)
     chess, chess_px = _find_chess(gray, geometry, ids[kept], corners)
     for pixels in (corners, chess_px):
         pixels += 0.5
@@ -179,8 +178,15 @@ def find_markers(
     gray = _gray(rgb)
     quads, ids = _quads(gray, dictionary, border_bits)
     once = [k for k in range(len(ids)) if (ids == ids[k]).sum() == 1]
-    corners = np.array([quads[k][0] for k in once], dtype=np.float64).reshape(-1, 4, 2)
-    return ids[once], refine_corners(gray, corners, dictionary.markerSize + 2 * border_bits) + 0.5
+    return ids[once], _refined(gray, [quads[k] for k in once], dictionary, border_bits) + 0.5
+
+
+def _refined(
+    gray: NDArray[np.uint8], quads: Sequence[NDArray], dictionary: "cv2.aruco.Dictionary", border_bits: int
+) -> Array:
+    """[M, 4, 2]: refined corners of OpenCV's quads [1, 4, 2], pixel centres at integers."""
+    corners = np.array(quads, dtype=np.float64).reshape(-1, 4, 2)
+    return refine_corners(gray, corners, dictionary.markerSize + 2 * border_bits)
 
 
 def _gray(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

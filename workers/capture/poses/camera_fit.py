@@ -17,12 +17,8 @@ from workers.capture.poses.terms import CAMERA, GROW_M, GROW_PX, GROWTH_M, POSE,
 
 FREE = np.array([0.1, 0.1, 0.1, 0.1, 1.0])
 """Sigma of fx, fy, cx, cy (shares of the focal length) and k1 beforehand: wide, so that only what is not seen stays put."""
-
-
 ALIKE_PX = 0.01
 """By so much markers may be displaced alike in all views, by what is printed beside them: no camera is blamed for it."""
-
-
 WEAK = 1e-3
 """Of what one view tells of the camera, directions with less than this share of the strongest are left aside."""
 

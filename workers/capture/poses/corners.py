@@ -31,17 +31,11 @@ from workers.geometry.lens import rays_of_pixels
 
 MODES = (2, 1, 5)
 """How many of the eight coordinates of a marker's corners are its place, the growth of its sides, and the rest: its shape."""
-
-
 LEVEL = 1e-3
 """Level of the F tests by which markers ask for another camera than camera.json's: one capture in a thousand is wronged."""
-
-
 SWEPT = 0.005
 """Sigma of the motion of a hand while an image is read, metres and radians: 0.15 m/s and 9 degrees/s for 1/30 s. A step across
 the rows and a turn that undoes it look alike on a board: of the two, the markers tell only the sum."""
-
-
 EXPLAINED = 0.2
 """Motion that explains a smaller share of the misfit is no finding: noise of a lens or of hidden markers is alike nearby."""
 
