@@ -16,7 +16,7 @@ AS_CHEAP = 1.05
 """Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %."""
 
 FEWEST_SCENES = 4
-"""Fewer scenes recommend nothing: a setting that is better in one or two is so by chance."""
+"""Fewer scenes recommend nothing, and compare nothing: a setting that is better in one or two is so by chance."""
 
 MORE_FAILED = 0.01
 """A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
@@ -62,16 +62,21 @@ def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
-    """The Pareto front of time and an error, from the cheapest setting to the best.
+    """The Pareto front of time and an error, from the cheapest setting to the best, of those measured in a few scenes at least.
 
     Of settings equal in both, the first by name is kept.
     """
     kept: list[Row] = []
-    measured = [row for row in rows if error in row.errors and not math.isnan(row.errors[error].value)]
-    for row in sorted(measured, key=lambda row: (row.ratio, row.errors[error].value, row.setting.name)):
+    known = [row for row in rows if tells(row, error) and not math.isnan(row.errors[error].value)]
+    for row in sorted(known, key=lambda row: (row.ratio, row.errors[error].value, row.setting.name)):
         if not kept or row.errors[error].value < kept[-1].errors[error].value:
             kept.append(row)
     return kept
+
+
+def tells(row: Row, error: str) -> bool:
+    """Whether a setting measured an error in enough scenes to say that it is better or worse than another."""
+    return error in row.errors and row.errors[error].scenes >= FEWEST_SCENES
 
 
 def as_cheap(row: Row, other: Row) -> bool:
@@ -83,7 +88,8 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
     """The cheapest setting all of whose errors meet the targets. Raises InputError, TargetError.
 
     What a user asks for, without `bounds`, is met with bounds for scenes at large (`Figure.bound`). Where no setting does, by
-    values (`value <= target`) of settings whose bounds are nearest to the targets. Default targets are met by values.
+    values (`value <= target`) of settings whose bounds are nearest to the targets; of fewer than `FEWEST_SCENES` scenes of
+    the job itself by nothing. Default targets are met by values.
 
     An error that a setting did not measure is the job's own (`error_of`). Unless failed scenes are a target themselves, a
     setting that fails `MORE_FAILED` more of them than the job is left out. `bounds` are further targets that the message
@@ -100,6 +106,12 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
         raise TargetError(describe_miss(rows, targets))
     if bounds is not None:
         return cheapest(able, rows)
+    own = own_row(rows)
+    if few := [name for name in targets if name in own.errors and not tells(own, name)]:
+        raise TargetError(
+            f"of {listed([short(name) for name in few])} fewer than {FEWEST_SCENES} scenes of the job were measured, which "
+            "promise nothing of others: give a longer --budget"
+        )
     excess = {row.setting.name: _excess(row, targets, rows) for row in able}
     most = max(1.0, min(excess.values()) * AS_CHEAP)
     return cheapest([row for row in able if excess[row.setting.name] <= most], rows)

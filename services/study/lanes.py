@@ -134,9 +134,9 @@ def _serve(pipe: Connection, job: str, folder: str, scratch: str) -> None:
 
 def _measure(context: WorkerContext, unit: Unit, scratch: Path) -> Mapping[str, Any]:
     """The parts are imported where they run: captures load what scenes have no use for."""
-    from services.study.measure import LIMIT
+    from services.study.measure import LIMIT, RESTS
 
-    LIMIT["s"] = unit.limit_s
+    LIMIT["s"], RESTS["folder"] = unit.limit_s, scratch
     if unit.part == "capture":
         from services.study.captures import measure_capture
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from schemas.errors import describe_seconds, milliseconds, number, size
-from services.study.choose import as_cheap, front, own_row
+from services.study.choose import as_cheap, front, own_row, tells
 from services.study.model import ERRORS, Proof, Row, Study, amount, short, shown, times, unit
 
 STUDY_FILE = "study.json"
@@ -292,12 +292,20 @@ def _line(study: Study, row: Row, best: Mapping[str, Sequence[Row]]) -> str:
 
 
 def _figure(name: str, row: Row, own: Row, best: Sequence[Row]) -> str:
-    """One error, marked where it is on the front and where it differs from the job's by more than both intervals."""
+    """One error, marked where it is on the front and where it differs from the job's by more than both intervals.
+
+    Fewer scenes than tell anything are pale.
+    """
     figure = row.errors.get(name)
     if figure is None:
         return "<td>·</td>"
-    mine = own.errors.get(name, figure)
-    side, mark = ("better", "▼ ") if figure.high < mine.low else ("worse", "▲ ") if figure.low > mine.high else ("", "")
+    mine, side, mark = own.errors.get(name, figure), "", ""
+    if not tells(row, name):
+        side = "few"
+    elif figure.high < mine.low:
+        side, mark = "better", "▼ "
+    elif figure.low > mine.high:
+        side, mark = "worse", "▲ "
     classes = " ".join(filter(None, [side, "front" if row in best else ""]))
     value, low, high = (number(shown(name, one)) for one in (figure.value, figure.low, figure.bound))
     return f'<td class="{classes}">{mark}{value}<small>{low} – {high}</small></td>'

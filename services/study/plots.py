@@ -17,7 +17,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from matplotlib.transforms import Bbox
 
 from schemas.errors import milliseconds, number
-from services.study.choose import front, own_row
+from services.study.choose import FEWEST_SCENES, front, own_row, tells
 from services.study.model import ERRORS, NEGLIGIBLE, Row, Study, as_often, cost, short, shown, unit
 
 _PHYSICS = "pose_mm outcome_mm penetration_mm gap_mm moved_mm unbalanced_share turned_deg outcome_deg"
@@ -132,8 +132,10 @@ def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
 
 def half_row(rows: Sequence[Row], error: str) -> Row | None:
     """The cheapest setting that measured at most half of the job's own error, and less than that with its whole interval."""
-    own = own_row(rows).errors.get(error)
-    if own is None or own.value <= NEGLIGIBLE[ERRORS[error].unit]:
+    if not tells(own_row(rows), error):
+        return None
+    own = own_row(rows).errors[error]
+    if own.value <= NEGLIGIBLE[ERRORS[error].unit]:
         return None
     halves = [row for row in front(rows, error) if row.errors[error].value <= own.value / 2]
     return next((row for row in halves if row.errors[error].high <= own.value), None)
@@ -162,8 +164,9 @@ def _draw_panel(study: Study, panel: Panel, axes: Axes) -> list[Label]:
     best = front(rows, error)
     axes.set_title(f"{panel.heading}: {_message(study.rows, panel)}", loc="left", fontsize=11)
     _set_axes(axes, [row.ms for row in rows], rows, error)
-    corners = pts_to_poststep(*zip(*(_place_of(row, error) for row in best), strict=True))
-    axes.plot(*corners, color=INK, lw=1.3, zorder=2, label="front: none is cheaper and better")
+    if best:
+        corners = pts_to_poststep(*zip(*(_place_of(row, error) for row in best), strict=True))
+        axes.plot(*corners, color=INK, lw=1.3, zorder=2, label="front: none is cheaper and better")
     for kind, (title, mark) in KINDS.items():
         _draw_rows(axes, [row for row in rows if row.setting.kind == kind], error, title, mark)
     for knob in single_knobs(rows):
@@ -177,17 +180,21 @@ def _draw_panel(study: Study, panel: Panel, axes: Axes) -> list[Label]:
 
 
 def _message(rows: Sequence[Row], panel: Panel) -> str:
-    """What a smaller error costs."""
-    best = front(rows, panel.error)[-1]
+    """What a smaller error costs, as far as its whole interval lies below the job's own."""
+    own, error = own_row(rows), panel.error
     if panel.half is not None:
         return f"half the error takes {cost(panel.half.ratio)}"
-    own = own_row(rows).errors.get(panel.error)
-    if own is not None and own.value <= NEGLIGIBLE[ERRORS[panel.error].unit]:
+    if error in own.errors and own.errors[error].value <= NEGLIGIBLE[ERRORS[error].unit]:
         return "the job's own is negligible"
-    less = 0.0 if own is None else 1.0 - best.errors[panel.error].value / own.value
-    if less <= MOVED:
+    if error not in own.errors:
         return "nothing better was measured"
-    return f"{100 * less:.2g} % less error takes {cost(best.ratio)}"
+    if not tells(own, error):
+        return "too few scenes to tell"
+    mine = own.errors[error].value
+    better = [row for row in front(rows, error) if row.errors[error].high < mine * (1.0 - MOVED)]
+    if not better:
+        return "nothing is surely better"
+    return f"{100 * (1.0 - better[-1].errors[error].value / mine):.2g} % less error takes {cost(better[-1].ratio)}"
 
 
 # ---------------------------------------------------------------------------------------------- each knob by itself
@@ -291,13 +298,16 @@ def _square(centre: np.ndarray, size: float) -> Bbox:
 
 
 def _draw_rows(axes: Axes, rows: Sequence[Row], error: str, title: str, mark: Mark) -> None:
-    """Markers of settings with the intervals of their errors, and an entry of the legend."""
+    """Markers of settings with the intervals of their errors, and an entry of the legend; a ring about those of few scenes."""
     if rows:
         x, y = zip(*(_place_of(row, error) for row in rows), strict=True)
         ends = [(shown(error, row.errors[error].low), shown(error, row.errors[error].bound)) for row in rows]
         low, high = zip(*ends, strict=True)
         axes.vlines(x, low, high, color=mark["color"], lw=0.8, alpha=0.55, label="95 % interval over scenes")
         axes.plot(x, y, label=title, clip_on=False, **{"ls": "", **mark})
+        if few := [at for row, at in zip(rows, zip(x, y, strict=True), strict=True) if not tells(row, error)]:
+            ring: Mark = {"ls": "", "marker": "o", "mfc": "none", "mec": PALE, "ms": 13.0, "zorder": 2.5}
+            axes.plot(*zip(*few, strict=True), label=f"fewer than {FEWEST_SCENES} scenes", clip_on=False, **ring)
 
 
 def _place_of(row: Row, error: str) -> tuple[float, float]:

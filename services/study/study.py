@@ -390,11 +390,12 @@ def prove(bench: Measurement, chosen: Row, targets: Mapping[str, float]) -> Proo
     digest = hashlib.sha256(repr(sorted(chosen.setting.changes.items())).encode()).hexdigest()[:8]
     first = bench.plan.job.first_scene + FRESH_SCENE
     most = {part: PROVED if part in ("rest", "draw") else MOST[part] for part in parts}
+    # A scene is drawn after its rest was measured, so that no process settles what another is settling.
+    turns = [(n + place * bench.plan.processes, part, n) for place, part in enumerate(parts) for n in range(most[part])]
     units = [
         Unit(part, first + n, n, (OWN,), chosen.setting)
-        for n in range(PROVED)
-        for part in parts
-        if n < most[part] and f"proof-{digest}/{part}/{first + n}" not in bench.journal
+        for _, part, n in sorted(turns)
+        if f"proof-{digest}/{part}/{first + n}" not in bench.journal
     ]
     for unit, answers in bench.lanes.run(units, bench.deadline(PROOF_SHARE)):
         bench.journal.add(f"proof-{digest}/{unit.part}/{unit.scene_id}", answers[OWN.name])

@@ -155,8 +155,7 @@ def figures_of(answers: Answers, references: Sequence[Answers] = ()) -> dict[str
     found: dict[str, Figure] = {}
     for name in ERRORS:
         if values := [one["errors"][name] for one in some.values() if name in one["errors"]]:
-            unit = ERRORS[name].unit
-            found[name] = figure_over_scenes(values, NEGLIGIBLE[unit], math.inf if unit else 1.0)
+            found[name] = figure_over_scenes(values, NEGLIGIBLE[ERRORS[name].unit], _most_of(name))
     if answers:
         found["failed_share"] = share(["failed" in one for one in answers.values()], counted=True)
     if counted := [one for one in answers.values() if "lost" in one]:
@@ -201,9 +200,15 @@ def _apart_mm(one: Answer, other: Answer) -> float:
     return float(np.linalg.norm(mine - theirs, axis=-1).max())
 
 
-def _scaled(figure: Figure, times: float) -> Figure:
-    ends = {name: getattr(figure, name) * times for name in ("value", "low", "high", "median")}
-    return replace(figure, **ends, most=None if figure.most is None else figure.most * times)
+def _scaled(figure: Figure, times: float, most: float) -> Figure:
+    """Times a factor, and at most `most`."""
+    ends = {name: min(most, getattr(figure, name) * times) for name in ("value", "low", "high", "median")}
+    return replace(figure, **ends, most=None if figure.most is None else min(most, figure.most * times))
+
+
+def _most_of(error: str) -> float:
+    """What an error can be at most: shares are at most 1."""
+    return math.inf if ERRORS[error].unit else 1.0
 
 
 def values_of(answers: Answers, error: str) -> list[float]:
@@ -346,7 +351,7 @@ class Table:
                 here, whole = self._figures_of(part, same), self.figures(part, OWN)
                 for name in found.keys() & here.keys():
                     if not ERRORS[name].pooled and here[name].value > NEGLIGIBLE[ERRORS[name].unit]:
-                        found[name] = _scaled(found[name], whole[name].value / here[name].value)
+                        found[name] = _scaled(found[name], whole[name].value / here[name].value, _most_of(name))
             self._figures[key] = found
         return self._figures[key]
 

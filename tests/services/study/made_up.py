@@ -16,11 +16,13 @@ PROOF = Proof("step=60", 80, {"depth_mm": 0.1}, {"depth_mm": Figure(0.09, 0.08, 
 """A recommendation that held, of an error that the setting did not measure itself."""
 
 
-def row(name: str = "", ratio: float = 1.0, noise: float = 0.02, failed: float = 0.0, **errors: float) -> Row:
+def row(
+    name: str = "", ratio: float = 1.0, noise: float = 0.02, failed: float = 0.0, scenes: int = 48, **errors: float
+) -> Row:
     """`row("step=240, tier=flat", 0.8, depth_mm=0.1)`; without a name the job itself. Intervals are 10 % to each side."""
     parts = tuple((part.split("=")[0], part.split("=")[1]) for part in name.split(", ")) if name else ()
     setting = Setting(parts, {f"made.{knob}": label for knob, label in parts})
-    figures = {error: Figure(value, value * 0.9, value * 1.1, value * 0.4, 48) for error, value in errors.items()}
+    figures = {error: Figure(value, value * 0.9, value * 1.1, value * 0.4, scenes) for error, value in errors.items()}
     noise = noise if parts else 0.0
     return Row(setting, 118.0 * ratio, ratio, ratio * (1 - noise), ratio * (1 + noise), 235.0, figures, failed)
 

@@ -117,13 +117,15 @@ def test_bounds_for_other_scenes_decide_and_where_none_meets_the_targets_the_nea
 
 
 def test_a_setting_that_few_scenes_measured_is_not_recommended():
-    fast = row("step=60", 0.5, depth_mm=0.01)
     for scenes, chosen in ((3, "the job"), (4, "step=60")):
-        few = dataclasses.replace(
-            fast, errors={"depth_mm": dataclasses.replace(fast.errors["depth_mm"], scenes=scenes)}
-        )
+        few = row("step=60", 0.5, scenes=scenes, depth_mm=0.01)
         assert choose([OWN, few], {"depth_mm": 0.2}).setting.name == chosen
         assert recommend([OWN, few]).setting.name == chosen
+        assert names(front([OWN, few], "depth_mm")) == ([chosen] if scenes == 4 else ["the job"])
+    unknown = row(scenes=3, depth_mm=0.1)
+    with pytest.raises(TargetError, match=r"depth of objects fewer than 4 scenes of the job .*--budget"):
+        choose([unknown], {"depth_mm": 0.2})
+    assert recommend([unknown]) is unknown  # who asks for nothing keeps the job
 
 
 def test_another_world_is_never_recommended():

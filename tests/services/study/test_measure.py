@@ -4,17 +4,28 @@ import time
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from schemas.errors import SettleError
 from schemas.job.job import Job
 from services.study import measure
 from services.study.knobs import REFERENCES
-from services.study.measure import QUICK_S, Meter, answer_for, measure_again, measure_rest, slopes, warm_answer_for
+from services.study.measure import (
+    QUICK_S,
+    Meter,
+    answer_for,
+    measure_again,
+    measure_rest,
+    own_rest,
+    slopes,
+    warm_answer_for,
+)
 from services.study.model import Setting
 from services.study.table import pose_error
 from workers.assets.catalogue import open_catalogue
-from workers.scene.context import WorkerContext
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import Laid, lay_scene
 
 
 def setting(name: str, **changes: object) -> Setting:
@@ -113,3 +124,36 @@ def test_a_process_measures_its_first_answer_of_a_setting_again_unless_that_take
     assert [warm_answer_for("draw", COARSE, first_compiles)["call"] for _ in range(2)] == [2, 3]
     monkeypatch.setitem(QUICK_S, "draw", 0.0)
     assert warm_answer_for("draw", BOX, first_compiles)["call"] == 4
+
+
+@pytest.mark.minute
+def test_a_slow_scene_settles_once_for_what_is_measured_and_what_is_drawn(monkeypatch, tmp_path):
+    """The job's own scene also warms a process up, where it is quick; a slow one is its answer at once."""
+    job = Job.model_validate({"name": "t", "seed": 2024, "start": {"pose": "upright"}})
+    made: list[str] = []
+
+    def counted(worker: WorkerContext, scene_id: int, watch: Stopwatch) -> Laid:
+        made.append("other" if worker.job.physics.collision == "box" else "own")
+        return lay_scene(worker, scene_id, watch)
+
+    monkeypatch.setattr(measure, "lay_scene", counted)
+    counts = {}
+    for quick_s in (1e9, 0.0):
+        folder = tmp_path / f"{quick_s:g}"
+        folder.mkdir()
+        monkeypatch.setitem(QUICK_S, "rest", quick_s)
+        monkeypatch.setitem(measure.RESTS, "folder", folder)
+        monkeypatch.setattr(measure, "_seen", set())
+        monkeypatch.setattr(measure, "_ran", {("rest", "the job"), ("rest", "box=x")})
+        processes = [
+            WorkerContext(job, open_catalogue(job.assets, Path(), tuple(job.categories)), None, "") for _ in range(2)
+        ]
+        made.clear()
+        measure_rest(processes[0], [OWN, BOX], 0, 0)
+        rest = own_rest(processes[1], 0)
+        monkeypatch.setattr(measure, "_seen", set())  # as in another process
+        measure_rest(processes[1], [BOX], 0, 0)
+        counts[quick_s] = (made.count("own"), made.count("other"), len(list(folder.iterdir())))
+        truth = lay_scene(processes[0], 0, Stopwatch()).rest
+        assert np.array_equal(rest.settled[0].T_world_obj, truth.settled[0].T_world_obj)
+    assert counts == {1e9: (4, 2, 0), 0.0: (1, 2, 1)}

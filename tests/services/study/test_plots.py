@@ -128,9 +128,15 @@ def test_titles_say_what_less_error_takes():
         ((dataclasses.replace(half, errors=unsure), row("b=1", 2.0, flip=0.04)), "half the error takes 2 × the time"),
         ((row("a=1", 2.0, flip=0.05), row("a=2", 3.0, flip=0.01)), "half the error takes 2 × the time"),
         ((row("a=1", 1.5, flip=0.06),), "40 % less error takes 1.5 × the time"),
-        ((row("a=1", 0.5, flip=0.2),), "nothing better was measured"),
+        ((row("a=1", 0.5, flip=0.2),), "nothing is surely better"),
+        ((row("a=1", 0.5, flip=0.093),), "nothing is surely better"),  # to 0.102
+        ((row("a=1", 0.5, flip=0.01, scenes=3), row("a=2", 0.4, flip=0.2)), "nothing is surely better"),
     ):
         assert draw_tradeoff(study(row(flip=0.1), *turned)).axes[0].get_title("left") == f"Colour: {told}"
+    few = draw_tradeoff(study(row(flip=0.1, scenes=2), row("a=1", 0.5, flip=0.01)))
+    assert few.axes[0].get_title("left") == "Colour: too few scenes to tell"
+    rings = [line for line in few.axes[0].get_lines() if line.get_label() == "fewer than 4 scenes"]
+    assert [tuple(map(tuple, line.get_xydata())) for line in rings] == [((118.0, 0.1),)]
 
 
 def test_a_panel_shows_the_first_error_of_a_part_that_settings_move_and_the_knobs_that_move_it():

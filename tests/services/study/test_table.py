@@ -176,11 +176,15 @@ def test_percentiles_of_fewer_scenes_are_as_many_times_the_jobs_as_in_the_same_s
     """The job's error is 1 mm in two scenes and 3 mm in two more, in which only it was measured; the setting's is half."""
 
     def drawn(depth_mm: float) -> dict:
-        return {"s": 1.0, "took": 1.0, "errors": {"depth_mm": depth_mm, "mirror_mm": 1e-9 * depth_mm}}
+        errors = {"depth_mm": depth_mm, "mirror_mm": 1e-9 * depth_mm, "mask_share": min(1.0, depth_mm / 3.0)}
+        return {"s": 1.0, "took": 1.0, "errors": errors}
 
     answers = {unit_name("draw", n, OWN): drawn(1.0 if n < 2 else 3.0) for n in range(4)}
     answers |= {unit_name("draw", n, UNITS): drawn(0.5) for n in range(2)}
+    answers |= {unit_name("draw", n, FLAT): drawn(2.0) for n in range(2)}
     table = Table(PARTS, answers)
+    flat = table.figures("draw", FLAT)["mask_share"]  # twice the job's, which is 1 in two more
+    assert (flat.value, flat.high, flat.bound) == (1.0, 1.0, 1.0)
     own, units = (table.figures("draw", one) for one in (OWN, UNITS))
     assert own["depth_mm"].value == pytest.approx(3.0)
     assert (units["depth_mm"].value, units["depth_mm"].scenes) == (pytest.approx(1.5), 2)
