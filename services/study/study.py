@@ -12,7 +12,7 @@ from pathlib import Path
 from schemas.errors import RunError, describe_seconds, plural
 from services.bench.figures import describe_machine
 from services.run.progress import ProgressLine
-from services.study.choose import DEFAULT_TARGETS, TargetError, answer, recommend, targets_of
+from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, answer, recommend, targets_of
 from services.study.knobs import REFERENCES, joined
 from services.study.lanes import Journal, Lanes, Unit
 from services.study.measure import slopes
@@ -200,11 +200,8 @@ def split_of(plan: Plan) -> Parts:
 
 
 def run_pilot(bench: Measurement, race: Race) -> None:
-    """One scene of the job itself, then one of every setting, for costs. Raises RunError."""
-    table = bench.table()
-    wanted = [one for part in bench.parts.measured for one in race.missing(table, part, 1)]
-    own = [one for one in wanted if one.setting == OWN and one.part not in UNTIMED]
-    bench.run(own, FIRST_SHARE)
+    """One scene of the job itself, a few more, then one of every setting, for costs. Raises RunError."""
+    run_own(bench, race, 1, FIRST_SHARE)
     table = bench.table()
     missing = [part for part in bench.parts.measured if part not in UNTIMED and not table.answers(part, OWN)]
     if missing:
@@ -228,7 +225,15 @@ def run_pilot(bench: Measurement, race: Race) -> None:
     rest_s = [one["took"] for one in table.answers("rest", OWN).values()]
     if rest_s and min(rest_s) > AGAIN_SHARE * bench.plan.budget_s and not AGAIN.keys() & set(race.targets):
         race.left_out.append("again")
+    run_own(bench, race, FEWEST_SCENES, PILOT_SHARE)
+    table = bench.table()
     bench.run(in_turn([one for part in parts_in(bench, race) for one in race.missing(table, part, 1)]), PILOT_SHARE)
+
+
+def run_own(bench: Measurement, race: Race, level: int, share: float) -> None:
+    """So many scenes of the job itself: part by part, so that a scene is drawn once another process has settled it."""
+    for part in (part for part in bench.parts.measured if part not in UNTIMED):
+        bench.run([one for one in race.missing(bench.table(), part, level) if one.setting == OWN], share)
 
 
 def parts_in(bench: Measurement, race: Race) -> list[Part]:
@@ -391,10 +396,12 @@ def prove(bench: Measurement, chosen: Row, targets: Mapping[str, float]) -> Proo
     first = bench.plan.job.first_scene + FRESH_SCENE
     most = {part: PROVED if part in ("rest", "draw") else MOST[part] for part in parts}
     # A scene is drawn after its rest was measured, so that no process settles what another is settling.
-    turns = [(n + place * bench.plan.processes, part, n) for place, part in enumerate(parts) for n in range(most[part])]
+    turns = [
+        (n + place * bench.plan.processes, place, n) for place, part in enumerate(parts) for n in range(most[part])
+    ]
     units = [
         Unit(part, first + n, n, (OWN,), chosen.setting)
-        for _, part, n in sorted(turns)
+        for part, n in ((parts[place], n) for _, place, n in sorted(turns))
         if f"proof-{digest}/{part}/{first + n}" not in bench.journal
     ]
     for unit, answers in bench.lanes.run(units, bench.deadline(PROOF_SHARE)):
