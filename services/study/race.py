@@ -6,13 +6,14 @@ surely takes longer than one that surely meets all (`Table.verdict`, 95 %). Part
 what is left of the budget.
 """
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
 
 from services.study.choose import AS_CHEAP
-from services.study.knobs import REFERENCES
-from services.study.model import OWN, Setting
+from services.study.knobs import REFERENCES, joined
+from services.study.model import ERRORS, NEGLIGIBLE, OWN, Row, Setting
 from services.study.table import Part, Table
 
 MOST: Mapping[Part, int] = {"rest": 512, "again": 64, "draw": 64, "colour": 8, "capture": 32}
@@ -214,3 +215,59 @@ class Race:
 def _timed(part: Part) -> Part:
     """The part that has the time of a part's settings."""
     return {"colour": "draw", "again": "rest"}.get(part, part)
+
+
+# ---------------------------------------------------------------------------------------------- combinations
+
+SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
+"""A value saves time at this share of the job's own, keeps an error that grows to this share, and shrinks one below this."""
+
+DEAREST = 5.0
+"""A value that takes at least this many times the job's time is measured by itself only."""
+
+MOST_OF_A_KIND = 3
+"""The most knobs that are paired among those that save time, and among those that are more exact."""
+
+
+def promising(rows: Sequence[Row], targets: Mapping[str, float]) -> tuple[Setting, ...]:
+    """Settings of two and more knobs to measure next.
+
+    `rows`: the job's own first, then one value of one knob each. For each knob the cheapest value that keeps every error, and
+    the most exact value that shrinks one; of either kind the best knobs, two by two and all at once; and at once the cheapest
+    value of every knob that meets the targets.
+    """
+    singles = [row for row in rows[1:] if len(row.setting.parts) == 1 and row.ratio < DEAREST]
+    shares = {row.setting.name: _least_share(row, rows[0]) for row in singles}
+    cheap = sorted((row for row in singles if row.ratio < SAVES), key=lambda row: (row.ratio, row.setting.name))
+    ranks = {name: share for name, share in shares.items() if share is not None and share < BETTER}
+    saving = _first_of_knobs(row for row in cheap if shares[row.setting.name] is not None)
+    shrinking = [row for row in singles if row.setting.name in ranks]
+    exact = _first_of_knobs(sorted(shrinking, key=lambda row: (ranks[row.setting.name], row.setting.name)))
+    meeting = _first_of_knobs(
+        row for row in cheap if all(row.errors[name].value <= targets[name] for name in set(targets) & set(row.errors))
+    )
+    pairs = [pair for kind in (saving, exact) for pair in itertools.combinations(kind[:MOST_OF_A_KIND], 2)]
+    together = [some for some in (*pairs, saving, exact, meeting) if len(some) > 1]
+    # In the order of the table, whatever the ranks, so that names do not depend on noise.
+    found = [joined([row.setting for row in singles if row in some]) for some in together]
+    return tuple({setting.name: setting for setting in found}.values())
+
+
+def _first_of_knobs(rows: Iterable[Row]) -> list[Row]:
+    """The first value of each knob, in the order of the rows."""
+    first: dict[str, Row] = {}
+    for row in rows:
+        first.setdefault(row.setting.knob, row)
+    return list(first.values())
+
+
+def _least_share(row: Row, own: Row) -> float | None:
+    """The least of its errors as a share of the job's own where that is not negligible, 1 without any.
+
+    None where an error has grown beyond the factor and is not negligible.
+    """
+    both = [name for name in row.errors if name in own.errors]
+    pairs = [(row.errors[name].value, own.errors[name].value, NEGLIGIBLE[ERRORS[name].unit]) for name in both]
+    if any(value > max(negligible, WORSE * mine) for value, mine, negligible in pairs):
+        return None
+    return min((value / mine for value, mine, negligible in pairs if mine > negligible), default=1.0)

@@ -5,7 +5,7 @@ import itertools
 import math
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from services.study.knobs import REFERENCES, joined
 from services.study.lanes import Journal, Lanes, Unit
 from services.study.measure import slopes
 from services.study.model import ERRORS, NEGLIGIBLE, OWN, Figure, Plan, Proof, Row, Setting, Study
-from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted, grouped
+from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted, grouped, promising
 from services.study.table import AGAIN, UNTIMED, Part, Parts, Table, figures_of, part_of, unit_name
 
 FIRST_SHARE, PILOT_SHARE, RACE_SHARE, LOOK_SHARE, PROOF_SHARE = 0.5, 0.3, 0.87, 0.9, 1.0
@@ -56,59 +56,6 @@ UNIT_SHARE = 0.01
 
 SLOW, LEAST_LIMIT_S = 3.0, 40.0
 """A scene that takes this many times the longest of the job's own, and so many seconds of processor at least, is a time out."""
-
-SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
-"""A value saves time at this share of the job's own, keeps an error that grows to this share, and shrinks one below this."""
-
-DEAREST = 5.0
-"""A value that takes at least this many times the job's time is measured by itself only."""
-
-MOST_OF_A_KIND = 3
-"""The most knobs that are paired among those that save time, and among those that are more exact."""
-
-
-def promising(rows: Sequence[Row], targets: Mapping[str, float]) -> tuple[Setting, ...]:
-    """Settings of two and more knobs to measure next.
-
-    `rows`: the job's own first, then one value of one knob each. For each knob the cheapest value that keeps every error, and
-    the most exact value that shrinks one; of either kind the best knobs, two by two and all at once; and at once the cheapest
-    value of every knob that meets the targets.
-    """
-    singles = [row for row in rows[1:] if len(row.setting.parts) == 1 and row.ratio < DEAREST]
-    shares = {row.setting.name: _least_share(row, rows[0]) for row in singles}
-    cheap = sorted((row for row in singles if row.ratio < SAVES), key=lambda row: (row.ratio, row.setting.name))
-    ranks = {name: share for name, share in shares.items() if share is not None and share < BETTER}
-    saving = _first_of_knobs(row for row in cheap if shares[row.setting.name] is not None)
-    shrinking = [row for row in singles if row.setting.name in ranks]
-    exact = _first_of_knobs(sorted(shrinking, key=lambda row: (ranks[row.setting.name], row.setting.name)))
-    meeting = _first_of_knobs(
-        row for row in cheap if all(row.errors[name].value <= targets[name] for name in set(targets) & set(row.errors))
-    )
-    pairs = [pair for kind in (saving, exact) for pair in itertools.combinations(kind[:MOST_OF_A_KIND], 2)]
-    together = [some for some in (*pairs, saving, exact, meeting) if len(some) > 1]
-    # In the order of the table, whatever the ranks, so that names do not depend on noise.
-    found = [joined([row.setting for row in singles if row in some]) for some in together]
-    return tuple({setting.name: setting for setting in found}.values())
-
-
-def _first_of_knobs(rows: Iterable[Row]) -> list[Row]:
-    """The first value of each knob, in the order of the rows."""
-    first: dict[str, Row] = {}
-    for row in rows:
-        first.setdefault(row.setting.knob, row)
-    return list(first.values())
-
-
-def _least_share(row: Row, own: Row) -> float | None:
-    """The least of its errors as a share of the job's own where that is not negligible, 1 without any.
-
-    None where an error has grown beyond the factor and is not negligible.
-    """
-    both = [name for name in row.errors if name in own.errors]
-    pairs = [(row.errors[name].value, own.errors[name].value, NEGLIGIBLE[ERRORS[name].unit]) for name in both]
-    if any(value > max(negligible, WORSE * mine) for value, mine, negligible in pairs):
-        return None
-    return min((value / mine for value, mine, negligible in pairs if mine > negligible), default=1.0)
 
 
 @dataclass
@@ -346,12 +293,12 @@ def look_at_errors(bench: Measurement) -> None:
 
 
 def telling(rows: Sequence[Row]) -> list[str]:
-    """Names of the settings with the largest and the least of each group's first error that settings move."""
+    """Names of the settings with the largest and the least of each group's first error that settings move to be seen."""
     found: dict[str, None] = {}
     for group in ("physics", "labels", "colour"):  # the mirror camera's errors are not in the input view
         for name in (kind.name for kind in ERRORS.values() if kind.group == group and not kind.pooled):
             some = sorted((row.errors[name].value, row.setting.name) for row in rows if name in row.errors)
-            if len(some) > 1 and some[-1][0] > 1.05 * some[0][0]:
+            if len(some) > 1 and some[-1][0] > max(1.05 * some[0][0], NEGLIGIBLE[ERRORS[name].unit]):
                 found |= {some[-1][1]: None, some[0][1]: None}
                 break
     return list(found)
@@ -478,6 +425,16 @@ def told(
     return replace(study, answer=words, chosen=chosen)
 
 
+NAMES: Mapping[Part, str] = {
+    "rest": "how objects rest",
+    "again": "motion when let go again",
+    "draw": "depth, masks and the mirror",
+    "colour": "colour",
+    "capture": "captures",
+}
+"""Of parts, in words."""
+
+
 def doubts_of(bench: Measurement, race: Race, table: Table) -> tuple[str, ...]:
     """What is not decided with 95 % confidence, and how long that would take."""
     found = []
@@ -498,5 +455,5 @@ def doubts_of(bench: Measurement, race: Race, table: Table) -> tuple[str, ...]:
             if wanted_s > 0
             else "they lie too near to a target to tell"
         )
-        found.append(f"whether these keep the targets is not sure to 95 %: {words}; {longer}")
+        found.append(f"{NAMES[part]}: whether these keep the targets is not sure to 95 %: {words}; {longer}")
     return tuple(found)

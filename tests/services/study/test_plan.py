@@ -15,7 +15,8 @@ from services.study.choose import error_of, own_row
 from services.study.knobs import FREE, REFERENCES, apply, choose_knobs, joined, knobs_of, settings_of
 from services.study.lanes import JOURNAL_FILE, Journal
 from services.study.model import ERRORS, NEGLIGIBLE, Row, Setting
-from services.study.study import promising
+from services.study.race import promising
+from services.study.study import telling
 from tests.services.study.made_up import row, stored
 
 JOB = Job(name="t", seed=2024, first_scene=100)
@@ -205,6 +206,12 @@ def test_what_is_measured_together_saves_time_or_is_more_exact_or_meets_the_targ
     assert names({"a=1": (0.5, 0.5), "b=1": (0.6, 0.4), "a=2": (0.4, 0.9)}, {"depth_mm": 0.5}) == {"a=1, b=1"}
     tiny = row(depth_mm=1e-6, mask_share=0.01)  # what stays negligible may grow by any factor
     assert names({"a=1": (0.8, 1e-3), "b=1": (0.9, 1e-4)}, {"depth_mm": 0.0}, tiny) == {"a=1, b=1"}
+
+
+def test_pictures_show_settings_whose_errors_are_to_be_seen():
+    rows = [OWN, row("step=60", gap_mm=1e-5, flip=0.3), row("step=120", gap_mm=1e-9), row("units=1", depth_mm=0.5)]
+    assert telling(rows) == ["units=1", "the job"]  # gaps differ by much, and none is to be seen; one FLIP has no other
+    assert telling([*rows, row("step=30", gap_mm=1.0)]) == ["step=30", "step=120", "units=1", "the job"]
 
 
 # ---------------------------------------------------------------------------------------------- the journal
