@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from schemas.errors import RunError, describe_seconds, plural
 from services.bench.figures import describe_machine
@@ -18,7 +19,7 @@ from services.study.lanes import Journal, Lanes, Unit
 from services.study.measure import slopes
 from services.study.model import ERRORS, NEGLIGIBLE, OWN, Figure, Plan, Proof, Row, Setting, Study
 from services.study.race import FIRST_LEVEL, MOST, SHARES, SURE_SCENES, Race, Wanted, grouped, promising
-from services.study.table import AGAIN, UNTIMED, Part, Parts, Table, figures_of, part_of, unit_name
+from services.study.table import AGAIN, UNTIMED, Part, Parts, Table, changes_by_part, figures_of, part_of, unit_name
 
 FIRST_SHARE, PILOT_SHARE, RACE_SHARE, LOOK_SHARE, PROOF_SHARE = 0.5, 0.3, 0.87, 0.9, 1.0
 """By these shares of the budget the job's own first scene must be there, and the pilot, the race, the pictures and the proof
@@ -309,8 +310,7 @@ def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Row, ..
     rows, crossed = all_rows(bench)
     proofs: list[Proof] = []
     while True:
-        withdrawn = {one.setting for one in proofs}
-        able = without((*rows, *crossed), withdrawn)
+        able = without((*rows, *crossed), proofs)
         try:
             chosen = recommend(able, bench.plan.targets)
         except TargetError:
@@ -318,7 +318,7 @@ def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Row, ..
         if chosen not in rows:
             rows = (*rows, chosen)
         asked = targets_of(able, bench.plan.targets)
-        if chosen.setting.name in withdrawn or (proof := prove(bench, chosen, asked)) is None:
+        if chosen.setting.name in {one.setting for one in proofs} or (proof := prove(bench, chosen, asked)) is None:
             break
         proofs.append(proof)
         if proof.holds or bench.left_s(PROOF_SHARE) <= 0.0:
@@ -326,9 +326,24 @@ def choose_and_prove(bench: Measurement) -> tuple[tuple[Row, ...], tuple[Row, ..
     return rows, (*rows, *(row for row in crossed if row not in rows)), tuple(proofs)
 
 
-def without(rows: Sequence[Row], withdrawn: set[str]) -> tuple[Row, ...]:
-    """The rows that are not withdrawn, and the job's own, which all others are held against."""
-    return tuple(row for row in rows if row.setting == OWN or row.setting.name not in withdrawn)
+def without(rows: Sequence[Row], proofs: Sequence[Proof]) -> tuple[Row, ...]:
+    """The rows without those that share what failed a proof: the changes of the part whose error was missed.
+
+    The job's own stays, because all others are held against it.
+    """
+    settings = {row.setting.name: row.setting for row in rows}
+    failed = [
+        (part, _changes(settings[proof.setting], part)) for proof in proofs for part in map(part_of, proof.missed)
+    ]
+    return tuple(
+        row
+        for row in rows
+        if row.setting == OWN or all(_changes(row.setting, part) != changes for part, changes in failed)
+    )
+
+
+def _changes(setting: Setting, part: Part) -> Mapping[str, Any]:
+    return changes_by_part(setting.changes, captured=part == "capture", again=True)[part]
 
 
 def prove(bench: Measurement, chosen: Row, targets: Mapping[str, float]) -> Proof | None:
@@ -393,7 +408,7 @@ def told(
     rows = tuple(
         replace(row, notes=(*row.notes, *race.reasons(bench.parts.of.get(row.setting.name, {})))) for row in rows
     )
-    able = without(among, withdrawn)
+    able = without(among, proofs)
     scenes = max(len(table.answers(part, OWN)) for part in bench.parts.measured)
     study = Study(
         job=plan.job.name,

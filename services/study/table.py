@@ -288,7 +288,7 @@ class Parts:
         for setting in settings:
             of[setting.name] = {}
             whole = again or setting.kind in ("own", "preset")
-            for part, changes in _changes_by_part(setting.changes, captured, whole).items():
+            for part, changes in changes_by_part(setting.changes, captured, whole).items():
                 key = part, repr(sorted(changes.items()))
                 one = known.setdefault(key, Setting(setting.parts, changes) if changes else OWN)
                 measured.setdefault(part, {OWN.name: OWN})[one.name] = of[setting.name][part] = one
@@ -297,7 +297,8 @@ class Parts:
         return cls({part: tuple(some.values()) for part, some in measured.items()}, of)
 
 
-def _changes_by_part(changes: Mapping[str, Any], captured: bool, again: bool) -> dict[Part, dict[str, Any]]:
+def changes_by_part(changes: Mapping[str, Any], captured: bool, again: bool) -> dict[Part, dict[str, Any]]:
+    """A setting's changes by the parts of a scene, or of a capture, that they change; with `again` of those let go again too."""
     if captured:
         return {"capture": dict(changes)}
     rest = {key: value for key, value in changes.items() if key.startswith(AT_REST)}

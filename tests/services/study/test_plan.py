@@ -1,6 +1,7 @@
 """What is measured: knobs, presets, rounds of settings, promising combinations, and the journal of what is done."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, get_args
 
 import pytest
@@ -14,9 +15,9 @@ from services.study import knobs as study_knobs
 from services.study.choose import error_of, own_row
 from services.study.knobs import FREE, REFERENCES, apply, choose_knobs, joined, knobs_of, settings_of
 from services.study.lanes import JOURNAL_FILE, Journal
-from services.study.model import ERRORS, NEGLIGIBLE, Row, Setting
+from services.study.model import ERRORS, NEGLIGIBLE, Figure, Proof, Row, Setting
 from services.study.race import promising
-from services.study.study import telling
+from services.study.study import telling, without
 from tests.services.study.made_up import row, stored
 
 JOB = Job(name="t", seed=2024, first_scene=100)
@@ -206,6 +207,23 @@ def test_what_is_measured_together_saves_time_or_is_more_exact_or_meets_the_targ
     assert names({"a=1": (0.5, 0.5), "b=1": (0.6, 0.4), "a=2": (0.4, 0.9)}, {"depth_mm": 0.5}) == {"a=1, b=1"}
     tiny = row(depth_mm=1e-6, mask_share=0.01)  # what stays negligible may grow by any factor
     assert names({"a=1": (0.8, 1e-3), "b=1": (0.9, 1e-4)}, {"depth_mm": 0.0}, tiny) == {"a=1, b=1"}
+
+
+def test_a_proof_that_fails_withdraws_all_that_share_what_failed():
+    """What is drawn with wide splats failed; how things rest did not."""
+
+    def changed(name: str, **changes: object) -> Row:
+        return replace(row(name), setting=Setting(row(name).setting.parts, changes))
+
+    wide, fast = {"images.projection.splat": 5}, {"physics.step_hz": 60}
+    rows = (OWN, changed("s=5", **wide), changed("step=60, s=5", **fast, **wide), changed("step=60", **fast))
+    off = {"hidden_share": Figure(0.5, 0.4, 0.6, 0.5, 8), "penetration_mm": Figure(0.0, 0.0, 0.0, 0.0, 8)}
+    targets = {"hidden_share": 0.1, "penetration_mm": 0.1}
+    failed, held = (Proof("step=60, s=5", 8, targets | loose, off, {}) for loose in ({}, {"hidden_share": 0.9}))
+    assert (failed.missed, held.missed, held.holds) == (("hidden_share",), (), True)
+    assert [one.setting.name for one in without(rows, [failed])] == ["the job", "step=60"]
+    assert without(rows, [held]) == rows
+    assert replace(held, measured={}).missed == tuple(targets)
 
 
 def test_pictures_show_settings_whose_errors_are_to_be_seen():
