@@ -72,7 +72,7 @@ class Figure:
 
     The bootstrap knows no scene worse than the worst of its own, so that its upper end tells settings of the same scenes
     apart, and says little of other scenes: `most` is the bound for those (services/study/table.py), None where there is no
-    better one than `high`.
+    better one than `high`. `less`: whether it is surely less than the job's own in most scenes, None where nothing tells.
     """
 
     value: float
@@ -81,6 +81,7 @@ class Figure:
     median: float
     scenes: int
     most: float | None = None
+    less: bool | None = None
 
     @property
     def bound(self) -> float:

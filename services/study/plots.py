@@ -18,7 +18,7 @@ from matplotlib.transforms import Bbox
 
 from schemas.errors import milliseconds, number
 from services.study.choose import FEWEST_SCENES, front, own_row, tells
-from services.study.model import ERRORS, NEGLIGIBLE, Row, Study, as_often, cost, short, shown, unit
+from services.study.model import ERRORS, NEGLIGIBLE, Figure, Row, Study, as_often, cost, short, shown, unit
 
 _PHYSICS = "pose_mm outcome_mm penetration_mm gap_mm moved_mm unbalanced_share turned_deg outcome_deg"
 
@@ -138,7 +138,12 @@ def half_row(rows: Sequence[Row], error: str) -> Row | None:
     if own.value <= NEGLIGIBLE[ERRORS[error].unit]:
         return None
     halves = [row for row in front(rows, error) if row.errors[error].value <= own.value / 2]
-    return next((row for row in halves if row.errors[error].high <= own.value), None)
+    return next((row for row in halves if is_less(row.errors[error], own.value)), None)
+
+
+def is_less(figure: Figure, value: float) -> bool:
+    """Whether an error is less than the job's, which is a value, with its whole interval, and in most scenes by themselves."""
+    return figure.high <= value and figure.less is not False
 
 
 @style.context(["default", PLAIN])
@@ -191,7 +196,7 @@ def _message(rows: Sequence[Row], panel: Panel) -> str:
     if not tells(own, error):
         return "too few scenes to tell"
     mine = own.errors[error].value
-    better = [row for row in front(rows, error) if row.errors[error].high < mine * (1.0 - MOVED)]
+    better = [row for row in front(rows, error) if is_less(row.errors[error], mine * (1.0 - MOVED))]
     if not better:
         return "nothing is surely better"
     return f"{100 * (1.0 - better[-1].errors[error].value / mine):.2g} % less error takes {cost(better[-1].ratio)}"

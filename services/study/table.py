@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta, nct, norm
+from scipy.stats import beta, binom, nct, norm
 
 from schemas.base import Array
 from services.study.knobs import REFERENCES
@@ -216,6 +216,17 @@ def values_of(answers: Answers, error: str) -> list[float]:
     return [one["errors"][error] for one in answers.values() if error in one.get("errors", {})]
 
 
+def _is_less(error: str, setting: Answers, own: Answers) -> bool | None:
+    """Whether most scenes surely have less of an error than with the job itself: the sign test (Conover 1999, 3.4).
+
+    None where no scene has both, or all are alike.
+    """
+    both = [(setting[n].get("errors", {}), own[n].get("errors", {})) for n in setting if n in own]
+    apart = [mine[error] - theirs[error] for mine, theirs in both if error in mine and error in theirs]
+    less, more = sum(one < 0.0 for one in apart), sum(one > 0.0 for one in apart)
+    return bool(binom.cdf(more, less + more, 0.5) <= 1.0 - SURE) if less + more else None
+
+
 def verdict(values: Sequence[float], figure: Figure | None, target: float) -> Verdict:
     """Whether an error is surely at most its target, with confidence `SURE`.
 
@@ -345,9 +356,11 @@ class Table:
         """
         key = part, setting.name
         if key not in self._figures:
-            found = self._figures_of(part, self.answers(part, setting))
-            own = self.answers(part, OWN)
-            same = {scene: own[scene] for scene in self.answers(part, setting) if scene in own}
+            answers, own = self.answers(part, setting), self.answers(part, OWN)
+            found = self._figures_of(part, answers)
+            same = {scene: own[scene] for scene in answers if scene in own}
+            if setting != OWN:
+                found = {name: replace(one, less=_is_less(name, answers, own)) for name, one in found.items()}
             if setting != OWN and 0 < len(same) < len(own):
                 here, whole = self._figures_of(part, same), self.figures(part, OWN)
                 for name in found.keys() & here.keys():

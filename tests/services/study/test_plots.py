@@ -130,6 +130,10 @@ def test_titles_say_what_less_error_takes():
         ((row("a=1", 1.5, flip=0.06),), "40 % less error takes 1.5 × the time"),
         ((row("a=1", 0.5, flip=0.2),), "nothing is surely better"),
         ((row("a=1", 0.5, flip=0.093),), "nothing is surely better"),  # to 0.102
+        (
+            (dataclasses.replace(half, errors={"flip": dataclasses.replace(half.errors["flip"], less=False)}),),
+            "nothing is surely better",
+        ),
         ((row("a=1", 0.5, flip=0.01, scenes=3), row("a=2", 0.4, flip=0.2)), "nothing is surely better"),
     ):
         assert draw_tradeoff(study(row(flip=0.1), *turned)).axes[0].get_title("left") == f"Colour: {told}"

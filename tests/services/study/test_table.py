@@ -191,6 +191,21 @@ def test_percentiles_of_fewer_scenes_are_as_many_times_the_jobs_as_in_the_same_s
     assert units["mirror_mm"].value == pytest.approx(0.5e-9)  # of what is negligible a ratio is noise
 
 
+@pytest.mark.parametrize(
+    ("scenes", "worse", "less"), [(4, 0, False), (5, 0, True), (7, 1, False), (8, 1, True), (5, 5, False)]
+)
+def test_an_error_is_surely_less_where_hardly_a_scene_says_otherwise(scenes, worse, less):
+    """1/2^4 > 0.05 >= 1/2^5; of eight scenes one may be worse: 9/256. Scenes that are alike say nothing."""
+
+    def drawn(depth_mm: float) -> dict:
+        return {"s": 1.0, "took": 1.0, "errors": {"depth_mm": depth_mm, "mirror_mm": 1.0}}
+
+    answers = {unit_name("draw", n, OWN): drawn(1.0) for n in range(scenes)}
+    answers |= {unit_name("draw", n, UNITS): drawn(2.0 if n < worse else 0.5) for n in range(scenes)}
+    found = Table(PARTS, answers).figures("draw", UNITS)
+    assert (found["depth_mm"].less, found["mirror_mm"].less) == (less, None)
+
+
 def test_a_scene_that_fails_counts_and_a_setting_without_a_time_has_no_row():
     some = journal() | {
         unit_name("rest", 1, STEP): lost(0.1),
