@@ -22,6 +22,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ DASHBOARD = os.environ.get("RAY_API_SERVER_ADDRESS", "http://127.0.0.1:8265")
 JOBS = Path.home() / "verso" / "jobs"
 VERSO = [sys.executable, "-P", "-m", "services.cli.main"]
 GOES_ON = {signal.SIGINT: "Ctrl-C", signal.SIGHUP: "a lost connection", signal.SIGTERM: "SIGTERM"}
+STARTING, STARTS_S = "No available agent", 90.0
+"""What Ray says while a head that was just started takes no jobs yet, and the seconds that it may say so."""
 
 
 class Refused(Exception):
@@ -141,9 +144,17 @@ def submit(command: list[str], job: str) -> str:
     name = "packed" if job.startswith("job:") else re.sub(r"[^A-Za-z0-9_]+", "-", Path(job).stem)[:40]
     asked, submission = client(), f"verso-{name}-{secrets.token_hex(4)}"
     # Ray's supervisor gives this line to a shell: quoted, every word arrives as it is.
+    entrypoint, deadline = shlex.join([*command, "--address", "auto"]), time.monotonic() + STARTS_S
     with told(DASHBOARD):
-        asked.submit_job(entrypoint=shlex.join([*command, "--address", "auto"]), submission_id=submission)
-    return submission
+        while True:
+            try:
+                asked.submit_job(entrypoint=entrypoint, submission_id=submission)
+                return submission
+            except RuntimeError as error:
+                if STARTING not in str(error) or time.monotonic() > deadline:
+                    raise
+            print("submit: the head has just started and takes no jobs yet: asked again", file=sys.stderr)
+            time.sleep(1.0)
 
 
 def follow(job: str) -> int:

@@ -1,5 +1,6 @@
 """deploy/submit.py on the head of a real cluster that was started in a bare shell."""
 
+import contextlib
 import os
 import re
 import signal
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from deploy import submit
 from schemas.environment import cache_folder
 from services.job.job_file import load_job
 from tests.datasets import run_here
@@ -55,9 +57,35 @@ def head(tmp_path_factory) -> Iterator[Head]:
         yield Head(home, cluster)
 
 
-pytestmark = [pytest.mark.ray, pytest.mark.minute]
+def starting(times: int, said: str) -> list[str]:
+    """What is asked of a head that refuses so many times, as a list of submissions; it raises what the last one meets."""
+    asked: list[str] = []
+
+    class Api:
+        def submit_job(self, entrypoint: str, submission_id: str) -> None:
+            asked.append(submission_id)
+            if len(asked) <= times:
+                raise RuntimeError(f"Request failed with status code 500: {said}")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(submit, "client", Api)
+        patch.setattr(time, "sleep", lambda _: None)
+        with contextlib.suppress(submit.Refused):
+            asked.append(submit.submit(["verso", "run"], "a.yaml"))
+    return asked
 
 
+def test_a_head_that_has_just_started_is_asked_again_for_the_same_job_and_no_other_refusal_is(monkeypatch):
+    """Ray's dashboard answers before its agent does."""
+    agent = "No available agent to submit job, please try again later.."
+    assert len(starting(2, agent)) == 4 and len(set(starting(2, agent))) == 1
+    assert len(starting(9, "the submission is refused")) == 1
+    monkeypatch.setattr(submit, "STARTS_S", -1.0)
+    assert len(starting(9, agent)) == 1
+
+
+@pytest.mark.ray
+@pytest.mark.minute
 def test_a_job_is_made_on_the_cluster_and_its_exit_code_comes_back(head):
     code, out, err = head.submit("shapes.yaml", "--out", "made", "--scenes", "4")
     assert code == 0, out + err
@@ -71,6 +99,8 @@ def test_a_job_is_made_on_the_cluster_and_its_exit_code_comes_back(head):
     assert code == 2 and "fewer scenes than committed" in out + err, "the job's own exit code and words"
 
 
+@pytest.mark.ray
+@pytest.mark.minute
 @pytest.mark.slow
 def test_words_with_shell_characters_are_text(head):
     """In the name of the job, the output folder and a setting: nothing of it is run, and the dataset says it as written."""
@@ -90,6 +120,8 @@ def test_words_with_shell_characters_are_text(head):
     assert not {"x", "y", "z"} & {path.name for path in left}  # what a shell would have made of ODD
 
 
+@pytest.mark.ray
+@pytest.mark.minute
 @pytest.mark.slow
 def test_a_job_outlives_the_one_who_follows_it_and_can_be_followed_and_stopped(head):
     process = head.start("shapes.yaml", "--out", "left", "--scenes", "60")
@@ -112,6 +144,8 @@ def test_a_job_outlives_the_one_who_follows_it_and_can_be_followed_and_stopped(h
     assert code == 1 and "what is committed is kept" in err
 
 
+@pytest.mark.ray
+@pytest.mark.minute
 def test_without_the_token_nobody_submits(head):
     code, _, err = head.submit("shapes.yaml", "--out", "none", RAY_AUTH_TOKEN="f" * 64)
     assert code == 2 and "oken" in err and "Traceback" not in err
@@ -127,6 +161,8 @@ def test_without_the_token_nobody_submits(head):
     assert not (head.home / "storage" / "none").exists()
 
 
+@pytest.mark.ray
+@pytest.mark.minute
 def test_wrong_words_are_refused_in_a_line(head):
     for words, told in (
         ((), "what it takes"),
