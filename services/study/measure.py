@@ -51,6 +51,9 @@ shaders. What draws compiles for seconds on a busy machine; rest compiles before
 RESTS: dict[str, Path | None] = {"folder": None}
 """Where the processes of a study keep how its slow scenes rest, for each other; None keeps nothing."""
 
+DIGITS = 6
+"""Decimals of an error that are kept: a nanometre, a millionth of a share. What is less is rounding."""
+
 SLEPT_S = 1.0
 """Times of what the machine slept in for longer are thrown away."""
 
@@ -105,6 +108,8 @@ def answer_for(measure: Callable[[Meter], Answer]) -> Answer:
                 signal.signal(signal.SIGPROF, _out_of_time)
                 signal.setitimer(signal.ITIMER_PROF, LIMIT["s"])
             answer = measure(meter)
+            if "errors" in answer:
+                answer["errors"] = {name: round(value, DIGITS) for name, value in answer["errors"].items()}
         except SceneError as error:
             answer = {"failed": error.reason}
         except Exception as error:  # one scene that breaks a measure must not end the study
@@ -225,7 +230,7 @@ def _corners_mm(start: ObjectStart, end: Settled) -> Array:
     """[8, 3] the corners of the object's own box in the world, mm, to a nanometre."""
     low, high = start.hull.vertices.min(axis=0), start.hull.vertices.max(axis=0)
     return np.round(
-        1e3 * transform(end.T_world_obj, np.array(list(itertools.product(*zip(low, high, strict=True))))), 6
+        1e3 * transform(end.T_world_obj, np.array(list(itertools.product(*zip(low, high, strict=True))))), DIGITS
     )
 
 

@@ -97,6 +97,8 @@ def test_what_breaks_a_measure_is_a_counted_answer_and_a_machine_that_sleeps_has
     found = answer_for(endless)
     assert found["failed"] == "time_out" and 0.03 < found["took"] < 20.0
     monkeypatch.setitem(measure.LIMIT, "s", float("inf"))
+    tiny = answer_for(lambda _: {"errors": {"penetration_mm": 4e-8, "gap_mm": 0.0123456789}})["errors"]
+    assert tiny == {"penetration_mm": 0.0, "gap_mm": 0.012346}
     assert answer_for(flat)["failed"] == "broken" and "initial simplex is flat" in answer_for(flat)["broken"]
     assert answer_for(lost)["failed"] == "left_table" and "broken" not in answer_for(lost)
     clock = iter((0.0, 3600.0))
