@@ -6,7 +6,6 @@ errors fall with the step where the truth is a formula.
 
 import contextlib
 import dataclasses
-import hashlib
 import itertools
 import math
 import os
@@ -24,6 +23,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.errors import SceneError
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Settled
 from services.study.knobs import apply
@@ -156,8 +156,8 @@ def measure_rest(
     answers: dict[str, Answer] = {}
     if scene_id not in _seen:
         _seen.add(scene_id)
-        with Meter() as planning:
-            _attempt(lambda: plan_with_effects(context, scene_id, Stopwatch()))
+        with Meter() as planning, contextlib.suppress(Exception):  # told by what is measured
+            plan_with_effects(context, scene_id, Stopwatch())
         new_s = planning.s
         if _kept_rest(context, scene_id) is None:
             cold = answer_for(partial(_rest, context, scene_id, number, OWN))
@@ -174,12 +174,6 @@ def measure_rest(
     if own is not None and new_s is not None:
         own["plan_s"] = new_s + max(0.0, (cold_s or 0.0) - (own.get("planned_s") or 0.0) - (own["s"] or 0.0))
     return answers
-
-
-def _attempt(work: Callable[[], object]) -> None:
-    """Runs what only warms up; whatever is wrong with it is told by what is measured."""
-    with contextlib.suppress(Exception):
-        work()
 
 
 def _rest(worker: WorkerContext, scene_id: int, number: int, setting: Setting, meter: Meter) -> Answer:
@@ -261,7 +255,7 @@ def own_rest(context: WorkerContext, scene_id: int) -> Rest:
 
 def _keep_rest(context: WorkerContext, scene_id: int, rest: Rest, took: float) -> None:
     """Keeps how a slow scene rests for all processes: a bin settles for half a minute, and is drawn in a fifth of a second."""
-    if (file := _rest_file(context, scene_id)) is not None and took >= QUICK_S["rest"]:
+    if took >= QUICK_S["rest"] and (file := _rest_file(context, scene_id)) is not None:
         fresh = file.with_suffix(f".{os.getpid()}")
         fresh.write_bytes(pickle.dumps(rest))
         fresh.replace(file)
@@ -273,10 +267,9 @@ def _kept_rest(context: WorkerContext, scene_id: int) -> Path | None:
 
 
 def _rest_file(context: WorkerContext, scene_id: int) -> Path | None:
-    """By the scene and the whole job, because a recommendation is proved with its own job."""
+    """By the scene and its settings, because a recommendation is proved with its own; the context's digest is of the job's."""
     folder = RESTS["folder"]
-    digest = hashlib.sha256(context.job.model_dump_json().encode()).hexdigest()[:16]
-    return folder and folder / f"rest-{scene_id}-{digest}"
+    return folder and folder / f"rest-{scene_id}-{settings_digest(context.job, context.catalogue.digest)}"
 
 
 def laid_for(context: WorkerContext, worker: WorkerContext, scene_id: int) -> Laid:

@@ -216,12 +216,12 @@ def values_of(answers: Answers, error: str) -> list[float]:
     return [one["errors"][error] for one in answers.values() if error in one.get("errors", {})]
 
 
-def _is_less(error: str, setting: Answers, own: Answers) -> bool | None:
+def _is_less(error: str, setting: Answers, same: Answers) -> bool | None:
     """Whether most scenes surely have less of an error than with the job itself: the sign test (Conover 1999, 3.4).
 
-    None where no scene has both, or all are alike.
+    `same`: the job's own answers in scenes of the setting. None where no scene has both, or all are alike.
     """
-    both = [(setting[n].get("errors", {}), own[n].get("errors", {})) for n in setting if n in own]
+    both = [(setting[n].get("errors", {}), one.get("errors", {})) for n, one in same.items()]
     apart = [mine[error] - theirs[error] for mine, theirs in both if error in mine and error in theirs]
     less, more = sum(one < 0.0 for one in apart), sum(one > 0.0 for one in apart)
     return bool(binom.cdf(more, less + more, 0.5) <= 1.0 - SURE) if less + more else None
@@ -360,8 +360,8 @@ class Table:
             found = self._figures_of(part, answers)
             same = {scene: own[scene] for scene in answers if scene in own}
             if setting != OWN:
-                found = {name: replace(one, less=_is_less(name, answers, own)) for name, one in found.items()}
-            if setting != OWN and 0 < len(same) < len(own):
+                found = {name: replace(one, less=_is_less(name, answers, same)) for name, one in found.items()}
+            if 0 < len(same) < len(own):  # never of the job itself
                 here, whole = self._figures_of(part, same), self.figures(part, OWN)
                 for name in found.keys() & here.keys():
                     if not ERRORS[name].pooled and here[name].value > NEGLIGIBLE[ERRORS[name].unit]:

@@ -58,7 +58,7 @@ def head(tmp_path_factory) -> Iterator[Head]:
 
 
 def starting(times: int, said: str) -> list[str]:
-    """What is asked of a head that refuses so many times, as a list of submissions; it raises what the last one meets."""
+    """The submissions that a head is asked for which refuses so many times, and at last the one that was made, if any was."""
     asked: list[str] = []
 
     class Api:
