@@ -47,7 +47,7 @@ from services.score.summary import summarise
 from workers.assets.winding import winding_numbers
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.geometry.projection import forward_project
-from workers.scene.chance import SceneChance, Stream
+from workers.scene.chance import SceneChance
 from workers.scene.sensor import sense_depth, sense_rgb
 from workers.store.images import encode_png
 from workers.store.local import open_store
@@ -306,13 +306,15 @@ def sense_input(pair: Pair, job: Job) -> Pair:
     """The pair with the input view, patches included, that the same job with this noise stores: the same pixels."""
     view = pair.input
     chance, number = SceneChance(job.seed, pair.scene_id), pair.pose_id // 2 % job.pairs_per_scene
-    streams = (Stream.SENSOR_DEPTH, Stream.SENSOR_RGB)
-    depth_rng, rgb_rng = (chance.stream(name, number, ROLES.index("input")) for name in streams)
+
+    def generator(name: str) -> np.random.Generator:
+        return chance.sensor_stream(name, number, ROLES.index("input"))
+
     exact_m = dequantise_depth(view.depth(), job.images)
-    sensed_m = sense_depth(exact_m, view.segment(), view.camera, DEPTH_NOISE, depth_rng)
+    sensed_m = sense_depth(exact_m, view.segment(), view.camera, DEPTH_NOISE, generator("depth_noise"))
     sensed: dict[PixelKind, Any] = {
         "depth": quantise_depth(sensed_m, job.images),
-        "rgb": sense_rgb(view.rgb(), view.camera.intrinsics, RGB_NOISE, rgb_rng, rgb_rng),
+        "rgb": sense_rgb(view.rgb(), view.camera.intrinsics, RGB_NOISE, generator),
     }
     crops = [patch for region in regions_of(pair) if (patch := view.patch(region)) is not None]
     images = {}

@@ -243,8 +243,8 @@ class SensorEffects(Frozen):
 
     @property
     def changes_rgb(self) -> bool:
-        """Whether any effect on RGB is on."""
-        return any(effect is not None for effect in (self.distortion, self.rgb_noise, self.exposure))
+        """Whether any effect on RGB is on: any but that on depth."""
+        return any(name != "depth_noise" and effect is not None for name, effect in self)
 
 
 ViewTarget = Literal["normals", "coordinates", "albedo", "amodal", "layers"]

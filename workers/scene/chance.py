@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from zlib import crc32
 
 import numpy as np
 
@@ -26,6 +27,11 @@ class Stream(IntEnum):
     MOTION = 14
     HELD_OUT = 15
     LOST = 16
+    SENSOR = 17
+
+
+_SENSORS = {"depth_noise": Stream.SENSOR_DEPTH, "rgb_noise": Stream.SENSOR_RGB, "exposure": Stream.SENSOR_EXPOSURE}
+"""The streams of the first effects of sensors; those after them share one, and have a part of it each by their names."""
 
 
 @dataclass(frozen=True)
@@ -46,3 +52,9 @@ class SceneChance:
     def object_stream(self, name: Stream, number: int) -> np.random.Generator:
         """The generator of one step for an object by its number: the first object's is that of a scene with only one."""
         return self.stream(name, *([number] if number else []))
+
+    def sensor_stream(self, effect: str, *within: int) -> np.random.Generator:
+        """The generator of an effect of a sensor, by its key of `sensor`."""
+        if effect in _SENSORS:
+            return self.stream(_SENSORS[effect], *within)
+        return self.stream(Stream.SENSOR, crc32(effect.encode()), *within)

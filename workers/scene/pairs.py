@@ -22,7 +22,7 @@ from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
 from workers.scene.ray_check import check_against_rays
-from workers.scene.sensor import SensorChance, sense_view
+from workers.scene.sensor import sense_view
 from workers.scene.targets import draw_targets
 
 
@@ -150,7 +150,8 @@ def sense(scene: SettledScene, exact: View, number: int) -> View:
     job, ran = scene.context.job, [name for name in scene.effects.ran if name.startswith("sensor_")]
     if not ran:
         return exact
-    streams = (Stream.SENSOR_DEPTH, Stream.SENSOR_RGB, Stream.SENSOR_EXPOSURE)
-    chance = SensorChance(*(scene.chance.stream(name, number, ROLES.index(exact.role)) for name in streams))
+    role = ROLES.index(exact.role)
     with scene.stopwatch.stage("sensor", ran[0] if len(ran) == 1 else None):
-        return sense_view(job.sensor, job.images, exact, chance, scene.effects)
+        return sense_view(
+            job.sensor, job.images, exact, lambda name: scene.chance.sensor_stream(name, number, role), scene.effects
+        )

@@ -9,8 +9,10 @@ function decides a rounding.
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -107,23 +109,20 @@ def shift_lookup(depth_m: Array, shift_px: Array, reach_px: int) -> Array:
     return np.where(seen > 0.0, seen, depth_m)
 
 
+Generators = Callable[[str], np.random.Generator]
+"""The generator of a sensor effect by its name: one each, so that no other view or effect changes its numbers."""
+
+
 def sense_rgb(
-    rgb: NDArray[np.uint8],
-    intrinsics: Intrinsics,
-    effects: SensorEffects,
-    exposure_rng: np.random.Generator,
-    noise_rng: np.random.Generator,
+    rgb: NDArray[np.uint8], intrinsics: Intrinsics, effects: SensorEffects, generator: Generators
 ) -> NDArray[np.uint8]:
     """[H, W, 3] uint8: the stored image of an exact one; the same array where no effect on RGB is on."""
     if not effects.changes_rgb:
         return rgb
     light = decode_codes(rgb)
-    if effects.distortion is not None:
-        light = distort(light, effects.distortion, intrinsics)
-    if effects.exposure is not None:
-        light = expose(light, effects.exposure, exposure_rng)
-    if effects.rgb_noise is not None:
-        light = add_noise(light, effects.rgb_noise, noise_rng)
+    for name, change in RGB_EFFECTS.items():
+        if (setting := getattr(effects, name)) is not None:
+            light = change(light, setting, intrinsics, generator(name))
     return encode_codes(light)
 
 
@@ -167,23 +166,26 @@ def add_noise(light: Array, noise: RgbNoise, rng: np.random.Generator) -> Array:
     return light + np.sqrt(variance) * rng.standard_normal(light.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class SensorChance:
-    """One generator for each random effect of one view, so that no other view or effect changes its numbers."""
+RGB_EFFECTS: Mapping[str, Callable[[Array, Any, Intrinsics, np.random.Generator], Array]] = {
+    "distortion": lambda light, lens, k, _: distort(light, lens, k),
+    "exposure": lambda light, exposure, _, rng: expose(light, exposure, rng),
+    "rgb_noise": lambda light, noise, _, rng: add_noise(light, noise, rng),
+}
+"""By its key of `sensor`, what an effect makes of linear light [H, W, 3], in the order in which light meets them.
 
-    depth: np.random.Generator
-    rgb: np.random.Generator
-    exposure: np.random.Generator
+A new effect on RGB is a row here and its key in schemas/job/views.py: its plan, receipt, chance and time follow from the key.
+"""
 
 
-def sense_view(sensor: SensorEffects, images: Images, view: View, chance: SensorChance, effects: EffectPlan) -> View:
+def sense_view(sensor: SensorEffects, images: Images, view: View, generator: Generators, effects: EffectPlan) -> View:
     """An exact view as its sensors store it; the same view where the plan runs no sensor effect."""
     assert view.region is not None
     withdrawn = [name for name in SensorEffects.model_fields if not effects.runs(f"sensor_{name}")]
     rgb, depth, sensor = view.rgb, view.depth, sensor.model_copy(update=dict.fromkeys(withdrawn))
     if rgb is not None:
-        rgb = sense_rgb(rgb, view.camera.intrinsics, sensor, chance.exposure, chance.rgb)
+        rgb = sense_rgb(rgb, view.camera.intrinsics, sensor, generator)
     if sensor.depth_noise is not None:
         exact_m = dequantise_depth(depth, images)
-        depth = quantise_depth(sense_depth(exact_m, view.region, view.camera, sensor.depth_noise, chance.depth), images)
+        rng = generator("depth_noise")
+        depth = quantise_depth(sense_depth(exact_m, view.region, view.camera, sensor.depth_noise, rng), images)
     return view if rgb is view.rgb and depth is view.depth else replace(view, rgb=rgb, depth=depth)

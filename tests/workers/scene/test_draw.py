@@ -58,8 +58,11 @@ def test_a_stream_is_a_function_of_seed_scene_step_and_object():
         assert not np.array_equal(draw, SceneChance(seed, scene_id).stream(name).random(4))
     draws = [chance.object_stream(Stream.START, number).random() for number in range(4)]
     assert draws[0] == chance.stream(Stream.START).random() and len(set(draws)) == 4
+    sensors = [chance.sensor_stream(name, 3) for name in ("exposure", "vignetting", "blur")]
+    assert sensors[0].random() == chance.stream(Stream.SENSOR_EXPOSURE, 3).random()
+    assert sensors[1].random() != sensors[2].random() != chance.stream(Stream.SENSOR, 3).random()
     names = "CATEGORY OBJECT TABLE START REDRAW CAMERA APPEARANCE RAYCAST_CHECK SENSOR_DEPTH SENSOR_RGB SENSOR_EXPOSURE"
-    names += " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT LOST"  # append-only: another number changes every dataset ever made
+    names += " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT LOST SENSOR"  # append-only: a number that changes changes datasets
     assert [(one.name, int(one)) for one in Stream] == [(name, n) for n, name in enumerate(names.split())]
 
 

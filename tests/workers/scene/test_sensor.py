@@ -11,7 +11,6 @@ from schemas.scene.scene import EffectPlan
 from schemas.scene.view import Camera, Intrinsics, View
 from workers.geometry.colour import decode_codes as decode
 from workers.scene.sensor import (
-    SensorChance,
     add_noise,
     distort,
     expose,
@@ -184,7 +183,7 @@ def test_a_straight_line_lands_where_opencv_says_that_the_lens_draws_it():
 
 def test_one_seed_is_one_picture_exposure_has_a_chance_of_its_own_and_with_everything_off_rgb_is_the_same_array():
     def see(rgb, seed=1, **effects):
-        return sense_rgb(rgb, K, SensorEffects(**effects), seeded(seed), seeded(seed + 100))
+        return sense_rgb(rgb, K, SensorEffects(**effects), lambda name: seeded(seed + 100 * len(name)))
 
     rgb, still = np.full((120, 160, 3), 120, np.uint8), {"exposure": {"stops": [0.0, 0.0]}}
     assert see(rgb) is rgb and np.array_equal(see(rgb, **still), rgb)
@@ -208,9 +207,8 @@ def exact_view() -> View:
 
 def sensed(names: tuple[str, ...], view: View | None = None, **branches: object) -> View:
     """The view as the sensors store it, with these effects in the plan and always the same chance."""
-    chance = SensorChance(*(seeded(seed) for seed in (1, 2, 3)))
     sensor = SensorEffects.model_validate({**EVERY, **branches})
-    return sense_view(sensor, Images(), view or exact_view(), chance, EffectPlan(names, {}))
+    return sense_view(sensor, Images(), view or exact_view(), lambda name: seeded(len(name)), EffectPlan(names, {}))
 
 
 def test_an_effect_runs_because_the_plan_has_it_and_changes_what_its_number_says():

@@ -387,9 +387,9 @@ def sense_light(studio: Studio, number: int, light: Array) -> Array:
     """[H, W, 3]: what the colour sensor makes of linear light: exposure, then noise."""
     simulate, sensed = studio.simulate, light
     if simulate.exposure is not None:
-        sensed = expose(sensed, simulate.exposure, studio.chance.stream(Stream.SENSOR_EXPOSURE, number))
+        sensed = expose(sensed, simulate.exposure, studio.chance.sensor_stream("exposure", number))
     if simulate.rgb_noise is not None:
-        sensed = add_noise(sensed, simulate.rgb_noise, studio.chance.stream(Stream.SENSOR_RGB, number))
+        sensed = add_noise(sensed, simulate.rgb_noise, studio.chance.sensor_stream("rgb_noise", number))
     return sensed
 
 
@@ -400,7 +400,7 @@ def measure_depth(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS)
     depth_m: Array = drawn.depth_m.astype(np.float64)
     if simulate.depth_noise is not None:
-        rng = studio.chance.stream(Stream.SENSOR_DEPTH, number)
+        rng = studio.chance.sensor_stream("depth_noise", number)
         depth_m = sense_depth(depth_m, drawn.region, camera, kinect_noise(simulate.depth_noise), rng)
         depth_m = STEP_M * np.rint(depth_m / STEP_M)
     assumed = assumed_device(device, simulate.registration_error)
