@@ -156,7 +156,7 @@ class Job(Frozen):
     first_scene: NonNegativeInt = 0
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Input and mirror poses of each scene."""
+    """Input and mirror poses of each scene, or views of a capture that are stored at most (default 64)."""
     objects_per_scene: ObjectCount = ONE_OBJECT
     """Number of objects on the table; a range is drawn from evenly. The first gives the scene's category."""
     categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
@@ -261,8 +261,8 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
             f"captures.folders names {folders} folders, and captures {job.first_scene} to {job.stop_scene - 1} are asked for: "
             f"first_scene must be 0 and scenes at most {folders}"
         )
-    if job.pairs_per_scene != captures.most_views:
-        return f"pairs_per_scene is {job.pairs_per_scene}: leave it out, captures.most_views ({captures.most_views}) decides it"
+    if not folders and captures.simulate.views > job.pairs_per_scene:
+        return f"captures.simulate.views is {captures.simulate.views}, and pairs_per_scene is {job.pairs_per_scene}: raise that"
     if job.cameras.depth.enabled:
         return "cameras.depth.enabled is true: leave it out, depth of a capture is registered to its colour camera"
     if job.objects_per_scene != ONE_OBJECT:

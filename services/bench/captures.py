@@ -67,7 +67,7 @@ def _compare(job: Job, catalogue: Any, chance: SceneChance, path: Path) -> dict[
     """Both sides of one capture: {"object", "ours": errors, by variant of the script: errors}."""
     assert job.captures is not None
     asset = load_object(job, catalogue, chance)
-    simulate_capture(job.captures.simulate, job.captures.board, asset, chance, path)
+    simulate_capture(job.captures.simulate, job.captures.printed_board, asset, chance, path)
     truth = read_whole_truth(open_folder(path))
     assert truth is not None
     scripts = {name: marker_script.run(path, name) for name in marker_script.REFINEMENTS}

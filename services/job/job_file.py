@@ -235,10 +235,6 @@ _SEVERAL: tuple[str, Acts] = ("objects_per_scene is 1", lambda job: job.objects_
 _PILE: tuple[str, Acts] = ("start.arrange is spread", lambda job: job.start.arrange == "pile")
 _RASTER: tuple[str, Acts] = ("render.tier is not raster", lambda job: job.render.tier == "raster")
 _TRACED: tuple[str, Acts] = ("render.tier is not pathtraced", lambda job: job.render.tier == "pathtraced")
-_PERCENTILE: tuple[str, Acts] = (
-    "cameras.mirror.pivot_depth is not percentile",
-    lambda job: job.cameras.mirror.pivot_depth == "percentile",
-)
 _PARTS: tuple[str, Acts] = (
     "physics.collision makes no convex parts",
     lambda job: job.physics.collision in ("planned", "parts"),
@@ -250,8 +246,7 @@ NEEDS: dict[str, tuple[tuple[str, Acts], ...]] = {
     "render.path_samples": (_COLOUR, _TRACED),
     "render.path_bounces": (_COLOUR, _TRACED),
     "cameras.mirror.T_z_m": (_MIRROR,),
-    "cameras.mirror.pivot_depth": (_MIRROR,),
-    "cameras.mirror.percentile": (_MIRROR, _PERCENTILE),
+    "cameras.mirror.percentile": (_MIRROR,),
     "cameras.depth.offset_m": (_DEPTH,),
     "images.projection.splat": (_PROJECTION,),
     "images.projection.hidden_point_removal": (_PROJECTION,),

@@ -329,8 +329,7 @@ OFF = {
     "render.path_samples": (64, {}, "render.tier is not pathtraced"),
     "render.path_bounces": (2, {}, "render.tier is not pathtraced"),
     "cameras.mirror.T_z_m": (0.8, {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled is false"),
-    "cameras.mirror.pivot_depth": ("median", {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled"),
-    "cameras.mirror.percentile": (9.0, {"cameras": {"mirror": {"pivot_depth": "median"}}}, "pivot_depth is not"),
+    "cameras.mirror.percentile": (9.0, {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled is false"),
     "cameras.depth.offset_m": ([0.0, 0.0, 0.0], {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled"),
     "images.projection.splat": (3, {"images": {"projection": {"enabled": False}}}, "projection.enabled is false"),
     "images.projection.hidden_point_removal": (

@@ -11,7 +11,7 @@ from schemas.job.job import Job
 from services.job.record import JobRecord, encode_job, is_job_sealed, read_job, record_job, refuse_foreign, require_job
 from workers.store.local import LocalStore
 
-CAPTURES = {"source": "folders", "folders": ["shots/mug", "shots/box"]}
+CAPTURES = {"folders": ["shots/mug", "shots/box"]}
 
 
 @pytest.fixture

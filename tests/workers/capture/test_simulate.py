@@ -112,10 +112,10 @@ def test_a_camera_stores_light_by_its_curve_and_sharpens_and_compresses_what_it_
     curve = stored(tone_curve={"contrast": 1.0})
     for code, before in ((curve[0, 0, 0], dark), (curve[0, -1, 0], grey)):
         assert code == pytest.approx(before - 255 * np.sin(2 * np.pi * before / 255) / (2 * np.pi), abs=0.51)
-    sharp = stored(sharpen={"amount": 1.0, "radius_px": 2.0})[32, :, 1]
+    sharp = stored(sharpen={"amount": 1.0})[32, :, 1]
     assert sharp[[5, -5]] == pytest.approx([dark, grey], abs=0.51)  # far from the edge nothing changes
-    # Half a pixel before a step, the blurred one has risen by the share of a normal law beyond a quarter of a sigma.
-    beyond = 0.5 * math.erfc(0.25 / math.sqrt(2))
+    # Half a pixel before a step, the blurred one has risen by the share of a normal law beyond half a sigma.
+    beyond = 0.5 * math.erfc(0.5 / math.sqrt(2))
     assert sharp[28] - dark == pytest.approx(-beyond * (grey - dark), abs=2)
     assert (
         0
@@ -154,23 +154,22 @@ def test_paths_go_around_the_object_at_several_heights_within_their_intervals():
         assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 0.7  # no jump across the object
 
 
-def test_the_roll_has_the_standard_deviation_that_is_asked_for():
-    T = np.concatenate([path_of(seed, views=24, roll_deg=12.0) for seed in range(150)])
+def test_the_roll_has_its_standard_deviation():
+    T = np.concatenate([path_of(seed, views=24) for seed in range(150)])
     rolls = np.degrees(np.arctan2(T[:, 2, 0], -T[:, 2, 1]))
     assert np.std(rolls) == pytest.approx(12.0, rel=0.1) and abs(np.mean(rolls)) < 1.0
-    assert np.abs(path_of(0, views=24, roll_deg=0.0)[:, 2, 0]).max() < 1e-12
 
 
 def test_way_and_turn_of_an_exposure_are_speed_times_time_in_any_direction_about_its_middle():
-    blur = MotionBlur(exposure_s=0.02, speed_m_s=0.3, turn_deg_s=10.0)
+    blur = MotionBlur(exposure_s=0.04)
     T, ways = pose(uniform_rotation(np.random.default_rng(3)), np.array([1.0, 2.0, 3.0])), []
     for seed in range(2000):
         motion = draw_motion(blur, np.random.default_rng(seed))
         ways.append(motion.way / 0.006)
         if seed < 10:
             first, last = pose_at(T, motion, -0.5), pose_at(T, motion, 0.5)
-            assert np.linalg.norm(last[:3, 3] - first[:3, 3]) == pytest.approx(0.3 * 0.02)
-            assert angle_between(first[:3, :3], last[:3, :3]) == pytest.approx(math.radians(10.0 * 0.02))
+            assert np.linalg.norm(last[:3, 3] - first[:3, 3]) == pytest.approx(0.15 * 0.04)
+            assert angle_between(first[:3, :3], last[:3, :3]) == pytest.approx(math.radians(8.0 * 0.04))
             assert np.array_equal(pose_at(T, motion, 0.0), T) and np.array_equal(pose_at(T, AT_REST, 0.3), T)
     assert np.abs(np.mean(ways, axis=0)).max() < 0.05 and np.allclose(
         np.cov(np.transpose(ways)), np.eye(3) / 3, atol=0.03

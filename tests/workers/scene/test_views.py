@@ -101,8 +101,8 @@ def test_the_front_distance_is_read_from_the_depth_of_whichever_object_is_seen()
     depth = np.concatenate([np.linspace(1.0, 2.0, 101), np.full(500, 0.3), [0.0]])[None, :]
     mask = np.zeros(depth.shape, bool)
     mask[0, :101] = mask[0, -1] = True  # the last pixel has no depth and must not count as nearest
-    for estimator, expected in (("percentile", 1.02), ("median", 1.5), ("nearest", 1.0)):
-        found = front_distance(depth, mask, mirror.model_copy(update={"pivot_depth": estimator}))
+    for percentile, expected in ((2.0, 1.02), (50.0, 1.5), (0.0, 1.0)):
+        found = front_distance(depth, mask, mirror.model_copy(update={"percentile": percentile}))
         assert found == pytest.approx(expected)
     for own in ([2.0], [2.0, 2.1]):
         assert 2.0 <= front_distance(np.array([own]), np.ones((1, len(own)), bool), mirror) <= 2.1

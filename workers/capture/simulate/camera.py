@@ -82,14 +82,20 @@ class Motion:
     turn_rad: float
 
 
+SHARPEN_PX = 1.0
+"""Standard deviation of the blur of the unsharp mask, as cameras have it."""
+
+HAND_M_S, HAND_DEG_S = 0.15, 8.0
+"""How fast a hand moves and turns a camera that it holds still."""
+
 AT_REST = Motion(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
 
 def draw_motion(moving: MotionBlur | RollingShutter, rng: np.random.Generator) -> Motion:
-    """A motion with the speeds of `moving` in its exposure or readout, in a uniform direction and about a uniform axis."""
+    """A motion of the hand in its exposure or readout, in a uniform direction and about a uniform axis."""
     direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     time_s = moving.exposure_s if isinstance(moving, MotionBlur) else moving.readout_s
-    return Motion(moving.speed_m_s * time_s * direction, axis, math.radians(moving.turn_deg_s) * time_s)
+    return Motion(HAND_M_S * time_s * direction, axis, math.radians(HAND_DEG_S) * time_s)
 
 
 def pose_at(T_world_cam: Pose, motion: Motion, moment: float) -> Pose:
@@ -126,7 +132,7 @@ def develop(light: Array, simulate: Simulate) -> NDArray[np.uint8]:
         if tone is not None:
             value = value - tone.contrast * np.sin(2 * math.pi * value) / (2 * math.pi)
         if sharpen is not None:
-            value = value + sharpen.amount * (value - cv2.GaussianBlur(value, (0, 0), sharpen.radius_px))
+            value = value + sharpen.amount * (value - cv2.GaussianBlur(value, (0, 0), SHARPEN_PX))
         codes = np.rint(255 * np.clip(value, 0.0, 1.0)).astype(np.uint8)
     if jpeg is not None:
         _, data = cv2.imencode(".jpg", np.ascontiguousarray(codes[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, jpeg.quality])
