@@ -1,7 +1,7 @@
 """Verso in Python: `import verso; dataset = verso.open("data/tabletop")`.
 
-Reading loads neither Ray, OpenGL nor PyBullet; `make_scene` loads what making a scene needs when it is called. What reads is loaded
-when a name is first asked for: every command of an installed reader imports this file.
+Reading loads neither Ray, OpenGL nor PyBullet; `make_scene` loads what making a scene needs when it is called. What reads is
+loaded when a name is first asked for: every command of an installed reader imports this file.
 """
 
 from collections.abc import Mapping, Sequence

@@ -112,7 +112,9 @@ def kind_of(tree: Keys) -> JobKind:
         return "piles"
     assets = tree.get("assets")
     sources = assets.get("objects") if isinstance(assets, Mapping) else None
-    kinds = [one.get("source") for one in sources if isinstance(one, Mapping)] if isinstance(sources, list) else []
+    kinds = (
+        [source.get("source") for source in sources if isinstance(source, Mapping)] if isinstance(sources, list) else []
+    )
     return "singles" if all(kind == "procedural" for kind in kinds) else "meshes"
 
 
@@ -205,8 +207,8 @@ class Job(Frozen):
     @model_validator(mode="after")
     def _has_ids(self) -> "Job":
         if self.stop_scene > MOST_SCENE_IDS:
-            told = f"and names of files have room for ids below {MOST_SCENE_IDS}"
-            raise ValueError(f"first_scene + scenes is {self.stop_scene}, {told}")
+            limit = f"and names of files have room for ids below {MOST_SCENE_IDS}"
+            raise ValueError(f"first_scene + scenes is {self.stop_scene}, {limit}")
         return self
 
     @model_validator(mode="after")
@@ -222,11 +224,11 @@ class Job(Frozen):
         if self.captures is not None and (unfit := _unfit_for_captures(self, self.captures)):
             raise ValueError(unfit)
         if self.images.projection.enabled and not self.cameras.mirror.enabled:
-            told = "what is projected is what the mirror camera would see; set images.projection.enabled: false too"
-            raise ValueError(f"images.projection.enabled is true and cameras.mirror.enabled is false: {told}")
+            remedy = "what is projected is what the mirror camera would see; set images.projection.enabled: false too"
+            raise ValueError(f"images.projection.enabled is true and cameras.mirror.enabled is false: {remedy}")
         if self.sensor.changes_rgb and not self.render.rgb:
-            told = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
-            raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {told}")
+            remedy = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
+            raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {remedy}")
         return self
 
     @property
@@ -270,6 +272,6 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
     if job.sensor != SensorEffects():
         return "sensor has effects: leave them out, those of a virtual capture are keys of captures.simulate"
     if unfit := [name for name in job.targets.views if name in ("albedo", "amodal")] + list(job.targets.shape):
-        told = "a capture has no shape but what its photographs saw; left are normals, coordinates and layers"
-        return f"targets asks for {', '.join(unfit)}: {told}"
+        why = "a capture has no shape but what its photographs saw; left are normals, coordinates and layers"
+        return f"targets asks for {', '.join(unfit)}: {why}"
     return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"

@@ -126,10 +126,10 @@ class Images(Frozen):
     def _fits_16_bits(self) -> "Images":
         units = self.depth_range_m.high * self.depth_units_per_m
         if units > 65_535:
-            told = (
+            bound = (
                 f"{units:.0f} units of depth_units_per_m {self.depth_units_per_m:g}: a 16-bit image holds at most 65535"
             )
-            raise ValueError(f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {told}")
+            raise ValueError(f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {bound}")
         return self
 
 

@@ -11,7 +11,6 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from schemas.base import Counts, Range
-from schemas.job.assets import FORMER
 from schemas.job.job import Job
 from schemas.job.physics import MOST_OBJECTS
 
@@ -37,9 +36,7 @@ def list_keys(model: type[BaseModel] = Job, prefix: str = "") -> Iterator[tuple[
 def _branches(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         source = annotation.model_fields.get("source")
-        kinds = [kind for kind in typing.get_args(source.annotation) if kind != FORMER] if source is not None else []
-        kind = f"[{kinds[0]}]" if len(kinds) == 1 else ""
-        yield kind, annotation
+        yield "" if source is None else f"[{typing.get_args(source.annotation)[0]}]", annotation
         return
     for argument in typing.get_args(annotation):
         if argument is not Ellipsis:
@@ -110,11 +107,11 @@ def _default(field: FieldInfo) -> str:
 def write_doc() -> str:
     """The whole page."""
     rows: dict[str, list[str]] = {}
-    told: dict[Any, str] = {}
+    firsts: dict[Any, str] = {}
     again: list[str] = []
     for path, field in list_keys():
-        if path.endswith(".source") and len(typing.get_args(field.annotation)) == 1:
-            continue
+        if path.endswith("].source"):
+            continue  # the kind stands in the brackets
         if path.startswith("assets.tables["):
             continue  # the same keys as those of objects
         meaning = " ".join((field.description or "").split())
@@ -123,7 +120,7 @@ def write_doc() -> str:
         if path.startswith(tuple(again)):
             continue  # told where the same branch stands first
         if field.annotation is not None and (branch := [kind for _, kind in _branches(field.annotation)]):
-            first = told.setdefault(tuple(branch), path)
+            first = firsts.setdefault(tuple(branch), path)
             if first != path and path != "assets.tables":
                 again.append(f"{path}.")
                 meaning += f" Its keys are those of `{first}`."

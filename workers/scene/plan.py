@@ -116,7 +116,7 @@ def draw_start(
     object begins above all earlier ones, about the place of the first.
     """
     number = len(earlier)
-    others = [points_of(one) for one in earlier]
+    others = [points_of(start) for start in earlier]
     middle = earlier[0].T_world_obj[:2, 3] if earlier and spec.arrange == "pile" else np.zeros(2)
     rng = chance.object_stream(Stream.START, number)
     return _find_place(

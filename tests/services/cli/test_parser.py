@@ -62,7 +62,7 @@ HOSTILE = (
     (["run", "j", "--workers", "0"], "whole number"),
     (["replay", "o", "x"], "whole number"),
     (["verify", "o", "--audit", "x"], "whole number"),
-    (["report", "o", "--scenes", "0"], "0 is not a whole number from 1 up"),
+    (["report", "o", "--scenes", "0"], "'0' is not a whole number from 1 up"),
     (["run", "j", "--out", "a\0b"], "'a\\x00b'"),
     (["run", "j", "--out", ""], "''"),
     (["run", "j", "--out", "\x1b[31m"], "\\x1b[31m"),
