@@ -88,7 +88,7 @@ def _compare(
     """
     (z_drawn, region_drawn), (z_cast, region_cast, cosine), (low, high, steepest) = drawn, cast, bounds
     width = z_cast.shape[1]
-    differ, found = np.empty(z_cast.size, np.int64), 0
+    differ, differing = np.empty(z_cast.size, np.int64), 0
     compared = np.zeros(z_cast.shape, np.uint8)
     count, large = np.zeros(256, np.int64), np.zeros(256, np.int64)
     for row in range(z_cast.shape[0]):
@@ -97,13 +97,13 @@ def _compare(
             error_mm = abs(np.float64(z_drawn[row, column]) - z) * 1e3
             if region != region_drawn[row, column]:
                 if error_mm > ONE_SURFACE_MM:
-                    differ[found] = row * width + column
-                    found += 1
+                    differ[differing] = row * width + column
+                    differing += 1
             elif region > 0 and low < z < high and cosine[row, column] > steepest:
                 compared[row, column] = region
                 count[region] += 1
                 large[region] += error_mm > LEAST_BOUND_MM
-    return differ[:found].copy(), compared, count, large
+    return differ[:differing].copy(), compared, count, large
 
 
 def _intersects(

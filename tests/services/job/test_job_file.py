@@ -247,10 +247,10 @@ def test_a_packed_job_is_the_same_job_with_whole_paths(tmp_path):
     file = write(tmp_path, ODD)
     assert load_job(Path(pack_job(file)), ["scenes=9"]) == load_job(file, ["scenes=9"])
     meshes = "name: meshes\nscenes: 2\ncategories: [mug]\nassets: {objects: [{source: urdf, folder: %s}]}\n"
-    told = r"assets\.objects\.0\.folder: 'meshes': a packed job has no folder of its own"
-    with pytest.raises(JobError, match=told):
+    why = r"assets\.objects\.0\.folder: 'meshes': a packed job has no folder of its own"
+    with pytest.raises(JobError, match=why):
         pack_job(write(tmp_path, meshes % "meshes"))
-    with pytest.raises(JobError, match=told):
+    with pytest.raises(JobError, match=why):
         load_job(Path(pack((meshes % "meshes").encode())))
     assert is_packed(pack_job(write(tmp_path, meshes % "/srv/meshes")))
 
@@ -306,15 +306,15 @@ def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path,
             job = load_job(path)
             assert Job.model_validate(job.model_dump(mode="json")) == job
             # Others name folders of meshes, whose reading has tests of its own.
-            built_in = all(isinstance(one, ProceduralSource) for one in (*job.assets.objects, *job.assets.tables))
+            built_in = all(isinstance(source, ProceduralSource) for source in (*job.assets.objects, *job.assets.tables))
             outcomes["job"] += 1
         except JobError as error:
             check_lines(str(error), path)
             outcomes["refused"] += 1
         if built_in:
             assert main(["run", str(path), "--dry-run", "--out", out]) in (0, 2), number
-            told = capsys.readouterr()
-            assert "Traceback" not in told.out + told.err and "\x1b" not in told.out + told.err
+            printed = capsys.readouterr()
+            assert "Traceback" not in printed.out + printed.err and "\x1b" not in printed.out + printed.err
         assert time.process_time() - started < MOST_SECONDS, number
     assert sorted(tmp_path.iterdir()) == [path]
     assert peak_mb() - before < MOST_MB

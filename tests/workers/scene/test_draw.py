@@ -43,9 +43,9 @@ def mesh_of(start: ObjectStart) -> trimesh.Trimesh:
     return trimesh.Trimesh(transform(start.T_world_obj, shape.vertices), shape.faces)
 
 
-def is_share(found: float, expected: float, count: int) -> bool:
+def is_share(share: float, expected: float, count: int) -> bool:
     """Within four standard deviations."""
-    return abs(found - expected) < 4 * math.sqrt(expected * (1 - expected) / count)
+    return abs(share - expected) < 4 * math.sqrt(expected * (1 - expected) / count)
 
 
 # ---------------------------------------------------------------------------------------------- chance
@@ -61,7 +61,7 @@ def test_a_stream_is_a_function_of_seed_scene_step_and_object():
     assert draws[0] == chance.stream(Stream.START).random() and len(set(draws)) == 4
     names = "CATEGORY OBJECT TABLE START REDRAW CAMERA APPEARANCE RAYCAST_CHECK SENSOR_DEPTH SENSOR_RGB SENSOR_EXPOSURE"
     names += " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT LOST"  # append-only: another number changes every dataset ever made
-    assert [(one.name, int(one)) for one in Stream] == [(name, n) for n, name in enumerate(names.split())]
+    assert [(stream.name, int(stream)) for stream in Stream] == [(name, n) for n, name in enumerate(names.split())]
 
 
 def test_categories_counts_and_checked_scenes_come_with_their_shares():
@@ -81,9 +81,9 @@ def test_categories_counts_and_checked_scenes_come_with_their_shares():
 
 
 def test_more_pairs_and_objects_move_neither_the_earlier_ones_nor_cameras_table_and_look():
-    one, three = (plan(3, BOX, pairs=n) for n in (1, 3))
-    assert np.array_equal(one.objects[0].T_world_obj, three.objects[0].T_world_obj)
-    assert np.array_equal(one.input_cameras[0].T_world_cam, three.input_cameras[0].T_world_cam)
+    single, three = (plan(3, BOX, pairs=n) for n in (1, 3))
+    assert np.array_equal(single.objects[0].T_world_obj, three.objects[0].T_world_obj)
+    assert np.array_equal(single.input_cameras[0].T_world_cam, three.input_cameras[0].T_world_cam)
     assert len({camera.T_world_cam.tobytes() for camera in three.input_cameras}) == 3
     for arrange in ("spread", "pile"):
         plans = [plan(7, *[SMALL, CAN, BIG, CAN, SMALL][:n], arrange=arrange) for n in (1, 3, 5)]
