@@ -85,8 +85,8 @@ def record_job(
 
 
 def encode_job(record: JobRecord) -> bytes:
-    """OUT/job.yaml."""
-    job = record.job.model_dump(mode="json")
+    """OUT/job.yaml; without the preset, which has filled its keys, and would fill those that a later version adds to it."""
+    job = record.job.model_dump(mode="json", exclude={"preset"})
     tree: dict[str, Any] = {"digest": record.digest, "catalogue": record.catalogue, "folder": record.folder}
     tree |= {"inputs": list(record.inputs)} if record.inputs else {}
     tree["job"] = job
