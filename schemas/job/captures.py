@@ -177,27 +177,6 @@ class KinectDepthNoise(Frozen):
     """Further systematic error, metres."""
 
 
-class MotionBlur(Frozen):
-    """Movement of the hand-held camera during an exposure."""
-
-    exposure_s: Positive = 0.008
-    """Time that the shutter is open, while the camera moves at 0.15 m/s and turns at 8 degrees a second."""
-
-
-class RollingShutter(Frozen):
-    """Rows that are read one after the other while the camera moves; a view's pose is that of its middle row."""
-
-    readout_s: Positive = 0.02
-    """First row to last, while the camera moves as in `motion_blur`."""
-
-
-class Sharpen(Frozen):
-    """Sharpening in the camera: an unsharp mask on encoded values."""
-
-    amount: NonNegative = 1.0
-    """Share of the difference from the image blurred by a pixel that is added."""
-
-
 class ToneCurve(Frozen):
     """What the camera stores in place of sRGB."""
 
@@ -205,20 +184,6 @@ class ToneCurve(Frozen):
     """Codes are linear light."""
     contrast: Share = 0.3
     """Steepening of the middle of an S-curve through black, middle grey and white."""
-
-
-class Jpeg(Frozen):
-    """Loss of a JPEG file; what it decodes to is stored."""
-
-    quality: Annotated[int, Field(ge=1, le=100)] = 85
-    """As in libjpeg."""
-
-
-class HiddenMarkers(Frozen):
-    """Patches of paper that cover markers in part."""
-
-    share: Share = 0.15
-    """Share of the markers that are covered in part."""
 
 
 class RegistrationError(Frozen):
@@ -249,22 +214,22 @@ class Simulate(Frozen):
     """Noise of the Azure Kinect's depth; nothing: exact depth."""
     rgb_noise: RgbNoise | None = None
     """Shot noise and read noise of RGB."""
-    motion_blur: MotionBlur | None = None
-    """Movement of the camera while it exposes."""
-    rolling_shutter: RollingShutter | None = None
-    """Rows read in turn."""
+    motion_blur: Positive | None = None
+    """Seconds that the shutter is open, such as 0.008, while the camera moves at 0.15 m/s and turns at 8 degrees a second."""
+    rolling_shutter: Positive | None = None
+    """Seconds from the first row to the last, such as 0.02, while the camera moves as much; a pose is that of the middle row."""
     exposure: Exposure | None = None
     """Exposure of every view."""
     tone_curve: ToneCurve | None = None
     """Tone curve of the camera; nothing: sRGB."""
-    sharpen: Sharpen | None = None
-    """Sharpening in the camera."""
-    jpeg: Jpeg | None = None
-    """Photographs that were JPEG files."""
+    sharpen: NonNegative | None = None
+    """Share of the difference from the image blurred by a pixel that the camera adds to encoded values, such as 1."""
+    jpeg: Annotated[int, Field(ge=1, le=100)] | None = None
+    """Quality, as in libjpeg, of the JPEG files that photographs were, such as 85; what they decode to is stored."""
     distortion: Distortion | None = None
     """Lens of the colour camera; nothing: a pinhole."""
-    hidden_markers: HiddenMarkers | None = None
-    """Patches of paper on the board."""
+    hidden_markers: Share | None = None
+    """Share of the markers that patches of paper cover in part, such as 0.15."""
     print_scale: Annotated[float, Field(gt=0.5, lt=2)] | None = None
     """True size of the print over its nominal size."""
     registration_error: RegistrationError | None = None
