@@ -13,7 +13,6 @@ import pytest
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import SettleError
-from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.views import Images, Patch
 from schemas.scene.view import Camera, Intrinsics, ObjectLabel, Pair, View
@@ -189,13 +188,3 @@ def test_opencv_of_a_worker_has_one_thread():
         assert cv2.getNumThreads() == 1
     finally:
         cv2.setNumThreads(before)
-
-
-def test_what_changes_a_scene_is_in_the_digest_of_its_settings_and_nothing_else():
-    def digest(catalogue: str = "assets", **changes) -> str:
-        return settings_digest(Job.model_validate({"name": "t", **changes}), catalogue)
-
-    for same in ({"name": "o"}, {"scenes": 7}, {"first_scene": 3}, {"run": {"scene_timeout_s": 5.0}}, {"sensor": {}}):
-        assert digest(**same) == digest()
-    others = ({"seed": 1}, {"sensor": {"rgb_noise": {}}}, {"physics": {"restitution": 0.5}}, {"catalogue": "others"})
-    assert len({digest(), *(digest(**changes) for changes in others)}) == 5
