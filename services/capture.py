@@ -66,7 +66,10 @@ def board(options: argparse.Namespace) -> int:
     elif kind != ".json":
         raise InputError(f"{path}: name a file that ends in .pdf, .png or .json")
     described, new = _describe_board(path, spec, data)
-    answer: dict[str, Any] = {"board_file": str(described), "board": spec.model_dump(mode="json")}
+    answer: dict[str, Any] = {
+        "board_file": str(described),
+        "board": spec.model_dump(mode="json", exclude=spec.unwritten),
+    }
     size = "" if spec.markers else f" of {spec.marker_m * 1000:g} mm"
     if data is not None:
         told = "A4 pages to glue" if options.tiles else "print at 100 %"
@@ -135,7 +138,8 @@ def _describe_board(path: Path, spec: Board, data: bytes | None) -> tuple[Path, 
         if data is not None:
             path.write_bytes(data)
         if new:
-            described.write_text(spec.model_copy(update=printed).model_dump_json(indent=1) + "\n", encoding="utf-8")
+            text = spec.model_copy(update=printed).model_dump_json(indent=1, exclude=spec.unwritten)
+            described.write_text(f"{text}\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}") from error
     return described, new
@@ -149,7 +153,7 @@ def simulate(options: argparse.Namespace) -> int:
     """
     keys = {"seed": options.seed, "categories": [options.category], "captures.simulate.views": options.views}
     if options.views is not None:
-        keys["captures.most_views"] = options.views  # of a dataset, which this folder is not
+        keys["pairs_per_scene"] = options.views  # of a dataset, which this folder is not
     job = capture_job(options.changes, keys)
     assert job.captures is not None
     path, begun = Path(options.out), time.perf_counter()
@@ -166,7 +170,7 @@ def simulate(options: argparse.Namespace) -> int:
     catalogue = open_catalogue(job.assets, Path.cwd(), job.categories)
     asset = load_object(job, catalogue, chance)
     plan = plan_capture(settings)
-    truth = simulate_capture(settings, job.captures.board, asset, chance, path)
+    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, path)
     seconds, ran = time.perf_counter() - begun, [name for name in CAPTURE_EFFECTS if plan.runs(name)]
     views = len(truth.T_board_cam)
     print(

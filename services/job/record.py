@@ -25,8 +25,9 @@ NOBODYS = {"lost+found"}
 HEADER = """\
 # The job as it was run, every default filled in. Written by the first run on this folder; `verso run` on the same
 # folder goes on where it stopped, and refuses a job that differs in anything but `scenes` (more of them) and `run`.
-# `digest` covers what the dataset is: all other keys and the files of the asset folders (`catalogue`). `folder` is where
-# the job file lay: relative asset folders start there. `seal` is the SHA-256 of all bytes above it.
+# `digest` covers what the dataset is: all other keys that differ from their defaults, and the files of the asset folders
+# (`catalogue`). `folder` is where the job file lay: relative asset folders start there. `seal` is the SHA-256 of all bytes
+# above it.
 """
 
 SEAL = "seal: "
@@ -84,8 +85,8 @@ def record_job(
 
 
 def encode_job(record: JobRecord) -> bytes:
-    """OUT/job.yaml."""
-    job = record.job.model_dump(mode="json")
+    """OUT/job.yaml; without the preset, which has filled its keys, and would fill those that a later version adds to it."""
+    job = record.job.model_dump(mode="json", exclude={"preset"})
     tree: dict[str, Any] = {"digest": record.digest, "catalogue": record.catalogue, "folder": record.folder}
     tree |= {"inputs": list(record.inputs)} if record.inputs else {}
     tree["job"] = job
@@ -119,11 +120,11 @@ def decode_job(data: bytes, name: str) -> JobRecord:
             raise TypeError(f"folder: {folder!r} is not an absolute path")
         return JobRecord(job, **texts, inputs=inputs)
     except JobError as error:
-        told = str(error).splitlines()[0].removeprefix(f"{name}: ")
-        raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
+        problem = str(error).splitlines()[0].removeprefix(f"{name}: ")
+        raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        told = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
+        problem = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
 
 
 def is_job_sealed(data: bytes) -> bool:

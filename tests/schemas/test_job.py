@@ -5,15 +5,17 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from schemas.job.assets import CATEGORIES, FolderSource, matches, offered_by
-from schemas.job.identity import compare_jobs, dataset_keys, job_digest, settings_digest
+from schemas.job.assets import CATEGORIES, Assets, FolderSource, ProceduralSource, matches, offered_by
+from schemas.job.identity import PATHS, compare_jobs, differing_keys, job_digest, settings_digest
 from schemas.job.job import PRESETS, Job, with_preset
+from schemas.job.physics import Start
+from schemas.job.views import Targets
 from tests.datasets import overlaid
 
 FRUIT = {"source": "urdf", "folder": "fruit", "category_map": {"*.obj": "banana", "*.glb": "Pear-2", "t.obj": "table"}}
 URDF = {"source": "urdf", "folder": "/somewhere"}
 BASE = {"name": "t", "assets": {"objects": [URDF]}}
-FOLDERS = {"name": "t", "captures": {"source": "folders", "folders": ["a", "b", "c"]}}
+FOLDERS = {"name": "t", "captures": {"folders": ["a", "b", "c"]}}
 SIMULATED = {"name": "t", "captures": {}}
 
 
@@ -75,8 +77,8 @@ def test_a_pattern_matches_what_pathlibs_glob_finds_and_many_stars_take_no_time(
         (tmp_path / name).touch()
     for pattern in PATTERNS:
         paths = () if pattern.endswith("**") else tmp_path.glob(pattern)  # files, from Python 3.13 on
-        found = {path.relative_to(tmp_path).as_posix() for path in paths if path.is_file()}
-        assert {name for name in FILES if matches(name, pattern)} == found, pattern
+        names = {path.relative_to(tmp_path).as_posix() for path in paths if path.is_file()}
+        assert {name for name in FILES if matches(name, pattern)} == names, pattern
     assert not matches("a/" * 200 + "b", "**/a/" * 100 + "*/c")
 
 
@@ -128,26 +130,22 @@ def test_a_preset_fills_the_keys_that_the_job_does_not_give():
 
 def test_what_follows_from_captures_unless_the_job_says_otherwise():
     assert (job(FOLDERS).scenes, job(FOLDERS, scenes=2).stop_scene) == (3, 2)
-    made = job(SIMULATED, captures={"most_views": 50})
+    made = job(SIMULATED, pairs_per_scene=50)
     assert (made.pairs_per_scene, made.cameras.depth.enabled, made.scenes) == (50, False, 64)
     assert (made.run.range_size, made.run.scene_timeout_s) == (1, 1800.0)
     assert job(SIMULATED, run={"range_size": 4}).run.range_size == 4
     for base in (FOLDERS, SIMULATED):
         assert Job.model_validate(job(base).model_dump(mode="json")) == job(base)
-    assert "captures" not in job().model_dump(mode="json") and "captures" not in job().model_dump_json()
 
 
 def test_what_a_capture_cannot_have_is_refused_with_its_key():
     for changes, words in (
         ({"scenes": 4}, "3 folders"),
         ({"first_scene": 1, "scenes": 2}, "first_scene must be 0"),
-        ({"pairs_per_scene": 2}, "most_views"),
         ({"cameras": {"depth": {"enabled": True}}}, "registered"),
         ({"objects_per_scene": [1, 3]}, "one object"),
         ({"sensor": {"depth_noise": {}}}, "captures.simulate"),
         ({"render": {"rgb": False}}, "render.rgb"),
-        ({"captures": {"source": "simulate"}}, "folders must be named"),
-        ({"captures": {"category": "a/b"}}, "letters, digits, - and _"),
         ({"captures": {"board": {"columns": 9}}}, "width_m is 0.6, and 9 markers with their gaps need"),
     ):
         with pytest.raises(ValidationError, match=words):
@@ -165,7 +163,7 @@ def test_a_key_belongs_to_the_dataset_to_its_scenes_or_to_neither():
         ({"name": "u"}, False, True),
         ({"first_scene": 4}, False, True),
         ({"output": {"layout": "tar"}}, False, True),
-        ({"preset": "exact", "physics": {"step_hz": 960}, "render": {"samples": 1}}, False, True),
+        ({"preset": "exact", "physics": {"step_hz": 960}, "render": {"samples": 1}}, True, True),
         ({"seed": 1}, False, False),
         ({"cameras": {"mirror": {"T_z_m": 1.4}}}, False, False),
         ({"sensor": {"rgb_noise": {}}}, False, False),
@@ -182,21 +180,54 @@ def test_a_key_belongs_to_the_dataset_to_its_scenes_or_to_neither():
     assert differing == [("seed", 0, 2), ("start.pose", "upright", "tumbled")]
 
 
-def test_settings_of_captures_belong_to_the_dataset_and_paths_and_what_the_source_does_not_use_do_not():
+def test_settings_of_captures_belong_to_the_dataset_and_paths_do_not():
     before, moved = job(FOLDERS), job(FOLDERS, captures={"folders": ["x/a", "x/b", "x/c"]})
     assert compare_jobs(before, moved) == [] and job_digest(before, "c") == job_digest(moved, "c")
     finer = job(FOLDERS, captures={"fusion": {"voxel_m": 0.001}})
     assert compare_jobs(before, finer) == [("captures.fusion.voxel_m", 0.002, 0.001)]
     assert settings_digest(before, "c") != settings_digest(finer, "c")
-    assert "folders" not in dataset_keys(before)["captures"]
-    views = {"simulate": {"views": 9}}
-    assert job_digest(before, "c") == job_digest(job(FOLDERS, captures=views), "c")
-    assert job_digest(job(SIMULATED), "c") != job_digest(job(SIMULATED, captures=views), "c")
 
 
-def test_digests_of_jobs_are_those_of_datasets_that_were_made_before():
-    assert job_digest(job(), "c")[:16] == "d3ee8e0fe9559a68"
-    assert settings_digest(job(), "c")[:16] == "938ee36c17800eba"
-    mapped = {"source": "urdf", "folder": "m", "category_map": {"*.obj": "mug"}, "up": "y"}
-    before_maps_of_axes = job_digest(Job(name="j", assets={"objects": [mapped]}), "c" * 64)
-    assert before_maps_of_axes == "2a98cd36192d5711e6a2502d718b8a394dcd9aed87ac5985e007aab10ed1d3f3"
+class _LongerStart(Start):
+    spin: float = 1.0
+
+
+class _LongerSource(ProceduralSource):
+    gloss: float = 0.5
+
+
+class _LongerAssets(Assets):
+    objects: tuple[_LongerSource, ...] = (_LongerSource(source="procedural"),)
+
+
+class _LongerJob(Job):
+    start: _LongerStart = _LongerStart()
+    assets: _LongerAssets = _LongerAssets()
+    other_targets: Targets | None = None
+    views: tuple[int, ...] = (1, 2)
+
+
+def test_a_key_that_a_later_version_adds_leaves_the_digests_of_older_jobs_and_counts_where_it_is_set():
+    keys = {"name": "t", "start": {"pose": "tumbled"}, "assets": {"objects": [{"source": "procedural", "seed": 3}]}}
+    older, newer = (kind.model_validate(keys) for kind in (Job, _LongerJob))
+    for digest in (job_digest, settings_digest):
+        assert digest(newer, "c") == digest(older, "c")
+        for changes in (
+            {"start": {"spin": 2.0}},
+            {"views": [1]},
+            {"other_targets": {}},
+            {"assets": {"objects": [{"source": "procedural", "seed": 3, "gloss": 0.4}]}},
+        ):
+            assert digest(_LongerJob.model_validate(overlaid(keys, changes)), "c") != digest(older, "c"), changes
+    assert differing_keys(older) == {**keys}
+
+
+def test_a_digest_is_that_of_what_differs_from_the_defaults_of_the_keys_whatever_filled_them():
+    exact = job(preset="exact")
+    assert differing_keys(exact)["physics"] == {"step_hz": 1920} and differing_keys(job(seed=0)) == {"name": "t"}
+    assert job_digest(exact, "c") == job_digest(job(physics={"step_hz": 1920}, render={"samples": 4}), "c")
+    assert job_digest(exact, "c") != job_digest(job(), "c")
+    noisy = job(sensor={"depth_noise": {}})
+    assert differing_keys(noisy)["sensor"] == {"depth_noise": {}}, "a branch that is there differs from none"
+    sources = differing_keys(job(BASE), PATHS)["assets"]["objects"]
+    assert sources == [{"source": "files"}], "the kind of a source stays, the path of its folder does not"
