@@ -4,7 +4,6 @@ What it does next is decided by pure functions, from the states of all jobs and 
 """
 
 import contextlib
-import shlex
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,8 +28,8 @@ class Drivers(Protocol):
     def states(self) -> dict[str, Driver]:
         """By submission id: the drivers that are known."""
 
-    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
-        """Starts a driver, unless one of this submission id is known already."""
+    def hand_over(self, submission: str, words: Sequence[str]) -> None:
+        """Starts a driver, which is a command line, unless one of this submission id is known already."""
 
     def stop(self, submission: str) -> None:
         """Asks for the end of a driver; returns at once."""
@@ -242,9 +241,8 @@ class Supervisor:
     def _hand_over(self, view: JobView) -> None:
         """Gives the driver of a decided attempt to Ray."""
         job, attempt = view.request.id, view.attempt
-        metadata = {"verso_job": job, "verso_queue": self._queue.name}
-        entrypoint = build_entrypoint(self._rules.command, self._queue.name, job, attempt)
-        self._drivers.hand_over(submission_id(job, attempt), entrypoint, metadata)
+        words = [*self._rules.command, "drive", job, str(attempt), "--queue", self._queue.name]
+        self._drivers.hand_over(submission_id(job, attempt), words)
 
     def _keep_logs(self, views: Sequence[JobView], known: Mapping[str, Driver]) -> None:
         """Copies the logs of drivers that are over into the queue, while Ray still has them."""
@@ -286,11 +284,6 @@ class Supervisor:
         if line not in self._memory.told:
             self._memory.told.add(line)
             self._say(line)
-
-
-def build_entrypoint(command: Sequence[str], queue: str, job: str, attempt: int) -> str:
-    """What Ray gives to a shell: each word quoted, and none of them from a job."""
-    return shlex.join([*command, "drive", job, str(attempt), "--queue", queue])
 
 
 def supervise(queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str], None]) -> None:

@@ -3,7 +3,6 @@
 import http.server
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -51,7 +50,7 @@ def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found
         stubborn = "trap 'echo told' TERM; echo $GIVEN; for ((i = 0; i < 600; i++)); do sleep 0.05; done"
         for name, script in {"stubborn": stubborn, "plain": "exit 3", "killed": "kill -9 $$"}.items():
             for _ in range(2):  # a driver that is known is not started again
-                drivers.hand_over(name, shlex.join(["bash", "-c", script]), {})
+                drivers.hand_over(name, ["bash", "-c", script])
         wait_for(lambda: [one.state for one in drivers.states().values()].count("over") == 2)
         assert drivers.states() == {
             "stubborn": Driver("running"),
@@ -65,7 +64,7 @@ def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found
             time.sleep(0.2)
         assert drivers.log("stubborn") == "to drivers\ntold\n" and reader.log("plain") == ""
         with pytest.raises(MachineError, match=r"--driver /no/verso: it cannot be started \(No such file"):
-            drivers.hand_over("other", "/no/verso drive", {})
+            drivers.hand_over("other", ["/no/verso", "drive"])
         monkeypatch.setattr(module, "STOP_S", 0.2)
         drivers.end()
         assert drivers.states()["stubborn"] == Driver("over", "killed by SIGKILL")
