@@ -32,6 +32,7 @@ from services.score.images import Alignment, align_depth, score_colour, score_de
 from services.score.pose import score_pose, symmetries_of
 from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
 from services.score.shape import align_shape, box_of, score_shape, score_volume
+from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
 PredictedFrame = Literal["object", "camera", "input", "world"]
@@ -56,6 +57,9 @@ INVERTED: Final = -0.8
 
 SIZE_SLACK: Final = 3.0
 """Most ratio of the diagonals of a predicted and the true box, and most distance of their centres in diagonals."""
+
+SIGN_SHARE: Final = 0.1
+"""Of the points, at most on the right side where the sign is the other one; a poor guess has more."""
 
 _UNITS: Final = {1e3: "millimetres", 1e2: "centimetres", 1e-3: "kilometres: it was divided by 1,000 once too often"}
 
@@ -83,8 +87,13 @@ def column(kind: str, name: str) -> str:
     return f"depth_{metric.removesuffix('_m')}{infix}_m" if metric.endswith("_m") else f"depth_{metric}{infix}"
 
 
-def score_pair(pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], asked: Asked) -> list[Row]:
-    """A row for each item of a pair. Raises InputError where the dataset has no mirror view, CorruptError where it is damaged."""
+def score_pair(
+    pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], asked: Asked, blame: str = ""
+) -> list[Row]:
+    """A row for each item of a pair; with `blame`, why its predictions are refused unread.
+
+    Raises InputError where the dataset has no mirror view, CorruptError where it is damaged.
+    """
     if pair.mirror is None:
         raise InputError("the dataset has no mirror view to score: its job's cameras.mirror.enabled is false")
     truth, rows = Truth(pair, pair.mirror), []
@@ -102,7 +111,10 @@ def score_pair(pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], a
                 "diagonal_m": truth.diagonal_m(region or REGION_FIRST_OBJECT),
             }
             names = found.get((kind, pair.mirror.pose_id, region), ())
-            rows.append(row | _score(kind, names, region, truth, folder, asked))
+            if names and blame:
+                rows.append(row | {"status": "refused", "reason": blame})
+            else:
+                rows.append(row | _score(kind, names, region, truth, folder, asked))
     return rows
 
 
@@ -113,11 +125,12 @@ def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folde
     prepared = truth.prepare(kind, region, asked)
     try:
         if len(names) > 1:
-            told = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
-            raise InputError(f"the id is there {len(names)} times: {told}")
-        scores, note = _SCORERS[kind](
-            folder / kind / names[0] if kind != "pose" else names[0], region, prepared, truth, asked
-        )
+            where = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
+            raise InputError(f"the id is there {len(names)} times: {where}")
+        with as_refusal(f"{kind} {names[0]}"):
+            scores, note = _SCORERS[kind](
+                folder / kind / names[0] if kind != "pose" else names[0], region, prepared, truth, asked
+            )
     except VersoError as error:
         return {"status": "refused", "reason": str(error).replace(f"{folder}/", "")}
     return {"status": "ok", "reason": note} | {column(kind, name): value for name, value in scores.items()}
@@ -303,9 +316,23 @@ def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: A
     if name not in prepared:
         raise InputError(f"the dataset stores no {name.removeprefix('volume_')} to hold it against")
     true = prepared[name].astype(np.float64)
-    if is_distance and np.abs(predicted).max() > 100.0 * np.abs(true).max():
-        raise InputError(f"distances reach {np.abs(predicted).max():.3g}: they seem to be in millimetres; write metres")
+    if is_distance:
+        check_distance(predicted, true)
     return score_volume(predicted, true, is_distance), None
+
+
+def check_distance(predicted: Array, true: Array) -> None:
+    """Raises InputError where signed distances [N] are no metres, or positive inside."""
+    times = float(np.abs(predicted).max() / max(float(np.abs(true).max()), 1e-9))
+    if times > 100.0:
+        raise InputError(f"distances reach {np.abs(predicted).max():.3g}: they seem to be in millimetres; write metres")
+    if times > 10.0:
+        raise InputError(
+            f"values reach {np.abs(predicted).max():.3g}, {times:.3g} times the largest distance: they seem to be logits; write "
+            "occupancy from 0 to 1, or distance in metres"
+        )
+    if float(np.mean((predicted < 0.0) == (true > 0.0))) > 1.0 - SIGN_SHARE:
+        raise InputError("the distances have the other sign: they are negative inside, positive outside")
 
 
 def _score_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
