@@ -29,9 +29,9 @@ from services.dataset.correspondence import carry
 from services.dataset.pair import Pair
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
+from services.score.points import box_of, check_distance, score_volume
 from services.score.pose import score_pose, symmetries_of
 from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
-from services.score.shape import align_shape, box_of, score_shape, score_volume
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
@@ -57,9 +57,6 @@ INVERTED: Final = -0.8
 
 SIZE_SLACK: Final = 3.0
 """Most ratio of the diagonals of a predicted and the true box, and most distance of their centres in diagonals."""
-
-SIGN_SHARE: Final = 0.1
-"""Of the points, at most on the right side where the sign is the other one; a poor guess has more."""
 
 _UNITS: Final = {1e3: "millimetres", 1e2: "centimetres", 1e-3: "kilometres: it was divided by 1,000 once too often"}
 
@@ -274,6 +271,8 @@ def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Aske
 
 
 def _score_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+    from services.score.shape import align_shape, score_shape  # loads what makes data
+
     predicted = read_shape(path)
     predicted, _ = align_shape(predicted, prepared, asked.align, asked.seed)
     points = predicted.vertices if isinstance(predicted, Mesh) else predicted
@@ -319,20 +318,6 @@ def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: A
     if is_distance:
         check_distance(predicted, true)
     return score_volume(predicted, true, is_distance), None
-
-
-def check_distance(predicted: Array, true: Array) -> None:
-    """Raises InputError where signed distances [N] are no metres, or positive inside."""
-    times = float(np.abs(predicted).max() / max(float(np.abs(true).max()), 1e-9))
-    if times > 100.0:
-        raise InputError(f"distances reach {np.abs(predicted).max():.3g}: they seem to be in millimetres; write metres")
-    if times > 10.0:
-        raise InputError(
-            f"values reach {np.abs(predicted).max():.3g}, {times:.3g} times the largest distance: they seem to be logits; write "
-            "occupancy from 0 to 1, or distance in metres"
-        )
-    if float(np.mean((predicted < 0.0) == (true > 0.0))) > 1.0 - SIGN_SHARE:
-        raise InputError("the distances have the other sign: they are negative inside, positive outside")
 
 
 def _score_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:

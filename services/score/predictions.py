@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from trimesh.exchange.ply import load_ply
 
 from schemas.base import Array, Pose
-from schemas.errors import InputError, needs_making, plain_line
+from schemas.errors import InputError, plain_line
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.score.pose import is_rigid
@@ -166,9 +166,9 @@ def _numbers(path: Path, values: object, shape: tuple[int, ...] | None) -> Array
 def read_shape(path: Path) -> Mesh | Array:
     """A mesh, or points [N, 3] of a file without faces, in the file's units. Raises VersoError."""
     data, suffix = read_bytes(path, int(LIMITS.max_file_mb * 1e6)), path.suffix.lower()
-    with needs_making("scoring meshes"):
-        from workers.assets.external.formats import load_shape
-        from workers.assets.external.plain import count_ply
+    from workers.assets.external.formats import load_shape  # loads what makes data
+    from workers.assets.external.plain import count_ply
+
     if suffix == ".npz":
         points = _read_points(path, data)
     elif suffix == ".ply" and not count_ply(data)[1]:

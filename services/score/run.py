@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.errors import MachineError, VersoError, plural
+from schemas.errors import MachineError, VersoError, needs_making, plural
 from services.dataset.dataset import iter_pairs
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
@@ -97,6 +97,9 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
     Raises InputError where the dataset has not what is predicted, CorruptError where it is damaged, MachineError where a
     process is killed.
     """
+    if "shape" in asked.kinds:
+        with needs_making("scoring shapes"):
+            import services.score.shape  # noqa: F401
     out.mkdir(parents=True, exist_ok=True)
     todo, scored = list(_ranges(store, predictions, asked)), list[_Range]()
     unknown, metrics = set(predictions.found), set[str]()

@@ -12,8 +12,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from schemas.scene.shape import Mesh
 from services.score.images import align_depth, score_colour, score_depth
+from services.score.points import score_volume
 from services.score.pose import score_pose, symmetries_of
-from services.score.shape import align_shape, score_shape, score_volume
+from services.score.shape import align_shape, score_shape
 from workers.geometry.frames import transform
 
 CASES = 100
