@@ -29,7 +29,7 @@ from services.dataset.correspondence import carry
 from services.dataset.pair import Pair
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
-from services.score.points import box_of, check_distance, score_volume
+from services.score.points import INVERTED, box_of, check_distance, score_volume
 from services.score.pose import score_pose, symmetries_of
 from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
 from workers.door.opening import as_refusal
@@ -51,9 +51,6 @@ JUDGED_PIXELS: Final = 10_000
 
 UNIT_SLACK: Final = 1.25
 """A median ratio to the truth within this factor of that of a unit is that unit."""
-
-INVERTED: Final = -0.8
-"""Correlation with the truth below which depth is inverted: of disparity it is near -1, of a poor guess near 0."""
 
 SIZE_SLACK: Final = 3.0
 """Most ratio of the diagonals of a predicted and the true box, and most distance of their centres in diagonals."""

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import InputError
 
-SIGN_SHARE: Final = 0.1
-"""Of the points, at most on the right side where the sign is the other one; a poor guess has more."""
+INVERTED: Final = -0.8
+"""Correlation with the truth below which a prediction is inverted: of disparity, or distance of the other sign, it is near -1,
+of a poor guess near 0."""
 
 
 def score_volume(predicted: NDArray, true: NDArray, is_distance: bool) -> dict[str, float | None]:
@@ -40,14 +41,16 @@ def score_volume(predicted: NDArray, true: NDArray, is_distance: bool) -> dict[s
 def check_distance(predicted: Array, true: Array) -> None:
     """Raises InputError where signed distances [N] are no metres, or positive inside."""
     times = float(np.abs(predicted).max() / max(float(np.abs(true).max()), 1e-9))
-    if times > 100.0:
+    if times > 300.0:
         raise InputError(f"distances reach {np.abs(predicted).max():.3g}: they seem to be in millimetres; write metres")
     if times > 10.0:
         raise InputError(
             f"values reach {np.abs(predicted).max():.3g}, {times:.3g} times the largest distance: they seem to be logits; write "
             "occupancy from 0 to 1, or distance in metres"
         )
-    if float(np.mean((predicted < 0.0) == (true > 0.0))) > 1.0 - SIGN_SHARE:
+    a, b = predicted - predicted.mean(), true - true.mean()
+    norm = float(np.sqrt((a @ a) * (b @ b)))
+    if norm > 0.0 and float(a @ b) / norm < INVERTED:
         raise InputError("the distances have the other sign: they are negative inside, positive outside")
 
 

@@ -136,7 +136,7 @@ def read_image(path: Path, shape: tuple[int, ...], depth_units_per_m: float = 0.
             raise InputError(f"{int((values < 0.0).sum())} pixels are negative: depth is metres along the optical axis")
         return values
     data = read_bytes(path, MOST_BYTES)
-    size = int.from_bytes(data[20:24]), int.from_bytes(data[16:20])
+    size = int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
     if data[:4] == b"\x89PNG" and len(data) > 24 and size != shape[:2]:  # before it is unpacked
         raise InputError(f"the image is {size[1]} x {size[0]}, the data set's {shape[1]} x {shape[0]}")
     with as_refusal(path.name):
