@@ -28,7 +28,7 @@ from ray.job_submission import JobSubmissionClient
 from schemas.errors import InputError, InUseError, MachineError, RunError, VersoError, plain_line
 from schemas.queue import JobRequest
 from services.queue.queue import Queue
-from services.queue.supervise import Driver, Drivers, EndingDrivers
+from services.queue.supervise import Driver, Drivers
 from services.run.machine import usable_cores
 from services.run.ray_cluster import address_here, living_folders, private_folder, ray_in
 from services.run.supervisor import STOP_S
@@ -95,6 +95,10 @@ class RayDrivers(Drivers):
         """The file that Ray keeps on the head."""
         with self._explained():
             return self._client.get_job_logs(submission) if submission in self.states() else None
+
+    def close(self) -> bool:
+        """Drivers of a cluster go on."""
+        return False
 
     def end_of(self, submission: str) -> tuple[int | None, str]:
         """The exit code of a driver that is over, None where it has none, and Ray's words."""
@@ -217,7 +221,7 @@ def answers(http: str) -> bool:
     return True
 
 
-class OwnDrivers(EndingDrivers):
+class OwnDrivers(Drivers):
     """Drivers that are children of this process, with their logs in `folder`."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
@@ -252,7 +256,7 @@ class OwnDrivers(EndingDrivers):
         """What lies in the folder."""
         return _read_log(self._folder, submission)
 
-    def end(self) -> None:
+    def close(self) -> bool:
         """Stops all drivers and waits for their ends."""
         for submission, driver in self.states().items():
             if driver.state == "running":
@@ -264,6 +268,7 @@ class OwnDrivers(EndingDrivers):
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        return True
 
 
 def _state_of(code: int | None) -> Driver:

@@ -236,7 +236,7 @@ class Queue:
         """How many jobs share the cluster, at least 1, as the supervisor said last."""
         try:
             return max(1, int(json.loads(_read_entry(self.store, SHARE_FILE))["running"]))
-        except (FileNotFoundError, CorruptError, ValueError, TypeError, KeyError):
+        except (FileNotFoundError, ValueError, TypeError, KeyError):
             return 1
 
     def put_share(self, running: int) -> None:

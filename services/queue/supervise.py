@@ -37,12 +37,8 @@ class Drivers(Protocol):
     def log(self, submission: str) -> str | None:
         """What a driver and its commands wrote so far; None where it is not known."""
 
-
-class EndingDrivers(Drivers, Protocol):
-    """Drivers that end with their supervisor."""
-
-    def end(self) -> None:
-        """Stops all of them and waits for their ends."""
+    def close(self) -> bool:
+        """At the end of their supervisor: whether all of them were ended with it; others go on."""
 
 
 PAUSES_S: Final = (10.0, 60.0, 300.0)
@@ -286,30 +282,22 @@ class Supervisor:
             self._say(line)
 
 
-def supervise(queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str], None]) -> None:
-    """Looks after a queue until it is interrupted. Raises RunError where another supervisor does, or took over."""
-    drivers.states()  # an address where nothing answers is told at once
-    with hold_queue(queue) as lock:
-        _look_on(Supervisor(queue, drivers, rules, say, time.monotonic), lock)
-
-
-def supervise_here(
-    queue: Queue, own: contextlib.AbstractContextManager[EndingDrivers], rules: Rules, say: Callable[[str], None]
+def supervise(
+    queue: Queue, place: contextlib.AbstractContextManager[Drivers], rules: Rules, say: Callable[[str], None]
 ) -> None:
-    """The same with drivers that end with this process: `own` is entered once the queue is held."""
-    with hold_queue(queue) as lock, own as drivers:
+    """Looks after a queue until it is interrupted; `place` is entered once the queue is held.
+
+    Raises RunError where another supervisor does, or took over.
+    """
+    with hold_queue(queue) as lock, place as drivers:
         supervisor = Supervisor(queue, drivers, rules, say, time.monotonic)
         try:
-            _look_on(supervisor, lock)
+            while True:
+                supervisor.look(lock.require_held)
+                time.sleep(EVERY_S)
         finally:
-            drivers.end()
-            supervisor.note_ends()
-
-
-def _look_on(supervisor: Supervisor, lock: Lock) -> None:
-    while True:
-        supervisor.look(lock.require_held)
-        time.sleep(EVERY_S)
+            if drivers.close():
+                supervisor.note_ends()
 
 
 @contextlib.contextmanager

@@ -41,6 +41,9 @@ class FakeDrivers(Drivers):
         self._answer()
         return self.logs.get(submission, f"log of {submission}\n") if submission in self.known else None
 
+    def close(self) -> bool:
+        return False
+
     def end(self, job: str, attempt: int) -> None:
         """The driver is over, whatever it told."""
         self.known[submission_id(job, attempt)] = Driver("over")
