@@ -1,6 +1,7 @@
 """Handlers of the queue's commands: each takes the parsed options, prints, and returns the exit code."""
 
 import argparse
+import contextlib
 import signal
 import sys
 import tempfile
@@ -103,17 +104,15 @@ def cancel(options: argparse.Namespace) -> int:
 def supervise(options: argparse.Namespace) -> int:
     """`verso supervise`."""
     from services.queue.drivers import answers, own_ray
-    from services.queue.supervise import Rules, supervise, supervise_here
+    from services.queue.supervise import Rules, supervise
 
     queue = make_queue(_place(options))
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     rules = Rules(options.at_once, _driver_command(options))
     on_own = options.address == rows.OWN_RAY or (options.address is None and not answers(rows.DASHBOARD))
     try:
-        if on_own:
-            supervise_here(queue, own_ray(queue.name, _say), rules, _say)
-        else:
-            supervise(queue, _cluster_drivers(options), rules, _say)
+        place = own_ray(queue.name, _say) if on_own else contextlib.nullcontext(_cluster_drivers(options))
+        supervise(queue, place, rules, _say)
     except KeyboardInterrupt:
         then = "its jobs wait" if on_own else "jobs that run go on, the others wait"
         _say(f"supervision ends; {then} for the next `verso supervise`")

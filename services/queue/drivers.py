@@ -8,6 +8,7 @@ where `verso logs` finds it.
 
 import contextlib
 import json
+import logging
 import os
 import shlex
 import signal
@@ -15,7 +16,7 @@ import socket
 import subprocess
 import time
 import urllib.parse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,16 +25,22 @@ from typing import Any, Final
 from ray.exceptions import AuthenticationError
 from ray.job_submission import JobSubmissionClient
 
-from schemas.errors import InUseError, MachineError, RunError, VersoError, plain_line
+from schemas.errors import InputError, InUseError, MachineError, RunError, VersoError, plain_line
 from schemas.queue import JobRequest
 from services.queue.queue import Queue
-from services.queue.supervise import Driver, Drivers, EndingDrivers
+from services.queue.supervise import Driver, Drivers
 from services.run.machine import usable_cores
 from services.run.ray_cluster import address_here, living_folders, private_folder, ray_in
 from services.run.supervisor import STOP_S
 
 ANSWER_S: Final = 30.0
 """Time for the job API to answer."""
+
+STARTING: Final = "No available agent"
+"""What Ray says while a head that was just started takes no jobs yet."""
+
+STARTS_S: Final = 90.0
+"""The time for which it may say so."""
 
 
 class _PatientClient(JobSubmissionClient):
@@ -58,14 +65,26 @@ class RayDrivers(Drivers):
                 if job.submission_id
             }
 
-    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
-        """Ray itself refuses a submission id that it knows."""
+    def require(self, submission: str) -> None:
+        """Raises InputError where the cluster does not know a driver."""
+        if submission not in self.states():
+            raise InputError(f"--address {self._address}: the cluster has no job {plain_line(submission)}")
+
+    def hand_over(self, submission: str, words: Sequence[str]) -> None:
+        """Ray itself refuses a submission id that it knows; a head that has just started is asked again."""
+        # Ray's supervisor gives this line to a shell: quoted, every word arrives as it is.
+        entrypoint, deadline = shlex.join(words), time.monotonic() + STARTS_S
         with self._explained():
-            try:
-                self._client.submit_job(entrypoint=entrypoint, submission_id=submission, metadata=dict(metadata))
-            except RuntimeError:
-                if submission not in self.states():
-                    raise
+            while True:
+                try:
+                    self._client.submit_job(entrypoint=entrypoint, submission_id=submission)
+                    return
+                except RuntimeError as error:
+                    if STARTING not in str(error) or time.monotonic() > deadline:
+                        if submission in self.states():
+                            return
+                        raise
+                time.sleep(1.0)
 
     def stop(self, submission: str) -> None:
         """Ray sends SIGTERM, and SIGKILL three seconds later."""
@@ -77,9 +96,22 @@ class RayDrivers(Drivers):
         with self._explained():
             return self._client.get_job_logs(submission) if submission in self.states() else None
 
+    def close(self) -> bool:
+        """Drivers of a cluster go on."""
+        return False
+
+    def end_of(self, submission: str) -> tuple[int | None, str]:
+        """The exit code of a driver that is over, None where it has none, and Ray's words."""
+        with self._explained():
+            job = self._client.get_job_info(submission)
+        if job.status == "STOPPED":
+            return None, "it was stopped"
+        return (0 if job.status == "SUCCEEDED" else job.driver_exit_code), _first_line(job.message)
+
     @cached_property
     def _client(self) -> "_PatientClient":
         """A client; Ray's own asks for the version first, and so notices a server that does not answer."""
+        logging.getLogger("ray.dashboard.modules.job.sdk").setLevel(logging.WARNING)  # else it tells of its sockets
         return _PatientClient(self._address)
 
     @contextlib.contextmanager
@@ -98,8 +130,8 @@ class RayDrivers(Drivers):
                 "the dashboard, as `ray start --head` prints it"
             ) from error
         except (RuntimeError, ValueError) as error:
-            told = plain_line(" ".join(str(error).split()), 300)
-            raise MachineError(f"--address {self._address}: Ray's job API refuses: {told}") from error
+            words = plain_line(" ".join(str(error).split()), 300)
+            raise MachineError(f"--address {self._address}: Ray's job API refuses: {words}") from error
 
 
 def _first_line(text: str | None) -> str:
@@ -189,7 +221,7 @@ def answers(http: str) -> bool:
     return True
 
 
-class OwnDrivers(EndingDrivers):
+class OwnDrivers(Drivers):
     """Drivers that are children of this process, with their logs in `folder`."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
@@ -202,11 +234,10 @@ class OwnDrivers(EndingDrivers):
         """Of the drivers that this process started."""
         return {submission: _state_of(process.poll()) for submission, process in self._known.items()}
 
-    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
+    def hand_over(self, submission: str, words: Sequence[str]) -> None:
         """Starts the process. Raises MachineError where the program cannot be started."""
         if submission in self._known:
             return
-        words = shlex.split(entrypoint)
         with (self._folder / f"{submission}.txt").open("wb") as log:
             try:
                 self._known[submission] = subprocess.Popen(
@@ -225,7 +256,7 @@ class OwnDrivers(EndingDrivers):
         """What lies in the folder."""
         return _read_log(self._folder, submission)
 
-    def end(self) -> None:
+    def close(self) -> bool:
         """Stops all drivers and waits for their ends."""
         for submission, driver in self.states().items():
             if driver.state == "running":
@@ -237,6 +268,7 @@ class OwnDrivers(EndingDrivers):
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        return True
 
 
 def _state_of(code: int | None) -> Driver:

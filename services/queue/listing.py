@@ -129,6 +129,18 @@ def _read(queue: Queue, drivers: Drivers, view: JobView, attempt: int, say: Call
         return ""
 
 
+def follow_log(drivers: Drivers, submission: str) -> Iterator[str]:
+    """What a driver writes, until it is over."""
+    shown, over = 0, False
+    while not over:
+        over = drivers.states()[submission].state == "over"  # asked first, so that its last words are shown
+        text = drivers.log(submission) or ""
+        yield text[shown:]
+        shown = len(text)
+        if not over:
+            time.sleep(EVERY_S)
+
+
 def follow_logs(
     queue: Queue, drivers: Drivers, job: str, say: Callable[[str], None], sleep: Callable[[float], None] = time.sleep
 ) -> Iterator[str]:

@@ -25,8 +25,9 @@ from schemas.queue import (
     log_path,
     request_path,
 )
+from workers.door.opening import read_bytes
 from workers.store.local import open_store
-from workers.store.store import Events, Store, retry_if_swept
+from workers.store.store import Events, Store, event_path, retry_if_swept
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
 """waiting: for its output folder. lost: drivers died more often than they are started again."""
@@ -140,6 +141,22 @@ MOST_LOG_BYTES: Final = 1 << 20
 """As much of a driver's log is kept, from its end."""
 
 
+def _read_entry(store: Store, key: str) -> bytes:
+    """What somebody put into the queue. Raises FileNotFoundError, and CorruptError for what is no file or too large."""
+    if store.root is None or store.size(key) is None:
+        return store.read(key)
+    return read_bytes(store.root / key, MOST_BYTES, lambda reason, sentence: CorruptError(sentence))
+
+
+class _JobEvents(Events):
+    """The events of a job."""
+
+    def _read(self, number: int) -> bytes:
+        if number not in self._known:
+            self._known[number] = _read_entry(self._store, event_path(self._folder, number))
+        return self._known[number]
+
+
 class Queue:
     """A queue that exists; `store` is the place that it lies in."""
 
@@ -169,7 +186,7 @@ class Queue:
             ) from None
         if request.id != job:
             raise CorruptError(f"{self.name}/{request_path(job)} is the request of another job, {request.id}")
-        log = self._logs.setdefault(job, Events(self.store, events_folder(job)))
+        log = self._logs.setdefault(job, _JobEvents(self.store, events_folder(job)))
         return fold(request, self._decoded(job, log.read()))
 
     def read_all(self, ids: Iterable[str]) -> tuple[list[JobView], dict[str, str]]:
@@ -207,7 +224,7 @@ class Queue:
     def read_log(self, job: str, attempt: int) -> str | None:
         """The kept log of an attempt, None where there is none."""
         try:
-            return self.store.read(log_path(job, attempt)).decode(errors="replace")
+            return _read_entry(self.store, log_path(job, attempt)).decode(errors="replace")
         except FileNotFoundError:
             return None
 
@@ -218,7 +235,7 @@ class Queue:
     def share(self) -> int:
         """How many jobs share the cluster, at least 1, as the supervisor said last."""
         try:
-            return max(1, int(json.loads(self.store.read(SHARE_FILE))["running"]))
+            return max(1, int(json.loads(_read_entry(self.store, SHARE_FILE))["running"]))
         except (FileNotFoundError, ValueError, TypeError, KeyError):
             return 1
 
@@ -229,7 +246,7 @@ class Queue:
     def _request(self, job: str) -> JobRequest:
         if job not in self._requests:
             key = request_path(job)
-            self._requests[job] = _decode(JobRequest, self.store.read(key), f"{self.name}/{key}")
+            self._requests[job] = _decode(JobRequest, _read_entry(self.store, key), f"{self.name}/{key}")
         return self._requests[job]
 
     def _decoded(self, job: str, events: Sequence[bytes]) -> list[JobEvent]:
@@ -250,7 +267,7 @@ def open_queue(url: str) -> Queue:
             f"--queue {url} is no queue: it holds no {MARK_FILE}; `verso submit` or `verso supervise` makes one in a new or "
             "empty folder"
         )
-    _decode(Mark, store.read(MARK_FILE), f"{store.name}/{MARK_FILE}")
+    _decode(Mark, _read_entry(store, MARK_FILE), f"{store.name}/{MARK_FILE}")
     return Queue(store)
 
 

@@ -4,7 +4,6 @@ What it does next is decided by pure functions, from the states of all jobs and 
 """
 
 import contextlib
-import shlex
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,8 +28,8 @@ class Drivers(Protocol):
     def states(self) -> dict[str, Driver]:
         """By submission id: the drivers that are known."""
 
-    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
-        """Starts a driver, unless one of this submission id is known already."""
+    def hand_over(self, submission: str, words: Sequence[str]) -> None:
+        """Starts a driver, which is a command line, unless one of this submission id is known already."""
 
     def stop(self, submission: str) -> None:
         """Asks for the end of a driver; returns at once."""
@@ -38,12 +37,8 @@ class Drivers(Protocol):
     def log(self, submission: str) -> str | None:
         """What a driver and its commands wrote so far; None where it is not known."""
 
-
-class EndingDrivers(Drivers, Protocol):
-    """Drivers that end with their supervisor."""
-
-    def end(self) -> None:
-        """Stops all of them and waits for their ends."""
+    def close(self) -> bool:
+        """At the end of their supervisor: whether all of them were ended with it; others go on."""
 
 
 PAUSES_S: Final = (10.0, 60.0, 300.0)
@@ -242,9 +237,8 @@ class Supervisor:
     def _hand_over(self, view: JobView) -> None:
         """Gives the driver of a decided attempt to Ray."""
         job, attempt = view.request.id, view.attempt
-        metadata = {"verso_job": job, "verso_queue": self._queue.name}
-        entrypoint = build_entrypoint(self._rules.command, self._queue.name, job, attempt)
-        self._drivers.hand_over(submission_id(job, attempt), entrypoint, metadata)
+        words = [*self._rules.command, "drive", job, str(attempt), "--queue", self._queue.name]
+        self._drivers.hand_over(submission_id(job, attempt), words)
 
     def _keep_logs(self, views: Sequence[JobView], known: Mapping[str, Driver]) -> None:
         """Copies the logs of drivers that are over into the queue, while Ray still has them."""
@@ -288,35 +282,22 @@ class Supervisor:
             self._say(line)
 
 
-def build_entrypoint(command: Sequence[str], queue: str, job: str, attempt: int) -> str:
-    """What Ray gives to a shell: each word quoted, and none of them from a job."""
-    return shlex.join([*command, "drive", job, str(attempt), "--queue", queue])
-
-
-def supervise(queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str], None]) -> None:
-    """Looks after a queue until it is interrupted. Raises RunError where another supervisor does, or took over."""
-    drivers.states()  # an address where nothing answers is told at once
-    with hold_queue(queue) as lock:
-        _look_on(Supervisor(queue, drivers, rules, say, time.monotonic), lock)
-
-
-def supervise_here(
-    queue: Queue, own: contextlib.AbstractContextManager[EndingDrivers], rules: Rules, say: Callable[[str], None]
+def supervise(
+    queue: Queue, place: contextlib.AbstractContextManager[Drivers], rules: Rules, say: Callable[[str], None]
 ) -> None:
-    """The same with drivers that end with this process: `own` is entered once the queue is held."""
-    with hold_queue(queue) as lock, own as drivers:
+    """Looks after a queue until it is interrupted; `place` is entered once the queue is held.
+
+    Raises RunError where another supervisor does, or took over.
+    """
+    with hold_queue(queue) as lock, place as drivers:
         supervisor = Supervisor(queue, drivers, rules, say, time.monotonic)
         try:
-            _look_on(supervisor, lock)
+            while True:
+                supervisor.look(lock.require_held)
+                time.sleep(EVERY_S)
         finally:
-            drivers.end()
-            supervisor.note_ends()
-
-
-def _look_on(supervisor: Supervisor, lock: Lock) -> None:
-    while True:
-        supervisor.look(lock.require_held)
-        time.sleep(EVERY_S)
+            if drivers.close():
+                supervisor.note_ends()
 
 
 @contextlib.contextmanager

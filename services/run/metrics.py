@@ -4,7 +4,9 @@ import contextlib
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Any
 
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -16,31 +18,8 @@ from schemas.errors import MachineError
 
 PHASES = ("planning", "making", "merging", "done")
 
-
-@dataclass(frozen=True)
-class Counts:
-    """The state of a run at one moment.
-
-    `failed` by `kind: reason`; `lost`: workers by the cause of their death; `seconds`: of the workers by stage;
-    `in_flight`: ranges given to Ray; `slots`: shards that may run at once; `since`: when the making began, seconds since
-    1970; `phase`: one of `PHASES`.
-    """
-
-    asked: int = 0
-    made: int = 0
-    failed: Mapping[str, int] = field(default_factory=dict)
-    lost: Mapping[str, int] = field(default_factory=dict)
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    commits: int = 0
-    in_flight: int = 0
-    slots: int = 0
-    since: float = 0.0
-    phase: str = "planning"
-
-    @property
-    def phases(self) -> dict[str, float]:
-        """1 for the phase of this moment, 0 for others."""
-        return {phase: float(phase == self.phase) for phase in PHASES}
+Counts = Mapping[str, Any]
+"""The state of a run at one moment: numbers, or by a label numbers, by the names of `METRICS`."""
 
 
 METRICS = (
@@ -49,13 +28,13 @@ METRICS = (
     (GaugeMetricFamily, "verso_slots", "slots", "", "Shards that may run at once."),
     (GaugeMetricFamily, "verso_making_since_timestamp_seconds", "since", "", "When the making began."),
     (CounterMetricFamily, "verso_scenes_made", "made", "", "Scenes made and committed in this run."),
-    (CounterMetricFamily, "verso_commits", "commits", "", "Ranges committed in this run."),
+    (CounterMetricFamily, "verso_commits", "ranges", "", "Ranges committed in this run."),
     (CounterMetricFamily, "verso_scenes_failed", "failed", "reason", "Scenes that could not be made."),
     (CounterMetricFamily, "verso_workers_lost", "lost", "reason", "Workers that died, by cause."),
     (CounterMetricFamily, "verso_stage_seconds", "seconds", "stage", "Time of the workers in each stage."),
     (GaugeMetricFamily, "verso_phase", "phases", "phase", "1 for what the run does now."),
 )
-"""Kind, name, the field of `Counts`, the label by which it is counted or nothing, and what it is."""
+"""Kind, name, the name in `Tally.counts`, the label by which it is counted or nothing, and what it is."""
 
 
 class Meter(Collector):
@@ -63,20 +42,23 @@ class Meter(Collector):
 
     def __init__(self, job: str) -> None:
         self._job = job
-        self._counts = Counts()  # replaced as a whole: the thread that serves sees one state or the next
+        self._counts: Counts = Tally(0, since=0.0).counts(
+            0
+        )  # replaced as a whole: who serves sees one state or the next
+        self.enter("planning")
 
     def show(self, counts: Counts) -> None:
-        """Replaces what is served."""
+        """Replaces what is served, as `Tally.counts` has it."""
         self._counts = counts
 
     def enter(self, phase: str) -> None:
         """Another phase, with the numbers as they are."""
-        self._counts = replace(self._counts, phase=phase)
+        self._counts = {**self._counts, "phases": {each: float(each == phase) for each in PHASES}}
 
     def collect(self) -> Iterable[Metric]:
         """The metrics of one scrape."""
         for kind, name, counted, label, what in METRICS:
-            values = getattr(self._counts, counted)
+            values = self._counts[counted]
             family = kind(name, what, labels=["job", *([label] if label else [])])
             for key, value in sorted(values.items()) if label else [("", values)]:
                 family.add_metric([self._job, *([key] if label else [])], value)
@@ -164,16 +146,7 @@ class Tally:
         return commits
 
     def counts(self, slots: int) -> Counts:
-        """What a run counts, as it is served: copies, because the run goes on."""
-        return Counts(
-            asked=self.asked,
-            made=self.made,
-            failed=dict(self.failed),
-            lost=dict(self.lost),
-            seconds=dict(self.seconds),
-            commits=self.ranges,
-            in_flight=self.in_flight,
-            slots=slots,
-            since=self.since,
-            phase="making",
-        )
+        """What a run that makes scenes in so many slots counts, as it is served: copies, because the run goes on."""
+        names = ("asked", "made", "failed", "lost", "seconds", "ranges", "in_flight", "since")
+        phases = {each: float(each == "making") for each in PHASES}
+        return {**{name: copy(getattr(self, name)) for name in names}, "slots": slots, "phases": phases}

@@ -8,12 +8,12 @@ import math
 from collections.abc import Mapping
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from schemas.base import Array
-from workers.geometry.jit import compiled
+from schemas.errors import needs_making
 
 Alignment = Literal["none", "scale", "similarity"]
 """Of a prediction with the truth before it is scored, where that is asked for. `none`: as it is. `scale`: one factor.
@@ -84,7 +84,7 @@ def _similarities(a: Array, b: Array, weights: Array) -> tuple[float, float]:
 def _similarity_maps(a: Array, b: Array) -> tuple[Array, Array]:
     """(luminance, contrast times structure), both [H, W, 3], of the windows about each pixel."""
     mean_a, mean_b, square_a, square_b, both = (
-        cv2.GaussianBlur(image, (2 * RADIUS_PX + 1,) * 2, SIGMA_PX) for image in (a, b, a * a, b * b, a * b)
+        ndimage.gaussian_filter(image, SIGMA_PX, axes=(0, 1), radius=RADIUS_PX) for image in (a, b, a * a, b * b, a * b)
     )
     variance_a, variance_b, covariance = square_a - mean_a**2, square_b - mean_b**2, both - mean_a * mean_b
     luminance = (2.0 * (mean_a * mean_b) + C1) / (mean_a**2 + mean_b**2 + C1)
@@ -106,7 +106,8 @@ def _mean(values: Array, weights: Array) -> float:
 def _flip(predicted: NDArray[np.uint8], true: NDArray[np.uint8]) -> float | None:
     if importlib.util.find_spec("flip_evaluator") is None:
         return None
-    from services.study.colour import flip_between  # loads what makes data
+    with needs_making("FLIP"):
+        from services.study.colour import flip_between
 
     return flip_between(true, predicted) if true.size else math.nan
 
@@ -140,8 +141,9 @@ def score_depth(predicted_m: ArrayLike, true_m: ArrayLike, parts: Mapping[str, N
         )
     for k, part in enumerate(parts.values()):
         code |= part.astype(np.uint16) << k
-    sums = np.zeros((1 << len(parts), len(METRICS)))
-    _add_up(predicted.ravel(), true.ravel(), code.ravel(), sums)
+    known = (code > 0) & (true > 0.0) & (true < np.inf)
+    where, values = code[known], _metrics_of(predicted[known], true[known])
+    sums = np.stack([np.bincount(where, each, 1 << len(parts)) for each in values], axis=1)
     scores: dict[str, float] = {}
     for k, name in enumerate(parts):
         row = sums[np.arange(len(sums)) >> k & 1 == 1].sum(axis=0)
@@ -152,29 +154,14 @@ def score_depth(predicted_m: ArrayLike, true_m: ArrayLike, parts: Mapping[str, N
     return scores
 
 
-@compiled
-def _add_up(predicted: Array, true: Array, code: NDArray[np.uint16], sums: Array) -> None:
-    """Adds each pixel to the sums [2^parts, METRICS] of its combination of parts, in one pass; numpy takes thrice as long."""
-    for n in range(len(true)):
-        t, d = true[n], predicted[n]
-        if code[n] == 0 or not 0.0 < t < np.inf:
-            continue
-        row = sums[code[n]]
-        row[11] += 1.0
-        if not 0.0 < d < np.inf:
-            row[10] += 1.0
-            continue
-        error, larger, smaller = abs(d - t), max(d, t), min(d, t)
-        row[0] += error
-        row[1] += error * error
-        row[2] += error / t
-        row[3] += error <= 0.001 + SLACK_M
-        row[4] += error <= 0.002 + SLACK_M
-        row[5] += error <= 0.005 + SLACK_M
-        row[6] += error <= 0.01 + SLACK_M
-        row[7] += larger < 1.25 * smaller - SLACK_M
-        row[8] += larger < 1.25**2 * smaller - SLACK_M
-        row[9] += larger < 1.25**3 * smaller - SLACK_M
+def _metrics_of(d: Array, t: Array) -> Array:
+    """[METRICS, N] of predicted and true depth [N], where there is truth: what each pixel adds to each of the sums."""
+    hit = (d > 0.0) & (d < np.inf)
+    safe = np.where(hit, d, t)
+    error, larger, smaller = np.abs(safe - t), np.maximum(safe, t), np.minimum(safe, t)
+    shares = [error <= limit_m + SLACK_M for limit_m in (0.001, 0.002, 0.005, 0.01)]
+    shares += [larger < 1.25**power * smaller - SLACK_M for power in (1, 2, 3)]
+    return np.stack([error, error**2, error / t, *(share & hit for share in shares), ~hit, np.ones(len(t))])
 
 
 def align_depth(predicted_m: Array, true_m: Array, how: Alignment) -> Array:

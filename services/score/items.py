@@ -29,9 +29,10 @@ from services.dataset.correspondence import carry
 from services.dataset.pair import Pair
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
+from services.score.points import INVERTED, box_of, check_distance, score_volume
 from services.score.pose import score_pose, symmetries_of
 from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
-from services.score.shape import align_shape, box_of, score_shape, score_volume
+from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
 PredictedFrame = Literal["object", "camera", "input", "world"]
@@ -50,9 +51,6 @@ JUDGED_PIXELS: Final = 10_000
 
 UNIT_SLACK: Final = 1.25
 """A median ratio to the truth within this factor of that of a unit is that unit."""
-
-INVERTED: Final = -0.8
-"""Correlation with the truth below which depth is inverted: of disparity it is near -1, of a poor guess near 0."""
 
 SIZE_SLACK: Final = 3.0
 """Most ratio of the diagonals of a predicted and the true box, and most distance of their centres in diagonals."""
@@ -83,8 +81,13 @@ def column(kind: str, name: str) -> str:
     return f"depth_{metric.removesuffix('_m')}{infix}_m" if metric.endswith("_m") else f"depth_{metric}{infix}"
 
 
-def score_pair(pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], asked: Asked) -> list[Row]:
-    """A row for each item of a pair. Raises InputError where the dataset has no mirror view, CorruptError where it is damaged."""
+def score_pair(
+    pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], asked: Asked, blame: str = ""
+) -> list[Row]:
+    """A row for each item of a pair; with `blame`, why its predictions are refused unread.
+
+    Raises InputError where the dataset has no mirror view, CorruptError where it is damaged.
+    """
     if pair.mirror is None:
         raise InputError("the dataset has no mirror view to score: its job's cameras.mirror.enabled is false")
     truth, rows = Truth(pair, pair.mirror), []
@@ -102,7 +105,10 @@ def score_pair(pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], a
                 "diagonal_m": truth.diagonal_m(region or REGION_FIRST_OBJECT),
             }
             names = found.get((kind, pair.mirror.pose_id, region), ())
-            rows.append(row | _score(kind, names, region, truth, folder, asked))
+            if names and blame:
+                rows.append(row | {"status": "refused", "reason": blame})
+            else:
+                rows.append(row | _score(kind, names, region, truth, folder, asked))
     return rows
 
 
@@ -113,11 +119,12 @@ def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folde
     prepared = truth.prepare(kind, region, asked)
     try:
         if len(names) > 1:
-            told = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
-            raise InputError(f"the id is there {len(names)} times: {told}")
-        scores, note = _SCORERS[kind](
-            folder / kind / names[0] if kind != "pose" else names[0], region, prepared, truth, asked
-        )
+            where = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
+            raise InputError(f"the id is there {len(names)} times: {where}")
+        with as_refusal(f"{kind} {names[0]}"):
+            scores, note = _SCORERS[kind](
+                folder / kind / names[0] if kind != "pose" else names[0], region, prepared, truth, asked
+            )
     except VersoError as error:
         return {"status": "refused", "reason": str(error).replace(f"{folder}/", "")}
     return {"status": "ok", "reason": note} | {column(kind, name): value for name, value in scores.items()}
@@ -261,6 +268,8 @@ def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Aske
 
 
 def _score_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+    from services.score.shape import align_shape, score_shape  # loads what makes data
+
     predicted = read_shape(path)
     predicted, _ = align_shape(predicted, prepared, asked.align, asked.seed)
     points = predicted.vertices if isinstance(predicted, Mesh) else predicted
@@ -303,8 +312,8 @@ def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: A
     if name not in prepared:
         raise InputError(f"the dataset stores no {name.removeprefix('volume_')} to hold it against")
     true = prepared[name].astype(np.float64)
-    if is_distance and np.abs(predicted).max() > 100.0 * np.abs(true).max():
-        raise InputError(f"distances reach {np.abs(predicted).max():.3g}: they seem to be in millimetres; write metres")
+    if is_distance:
+        check_distance(predicted, true)
     return score_volume(predicted, true, is_distance), None
 
 

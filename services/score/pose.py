@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from trimesh.triangles import closest_point
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import Mesh
-from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import angle_between, transform
-from workers.geometry.mesh import face_areas
 
 ROTATION = 1e-3
 """How far the products of a rotation's rows may be from 0 and 1: csv files of poses have as few as four digits."""
@@ -70,8 +69,9 @@ def symmetries_of(mesh: Mesh) -> list[Pose]:
     of `STEP_DEG`; and their products. The same: no vertex moves farther from the surface than `SAME` of the diagonal.
     """
     vertices = np.asarray(mesh.vertices, np.float64)
-    areas = face_areas(vertices, mesh.faces)
-    middle = areas @ vertices[mesh.faces].mean(axis=1) / areas.sum()
+    corners = vertices[mesh.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    middle = areas @ corners.mean(axis=1) / areas.sum()
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     some, limit = vertices[:: -(-len(vertices) // LOOKED_AT)], SAME * float(np.linalg.norm(high - low))
 
@@ -82,7 +82,7 @@ def symmetries_of(mesh: Mesh) -> list[Pose]:
         return T
 
     def same(axis: int, degrees: float) -> bool:
-        return bool(distance_to_mesh(transform(turn(axis, degrees), some), mesh)[0].max() <= limit)
+        return is_near(transform(turn(axis, degrees), some), corners, limit)
 
     turns: list[list[float]] = []
     for axis in range(3):
@@ -94,6 +94,26 @@ def symmetries_of(mesh: Mesh) -> list[Pose]:
         return [turn(axis, angle) for axis, some_turns in enumerate(turns) for angle in some_turns]
     products = [turn(2, c) @ turn(1, b) @ turn(0, a) for a, b, c in itertools.product(*turns)]
     return list({(np.round(T, 6) + 0.0).tobytes(): T for T in products}.values())
+
+
+def is_near(points: Array, corners: Array, limit: float) -> bool:
+    """Whether every point [N, 3] is within a distance of a surface, by the corners [F, 3, 3] of its faces.
+
+    Faces are asked by the power of two of their size, so that a large one does not make candidates of all small ones.
+    """
+    centre = corners.mean(axis=1)
+    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    size, left = np.frexp(radius)[1], points
+    for each in np.unique(size):
+        faces = np.flatnonzero(size == each)
+        near = cKDTree(centre[faces]).query_ball_point(left, limit + radius[faces].max())
+        of = np.repeat(np.arange(len(left)), [len(one) for one in near])
+        there = left[of]
+        nearest = closest_point(corners[faces[np.concatenate([*near, []]).astype(np.int64)]], there)
+        left = np.delete(left, of[np.linalg.norm(nearest - there, axis=1) <= limit], axis=0)
+        if not len(left):
+            return True
+    return False
 
 
 def is_rigid(T: Pose) -> bool:

@@ -9,7 +9,9 @@ of the second object of a scene, as with stored files.
 """
 
 import csv
+import hashlib
 import io
+import os
 import re
 import zipfile
 from collections import defaultdict
@@ -20,15 +22,14 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
+from trimesh.exchange.ply import load_ply
 
 from schemas.base import Array, Pose
 from schemas.errors import InputError, plain_line
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.score.pose import is_rigid
-from workers.assets.external.formats import load_shape, read_bytes
-from workers.assets.external.plain import count_ply
+from workers.door.opening import as_refusal, read_bytes
 from workers.store.images import decode_png
 
 SUFFIXES: Final = {
@@ -42,10 +43,14 @@ SUFFIXES: Final = {
 KINDS: Final = (*SUFFIXES, "pose")
 POSES_FILE: Final = "poses.csv"
 _NAME = re.compile(r"([0-9]{1,18})(?:obj([0-9]{1,4}))?", re.ASCII)
+_NUMBER = re.compile(r"\s*[0-9]{1,18}\s*", re.ASCII)
 _POSE_COLUMNS = ("scene_id", "im_id", "obj_id", "R", "t")
 
 LIMITS: Final = MeshLimits(max_file_mb=64.0, max_vertices=1_000_000, max_faces=2_000_000, max_asset_mb=64.0)
 """Caps on predicted shapes."""
+
+MOST_BYTES: Final = 1 << 28
+"""Larger than any array, image or table of poses."""
 
 Key = tuple[str, int, int]
 """(kind, pose id, region); images are of region 0, all regions."""
@@ -55,59 +60,69 @@ Key = tuple[str, int, int]
 class Predictions:
     """What a folder has: by key the names of files, or rows of `poses.csv` as text, of which there should be one.
 
-    `strays`: (kind, name, why) of what has no id.
+    `strays`: (kind, why) of what has no id.
     """
 
     folder: Path
     found: Mapping[Key, tuple[str, ...]]
-    strays: tuple[tuple[str, str, str], ...]
+    strays: tuple[tuple[str, str], ...]
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds that there are."""
-        there = {kind for kind, _, _ in self.found} | {kind for kind, _, _ in self.strays}
+        there = {kind for kind, _, _ in self.found} | {kind for kind, _ in self.strays}
         return tuple(kind for kind in KINDS if kind in there)
 
 
 def find_predictions(folder: Path) -> Predictions:
     """Everything in the folder, by names alone. Raises InputError where there is nothing."""
-    found, strays = defaultdict[Key, list[str]](list), list[tuple[str, str, str]]()
+    found, strays = defaultdict[Key, list[str]](list), list[tuple[str, str]]()
     for kind, suffixes in SUFFIXES.items():
         for path in sorted((folder / kind).iterdir()) if (folder / kind).is_dir() else ():
             name = _NAME.fullmatch(path.stem)
             if path.name.startswith(".") or path.suffix.lower() not in suffixes:
                 continue
             if name is None or (name[2] and kind not in ("shape", "volume")):
-                strays.append((kind, path.name, f"{path.name} is no pose id"))
+                strays.append((kind, f"{plain_line(path.name)} is no pose id"))
                 continue
             region = REGION_FIRST_OBJECT + int(name[2] or 0) if kind in ("shape", "volume") else 0
             found[kind, int(name[1]), region].append(path.name)
-    if (folder / POSES_FILE).is_file():
-        for key, text in _read_poses(folder / POSES_FILE, strays):
-            found[key].append(text)
+    if os.path.lexists(folder / POSES_FILE):
+        try:
+            for key, text in _read_poses(folder / POSES_FILE, strays):
+                found[key].append(text)
+        except InputError as error:
+            strays.append(("pose", str(error)))
     if not found and not strays:
-        told = ", ".join(f"{kind}/ID{suffixes[0]}" for kind, suffixes in SUFFIXES.items())
+        places = ", ".join(f"{kind}/ID{suffixes[0]}" for kind, suffixes in SUFFIXES.items())
         raise InputError(
-            f"{folder} has no predictions: put them into {told} or {POSES_FILE}, named by the mirror pose's id"
+            f"{folder} has no predictions: put them into {places} or {POSES_FILE}, named by the mirror pose's id"
         )
     return Predictions(folder, {key: tuple(found[key]) for key in sorted(found)}, tuple(strays))
 
 
-def _read_poses(path: Path, strays: list[tuple[str, str, str]]) -> Iterator[tuple[Key, str]]:
+def digest_of(folder: Path, key: Key, name: str) -> str:
+    """SHA-256 of a prediction, hex: of a file's bytes, or of a line; empty of a file that is refused unread."""
     try:
-        reader = csv.DictReader(io.StringIO(path.read_bytes().decode("utf-8-sig")))
+        data = name.encode() if key[0] == "pose" else read_bytes(folder / key[0] / name, MOST_BYTES)
+    except InputError:
+        return ""
+    return hashlib.sha256(data).hexdigest()
+
+
+def _read_poses(path: Path, strays: list[tuple[str, str]]) -> Iterator[tuple[Key, str]]:
+    data = read_bytes(path, MOST_BYTES)
+    with as_refusal(path, remedy="write it as CSV"):
+        reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig")))
         rows, names = list(reader), reader.fieldnames or ()
-    except (csv.Error, ValueError) as error:
-        raise InputError(f"{path} is no CSV: {error}") from error
     if missing := [name for name in _POSE_COLUMNS if name not in names]:
         raise InputError(f"{path} has no column {', '.join(missing)}: it needs {', '.join(_POSE_COLUMNS)}")
     for line, row in enumerate(rows, 2):
-        try:
-            key = "pose", int(row["im_id"]), int(row["obj_id"])
-        except (TypeError, ValueError):
-            strays.append(("pose", f"line {line}", f"line {line} of {POSES_FILE} has no whole im_id and obj_id"))
+        ids = [_NUMBER.fullmatch(row[name] or "") for name in ("im_id", "obj_id")]
+        if not all(ids):
+            strays.append(("pose", f"line {line} of {POSES_FILE} has no whole im_id and obj_id"))
             continue
-        yield key, f"{row['R']}|{row['t']}"
+        yield ("pose", int(row["im_id"]), int(row["obj_id"])), f"{row['R']}|{row['t']}"
 
 
 def read_image(path: Path, shape: tuple[int, ...], depth_units_per_m: float = 0.0) -> NDArray:
@@ -120,70 +135,64 @@ def read_image(path: Path, shape: tuple[int, ...], depth_units_per_m: float = 0.
         if (values < 0.0).any():
             raise InputError(f"{int((values < 0.0).sum())} pixels are negative: depth is metres along the optical axis")
         return values
-    data = path.read_bytes()
-    size = int.from_bytes(data[20:24]), int.from_bytes(data[16:20])
+    data = read_bytes(path, MOST_BYTES)
+    size = int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
     if data[:4] == b"\x89PNG" and len(data) > 24 and size != shape[:2]:  # before it is unpacked
         raise InputError(f"the image is {size[1]} x {size[0]}, the data set's {shape[1]} x {shape[0]}")
-    pixels = decode_png(data, path.name)
-    wanted = np.uint16 if depth_units_per_m else np.uint8
-    if pixels.shape != shape or pixels.dtype != wanted:
-        told = "one channel of 16 bits" if depth_units_per_m else "three channels of 8 bits"
-        raise InputError(f"the image is {pixels.shape} {pixels.dtype}, and should have {told}")
+    with as_refusal(path.name):
+        pixels = decode_png(data, path.name)
+    if pixels.shape != shape or pixels.dtype != (np.uint16 if depth_units_per_m else np.uint8):
+        wanted = "one channel of 16 bits" if depth_units_per_m else "three channels of 8 bits"
+        raise InputError(f"the image is {pixels.shape} {pixels.dtype}, and should have {wanted}")
     return pixels / depth_units_per_m if depth_units_per_m else pixels
 
 
 def read_array(path: Path, shape: tuple[int, ...]) -> Array:
     """float64 of this shape. Raises InputError; its header is not believed, and no Python object is unpickled."""
-    try:
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
-        raise InputError(
-            f"{path.name} cannot be read as an array of numbers: {str(error).splitlines()[0][:200]}"
-        ) from error
+    data = read_bytes(path, MOST_BYTES)
+    with as_refusal(path.name):
+        values = np.load(io.BytesIO(data), allow_pickle=False)
+    return _numbers(path, values, shape)
+
+
+def _numbers(path: Path, values: object, shape: tuple[int, ...] | None) -> Array:
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub":
         raise InputError(f"{path.name} holds no array of numbers")
-    if values.shape != shape:
+    if shape is not None and values.shape != shape:
         raise InputError(f"the array is {values.shape}, and should be {shape}")
     return np.asarray(values, np.float64)
 
 
 def read_shape(path: Path) -> Mesh | Array:
     """A mesh, or points [N, 3] of a file without faces, in the file's units. Raises VersoError."""
-    if path.suffix.lower() == ".npz":
-        return _checked(_read_points(path))
-    if path.suffix.lower() == ".ply" and not count_ply(read_bytes(path, LIMITS))[1]:
-        return _checked(_read_cloud(path))
-    return load_shape(path, LIMITS).shape.mesh
+    data, suffix = read_bytes(path, int(LIMITS.max_file_mb * 1e6)), path.suffix.lower()
+    from workers.assets.external.formats import load_shape  # loads what makes data
+    from workers.assets.external.plain import count_ply
 
-
-def _read_points(path: Path) -> Array:
-    try:
-        with zipfile.ZipFile(path) as file:
-            unpacked = sum(one.file_size for one in file.infolist())
-        if unpacked > LIMITS.max_file_mb * 1e6:
-            raise InputError(f"{path.name} unpacks to {unpacked / 1e6:.0f} MB, over {LIMITS.max_file_mb:g}")
-        with np.load(path, allow_pickle=False) as arrays:
-            if "points" not in arrays:
-                raise InputError(f"{path.name} has {', '.join(arrays.files) or 'nothing'}, and no `points`")
-            return np.asarray(arrays["points"], np.float64)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path.name} cannot be read: {str(error).splitlines()[0][:200]}") from error
-
-
-def _read_cloud(path: Path) -> Array:
-    try:
-        vertices = PlyData.read(str(path))["vertex"]
-        return np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
-    except (PlyParseError, ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} cannot be read: {str(error).splitlines()[0][:200]}") from error
-
-
-def _checked(points: Array) -> Array:
+    if suffix == ".npz":
+        points = _read_points(path, data)
+    elif suffix == ".ply" and not count_ply(data)[1]:
+        with as_refusal(path.name):
+            points = _numbers(path, load_ply(io.BytesIO(data))["vertices"], None)
+    else:
+        return load_shape(path, LIMITS).shape.mesh
     if points.ndim != 2 or points.shape[1] != 3 or not 3 <= len(points) <= LIMITS.max_vertices:
         raise InputError(f"the cloud is {points.shape}, and should be [N, 3] with 3 to {LIMITS.max_vertices:,} points")
     if not np.isfinite(points).all():
         raise InputError("the cloud has points that are not finite")
     return points
+
+
+def _read_points(path: Path, data: bytes) -> Array:
+    with as_refusal(path.name):
+        with zipfile.ZipFile(io.BytesIO(data)) as file:
+            unpacked = sum(entry.file_size for entry in file.infolist())
+        if unpacked > LIMITS.max_file_mb * 1e6:
+            raise InputError(f"{path.name} unpacks to {unpacked / 1e6:.0f} MB, over {LIMITS.max_file_mb:g}")
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            if "points" not in arrays:
+                raise InputError(f"{path.name} has {', '.join(arrays.files) or 'nothing'}, and no `points`")
+            return _numbers(path, arrays["points"], None)
 
 
 def read_pose(text: str) -> Pose:

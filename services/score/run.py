@@ -1,45 +1,44 @@
 """Edge: scores the items of a dataset range by range, in processes side by side, and keeps what is scored.
 
-A range's rows are a Parquet file of SCORE/_kept, whose name is the digest of all that they follow from: the range's commit,
-the predictions' bytes, what was asked, and this room's code. The same command reads it instead of scoring again.
+What is kept of a range has the digest of all that it follows from: the range's commit, the predictions' bytes, what was asked,
+and this room's code. The same command reads it instead of scoring again.
 """
 
 import hashlib
 import json
-import multiprocessing
 import os
+import platform
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.errors import MachineError, plural
+from schemas.errors import MachineError, VersoError, needs_making, plural
 from services.dataset.dataset import iter_pairs
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.score.items import Asked, score_pair
-from services.score.predictions import Key, Predictions
+from services.score.predictions import Key, Predictions, digest_of
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
 
-KEPT: Final = "_kept"
-ITEMS_FILE: Final = "items.parquet"
+if TYPE_CHECKING:
+    from workers.pool import Ended
 
-FEW: Final = 64
-"""Predictions below which no processes are started: each takes seconds to begin."""
+KEPT: Final = "_kept.answers"
+ITEMS_FILE: Final = "items.parquet"
 
 FACTS: Final = pa.schema(
     [
@@ -60,14 +59,36 @@ FACTS: Final = pa.schema(
 
 @dataclass(frozen=True)
 class _Range:
-    """A range to score: where its rows go, and what is predicted of it."""
+    """A range to score, what is predicted of it, and the digest of all that its rows follow from.
+
+    poses: the mirror poses that are scored. blame: why what is predicted of them is refused unread.
+    """
 
     place: str
     records: Sequence[CommitRecord]
+    poses: Sequence[int]
     folder: Path
-    found: Mapping[Key, tuple[str, ...]]
+    predicted: Mapping[Key, tuple[str, ...]]
     asked: Asked
-    kept: Path
+    digest: str
+    blame: str = ""
+
+    @property
+    def key(self) -> str:
+        """The name of its rows among those that are kept."""
+        return f"{self.digest} {self.poses[0]} {len(self.poses)} {self.blame}"
+
+    def instead(self, end: "Ended") -> "Iterator[_Range]":
+        """What is asked in place of a range that ended its process: its poses one by one, of which one is refused then.
+
+        Raises MachineError where one pose alone was killed from outside.
+        """
+        if len(self.poses) > 1:
+            yield from (replace(self, poses=(pose,)) for pose in self.poses)
+        elif end.how == "killed":
+            raise MachineError(f"scoring pose {self.poses[0]}: {end.detail}: start again, what is scored is kept")
+        else:
+            yield replace(self, blame=f"scoring it {end.detail}")
 
 
 def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Path) -> Path:
@@ -76,64 +97,78 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
     Raises InputError where the dataset has not what is predicted, CorruptError where it is damaged, MachineError where a
     process is killed.
     """
-    (out / KEPT).mkdir(parents=True, exist_ok=True)
-    ranges = list(_ranges(store, predictions, asked, out / KEPT))
-    todo = [one for one in ranges if not one.kept.exists()]
+    if "shape" in asked.kinds:
+        with needs_making("scoring shapes"):
+            import services.score.shape  # noqa: F401
+    out.mkdir(parents=True, exist_ok=True)
+    todo, scored = list(_ranges(store, predictions, asked)), list[_Range]()
+    unknown, metrics = set(predictions.found), set[str]()
     with closing(ProgressLine(len(todo), "score", "range")) as line:
-        for done, _ in enumerate(_scored(todo), 1):
-            line.show(done)
-    parts = [one.kept for one in ranges]
-    _write_items(parts, predictions, store.name, out / ITEMS_FILE)
-    for path in set((out / KEPT).iterdir()) - set(parts):
-        path.unlink()
+        while todo:
+            again: list[_Range] = []
+            for item, answer in _answers(todo, out / KEPT):
+                if not isinstance(answer, bytes):
+                    again += item.instead(answer)
+                    line.expect(len(scored) + len(todo) + len(again))
+                    continue
+                table = _table_of(item, answer)
+                unknown -= {tuple(row.values()) for row in table.select(["kind", "pose_id", "region"]).to_pylist()}
+                metrics |= set(table.column_names) - set(FACTS.names)
+                scored.append(item)
+                line.show(len(scored))
+            todo = again
+    scored.sort(key=lambda item: item.poses[0])
+    tables = (_table_of(item, answer) for item, answer in _answers(scored, out / KEPT) if isinstance(answer, bytes))
+    strays = _table([*_strays(predictions, unknown, store.name)])
+    _write_items((*tables, strays), metrics, out / ITEMS_FILE)
     return out / ITEMS_FILE
 
 
-def _ranges(store: Store, predictions: Predictions, asked: Asked, kept: Path) -> Iterator[_Range]:
-    job = require_job(store).job
+def _ranges(store: Store, predictions: Predictions, asked: Asked) -> Iterator[_Range]:
+    pairs = require_job(store).job.pairs_per_scene
     by_scene = defaultdict[int, dict[Key, tuple[str, ...]]](dict)
     for key, names in predictions.found.items():
-        by_scene[key[1] // (2 * job.pairs_per_scene)][key] = names
-    code = hashlib.sha256(
-        b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    ).hexdigest()
+        by_scene[key[1] // (2 * pairs)][key] = names
+    code = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
+    code_digest = hashlib.sha256(b"".join(code)).hexdigest()
     for records in iter_committed(store):
-        scenes = [by_scene[one] for one in range(records[0].span.start, records[0].span.stop) if one in by_scene]
-        found = {key: names for scene in scenes for key, names in scene.items()}
-        files = [
-            (key, names, [_digest(predictions.folder / key[0] / name) for name in names])
-            for key, names in found.items()
-        ]
+        span = records[0].span
+        predicted = {
+            key: names for scene in range(span.start, span.stop) for key, names in by_scene.get(scene, {}).items()
+        }
+        files = [[key, [digest_of(predictions.folder, key, name) for name in predicted[key]]] for key in predicted]
         commits = [record.model_dump_json() for record in records]
-        told = json.dumps([code, str(predictions.folder), asdict(asked), commits, files])
-        digest = hashlib.sha256(told.encode()).hexdigest()[:32]
-        yield _Range(store.name, records, predictions.folder, found, asked, kept / f"{digest}.parquet")
+        what = json.dumps([code_digest, str(predictions.folder), asdict(asked), commits, files])
+        poses = range(2 * pairs * span.start + 1, 2 * pairs * span.stop, 2)
+        digest = hashlib.sha256(what.encode()).hexdigest()
+        yield _Range(store.name, records, poses, predictions.folder, predicted, asked, digest)
 
 
-def _digest(path: Path) -> str:
-    """SHA-256 of a file, empty for a line of a table, whose text is told. A clock that is set back may hide a change."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return ""
-
-
-def _scored(ranges: Sequence[_Range]) -> Iterator[None]:
-    count = min(usable_cores(), len(ranges))
-    if count < 2 or sum(len(one.found) for one in ranges) < FEW:
-        yield from map(_score_range, ranges)
+def _answers(ranges: Iterable[_Range], kept: Path) -> "Iterator[tuple[_Range, bytes | Ended]]":
+    """Each range with its packed rows; away from Linux one after another, and none kept."""
+    if platform.system() != "Linux":
+        yield from ((item, _score_range(item)) for item in ranges)
         return
-    with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as pool:
-        tasks = [pool.submit(_score_range, one) for one in ranges]
-        try:
-            for task in as_completed(tasks):
-                yield task.result()
-        except BrokenProcessPool as error:
-            told = "perhaps for want of memory: start again, what is scored is kept"
-            raise MachineError(f"a process that scores predictions was killed from outside, {told}") from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+    from workers.pool import Answers, run_pool
+
+    cores, answers = usable_cores(), Answers(kept)
+    yield from run_pool(_score_range, ranges, key=attrgetter("key"), kept=answers, processes=cores, quiet=False)
+
+
+def _score_range(item: _Range) -> bytes:
+    """A range's rows as an Arrow stream; empty where the dataset is damaged, which the process that asks finds again."""
+    try:
+        table = _table(_rows(item))
+    except VersoError:
+        return b""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as stream:
+        stream.write_table(table)
+    return bytes(sink.getvalue())
+
+
+def _table_of(item: _Range, answer: bytes) -> pa.Table:
+    return pa.ipc.open_stream(answer).read_all() if answer else _table(_rows(item))
 
 
 @cache
@@ -143,70 +178,64 @@ def _files(place: str) -> StoredFiles:
     return StoredFiles(store, require_job(store))
 
 
-def _score_range(one: _Range) -> None:
-    """Writes the rows of a range, whole or not at all."""
-    files = _files(one.place)
+def _rows(item: _Range) -> list[Row]:
+    files = _files(item.place)
+    pairs = iter_pairs(lambda table: range_rows(files.store, item.records, table), RangeFiles(files, item.records))
     rows: list[Row] = []
-    for pair in iter_pairs(lambda table: range_rows(files.store, one.records, table), RangeFiles(files, one.records)):
-        rows += score_pair(pair, one.folder, one.found, one.asked)
-    partial = one.kept.with_name(f".{one.kept.name}.{os.getpid()}")
-    pq.write_table(_table(rows), partial)
-    os.replace(partial, one.kept)
+    for pair in pairs:
+        if pair.mirror is None or pair.mirror.pose_id in item.poses:
+            rows += score_pair(pair, item.folder, item.predicted, item.asked, item.blame)
+    return rows
 
 
 def _table(rows: Sequence[Row]) -> pa.Table:
-    metrics = sorted({name for row in rows for name in row} - set(FACTS.names))
-    schema = pa.schema([*FACTS, *((name, pa.float64()) for name in metrics)])
+    metrics = {name for row in rows for name in row} - set(FACTS.names)
+    schema = _schema(metrics)
     return pa.Table.from_pylist([{name: row.get(name) for name in schema.names} for row in rows], schema)
 
 
-def _write_items(parts: Sequence[Path], predictions: Predictions, place: str, target: Path) -> None:
-    """Joins the ranges' rows, with a refused row for each prediction that no pair of the dataset has."""
-    unknown = set(predictions.found)
-    for part in parts:
-        ids = pq.read_table(part, columns=["kind", "pose_id", "region"]).to_pylist()
-        unknown -= {(row["kind"], row["pose_id"], row["region"]) for row in ids}
-    strays = [
-        {"kind": kind, "pose_id": pose_id, "region": region, "reason": _why_unknown(pose_id, place)}
-        for kind, pose_id, region in sorted(unknown)
-    ]
-    strays += [{"kind": kind, "reason": why} for kind, _, why in predictions.strays]
-    last = _table([row | {"status": "refused"} for row in strays])
-    schema = pa.unify_schemas([FACTS, *(pq.read_schema(part) for part in parts)])
-    partial = target.with_name(f".{target.name}.{os.getpid()}")
+def _schema(metrics: Collection[str]) -> pa.Schema:
+    return pa.schema([*FACTS, *((name, pa.float64()) for name in sorted(metrics))])
+
+
+def _write_items(tables: Iterable[pa.Table], metrics: Collection[str], target: Path) -> None:
+    """Joins tables into one with all columns, whole or not at all."""
+    schema, partial = _schema(metrics), target.with_name(f".{target.name}.{os.getpid()}")
     with pq.ParquetWriter(partial, schema) as file:
-        for table in (*map(pq.read_table, parts), last):
-            filled = [
-                table[name] if name in table.column_names else pa.nulls(len(table), pa.float64())
-                for name in schema.names
-            ]
-            file.write_table(pa.table(filled, schema))
+        for table in tables:
+            there = set(table.column_names)
+            columns = [table[name] if name in there else pa.nulls(len(table), pa.float64()) for name in schema.names]
+            file.write_table(pa.table(columns, schema))
     os.replace(partial, target)
 
 
-def _why_unknown(pose_id: int, place: str) -> str:
-    if pose_id % 2 == 0:
-        return f"{pose_id} is the id of an input pose: predictions have that of the mirror pose, {pose_id + 1}"
-    return f"{place} has no such item {pose_id}: the id is of another dataset"
+def _strays(predictions: Predictions, unknown: Collection[Key], place: str) -> Iterator[Row]:
+    """A refused row for each prediction that no pair of the dataset has."""
+    for kind, pose_id, region in sorted(unknown):
+        why = f"{place} has no such item {pose_id}: the id is of another dataset"
+        if pose_id % 2 == 0:
+            why = f"{pose_id} is the id of an input pose: predictions have that of the mirror pose, {pose_id + 1}"
+        yield {"kind": kind, "pose_id": pose_id, "region": region, "status": "refused", "reason": why}
+    for kind, why in predictions.strays:
+        yield {"kind": kind, "status": "refused", "reason": why}
 
 
 def describe_refused(path: Path, most: int = 10) -> list[str]:
     """A line for each refused item of items.parquet, and then for the missing ones by kind; the first ones alone."""
-    rows = pq.read_table(
-        path, columns=["kind", "pose_id", "status", "reason"], filters=[("status", "!=", "ok")]
-    ).to_pylist()
-    ids = ["" if row["pose_id"] is None else f" {row['pose_id']:05d}" for row in rows]
-    lines = [
-        f"{row['kind']}{name} refused: {row['reason']}"
-        for name, row in zip(ids, rows, strict=True)
-        if row["status"] == "refused"
-    ]
-    told = [*lines[:most], *([f"and {plural(len(lines) - most, 'more item')} refused"] if len(lines) > most else [])]
+    names = ["kind", "pose_id", "status", "reason"]
+    rows = pq.read_table(path, columns=names, filters=[("status", "!=", "ok")]).to_pylist()
+    refused = [row for row in rows if row["status"] == "refused"]
+    lines = []
+    for row in refused[:most]:
+        pose = "" if row["pose_id"] is None else f" {row['pose_id']:05d}"
+        lines.append(f"{row['kind']}{pose} refused: {row['reason']}")
+    if len(refused) > most:
+        lines.append(f"and {plural(len(refused) - most, 'more item')} refused")
     missing = defaultdict[str, list[str]](list)
     for row in rows:
         if row["status"] == "missing":
             missing[row["kind"]].append(f"{row['pose_id']:05d}")
     for kind, ids in missing.items():
         more = f" and {len(ids) - most} more" if len(ids) > most else ""
-        told.append(f"{kind} missing: {', '.join(ids[:most])}{more}")
-    return told
+        lines.append(f"{kind} missing: {', '.join(ids[:most])}{more}")
+    return lines

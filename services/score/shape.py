@@ -1,4 +1,4 @@
-"""Errors of a predicted shape: a mesh, a cloud, or values at points of space; and its alignment with the truth. Pure.
+"""Errors of a predicted shape, a mesh or a cloud; and its alignment with the truth. Pure.
 
 Points are drawn uniformly by area; their distances to the other surface are exact. So sampling adds an error but no bias.
 """
@@ -16,6 +16,7 @@ from trimesh.registration import procrustes
 from schemas.base import Array, Pose
 from schemas.scene.shape import Mesh
 from services.score.images import Alignment
+from services.score.points import box_of
 from workers.assets.external.mesh import is_solid, merge_points
 from workers.assets.mass import unite_bodies
 from workers.assets.winding import winding_numbers
@@ -193,30 +194,6 @@ def _solid(mesh: Mesh) -> manifold3d.Manifold | None:
     return None
 
 
-def score_volume(predicted: NDArray, true: NDArray, is_distance: bool) -> dict[str, float | None]:
-    """Errors at the same points of space, as many as [M], of occupancy, or of signed distance, metres, negative inside.
-
-    Inside is a distance below 0, an occupancy above 0.5.
-    iou: points inside both by those inside either (Mescheder et al. 2019, section 4); None where none is in either. It is of the
-    points, which lie more densely about the surface, not of the volume.
-    accuracy: share of points on the right side. distance_mae_m: mean |difference|, metres; None of occupancy.
-
-    A true value that is not finite does not count. A predicted one is wrong: in accuracy, and in iou as a point inside one of
-    the two; it is left out of distance_mae_m. nan where no value is left. Raises ValueError where sizes differ.
-    """
-    if np.shape(predicted) != np.shape(true):
-        raise ValueError(f"{np.shape(predicted)} values of {np.shape(true)} points")
-    truth, values = (np.asarray(each, np.float64)[np.isfinite(true)] for each in (true, predicted))
-    known = np.isfinite(values)
-    within, inside = ((each < 0.0 if is_distance else each > 0.5) for each in (truth, values))
-    either, error = int((within | inside | ~known).sum()), np.abs(values - truth)[known]
-    return {
-        "iou": float((within & inside & known).sum() / either) if either else None,
-        "accuracy": float(((within == inside) & known).mean()) if len(truth) else math.nan,
-        "distance_mae_m": None if not is_distance else float(error.mean()) if len(error) else math.nan,
-    }
-
-
 POINTS: Final = 2_000
 """Drawn on each surface to align them."""
 
@@ -277,9 +254,3 @@ def _nearest_points(points: Array, shape: Mesh | Array) -> Array:
     solid = with_area(shape)
     corners = np.asarray(solid.vertices)[solid.faces[distance_to_mesh(points, solid)[1]]]
     return np.asarray(trimesh.triangles.closest_point(corners, points))
-
-
-def box_of(points: Array) -> tuple[Array, float]:
-    """The middle [3] and the diagonal of a box about points."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2.0, float(np.linalg.norm(high - low))

@@ -153,14 +153,6 @@ def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run
     assert outcomes == {True, False}
 
 
-def test_on_a_store_an_attempt_is_evidence_once(coordinator_of):
-    store = fresh_bucket()
-    begin_attempt(store, Span(start=0, stop=2), TAR, LABEL).begin_scene(1)
-    coordinator, span = coordinator_of(store), Span(start=0, stop=2)
-    assert coordinator._find_evidence([span]) == (span, 1, False)
-    assert coordinator._find_evidence([span]) == (span, None, False)
-
-
 @pytest.mark.parametrize("kind", ["disk", "bucket"])
 def test_the_scene_in_progress_is_evidence_while_the_range_before_it_is_committed(kind, coordinator_of, tmp_path):
     store = LocalStore(tmp_path) if kind == "disk" else fresh_bucket()

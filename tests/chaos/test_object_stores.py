@@ -2,7 +2,6 @@
 
 import itertools
 import random
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -96,18 +95,6 @@ def fail_puts_of(
             yield fault
 
     vars(bucket)["counted"] = counted
-
-
-@pytest.mark.parametrize("delay_s", [0.01, pytest.param(0.2, marks=pytest.mark.slow)])
-def test_a_slow_store_gets_the_dataset_of_a_disk(delay_s, tmp_path, record_figure):
-    bucket = Bucket()
-    bucket.delay_s = delay_s
-    begun = time.perf_counter()
-    with store_in(bucket) as store:
-        assert make_dataset(store, "tar").digest == on_disk(tmp_path)
-    seconds, requests = time.perf_counter() - begun, bucket.requests.total()
-    print(f"{requests} requests of {delay_s} s in {seconds:.1f} s, {bucket.most_at_once} at once at most")
-    record_figure(f"seconds at {delay_s} s a request", "passed", seconds, requests * delay_s)
 
 
 @pytest.mark.parametrize("conditional", ["ignored", pytest.param("refused", marks=pytest.mark.minute)])

@@ -9,7 +9,7 @@ import pytest
 import ray
 import yaml
 
-from services.run.metrics import Counts, Meter
+from services.run.metrics import Meter, Tally
 from tests.kit.containers import ROOT, must, run
 
 DEPLOY = ROOT / "deploy"
@@ -166,7 +166,7 @@ QUESTIONS = [target["expr"] for panel in BOARD["panels"] for target in panel["ta
 
 def test_the_dashboard_asks_for_every_metric_that_a_run_serves_and_for_no_other():
     meter = Meter("mugs")
-    meter.show(Counts(asked=1, failed={"a": 1}, lost={"b": 1}, seconds={"c": 1.0}))
+    meter.show({**Tally(1).counts(1), "failed": {"a": 1}, "lost": {"b": 1}, "seconds": {"c": 1.0}})
     served = {sample.name: set(sample.labels) for family in meter.collect() for sample in family.samples}
     for expression in QUESTIONS:
         asked = re.findall(r"(verso_\w+)(?:\{(\w+))?", expression)

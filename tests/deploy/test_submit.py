@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,12 +13,14 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from deploy import submit
 from schemas.environment import cache_folder
+from schemas.errors import MachineError
 from services.job.job_file import load_job
+from services.queue import drivers
 from tests.datasets import run_here
 from tests.kit.ray_head import ROOT, BareCluster, bare_cluster
 
@@ -57,30 +60,34 @@ def head(tmp_path_factory) -> Iterator[Head]:
         yield Head(home, cluster)
 
 
-def starting(times: int, said: str) -> list[str]:
-    """The submissions that a head is asked for which refuses so many times, and at last the one that was made, if any was."""
-    asked: list[str] = []
+def starting(times: int, said: str) -> list[tuple[str, str]]:
+    """(submission, command line) of what a head is asked for which refuses so many times."""
+    asked: list[tuple[str, str]] = []
 
     class Api:
         def submit_job(self, entrypoint: str, submission_id: str) -> None:
-            asked.append(submission_id)
+            asked.append((submission_id, entrypoint))
             if len(asked) <= times:
                 raise RuntimeError(f"Request failed with status code 500: {said}")
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(submit, "client", Api)
+        def list_jobs(self) -> list[Any]:
+            return []
+
+    handing = drivers.RayDrivers("http://127.0.0.1:1")
+    vars(handing)["_client"] = Api()
+    with pytest.MonkeyPatch.context() as patch, contextlib.suppress(MachineError):
         patch.setattr(time, "sleep", lambda _: None)
-        with contextlib.suppress(submit.Refused):
-            asked.append(submit.submit(["verso", "run"], "a.yaml"))
+        handing.hand_over("verso-a-1", ["verso", "run", ODD])
     return asked
 
 
 def test_a_head_that_has_just_started_is_asked_again_for_the_same_job_and_no_other_refusal_is(monkeypatch):
     """Ray's dashboard answers before its agent does."""
     agent = "No available agent to submit job, please try again later.."
-    assert len(starting(2, agent)) == 4 and len(set(starting(2, agent))) == 1
+    assert len(starting(2, agent)) == 3 and len(set(starting(2, agent))) == 1
+    assert shlex.split(starting(0, "")[0][1]) == ["verso", "run", ODD]
     assert len(starting(9, "the submission is refused")) == 1
-    monkeypatch.setattr(submit, "STARTS_S", -1.0)
+    monkeypatch.setattr(drivers, "STARTS_S", -1.0)
     assert len(starting(9, agent)) == 1
 
 
@@ -148,7 +155,7 @@ def test_a_job_outlives_the_one_who_follows_it_and_can_be_followed_and_stopped(h
 @pytest.mark.minute
 def test_without_the_token_nobody_submits(head):
     code, _, err = head.submit("shapes.yaml", "--out", "none", RAY_AUTH_TOKEN="f" * 64)
-    assert code == 2 and "oken" in err and "Traceback" not in err
+    assert code == 1 and "oken" in err and "Traceback" not in err
     code, _, err = head.submit("shapes.yaml", "--out", "none", RAY_AUTH_TOKEN="")
     assert code == 2 and "no token: set RAY_AUTH_TOKEN" in err
     body = b'{"entrypoint": "touch /tmp/x"}'

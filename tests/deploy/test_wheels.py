@@ -9,10 +9,15 @@ import tomllib
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deploy import wheels
+from schemas.dataset.codec import read_matrix
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from services.dataset.dataset import open_dataset
 from tests.datasets import make_dataset
+from workers.store.images import encode_png
 
 ROOT = Path(__file__).parents[2]
 IMPORTED_AS = {
@@ -38,7 +43,6 @@ HEAVY = {
     "rtree",
 }
 HEAVY |= {
-    "scipy",
     "plyfile",
     "mapbox_earcut",
     "clarabel",
@@ -71,13 +75,40 @@ def test_reading_loads_what_the_wheel_names_and_nothing_that_makes_data():
     assert others == {IMPORTED_AS.get(name, name) for name in names}
     rooms = {".".join(name.split(".")[:2]) for name in modules}
     assert not rooms & {"workers.physics", "workers.render", "workers.capture", "workers.shard", "services.queue"}
-    assert len(modules) < 105  # nine export formats are thirteen of them
+    assert len(modules) < 117  # nine export formats are thirteen of them
     code = "import sys, verso; verso.open; print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.split()
     ours = {name for name in loaded if name.split(".")[0] in wheels.OURS and wheels.file_of(name).name != "__init__.py"}
-    assert ours <= modules.keys() and not {*HEAVY, "trimesh", "duckdb", "obstore"} & set(loaded)
+    assert ours <= modules.keys() and not {*HEAVY, "scipy", "trimesh", "duckdb", "obstore"} & set(loaded)
+
+
+@pytest.fixture(scope="module")
+def predictions(dataset, tmp_path_factory):
+    """What is true of depth, colour and poses, as predictions."""
+    folder = tmp_path_factory.mktemp("predictions")
+    lines = ["scene_id,im_id,obj_id,R,t"]
+    for kind in ("depth", "rgb"):
+        (folder / kind).mkdir()
+    for pair in open_dataset(str(dataset)).pairs():
+        view = pair.mirror
+        np.save(folder / "depth" / f"{view.pose_id}.npy", view.depth() / view.depth_units_per_m)
+        (folder / "rgb" / f"{view.pose_id}.png").write_bytes(encode_png(view.rgb()))
+        for region in (region for region in view.regions if region >= REGION_FIRST_OBJECT):
+            T = read_matrix(view.regions[region]["T_cam_obj"])
+            R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
+            lines.append(f"{pair.scene_id},{view.pose_id},{region},{R},{t}")
+    (folder / "poses.csv").write_text("\n".join(lines))
+    return folder
+
+
+def check_score(answer: str) -> None:
+    """The JSON line of a score of the truth."""
+    told = json.loads(answer.splitlines()[-1])
+    values = {name: figure["value"] for name, figure in told["metrics"].items()}
+    assert (told["missing"], told["refused"]) == (0, 0), told
+    assert values["depth_mae_m"] == 0.0 and values["rgb_ssim"] == 1.0 and values["pose_add_s_m"] < 1e-9, values
 
 
 ALONE = f"""
@@ -117,17 +148,25 @@ def site(built, tmp_path_factory):
     return folder
 
 
-def test_every_command_of_reading_works_from_the_wheel_and_the_others_say_what_to_install(site, dataset, tmp_path):
+def test_every_command_of_reading_works_from_the_wheel_and_the_others_say_what_to_install(
+    site, dataset, predictions, tmp_path
+):
     out = str(dataset)
     commands = [["status", out], ["columns"], ["query", out, "select count(*) from scenes"], ["verify", out]]
     commands += [["export", out, str(tmp_path / name), "--format", name] for name in ("bop", "gltf", "huggingface")]
     commands += [["export", out, str(tmp_path / name), "--format", name] for name in ("mirror-recon", "webdataset")]
     commands += [["report", out, "--out", str(tmp_path / "page.html")]]
-    commands += [["verify", out, "--json"]]
+    commands += [
+        ["score", out, str(predictions), "--out", str(tmp_path / "score"), "--json"],
+        ["verify", out, "--json"],
+    ]
     refused = [["run", str(ROOT / "deploy/jobs/tabletop.yaml")], ["replay", out, "0"]]
-    refused += [["doctor"], ["verify", out, "--audit", "1"]]
+    (tmp_path / "shapes" / "shape").mkdir(parents=True)
+    (tmp_path / "shapes" / "shape" / "1.ply").touch()
+    refused += [["doctor"], ["verify", out, "--audit", "1"], ["score", out, str(tmp_path / "shapes")]]
     ends = read(site, *commands, *refused)
     assert [code for code, *_ in ends] == [0] * len(commands) + [1] * len(refused), ends
+    check_score(ends[len(commands) - 2][1])
     told = ends[len(commands) - 1][1]
     assert json.loads(told.splitlines()[-1])["pairs"] == 0 and "deriving labels again needs what makes data" in told
     assert all("install verso-data" in err for _, _, err in ends[len(commands) :]), ends
@@ -158,7 +197,7 @@ print(json.dumps(made))
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("version", ["3.10", "3.12", "3.13"])
-def test_the_wheel_installs_and_reads_on(version, built, dataset, tmp_path):
+def test_the_wheel_installs_and_reads_on(version, built, dataset, predictions, tmp_path):
     python = find_python(version)
     if python is None:
         pytest.skip(f"no Python {version} is installed")
@@ -167,6 +206,9 @@ def test_the_wheel_installs_and_reads_on(version, built, dataset, tmp_path):
     subprocess.run([str(own / "pip"), "install", "-q", str(wheel)], check=True)
     for words in (["verify", str(dataset)], ["export", str(dataset), str(tmp_path / "bop"), "--format", "bop"]):
         subprocess.run([str(own / "verso"), *words], check=True, cwd=tmp_path)
+    words = ["score", str(dataset), str(predictions), "--out", str(tmp_path / "score"), "--json"]
+    scored = subprocess.run([str(own / "verso"), *words], check=True, cwd=tmp_path, capture_output=True, text=True)
+    check_score(scored.stdout)
     ended = subprocess.run(
         [str(own / "python"), "-c", PYTHON, str(dataset)], capture_output=True, text=True, cwd=tmp_path
     )

@@ -1,8 +1,7 @@
 """A stand-in for Ray's job API, queues with made-up jobs, and a world whose drivers work and are watched for doubles."""
 
-import shlex
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ class FakeDrivers(Drivers):
 
     def __init__(self) -> None:
         self.known: dict[str, Driver] = {}
-        self.entrypoints: dict[str, list[str]] = {}
         self.stopped: list[str] = []
         self.logs: dict[str, str] = {}
         self.handed_over: list[str] = []
@@ -29,12 +27,11 @@ class FakeDrivers(Drivers):
         self._answer()
         return dict(self.known)
 
-    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
+    def hand_over(self, submission: str, words: Sequence[str]) -> None:
         self._answer()
         if submission not in self.known:
             self.known[submission] = Driver("running")
             self.handed_over.append(submission)
-            self.entrypoints[submission] = shlex.split(entrypoint)
 
     def stop(self, submission: str) -> None:
         self._answer()
@@ -43,6 +40,9 @@ class FakeDrivers(Drivers):
     def log(self, submission: str) -> str | None:
         self._answer()
         return self.logs.get(submission, f"log of {submission}\n") if submission in self.known else None
+
+    def close(self) -> bool:
+        return False
 
     def end(self, job: str, attempt: int) -> None:
         """The driver is over, whatever it told."""
@@ -112,9 +112,9 @@ class World(FakeDrivers):
         vars(queue)["append"] = append
         return Supervisor(queue, self, Rules(AT_ONCE, ["verso"]), say, lambda: 1000.0 * self.ticks)
 
-    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
+    def hand_over(self, submission: str, words: Sequence[str]) -> None:
         self.effect()
-        super().hand_over(submission, entrypoint, metadata)
+        super().hand_over(submission, words)
         self.effect()
 
     def stop(self, submission: str) -> None:

@@ -146,7 +146,7 @@ def test_the_kept_copy_of_a_log_comes_before_ray_and_is_there_without_it(queue):
     for kind, attempt in (("died", 1), ("started", 2), ("began", 2)):
         queue.append(A, kind, attempt)
     queue.put_log(A, 1, "first\n")
-    drivers.hand_over(submission_id(A, 2), "verso", {})
+    drivers.hand_over(submission_id(A, 2), ["verso"])
     both = {1: "first\n", 2: f"log of verso-{A}-2\n"}
     assert read_logs(queue, drivers, queue.read(A), said.append) == both
     assert said == []
@@ -164,10 +164,10 @@ def test_following_shows_each_line_once_over_a_death_until_the_end(queue):
 
     script = iter(
         [
-            lambda: (drivers.hand_over(first, "", {}), write(first, "one\n")),
+            lambda: (drivers.hand_over(first, []), write(first, "one\n")),
             lambda: write(first, "two\n"),
             lambda: (write(first, "three\n"), queue.append(A, "died", 1), queue.append(A, "started", 2)),
-            lambda: (drivers.hand_over(second, "", {}), write(second, "four\n"), queue.append(A, "began", 2)),
+            lambda: (drivers.hand_over(second, []), write(second, "four\n"), queue.append(A, "began", 2)),
             lambda: (write(second, "five\n"), queue.append(A, "ended", 2, code=0)),
         ]
     )

@@ -3,7 +3,6 @@
 import http.server
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from services.job.job_file import load_job
 from services.queue import drivers as module
 from services.queue.drivers import LogsHere, OwnDrivers, answers, own_ray
 from services.queue.queue import open_queue
-from services.queue.supervise import Driver, Rules, supervise_here
+from services.queue.supervise import Driver, Rules, supervise
 from services.run.ray_cluster import private_folder
 from tests.datasets import run_here
 from tests.kit.killed_runs import chain_of, processes_with
@@ -51,7 +50,7 @@ def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found
         stubborn = "trap 'echo told' TERM; echo $GIVEN; for ((i = 0; i < 600; i++)); do sleep 0.05; done"
         for name, script in {"stubborn": stubborn, "plain": "exit 3", "killed": "kill -9 $$"}.items():
             for _ in range(2):  # a driver that is known is not started again
-                drivers.hand_over(name, shlex.join(["bash", "-c", script]), {})
+                drivers.hand_over(name, ["bash", "-c", script])
         wait_for(lambda: [one.state for one in drivers.states().values()].count("over") == 2)
         assert drivers.states() == {
             "stubborn": Driver("running"),
@@ -65,9 +64,9 @@ def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found
             time.sleep(0.2)
         assert drivers.log("stubborn") == "to drivers\ntold\n" and reader.log("plain") == ""
         with pytest.raises(MachineError, match=r"--driver /no/verso: it cannot be started \(No such file"):
-            drivers.hand_over("other", "/no/verso drive", {})
+            drivers.hand_over("other", ["/no/verso", "drive"])
         monkeypatch.setattr(module, "STOP_S", 0.2)
-        drivers.end()
+        assert drivers.close()
         assert drivers.states()["stubborn"] == Driver("over", "killed by SIGKILL")
     with pytest.raises(MachineError, match=r"--address http://127\.0\.0\.1:1"):
         reader.log("stubborn")
@@ -93,7 +92,7 @@ def test_an_orderly_end_is_no_death_of_a_job_and_of_a_cancelled_one_the_end(tmp_
     monkeypatch.setattr("services.queue.supervise.time.sleep", interrupt)
     rules = Rules(2, [sys.executable, "-c", "import time; time.sleep(600)"])
     with pytest.raises(KeyboardInterrupt):
-        supervise_here(queue, Slow(tmp_path, os.environ), rules, said.append)
+        supervise(queue, Slow(tmp_path, os.environ), rules, said.append)
     view = queue.read(job)
     assert (view.state, view.deaths, view.attempt) == ("queued", 0, 1)
     assert queue.read(cancelled).state == "cancelled"

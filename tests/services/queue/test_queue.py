@@ -1,5 +1,8 @@
 """Queues in folders and buckets: a job's state after its events, what is refused, and what several writers may not do."""
 
+import os
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -63,11 +66,21 @@ def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path):
             (request_path(A), None, "is the request of another job"),
             (event_path(event, 0), b"[]", "was not written by this program"),
             (event_path(event, 3), b"{}", "lacks an event"),
-            (event_path(event, 0), b"x" * (2 << 20), "should have less"),
+            (event_path(event, 0), b"x" * (2 << 20), "no more are read"),
+            (request_path(A), Path.mkdir, "is a folder"),
+            (request_path(A), os.mkfifo, "is a pipe"),
+            (event_path(event, 0), os.mkfifo, "is a pipe"),
+            (request_path(A), lambda place: place.symlink_to("/dev/zero"), "is a device"),
         ]
     ):
         queue = queue_of(tmp_path / str(number), request_of(A), request_of(B))
-        queue.store.put(key, queue.store.read(request_path(B)) if data is None else data)
+        if callable(data):
+            place = tmp_path / str(number) / key
+            place.parent.mkdir(exist_ok=True)
+            place.unlink(missing_ok=True)
+            data(place)
+        else:
+            queue.store.put(key, queue.store.read(request_path(B)) if data is None else data)
         views, faults = queue.read_all(queue.ids())
         assert [view.request.id for view in views] == [B]
         assert words in faults[A] and key.rpartition("/")[0] in faults[A] and "\n" not in faults[A]

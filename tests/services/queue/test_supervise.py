@@ -1,8 +1,6 @@
 """A queue looked after: turns, deaths, cancelling, and a supervisor that is killed, or not alone, at any step."""
 
 import itertools
-import shlex
-import subprocess
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +13,6 @@ from services.queue.supervise import (
     PAUSES_S,
     Action,
     Driver,
-    build_entrypoint,
     choose_starts,
     hold_queue,
     pause_of,
@@ -240,15 +237,6 @@ def test_a_cancelled_job_that_waits_never_starts_and_a_damaged_one_is_told_once_
     assert [world.queue.read(job).state for job in (PLAIN, DYING)] == ["done", "cancelled"]
     assert not any(DYING in one for one in world.handed_over)
     assert sum(f"job {LAST} is left alone" in line for line in said) == 1
-
-
-@pytest.mark.parametrize("place", ["/q", "/it's $(touch x) `touch x`; touch x", "/a\nb&&touch x", 's3://b/ü "x"'])
-def test_the_entrypoint_gives_the_shell_nothing_to_do(place, tmp_path):
-    line = build_entrypoint(["/opt/my verso", "-P"], place, PLAIN, 3).replace("'/opt/my verso'", "printf '%s\\0'")
-    told = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, check=True)
-    assert told.stdout.decode().split("\0")[:-1] == ["-P", "drive", PLAIN, "3", "--queue", place]
-    assert list(tmp_path.iterdir()) == []
-    assert shlex.split(build_entrypoint(["verso"], place, PLAIN, 3))[0] == "verso"
 
 
 def test_a_second_supervisor_is_refused_by_name(tmp_path):

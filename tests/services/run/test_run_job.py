@@ -11,7 +11,7 @@ import pytest
 import services.run.run_job
 from schemas.errors import OutputError, RunError
 from schemas.job.job import Job
-from services.job.job_file import load_job, validate_job
+from services.job.job_file import validate_job
 from services.merge.merge import merge
 from services.read.query import query
 from services.run.ray_cluster import Slots, private_ray
@@ -73,29 +73,6 @@ def test_scenes_of_several_objects_are_one_dataset_too_and_the_one_made_without_
     grown = make(tmp_path / "grown", **changes, run={"range_size": 4})
     assert digests == {grown.digest}
     assert grown.scenes == {"made": 4, "intrinsic": 0, "environmental": 0}
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_the_first_job_is_one_dataset_however_it_is_made(cluster, tmp_path):
-    """All 64 full-size scenes of tabletop.yaml: workers 1 and 2, shards of 1, 7 and 64, ranges of 4 and 16, extended."""
-    job = load_job(ROOT / "deploy" / "jobs" / "tabletop.yaml")
-
-    def digest(name: str, slots: int, **run: int) -> str:
-        out = tmp_path / name
-        changed = job.model_copy(update={"scenes": run.pop("scenes", 64), "run": job.run.model_copy(update=run)})
-        made = run_job(RunRequest(changed, Path(), str(out)), contextlib.nullcontext(Slots(slots, slots)))
-        if changed.scenes == 64:
-            shutil.rmtree(out)
-        return made.merged.digest
-
-    found = {
-        digest(f"{slots}-{shard}-{size}", slots, shard_size=shard, range_size=size)
-        for slots, shard, size in [(1, 64, 16), (2, 1, 4), (2, 7, 16), (2, 64, 4), (1, 7, 4), (2, 1, 16)]
-    }
-    digest("grown", 2, scenes=24, range_size=16)
-    found.add(digest("grown", 2, scenes=64, range_size=16))
-    assert len(found) == 1
 
 
 def test_the_finished_folder_holds_what_was_promised(made):

@@ -20,7 +20,7 @@ from services.job.record import encode_job, record_job
 from services.run import dry_run
 from services.run import progress as module
 from services.run.dry_run import describe_plan, measure_scene
-from services.run.metrics import Counts, Meter, serve
+from services.run.metrics import Meter, Tally, serve
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.run_job import RunRequest, open_inputs
 from tests.kit.network import free_port
@@ -156,18 +156,12 @@ def test_what_is_counted_is_served_while_it_lasts(place):
     with serve(meter, place):
         assert scrape(place)["verso_phase", "planning"] == 1.0
         meter.show(
-            Counts(
-                asked=100,
-                made=40,
-                failed={"intrinsic: left_table": 3},
-                lost={"memory": 1},
-                seconds={"settle": 1.5, 'a "stage"\n': 2.0},
-                commits=4,
-                in_flight=7,
-                slots=2,
-                since=1.8e9,
-                phase="making",
-            )
+            {
+                **Tally(100, 40, since=1.8e9, ranges=4, in_flight=7).counts(2),
+                "failed": {"intrinsic: left_table": 3},
+                "lost": {"memory": 1},
+                "seconds": {"settle": 1.5, 'a "stage"\n': 2.0},
+            }
         )
         found = scrape(place)
     assert found["verso_scenes_failed_total", "intrinsic: left_table"] == 3

@@ -1,9 +1,11 @@
 """`verso score` from the command line: truth is perfect, each fault is an item with a reason, scores are compared and kept."""
 
+import io
 import json
 import os
 import re
 import shutil
+import struct
 import zipfile
 
 import cv2
@@ -14,6 +16,8 @@ import trimesh
 
 from services.cli.main import main
 from services.dataset.dataset import open_dataset
+from services.score import run as module
+from workers.pool import Ended
 
 PAIRS = 8
 """Of the dataset `files`."""
@@ -61,51 +65,118 @@ def test_truth_is_perfect_and_its_page_needs_no_network(files, truth, tmp_path, 
     assert len(rows) == 3 * PAIRS and {row["status"] for row in rows} == {"ok"}
 
 
-def spoil(folder):
-    """Eleven faults, and one prediction that is missing."""
-    depth = sorted((folder / "depth").glob("*.npy"))
-    values = np.load(depth[0])
-    np.save(depth[0], values * 1000.0)
-    np.save(depth[1], values[:50])
-    far = np.load(depth[2])
-    np.save(depth[2], np.divide(1.0, far, out=np.zeros_like(far), where=far > 0.0))
-    depth[3].write_bytes(depth[3].read_bytes()[:500])
-    np.save(depth[4], np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    cv2.imwrite(str(depth[5].with_suffix(".png")), np.zeros(values.shape, np.uint16))
-    np.save(folder / "depth" / "90001.npy", values)
-    depth[6].unlink()
-    shape = sorted((folder / "shape").glob("*.ply"))
-    trimesh.load(shape[0], process=False).apply_scale(1000.0).export(shape[0])
-    shape[1].write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
-    shape[2].unlink()
-    with zipfile.ZipFile(shape[2].with_suffix(".npz"), "w", zipfile.ZIP_DEFLATED) as bomb:
-        bomb.writestr("points.npy", b"\0" * 200_000_000)
-    rgb = sorted((folder / "rgb").glob("*.png"))
-    rgb[0].write_bytes(rgb[0].read_bytes()[:-40])
+def archive(path, flags=0, method=0, shape=(4, 3)):
+    """An npz of points that says what is not so of itself."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(path, "w") as packed:
+        packed.writestr("points.npy", header.getvalue() + bytes(96))
+    data = bytearray(path.read_bytes())
+    for at in (6, data.index(b"PK\x01\x02") + 8):  # the file's own header, and the list at the end
+        data[at : at + 4] = struct.pack("<HH", flags, method or int.from_bytes(data[at + 2 : at + 4], "little"))
+    path.write_bytes(data)
+
+
+def cut(path, keep):
+    path.write_bytes(path.read_bytes()[:keep])
+
+
+def invert_depth(path):
+    far = np.load(path)
+    np.save(path, np.divide(1.0, far, out=np.zeros_like(far), where=far > 0.0))
+
+
+def bomb(path):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("points.npy", b"\0" * 200_000_000)
+
+
+def header_of_brackets(path):
+    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"(" * 9000)
+
+
+def twice(path):
+    cv2.imwrite(str(path.with_suffix(".png")), np.zeros(np.load(path).shape, np.uint16))
+
+
+def become_a_pipe(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+FAULTS = [
+    ("depth", ".npy", lambda path: np.save(path, np.load(path) * 1000.0), "millimetres"),
+    ("depth", ".npy", lambda path: np.save(path, np.load(path)[:50]), r"\(50, 160\)"),
+    ("depth", ".npy", invert_depth, "inverted"),
+    ("depth", ".npy", lambda path: cut(path, 500), "cannot be read"),
+    ("depth", ".npy", lambda path: np.save(path, np.array([{}], dtype=object), allow_pickle=True), "allow_pickle"),
+    ("depth", ".npy", twice, "there 2 times"),
+    ("depth", ".npy", header_of_brackets, "cannot be read"),
+    ("rgb", ".png", lambda path: cut(path, -40), "torn|damaged|cut"),
+    ("rgb", ".png", lambda path: (path.unlink(), path.mkdir()), "is a folder"),
+    ("rgb", ".png", become_a_pipe, "is a pipe"),
+    ("rgb", ".png", lambda path: (path.unlink(), path.symlink_to("/dev/zero")), "is a device"),
+    ("rgb", ".png", lambda path: (path.unlink(), path.symlink_to("nowhere")), "No such file"),
+    ("rgb", ".png", lambda path: os.truncate(path, 6 << 30), "no more are read"),
+    ("shape", ".ply", lambda path: trimesh.load(path, process=False).apply_scale(1e3).export(path), "millimetres"),
+    (
+        "shape",
+        ".ply",
+        lambda path: path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"),
+        "vertices",
+    ),
+    ("shape", ".npz", bomb, "unpacks to 200 MB"),
+    ("shape", ".npz", lambda path: archive(path, shape=(10**12, 3)), "more memory than there is"),
+    ("shape", ".npz", lambda path: archive(path, flags=1), "encrypted"),
+    ("shape", ".npz", lambda path: archive(path, method=99), "not supported"),
+    ("shape", ".npz", lambda path: archive(path, shape=(5, 3)), "cannot be read"),
+]
+"""Kind of prediction, suffix, what is done to the file of the truth, and what is told."""
 
 
 def test_each_fault_is_an_item_with_its_reason_and_counts_as_worst(files, truth, tmp_path, capsys):
     folder = shutil.copytree(truth, tmp_path / "spoilt")
-    spoil(folder)
+    waiting = {kind: sorted((folder / kind).iterdir()) for kind in ("depth", "rgb", "shape")}
+    expected = {}
+    for kind, suffix, spoil, told in FAULTS:
+        path = waiting[kind].pop(0)
+        expected[kind, int(path.stem)] = told
+        path = path if path.suffix == suffix else path.rename(path.with_suffix(suffix))
+        spoil(path)
+    waiting["rgb"].pop().unlink()
+    shutil.copy(waiting["depth"][0], folder / "depth" / "90001.npy")
+    shutil.copy(waiting["depth"][0], os.fsencode(folder / "depth") + b"/\xff.npy")
+    (folder / "poses.csv").write_text(f"scene_id,im_id,obj_id,R,t\n1,{10**30},3,1 0 0 0 1 0 0 0 1,0 0 1000\n")
     status, answer, said = score(capsys, files.root, folder, "--out", tmp_path / "score")
-    assert (status, answer["refused"], answer["missing"]) == (1, 11, 1)
     rows = pq.read_table(tmp_path / "score" / "items.parquet").to_pylist()
-    reasons = [row["reason"] for row in rows if row["status"] == "refused"]
-    for told in (
-        "millimetres",
-        r"\(50, 160\)",
-        "inverted",
-        "torn|cut|damaged|read",
-        "pickle|objects",
-        "there 2 times",
-        "90001",
-        "unpacks to 200 MB",
-    ):
-        assert sum(bool(re.search(told, reason)) for reason in reasons) >= 1, (told, reasons)
+    refused = {(row["kind"], row["pose_id"]): row["reason"] for row in rows if row["status"] == "refused"}
+    for key, told in expected.items():
+        assert re.search(told, refused.pop(key)), key
+    others = {("depth", 90001): "another dataset", ("depth", None): "no pose id", ("pose", None): "line 2 of poses.csv"}
+    assert set(refused) == set(others) and all(others[key] in why for key, why in refused.items())
+    assert (status, answer["refused"], answer["missing"]) == (1, len(FAULTS) + 3, 1 + PAIRS)
     assert "missing" in said and answer["metrics"]["depth_mae_m"]["value"] > 0.0
-    assert answer["metrics"]["depth_within_2mm"]["value"] == pytest.approx(
-        1 / PAIRS
-    )  # of seven, and one of another dataset
+    share = pytest.approx(1 / (PAIRS + 2))  # of eight, one of another dataset, and one without an id
+    assert answer["metrics"]["depth_within_2mm"]["value"] == share
+
+
+def test_an_item_that_ends_its_process_is_refused_and_the_others_are_scored(
+    files, truth, tmp_path, capsys, monkeypatch
+):
+    deadly, real = min(int(path.stem) for path in (truth / "depth").iterdir()), module._answers
+
+    def answers(ranges, kept):
+        for item, answer in real(ranges, kept):
+            ends = deadly in item.poses and not item.blame
+            yield item, Ended("crashed", "crashes its process (SIGSEGV)") if ends else answer
+
+    monkeypatch.setattr(module, "_answers", answers)
+    status, answer, said = score(capsys, files.root, truth, "--out", tmp_path)
+    assert (status, answer["items"], answer["refused"], answer["missing"]) == (1, 3 * PAIRS, 3, 0)
+    assert said.count(f"{deadly:05d} refused: scoring it crashes its process (SIGSEGV)") == 3
+    monkeypatch.setattr(module, "_answers", lambda ranges, kept: ((item, Ended("killed", "killed")) for item in ranges))
+    assert main(["score", str(files.root), str(truth), "--out", str(tmp_path)]) == 1
+    assert "start again, what is scored is kept" in capsys.readouterr().err
 
 
 def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp_path, capsys):
@@ -121,9 +192,9 @@ def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp
     assert "--align none and scale" in capsys.readouterr().err
     found = score(capsys, files.root, "--compare", near, far)[1]["metrics"]
     assert found["depth_mae_m"]["better"] == "a" and found["rgb_ssim"]["better"] is None
-    kept = {path.name: path.stat().st_mtime_ns for path in (near / "score" / "_kept").iterdir()}
+    kept = (near / "score" / module.KEPT).stat()
     assert score(capsys, files.root, near)[1] == answers[0]
-    assert {path.name: path.stat().st_mtime_ns for path in (near / "score" / "_kept").iterdir()} == kept
+    assert (near / "score" / module.KEPT).stat() == kept
     first = min((near / "depth").glob("*.npy"))
     time_of_change = first.stat().st_mtime_ns
     np.save(first, np.load(first) + 0.01)

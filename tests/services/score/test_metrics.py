@@ -10,10 +10,12 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from schemas.errors import InputError
 from schemas.scene.shape import Mesh
 from services.score.images import align_depth, score_colour, score_depth
+from services.score.points import check_distance, score_volume
 from services.score.pose import score_pose, symmetries_of
-from services.score.shape import align_shape, score_shape, score_volume
+from services.score.shape import align_shape, score_shape
 from workers.geometry.frames import transform
 
 CASES = 100
@@ -452,3 +454,13 @@ def test_sizes_that_differ_are_refused():
     ):
         with pytest.raises(ValueError, match="of"):
             score(*arguments)
+
+
+def test_distances_of_another_unit_or_sign_and_logits_are_told_and_a_poor_guess_is_not():
+    true = np.random.default_rng(11).normal(size=1000) * 0.02
+    noise = np.random.default_rng(12).normal(size=1000) * 0.02
+    for predicted, told in ((1e3 * true, "millimetres"), (60.0 * true, "logits"), (0.2 * noise - true, "other sign")):
+        with pytest.raises(InputError, match=told):
+            check_distance(predicted, true)
+    check_distance(noise, true)
+    check_distance(true, true)
