@@ -76,6 +76,8 @@ class Modality:
     """It is stored where the job's `targets.layers` is at least this."""
     each: bool = False
     """One image for each object, in the order of their regions; as an array [objects, H, W]."""
+    formula: str | None = None
+    """The formula of `services/read/independent/targets.py` for what a pixel shows; None where it has none of its own there."""
 
     def word_of(self, role: ViewRole) -> str | None:
         """The word in the file's name (`RGB`, `RGBaligned`, `depthAligned`); None where such a view has no such image."""
@@ -95,9 +97,9 @@ MODALITIES: dict[PixelKind, Modality] = {
         Modality("rgb", "RGB", "uint8", 3, "render.rgb", projected=True),
         Modality("depth", "depth", "uint16", projected=True),
         Modality("region", "segment", "uint8"),
-        Modality("normals", "normals", "uint16", 3, target="normals"),
-        Modality("coordinates", "coordinates", "uint16", 3, target="coordinates"),
-        Modality("albedo", "albedo", "uint8", 3, target="albedo"),
+        Modality("normals", "normals", "uint16", 3, target="normals", formula="normals"),
+        Modality("coordinates", "coordinates", "uint16", 3, target="coordinates", formula="coordinates"),
+        Modality("albedo", "albedo", "uint8", 3, target="albedo", formula="albedo"),
         Modality("amodal", "amodal", "uint8", target="amodal", each=True),
         *(Modality(f"layer{n}", f"layer{n}_", "uint16", target="layers", layer=n) for n in LAYERS),
         *(Modality(f"layer{n}_region", f"layerSegment{n}_", "uint8", target="layers", layer=n) for n in LAYERS),

@@ -221,12 +221,7 @@ def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
     from services.read.replay import replay_scene
 
-    if options.repair:
-        return _repair(options)
-    if len(options.scene) != 1:
-        raise InputError(f"one scene is replayed at a time: verso replay {options.out} SCENE, or --repair for all")
-    (scene_id,) = options.scene
-    store = _dataset(options.out)
+    scene_id, store = options.scene, _dataset(options.out)
     with explain_damage(store):
         result = replay_scene(store, scene_id)
     for difference in result.differences:
@@ -235,20 +230,6 @@ def replay(options: argparse.Namespace) -> int:
     differ = f"{len(result.differences) or 'none'} differ"
     print(f"scene {scene_id}: {result.compared} files and tables compared {how}: {differ}")
     return finish(options, not result.differences, **dataclasses.asdict(result))
-
-
-def _repair(options: argparse.Namespace) -> int:
-    """`verso replay --repair`."""
-    from services.read.repair import repair
-
-    store = _committed(options.out)
-    with explain_damage(store):
-        repaired = _with_progress(_scenes_asked(store), "verify", partial(repair, store, options.scene))
-    for line in (*repaired.done, *repaired.left):
-        print(line)
-    off = _tell_faults(repaired.verdict)
-    print(f"{options.out}: {plural(len(repaired.done), 'file')} put back or written again; {off or 'nothing'} off")
-    return finish(options, not off, done=repaired.done, left=repaired.left, faults=repaired.verdict.faults)
 
 
 def _dataset(out: str) -> Store:

@@ -334,14 +334,10 @@ COMMANDS: Final[dict[str, Command]] = {
         option("table", "TABLE", "scenes, views, objects, ... (default: all)", nargs="?"),
     ),
     "replay": command(
-        "make one scene again and compare it with what is stored, or put back what was lost",
+        "make one scene again and compare it with what is stored",
         "data/tabletop 17",
         OUT,
-        option("scene", "SCENE", kind=read.read_index, nargs="*"),
-        flag(
-            "--repair",
-            "put back what is missing or damaged (with SCENEs: in their ranges) where it comes out as it was",
-        ),
+        option("scene", "SCENE", kind=read.read_index),
     ),
     **REPORT_COMMANDS,
     "score": command(

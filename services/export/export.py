@@ -99,8 +99,13 @@ class _Export:
                 self._finished = True
                 self._checkpoint(self._next_scene)
             counts = {name: self._counts[name] for name in ("scenes", "pairs", "pairs_left_out")}
-            told = {"left_out": dict(sorted(self._left_out.items())), **self._writer.describe()}
-        manifest = {**self._folder.plan, "ranges": len(self._codes), **counts, **told}
+            left_out, described = dict(sorted(self._left_out.items())), self._writer.describe()
+        manifest = {**self._folder.plan, "ranges": len(self._codes), **counts, "left_out": left_out}
+        if reserved := sorted(described.keys() & manifest.keys()):
+            raise ValueError(
+                f"the writer of {self._request.format} describes {', '.join(reserved)}: export.json has that"
+            )
+        manifest |= described
         self._folder.finish(manifest)
         return ExportResult(manifest, self._counts["pairs"] - before)
 

@@ -157,7 +157,7 @@ class Writer:
         """Writes what is still waiting. Afterwards `state` is not None."""
 
     def describe(self) -> dict[str, Any]:
-        """What the manifest says of this format: units, frames, counts."""
+        """What the manifest says of this format: units, frames, counts; none of the keys that docs/export.md reserves."""
         raise NotImplementedError
 
     def close(self) -> None:

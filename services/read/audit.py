@@ -16,15 +16,16 @@ from scipy.stats import t as student_t
 
 from schemas.base import Pose
 from schemas.dataset.codec import Row
-from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
+from schemas.dataset.layout import FINGERPRINT_FILE, is_shape, stored_images, stored_roles
 from schemas.dataset.shard import Fingerprint
 from schemas.errors import CorruptError, InputError, SceneError, plural
+from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
-from schemas.scene.view import Camera, View
+from schemas.scene.view import MODALITIES, Camera, View
 from services.job.record import read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, file_reader, find_scene
-from services.read.independent.derive import StoredPair, check_forces
+from services.read.independent.derive import Kind, StoredPair, check_forces
 from services.read.independent.poses import check_merged, check_pair, list_underived
 from services.read.referee import Held, describe_held, hold_scene, is_installed
 from services.read.replay import compare_files, compare_rows, open_context
@@ -197,13 +198,22 @@ class IndependentVerdict:
     faults: list[str] = field(default_factory=list)
 
 
+def stored_kinds(job: Job) -> dict[str, list[Kind]]:
+    """The rows of the modalities that a job stores, by role, as the independent code takes them."""
+    kinds = {}
+    for role in stored_roles(job):
+        images = ((image.content, MODALITIES[image.pixels]) for image in stored_images(role, job))
+        kinds[str(role)] = [Kind(m.name, word, m.dtype, m.channels, m.each, m.formula) for word, m in images]
+    return kinds
+
+
 def verify_independently(
     store: Store, count: int, progress: Callable[[IndependentVerdict], None]
 ) -> IndependentVerdict:
     """Derive the labels of `count` scenes a second time. Raises OutputError where the folder is no dataset."""
     record = require_job(store)
     job = record.job.model_dump(mode="json")
-    found = IndependentVerdict(underived=list_underived(job))
+    found, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
     views: list[Row] = []
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
@@ -216,7 +226,7 @@ def verify_independently(
             return store.read(path) if is_shape(path) else images(path)
 
         for pair_views, pair_objects in stored.pairs(scene_id):
-            pair = StoredPair(job, scene, pair_views, pair_objects, read)
+            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds)
             try:
                 found.faults += check_pair(pair)
             except CorruptError as error:

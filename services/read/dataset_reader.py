@@ -153,7 +153,7 @@ def decode_samples(data: bytes, name: str) -> dict[str, NDArray]:
             arrays = {one.filename.removesuffix(".npy"): _decode_array(file.read(one)) for one in file.infolist()}
         _check_samples(arrays)
     except Exception as error:  # zipfile and numpy raise errors of many kinds for a damaged file
-        raise CorruptError(f"{name} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
+        raise CorruptError(f"{name} cannot be read: {error}; `verso verify OUT` says what to do") from error
     return arrays
 
 

@@ -45,7 +45,7 @@ class Sources:
         """
         path = asset_path(category, instance_id)
         if self._record.job.captures is not None:
-            raise CorruptError(f"{path} is missing: `verso replay OUT --repair` makes it again")
+            raise CorruptError(f"{path} is missing: `verso verify OUT` says what to do")
         told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off), and"
         with needs_making(told):
             from workers.assets.catalogue import load_asset
@@ -90,7 +90,7 @@ def load_glb(data: bytes, path: str) -> Mapping[str, trimesh.Trimesh]:
             raise ValueError("it has no mesh")
         return meshes
     except Exception as error:  # trimesh raises errors of many kinds for a damaged file
-        raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
+        raise CorruptError(f"{path} cannot be read: {error}; `verso verify OUT` says what to do") from error
 
 
 def region_names(scene: Mapping[str, Any]) -> dict[int, tuple[str, str]]:

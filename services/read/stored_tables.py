@@ -158,7 +158,7 @@ class StoredTables:
         ):
             return list(files)
         told = f"{SUCCESS_FILE} in {self._store.name} does not name its merged files"
-        raise CorruptError(f"{told}: `verso replay {self._store.name} --repair` writes it again")
+        raise CorruptError(f"{told}: remove it, and run the job again")
 
     def parts(self, table: str) -> list[Rows]:
         """The rows of one table in one or two pieces. In `assets` of an unfinished dataset an instance may be repeated."""

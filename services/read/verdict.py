@@ -9,6 +9,7 @@ from typing import Literal
 
 import pyarrow as pa
 
+from schemas.dataset.layout import SUCCESS_FILE, commit_path
 from schemas.errors import CorruptError
 from services.merge.shared import open_scratch
 from workers.store.store import Store
@@ -49,10 +50,15 @@ class Verdict:
         else:
             self.untold += 1
 
+    def make_again(self, start: int) -> str:
+        """The remedy for a lost file of the range at `start`: its scenes, and so its files, come out the same again."""
+        commits = commit_path(start).replace(".json", "*.json")
+        return f"{COPY}, or remove it, {commits} and {SUCCESS_FILE}, and {self.run_again}"
+
     @property
-    def repair(self) -> str:
-        """The remedy for what can be made again."""
-        return f"`verso replay {self.out} --repair` puts it back, or restore it from a copy"
+    def merge_again(self) -> str:
+        """The remedy for what the end of a run writes."""
+        return f"remove it and {SUCCESS_FILE}, and {self.run_again}"
 
     @property
     def run_again(self) -> str:

@@ -120,9 +120,9 @@ def read_stored_job(store: Store, verdict: Verdict) -> StoredJob:
         return StoredJob()
     found = StoredJob(record, is_job_sealed(data))
     if not found.whole:
-        verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "job")
+        verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", COPY, "job")
     elif record.digest != found.digest:
-        verdict.tell(f"{JOB_FILE}: its digest is not that of its keys", verdict.repair, "job")
+        verdict.tell(f"{JOB_FILE}: its digest is not that of its keys", COPY, "job")
     return found
 
 
@@ -171,18 +171,18 @@ def check_fingerprint(store: Store, terms: Terms, verdict: Verdict) -> None:
         data = store.read(FINGERPRINT_FILE)
         stored = Fingerprint.model_validate_json(data)
     except OSError as error:
-        verdict.tell(f"{FINGERPRINT_FILE}: {describe_os_error(error)}", verdict.repair, "job")
+        verdict.tell(f"{FINGERPRINT_FILE}: {describe_os_error(error)}", COPY, "job")
         return
     except (ValidationError, ValueError):
-        verdict.tell(f"{FINGERPRINT_FILE}: is damaged: it is no fingerprint", verdict.repair, "job")
+        verdict.tell(f"{FINGERPRINT_FILE}: is damaged: it is no fingerprint", COPY, "job")
         return
     if not terms.stacks:
         return
     if data != encode_fingerprint(stored):
-        verdict.tell(f"{FINGERPRINT_FILE}: was altered after a worker wrote it", verdict.repair, "job")
+        verdict.tell(f"{FINGERPRINT_FILE}: was altered after a worker wrote it", COPY, "job")
     elif stored.digest not in {stack for stack, _ in terms.stacks} and not _is_in_card(store, stored):
         told = f"{FINGERPRINT_FILE}: is the fingerprint {stored.digest[:12]}, which no commit has"
-        verdict.tell(told, verdict.repair, "job")
+        verdict.tell(told, COPY, "job")
     else:
         for (stack, mode), key in terms.stacks.items():
             if mode == "strict" and stack != stored.digest:
@@ -352,7 +352,7 @@ def _tell_unfinished(found: Ranges, remade: dict[str, Any] | None, verdict: Verd
         verdict.tell(f"{missing} {told}", f"{verdict.run_again} --retry-failed")
     else:
         told = "every scene is committed, and they were not merged, or the file was removed"
-        verdict.tell(f"{missing} {told}", f"{verdict.run_again}, or {verdict.repair}", "merge")
+        verdict.tell(f"{missing} {told}", verdict.run_again, "merge")
 
 
 @contextlib.contextmanager

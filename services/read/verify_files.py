@@ -176,7 +176,7 @@ def read_stored_success(store: Store, verdict: Verdict) -> Success:
     except FileNotFoundError:
         return Success(None, {})
     except OSError as error:
-        verdict.tell(f"{SUCCESS_FILE}: {describe_os_error(error)}", verdict.repair, "merge")
+        verdict.tell(f"{SUCCESS_FILE}: {describe_os_error(error)}", verdict.merge_again, "merge")
         return Success(b"", {})
     try:
         told = json.loads(data)
@@ -184,7 +184,7 @@ def read_stored_success(store: Store, verdict: Verdict) -> Success:
         told = None
     if isinstance(told, dict):
         return Success(data, told)
-    verdict.tell(f"{SUCCESS_FILE}: is {'damaged' if data else 'empty'}", verdict.repair, "merge")
+    verdict.tell(f"{SUCCESS_FILE}: is {'damaged' if data else 'empty'}", verdict.merge_again, "merge")
     return Success(data, {})
 
 
@@ -195,7 +195,7 @@ def check_success(success: Success, expected: Mapping[str, Any], verdict: Verdic
     wrong = sorted(key for key in {*success.told, *expected} if success.told.get(key) != expected.get(key))
     told = f"its {', '.join(map(printable, wrong))} {'is' if len(wrong) == 1 else 'are'} not what the commits give"
     verdict.tell(
-        f"{SUCCESS_FILE}: {told if wrong else 'was altered after the merge wrote it'}", verdict.repair, "merge"
+        f"{SUCCESS_FILE}: {told if wrong else 'was altered after the merge wrote it'}", verdict.merge_again, "merge"
     )
 
 
@@ -212,13 +212,13 @@ def check_merged(
         found = _hash_file(store, path, verdict)
         vouched = found == success.files.get(path)
         if isinstance(found, str):
-            verdict.tell(f"{path}: {found}", verdict.repair, "merge")
+            verdict.tell(f"{path}: {found}", verdict.merge_again, "merge")
         elif found != entry and not vouched:
-            verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.repair, "merge")
+            verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.merge_again, "merge")
         elif found != entry and path.endswith(".parquet") and _same_rows(store, path, remade[path]):
             entries[path] = found
         elif found != entry:
-            verdict.tell(f"{path}: does not hold the rows of the commits", verdict.repair, "merge")
+            verdict.tell(f"{path}: does not hold the rows of the commits", verdict.merge_again, "merge")
     return entries
 
 
@@ -227,14 +227,14 @@ def check_card(store: Store, digest: str, verdict: Verdict) -> None:
     try:
         data = store.read(README_FILE)
     except OSError as error:
-        verdict.tell(f"{README_FILE}: {describe_os_error(error)}", verdict.repair, "card")
+        verdict.tell(f"{README_FILE}: {describe_os_error(error)}", verdict.merge_again, "card")
         return
     if not is_card_sealed(data):
         verdict.tell(
-            f"{README_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "card"
+            f"{README_FILE}: was altered after a run wrote it: its seal does not match", verdict.merge_again, "card"
         )
     elif f"| dataset digest | `{digest}` |".encode() not in data:
-        verdict.tell(f"{README_FILE}: does not name the dataset digest {digest[:12]}", verdict.repair, "card")
+        verdict.tell(f"{README_FILE}: does not name the dataset digest {digest[:12]}", verdict.merge_again, "card")
 
 
 def _hash_file(store: Store, path: str, verdict: Verdict) -> dict[str, object] | str:

@@ -129,8 +129,7 @@ def read_records(store: Store, start: int, retries: Sequence[int], verdict: Verd
             record = read_record(store, start, retry)
         except CorruptError as error:
             told = _without_remedy(error).removeprefix(key).lstrip(": ")
-            drop = f"`verso replay {verdict.out} --repair` drops it, so that a run makes its scenes again"
-            verdict.tell(f"{key}: {told}", f"{COPY}, or {drop}")
+            verdict.tell(f"{key}: {told}", verdict.make_again(start))
         except OSError as error:
             verdict.tell(f"{key}: {describe_os_error(error)}", COPY)
         else:
@@ -204,7 +203,9 @@ class RangeCheck:
                     continue
             if fault := self._check_file(entry, digests, found):
                 damaged.add(entry.path)
-                self.verdict.tell(f"{entry.path}: {fault}", self.verdict.repair, "file")
+                self.verdict.tell(
+                    f"{entry.path}: {fault}", self.verdict.make_again(found.records[0].span.start), "file"
+                )
 
     def _check_file(self, entry: FileEntry, digests: dict[str, str], found: ReadRange) -> str | None:
         try:

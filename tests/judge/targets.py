@@ -22,6 +22,7 @@ from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.views import ViewTarget
 from schemas.scene.scene import SceneOutput
+from services.read.audit import stored_kinds
 from services.read.independent.derive import StoredPair
 from services.read.independent.poses import check_pair
 from services.read.independent.rays import Faces, read_shape
@@ -59,11 +60,12 @@ def stored_pairs(context: WorkerContext, scene: Scene) -> Iterator[StoredPair]:
 def pairs_of(job: Job, output: SceneOutput) -> Iterator[StoredPair]:
     """The pairs of what a scene or a capture leaves."""
     files, keys = {file.path: file.data for file in output.files}, job.model_dump(mode="json")
+    kinds = stored_kinds(job)
     for parent in dict.fromkeys(row["parent_id"] for row in output.rows["views"]):
         views = {str(row["role"]): row for row in output.rows["views"] if row["parent_id"] == parent}
         ids = {row["pose_id"] for row in views.values()}
         objects = [row for row in output.rows["objects"] if row["pose_id"] in ids]
-        yield StoredPair(keys, output.rows["scenes"][0], views, objects, files.__getitem__)
+        yield StoredPair(keys, output.rows["scenes"][0], views, objects, files.__getitem__, kinds)
 
 
 def judge_scene(job_json: str, scene_id: int) -> Judged:

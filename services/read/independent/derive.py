@@ -44,26 +44,19 @@ def beside(job: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return {"aligned" if name == "depth" else name: branch for name, branch in cameras if "offset_m" in branch}
 
 
-def words(role: str, targets: Mapping[str, Any]) -> dict[str, str]:
-    """Content word of each image of a view, by kind of pixel; `targets` is the job's branch."""
-    suffix = "" if role in ("input", "mirror") else role.capitalize()
-    said = {"rgb": f"RGB{suffix.lower()}", "depth": f"depth{suffix}"}
-    if role == "projected":
-        return said
-    asked = targets["views"]
-    kinds = [name for name in ("normals", "coordinates", "albedo", "amodal") if name in asked]
-    said |= {"region": f"segment{suffix}", **{name: f"{name}{suffix}" for name in kinds}}
-    if "layers" in asked:
-        for n in range(1, targets["layers"] + 1):
-            said |= {f"layer{n}": f"layer{n}_{suffix}", f"layer{n}_region": f"layerSegment{n}_{suffix}"}
-        said |= {"back": f"back{suffix}", "back_region": f"backSegment{suffix}"}
-    return said
+@dataclass(frozen=True)
+class Kind:
+    """A kind of pixel that the job stores of a view, as the table of modalities says."""
 
-
-def pixel_type(kind: str) -> tuple[type[np.unsignedinteger], int]:
-    """(type, channels) of a kind of pixel."""
-    wide = kind in ("depth", "normals", "coordinates") or (kind.startswith(("layer", "back")) and "region" not in kind)
-    return np.uint16 if wide else np.uint8, 3 if kind in ("rgb", "normals", "coordinates", "albedo") else 1
+    name: str
+    word: str
+    """The content word in the file's name."""
+    dtype: str
+    channels: int
+    each: bool
+    """An image for each object."""
+    formula: str | None
+    """The formula of `targets.py` that gives its values; None where there is none of this name."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +68,8 @@ class StoredPair:
     views: Mapping[str, Row]
     objects: Sequence[Row]
     read: Callable[[str], bytes]
+    stored: Mapping[str, Sequence[Kind]]
+    """By role, what the job stores of a view."""
     images: dict[tuple[str, str], NDArray] = field(default_factory=dict)
     """Decoded images by role and kind of pixel."""
     shapes: dict[str, Any] = field(default_factory=dict)
@@ -110,11 +105,13 @@ class StoredPair:
         """Region ids of the objects."""
         return [body["region_id"] for body in self.bodies]
 
-    def kinds(self, role: str) -> list[str]:
+    def kinds(self, role: str) -> dict[str, Kind]:
         """Kinds of pixel that the job stores of a view; `amodal3`, `amodal4` of one that each object has."""
-        stored = [kind for kind in words(role, self.targets) if kind != "rgb" or self.job["render"]["rgb"]]
-        each = {"amodal": [f"amodal{region}" for region in self.regions]}
-        return [one for kind in stored for one in each.get(kind, [kind])]
+        return {
+            name: kind
+            for kind in self.stored[role]
+            for name in ([f"{kind.name}{region}" for region in self.regions] if kind.each else [kind.name])
+        }
 
     def path(self, view: Row, kind: str, patch_of: int | None = None) -> str:
         """`mug/depth00000.png`; of a patch, and of an object's own image, with the object's number where there are several.
@@ -123,7 +120,7 @@ class StoredPair:
         """
         number = view["parent_id"] + (view["role"] == "mirror")
         own = own_region(kind)
-        word = words(view["role"], self.targets)["amodal" if own else kind]
+        word = self.kinds(view["role"])[kind].word
         region = patch_of or own
         suffix = f"obj{region - FIRST_OBJECT}" if region and len(self.regions) > 1 else ""
         return f"{view['category']}/{'patches/' if patch_of else ''}{word}{number:05d}{suffix}.png"
@@ -137,13 +134,12 @@ def own_region(kind: str) -> int | None:
 def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
     """Decode the view's images; type, size, and every file's size and digest in its row."""
     role, size = view["role"], (view["height"], view["width"])
-    for kind in pair.kinds(role):
-        path = pair.path(view, kind)
-        image = pair.images[role, kind] = _decode(pair.read(path))
-        dtype, channels = pixel_type(kind)
-        shape = size if channels == 1 else (*size, channels)
-        if image.dtype != dtype or image.shape != shape:
-            yield f"{path}: is {image.dtype} {image.shape}, and must be {np.dtype(dtype)} {shape}"
+    for name, kind in pair.kinds(role).items():
+        path = pair.path(view, name)
+        image = pair.images[role, name] = _decode(pair.read(path))
+        shape = size if kind.channels == 1 else (*size, kind.channels)
+        if image.dtype != np.dtype(kind.dtype) or image.shape != shape:
+            yield f"{path}: is {image.dtype} {image.shape}, and must be {kind.dtype} {shape}"
     for file in view["files"]:
         data = pair.read(file["path"])
         if (len(data), hashlib.sha256(data).hexdigest()) != (file["bytes"], file["sha256"]):

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.read.independent.derive import FIRST_OBJECT, FLOOR, TABLE, Array, Row, StoredPair, matrix
+from services.read.independent.derive import FIRST_OBJECT, FLOOR, TABLE, Array, Kind, Row, StoredPair, matrix
 from services.read.independent.rays import Faces, Hits, cast, place_shapes, read_shape
 
 STEP = 1.0 / 65_535.0
@@ -139,7 +139,8 @@ def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
     hits, asked = cast(faces, view), pair.targets["views"]
     region = pair.images[view["role"], "region"].reshape(-1)
     own = hits.where(faces.region[hits.face] == region[hits.pixel])
-    found = [_judge_seen(name, pair, view, faces, own) for name in _ANSWERS if name in asked]
+    seen = (kind for kind in pair.kinds(view["role"]).values() if kind.formula is not None)
+    found = [_judge_seen(kind, pair, view, faces, own) for kind in seen]
     objects = hits.where(faces.region[hits.face] >= FIRST_OBJECT)
     if "amodal" in asked:
         found += [_judge_amodal(pair, view, faces, objects, number) for number in pair.regions]
@@ -192,13 +193,14 @@ def _settle(exact: _Exact, view: Row, faces: Faces, hits: Hits, fits: Callable[[
     return Finding(exact.target, exact.unit, pixels, edges, other, unjudged, len(wrong), (column, row), worst)
 
 
-def _judge_seen(name: str, pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Finding:
+def _judge_seen(kind: Kind, pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Finding:
     """A target of what is seen; `own`: hits of the thing that the mask shows."""
     region = pair.images[view["role"], "region"].reshape(-1)
-    stored = pair.images[view["role"], name].reshape(-1, 3)
-    least, unit, answer = _ANSWERS[name]
+    stored = pair.images[view["role"], kind.name].reshape(-1, kind.channels)
+    assert kind.formula is not None
+    least, unit, answer = _ANSWERS[kind.formula]
     shown = region >= least
-    if name == "albedo" and np.isnan(faces.colors[faces.region == FLOOR]).any():
+    if kind.formula == "albedo" and np.isnan(faces.colors[faces.region == FLOOR]).any():
         shown &= region != FLOOR
     judged = shown | (region < least)
     off = np.where(stored.any(axis=1), np.inf, 0.0)
@@ -218,7 +220,7 @@ def _judge_seen(name: str, pair: StoredPair, view: Row, faces: Faces, own: Hits)
         error, most = answer(pair, view, faces, first, np.repeat(stored[pixel][None], len(first.z), axis=0))
         return bool((error <= most).any()) and bool(shown[pixel])
 
-    return _settle(_Exact(name, unit, judged, judged & (off > limit), off), view, faces, own, fits)
+    return _settle(_Exact(kind.name, unit, judged, judged & (off > limit), off), view, faces, own, fits)
 
 
 def _rays(view: Row, hits: Hits) -> Array:
@@ -322,7 +324,7 @@ _ANSWERS: dict[str, tuple[int, str, Callable[[StoredPair, Row, Faces, Hits, NDAr
     "coordinates": (FIRST_OBJECT, "of the diagonal", _coordinates),
     "albedo": (FLOOR, "codes", _albedo),
 }
-"""Targets of what is seen: the least region that has it, the unit of its errors, and what they are."""
+"""Formulas that rows of modalities name: least region that has it, the unit of its errors, and what they are."""
 
 
 def _judge_amodal(pair: StoredPair, view: Row, faces: Faces, objects: Hits, number: int) -> Finding:

@@ -125,7 +125,7 @@ def test_the_page_says_which_samples_are_damaged_and_shows_the_rest(sampled, tmp
     store = LocalStore(shutil.copytree(sampled.root, tmp_path / "damaged"))
     file = next((store.root / "assets" / "mug").glob("*.npz"))
     file.write_bytes(file.read_bytes()[:1000])
-    told = rf" There are no samples: assets/mug/{file.name} cannot be read: [^.]*; `verso replay OUT --repair` makes it again\."
+    told = rf" There are no samples: assets/mug/{file.name} cannot be read: [^.]*; `verso verify OUT` says what to do\."
     space = read_space(store, 0)
     assert re.fullmatch(told, space.missing) and [cloud.role for cloud in space.clouds] == ["input", "mirror"]
     assert space.bodies and re.search(told, space_html([space], "{}"))

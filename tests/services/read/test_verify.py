@@ -154,11 +154,11 @@ def special_files(out: Path) -> None:
     os.mkfifo(out / "pipe")
 
 
-NO_SEAL = "was altered after a run wrote it: its seal does not match: `verso replay"
+NO_SEAL = "was altered after a run wrote it: its seal does not match: "
 NOT_JOB = f"are not those of {COMMIT(0)}"
 NOT_FINISHED = "_SUCCESS: is missing, not finished: "
 DIFFERS = "does not match the SHA-256 in"
-MISSING = "is committed and missing: `verso replay"
+MISSING = "is committed and missing: restore it from a copy, or remove it, manifest/_commits/000000000"
 AGAIN = "run the job again"
 
 FILES: dict[str, tuple[tuple[Damage, ...], tuple[str, ...]]] = {
@@ -173,7 +173,10 @@ FILES: dict[str, tuple[tuple[Damage, ...], tuple[str, ...]]] = {
         ),
         (
             *(f"job.yaml: {NO_SEAL}", f"can/RGB00000.png: {MISSING}", f"{FINGERPRINT}: was altered"),
-            *(f"can/depth00000.png: {DIFFERS} its commit: `verso replay", "can/stray.png: is in no commit: move it"),
+            *(
+                f"can/depth00000.png: {DIFFERS} its commit: restore it from a copy, or remove it",
+                "can/stray.png: is in no commit: move it",
+            ),
             *(f"cameras.csv: {DIFFERS} _SUCCESS", f"DATASET.md: {NO_SEAL}"),
         ),
     ),
@@ -200,10 +203,13 @@ FILES: dict[str, tuple[tuple[Damage, ...], tuple[str, ...]]] = {
     ),
     "a file where a folder was": (
         (lambda out: shutil.rmtree(out / "can/patches"), lambda out: (out / "can/patches").write_bytes(b"")),
-        (*("can/patches/*.png: is committed and is missing: `verso replay",) * 11, "can/patches: is in no commit"),
+        (
+            *("can/patches/*.png: is committed and is missing: restore it from a copy, or",) * 11,
+            "can/patches: is in no commit",
+        ),
     ),
     "the merge undone": ((remove("_SUCCESS"),), (f"{NOT_FINISHED}every scene is committed, and they were not merged",)),
-    "an empty _SUCCESS": ((lambda out: (out / "_SUCCESS").write_bytes(b""),), ("_SUCCESS: is empty: `verso replay",)),
+    "an empty _SUCCESS": ((lambda out: (out / "_SUCCESS").write_bytes(b""),), ("_SUCCESS: is empty: remove it",)),
     "another digest": ((success(digest="0" * 64),), ("_SUCCESS: its digest is not what the commits give",)),
     "merged bytes of another version": ((vouched_bytes,), ()),
     "merged rows of another dataset": (
@@ -377,7 +383,7 @@ def missed(store: LocalStore, count: int, seed: int) -> list[str]:
         with damaged(store.root, path, how, place):
             faults = faults_of(store)
         named = [fault for fault in faults if fault.startswith(f"{path}: ")]
-        remedies = ("--repair`", COPY, AGAIN)
+        remedies = (COPY, AGAIN)
         if not named or not any(remedy in named[0] for remedy in remedies) or "\n" in "".join(faults):
             wrong.append(f"{path}, {how} {place}: {faults}")
     return wrong
