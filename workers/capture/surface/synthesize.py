@@ -16,7 +16,7 @@ from schemas.capture import SynthesizedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
 from schemas.scene.view import Camera
-from workers.capture.surface.posed_view import PosedView
+from workers.capture.surface.posed_view import PosedView, pixel_of
 from workers.capture.surface.tsdf import FittedDepth
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
@@ -112,12 +112,9 @@ def _carry_colours(
                 continue
             z = 1.0 / inverse[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, (row + 0.5 - k[3]) / k[1] * z
-            Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if not Z > 0.05:
-                continue
-            u = k[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + k[2] - 0.5
-            v = k[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + k[3] - 0.5
-            if not (0.0 <= u < width - 1 and 0.0 <= v < height - 1):
+            u, v, Z = pixel_of(T, k, x, y, z)
+            u, v = u - 0.5, v - 0.5
+            if not (Z > 0.0 and 0.0 <= u < width - 1 and 0.0 <= v < height - 1):
                 continue
             c, r = int(np.floor(u)), int(np.floor(v))
             s, t = u - c, v - r
@@ -144,12 +141,10 @@ def _carry(
                 continue
             z = 1.0 / inverse[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
-            Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if Z > 0.05:
+            u, v, Z = pixel_of(T, m, x, y, z)
+            if Z > 0.0:
                 n = row * width + column
-                pixels[n, 0] = m[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + m[2] - 0.5
-                pixels[n, 1] = m[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + m[3] - 0.5
-                depth[n] = Z
+                pixels[n, 0], pixels[n, 1], depth[n] = u - 0.5, v - 0.5, Z
     return pixels, depth
 
 
