@@ -533,10 +533,19 @@ def test_a_folder_that_was_not_processed_or_whose_record_is_damaged_is_refused(t
     assert refusal.value.reason == "not_processed"
     path = copy_of(processed()[0], tmp_path)
     record = json.loads((path / "process.json").read_bytes())
-    for key in ("depth", "settings", "views", "board_as_measured"):
+    for key in ("depth", "settings", "board_as_measured"):
         (path / "process.json").write_text(json.dumps(record | {key: "nonsense"}))
-        with pytest.raises(CaptureError, match="is damaged"):
+        with pytest.raises(CaptureError, match=r"process\.json is damaged"):
             read_result(path)
+    (path / "process.json").write_text(json.dumps(record))
+    whole = (path / "poses.parquet").read_bytes()
+    for data in (b"", whole[:-9], b"x" * len(whole)):
+        (path / "poses.parquet").write_bytes(data)
+        with pytest.raises(CaptureError, match=r"poses\.parquet is damaged"):
+            read_result(path)
+    (path / "poses.parquet").unlink()
+    with pytest.raises(CaptureError, match=r"poses\.parquet is not there: run"):
+        read_result(path)
 
 
 # ---------------------------------------------------------------------------------------------- views

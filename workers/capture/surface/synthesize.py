@@ -77,7 +77,7 @@ def prepare_source(view: PosedView, fitted: FittedDepth, mask: NDArray[np.bool_]
 def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> NDArray[np.float32]:
     """[H, W] float32: a depth image as another camera nearby has it, as it was measured; 0 where it shows nothing."""
     inverse = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0.0)
-    fitted = FittedDepth(0, 0, inverse, np.ones_like(inverse))
+    fitted = FittedDepth(inverse, np.ones_like(inverse))
     blank = np.zeros((*depth_m.shape, 3), np.uint8)
     layer = warp(Source(0, source, fitted, blank, blank[..., 0] > 0, np.ones_like(inverse)), target)
     return np.where(layer.weight > 0.0, layer.depth_m, np.float32(0.0))

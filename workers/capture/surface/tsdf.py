@@ -64,21 +64,19 @@ STEEP = 0.5
 
 @dataclass(frozen=True, eq=False)
 class FittedDepth:
-    """A window of a depth image after the fit; its first pixel is the image's (`top`, `left`).
+    """A depth image after the fit.
 
     inverse [h, w] float32: 1/z of the fitted plane, 1/m, 0 where there is none; facing [h, w] float32: the cosine of
     incidence times the length of the pixel's ray at z = 1, which turns a difference of z into a distance from the plane.
     """
 
-    top: int
-    left: int
     inverse: NDArray[np.float32]
     facing: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDepth(FittedDepth):
-    """The fit with what is on an edge found out.
+    """The fit with what is on an edge found out, of a window whose first pixel is the image's (`top`, `left`).
 
     sure [h, w] uint8: 1 where all samples were fitted, 2 where they were in the pixels around, too, else 0. beyond [h, w]
     float32: `inverse` and, where that is 0, 1/z of the board where the view shows it: there `facing` is the board's.
@@ -86,24 +84,22 @@ class SurfaceDepth(FittedDepth):
 
     sure: NDArray[np.uint8]
     beyond: NDArray[np.float32]
+    top: int = 0
+    left: int = 0
 
 
-def fit_depth(
-    depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float, window: tuple[int, int, int, int] | None = None
-) -> FittedDepth:
-    """The fit of depth [H, W] in a window (top, left, bottom, right), all of it by default."""
-    top, left, bottom, right = window or (0, 0, *depth_m.shape)
-    shape = (max(bottom - top, 0), max(right - left, 0))
-    inverse, facing, rough = (np.zeros(shape, np.float32) for _ in range(3))
-    _fit(depth_m, _focal(k), _stride(k), _least_cos(max_edge_deg), (top, left), REACHES[0], inverse, facing, rough)
-    return FittedDepth(top, left, inverse, facing)
+def fit_depth(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float) -> FittedDepth:
+    """The fit of depth [H, W]."""
+    inverse, facing, rough = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
+    _fit(depth_m, _focal(k), _stride(k), _least_cos(max_edge_deg), REACHES[0], inverse, facing, rough)
+    return FittedDepth(inverse, facing)
 
 
 def fit_surfaces(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float) -> SurfaceDepth:
     """The fit of depth [H, W] with fewer samples where more do not lie on a plane, and without ramps between two surfaces."""
     inverse, facing, rough = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
-    stride, least_cos, corner = _stride(k), _least_cos(max_edge_deg), (0, 0)
-    _fit(depth_m, _focal(k), stride, least_cos, corner, REACHES[0], inverse, facing, rough)
+    stride, least_cos = _stride(k), _least_cos(max_edge_deg)
+    _fit(depth_m, _focal(k), stride, least_cos, REACHES[0], inverse, facing, rough)
     usual = float(np.median(rough[inverse > 0.0])) if inverse.any() else 0.0
     roughest = ROUGHEST * max(usual, LEAST_ROUGH)
     bent = rough > roughest
@@ -111,13 +107,13 @@ def fit_surfaces(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: floa
     whole = inverse > 0.0
     rough[~bent] = SETTLED
     least_cos = max(least_cos, _least_cos(SMALL_EDGE_DEG))
-    _fit(depth_m, _focal(k), stride, least_cos, corner, REACHES[1], inverse, facing, rough)
+    _fit(depth_m, _focal(k), stride, least_cos, REACHES[1], inverse, facing, rough)
     inverse[rough > roughest] = 0.0
     ramps = _ramps(inverse, facing, stride)
     inverse[ramps] = 0.0
     whole &= ~ramps
     sure = whole.astype(np.uint8) + ndimage.binary_erosion(whole, np.ones((3, 3), np.bool_))
-    return SurfaceDepth(0, 0, inverse, facing, sure, inverse)
+    return SurfaceDepth(inverse, facing, sure, inverse)
 
 
 def _focal(k: Intrinsics) -> tuple[float, float, float, float]:
@@ -163,31 +159,28 @@ def _fit(
     k: tuple[float, float, float, float],
     stride: int,
     least_cos: float,
-    corner: tuple[int, int],
     reach: int,
     inverse: NDArray[np.float32],
     facing: NDArray[np.float32],
     rough: NDArray[np.float32],
 ) -> None:
-    """Fits a plane 1/z = a + b i + c j to the samples around each pixel of a window, i and j counted in strides.
+    """Fits a plane 1/z = a + b i + c j to the samples around each pixel, i and j counted in strides.
 
     It is fitted twice: to the samples at about the pixel's depth, then to those of them that are near the first plane.
 
-    `corner`: row and column of the window's first pixel; `reach`: samples to each side. rough [h, w] is `SETTLED` where
-    nothing is to be done; it becomes the scatter of 1/z about the plane, 1/m, times the slope, by which noise grows.
+    `reach`: samples to each side. rough [h, w] is `SETTLED` where nothing is to be done; it becomes the scatter of 1/z
+    about the plane, 1/m, times the slope, by which noise grows.
     """
     side = 2 * reach + 1
     least = int(np.ceil(LEAST_SHARE * side * side))
     samples, plane = np.empty((3, side * side)), np.empty(3)
-    for at_row in range(inverse.shape[0]):
-        row = at_row + corner[0]
+    for row in range(depth_m.shape[0]):
         ray_y = (row + 0.5 - k[3]) / k[1]
-        for at_column in range(inverse.shape[1]):
-            column = at_column + corner[1]
+        for column in range(depth_m.shape[1]):
             z0 = depth_m[row, column]
-            if not z0 > 0.0 or rough[at_row, at_column] < 0.0:
+            if not z0 > 0.0 or rough[row, column] < 0.0:
                 continue
-            rough[at_row, at_column] = 0.0
+            rough[row, column] = 0.0
             count = _gather(depth_m, row, column, stride, reach, samples)
             if count < least or not _solve(samples, count, plane):
                 continue
@@ -200,9 +193,9 @@ def _fit(
                 continue
             slope = _facing(plane, stride, k, ray_x, ray_y)
             if slope >= least_cos * ray and abs(1.0 / z0 - plane[0]) < gate:
-                inverse[at_row, at_column] = plane[0]
-                facing[at_row, at_column] = slope
-                rough[at_row, at_column] = slope * _scatter(samples, count, plane)
+                inverse[row, column] = plane[0]
+                facing[row, column] = slope
+                rough[row, column] = slope * _scatter(samples, count, plane)
 
 
 @compiled
