@@ -310,7 +310,7 @@ class CaptureViews:
         """What `camera` sees, poses in the board frame; `without` names a view that must not be a source."""
         axes = {number: T[:3, 2] for number, T in self.cameras.items() if number != without}
         chosen = choose_sources(axes, camera, self.captures.synthesis)
-        return synthesize_view([self._source(number) for number in chosen], camera, self.captures.synthesis)
+        return synthesize_view([self._source(number) for number in chosen], camera, self.captures.synthesis.fill_px)
 
     def mirror(self, number: int, mirror: Mirror | None = None) -> tuple[Camera, float, SynthesizedView]:
         """(camera, d_z in metres, view) from the other side of the object, half a turn about the board's normal.

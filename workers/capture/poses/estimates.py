@@ -406,21 +406,9 @@ def _result(
     asked = rolled or (fitted if misfit or evidence.spec.calibrate else None)
     shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
     correction = shared.correction(identified(sigma, joint.prior))
-    views, wider = {}, problem.corner_term().misfit(solution.poses, solution.shared)
-    single_px = max(evidence.corner_px, evidence.spec.corner_px)
+    wider, views = problem.corner_term().misfit(solution.poses, shared), {}
     for place, start in enumerate(starts):
-        block = slice(POSE * place, POSE * (place + 1))
-        judgement = Judged(
-            solution.poses[place],
-            joint.covariance[block, block] * max(wider[place], problem.widening(place, single_px)),
-            ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
-            (evidence.observations[start.index].given_by,) if start.fixed else (),
-            by_corners=False,
-        )
-        view = judge(evidence.observations[start.index], judgement, evidence, correction, shared.print_scale)
-        if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:
-            reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
-            view = dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
+        view = _joint_view(place, start, (problem, joint, evidence), float(wider[place]), correction)
         if asked is not None and not start.fixed:
             view = _less_certain(view, asked.motion[place], asked.covariance[place])
         views[start.index] = view
@@ -439,6 +427,28 @@ def _result(
         tuple(note for note in notes if note),
         fitted.camera if fitted is not None and fitted.is_known() else None,
     )
+
+
+def _joint_view(
+    place: int, start: Start, solved: tuple[Views, Joint, Evidence], wider: float, correction: DepthCorrection
+) -> ViewEstimate:
+    """The view at a place of the problem, judged; its covariance is at least `wider` times that of independent corners."""
+    problem, joint, evidence = solved
+    block = slice(POSE * place, POSE * (place + 1))
+    widening = problem.widening(place, max(evidence.corner_px, evidence.spec.corner_px))
+    observation = evidence.observations[start.index]
+    judgement = Judged(
+        joint.solution.poses[place],
+        joint.covariance[block, block] * max(wider, widening),
+        ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
+        (observation.given_by,) if start.fixed else (),
+        by_corners=False,
+    )
+    view = judge(observation, judgement, evidence, correction, joint.solution.shared.print_scale)
+    if view.depth_mm is None or view.depth_mm <= OFF_BOARD_MM:
+        return view
+    reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
+    return dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
 
 
 def _mark_moved(estimate: CaptureEstimate, groups: list[list[int]], settled: bool) -> CaptureEstimate:

@@ -292,16 +292,13 @@ def choose_sources(axes: Mapping[int, Array], camera: Camera, spec: Synthesis) -
     return [numbers[n] for n in np.argsort(-cosines, kind="stable")[: spec.views]]
 
 
-def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) -> SynthesizedView:
-    """What `camera` would see, from the best `spec.views` of the sources.
+def synthesize_view(sources: Sequence[Source], camera: Camera, fill_px: int) -> SynthesizedView:
+    """What `camera` would see, made of sources, with small holes filled as `fill_holes` does.
 
     Raises CaptureError where none of them shows anything to it.
     """
-    by_number = {source.number: source for source in sources}
-    numbers = choose_sources({n: source.camera.T_world_cam[:3, 2] for n, source in by_number.items()}, camera, spec)
-    layers = []
-    for number in numbers:
-        source = by_number[number]
+    numbers, layers = [source.number for source in sources], []
+    for source in sources:
         cosine = max(float(source.camera.T_world_cam[:3, 2] @ camera.T_world_cam[:3, 2]), 0.0)
         layers.append(warp(source, camera, max(cosine**SHARPNESS, 1e-6)))
     if not any(layer.weight.any() for layer in layers):
@@ -310,7 +307,7 @@ def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) 
             f"none of the {len(numbers)} nearest views ({', '.join(map(str, numbers))}) shows anything to this camera",
         )
     rgb, depth_m, mask = merge_layers(layers, camera)
-    filled = fill_holes(rgb, depth_m, mask, spec.fill_px)
+    filled = fill_holes(rgb, depth_m, mask, fill_px)
     measured = depth_m > 0.0
     return SynthesizedView(
         rgb=filled[0],
