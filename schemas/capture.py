@@ -242,7 +242,6 @@ class Reconstruction:
     vertices: Array
     faces: np.ndarray
     vertex_colors: np.ndarray
-    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

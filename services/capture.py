@@ -21,8 +21,8 @@ from schemas.job.views import Render
 from services.job.job_file import change_key, validate_job
 
 if TYPE_CHECKING:
+    from workers.capture.process import ProcessedFolder, StoredResult
     from workers.capture.score import SurfaceErrors
-    from workers.capture.views import StoredResult
 
 
 def capture_job(changes: Sequence[str] = (), keys: Mapping[str, Any] | None = None) -> Job:
@@ -239,22 +239,9 @@ def process(options: argparse.Namespace) -> int:
     from workers.capture.process import process_folder
 
     done = process_folder(options.folder, captures)
-    for estimate in done.estimates.by_name.values():
-        chosen = " (chosen)" * (estimate.estimate == done.estimates.chosen)
-        print(f"{estimate.estimate:8} {_describe_estimate(estimate)}{chosen}")
-    for view in done.estimates.estimate.views:
-        if view.status != "used":
-            print(f"view {view.number} {view.status}: {'; '.join(view.reasons)}")
-    for note in done.notes:
-        print(f"note: {note}")
-    for name in done.users:
-        print(f"kept: {name}, which processing did not write")
-    surface, slowest = done.merged.surface, sorted(done.seconds.items(), key=lambda item: -item[1])
-    counts = f"{len(surface.points)} points, {len(surface.faces)} faces"
-    print(f"{options.folder}: {counts}, {done.seconds['total']:.1f} s of processor time")
-    print("  " + ", ".join(f"{name} {s:.1f} s" for name, s in slowest if name != "total"))
+    _print_processed(options.folder, done)
     if options.json:
-        final = done.estimates.estimate
+        final, surface = done.estimates.estimate, done.merged.surface
         answer = {
             "ok": True,
             "folder": str(options.folder),
@@ -269,6 +256,23 @@ def process(options: argparse.Namespace) -> int:
         }
         print(json.dumps(answer))
     return 0
+
+
+def _print_processed(folder: Path, done: "ProcessedFolder") -> None:
+    for estimate in done.estimates.by_name.values():
+        chosen = " (chosen)" * (estimate.estimate == done.estimates.chosen)
+        print(f"{estimate.estimate:8} {_describe_estimate(estimate)}{chosen}")
+    for view in done.estimates.estimate.views:
+        if view.status != "used":
+            print(f"view {view.number} {view.status}: {'; '.join(view.reasons)}")
+    for note in done.notes:
+        print(f"note: {note}")
+    for name in done.users:
+        print(f"kept: {name}, which processing did not write")
+    surface, slowest = done.merged.surface, sorted(done.seconds.items(), key=lambda item: -item[1])
+    counts = f"{len(surface.points)} points, {len(surface.faces)} faces"
+    print(f"{folder}: {counts}, {done.seconds['total']:.1f} s of processor time")
+    print("  " + ", ".join(f"{name} {s:.1f} s" for name, s in slowest if name != "total"))
 
 
 def _describe_estimate(estimate: CaptureEstimate) -> str:
@@ -293,7 +297,7 @@ def synthesize(options: argparse.Namespace) -> int:
     Returns 0. Raises InputError where the pose file is missing, CaptureError where nothing was processed or nothing is seen.
     """
     from workers.capture.folder import read_pose
-    from workers.capture.views import read_result, write_mirrors, write_synthesized
+    from workers.capture.process import read_result, write_mirrors, write_synthesized
 
     out = options.out or Path(options.folder) / "views"
     result = read_result(options.folder)
@@ -320,7 +324,7 @@ def evaluate(options: argparse.Namespace) -> int:
 
     Raises CaptureError where the folder was not processed, or there is neither truth nor a mesh.
     """
-    from workers.capture.views import read_result
+    from workers.capture.process import read_result
 
     result = read_result(options.folder)
     surface, answer = _against_truth(result) if options.mesh is None else _against_mesh(result, options)

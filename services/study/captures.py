@@ -19,9 +19,9 @@ from services.study.measure import Answer, Meter, answer_for, context_for
 from services.study.model import OWN, Setting
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.make_capture import require_captures, simulate_one
+from workers.capture.process import CaptureViews
 from workers.capture.reconstruct import ProcessorClock, estimate_surface, given_files
 from workers.capture.score import read_whole_truth, score_capture
-from workers.capture.views import CaptureViews
 from workers.geometry.camera import spread_evenly
 from workers.scene.context import WorkerContext
 

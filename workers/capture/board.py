@@ -235,11 +235,6 @@ def lay_out_print(board: Board) -> PrintLayout:
     return PrintLayout(width, height, markers, ruler, arrow, words)
 
 
-def nominal(board: Board) -> Array:
-    """[N, 4, 3] float64: the markers' corners where the print is exact."""
-    return marker_corners(board.model_copy(update={"measured_ruler_m": None}))
-
-
 def marker_cells(board: Board, folder: Path | None = None) -> NDArray[np.bool_]:
     """[N, n, n] bool: the black cells of each marker with its border, top row of OpenCV's picture first, by ascending id."""
     dictionary = open_dictionary(board, folder)

@@ -20,6 +20,7 @@ from workers.assets.builtin.make import shape_digest
 from workers.assets.external.mesh import is_solid
 from workers.assets.mass import mass_properties
 from workers.capture.folder import CaptureFolder, open_folder, read_receipt, read_truth
+from workers.capture.process import CaptureViews
 from workers.capture.reconstruct import estimate_surface, given_files
 from workers.capture.results import digest_inputs
 from workers.capture.rows import (
@@ -33,7 +34,6 @@ from workers.capture.rows import (
 )
 from workers.capture.score import read_whole_truth, score_capture
 from workers.capture.simulate.simulate import load_object, simulate_capture
-from workers.capture.views import CaptureViews
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import translation
 from workers.scene.chance import SceneChance

@@ -156,7 +156,7 @@ def _expand(data: bytes, most: int) -> bytes:
 
 @functools.lru_cache(maxsize=4)
 def pinhole_maps(
-    k: Intrinsics, lens: tuple[float, ...], fisheye: bool
+    k: Intrinsics, lens: tuple[float, ...], fisheye: bool = False
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(column [H, W], row [H, W]) in the image of a lens of each pixel of a pinhole with the same numbers, for cv2.remap.
 

@@ -1,8 +1,10 @@
-"""A capture's folder from photographs to poses, masks, cloud and mesh, written beside them: the list of steps."""
+"""A capture's folder from photographs to poses, masks, cloud and mesh; the files that say so, read back; views from anywhere."""
 
 import io
+import json
+from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +12,64 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.capture import CaptureCamera, CaptureEstimate, Estimates, ViewEstimate
+from schemas.base import Pose, frozen_array
+from schemas.capture import (
+    CaptureCamera,
+    CaptureEstimate,
+    DepthCorrection,
+    Estimates,
+    PosedImages,
+    Reconstruction,
+    SynthesizedView,
+    ViewEstimate,
+)
 from schemas.dataset.codec import Row, camera_columns
+from schemas.dataset.tables import SCHEMAS
+from schemas.errors import CaptureError, OutputError, ViewError
 from schemas.job.captures import Captures
+from schemas.job.views import Mirror
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.capture.folder import CaptureFolder, describe_camera, open_folder, pose_text
-from workers.capture.reconstruct import Given, Merged, ProcessorClock, corrections_of, estimate_surface, given_files
-from workers.capture.results import CLOUD_FILE, MESH_FILE, POSES_FILE, cloud_ply, mesh_ply, write_results
-from workers.capture.surface.object_mask import silhouette
-from workers.capture.surface.posed_view import distort_mask
-from workers.store.images import encode_mask
+from workers.capture.folder import (
+    CameraFile,
+    CaptureFolder,
+    camera_of,
+    describe_camera,
+    open_folder,
+    pose_text,
+    write_pose,
+)
+from workers.capture.reconstruct import (
+    Given,
+    Merged,
+    ProcessorClock,
+    corrections_of,
+    estimate_surface,
+    given_files,
+    read_posed,
+)
+from workers.capture.results import (
+    CLOUD_FILE,
+    MESH_FILE,
+    POSES_FILE,
+    PROCESS_FILE,
+    cloud_ply,
+    mesh_ply,
+    read_cloud,
+    read_mesh,
+    read_record,
+    write_results,
+)
+from workers.capture.surface.object_mask import Ground, down_to_board, silhouette
+from workers.capture.surface.posed_view import PosedView, distort_mask
+from workers.capture.surface.synthesize import Source, choose_sources, move_depth, prepare_source, synthesize_view
+from workers.capture.surface.tsdf import MOST_EDGE_DEG, fit_depth
+from workers.geometry.pixels import round_depth
+from workers.scene.pairs import front_distance, place_mirror_camera
+from workers.store.images import encode_mask, encode_png
 
 _f64, _i64, _str = pa.float64(), pa.int64(), pa.string()
-_matrix = pa.list_(pa.field("item", _f64, nullable=False), 16)
+_OF_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv")
 
 SCHEMA = pa.schema(
     [
@@ -32,9 +78,8 @@ SCHEMA = pa.schema(
         pa.field("chosen", pa.bool_(), False),
         pa.field("status", _str, False),
         pa.field("reasons", pa.list_(_str), False),
-        pa.field("T_world_cam", _matrix, True),
-        *(pa.field(name, _i64, False) for name in ("width", "height")),
-        *(pa.field(name, _f64, False) for name in ("fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv")),
+        SCHEMAS["views"].field("T_world_cam").with_nullable(True),
+        *(SCHEMAS["views"].field(name) for name in _OF_CAMERA),
         pa.field("markers", _i64, False),
         *(
             pa.field(name, _f64)
@@ -50,39 +95,40 @@ place and direction in any direction.
 """
 
 
-def pose_rows(estimates: Estimates, camera: CaptureCamera) -> list[Row]:
-    """The rows in order of estimate and number."""
-    before = estimates.by_markers
-    return [
-        _row(view, before.get(view.number), camera) | {"estimate": name, "chosen": name == estimates.chosen}
-        for name, estimate in estimates.by_name.items()
-        for view in estimate.views
-    ]
+def residual_columns(view: ViewEstimate, before: ViewEstimate | None) -> Row:
+    """The columns of a view's residuals that poses.parquet and the table `views` of a dataset share."""
+    return {
+        "number": view.number,
+        "markers": view.markers,
+        "reprojection_before_px": before.reprojection_px if before is not None else None,
+        "reprojection_px": view.reprojection_px,
+        "depth_mm": view.depth_mm,
+    }
 
 
 def pose_table(estimates: Estimates, camera: CaptureCamera) -> bytes:
-    """The rows as a Parquet file."""
+    """A Parquet file with a row for each estimate and view, in this order."""
+    rows = [
+        _pose_row(view, estimates.by_markers.get(view.number), camera)
+        | {"estimate": name, "chosen": name == estimates.chosen}
+        for name, estimate in estimates.by_name.items()
+        for view in estimate.views
+    ]
     sink = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist(pose_rows(estimates, camera), SCHEMA), sink, compression="zstd")
+    pq.write_table(pa.Table.from_pylist(rows, SCHEMA), sink, compression="zstd")
     return sink.getvalue()
 
 
-def _row(view: ViewEstimate, before: ViewEstimate | None, camera: CaptureCamera) -> Row:
-    T = np.eye(4) if view.T_board_cam is None else view.T_board_cam
-    columns = camera_columns(Camera(camera.intrinsics, T))
-    if view.T_board_cam is None:
-        columns["T_world_cam"] = None
+def _pose_row(view: ViewEstimate, before: ViewEstimate | None, camera: CaptureCamera) -> Row:
+    columns = camera_columns(Camera(camera.intrinsics, np.eye(4) if view.T_board_cam is None else view.T_board_cam))
     sigma_mm, sigma_deg = _sigmas(view)
     return {
         **columns,
-        "number": view.number,
+        "T_world_cam": None if view.T_board_cam is None else columns["T_world_cam"],
+        **residual_columns(view, before),
         "status": view.status,
         "reasons": list(view.reasons),
-        "markers": view.markers,
-        "reprojection_before_px": None if before is None else before.reprojection_px,
-        "reprojection_px": view.reprojection_px,
         "depth_before_mm": None if before is None else before.depth_mm,
-        "depth_mm": view.depth_mm,
         "sigma_mm": sigma_mm,
         "sigma_deg": sigma_deg,
     }
@@ -91,17 +137,40 @@ def _row(view: ViewEstimate, before: ViewEstimate | None, camera: CaptureCamera)
 def _sigmas(view: ViewEstimate) -> tuple[float | None, float | None]:
     if view.covariance is None:
         return None, None
-    place, turn = (
-        float(np.linalg.eigvalsh(block).max()) for block in (view.covariance[:3, :3], view.covariance[3:, 3:])
+    blocks = view.covariance[:3, :3], view.covariance[3:, 3:]
+    place, turn = (float(np.sqrt(max(np.linalg.eigvalsh(block).max(), 0.0))) for block in blocks)
+    return 1e3 * place, float(np.degrees(turn))
+
+
+def read_poses(path: Path) -> tuple[ViewEstimate, ...]:
+    """The views of the chosen estimate in a folder's poses.parquet, without their covariances. Raises CaptureError."""
+    try:
+        rows = pq.read_table(path / POSES_FILE, schema=SCHEMA).to_pylist()
+    except FileNotFoundError:
+        words = f"{path / POSES_FILE} is not there: run `verso capture process {path}`"
+        raise CaptureError("not_processed", words) from None
+    except (pa.ArrowException, OSError) as error:
+        raise CaptureError("unreadable", f"{path / POSES_FILE} is damaged: process the capture again") from error
+    return tuple(
+        ViewEstimate(
+            number=row["number"],
+            status=row["status"],
+            T_board_cam=None if row["T_world_cam"] is None else frozen_array(row["T_world_cam"]).reshape(4, 4),
+            covariance=None,
+            markers=row["markers"],
+            reprojection_px=row["reprojection_px"],
+            depth_mm=row["depth_mm"],
+            reasons=tuple(row["reasons"]),
+        )
+        for row in rows
+        if row["chosen"]
     )
-    return 1e3 * float(np.sqrt(max(place, 0.0))), float(np.degrees(np.sqrt(max(turn, 0.0))))
 
 
 @dataclass(frozen=True, eq=False)
 class ProcessedFolder:
     """What processing found and wrote; `users`: files that the user gave and that stayed."""
 
-    folder: CaptureFolder
     estimates: Estimates
     merged: Merged
     seconds: Mapping[str, float]
@@ -136,7 +205,7 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     stayed = write_results(
         path, files, _record(captures, estimates, merged, given.folder.camera) | {"seconds": seconds}
     )
-    return ProcessedFolder(folder, estimates, merged, seconds, tuple(sorted([*stayed, *masks])))
+    return ProcessedFolder(estimates, merged, seconds, tuple(sorted([*stayed, *masks])))
 
 
 def _pose_files(given: Given, estimates: Estimates) -> dict[str, bytes]:
@@ -175,9 +244,6 @@ def _record(captures: Captures, estimates: Estimates, merged: Merged, camera: Ca
         "settings": captures.model_dump(mode="json", include={"estimation", "fusion", "synthesis"}),
         "camera": describe_camera(camera).model_dump(mode="json"),
         "estimate": chosen.estimate,
-        "views": [
-            {"number": view.number, "status": view.status, "reasons": list(view.reasons)} for view in chosen.views
-        ],
         "depth": {
             "offset_m": depth.offset_m,
             "scale": depth.scale,
@@ -195,3 +261,160 @@ def _record(captures: Captures, estimates: Estimates, merged: Merged, camera: Ca
         "mesh_faces": len(merged.surface.faces),
         "notes": list(chosen.notes),
     }
+
+
+KEPT = 12
+"""Prepared views in memory, 40 MB each at 1920 x 1080: twice as many as one synthesised view needs."""
+
+
+@dataclass(eq=False)
+class CaptureViews:
+    """Reads and prepares views when they are needed, and keeps the latest. `body` is the object down to the board."""
+
+    given: Given
+    estimate: CaptureEstimate
+    captures: Captures
+    body: Mesh
+    _sources: OrderedDict[int, Source] = field(default_factory=OrderedDict)
+
+    def __post_init__(self) -> None:
+        self.cameras = {
+            view.number: view.T_board_cam @ self.estimate.depth.T_cam_depth
+            for view in self.estimate.used
+            if view.T_board_cam is not None and self.folder.file("depth", view.number) is not None
+        }
+        """T_board_depth [4, 4] of the views that can be sources."""
+
+    @property
+    def folder(self) -> CaptureFolder:
+        """Where the views are."""
+        return self.given.folder
+
+    def posed(self, number: int) -> PosedView:
+        """A used view, read anew. Raises CaptureError."""
+        return read_posed(self.given, self.estimate, number)
+
+    def images(self, number: int) -> PosedImages:
+        """A captured view: its picture without the lens, its depth in the same camera, the object's mask.
+
+        Depth is what was measured, corrected. Where the correction moves the depth camera, depth is drawn anew from there.
+        """
+        view = self.posed(number)
+        mask = silhouette(self.body, view.camera) if view.mask is None else view.mask
+        depth_m = view.depth_m
+        if not np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
+            depth_m = move_depth(depth_m, view.depth_camera, view.camera)
+        return PosedImages(number, view.camera, view.rgb, depth_m.astype(np.float64), mask)
+
+    def synthesize(self, camera: Camera, without: int | None = None) -> SynthesizedView:
+        """What `camera` sees, poses in the board frame; `without` names a view that must not be a source."""
+        axes = {number: T[:3, 2] for number, T in self.cameras.items() if number != without}
+        chosen = choose_sources(axes, camera, self.captures.synthesis)
+        return synthesize_view([self._source(number) for number in chosen], camera)
+
+    def mirror(self, number: int, mirror: Mirror | None = None) -> tuple[Camera, float, SynthesizedView]:
+        """(camera, d_z in metres, view) from the other side of the object, half a turn about the board's normal.
+
+        d_z comes from the object's own depth pixels. Raises ViewError where the view has none, CaptureError.
+        """
+        images = self.images(number)
+        d_z = front_distance(images.depth_m, images.mask, mirror or Mirror())
+        camera = place_mirror_camera(images.camera, d_z, mirror or Mirror())
+        return camera, d_z, self.synthesize(camera)
+
+    def _source(self, number: int) -> Source:
+        if number not in self._sources:
+            view = self.posed(number)
+            fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics, MOST_EDGE_DEG)
+            self._sources[number] = prepare_source(view, fitted, silhouette(self.body, view.depth_camera))
+            while len(self._sources) > max(KEPT, 2 * self.captures.synthesis.views):
+                self._sources.popitem(last=False)
+        self._sources.move_to_end(number)
+        return self._sources[number]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredResult:
+    """The folder, the settings it was processed with, the estimate with its final poses, the surface, and its views."""
+
+    folder: CaptureFolder
+    captures: Captures
+    estimate: CaptureEstimate
+    surface: Reconstruction
+    views: CaptureViews
+
+
+def read_result(path: Path) -> StoredResult:
+    """What processing wrote. Raises CaptureError where the folder was not processed, or a file is missing or damaged."""
+    folder, record = open_folder(path), read_record(path)
+    if record is None:
+        raise CaptureError("not_processed", f"{path} was not processed: run `verso capture process {path}`")
+    try:
+        captures = Captures.model_validate(record["settings"])
+        if captures.estimation.calibrate:
+            folder = replace(folder, camera=camera_of(CameraFile.model_validate(record["camera"])))
+        estimate = _estimate(path, record)
+        ground = Ground(tuple(record["board_as_measured"]["plane"]), float(record["board_as_measured"]["clearance_m"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise CaptureError("unreadable", f"{path / PROCESS_FILE} is damaged ({error!r}): process it again") from error
+    points, normals, colors, views = read_cloud(path)
+    vertices, faces, vertex_colors = read_mesh(path)
+    surface = Reconstruction(points, normals, colors, views, vertices, faces, vertex_colors)
+    body = down_to_board(Mesh(vertices, faces), ground)
+    return StoredResult(
+        folder, captures, estimate, surface, CaptureViews(given_files(folder), estimate, captures, body)
+    )
+
+
+def _estimate(path: Path, record: dict[str, Any]) -> CaptureEstimate:
+    depth = record["depth"]
+    correction = DepthCorrection(
+        float(depth["offset_m"]), float(depth["scale"]), frozen_array(depth["T_cam_depth"]), tuple(depth["identified"])
+    )
+    return CaptureEstimate(record["estimate"], read_poses(path), correction, float(record["print_scale"]))
+
+
+FARTHEST_UNITS = 65_535.0
+
+
+def write_synthesized(result: StoredResult, T_board_cam: Pose, out: Path, number: int = 0) -> dict[str, Any]:
+    """The view from one pose. Returns what is said of it; raises CaptureError where nothing is seen from there."""
+    camera = Camera(result.folder.camera.intrinsics, frozen_array(T_board_cam))
+    return _finish(result, out, [_write(result, result.views.synthesize(camera), camera, out, number)])[0]
+
+
+def write_mirrors(result: StoredResult, out: Path) -> list[dict[str, Any]]:
+    """The mirror view of every used view, with the number of that view; views that see nothing of the object have none."""
+    made = []
+    for view in result.estimate.used:
+        try:
+            camera, d_z, shown = result.views.mirror(view.number)
+        except (ViewError, CaptureError):
+            continue
+        made.append(_write(result, shown, camera, out, view.number) | {"d_z_m": d_z})
+    return _finish(result, out, made)
+
+
+def _write(result: StoredResult, view: SynthesizedView, camera: Camera, out: Path, number: int) -> dict[str, Any]:
+    if out.resolve() == result.folder.path.resolve():
+        raise OutputError(f"{out} is the capture itself: name another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    units = result.folder.camera.depth_units_per_m
+    depth = round_depth(view.depth_m, 0.0, FARTHEST_UNITS / units, units)
+    (out / f"rgb_{number:05d}.png").write_bytes(encode_png(view.rgb))
+    (out / f"depth_{number:05d}.png").write_bytes(encode_png(depth))
+    (out / f"mask_{number:05d}.png").write_bytes(encode_mask(view.mask))
+    (out / f"measured_{number:05d}.png").write_bytes(encode_mask(view.measured))
+    write_pose(out / f"board_{number:05d}.txt", camera.T_world_cam)
+    return {"name": f"{number:05d}", "measured_share": view.measured_share, "sources": list(view.sources)}
+
+
+def _finish(result: StoredResult, out: Path, made: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """views.json: the pinhole camera, pixel centres at 0.5, and what is said of each view."""
+    if made:
+        k = result.folder.camera.intrinsics
+        camera = {**k.model_dump(), "pixel_centre": "0.5", "depth_units_per_m": result.folder.camera.depth_units_per_m}
+        (out / "views.json").write_text(
+            json.dumps({"camera": camera, "views": made}, indent=1) + "\n", encoding="utf-8"
+        )
+    return made

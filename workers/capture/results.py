@@ -8,7 +8,6 @@ A file that process.json does not name, or that has other bytes, is the user's: 
 """
 
 import hashlib
-import io
 import json
 import os
 import re
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from schemas.base import Array
 from schemas.capture import CaptureListing
@@ -34,7 +32,8 @@ PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "
 _PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 _CLOUD = np.dtype([*((name, "<f4") for name in _PLACE + _NORMAL), *((name, "u1") for name in _COLOR), ("views", "<u2")])
 _VERTEX = np.dtype([*((name, "<f4") for name in _PLACE), *((name, "u1") for name in _COLOR)])
-_FACE = np.dtype([("vertex_indices", "<i4", (3,))])
+_FACE = np.dtype([("corners", "u1"), ("vertex_indices", "<i4", (3,))])
+_PLY_WORDS = {"f4": "float", "u1": "uchar", "u2": "ushort"}
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
@@ -82,48 +81,57 @@ def cloud_ply(points: Array, normals: Array, colors: NDArray[np.uint8], views: N
 
 def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
     """A binary PLY of a mesh with coloured vertices."""
-    triangles = np.empty(len(faces), _FACE)
-    triangles["vertex_indices"] = faces
-    return _ply(_VERTEX, *vertices.T, *colors.T, faces=triangles)
+    return _ply(_VERTEX, *vertices.T, *colors.T, faces=faces)
 
 
 def _ply(kind: np.dtype, *columns: NDArray, faces: NDArray | None = None) -> bytes:
-    rows, stream = np.empty(len(columns[0]), kind), io.BytesIO()
+    rows, triangles = np.empty(len(columns[0]), kind), np.empty(0 if faces is None else len(faces), _FACE)
     for name, column in zip(kind.names or (), columns, strict=True):
         rows[name] = column
-    elements = [PlyElement.describe(rows, "vertex"), *([] if faces is None else [PlyElement.describe(faces, "face")])]
-    PlyData(elements, byte_order="<", comments=["board frame, metres"]).write(stream)
-    return stream.getvalue()
+    if faces is not None:
+        triangles["corners"], triangles["vertex_indices"] = 3, faces
+    return _ply_head(kind, len(rows), None if faces is None else len(faces)) + rows.tobytes() + triangles.tobytes()
+
+
+def _ply_head(kind: np.dtype, vertices: int, faces: int | None) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", "comment board frame, metres", f"element vertex {vertices}"]
+    lines += [f"property {_PLY_WORDS[kind[name].str[1:]]} {name}" for name in kind.names or ()]
+    if faces is not None:
+        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header\n"]).encode()
 
 
 def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
     """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
-    rows = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"].data
+    rows, _ = _read_ply(path / CLOUD_FILE, _CLOUD)
     places, normals = (_columns(rows, names).astype(np.float64) for names in (_PLACE, _NORMAL))
     return places, normals, _columns(rows, _COLOR), rows["views"].astype(np.int32)
 
 
 def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
     """(vertices, faces, colours) of mesh.ply. Raises CaptureError where it is not there or another's."""
-    found = _read_ply(path / MESH_FILE, _VERTEX)
-    rows, faces = found["vertex"].data, found["face"].data["vertex_indices"]
-    return _columns(rows, _PLACE).astype(np.float64), faces.astype(np.int32), _columns(rows, _COLOR)
+    rows, faces = _read_ply(path / MESH_FILE, _VERTEX)
+    return _columns(rows, _PLACE).astype(np.float64), faces["vertex_indices"].astype(np.int32), _columns(rows, _COLOR)
 
 
 def _columns(rows: NDArray, names: Sequence[str]) -> NDArray:
     return np.stack([rows[name] for name in names], axis=1)
 
 
-def _read_ply(file: Path, kind: np.dtype) -> PlyData:
+def _read_ply(file: Path, kind: np.dtype) -> tuple[NDArray, NDArray]:
+    """(vertices, faces) of a file that begins with exactly the head that `_ply_head` writes, and is as long as that says."""
     try:
-        found = PlyData.read(str(file), known_list_len={"face": {"vertex_indices": 3}})
-        if found["vertex"].data.dtype.names == kind.names:
-            return found
+        data = file.read_bytes()
     except FileNotFoundError:
         raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`") from None
-    except (PlyParseError, UnicodeDecodeError, KeyError, ValueError):
-        pass
-    raise CaptureError("unreadable", f"{file} is not what `verso capture process` wrote, or ends early: delete it")
+    head = data[: data.find(b"end_header\n") + 11]
+    counts = [int(count) for count in re.findall(rb"^element \w+ ([0-9]{1,10})$", head, re.MULTILINE)]
+    vertices, faces = (*counts, 0, 0)[:2]
+    size = len(head) + vertices * kind.itemsize + faces * _FACE.itemsize
+    if head != _ply_head(kind, vertices, faces if len(counts) == 2 else None) or len(data) != size:
+        raise CaptureError("unreadable", f"{file} is not what `verso capture process` wrote, or ends early: delete it")
+    rows = np.frombuffer(data, kind, vertices, len(head))
+    return rows, np.frombuffer(data, _FACE, faces, size - faces * _FACE.itemsize)
 
 
 def _digest_of(file: Path) -> str | None:

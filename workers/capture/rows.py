@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Pose, frozen_array
-from schemas.capture import CaptureEstimate, PosedImages, ProcessedCapture, SynthesizedView, ViewScore
+from schemas.capture import PosedImages, ProcessedCapture, SynthesizedView, ViewScore
 from schemas.dataset.codec import Row, matrix_column
 from schemas.dataset.layout import asset_path, file_pose_id, input_pose_id
 from schemas.dataset.tables import NOT_OF_CAPTURES
@@ -18,6 +18,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABL
 from schemas.scene.view import Camera, Pair, Role, View
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
+from workers.capture.process import residual_columns
 from workers.geometry.pixels import quantise_depth
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import CountPixels, derive_projected, label_things, projection_shares
@@ -274,17 +275,11 @@ def quality_columns(
 
 def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
     """The column `capture` of `views`: residuals and errors of the captured view, and of what the mirror view is made."""
-    estimate: CaptureEstimate = done.estimates.estimate
-    own = next(view for view in estimate.views if view.number == one.number)
-    before = done.estimates.by_markers.get(one.number)
+    view = next(view for view in done.estimates.estimate.views if view.number == one.number)
     score = done.score.views.get(one.number, ViewScore()) if done.score is not None else ViewScore()
     made = one.mirror if role == "mirror" else None
     return {
-        "number": one.number,
-        "markers": own.markers,
-        "reprojection_before_px": before.reprojection_px if before is not None else None,
-        "reprojection_px": own.reprojection_px,
-        "depth_mm": own.depth_mm,
+        **residual_columns(view, done.estimates.by_markers.get(view.number)),
         "pose_mm": score.pose_mm,
         "pose_deg": score.pose_deg,
         "measured_share": made.measured_share if made is not None else None,

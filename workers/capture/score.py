@@ -16,8 +16,8 @@ from schemas.errors import CaptureError, ViewError
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.folder import MESH_FILE, TRUTH, CaptureFolder, read_truth
+from workers.capture.process import CaptureViews, StoredResult
 from workers.capture.surface.posed_view import PosedView, facing_cosine, placed, visible_points
-from workers.capture.views import CaptureViews, StoredResult
 from workers.geometry.camera import project, spread_evenly
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import angle_between, invert, pose, rotation_about, transform

@@ -20,11 +20,11 @@ from tests.workers.capture.simulated import asset_of, made
 from workers.capture.folder import open_folder, read_truth
 from workers.capture.make_capture import process_capture
 from workers.capture.poses.markers import motion_between
+from workers.capture.process import CaptureViews
 from workers.capture.reconstruct import ProcessorClock, estimate_poses, given_files
 from workers.capture.score import compare_poses, read_whole_truth, score_measured
 from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth, place_object
 from workers.capture.simulate.simulate import simulate_capture
-from workers.capture.views import CaptureViews
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
 from workers.store.images import encode_png

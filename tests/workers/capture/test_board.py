@@ -18,7 +18,6 @@ from workers.capture.board import (
     lay_out_print,
     marker_cells,
     marker_corners,
-    nominal,
     open_dictionary,
 )
 from workers.capture.board_kinds import KINDS, BoardSizes, read_board_file
@@ -73,7 +72,8 @@ def read_again(board):
 def test_a_grid_written_marker_by_marker_is_the_same_board():
     """One mechanism: neighbours, corners and frames of a list are those of the grid; and a grid is written as it always was."""
     grid = Board(columns=4, rows=3, first_id=5, measured_ruler_m=0.21)
-    markers = [{"id": 5 + n, "corners": quad} for n, quad in enumerate(nominal(grid).tolist())]
+    places = marker_corners(grid.model_copy(update={"measured_ruler_m": None})).tolist()
+    markers = [{"id": 5 + n, "corners": quad} for n, quad in enumerate(places)]
     listed = Board.model_validate({"markers": markers[::-1], "measured_ruler_m": 0.21})
     one, other = board_geometry(grid), board_geometry(listed)
     for name in ("ids", "corners", "right", "below"):
@@ -219,7 +219,7 @@ def test_dictionary_that_does_not_exist_or_is_too_small_is_refused():
 def test_the_black_rectangles_are_the_black_cells_of_the_markers():
     layout = lay_out_print(BOARD)
     left, bottom, right, top = layout.markers.T
-    for cells, corners in zip(marker_cells(BOARD), nominal(BOARD), strict=True):
+    for cells, corners in zip(marker_cells(BOARD), marker_corners(BOARD), strict=True):
         side = BOARD.marker_m / len(cells)
         for row, column in np.ndindex(cells.shape):
             x, y = corners[0, 0] + (column + 0.5) * side, corners[0, 1] - (row + 0.5) * side
@@ -267,7 +267,7 @@ def test_every_marker_of_the_png_is_found_where_the_layout_has_it(board, dpi):
     corners, ids, _ = cv2.aruco.ArucoDetector(open_dictionary(board), parameters).detectMarkers(np.asarray(image))
     assert sorted(ids.ravel()) == board_geometry(board).ids.tolist()
     for found, number in zip(corners, ids.ravel(), strict=True):
-        true = nominal(board)[board_geometry(board).index(int(number)), :, :2]
+        true = marker_corners(board)[board_geometry(board).index(int(number)), :, :2]
         pixels = (true * [1, -1] + [0.5 * layout.width_m, 0.5 * layout.height_m]) * px_per_m
         assert np.abs(found[0] + 0.5 - pixels).max() < 0.2
 

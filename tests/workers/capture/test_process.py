@@ -24,7 +24,15 @@ from tests.workers.capture.drawn import KINECT, errors, median_errors, write_cap
 from tests.workers.capture.simulated import CAPTURES, VIEWS, asset_of, box, copy_of, made, processed, true_estimates
 from workers.capture.board import frame_in_board
 from workers.capture.folder import open_folder, pose_text, read_pose, read_truth, read_view, write_pose
-from workers.capture.process import SCHEMA, pose_table, process_folder
+from workers.capture.process import (
+    SCHEMA,
+    CaptureViews,
+    pose_table,
+    process_folder,
+    read_result,
+    write_mirrors,
+    write_synthesized,
+)
 from workers.capture.reconstruct import (
     MANUAL,
     ProcessorClock,
@@ -51,7 +59,6 @@ from workers.capture.simulate import simulate
 from workers.capture.simulate.camera import develop
 from workers.capture.simulate.photograph import place_object
 from workers.capture.simulate.simulate import plan_path
-from workers.capture.views import CaptureViews, read_result, write_mirrors, write_synthesized
 from workers.geometry.colour import decode_codes
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import half_turn, invert, pose, rotation_about, transform, translation
@@ -526,10 +533,19 @@ def test_a_folder_that_was_not_processed_or_whose_record_is_damaged_is_refused(t
     assert refusal.value.reason == "not_processed"
     path = copy_of(processed()[0], tmp_path)
     record = json.loads((path / "process.json").read_bytes())
-    for key in ("depth", "settings", "views", "board_as_measured"):
+    for key in ("depth", "settings", "board_as_measured"):
         (path / "process.json").write_text(json.dumps(record | {key: "nonsense"}))
-        with pytest.raises(CaptureError, match="is damaged"):
+        with pytest.raises(CaptureError, match=r"process\.json is damaged"):
             read_result(path)
+    (path / "process.json").write_text(json.dumps(record))
+    whole = (path / "poses.parquet").read_bytes()
+    for data in (b"", whole[:-9], b"x" * len(whole)):
+        (path / "poses.parquet").write_bytes(data)
+        with pytest.raises(CaptureError, match=r"poses\.parquet is damaged"):
+            read_result(path)
+    (path / "poses.parquet").unlink()
+    with pytest.raises(CaptureError, match=r"poses\.parquet is not there: run"):
+        read_result(path)
 
 
 # ---------------------------------------------------------------------------------------------- views

@@ -73,9 +73,6 @@ def test_a_plane_is_fitted_exactly_with_its_angle_up_to_the_largest_one():
         fitted = fit_depth(depth, WINDOW, 80.0)
         assert np.abs(1.0 / fitted.inverse[INNER] - depth[INNER]).max() < 2e-6
         assert np.abs(fitted.facing[INNER] - along[INNER]).max() < 2e-3
-    part = fit_depth(depth, WINDOW, 80.0, (20, 30, 60, 80))  # a window is the same part of the whole
-    assert (part.top, part.left, part.inverse.shape) == (20, 30, (40, 50))
-    assert np.array_equal(part.inverse, fitted.inverse[20:60, 30:80])
     depth, along, rays = plane_depth(WINDOW, (1.2, 0, 1), 0.5)
     angle = np.degrees(np.arccos(along / np.linalg.norm(rays, axis=-1)))[45, 60]
     assert not fit_depth(depth, WINDOW, angle - 1.5).inverse[20:-20, 55:65].any()

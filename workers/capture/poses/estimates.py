@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from schemas.base import Array, Pose
@@ -17,17 +16,18 @@ from workers.capture.poses.camera_fit import CameraFit, camera_note, fit_camera
 from workers.capture.poses.joint import Joint, Views, gather, measure_corners, solve_jointly
 from workers.capture.poses.markers import (
     AMBIGUOUS,
+    MIN_CORNERS,
     MOST_REPROJECTION_PX,
+    SETTLED,
     Evidence,
     Fit,
     Judged,
     MarkerPose,
     cross_matrix,
-    exponential,
     is_ambiguous,
     judge,
     median_reprojection,
-    moved,
+    motion_between,
 )
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
 from workers.capture.poses.terms import (
@@ -41,9 +41,8 @@ from workers.capture.poses.terms import (
     Shared,
     identified,
 )
-from workers.geometry.frames import invert, transform
+from workers.geometry.frames import invert, pose, transform
 
-MIN_CORNERS = 4
 ARTICLE_SCALE_M = 0.02
 """Distance from which on a corner's loss grows linearly and no longer with the square: depth at an edge may be the floor's."""
 
@@ -61,69 +60,47 @@ def estimate_article(evidence: Evidence) -> CaptureEstimate:
     views: list[ViewEstimate] = []
     most, converged = 0, True
     for observation, found in zip(evidence.observations, evidence.markers, strict=True):
-        pose = Judged(None, faults=(found.reason,))
+        judgement = Judged(None, faults=(found.reason,))
         if observation.manual_T_board_cam is not None:
-            pose = Judged(observation.manual_T_board_cam, remarks=(observation.given_by,))
+            judgement = Judged(observation.manual_T_board_cam, remarks=(observation.given_by,))
         elif found.fit is not None:
             fitted = fit_article(observation.corners, found.fit.T_board_cam, evidence.spec.max_iterations)
             lifted = int((observation.corners.depth_m > 0).sum())
-            pose = Judged(None, faults=(f"{lifted} corners have depth, and {MIN_CORNERS} are needed",))
+            judgement = Judged(None, faults=(f"{lifted} corners have depth, and {MIN_CORNERS} are needed",))
             if fitted is not None:
-                pose = Judged(fitted.T_board_cam, fitted.covariance, by_corners=False)
+                judgement = Judged(fitted.T_board_cam, fitted.covariance, by_corners=False)
                 most, converged = max(most, fitted.iterations), converged and fitted.converged
-        views.append(judge(observation, pose, evidence, DepthCorrection()))
+        views.append(judge(observation, judgement, evidence, DepthCorrection()))
     return CaptureEstimate("article", tuple(views), iterations=most, converged=converged)
 
 
 def fit_article(corners: Corners, start: Pose, max_iterations: int = 100) -> _Fitted | None:
-    """The pose of least robust distance between lifted corners and their places on the board; None without enough depth."""
+    """The pose of least robust distance between lifted corners and their places on the board; None without enough depth.
+
+    The loss of a corner is 2 (sqrt(1 + (d / scale)^2) - 1), d its distance. Each step is the closed solution of weighted
+    least squares (Umeyama 1991) with the weights that the loss has at the step before, which never makes it larger.
+    """
     lifted = corners.depth_m > 0
     if lifted.sum() < MIN_CORNERS:
         return None
-    z = corners.depth_m[lifted]
+    z, board = corners.depth_m[lifted], corners.board[lifted]
     points = np.column_stack([corners.rays[lifted] * z[:, None], z])
-    board = corners.board[lifted]
-    result = minimize(
-        lambda motion: loss(motion, start, points, board),
-        np.zeros(6),
-        jac=True,
-        method="BFGS",
-        options={"maxiter": max_iterations, "gtol": 1e-7},
-    )
-    T = moved(start, result.x)
-    # A line search that finds no further decrease has met the limit of float64: the gradient tells whether it is the end.
-    converged = bool(result.success or np.abs(result.jac).max() < 1e-4)
-    return _Fitted(T, _covariance(T, points, board), int(result.nit), converged)
+    T, iterations, converged = start, 0, False
+    while iterations < max_iterations and not converged:
+        squares = ((transform(T, points) - board) ** 2).sum(axis=1) / ARTICLE_SCALE_M**2
+        before, T = T, _align(points, board, 1.0 / np.sqrt(1.0 + squares))
+        iterations += 1
+        converged = float(np.abs(motion_between(before, T)).max()) < SETTLED
+    return _Fitted(T, _covariance(T, points, board), iterations, converged)
 
 
-def loss(motion: Array, start: Pose, points: Array, board: Array) -> tuple[float, Array]:
-    """(mean of 2 (sqrt(1 + (d / scale)^2) - 1), its gradient [6]) after a motion (metres, radians) of `start`.
-
-    d is the distance of a lifted corner (points [K, 3], camera axes) from its place (board [K, 3]). The gradient by the
-    rotation vector goes through the right Jacobian of SO(3): exp(w + dw) = exp(w) exp(J(w) dw).
-    """
-    rotation = exponential(motion[3:])
-    turned = points @ rotation.T
-    R = start[:3, :3]
-    difference = (turned + motion[:3]) @ R.T + start[:3, 3] - board
-    squares = (difference**2).sum(axis=1) / ARTICLE_SCALE_M**2
-    root = np.sqrt(1.0 + squares)
-    pull = (
-        (2.0 / ARTICLE_SCALE_M**2) * difference / root[:, None] / len(points)
-    )  # derivative by the moved points, board axes
-    in_camera = pull @ R
-    by_turn = np.cross(points, in_camera @ rotation).sum(axis=0)
-    gradient = np.concatenate([in_camera.sum(axis=0), right_jacobian(motion[3:]).T @ by_turn])
-    return float((2.0 * (root - 1.0)).mean()), gradient
-
-
-def right_jacobian(rotation_vector: Array) -> Array:
-    """[3, 3]: J(w) of exp(w + dw) = exp(w) exp(J(w) dw) to first order (Chirikjian 2012, equation 10.86)."""
-    angle = float(np.linalg.norm(rotation_vector))
-    W = cross_matrix(rotation_vector)
-    if angle < 1e-5:
-        return np.eye(3) - 0.5 * W + W @ W / 6.0
-    return np.eye(3) - (1 - math.cos(angle)) / angle**2 * W + (angle - math.sin(angle)) / angle**3 * (W @ W)
+def _align(points: Array, goals: Array, weight: Array) -> Pose:
+    """[4, 4]: the rigid transform of points [N, 3] with the least weighted squares of distance to goals [N, 3]."""
+    share = weight / weight.sum()
+    middle, goal = share @ points, share @ goals
+    U, _, V = np.linalg.svd(((goals - goal) * share[:, None]).T @ (points - middle))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+    return pose(R, goal - R @ middle)
 
 
 def _covariance(T: Pose, points: Array, board: Array) -> Array:
@@ -430,21 +407,9 @@ def _result(
     asked = rolled or (fitted if misfit or evidence.spec.calibrate else None)
     shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
     correction = shared.correction(identified(sigma, joint.prior))
-    views, wider = {}, problem.corner_term().misfit(solution.poses, solution.shared)
-    single_px = max(evidence.corner_px, evidence.spec.corner_px)
+    wider, views = problem.corner_term().misfit(solution.poses, shared), {}
     for place, start in enumerate(starts):
-        block = slice(POSE * place, POSE * (place + 1))
-        pose = Judged(
-            solution.poses[place],
-            joint.covariance[block, block] * max(wider[place], problem.widening(place, single_px)),
-            ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
-            (evidence.observations[start.index].given_by,) if start.fixed else (),
-            by_corners=False,
-        )
-        view = judge(evidence.observations[start.index], pose, evidence, correction, shared.print_scale)
-        if view.depth_mm is not None and view.depth_mm > OFF_BOARD_MM:
-            reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
-            view = dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
+        view = _joint_view(place, start, (problem, joint, evidence), float(wider[place]), correction)
         if asked is not None and not start.fixed:
             view = _less_certain(view, asked.motion[place], asked.covariance[place])
         views[start.index] = view
@@ -463,6 +428,28 @@ def _result(
         tuple(note for note in notes if note),
         fitted.camera if fitted is not None and fitted.is_known() else None,
     )
+
+
+def _joint_view(
+    place: int, start: Start, solved: tuple[Views, Joint, Evidence], wider: float, correction: DepthCorrection
+) -> ViewEstimate:
+    """The view at a place of the problem, judged; its covariance is at least `wider` times that of independent corners."""
+    problem, joint, evidence = solved
+    block = slice(POSE * place, POSE * (place + 1))
+    widening = problem.widening(place, max(evidence.corner_px, evidence.spec.corner_px))
+    observation = evidence.observations[start.index]
+    judgement = Judged(
+        joint.solution.poses[place],
+        joint.covariance[block, block] * max(wider, widening),
+        ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
+        (observation.given_by,) if start.fixed else (),
+        by_corners=False,
+    )
+    view = judge(observation, judgement, evidence, correction, joint.solution.shared.print_scale)
+    if view.depth_mm is None or view.depth_mm <= OFF_BOARD_MM:
+        return view
+    reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
+    return dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
 
 
 def _mark_moved(estimate: CaptureEstimate, groups: list[list[int]], settled: bool) -> CaptureEstimate:

@@ -15,7 +15,7 @@ from schemas.job.captures import Fusion
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.surface.object_mask import ObjectRegion
-from workers.capture.surface.posed_view import PosedView, visible_points
+from workers.capture.surface.posed_view import NEAREST_M, PosedView, pixel_of, visible_points
 from workers.capture.surface.tsdf import (
     FRONT_VOXELS,
     MOST_EDGE_DEG,
@@ -137,7 +137,7 @@ def _observe(
     for i in range(len(points)):
         p, n = points[i], normals[i]
         z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-        if not z > 0.05:
+        if not z > NEAREST_M:
             continue
         ray_x = (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z
         ray_y = (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z
@@ -247,12 +247,8 @@ def _sample_light(
     height, width = rgb.shape[0], rgb.shape[1]
     for i in range(len(points)):
         p = points[i]
-        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-        if not z > 0.05:
-            continue
-        x = k[0] * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + k[2]
-        y = k[1] * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + k[3]
-        if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
+        x, y, z = pixel_of(T, k, p[0], p[1], p[2])
+        if not (z > 0.0 and 0.0 <= x < width - 1 and 0.0 <= y < height - 1):
             continue
         column, row = int(np.floor(x)), int(np.floor(y))
         s, t = x - column, y - row
@@ -311,7 +307,7 @@ def object_window(region: ObjectRegion, camera: Camera) -> tuple[int, int, int, 
     low, high = region.low, region.high
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     k = camera.intrinsics
-    left, top, right, bottom = project_bounds(transform(invert(camera.T_world_cam), corners), k, 0.05)
+    left, top, right, bottom = project_bounds(transform(invert(camera.T_world_cam), corners), k, NEAREST_M)
     rows = np.clip([math.floor(top) - MARGIN_PX, math.ceil(bottom) + MARGIN_PX], 0, k.height)
     columns = np.clip([math.floor(left) - MARGIN_PX, math.ceil(right) + MARGIN_PX], 0, k.width)
     return int(rows[0]), int(columns[0]), int(rows[1]), int(columns[1])

@@ -173,15 +173,8 @@ def _split(
 def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> ObjectRegion:
     """The object of a capture. Raises CaptureError where the board has no depth, or nothing stands on it."""
     half = 0.5 * np.array([board.width_m, board.height_m]) * board.scale
-    cells = np.ceil(2.0 * half / CELL_M).astype(np.int64)
-    low_bins = np.zeros((cells[0], cells[1], round(2 * REACH_M / BIN_M) + 2), np.int32)
-    tall_bins = np.zeros((cells[0], cells[1], round(TALLEST_M / REACH_M)), np.int32)
-    for view in views:
-        k = view.depth_camera.intrinsics
-        stride = max(1, int(np.sqrt(k.width * k.height / SAMPLES)))
-        intrinsics = (k.fx, k.fy, k.cx, k.cy)
-        mask = np.ones((1, 1), np.bool_) if view.mask is None else view.mask
-        _collect(view.depth_m, mask, stride, intrinsics, view.depth_camera.T_world_cam, -half, low_bins, tall_bins)
+    low_bins, tall_bins = _heights(views, half)
+    cells = low_bins.shape[:2]
     height, count = _medians(low_bins)
     usual = float(np.median(count[count > 0])) if count.any() else 0.0
     known = count >= np.clip(usual / 3.0, 1.0, LEAST_SAMPLES)
@@ -196,7 +189,7 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
     plane, spread = _board_plane(grid[known], height[known])
     above = height - (grid @ np.array(plane[:2]) + plane[2])
     clearance = max(spec.board_clearance_m, 4.0 * spread)
-    stands = _stands(board, -half, (int(cells[0]), int(cells[1])))
+    stands = _stands(board, -half, cells)
     found = known & (above > clearance) & ~stands
     footprint, others = _largest(found, np.where(found, above, 0.0))
     if footprint is None:
@@ -221,7 +214,24 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
     return _region(footprint, floor, tall_bins, -half, ground, tuple(notes))
 
 
-def _stands(board: Board, corner: Array, cells: tuple[int, int]) -> NDArray[np.bool_]:
+def _heights(views: Sequence[PosedView], half: Array) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """(low_bins, tall_bins), each [cells in x, cells in y, bins]: how often the views measured each height over a board.
+
+    half [2]: half its width and height. low_bins are `BIN_M` high around its plane, tall_bins `REACH_M` from it on.
+    """
+    cells = np.ceil(2.0 * half / CELL_M).astype(np.int64)
+    low_bins = np.zeros((cells[0], cells[1], round(2 * REACH_M / BIN_M) + 2), np.int32)
+    tall_bins = np.zeros((cells[0], cells[1], round(TALLEST_M / REACH_M)), np.int32)
+    for view in views:
+        k = view.depth_camera.intrinsics
+        stride = max(1, int(np.sqrt(k.width * k.height / SAMPLES)))
+        intrinsics = (k.fx, k.fy, k.cx, k.cy)
+        mask = np.ones((1, 1), np.bool_) if view.mask is None else view.mask
+        _collect(view.depth_m, mask, stride, intrinsics, view.depth_camera.T_world_cam, -half, low_bins, tall_bins)
+    return low_bins, tall_bins
+
+
+def _stands(board: Board, corner: Array, cells: tuple[int, ...]) -> NDArray[np.bool_]:
     """[cells in x, cells in y]: those within `STAND_M` of the ground below markers that are out of the board's plane."""
     found = np.zeros(cells, np.uint8)
     places = board_geometry(board).corners

@@ -13,6 +13,7 @@ from schemas.errors import CaptureError
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
 from schemas.scene.view import Camera
+from workers.capture.pictures import pinhole_maps, remap
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
@@ -47,10 +48,9 @@ def pose_view(view: CapturedView, camera: CaptureCamera, T_board_cam: Pose, dept
     k = camera.intrinsics
     rgb, stored, mask = view.rgb, view.depth, view.mask
     if camera.has_lens:
-        columns, rows = lens_map(camera)
-        rgb = cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
-        stored = _nearest(stored, columns, rows)
-        mask = None if mask is None else _nearest(mask.view(np.uint8), columns, rows).view(np.bool_)
+        maps = pinhole_maps(k, tuple(camera.lens.tolist()))
+        rgb, stored = remap(rgb, maps, between=True), remap(stored, maps, between=False)
+        mask = None if mask is None else remap(mask.view(np.uint8), maps, between=False).view(np.bool_)
     depth_m = correct_depth(stored, 1.0 / camera.depth_units_per_m, depth.scale, depth.offset_m)
     T_board_depth = frozen_array(T_board_cam @ depth.T_cam_depth)
     return PosedView(view.number, Camera(k, frozen_array(T_board_cam)), Camera(k, T_board_depth), rgb, depth_m, mask)
@@ -67,16 +67,6 @@ def correct_depth(stored: NDArray[np.uint16], metres: float, scale: float, offse
     return depth
 
 
-def lens_map(camera: CaptureCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(columns, rows), each [H, W] float32: where in the stored image each pixel of the pinhole's lies, OpenCV's convention."""
-    k = camera.intrinsics
-    matrix = opencv_matrix(k)
-    columns, rows = cv2.initUndistortRectifyMap(
-        matrix, camera.lens, np.eye(3), matrix, (k.width, k.height), cv2.CV_32FC1
-    )
-    return columns.astype(np.float32, copy=False), rows.astype(np.float32, copy=False)
-
-
 def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.bool_]:
     """[H, W] bool: a pinhole's mask as the lens draws it, so that it fits the stored images."""
     if not camera.has_lens:
@@ -86,17 +76,29 @@ def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.b
     rows, columns = np.mgrid[0 : k.height, 0 : k.width].astype(np.float64)
     stored = np.stack([columns.ravel(), rows.ravel()], axis=1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(stored, matrix, camera.lens, P=matrix).reshape(k.height, k.width, 2)
-    columns32, rows32 = (straight[..., i].astype(np.float32) for i in range(2))
-    return _nearest(mask.view(np.uint8), columns32, rows32).view(np.bool_)
-
-
-def _nearest(image: NDArray, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> NDArray:
-    return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+    maps = [straight[..., axis].astype(np.float32) for axis in range(2)]
+    return remap(mask.view(np.uint8), maps, between=False).view(np.bool_)
 
 
 CLEAR_M = 1e-5
 """A point is lifted off its face by so much before it is looked at, above float32's steps in the ray caster."""
 
+
+@compiled
+def pixel_of(
+    T: Array, k: tuple[float, float, float, float], x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """(column, row, depth) of a point (x, y, z) after T [4, 4] by k (fx, fy, cx, cy); depth 0 where it is not in front."""
+    depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    if not depth > NEAREST_M:
+        return 0.0, 0.0, 0.0
+    column = k[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / depth + k[2]
+    row = k[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / depth + k[3]
+    return column, row, depth
+
+
+NEAREST_M = 0.05
+"""What is nearer to a camera is not seen by it."""
 
 UNSEEN = -2.0
 """Stands for the cosine of a point that is not in the image."""
@@ -139,7 +141,7 @@ def visible_points(
 def facing_cosine(points: Array, normals: Array, camera: Camera) -> Array:
     """[N] cosine between the normal of points [N, 3] and the way to a camera, `UNSEEN` where they are not in its image."""
     seen = transform(invert(camera.T_world_cam), points)
-    front = seen[:, 2] > 0.05
+    front = seen[:, 2] > NEAREST_M
     u, v = project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]), camera.intrinsics)
     towards = camera.position - points
     cosine = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)

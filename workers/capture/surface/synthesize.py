@@ -16,7 +16,7 @@ from schemas.capture import SynthesizedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
 from schemas.scene.view import Camera
-from workers.capture.surface.posed_view import PosedView
+from workers.capture.surface.posed_view import PosedView, pixel_of
 from workers.capture.surface.tsdf import FittedDepth
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
@@ -80,7 +80,7 @@ def prepare_source(view: PosedView, fitted: FittedDepth, mask: NDArray[np.bool_]
 def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> NDArray[np.float32]:
     """[H, W] float32: a depth image as another camera nearby has it, as it was measured; 0 where it shows nothing."""
     inverse = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0.0)
-    fitted = FittedDepth(0, 0, inverse, np.ones_like(inverse))
+    fitted = FittedDepth(inverse, np.ones_like(inverse))
     blank = np.zeros((*depth_m.shape, 3), np.uint8)
     layer = warp(Source(0, source, fitted, blank, blank[..., 0] > 0, np.ones_like(inverse)), target)
     return np.where(layer.weight > 0.0, layer.depth_m, np.float32(0.0))
@@ -115,12 +115,9 @@ def _carry_colours(
                 continue
             z = 1.0 / inverse[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, (row + 0.5 - k[3]) / k[1] * z
-            Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if not Z > 0.05:
-                continue
-            u = k[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + k[2] - 0.5
-            v = k[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + k[3] - 0.5
-            if not (0.0 <= u < width - 1 and 0.0 <= v < height - 1):
+            u, v, Z = pixel_of(T, k, x, y, z)
+            u, v = u - 0.5, v - 0.5
+            if not (Z > 0.0 and 0.0 <= u < width - 1 and 0.0 <= v < height - 1):
                 continue
             c, r = int(np.floor(u)), int(np.floor(v))
             s, t = u - c, v - r
@@ -147,12 +144,10 @@ def _carry(
                 continue
             z = 1.0 / inverse[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
-            Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if Z > 0.05:
+            u, v, Z = pixel_of(T, m, x, y, z)
+            if Z > 0.0:
                 n = row * width + column
-                pixels[n, 0] = m[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + m[2] - 0.5
-                pixels[n, 1] = m[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + m[3] - 0.5
-                depth[n] = Z
+                pixels[n, 0], pixels[n, 1], depth[n] = u - 0.5, v - 0.5, Z
     return pixels, depth
 
 
@@ -300,16 +295,13 @@ def choose_sources(axes: Mapping[int, Array], camera: Camera, spec: Synthesis) -
     return [numbers[n] for n in np.argsort(-cosines, kind="stable")[: spec.views]]
 
 
-def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) -> SynthesizedView:
-    """What `camera` would see, from the best `spec.views` of the sources.
+def synthesize_view(sources: Sequence[Source], camera: Camera) -> SynthesizedView:
+    """What `camera` would see, made of sources, with small holes filled as `fill_holes` does.
 
     Raises CaptureError where none of them shows anything to it.
     """
-    by_number = {source.number: source for source in sources}
-    numbers = choose_sources({n: source.camera.T_world_cam[:3, 2] for n, source in by_number.items()}, camera, spec)
-    layers = []
-    for number in numbers:
-        source = by_number[number]
+    numbers, layers = [source.number for source in sources], []
+    for source in sources:
         cosine = max(float(source.camera.T_world_cam[:3, 2] @ camera.T_world_cam[:3, 2]), 0.0)
         layers.append(warp(source, camera, max(cosine**SHARPNESS, 1e-6)))
     if not any(layer.weight.any() for layer in layers):

@@ -21,6 +21,7 @@ from skimage.measure import marching_cubes
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera, Intrinsics
+from workers.capture.surface.posed_view import pixel_of
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
 
@@ -66,21 +67,19 @@ STEEP = 0.5
 
 @dataclass(frozen=True, eq=False)
 class FittedDepth:
-    """A window of a depth image after the fit; its first pixel is the image's (`top`, `left`).
+    """A depth image after the fit.
 
     inverse [h, w] float32: 1/z of the fitted plane, 1/m, 0 where there is none; facing [h, w] float32: the cosine of
     incidence times the length of the pixel's ray at z = 1, which turns a difference of z into a distance from the plane.
     """
 
-    top: int
-    left: int
     inverse: NDArray[np.float32]
     facing: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDepth(FittedDepth):
-    """The fit with what is on an edge found out.
+    """The fit with what is on an edge found out, of a window whose first pixel is the image's (`top`, `left`).
 
     sure [h, w] uint8: 1 where all samples were fitted, 2 where they were in the pixels around, too, else 0. beyond [h, w]
     float32: `inverse` and, where that is 0, 1/z of the board where the view shows it: there `facing` is the board's.
@@ -88,24 +87,22 @@ class SurfaceDepth(FittedDepth):
 
     sure: NDArray[np.uint8]
     beyond: NDArray[np.float32]
+    top: int = 0
+    left: int = 0
 
 
-def fit_depth(
-    depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float, window: tuple[int, int, int, int] | None = None
-) -> FittedDepth:
-    """The fit of depth [H, W] in a window (top, left, bottom, right), all of it by default."""
-    top, left, bottom, right = window or (0, 0, *depth_m.shape)
-    shape = (max(bottom - top, 0), max(right - left, 0))
-    inverse, facing, rough = (np.zeros(shape, np.float32) for _ in range(3))
-    _fit(depth_m, _focal(k), _stride(k), _least_cos(max_edge_deg), (top, left), REACHES[0], inverse, facing, rough)
-    return FittedDepth(top, left, inverse, facing)
+def fit_depth(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float) -> FittedDepth:
+    """The fit of depth [H, W]."""
+    inverse, facing, rough = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
+    _fit(depth_m, _focal(k), _stride(k), _least_cos(max_edge_deg), REACHES[0], inverse, facing, rough)
+    return FittedDepth(inverse, facing)
 
 
 def fit_surfaces(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float) -> SurfaceDepth:
     """The fit of depth [H, W] with fewer samples where more do not lie on a plane, and without ramps between two surfaces."""
     inverse, facing, rough = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
-    stride, least_cos, corner = _stride(k), _least_cos(max_edge_deg), (0, 0)
-    _fit(depth_m, _focal(k), stride, least_cos, corner, REACHES[0], inverse, facing, rough)
+    stride, least_cos = _stride(k), _least_cos(max_edge_deg)
+    _fit(depth_m, _focal(k), stride, least_cos, REACHES[0], inverse, facing, rough)
     usual = float(np.median(rough[inverse > 0.0])) if inverse.any() else 0.0
     roughest = ROUGHEST * max(usual, LEAST_ROUGH)
     bent = rough > roughest
@@ -113,13 +110,13 @@ def fit_surfaces(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: floa
     whole = inverse > 0.0
     rough[~bent] = SETTLED
     least_cos = max(least_cos, _least_cos(SMALL_EDGE_DEG))
-    _fit(depth_m, _focal(k), stride, least_cos, corner, REACHES[1], inverse, facing, rough)
+    _fit(depth_m, _focal(k), stride, least_cos, REACHES[1], inverse, facing, rough)
     inverse[rough > roughest] = 0.0
     ramps = _ramps(inverse, facing, stride)
     inverse[ramps] = 0.0
     whole &= ~ramps
     sure = whole.astype(np.uint8) + ndimage.binary_erosion(whole, np.ones((3, 3), np.bool_))
-    return SurfaceDepth(0, 0, inverse, facing, sure, inverse)
+    return SurfaceDepth(inverse, facing, sure, inverse)
 
 
 def _focal(k: Intrinsics) -> tuple[float, float, float, float]:
@@ -165,69 +162,91 @@ def _fit(
     k: tuple[float, float, float, float],
     stride: int,
     least_cos: float,
-    corner: tuple[int, int],
     reach: int,
     inverse: NDArray[np.float32],
     facing: NDArray[np.float32],
     rough: NDArray[np.float32],
 ) -> None:
-    """Two fits of 1/z = a + b du + c dv: to the samples at about the pixel's depth, then to those near the first plane.
+    """Fits a plane 1/z = a + b i + c j to the samples around each pixel, i and j counted in strides.
 
-    `reach`: samples to each side. rough [h, w] is `SETTLED` where nothing is to be done; it becomes the scatter of 1/z about
-    the plane, 1/m, times the slope, by which a depth camera's noise grows.
+    It is fitted twice: to the samples at about the pixel's depth, then to those of them that are near the first plane.
+
+    `reach`: samples to each side. rough [h, w] is `SETTLED` where nothing is to be done; it becomes the scatter of 1/z
+    about the plane, 1/m, times the slope, by which noise grows.
     """
-    height, width = depth_m.shape
     side = 2 * reach + 1
     least = int(np.ceil(LEAST_SHARE * side * side))
-    q, at_x, at_y = np.empty(side * side), np.empty(side * side), np.empty(side * side)
-    plane = np.empty(3)
-    for at_row in range(inverse.shape[0]):
-        row = at_row + corner[0]
+    samples, plane = np.empty((3, side * side)), np.empty(3)
+    for row in range(depth_m.shape[0]):
         ray_y = (row + 0.5 - k[3]) / k[1]
-        for at_column in range(inverse.shape[1]):
-            column = at_column + corner[1]
+        for column in range(depth_m.shape[1]):
             z0 = depth_m[row, column]
-            if not z0 > 0.0 or rough[at_row, at_column] < 0.0:
+            if not z0 > 0.0 or rough[row, column] < 0.0:
                 continue
-            rough[at_row, at_column] = 0.0
-            n = 0
-            for i in range(-reach, reach + 1):
-                y = row + i * stride
-                for j in range(-reach, reach + 1):
-                    x = column + j * stride
-                    if 0 <= y < height and 0 <= x < width:
-                        z = depth_m[y, x]
-                        if z0 * (1.0 - WIDE) < z < z0 * (1.0 + WIDE):
-                            q[n], at_x[n], at_y[n] = 1.0 / z, j, i
-                            n += 1
-            if n < least or not _solve(q, at_x, at_y, n, plane):
+            rough[row, column] = 0.0
+            count = _gather(depth_m, row, column, stride, reach, samples)
+            if count < least or not _solve(samples, count, plane):
                 continue
             ray_x = (column + 0.5 - k[2]) / k[0]
             ray = np.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
-            slope = _facing(plane, stride, k, ray_x, ray_y)
-            # dz = z^2 dq, so a share of the depth is the same share of its inverse.
-            gate = min(GATE * ray / slope, WIDE) * plane[0]
-            kept = 0
-            for i in range(n):
-                if abs(q[i] - plane[0] - plane[1] * at_x[i] - plane[2] * at_y[i]) < gate:
-                    q[kept], at_x[kept], at_y[kept] = q[i], at_x[i], at_y[i]
-                    kept += 1
-            if kept < least or not _solve(q, at_x, at_y, kept, plane):
+            # dz = z^2 d(1/z), so a share of the depth is the same share of its inverse.
+            gate = min(GATE * ray / _facing(plane, stride, k, ray_x, ray_y), WIDE) * plane[0]
+            count = _keep_near(samples, count, plane, gate)
+            if count < least or not _solve(samples, count, plane):
                 continue
             slope = _facing(plane, stride, k, ray_x, ray_y)
             if slope >= least_cos * ray and abs(1.0 / z0 - plane[0]) < gate:
-                inverse[at_row, at_column] = plane[0]
-                facing[at_row, at_column] = slope
-                total = 0.0
-                for i in range(kept):
-                    error = q[i] - plane[0] - plane[1] * at_x[i] - plane[2] * at_y[i]
-                    total += error * error
-                rough[at_row, at_column] = slope * np.sqrt(total / (kept - 3))
+                inverse[row, column] = plane[0]
+                facing[row, column] = slope
+                rough[row, column] = slope * _scatter(samples, count, plane)
 
 
 @compiled
-def _solve(q: Array, x: Array, y: Array, n: int, plane: Array) -> bool:
+def _gather(depth_m: NDArray[np.float32], row: int, column: int, stride: int, reach: int, samples: Array) -> int:
+    """How many samples around a pixel are at about its depth; their 1/z, column and row in strides go into `samples`."""
+    height, width = depth_m.shape
+    z0, count = depth_m[row, column], 0
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            y, x = row + i * stride, column + j * stride
+            if 0 <= y < height and 0 <= x < width and z0 * (1.0 - WIDE) < depth_m[y, x] < z0 * (1.0 + WIDE):
+                samples[0, count], samples[1, count], samples[2, count] = 1.0 / depth_m[y, x], j, i
+                count += 1
+    return count
+
+
+@compiled
+def _off_plane(samples: Array, n: int, plane: Array) -> float:
+    """1/z of a sample less that of the plane there."""
+    return float(samples[0, n] - plane[0] - plane[1] * samples[1, n] - plane[2] * samples[2, n])
+
+
+@compiled
+def _keep_near(samples: Array, count: int, plane: Array, gate: float) -> int:
+    """Moves the samples that are nearer to the plane than `gate`, 1/m, to the front; how many they are."""
+    kept = 0
+    for n in range(count):
+        if abs(_off_plane(samples, n, plane)) < gate:
+            for axis in range(3):
+                samples[axis, kept] = samples[axis, n]
+            kept += 1
+    return kept
+
+
+@compiled
+def _scatter(samples: Array, count: int, plane: Array) -> float:
+    """Standard deviation of 1/z of samples about their plane, which takes up three numbers."""
+    total = 0.0
+    for n in range(count):
+        error = _off_plane(samples, n, plane)
+        total += error * error
+    return float(np.sqrt(total / (count - 3)))
+
+
+@compiled
+def _solve(samples: Array, n: int, plane: Array) -> bool:
     """Least squares of q = plane . (1, x, y) by Cramer's rule about the means; False where the samples lie in a line."""
+    q, x, y = samples[0], samples[1], samples[2]
     mx = my = mq = 0.0
     for i in range(n):
         mx += x[i]
@@ -338,37 +357,48 @@ def _integrate(
     beyond: NDArray[np.float32],
 ) -> None:
     """T: board to camera; k: fx, fy, cx, cy of the window with pixel centres on integers."""
-    front, back, full = FRONT_VOXELS * voxel_m, BACK_VOXELS * voxel_m, 0.5 * BACK_VOXELS * voxel_m
-    height, width = inverse.shape
     for i in range(distance_m.shape[0]):
         for j in range(distance_m.shape[1]):
-            bx, by = origin[0] + i * voxel_m, origin[1] + j * voxel_m
             for n in range(distance_m.shape[2]):
-                bz = origin[2] + n * voxel_m
-                z = T[2, 0] * bx + T[2, 1] * by + T[2, 2] * bz + T[2, 3]
-                if not z > 0.05:
+                x, y, z = pixel_of(T, k, origin[0] + i * voxel_m, origin[1] + j * voxel_m, origin[2] + n * voxel_m)
+                if not z > 0.0:
                     continue
-                x = k[0] * (T[0, 0] * bx + T[0, 1] * by + T[0, 2] * bz + T[0, 3]) / z + k[2]
-                y = k[1] * (T[1, 0] * bx + T[1, 1] * by + T[1, 2] * bz + T[1, 3]) / z + k[3]
-                if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
-                    continue
-                row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
-                q, slope, behind = sample_inverse(inverse, x, y), facing[row, column], back
-                if q == 0.0:  # of the board a view says where nothing is
-                    q, behind = beyond[row, column], 0.0
-                    if q == 0.0:
-                        continue
-                s = (1.0 / q - z) * slope
-                if s <= -behind:
-                    continue
-                # Depth's standard deviation grows with z^2 and with 1 / cosine.
-                w = slope * slope * q * q * q * q
-                if s < -full:
-                    w *= (back + s) / (back - full)
-                total = weight[i, j, n] + w
-                s = min(s, front)
-                distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
-                weight[i, j, n] = total
+                s, w = _measure(x, y, z, voxel_m, inverse, facing, beyond)
+                if w > 0.0:
+                    total = weight[i, j, n] + w
+                    distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
+                    weight[i, j, n] = total
+
+
+@compiled
+def _measure(
+    x: float,
+    y: float,
+    z: float,
+    voxel_m: float,
+    inverse: NDArray[np.float32],
+    facing: NDArray[np.float32],
+    beyond: NDArray[np.float32],
+) -> tuple[float, float]:
+    """(distance to the surface that pixel (x, y) sees from a voxel at depth z, its weight); weight 0 where that is unknown."""
+    back, full = BACK_VOXELS * voxel_m, 0.5 * BACK_VOXELS * voxel_m
+    height, width = inverse.shape
+    if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
+        return 0.0, 0.0
+    row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+    q, slope, behind = sample_inverse(inverse, x, y), facing[row, column], back
+    if q == 0.0:  # of the board a view says where nothing is
+        q, behind = beyond[row, column], 0.0
+        if q == 0.0:
+            return 0.0, 0.0
+    s = (1.0 / q - z) * slope
+    if s <= -behind:
+        return 0.0, 0.0
+    # Depth's standard deviation grows with z^2 and with 1 / cosine.
+    w = slope * slope * q * q * q * q
+    if s < -full:
+        w *= (back + s) / (back - full)
+    return min(s, FRONT_VOXELS * voxel_m), w
 
 
 EMPTY = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
