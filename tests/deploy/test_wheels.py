@@ -39,7 +39,6 @@ HEAVY = {
 }
 HEAVY |= {
     "scipy",
-    "plyfile",
     "mapbox_earcut",
     "clarabel",
     "daqp",
