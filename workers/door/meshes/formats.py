@@ -12,6 +12,7 @@ from pathlib import Path
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
+from workers.door import opening
 from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.dae import named_by_dae, read_dae
 from workers.door.meshes.gltf import named_by_gltf, read_gltf
@@ -96,18 +97,17 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
 
 
 def read_bytes(path: Path, limits: MeshLimits) -> bytes:
-    """A mesh file's bytes; MeshError `missing`, `format` or `too_large`."""
+    """A mesh file's bytes; MeshError `missing`, `irregular`, `format` or `too_large`."""
     if path.suffix.lower() not in FORMATS:
         raise MeshError(
             "format", f"{path}: {path.suffix or 'no suffix'} is not one of {', '.join(FORMATS)}: export it as .glb"
         )
-    try:
-        size = path.stat().st_size
-        if size > limits.max_file_mb * 1e6:
-            raise MeshError("too_large", f"{path} has {size / 1e6:.1f} MB, over max_file_mb = {limits.max_file_mb:g}")
-        return path.read_bytes()
-    except OSError as error:
-        raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
+
+    def refuse(reason: str, sentence: str) -> MeshError:
+        large = f"{path} is over max_file_mb = {limits.max_file_mb:g}"
+        return MeshError(reason, large if reason == "too_large" else sentence)
+
+    return opening.read_bytes(path, int(limits.max_file_mb * 1e6), refuse)
 
 
 def _find(resolver: FolderResolver, names: Iterable[str]) -> list[Path]:
