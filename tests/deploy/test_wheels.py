@@ -43,6 +43,7 @@ HEAVY |= {
     "clarabel",
     "daqp",
     "reportlab",
+    "rosbags",
     "prometheus_client",
     "networkx",
     "pyglet",
