@@ -22,7 +22,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.exchange.ply import load_ply
 
 from schemas.base import Array, Pose
 from schemas.errors import InputError, plain_line
@@ -166,14 +165,15 @@ def _numbers(path: Path, values: object, shape: tuple[int, ...] | None) -> Array
 def read_shape(path: Path) -> Mesh | Array:
     """A mesh, or points [N, 3] of a file without faces, in the file's units. Raises VersoError."""
     data, suffix = read_bytes(path, int(LIMITS.max_file_mb * 1e6)), path.suffix.lower()
-    from workers.assets.external.formats import load_shape  # loads what makes data
-    from workers.assets.external.plain import count_ply
+    from workers.door.meshes.formats import load_shape  # loads what makes data
+    from workers.door.meshes.ply import count_ply, parse_ply
 
     if suffix == ".npz":
         points = _read_points(path, data)
     elif suffix == ".ply" and not count_ply(data)[1]:
         with as_refusal(path.name):
-            points = _numbers(path, load_ply(io.BytesIO(data))["vertices"], None)
+            vertices = parse_ply(data)["vertex"]
+            points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
     else:
         return load_shape(path, LIMITS).shape.mesh
     if points.ndim != 2 or points.shape[1] != 3 or not 3 <= len(points) <= LIMITS.max_vertices:

@@ -43,11 +43,11 @@ HEAVY = {
     "rtree",
 }
 HEAVY |= {
-    "plyfile",
     "mapbox_earcut",
     "clarabel",
     "daqp",
     "reportlab",
+    "rosbags",
     "prometheus_client",
     "networkx",
     "pyglet",

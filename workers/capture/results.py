@@ -12,6 +12,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,19 +22,19 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.capture import CaptureListing
-from schemas.errors import AssetSourceError, CaptureError
+from schemas.errors import AssetSourceError, CaptureError, InputError
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.assets.external.listing import Watch, ignore
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW, TRUTH
+from workers.door.meshes.ply import Element, encode_ply, parse_ply
+from workers.door.opening import as_refusal
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
 _PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 _CLOUD = np.dtype([*((name, "<f4") for name in _PLACE + _NORMAL), *((name, "u1") for name in _COLOR), ("views", "<u2")])
 _VERTEX = np.dtype([*((name, "<f4") for name in _PLACE), *((name, "u1") for name in _COLOR)])
-_FACE = np.dtype([("corners", "u1"), ("vertex_indices", "<i4", (3,))])
-_PLY_WORDS = {"f4": "float", "u1": "uchar", "u2": "ushort"}
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
@@ -81,57 +82,43 @@ def cloud_ply(points: Array, normals: Array, colors: NDArray[np.uint8], views: N
 
 def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
     """A binary PLY of a mesh with coloured vertices."""
-    return _ply(_VERTEX, *vertices.T, *colors.T, faces=faces)
+    return _ply(_VERTEX, *vertices.T, *colors.T, face={"vertex_indices": faces.astype(np.int32)})
 
 
-def _ply(kind: np.dtype, *columns: NDArray, faces: NDArray | None = None) -> bytes:
-    rows, triangles = np.empty(len(columns[0]), kind), np.empty(0 if faces is None else len(faces), _FACE)
-    for name, column in zip(kind.names or (), columns, strict=True):
-        rows[name] = column
-    if faces is not None:
-        triangles["corners"], triangles["vertex_indices"] = 3, faces
-    return _ply_head(kind, len(rows), None if faces is None else len(faces)) + rows.tobytes() + triangles.tobytes()
-
-
-def _ply_head(kind: np.dtype, vertices: int, faces: int | None) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", "comment board frame, metres", f"element vertex {vertices}"]
-    lines += [f"property {_PLY_WORDS[kind[name].str[1:]]} {name}" for name in kind.names or ()]
-    if faces is not None:
-        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
-    return "\n".join([*lines, "end_header\n"]).encode()
+def _ply(kind: np.dtype, *columns: NDArray, **faces: Element) -> bytes:
+    names = kind.names or ()
+    vertex = {name: np.asarray(column, kind[name]) for name, column in zip(names, columns, strict=True)}
+    return encode_ply("board frame, metres", vertex=vertex, **faces)
 
 
 def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
     """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
-    rows, _ = _read_ply(path / CLOUD_FILE, _CLOUD)
+    rows = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"]
     places, normals = (_columns(rows, names).astype(np.float64) for names in (_PLACE, _NORMAL))
     return places, normals, _columns(rows, _COLOR), rows["views"].astype(np.int32)
 
 
 def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
     """(vertices, faces, colours) of mesh.ply. Raises CaptureError where it is not there or another's."""
-    rows, faces = _read_ply(path / MESH_FILE, _VERTEX)
-    return _columns(rows, _PLACE).astype(np.float64), faces["vertex_indices"].astype(np.int32), _columns(rows, _COLOR)
+    found = _read_ply(path / MESH_FILE, _VERTEX)
+    rows, faces = found["vertex"], found["face"]["vertex_indices"]
+    return _columns(rows, _PLACE).astype(np.float64), faces.astype(np.int32), _columns(rows, _COLOR)
 
 
-def _columns(rows: NDArray, names: Sequence[str]) -> NDArray:
+def _columns(rows: Element, names: Sequence[str]) -> NDArray:
     return np.stack([rows[name] for name in names], axis=1)
 
 
-def _read_ply(file: Path, kind: np.dtype) -> tuple[NDArray, NDArray]:
-    """(vertices, faces) of a file that begins with exactly the head that `_ply_head` writes, and is as long as that says."""
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
-        raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`") from None
-    head = data[: data.find(b"end_header\n") + 11]
-    counts = [int(count) for count in re.findall(rb"^element \w+ ([0-9]{1,10})$", head, re.MULTILINE)]
-    vertices, faces = (*counts, 0, 0)[:2]
-    size = len(head) + vertices * kind.itemsize + faces * _FACE.itemsize
-    if head != _ply_head(kind, vertices, faces if len(counts) == 2 else None) or len(data) != size:
-        raise CaptureError("unreadable", f"{file} is not what `verso capture process` wrote, or ends early: delete it")
-    rows = np.frombuffer(data, kind, vertices, len(head))
-    return rows, np.frombuffer(data, _FACE, faces, size - faces * _FACE.itemsize)
+def _read_ply(file: Path, kind: np.dtype) -> dict[str, Element]:
+    with suppress(InputError), as_refusal(file):
+        elements = parse_ply(file.read_bytes())
+        if {name: column.dtype for name, column in elements["vertex"].items()} == {
+            name: kind[name] for name in kind.names or ()
+        }:
+            return elements
+    if not file.exists():
+        raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`")
+    raise CaptureError("unreadable", f"{file} is not what `verso capture process` wrote, or ends early: delete it")
 
 
 def _digest_of(file: Path) -> str | None:
