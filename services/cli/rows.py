@@ -401,9 +401,9 @@ COMMANDS: Final[dict[str, Command]] = {
         handler="cli.reference:main",
     ),
     "extra": command(
-        "install what only some commands need: Mitsuba, MuJoCo as a referee, or the plots of studies",
+        "install what only some commands need: Mitsuba, or the plots of studies",
         "pathtraced",
-        choice("name", ("pathtraced", "audit", "study")),
+        choice("name", ("pathtraced", "study")),
     ),
     "lock": command("make the lock files of a checkout anew, with the newest versions that pyproject.toml allows", ""),
     "wheels": command(

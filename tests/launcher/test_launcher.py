@@ -173,15 +173,15 @@ def test_the_locks_pin_everything_by_hash_name_no_index_and_agree():
         assert all("==" in pin and pin.endswith("\\") for pin in named) and not any("://" in line for line in lines)
         assert all(line.strip().startswith("--hash=sha256:") for line in lines if line.startswith(" "))
         pins.append(dict(pin.rstrip(" \\").split("==") for pin in named))
-    runtime, traced, study, audit, development = pins
+    runtime, traced, study, development = pins
     for lock in pins[1:]:
         shared = runtime.keys() & lock.keys()
         assert lock and {name: runtime[name] for name in shared} == {name: lock[name] for name in shared}
-    assert (traced | study | audit).items() <= development.items()
+    assert (traced | study).items() <= development.items()
     assert runtime.keys() & development.keys() and not traced.keys() & runtime.keys()
     tree = tomllib.loads((ROOT / "pyproject.toml").read_text())
     extras = tree["project"]["optional-dependencies"]
     assert extras == {name: tree["dependency-groups"][name] for name in extras}
-    assert extras["pathtraced"] == [f"mitsuba=={traced['mitsuba']}"] and extras["audit"] == ["mujoco"]
+    assert extras["pathtraced"] == [f"mitsuba=={traced['mitsuba']}"]
     assert set(extras["study"]) <= study.keys() and not set(extras["study"]) & runtime.keys()
     assert not set(extras["study"]) & {name.partition("==")[0] for name in tree["project"]["dependencies"]}
