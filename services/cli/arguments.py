@@ -45,11 +45,6 @@ def read_count(text: str) -> int:
     return int(text)
 
 
-def read_counts(text: str) -> list[int]:
-    """Whole numbers from 1 up, with commas between. Raises argparse.ArgumentTypeError."""
-    return [read_count(one) for one in text.split(",")]
-
-
 def read_duration(text: str) -> float:
     """Seconds, of a number with s, m or h behind it. Raises argparse.ArgumentTypeError."""
     found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)(s|m|h)", text, re.ASCII)

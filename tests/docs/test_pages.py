@@ -59,7 +59,7 @@ SMALLER = {
     r"(run deploy/jobs/benchmark.yaml)": r"\1 --scenes 24",
     r"^\./verso test$": "./verso test tests/test_layers.py",
     r"tests/hard_cases": "tests/test_layers.py",
-    r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
+    r"--scenes 64 --workers 2": "--scenes 2",
     r"(\./verso tradeoff .*)": r"\1 --budget 60s --knobs step",
     r"(run deploy/jobs/captures.yaml)": r"\1 --scenes 1 --set captures.simulate.views=8 " + TINY,
     r"--views 40 --category mug": f"--views 10 --category mug {TINY}",

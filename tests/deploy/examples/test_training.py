@@ -115,7 +115,9 @@ def test_the_occupancy_network_learns_volumes_and_no_shuffled_ones_and_the_scrip
     script = str(EXAMPLES / "train_occupancy.py")
     *_, last = python(script, few.name, "--epochs", "1", "--out", str(tmp_path)).splitlines()
     assert list(json.loads(last)) == ["network", "half turn", "shadow"]
-    load = "import sys, torch, train_occupancy as t; t.OccupancyNet().load_state_dict(torch.load(sys.argv[1])['weights'])"
+    load = (
+        "import sys, torch, train_occupancy as t; t.OccupancyNet().load_state_dict(torch.load(sys.argv[1])['weights'])"
+    )
     python("-c", load, str(tmp_path / "network.pt"))
 
 
