@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from services.bench.command import PACKAGES
+from services.study.command import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -27,7 +27,6 @@ FORBIDDEN = (
     ("services.read.independent.derive", "workers.geometry.thing", "the independent derivation"),
     ("services.read.independent.derive", "schemas.dataset.thing", "the independent derivation"),
     ("services.read.independent.poses", "services.read.verify", "the independent derivation"),
-    ("services.bench.marker_script", "workers.geometry.thing", "the script that captures are compared with"),
     ("schemas.scene.scene", "trimesh", "schemas load nothing heavy"),
     ("workers.shard.run_shard", "ray", "workers never import Ray"),
     ("services.cli.main", "ray", "Ray is known"),

@@ -13,8 +13,6 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,6 @@ import pybullet  # noqa: E402
 import pyrender  # noqa: E402
 import trimesh  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
-from PIL import Image  # noqa: E402
 
 STEP_HZ, SECONDS = 240, 3.0
 """The simulation, as such scripts have it."""
@@ -36,25 +33,22 @@ STEP_HZ, SECONDS = 240, 3.0
 FLOOR, TABLE, OBJECT = 1, 2, 3
 """Region ids."""
 
+FLOOR_COLOR = (150, 140, 130, 255)
+"""In the plain look."""
+
 OPTICAL_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Images = dict[str, NDArray]
 
 
-def load_meshes(description: dict[str, Any], folder: Path, look: str) -> dict[str, Any]:
+def load_meshes(folder: Path, look: str) -> dict[str, Any]:
     """The meshes of a scene for pyrender."""
-    given = description["floor"]
-    floor: Any = trimesh.Trimesh(given["vertices"], given["faces"], process=False)
-    if look == "same":
-        picture = Image.open(folder / "floor.png")
-        picture.load()
-        surface = {"baseColorTexture": picture, "metallicFactor": 0.0, "roughnessFactor": given["roughness"]}
-        material = trimesh.visual.material.PBRMaterial(**surface)
-        floor.visual = trimesh.visual.TextureVisuals(uv=np.array(given["uv"]), material=material)
-    else:
-        floor.visual.face_colors = [round(255 * c) for c in given["color"]]
-    loaded: dict[str, Any] = {name: trimesh.load(folder / f"{name}.glb") for name in ("table", "object")}
-    return {"floor": [floor], **{name: scene.dump() for name, scene in loaded.items()}}
+    loaded: dict[str, Any] = {name: trimesh.load(folder / f"{name}.glb") for name in ("floor", "table", "object")}
+    meshes = {name: scene.dump() for name, scene in loaded.items()}
+    if look == "plain":
+        for mesh in meshes["floor"]:
+            mesh.visual = trimesh.visual.ColorVisuals(mesh, face_colors=FLOOR_COLOR)
+    return meshes
 
 
 def simulate(description: dict[str, Any], folder: Path) -> NDArray:
@@ -149,38 +143,34 @@ def write(views: dict[str, Images], images: list[dict[str, Any]], units: float, 
         cv2.imwrite(str(path), pixels)
 
 
-@cache
-def renderer_of(width: int, height: int) -> Any:
-    """Pyrender's renderer, which is made in the first scene."""
-    return pyrender.OffscreenRenderer(width, height)
+renderer_of = cache(pyrender.OffscreenRenderer)
+"""Pyrender's renderer by width and height, made in the first scene."""
 
 
 def make(description: dict[str, Any], folder: Path, meshes: dict[str, Any], out: Path, look: str) -> dict[str, float]:
     """One scene's images; seconds by stage."""
-    seconds: dict[str, float] = {}
-    k = description["intrinsics"]
+    seconds = dict.fromkeys(("physics", "scene", "render", "projection", "write"), 0.0)
+    k, last = description["intrinsics"], time.perf_counter()
+
+    def count(stage: str) -> None:
+        nonlocal last
+        seconds[stage] += time.perf_counter() - last
+        last = time.perf_counter()
+
+    T_world_obj = simulate(description, folder)
+    count("physics")
+    scene, colors = build(description, meshes, T_world_obj, look)
     renderer = renderer_of(k["width"], k["height"])
-    with _timed(seconds, "physics"):
-        T_world_obj = simulate(description, folder)
-    with _timed(seconds, "scene"):
-        scene, colors = build(description, meshes, T_world_obj, look)
+    count("scene")
     for pair in description["pairs"]:
         cameras = {role: np.array(T) for role, T in pair["cameras"].items()}
-        with _timed(seconds, "render"):
-            views = {role: render(scene, colors, renderer, k, T, look) for role, T in cameras.items()}
-        T_mirror_input = np.linalg.inv(cameras["mirror"]) @ cameras["input"]
-        with _timed(seconds, "projection"):
-            views["projected"] = project(views["input"], k, T_mirror_input)
-        with _timed(seconds, "write"):
-            write(views, pair["images"], description["depth_units_per_m"], out)
+        views = {role: render(scene, colors, renderer, k, T, look) for role, T in cameras.items()}
+        count("render")
+        views["projected"] = project(views["input"], k, np.linalg.inv(cameras["mirror"]) @ cameras["input"])
+        count("projection")
+        write(views, pair["images"], description["depth_units_per_m"], out)
+        count("write")
     return seconds
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    begun = time.perf_counter()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - begun
 
 
 def answer_scenes() -> None:
@@ -188,13 +178,12 @@ def answer_scenes() -> None:
     # Libraries talk on standard output, so that is moved.
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
-    print(json.dumps({"ready": True}), file=answers)
     pybullet.connect(pybullet.DIRECT)
     for line in sys.stdin:
         asked = json.loads(line)
         path, before = Path(asked["scene"]), time.perf_counter()
         description = json.loads(path.read_text())
-        meshes = load_meshes(description, path.parent, asked["look"])
+        meshes = load_meshes(path.parent, asked["look"])
         wall, cpu = time.perf_counter(), time.process_time()
         stages = make(description, path.parent, meshes, Path(asked["out"]), asked["look"])
         answer = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu, "stages_s": stages}

@@ -1,36 +1,35 @@
-"""The rounds of the benchmark: whole scenes of a job by the production code onto a real disk, beside the other sides."""
+"""The rounds of the benchmark: whole scenes of a job by the production code onto a real disk, beside the other sides.
 
-import multiprocessing
+The lower bound of time for the same files is bare draws, the same encoding, and the same durable write.
+"""
+
+import os
+import pickle
 import tempfile
 import time
-from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
-from statistics import median
 from typing import NamedTuple
 
 from schemas.dataset.commit import Span
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import OutputError, RunError, SceneError
 from schemas.job.job import MOST, Job
-from services.bench.figures import Lap, by_processor, describe_machine, pinned, process_age_s
-from services.bench.sides import Look, choose_encoders, hand_over, images_of, looks_of, run_lower_bound, start_script
+from services.bench.figures import Lap, describe_machine, pinned
+from services.bench.script import LOOKS, hand_over, start_script
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
+from workers.render.raster.gbuffer import FLAT, Renderer
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.make_scene import Scene, make_scene
 from workers.shard.run_shard import run_ranges
 from workers.store.commit import committed_files, read_record
 from workers.store.file_system import sync_tree
+from workers.store.images import decode_png, encode_png
 from workers.store.local import LocalStore
-
-LOOP_TURNS = 10_000
-"""Turns of an empty loop, 0.2 ms, between two looks at the clock."""
 
 WARM_UP = 8
 """Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
@@ -38,9 +37,6 @@ WARM_UP = 8
 ROUND = MOST
 """Scenes of a round where the job does not give its range's: as in a job of 512 scenes or more, whose ranges they are. A
 smaller job commits more often."""
-
-SETTLED = 200
-"""Scenes after which every cache is full and every shader compiled."""
 
 
 @dataclass(eq=False)
@@ -63,14 +59,12 @@ class Workbench:
         watch = Stopwatch()
         wall, cpu = time.perf_counter(), time.process_time()
         reports = run_ranges(self.context, self.store, self.order, spans, watch)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         made = sum(report.made for report in reports)
-        lap = Lap(made, time.perf_counter() - wall, time.process_time() - cpu, watch.seconds)
         if not made:
-            failed = {reason for report in reports for reason in report.failed}
-            raise RunError(
-                f"none of the scenes {spans[0].start} to {spans[-1].stop - 1} could be made: {', '.join(sorted(failed))}"
-            )
-        return lap
+            why = ", ".join(sorted({reason for report in reports for reason in report.failed}))
+            raise RunError(f"none of the scenes {spans[0].start} to {spans[-1].stop - 1} could be made: {why}")
+        return Lap(made, wall, cpu, watch.seconds)
 
     def files(self, span: Span) -> dict[str, bytes]:
         """The bytes of every file that the range's commit names, by path."""
@@ -93,48 +87,31 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
 
 
 def make_in_memory(context: WorkerContext, span: Span) -> list[Scene]:
-    """The scenes that can be made, as input for the other sides. Raises RunError for none."""
-    made, reason = [], ""
+    """The scenes that can be made, as input for the other sides."""
+    made = []
     for scene_id in span.scene_ids:
-        try:
+        with suppress(SceneError):
             made.append(make_scene(context, scene_id, Stopwatch()))
-        except SceneError as error:
-            reason = str(error)
-    if not made:
-        raise RunError(f"none of the scenes {span.start} to {span.stop - 1} could be made: {reason}")
     return made
 
 
-def run_process(job: Job, job_folder: Path, folder: Path, span: Span) -> Lap:
-    """A plain process's part: make and commit a span into a new folder, range by range."""
-    bench = open_workbench(job, job_folder, folder)
-    starts = range(span.start, span.stop, job.range_size)
-    return bench.run(*(Span(start=start, stop=min(start + job.range_size, span.stop)) for start in starts))
+class Part(NamedTuple):
+    """What a plain process makes, into a new folder, on which core."""
 
-
-def count_for(seconds: float) -> Lap:
-    """So many turns of an empty loop as `scenes`: what the core gives to one that uses no memory and waits for nothing."""
-    turns, wall, cpu = 0, time.perf_counter(), time.process_time()
-    while time.perf_counter() < wall + seconds:
-        for _ in range(LOOP_TURNS):
-            pass
-        turns += LOOP_TURNS
-    return Lap(turns, time.perf_counter() - wall, time.process_time() - cpu, {})
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The laps of each side, one a round in which all make the same scenes, and the bytes that ours committed."""
-
-    machine: dict[str, object]
+    job: Job
+    job_folder: Path
+    out: Path
+    span: Span
     core: int
-    laps: Mapping[str, list[Lap]]
-    """By the side's name; `ours` and `floor`, the lower bound, are the first two."""
-    bytes: int
-    encoders: dict[str, str]
-    looks: Mapping[str, Look]
-    startup_s: dict[str, float]
-    """From the start of each side's process to the end of its first scenes."""
+
+
+def run_part(part: Part) -> bytes:
+    """In a plain process: the pickled lap of making and committing a span, range by range."""
+    os.sched_setaffinity(0, {part.core})
+    bench = open_workbench(part.job, part.job_folder, part.out)
+    starts = range(part.span.start, part.span.stop, part.job.range_size)
+    ranges = [Span(start=start, stop=min(start + part.job.range_size, part.span.stop)) for start in starts]
+    return pickle.dumps(bench.run(*ranges))
 
 
 @contextmanager
@@ -149,101 +126,89 @@ def bench_folder(parent: Path) -> Iterator[Path]:
         yield Path(name).resolve()
 
 
+class Measured(NamedTuple):
+    """The laps of each side, one a round in which all make the same scenes, and the bytes that ours committed."""
+
+    machine: Mapping[str, object]
+    core: int
+    bytes: int
+    ours: list[Lap]
+    floor: list[Lap]
+    """Of the lower bound."""
+    script: Mapping[str, list[Lap]]
+    """By look."""
+
+
 def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
     """Ranges until `scenes` are made, each by all sides in turn on one core: ours, the lower bound, each look of the script.
 
     Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
-    with pinned() as core, ExitStack() as running:
+    # The flat tier has no shadows, and a path tracer is no rival of pyrender.
+    looks = LOOKS if job.render.tier == "raster" else ["plain"]
+    laps: dict[str, list[Lap]] = {look: [] for look in looks}
+    ours: list[Lap] = []
+    floor: list[Lap] = []
+    written, size = 0, job.run.range_size or ROUND
+    with pinned() as core, start_script() as script:
         bench = open_workbench(job, job_folder, folder / "ours")
         warm = bench.next_span(WARM_UP)
         bench.run(warm)
-        startup_s = {"ours": process_age_s()}
-        encoders = choose_encoders(images_of(bench.files(warm)))
-        given = _hand_over(make_in_memory(bench.context, warm), job, folder / "given_warm")
-        begun = time.perf_counter()
-        script, looks = running.enter_context(start_script()), looks_of(job)
-        for word, look in looks.items():
-            script.run(given, folder / look.name, word)
-            startup_s[look.name] = time.perf_counter() - begun
-        laps: dict[str, list[Lap]] = {name: [] for name in ("ours", "floor", *(look.name for look in looks.values()))}
-        written = 0
-        size = job.run.range_size or ROUND
+        given = [hand_over(scene, job, folder / "given") for scene in make_in_memory(bench.context, warm)]
+        for look in laps:
+            script.run(given, folder / look, look)
         for start in range(0, scenes, size):
             span = bench.next_span(min(size, scenes - start))
             # What the other sides wrote: ours would wait for it, because its commits flush the file system.
             sync_tree(folder)
-            laps["ours"].append(bench.run(span))
+            ours.append(bench.run(span))
             # The input of the next side is made between the clocks.
-            files = bench.files(span)
+            files, made = bench.files(span), make_in_memory(bench.context, span)
             written += sum(map(len, files.values()))
-            made, out = make_in_memory(bench.context, span), folder / f"lower_bound{span.start}"
-            laps["floor"].append(run_lower_bound(bench.context.renderer, made, files, encoders, out))
-            given = _hand_over(made, job, folder / f"given{span.start}")
-            for word, look in looks.items():
-                laps[look.name].append(script.run(given, folder / look.name, word))
-    names = {kind: name for kind, (name, _) in encoders.items()}
-    return Measured(describe_machine(bench.context.renderer.name), core, laps, written, names, looks, startup_s)
+            floor.append(run_lower_bound(bench.context.renderer, made, files, folder / f"lower_bound{span.start}"))
+            given = [hand_over(scene, job, folder / "given") for scene in made]
+            for look, of_look in laps.items():
+                of_look.append(script.run(given, folder / look, look))
+    return Measured(describe_machine(bench.context.renderer.name), core, written, ours, floor, laps)
 
 
-def _hand_over(scenes: Sequence[Scene], job: Job, folder: Path) -> list[Path]:
-    """The same scenes as files for the script."""
-    return [hand_over(scene, job, folder / str(scene.plan.scene_id)) for scene in scenes]
+# ---------------------------------------------------------------------------------------------- the lower bound
 
 
-# ---------------------------------------------------------------------------------------------- one worker over many scenes
+def run_lower_bound(renderer: Renderer, scenes: Sequence[Scene], files: Mapping[str, bytes], folder: Path) -> Lap:
+    """Draw every view, encode every image, and write every byte so that it survives a loss of power. `folder` is new.
 
-
-class Sample(NamedTuple):
-    """One range: its scenes, resident MB after it, and seconds of processor a scene."""
-
-    scenes: int
-    mb: float
-    cpu_s: float
-
-
-def measure_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> dict[str, float]:
-    """Make that many scenes in one fresh worker; returns the figures of `memory_figures`."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return memory_figures(*pool.submit(sample_memory, job, job_folder, folder, scenes).result())
-
-
-def sample_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> tuple[list[Sample], float]:
-    """A sample for each range, and the peak MB of this process."""
-    bench = open_workbench(job, job_folder, folder)
-    stop, samples = job.first_scene + scenes, []
-    while bench.next_scene < stop:
-        span = bench.next_span(min(job.range_size, stop - bench.next_scene))
-        lap = bench.run(span)
-        samples.append(Sample(len(span.scene_ids), resident_mb("VmRSS"), by_processor(lap)))
-    return samples, resident_mb("VmHWM")
-
-
-def resident_mb(field: str) -> float:
-    """Resident memory of this process, MB: `VmRSS` now, `VmHWM` the peak; a child inherits `ru_maxrss` from its parent."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(field)) * 1024 / 1e6
-
-
-def memory_figures(samples: list[Sample], peak_mb: float) -> dict[str, float]:
-    """Resident memory and pace over the scenes; below ten times `SETTLED` scenes, the first tenth counts as settling.
-
-    grown: growth of the memory since it settled, 0.05 for 5 %. peak_mb: the peak of the process. first_ms and last_ms: of
-    processor a scene in the first `settled_after` scenes and in as many at the end, medians over ranges, which other
-    processes disturb little; last_to_first: their ratio.
+    The lap's `apart_s` is a first draw of each scene, which uploads its shapes.
     """
-    counts, megabytes, paces = zip(*samples, strict=True)
-    scenes = list(accumulate(counts))
-    settled = bisect_left(scenes, min(SETTLED, scenes[-1] // 10 or 1))
-    window = settled + 1
-    return {
-        "scenes": scenes[-1],
-        "settled_after": scenes[settled],
-        "settled_mb": megabytes[settled],
-        "last_mb": megabytes[-1],
-        "peak_mb": max(peak_mb, *megabytes),
-        "grown": megabytes[-1] / megabytes[settled] - 1.0,
-        "first_ms": median(paces[:window]) * 1e3,
-        "last_ms": median(paces[-window:]) * 1e3,
-        "last_to_first": median(paces[-window:]) / median(paces[:window]),
-    }
+    upload, draw, draw_cpu = _draw(renderer, scenes)
+    images = [decode_png(data, path) for path, data in files.items() if path.endswith(".png")]
+    begun, cpu = time.perf_counter(), time.process_time()
+    for pixels in images:
+        encode_png(pixels)
+    encoded = time.perf_counter()
+    for path, data in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(data)
+    sync_tree(folder)
+    written = time.perf_counter()
+    stages = {"draw": draw, "encode": encoded - begun, "write": written - encoded}
+    return Lap(len(scenes), sum(stages.values()), draw_cpu + time.process_time() - cpu, stages, upload)
+
+
+def _draw(renderer: Renderer, scenes: Sequence[Scene]) -> tuple[float, float, float]:
+    """Seconds of uploading every scene's shapes, then of the clock and of the processor for bare passes.
+
+    A bare pass draws and reads back colour without shadows, depth and region, as tier flat does, whatever the job's tier.
+    """
+    upload, wall, cpu = 0.0, 0.0, 0.0
+    for scene in scenes:
+        cameras = [view.camera for pair in scene.pairs for view in pair.views if view.role != "projected"]
+        things, appearance = scene.posed.things, scene.posed.appearance
+        begun = time.perf_counter()
+        renderer.draw(things, appearance, cameras[0], FLAT)
+        uploaded, uploaded_cpu = time.perf_counter(), time.process_time()
+        for camera in cameras:
+            renderer.draw(things, appearance, camera, FLAT)
+        upload, wall = upload + uploaded - begun, wall + time.perf_counter() - uploaded
+        cpu += time.process_time() - uploaded_cpu
+    return upload, wall, cpu

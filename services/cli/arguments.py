@@ -50,11 +50,6 @@ HOST: Final = r"(?:[\w-]{1,63}(?:\.[\w-]{1,63})*|\[[0-9a-fA-F:.]{2,45}\])"
 
 read_index = reader(r"\d{1,18}", " is not a whole number from 0 up", lambda match: int(match[0]))
 read_count = reader(r"0*[1-9]\d{0,17}", " is not a whole number from 1 up", lambda match: int(match[0]))
-read_counts = reader(
-    r"[1-9]\d{0,8}(?:,[1-9]\d{0,8})*",
-    " are not whole numbers from 1 up with commas between",
-    lambda match: [int(count) for count in match[0].split(",")],
-)
 read_duration = reader(
     r"(?=.*[1-9])(\d{1,6}(?:\.\d{1,3})?)(s|m|h)",
     " is not a time such as 90s, 15m or 2h",

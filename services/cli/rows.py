@@ -140,33 +140,16 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
 
 STUDY_COMMANDS: Final[dict[str, Command]] = {
     "bench": command(
-        "time by stage, beside a straightforward script and a lower bound; or poses (`captures`)",
-        "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
-        path(
-            "job",
-            "JOB.yaml",
-            "default: a job of built-in shapes; `captures`: poses of simulated captures beside those of OpenCV",
-            nargs="?",
-        ),
-        number("--scenes", "how many scenes each side makes (default: 80), or captures (12)"),
+        "time by stage, beside a straightforward script and a lower bound",
+        "deploy/jobs/tabletop.yaml --scenes 64 --workers 2",
+        path("job", "JOB.yaml", "default: a job of built-in shapes", nargs="?"),
+        number("--scenes", "how many scenes each side makes", 80),
         path("--folder", "DIR", "on the disk to measure (default: data)", default=Path("data")),
-        number("--memory", "also watch one worker's memory over N scenes"),
         number("--workers", "also compare N workers with one, beside N plain processes"),
         number("--scaling-scenes", "how many scenes that comparison makes", 512),
         SET,
-        option(
-            "--nodes",
-            "N,N,...",
-            "measure the coordinator instead, on so many simulated nodes whose scenes only take their time",
-            read.read_counts,
-        ),
-        number(
-            "--effects",
-            "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
-        ),
-        number("--targets", "time image targets instead: N scenes without, with each, and with all"),
         handler="bench.command:main",
-        starts_ray=lambda options: options.workers is not None or options.nodes is not None,
+        starts_ray=lambda options: options.workers is not None,
         kept="no figures are kept",
     ),
     "tradeoff": command(
@@ -402,9 +385,9 @@ COMMANDS: Final[dict[str, Command]] = {
         handler="cli.reference:main",
     ),
     "extra": command(
-        "install what only some commands need: Mitsuba, MuJoCo as a referee, or the plots of studies",
+        "install what only some commands need: Mitsuba, or the plots of studies",
         "pathtraced",
-        choice("name", ("pathtraced", "audit", "study")),
+        choice("name", ("pathtraced", "study")),
     ),
     "lock": command(
         "make the lock files of a checkout anew, with the newest versions that pyproject.toml allows",

@@ -2,8 +2,7 @@
 
 Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored. Approximations: the
 scene at rest is released again with every effect of physics on, and must stay; and it is dropped again from its start. A drop
-is chaotic, so that single ends differ; what must agree is how far things go on average. Where MuJoCo is installed, it holds
-every scene as a referee (referee.py): its figures are told, and have no bound.
+is chaotic, so that single ends differ; what must agree is how far things go on average.
 """
 
 import dataclasses
@@ -27,7 +26,6 @@ from services.job.record import read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, file_reader, find_scene
 from services.read.independent.derive import Kind, StoredPair, check_forces
 from services.read.independent.poses import check_merged, check_pair, list_underived
-from services.read.referee import Held, describe_held, hold_scene, is_installed
 from services.read.replay import compare_files, compare_rows, open_context
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
@@ -280,8 +278,6 @@ class Audit:
     motion: Motion = field(default_factory=Motion)
     """Largest motion of any scene, and changed pixels of all."""
     drops: Drops = field(default_factory=Drops)
-    held: Held | None = None
-    """What MuJoCo found; None where it is not installed."""
     effects: dict[str, Tally] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
@@ -298,7 +294,6 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     tallies = {effect.name: Tally(effect.kind) for effect in EFFECTS if effect.kind != "asked"}
     found = Audit(take_fingerprint(context.renderer, context.job.render.tier) == theirs, effects=tallies)
-    found.held = Held() if is_installed() else None
     for scene_id in choose_scenes(store, count, record.job.seed):
         _audit_scene(context, store, scene_id, found)
         progress(found)
@@ -329,9 +324,6 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Aud
     found.bytes += sum(len(file.data) for file in output.files)
     plain = None if found.same_stack else make_forced(context, scene_id)[1]
     proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, found)
-    if found.held is not None:
-        held = hold_scene(scene.plan, scene.settled, context.job.physics)
-        found.held = found.held.join(held or Held())
     if approximations:
         motion = measure_motion(context, scene)
         drop_again(context, scene, found.drops)
@@ -405,7 +397,6 @@ def describe_audit(found: Audit) -> Iterator[str]:
         "away from any silhouette"
     )
     yield found.drops.describe()
-    yield describe_held(found.held)
     for name, tally in found.effects.items():
         if tally.skipped:
             yield f"  {name} ({tally.kind}): left out in {plural(tally.skipped, 'scene')}, proven in {tally.proven}"

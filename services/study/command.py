@@ -10,13 +10,13 @@ import time
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import yaml
 
-from schemas.errors import RunError, describe_seconds
+from schemas.errors import MachineError, RunError, describe_seconds
 from schemas.job.job import Job
-from services.bench.command import require_extra
 from services.job.job_file import load_job, read_tree
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
@@ -44,10 +44,24 @@ UNMEASURED = {"check.raycast_share": 0.0, "output.layout": "files"}
 """What no setting is measured with: checks of labels, and tar archives."""
 
 
+PACKAGES = {"flip_evaluator": "flip-evaluator", "matplotlib": "matplotlib"}
+"""Names on the index by the names that are imported."""
+
+
+def require_extra() -> None:
+    """Raises MachineError, with the remedy, where a package of the extra is not installed."""
+    missing = [name for module, name in PACKAGES.items() if find_spec(module) is None]
+    if missing:
+        raise MachineError(
+            f"`verso tradeoff` needs {', '.join(missing)}: `./verso extra study` installs what is missing in a checkout; "
+            "elsewhere use `pip install --require-hashes -r requirements-study.lock`"
+        )
+
+
 def main(options: argparse.Namespace) -> int:
     """0 where a recommendation held on fresh scenes. Raises InputError, RunError."""
     began = time.monotonic()
-    require_extra("tradeoff")
+    require_extra()
     from services.study.plots import write_plots  # draws with matplotlib, of the extra `study`
 
     targets = parse_targets(options.target) if options.target else None

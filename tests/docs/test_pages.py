@@ -59,7 +59,7 @@ SMALLER = {
     r"(run deploy/jobs/benchmark.yaml)": r"\1 --scenes 24",
     r"^\./verso test$": "./verso test tests/test_layers.py",
     r"tests/hard_cases": "tests/test_layers.py",
-    r"--scenes 64 --memory 2000 --workers 2": "--scenes 2 --memory 8",
+    r"--scenes 64 --workers 2": "--scenes 2",
     r"(\./verso tradeoff .*)": r"\1 --budget 60s --knobs step",
     r"(run deploy/jobs/captures.yaml)": r"\1 --scenes 1 --set captures.simulate.views=8 " + TINY,
     r"--views 40 --category mug": f"--views 10 --category mug {TINY}",
@@ -165,7 +165,7 @@ def checkout_at(root: Path) -> Path:
             (root / ".venv" / entry.name).symlink_to(entry)
     stamp = re.search(r"^stamp_of\(\) \{.*?^\}\n", (root / "verso").read_text(), re.MULTILINE | re.DOTALL)
     assert stamp is not None
-    for name in ("base", "dev", "study", "audit", "pathtraced"):
+    for name in ("base", "dev", "study", "pathtraced"):
         script = f'root={root} venv={root}/.venv; {stamp[0]} stamp_of {name} >"$venv/verso-{name}"'
         subprocess.run(["bash", "-c", script], check=True)
     write_mesh(root / "meshes/mug/a.obj", cup())

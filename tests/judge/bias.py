@@ -18,8 +18,8 @@ from schemas.base import Array, Pose
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, ObjectStart
-from services.read.referee import simulate
 from tests.judge.piles import catalogue_of
+from tests.judge.referee import simulate
 from workers.geometry.frames import transform
 from workers.physics.effects import called_for
 from workers.physics.pour import NOTHING_MORE
@@ -64,7 +64,7 @@ def try_both(job: Job, scene_id: int) -> Both:
     chance = SceneChance(job.seed, scene_id)
     plan = plan_scene(job, catalogue_of(job.model_dump_json()), chance)
     top_m = plan.table.top.height_m
-    after, _ = simulate(plan, [one.T_world_obj for one in plan.objects], job.physics, FALL_S, STEP_S)
+    after = simulate(plan, [one.T_world_obj for one in plan.objects], job.physics, FALL_S, STEP_S)
     dropped = [
         lying(scene_id, one, T, top_m, bool(transform(T, one.hull.vertices)[:, 2].max() < top_m))
         for one, T in zip(plan.objects, after, strict=True)

@@ -17,7 +17,6 @@ import yaml
 
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from services.read.referee import is_installed
 from tests.judge.scenes import CRASHED, Asked, Outcome, try_scene
 from tests.judge.table import describe, is_within, summary, tabulate
 from workers.assets.catalogue import Catalogue, open_catalogue
@@ -61,9 +60,7 @@ def main() -> int:
             "assets": {**document["assets"], "tables": [{"source": "procedural", "kind": given.table}]},
         }
     job = Job.model_validate(document | {key: value for key, value in changes.items() if value is not None})
-    if given.mujoco and not is_installed():
-        print("NOT HELD IN MUJOCO: `mujoco` is not installed here, so its columns stay empty", file=sys.stderr)
-    asked = Asked(given.recheck, given.mujoco and is_installed())
+    asked = Asked(given.recheck, given.mujoco)
     make: Callable[[int], Outcome] = functools.partial(_try_hollow if given.hollows else try_pile, job, asked)
     outcomes = []
     with ProcessPoolExecutor(given.processes) as pool:

@@ -12,8 +12,8 @@ from schemas.errors import SceneError
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
 from schemas.scene.shape import Mesh
-from services.read.referee import hold_scene
 from tests.judge.judge import Thing, Verdict, judge
+from tests.judge.referee import hold_scene
 from workers.geometry.frames import transform
 from workers.physics import settle
 from workers.physics.effects import called_for
@@ -98,7 +98,8 @@ def try_scene(
     if asked.recheck:
         again = recheck_scene(plan, rest, physics, effects, FINEST).settled
         moved = max(one.recheck_move_mm or 0.0 for one in again), max(one.recheck_turn_deg or 0.0 for one in again)
-    held = hold_scene(plan, rest.settled, physics) if asked.mujoco else None
+    poses = [one.T_world_obj for one in rest.settled]
+    held = (hold_scene(plan, poses, physics) if asked.mujoco else None) or (None, None)
     return Outcome(
         scene_id,
         len(plan.objects),
@@ -111,8 +112,8 @@ def try_scene(
         judge_s=judge_s,
         moved_mm=moved[0],
         turned_deg=moved[1],
-        mujoco_mm=None if held is None else held.moved_mm,
-        mujoco_deg=None if held is None else held.turned_deg,
+        mujoco_mm=held[0],
+        mujoco_deg=held[1],
         redrawn=sum(one.redraws for one in plan.objects) - sum(one.redraws for one in drawn.objects),
     )
 

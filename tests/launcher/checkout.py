@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-EXTRAS = ("pathtraced", "study", "audit")
+EXTRAS = ("pathtraced", "study")
 LOCKS = ("requirements.lock", *(f"requirements-{name}.lock" for name in (*EXTRAS, "dev")))
 
 # Answers the launcher's probe, makes a `.venv` that links back to itself, and logs every call of pip. PyBullet has no wheel.

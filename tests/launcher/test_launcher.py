@@ -41,7 +41,6 @@ def test_a_changed_lock_updates_the_environment_in_place(checkout, changed):
         ("requirements-dev.lock", ["test", "--ci"]),
         ("requirements-pathtraced.lock", ["extra", "pathtraced"]),
         ("requirements-study.lock", ["extra", "study"]),
-        ("requirements-study.lock", ["bench"]),
         ("requirements-study.lock", ["tradeoff", "job.yaml"]),
     ],
 )
@@ -53,7 +52,7 @@ def test_a_further_lock_is_installed_with_the_first_command_that_needs_it_and_ma
     for change in (False, True):
         if change:
             (checkout.root / lock).write_text("something else\n")
-        for words in (("--version",), ("status", "bench"), ("run", "test")):
+        for words in (("--version",), ("status", "tradeoff"), ("run", "test")):
             assert checkout.run(*words)[0] == 0 and checkout.calls() == []
         assert checkout.run(*command)[0] == 0
         assert checkout.calls() == [locked(lock, checkout.root)]
@@ -63,7 +62,7 @@ def test_a_further_lock_is_installed_with_the_first_command_that_needs_it_and_ma
 def test_extras_start_no_command_and_bring_the_library_that_their_package_lacks(checkout):
     code, out, err = checkout.run("extra", "study")
     assert (code, out) == (0, "") and "study is installed" in err
-    assert "what plots and measures for bench and tradeoff" in checkout.run("bench")[2] + err
+    assert "what plots and measures for tradeoff" in checkout.run("tradeoff", "job.yaml")[2] + err
     checkout.calls()
     checkout.fault("no-libatomic1")
     code, _, err = checkout.run("extra", "pathtraced")
@@ -173,15 +172,15 @@ def test_the_locks_pin_everything_by_hash_name_no_index_and_agree():
         assert all("==" in pin and pin.endswith("\\") for pin in named) and not any("://" in line for line in lines)
         assert all(line.strip().startswith("--hash=sha256:") for line in lines if line.startswith(" "))
         pins.append(dict(pin.rstrip(" \\").split("==") for pin in named))
-    runtime, traced, study, audit, development = pins
+    runtime, traced, study, development = pins
     for lock in pins[1:]:
         shared = runtime.keys() & lock.keys()
         assert lock and {name: runtime[name] for name in shared} == {name: lock[name] for name in shared}
-    assert (traced | study | audit).items() <= development.items()
+    assert (traced | study).items() <= development.items()
     assert runtime.keys() & development.keys() and not traced.keys() & runtime.keys()
     tree = tomllib.loads((ROOT / "pyproject.toml").read_text())
     extras = tree["project"]["optional-dependencies"]
     assert extras == {name: tree["dependency-groups"][name] for name in extras}
-    assert extras["pathtraced"] == [f"mitsuba=={traced['mitsuba']}"] and extras["audit"] == ["mujoco"]
+    assert extras["pathtraced"] == [f"mitsuba=={traced['mitsuba']}"]
     assert set(extras["study"]) <= study.keys() and not set(extras["study"]) & runtime.keys()
     assert not set(extras["study"]) & {name.partition("==")[0] for name in tree["project"]["dependencies"]}

@@ -23,6 +23,6 @@ FULL_SIZE = {
 @pytest.fixture(scope="package")
 def few(tmp_path_factory) -> LocalStore:
     """A few pairs in the article's size with targets, half of them to train on."""
-    targets = {"views": ["normals"], "shape": ["volume"], "points": 4000}
+    targets = {"shape": ["volume"], "points": 4000}
     out = tmp_path_factory.mktemp("few")
     return make_dataset(out, scenes=6, categories=["mug", "box"], targets=targets, **FULL_SIZE)[0]

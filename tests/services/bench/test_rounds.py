@@ -3,6 +3,7 @@ camera, because no time is asserted."""
 
 import json
 import os
+import pickle
 import shutil
 from statistics import median
 
@@ -14,21 +15,13 @@ import trimesh
 from schemas.dataset.commit import Span
 from schemas.environment import FOR_SPEED
 from schemas.errors import MachineError, OutputError, RunError, SceneError
-from services.bench import sides
-from services.bench.measure import bench_folder, make_in_memory, open_workbench, run_process, sample_memory
-from services.bench.sides import (
-    choose_encoders,
-    encoders,
-    hand_over,
-    images_of,
-    kind_of,
-    looks_of,
-    run_lower_bound,
-    start_script,
-)
+from services.bench import script as module
+from services.bench.measure import Part, bench_folder, make_in_memory, open_workbench, run_lower_bound, run_part
+from services.bench.script import hand_over, start_script
 from services.cli.main import main
 from services.job.job_file import validate_job
 from tests.datasets import SMALL as ANY_SMALL
+from workers.pool import Pool
 from workers.store.commit import committed_files, read_record
 
 SMALL = {**ANY_SMALL, "run": {"range_size": 2}}
@@ -48,33 +41,38 @@ def ours(tmp_path_factory):
 def given(ours, tmp_path_factory):
     """The range's scenes as the script gets them."""
     folder = tmp_path_factory.mktemp("given")
-    return [hand_over(scene, JOB, folder / str(number)) for number, scene in enumerate(ours[2])]
+    return [hand_over(scene, JOB, folder) for scene in ours[2]]
 
 
 # ---------------------------------------------------------------------------------------------- ours
 
 
-def test_the_scenes_in_memory_are_those_of_the_committed_files(ours, monkeypatch):
+def test_the_scenes_in_memory_are_those_of_the_committed_files(ours):
     bench, span, made = ours
     assert [scene.plan.scene_id for scene in made] == list(span.scene_ids) and bench.next_scene == span.stop
     assert all((bench.store.root / path).read_bytes() == data for path, data in bench.files(span).items())
 
+
+def test_where_no_scene_can_be_made_the_reason_is_told(ours, tmp_path, monkeypatch):
     def fail(*_: object) -> None:
         raise SceneError("physics", "fell off")
 
-    monkeypatch.setattr("services.bench.measure.make_scene", fail)
-    with pytest.raises(RunError, match=r"none of the scenes 0 to 3 could be made: .*fell off"):
-        make_in_memory(bench.context, span)
+    monkeypatch.setattr("workers.shard.run_shard.make_scene", fail)
+    bench = open_workbench(JOB, tmp_path, tmp_path / "out")
+    with pytest.raises(RunError, match=r"none of the scenes 0 to 1 could be made: .*physics"):
+        bench.run(bench.next_span(2))
 
 
-def test_a_process_makes_every_range_of_its_span(tmp_path):
-    lap = run_process(JOB, tmp_path, tmp_path / "out", Span(start=0, stop=3))
-    assert lap.scenes == 3 and lap.cpu_s > 0
-    commits = (tmp_path / "out" / "manifest" / "_commits").glob("*.json")
-    assert sorted(int(path.stem) for path in commits) == [0, 2]
-    samples, peak_mb = sample_memory(JOB, tmp_path, tmp_path / "memory", 3)
-    assert [sample.scenes for sample in samples] == [2, 1]
-    assert peak_mb > 0.0 and all(sample.mb > 0.0 and sample.cpu_s > 0.0 for sample in samples)
+def test_a_plain_process_makes_every_range_of_its_span_on_its_core(tmp_path):
+    before = os.sched_getaffinity(0)
+    parts = [Part(JOB, tmp_path, tmp_path / str(n), Span(start=0, stop=3), min(before)) for n in range(2)]
+    with Pool(run_part, processes=2) as pool:
+        laps = [pickle.loads(answer) for _, answer in pool.run(parts)]
+    assert [lap.scenes for lap in laps] == [3, 3] and all(0 < lap.cpu_s <= lap.wall_s for lap in laps)
+    for part in parts:
+        commits = (part.out / "manifest" / "_commits").glob("*.json")
+        assert sorted(int(path.stem) for path in commits) == [0, 2]
+    assert os.sched_getaffinity(0) == before
 
 
 def test_a_folder_that_cannot_be_made_is_told_of(tmp_path):
@@ -97,8 +95,6 @@ def test_the_script_is_given_our_poses_shapes_and_images(ours, given):
         assert (mesh.faces == start.asset.shape.mesh.faces).all()
         images = [image["path"] for pair in told["pairs"] for image in pair["images"]]
         assert images and all((bench.store.root / image).is_file() for image in images)
-    flat = JOB.model_copy(update={"render": JOB.render.model_copy(update={"tier": "flat"})})
-    assert list(looks_of(JOB)) == ["plain", "same"] and list(looks_of(flat)) == ["plain"]
 
 
 def pictures(folder) -> dict[str, np.ndarray]:
@@ -120,7 +116,9 @@ def test_script_and_ours_make_the_same_images_with_the_same_floor_and_shadows(ou
     root = ours[0].store.root
     for path in given:
         shutil.copytree(path.parent, tmp_path / "painted" / path.parent.name)
-        cv2.imwrite(str(tmp_path / "painted" / path.parent.name / "floor.png"), np.full((8, 8, 3), 128, np.uint8))
+        floor = trimesh.load(path.parent / "floor.glb", force="mesh")
+        floor.visual = trimesh.visual.ColorVisuals(floor, face_colors=(128, 128, 128, 255))
+        floor.export(tmp_path / "painted" / path.parent.name / "floor.glb")
     with start_script() as script:
         for look in ("plain", "same"):
             assert script.run(given, tmp_path / look, look).scenes == len(given) == 4
@@ -147,7 +145,7 @@ def test_a_script_that_dies_says_why_and_none_inherits_what_is_set_for_our_speed
     monkeypatch.setenv("OTHER", "kept")
     for set_to, seen in ((value, None), ("glibc.cpu.hwcaps=-AVX2", "glibc.cpu.hwcaps=-AVX2")):
         monkeypatch.setenv(name, set_to)
-        inherited = sides._plain_environment()
+        inherited = module._plain_environment()
         assert (inherited.get(name), inherited["OTHER"]) == (seen, "kept")
 
 
@@ -157,33 +155,13 @@ def test_a_script_that_dies_says_why_and_none_inherits_what_is_set_for_our_speed
 def test_the_lower_bound_writes_the_bytes_that_ours_committed(ours, tmp_path):
     bench, span, made = ours
     files = bench.files(span)
-    chosen = choose_encoders(images_of(files))
-    assert set(chosen) == {"rgb", "uint16", "uint8"}
-    lap = run_lower_bound(bench.context.renderer, made, files, chosen, tmp_path / "floor")
-    assert list(lap.stages_s) == ["draw", "encode", "write"]
+    lap = run_lower_bound(bench.context.renderer, made, files, tmp_path / "floor")
+    assert list(lap.stages_s) == ["draw", "encode", "write"] and all(0 < s <= lap.wall_s for s in lap.stages_s.values())
     assert lap.apart_s > 0, "shapes reach the GPU before the clock"
     written = {str(p.relative_to(tmp_path / "floor")): p.read_bytes() for p in (tmp_path / "floor").rglob("*.*")}
     assert written == files
     record = read_record(bench.store, span.start)
     assert sum(map(len, written.values())) == sum(entry.bytes for entry in committed_files(bench.store, record))
-
-
-def test_every_encoder_that_may_be_chosen_is_lossless_and_compresses(ours):
-    bench, span, _ = ours
-    images = images_of(bench.files(span))
-    noise = np.random.default_rng(1).integers(0, 65536, (5, 7), np.uint16)
-    kinds = {kind_of(pixels): pixels for pixels, _ in images}
-    assert set(kinds) == {"rgb", "uint16", "uint8"}
-    several = [*kinds.values(), noise, noise.astype(np.uint8)[:1, :1]]
-    for name, encode in encoders().items():
-        encoded = {f"{n}.png": encode(pixels) for n, pixels in enumerate(several)}
-        for pixels, (again, _) in zip(several, images_of(encoded), strict=True):
-            assert pixels.dtype == again.dtype and np.array_equal(pixels, again), name
-    rgb = [one for one in images if kind_of(one[0]) == "rgb"]
-    _, encode = choose_encoders(rgb)["rgb"]
-    assert sum(len(encode(pixels)) for pixels, _ in rgb) <= 2 * sum(size for _, size in rgb)
-    with pytest.raises(ValueError, match="empty"):  # not one of them is that small
-        choose_encoders([(pixels, size // 100) for pixels, size in rgb])
 
 
 # ---------------------------------------------------------------------------------------------- the command
@@ -196,10 +174,10 @@ def test_bench_prints_one_object_last_and_leaves_nothing(tmp_path, capsys):
     before = os.sched_getaffinity(0)
     assert main(["bench", str(job), "--scenes", "3", "--folder", str(folder), "--json"]) == 0
     figures = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert figures["rounds"] == 2 and figures["scenes"] == 3
-    for name in ("script_plain", "script_same_look"):
-        ratio = figures["others"][name]["ratio"]
+    assert figures["rounds"] == 2 and figures["scenes"] == 3 and figures["job"] == "small"
+    for look in ("plain", "same"):
+        ratio = figures["script"][look]["ratio"]
         assert ratio["least"] <= ratio["median"] <= ratio["most"]
-        assert {"physics", "scene", "render", "projection", "write"} <= set(figures["others"][name]["stages_ms"])
+        assert {"physics", "scene", "render", "projection", "write"} <= set(figures["script"][look]["stages_ms"])
     assert {"render", "encode", "write", "commit", "physics"} <= set(figures["ours"]["stages_ms"])
     assert os.sched_getaffinity(0) == before and list(folder.iterdir()) == []

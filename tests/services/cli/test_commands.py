@@ -95,7 +95,7 @@ REFUSED = (
     (["verify", "nowhere"], ["nowhere", "job.yaml"]),
     (["replay", "nowhere", "x"], ["'x'"]),
     (["status", str(ROOT)], ["job.yaml"]),
-    (["extra", "audit"], ["pip install 'verso-data[audit]'"]),
+    (["extra", "study"], ["pip install 'verso-data[study]'"]),
     (["lock"], ["type ./verso lock there"]),
 )
 

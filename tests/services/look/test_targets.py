@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from schemas.scene.view import MODALITIES, Modality
-from services.look.clouds import INSIDE, OUTSIDE, Cloud, pack_space, read_samples, read_space
-from services.look.contact_sheet import WIDTH, draw_contact_sheet, draw_points
+from services.look.clouds import INSIDE, OUTSIDE, pack_space, read_samples, read_space
 from services.look.pictures import (
     OBJECT_REGIONS,
     picture_of_codes,
@@ -129,17 +128,3 @@ def test_the_page_says_which_samples_are_damaged_and_shows_the_rest(sampled, tmp
     space = read_space(store, 0)
     assert re.fullmatch(told, space.missing) and [cloud.role for cloud in space.clouds] == ["input", "mirror"]
     assert space.bodies and re.search(told, space_html([space], "{}"))
-
-
-def test_the_contact_sheet_has_every_target_and_a_slice_of_the_volume(sampled):
-    near, far = np.array([[0.0, 0, 1], [1, 0, 2]]), np.array([[0.0, 0, 3], [1, 1, 2]])
-    clouds = [Cloud("a", near, np.full((2, 3), 9, np.uint8), 1.0), Cloud("b", far, np.full((2, 3), 99, np.uint8), 1.0)]
-    seen = draw_points(clouds, np.eye(4), (100, 100))
-    assert seen[4, 4].tolist() == [9] * 3 and seen[96, 96].tolist() == [99] * 3 and seen[4, 96].tolist() == [9] * 3
-    middle = draw_points(clouds, np.eye(4), (100, 100), 0.1)
-    assert middle[4, 4].tolist() not in ([9] * 3, [99] * 3) and middle[4, 96].tolist() == [9] * 3
-    sheet = np.asarray(draw_contact_sheet(sampled, 0, "mirror"))
-    colors = set(map(tuple, sheet.reshape(-1, 3).tolist()))
-    stored = cv2.imread(str(sampled.root / "mug/patches/normals00001obj0.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] >> 8
-    assert sheet.shape[1] == WIDTH and {(10, 200, 30), INSIDE, OUTSIDE} <= colors
-    assert set(map(tuple, stored.reshape(-1, 3).tolist())) <= colors

@@ -12,20 +12,15 @@ import pytest
 import workers.scene.effects
 import workers.scene.pairs
 from schemas.dataset.layout import FINGERPRINT_FILE
-from schemas.scene.scene import Placed, PosedScene, Settled
+from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.view import Camera, Intrinsics, View
 from services.cli.main import main
 from services.job.job_file import validate_job
 from services.read import audit as module
 from services.read.audit import Audit, Motion, audit, compare_masks, describe_audit, move_between, shift_px
-from services.read.referee import Held, describe_held, hold_scene
 from tests.datasets import run_here
 from tests.effects.scenes import SMALL, merged
-from tests.hard_cases.bodies import built_in, cube
-from tests.hard_cases.drops import level
-from tests.hard_cases.groups import Group, put, stack, together, tray
 from tests.kit.shapes import box, shape_of
-from tests.physics.settling import PHYSICS, scene_of
 from tests.workers.render.random_scenes import APPEARANCE, floor
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
@@ -41,12 +36,6 @@ TWO = JOB.model_copy(update={"scenes": 2})
 def made(tmp_path_factory) -> LocalStore:
     """Four scenes, made in this process."""
     return run_here(JOB, tmp_path_factory.mktemp("audit") / "small")[0]
-
-
-@pytest.fixture(autouse=True)
-def no_referee(monkeypatch) -> None:
-    """Holding a scene in MuJoCo takes seconds."""
-    monkeypatch.setattr(module, "is_installed", lambda: False)
 
 
 @contextlib.contextmanager
@@ -75,7 +64,6 @@ def test_a_healthy_dataset_passes_and_each_effect_that_was_left_out_is_proven(ma
     assert all(tally.proven == tally.skipped for tally in found.effects.values())
     assert found.forced == 8 and found.bytes > 4 * 10_000 and found.files >= 4 * 20
     assert found.motion == Motion(0.0, 0.0, 0, 0)
-    assert "MuJoCo is not installed" in "\n".join(describe_audit(found))
 
 
 def test_what_moves_too_far_is_named_and_within_the_bound_changes_masks_at_silhouettes_alone(made):
@@ -168,48 +156,3 @@ def test_pixels_that_a_moved_box_uncovers_lie_within_its_motion_and_others_are_c
     region = seen.region.copy()
     region[120, 150:157] = 1
     assert compare_masks(renderer, before, before, dataclasses.replace(view, region=region)) == (7, 7)
-
-
-# ------------------------------------------------------------------------------- MuJoCo as a referee
-
-
-def held(group: Group, *moved_m: tuple[float, float, float]) -> Held | None:
-    """The group held from where it starts, its objects moved first."""
-    settled = []
-    for start, by in zip(group.starts, moved_m, strict=True):
-        T = np.array(start.T_world_obj)
-        T[:3, 3] += by
-        settled.append(Settled(T, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "mesh"))
-    return hold_scene(scene_of(group.starts, group.table), settled, PHYSICS)
-
-
-@pytest.mark.minute
-def test_what_rests_stays_to_some_micrometres_and_what_does_not_falls():
-    pytest.importorskip("mujoco")
-    cubes = stack(cube(0.05), cube(0.05))
-    found = held(cubes, (0.0, 0.0, -0.0005), (0.0, 0.0, -0.001))
-    assert found.moved_mm < 0.02 and found.turned_deg < 0.01
-    assert found.scenes == 1 and found.shapes == {"as meshes, being convex": 2}
-    assert held(stack(cube(0.05)), (0.0, 0.0, 0.0995)).moved_mm == pytest.approx(100.0, abs=0.1)  # in the air
-    assert held(cubes, (0.0, 0.0, -0.0005), (0.03, 0.0, -0.001)).moved_mm > 10.0  # beyond the edge
-    found = held(together(level(), [put(built_in("mug"), level(), 0.0)]), (0.0, 0.0, 0.0))
-    assert found.moved_mm < 0.02 and found.shapes == {"as parts from their making, not being convex": 1}
-    table = tray()  # not convex
-    assert held(together(table, [put(cube(0.05), table, 0.0)]), (0.0, 0.0, 0.0)) is None
-
-
-def test_where_mujoco_is_installed_it_holds_every_scene_and_the_figures_are_told(made, monkeypatch):
-    given, convex = [], "as meshes, being convex"
-
-    def hold_one(plan, settled, physics):
-        given.append((len(plan.objects), len(settled), physics))
-        return Held(0.125 * len(given), 0.5, 1, {convex: len(settled)})
-
-    monkeypatch.setattr(module, "is_installed", lambda: True)
-    monkeypatch.setattr(module, "hold_scene", hold_one)
-    found = run_audit(made)
-    assert given == [(1, 1, JOB.physics)] * 2 and found.faults == []
-    assert found.held == Held(0.25, 0.5, 2, {convex: 2})
-    told = "\n".join(describe_audit(found))
-    assert "MuJoCo held 2 scenes for 1 s: moved at most 0.2500 mm, turned at most 0.50000 degrees" in told
-    assert f"(2 objects {convex})" in told and "not convex" in describe_held(Held())

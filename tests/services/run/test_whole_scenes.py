@@ -241,7 +241,7 @@ def test_what_a_job_switches_off_is_not_there_and_nothing_else_changes(full, nam
     merged = MergeResult(digest, True, dict(success["scenes"]), dict(success["rows"]))
     card = describe_dataset(record, open_context(record).catalogue, merged, fingerprint)
     assert told in next(line for line in card.splitlines() if line.startswith("| views of each pair"))
-    with pytest.raises(InputError, match="is off"):
+    with pytest.raises(InputError, match="compares whole pairs"):
         refuse_unmatched(validate_job({"name": "t", **changes}, "t"))
     assert replay_scene(store, 1).differences == ()
     (store.root / "job.yaml").write_text((full.root / "job.yaml").read_text())

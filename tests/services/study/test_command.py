@@ -1,6 +1,7 @@
 """`verso tradeoff` from the command line to the page: small, stopped and gone on with, asked for what cannot be."""
 
 import json
+import re
 from functools import reduce
 from pathlib import Path
 
@@ -211,3 +212,14 @@ def test_captures_without_truth_and_targets_that_a_job_cannot_have_are_refused()
     with pytest.raises(InputError, match=r"extra pathtraced"):
         refuse_unmeasured(Job(name="t"), {"flip": 0.1}, "`./verso extra pathtraced`")
     refuse_unmeasured(Job(name="t"), {"edge_flip": 0.1, "pose_mm": 0.1}, None)
+
+
+def test_without_the_extra_the_command_ends_with_one_message_before_anything_is_made(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["tradeoff", TABLETOP, "--out", "OUT", "--json"]
+    for module, package in command.PACKAGES.items():
+        monkeypatch.setattr(command, "find_spec", lambda name, module=module: None if name == module else object())
+        assert main(words) == 1
+        printed = capsys.readouterr()
+        assert re.fullmatch(rf"[^\n]*needs {package}: .*extra study.*requirements-study\.lock[^\n]*\n", printed.err)
+        assert json.loads(printed.out)["kind"] == "MachineError" and list(tmp_path.iterdir()) == []

@@ -1,15 +1,10 @@
-"""What the two target examples give a network, their baselines and their scores, without PyTorch."""
+"""What the occupancy example gives a network, its baselines and its score, without PyTorch."""
 
-from types import SimpleNamespace
-
-import normals
 import numpy as np
 import occupancy
 import pytest
 
-from schemas.scene.view import Intrinsics
 from services.dataset.dataset import open_dataset
-from services.dataset.view import Pixels
 
 
 @pytest.fixture(scope="module")
@@ -72,47 +67,3 @@ def test_iou_is_one_for_the_truth_and_falls_when_answers_are_shuffled(shapes):
         assert occupancy.iou(shuffled, one.inside) == pytest.approx(
             share / (2 - share), abs=0.04
         )  # of independent draws
-
-
-@pytest.mark.parametrize("size", normals.WINDOWS.values())
-def test_planes_fitted_to_the_depth_of_two_planes_have_their_normals_up_to_the_step_between_them(size):
-    k = Intrinsics(width=64, height=48, fx=200.0, fy=150.0, cx=30.0, cy=20.0)
-    y, x = np.mgrid[:48, :64] + 0.5
-    rays = np.stack([(x - k.cx) / k.fx, (y - k.cy) / k.fy, np.ones_like(x)], axis=2)
-    left, right = np.array([0.3, -0.2, 1.0]), np.array([-0.4, 0.5, 1.0])
-    depth = np.where(x < 32, 1 / (rays @ left), 2 / (rays @ right))
-    depth[10, 10] = 0
-    found = normals.normals_of_depth(
-        SimpleNamespace(camera=SimpleNamespace(intrinsics=k)), depth.astype(np.float32), size
-    )
-    expected = np.where(x[..., None] < 32, -left / np.linalg.norm(left), -right / np.linalg.norm(right))
-    expected[10, 10] = -rays[10, 10] / np.linalg.norm(rays[10, 10])
-    np.testing.assert_allclose(found, expected, atol=2e-4)
-
-
-def test_normals_of_exact_depth_are_nearly_the_stored_ones_and_what_goes_in_holds_nothing_of_them(pairs, monkeypatch):
-    examples = [normals.make_example(pair) for pair in pairs]
-    for pair, one in zip(pairs, examples, strict=True):
-        assert one.features.shape == (normals.CHANNELS, *one.mask.shape) and one.mask.any()
-        if pair.category == "box":
-            assert normals.score(normals.errors_deg(one.baselines["planes"], one))["median"] < 3
-    monkeypatch.setattr(Pixels, "normals", lambda self: np.zeros((*self.depth().shape, 3), np.float32))
-    for pair, one in zip(pairs, examples, strict=True):
-        blind = normals.make_example(pair)
-        assert np.array_equal(blind.features, one.features) and not blind.mask.any()
-
-
-def test_scores_of_normals_are_those_of_known_angles(pairs):
-    one = normals.make_example(pairs[0])
-    assert normals.score(normals.errors_deg(one.truth, one)) == {
-        "mean": 0, "median": 0, "within 11.25": 1, "within 22.5": 1, "within 30": 1,
-    }  # fmt: skip
-    axis = np.cross(one.truth, [1.0, 2.0, 3.0])
-    axis /= np.maximum(np.linalg.norm(axis, axis=2, keepdims=True), 1e-9)
-    turned = one.truth * np.cos(np.radians(20)) + np.cross(axis, one.truth) * np.sin(np.radians(20))
-    found = normals.score(normals.errors_deg(turned, one))
-    assert found["mean"] == pytest.approx(20, abs=0.01) == found["median"]
-    assert (found["within 11.25"], found["within 22.5"], found["within 30"]) == (0, 1, 1)
-    other = np.zeros_like(one.truth)
-    other[one.mask] = np.random.default_rng(1).permutation(one.truth[one.mask])
-    assert normals.score(normals.errors_deg(other, one))["mean"] > 20
