@@ -22,32 +22,6 @@ OTHER_WORLD = frozenset(
 )
 """Knobs whose cost is shown and which are never recommended: they make another world, another camera or other files."""
 
-FREE: Mapping[str, str] = {
-    "verso name seed scenes first_scene preset": "says which scenes",
-    "run output check": "costs no setting of a scene anything, or is not measured",
-    "pairs_per_scene objects_per_scene categories": "what is in a scene: twice as much takes about twice as long",
-    "assets.objects assets.tables assets.split assets.limits assets.shell_kg_m2": "which shapes",
-    "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m start.max_redraws": "where things begin",
-    "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
-    "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
-    "targets.smooth targets.layers targets.shape targets.points": "which files; their time is in the table of timings",
-    "cameras.orbit cameras.depth cameras.mirror.enabled cameras.mirror.T_z_m": "where cameras stand",
-    "images.depth_range_m images.patch images.projection.enabled": "which files",
-    "render.rgb render.path_bounces": "a whole image, or of the path-traced tier alone",
-    "captures.source captures.folders captures.category captures.board captures.most_views": "what is captured",
-    "captures.simulate.distance_m captures.simulate.inclination_rad captures.simulate.roll_deg": "where views are",
-    "captures.simulate.tier captures.simulate.depth_noise captures.simulate.rgb_noise captures.simulate.motion_blur "
-    "captures.simulate.exposure captures.simulate.distortion captures.simulate.hidden_markers captures.simulate.print_scale "
-    "captures.simulate.registration_error captures.simulate.tone_curve captures.simulate.sharpen "
-    "captures.simulate.rolling_shutter captures.simulate.jpeg": "the simulated camera, which a real one has anyway",
-    "captures.estimation.compare captures.estimation.min_markers captures.estimation.max_reprojection_px "
-    "captures.estimation.corner_px captures.estimation.depth_sigma_m captures.estimation.trust "
-    "captures.estimation.calibrate": "no time",
-    "captures.fusion.max_edge_deg captures.fusion.board_clearance_m captures.fusion.min_views "
-    "captures.synthesis.fill_px": "no time",
-}
-"""Keys of a job, or branches of keys, that no knob turns, and why. Every other key that costs time is a row of `knobs_of`."""
-
 VIEWS = (4, 6, 10, 20, 40)
 """Numbers of views, as far as the job's captures have as many."""
 
@@ -80,7 +54,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
             "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
             "image_scale": _values("captures.simulate.image_scale", (0.25, 0.5, 1.0)),
         }
-        return tuple(Knob(name, "capture", tuple(values)) for name, values in simulated.items())
+        return tuple(Knob(name, tuple(values)) for name, values in simulated.items())
     speed, spin = "physics.rest.speed_mm_s", "physics.rest.spin_rad_s"
     physics = {
         "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
@@ -108,15 +82,15 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         for size, removed in itertools.product((1, 3, 5), (False, True))
     ]
     return (
-        *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
-        Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
-        Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
-        Knob("pivot_depth", "mirror", _pivot_depths()),
-        Knob("splat", "mirror", tuple(splats)),
-        *(Knob(name, "labels", values) for name, values in sensors.items()),
-        Knob("targets", "labels", tuple(_targets())),
-        Knob("png_level", "labels", tuple(_values("images.png_level", (0, 1, 2, 6, 9)))),
-        Knob("colour", "colour", _tiers()),
+        *(Knob(name, tuple(values)) for name, values in physics.items()),
+        Knob("size", tuple(size_value(job, width) for width in WIDTHS)),
+        Knob("units", tuple(_values("images.depth_units_per_m", units))),
+        Knob("pivot_depth", _pivot_depths()),
+        Knob("splat", tuple(splats)),
+        *(Knob(name, values) for name, values in sensors.items()),
+        Knob("targets", tuple(_targets())),
+        Knob("png_level", tuple(_values("images.png_level", (0, 1, 2, 6, 9)))),
+        Knob("colour", _tiers()),
     )
 
 
