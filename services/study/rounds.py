@@ -21,6 +21,9 @@ Targets = Mapping[str, float]
 MOST: Mapping[Part, int] = {"rest": 512, "again": 64, "draw": 64, "colour": 8, "capture": 32}
 """The most scenes of each part."""
 
+SHARES: Mapping[Part, float] = {"rest": 3.0, "again": 1.0, "draw": 2.0, "colour": 1.0, "capture": 1.0}
+"""How the time of a round is shared among the parts that are not decided."""
+
 LEAST = 8
 """Nothing is out before it was measured in so many scenes."""
 

@@ -19,7 +19,7 @@ from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, r
 from services.study.knobs import REFERENCES, joined
 from services.study.measure import Answer, Unit, answer_unit
 from services.study.model import OWN, Figure, Plan, Proof, Row, Setting, Study
-from services.study.rounds import MOST, Wanted, missing, next_round, promising, undecided, why_out
+from services.study.rounds import MOST, SHARES, Wanted, missing, next_round, promising, undecided, why_out
 from services.study.table import AGAIN, TIMED, Part, Parts, Table, changes_by_part, figures_of, part_of, unit_name
 from workers.pool import Answers, Ended, Pool
 
@@ -272,16 +272,16 @@ LEVEL_OF_CHOICE = 8
 def run_rounds(bench: Measurement) -> None:
     """Rounds of twice as many scenes, until every part is decided or the budget's share is spent.
 
-    A round takes half of the time that is left at most, and each part its even share of that.
+    A round takes half of the time that is left at most, and each part its share of that.
     """
     levels, share, first = dict.fromkeys(bench.parts.measured, 2), bench.race_share(), bench.plan.job.first_scene
     combined = False
     while levels and bench.left_s(share) > 0.0:
-        table, allowed_s = bench.table(), bench.left_s(share) * bench.plan.processes / 2 / len(levels)
-        wanted: list[Wanted] = []
+        table, allowed_s = bench.table(), bench.left_s(share) * bench.plan.processes / 2
+        weights, wanted = sum(SHARES[part] for part in levels), list[Wanted]()
         for part, level in list(levels.items()):
             scenes = range(first, first + min(level, MOST[part]))
-            some, whole = next_round(table, part, bench.targets, scenes, allowed_s)
+            some, whole = next_round(table, part, bench.targets, scenes, allowed_s * SHARES[part] / weights)
             wanted += some
             decided = level >= MOST[part] or (level > LEVEL_OF_CHOICE and not undecided(table, part, bench.targets))
             if decided if whole else not some:
