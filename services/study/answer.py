@@ -14,9 +14,10 @@ from services.study.choose import (
     own_row,
     recommend,
 )
+from services.study.knobs import Part
 from services.study.model import ERRORS, NEGLIGIBLE, Proof, Row, Study, amount, listed, short, times
 from services.study.rounds import MOST, undecided
-from services.study.table import Part, Table
+from services.study.table import Table
 
 
 def answer(study: Study, rows: Sequence[Row], targets: Targets | None = None) -> str:

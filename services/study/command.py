@@ -21,13 +21,12 @@ from services.job.job_file import load_job, read_tree
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.study.captures import check_captures
-from services.study.choose import Targets, recommend
+from services.study.choose import Targets, parse_targets, recommend, refuse_unmeasured
 from services.study.colour import colour_truth_missing
 from services.study.knobs import apply, choose_knobs, job_tree_with, knobs_of, preset_settings, settings_of
 from services.study.model import Plan, Row, Study
 from services.study.page import describe_proof, write_page, write_tables
 from services.study.study import OTHERS, Journal, run_study
-from services.study.targets import parse_targets, refuse_unmeasured
 from workers.assets.catalogue import open_catalogue
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier

@@ -1,8 +1,9 @@
-"""The knobs that a study turns, of scenes and of captures, and the settings made of them. Pure."""
+"""The knobs that a study turns, of scenes and of captures, the settings made of them, and the parts that these change. Pure."""
 
 import copy
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, get_args
 
@@ -15,7 +16,7 @@ from schemas.job.job import PRESETS, Job, kind_of
 from schemas.job.keys import set_key
 from schemas.job.views import ViewTarget
 from services.job.job_file import describe_fault
-from services.study.model import OWN, Changes, Knob, Setting, Value
+from services.study.model import ERRORS, OWN, Changes, Group, Knob, Setting, Value
 
 OTHER_WORLD = frozenset(
     {"friction", "density", "if_lost", "depth_noise", "rgb_noise", "distortion", "exposure", "targets"}
@@ -202,3 +203,73 @@ def job_tree_with(changes: Changes, tree: Mapping[str, Any] | None = None) -> di
     for path, value in changes.items():
         set_key(made, path, to_jsonable_python(value))
     return made
+
+
+# ---------------------------------------------------------------------------------------------- parts of a scene
+
+Part = str
+"""rest, again, draw, colour or capture."""
+
+_PART_OF: Mapping[Group, Part] = {
+    "physics": "rest",
+    "labels": "draw",
+    "mirror": "draw",
+    "colour": "colour",
+    "capture": "capture",
+}
+
+AGAIN = frozenset({"moved_mm", "turned_deg"})
+"""Errors that only another release tells, which takes a hundred times as long as the fall: measured where a target asks."""
+
+TIMED: Mapping[Part, Part] = {"colour": "draw", "again": "rest"}
+"""Parts that measure errors and no time, and the part that has the time of their settings."""
+
+AT_REST = ("physics.", "start.", "assets.")
+"""Keys that change how objects rest; every other one changes what is drawn."""
+
+
+def part_of(error: str) -> Part:
+    """The part that measures an error."""
+    return "again" if error in AGAIN else _PART_OF[ERRORS[error].group]
+
+
+def changes_by_part(changes: Mapping[str, Any], parts: Iterable[Part]) -> dict[Part, dict[str, Any]]:
+    """A setting's changes by the parts of a scene, or of a capture, that they change."""
+    belongs = {
+        "rest": lambda key: key.startswith(AT_REST),
+        "again": lambda key: key.startswith(AT_REST),
+        "draw": lambda key: not key.startswith(AT_REST),
+        "colour": lambda key: key.startswith("render."),
+        "capture": lambda key: True,
+    }
+    return {part: {key: value for key, value in changes.items() if belongs[part](key)} for part in parts}
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What is measured: by part the settings, the job itself first, and of each setting of the table its settings by part."""
+
+    measured: Mapping[Part, tuple[Setting, ...]]
+    of: Mapping[str, Mapping[Part, Setting]]
+
+    @classmethod
+    def split(cls, settings: Iterable[Setting], captured: bool, again: bool = False) -> "Parts":
+        """Settings by part; equal changes are measured once, under the name of the first setting that has them."""
+        parts = ("capture",) if captured else ("rest", *(("again",) if again else ()), "draw", "colour")
+        known: dict[tuple[Part, str], Setting] = {}
+        measured: dict[Part, dict[str, Setting]] = {part: {OWN.name: OWN} for part in parts}
+        of: dict[str, dict[Part, Setting]] = {}
+        for setting in settings:
+            of[setting.name] = {}
+            for part, changes in changes_by_part(setting.changes, parts).items():
+                key = part, repr(sorted(changes.items()))
+                alike = known.setdefault(key, Setting(setting.parts, changes) if changes else OWN)
+                measured[part][alike.name] = of[setting.name][part] = alike
+        if not captured:
+            measured["rest"] |= {reference.name: reference for reference in REFERENCES}
+        return cls({part: tuple(some.values()) for part, some in measured.items()}, of)
+
+    @property
+    def timed(self) -> tuple[Part, ...]:
+        """The parts whose times make up a scene's."""
+        return tuple(part for part in self.measured if part not in TIMED)

@@ -44,7 +44,7 @@ class Unit:
     """One scene to measure with these settings on top of a base setting.
 
     `job`: the job as JSON, beside the folder that its paths are of; `scratch`: a folder that all processes share; `part`: one of
-    services/study/table.py; `number`: the scene's place among the measured ones; `limit_s`: seconds of processor
+    services/study/knobs.py; `number`: the scene's place among the measured ones; `limit_s`: seconds of processor
     that one setting may take.
     """
 

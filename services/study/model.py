@@ -73,7 +73,7 @@ class Figure:
     """An error of a setting: its value, its 95 % interval by bootstrap over these scenes, and their number.
 
     The bootstrap knows no scene worse than the worst of its own, so that its upper end tells settings of the same scenes
-    apart, and says little of other scenes: `least` and `most` are the bounds for those (services/study/bounds.py), None where
+    apart, and says little of other scenes: `least` and `most` are the bounds for those (services/study/table.py), None where
     there are no better ones. `less`: whether it is surely less than the job's own in most scenes, None where nothing tells.
     """
 

@@ -12,9 +12,9 @@ from statistics import median
 from typing import NamedTuple
 
 from services.study.choose import AS_CHEAP
-from services.study.knobs import REFERENCES, joined
+from services.study.knobs import REFERENCES, Part, joined, part_of
 from services.study.model import ERRORS, NEGLIGIBLE, OWN, Row, Setting, Verdict
-from services.study.table import Part, Table, part_of
+from services.study.table import Table
 
 Targets = Mapping[str, float]
 

@@ -16,11 +16,11 @@ from schemas.errors import OutputError, RunError, describe_seconds, plural
 from services.run.progress import ProgressLine
 from services.study import answer as words
 from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, recommend, targets_of
-from services.study.knobs import REFERENCES, joined
+from services.study.knobs import AGAIN, REFERENCES, TIMED, Part, Parts, changes_by_part, joined, part_of
 from services.study.measure import Answer, Unit, answer_unit
 from services.study.model import OWN, Figure, Plan, Proof, Row, Setting, Study
 from services.study.rounds import MOST, SHARES, Wanted, missing, next_round, promising, undecided, why_out
-from services.study.table import AGAIN, TIMED, Part, Parts, Table, changes_by_part, figures_of, part_of, unit_name
+from services.study.table import Table, figures_of, unit_name
 from workers.pool import Answers, Ended, Pool
 
 # ---------------------------------------------------------------------------------------------- what was measured before

@@ -19,10 +19,10 @@ from services.study.choose import (
     front,
     next_better,
     own_row,
+    parse_targets,
     recommend,
 )
 from services.study.model import Row, Study, amount, as_often, listed, times
-from services.study.targets import parse_targets
 from tests.services.study.made_up import row, stored, study
 
 OWN = row(depth_mm=0.1, penetration_mm=0.01, mirror_mm=1.0)

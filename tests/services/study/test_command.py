@@ -15,10 +15,10 @@ from services.cli.main import main
 from services.job.job_file import load_job
 from services.study import command
 from services.study.captures import check_captures, errors_of, fewer_views, measure_capture
+from services.study.choose import refuse_unmeasured
 from services.study.measure import Unit, answer_unit
 from services.study.model import Setting
 from services.study.study import HEADER, JOURNAL_FILE, OTHERS, SPENT, Journal
-from services.study.targets import refuse_unmeasured
 from tests.services.cli.test_commands import TABLETOP, told
 from tests.services.study.made_up import read_study
 from workers.assets.catalogue import open_catalogue

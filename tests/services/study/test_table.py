@@ -5,12 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from services.study.bounds import apart, bounds_of_percentile, figure_over_scenes, share
-from services.study.knobs import REFERENCES
+from services.study.knobs import REFERENCES, Parts
 from services.study.model import OWN, Figure, Setting
 from services.study.rounds import LEAST, MOST, OUT_COSTS, OUT_MISSES, Wanted, missing, next_round, undecided, why_out
 from services.study.study import in_turn
-from services.study.table import LEAST_OUTCOMES, Parts, Table, figures_of, unit_name
+from services.study.table import (
+    LEAST_OUTCOMES,
+    Table,
+    apart,
+    bounds_of_percentile,
+    figure_over_scenes,
+    figures_of,
+    share,
+    unit_name,
+)
 
 STEP = Setting((("step", "60"),), {"physics.step_hz": 60})
 FLAT = Setting((("colour", "flat"),), {"render.tier": "flat"})
