@@ -7,7 +7,6 @@ import resource
 import shlex
 import sys
 import time
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
@@ -17,17 +16,17 @@ import yaml
 
 from schemas.errors import MachineError, RunError, describe_seconds
 from schemas.job.job import Job
+from services.bench.figures import describe_machine
 from services.job.job_file import load_job, read_tree
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.study.captures import check_captures
-from services.study.choose import parse_targets, recommend, refuse_unmeasured
+from services.study.choose import Targets, parse_targets, recommend, refuse_unmeasured
 from services.study.colour import colour_truth_missing
 from services.study.knobs import apply, choose_knobs, job_tree_with, knobs_of, preset_settings, settings_of
-from services.study.lanes import Journal
-from services.study.model import Plan, Row
+from services.study.model import Plan, Row, Study
 from services.study.page import describe_proof, write_page, write_tables
-from services.study.study import LOOKS, run_study
+from services.study.study import OTHERS, Journal, run_study
 from workers.assets.catalogue import open_catalogue
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier
@@ -36,9 +35,6 @@ from workers.source import code_digest
 
 BUSY = 0.05
 """A study says so where other processes took more than this share of the machine's processor time while it measured."""
-
-OTHERS = "others"
-"""The journal's entry of the processor seconds that other processes took."""
 
 UNMEASURED = {"check.raycast_share": 0.0, "output.layout": "files"}
 """What no setting is measured with: checks of labels, and tar archives."""
@@ -71,24 +67,26 @@ def main(options: argparse.Namespace) -> int:
     catalogue = open_catalogue(plan.job.assets, plan.job_folder, tuple(plan.job.categories))
     context = open_worker(plan.job, catalogue)
     require_device(context.renderer.name, plan.job.run.device, context.renderer.choice)
-    header = {"job": context.settings_digest, "code": code_digest()}
-    budget, command = round(plan.budget_s), shlex.join(["verso", *sys.argv[1:]])
     print(f"measures for at most {describe_seconds(plan.budget_s)} (--budget), {plan.processes} scenes at a time")
-    with Journal(options.out, header) as journal, closing(ProgressLine(budget, "tradeoff", unit="second")) as progress:
-        others_s = float(journal.get(OTHERS, 0.0)) - others_seconds()
+    journal = Journal(options.out, {"job": context.settings_digest, "code": code_digest()})
+    others_s = float(journal.get(OTHERS, 0.0)) - others_seconds()
+    about = {"command": shlex.join(["verso", *sys.argv[1:]]), "machine": describe_machine(context.renderer.name)}
+    with closing(ProgressLine(round(plan.budget_s), "tradeoff", unit="second")) as progress:
         try:
-            study = run_study(plan, journal, context.renderer.name, command, left_out, progress, began)
+            study = run_study(plan, journal, progress, began, notes=tuple(left_out), **about)
         finally:
             others_s += others_seconds()
             journal.add(OTHERS, others_s)
     if (share := others_s / (study.seconds * (os.cpu_count() or 1))) > BUSY:
-        told = f"other processes took {share:.0%} of this machine while it was measured: times are noisy"
-        study = replace(study, notes=(*study.notes, told))
+        noisy = f"other processes took {share:.0%} of this machine while it was measured: times are noisy"
+        study = replace(study, notes=(*study.notes, noisy))
     write_tables(study, options.out)
-    looks = {name.split("/", 2)[2]: one for name, one in journal.items() if name.startswith(f"{LOOKS}/")}
-    write_page(study, write_plots(study, options.out), options.out / "index.html", looks)
-    for name, order in study.slopes.items():
-        print(f"convergence  {name}: error goes with the step to the power {order:.3f}")
+    write_page(study, write_plots(study, options.out), options.out / "index.html")
+    return tell(study, options, targets)
+
+
+def tell(study: Study, options: argparse.Namespace, targets: Targets | None) -> int:
+    """Prints the notes, the proofs and the answer, and writes the job for targets. Raises RunError."""
     for note in study.notes:
         print(f"note         {note}")
     for doubt in study.doubts:
@@ -118,7 +116,7 @@ def others_seconds() -> float:
     return (sum(ticks) - ticks[3] - ticks[4]) / os.sysconf("SC_CLK_TCK") - own
 
 
-def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, float] | None) -> tuple[Plan, list[str]]:
+def make_plan(asked: Job, options: argparse.Namespace, targets: Targets | None) -> tuple[Plan, list[str]]:
     """The plan for these options, and what is left out, and why. Raises InputError."""
     captured, missing = asked.captures is not None, colour_truth_missing()
     if captured:
@@ -129,7 +127,7 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, flo
     settings, left_out = settings_of(job, knobs)
     presets = preset_settings(job)
     processes = options.workers or usable_cores()
-    plan = Plan(job, options.job.parent, knobs, settings, presets, targets, options.budget, processes)
+    plan = Plan(job, options.job.parent, settings, presets, targets, options.budget, processes)
     return plan, [*left_out, *([missing] if missing and not captured else [])]
 
 

@@ -4,25 +4,21 @@ The rays are cast from the scene's own cameras at its own poses: through pixels'
 the size of pixels, through places that do not depend on it. Views of all pairs count together.
 """
 
-import base64
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache, partial
 from typing import Any
 
-import cv2
 import numpy as np
 from cachetools import LRUCache, cachedmethod
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.errors import SceneError, ViewError
+from schemas.errors import SceneError
 from schemas.job.views import Images
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Camera, Pair, View
 from services.study.colour import (
-    HEIGHT,
-    WIDTH,
     ColourTruth,
     Crop,
     colour_truth_missing,
@@ -35,12 +31,10 @@ from services.study.knobs import size_value
 from services.study.measure import Answer, Meter, answer_for, context_for, laid_for, own_rest, warm_answer_for
 from services.study.model import OWN, Setting
 from services.study.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
-from services.study.table import AT_REST
 from workers.geometry.pixels import dequantise_depth
 from workers.scene.context import Stopwatch, WorkerContext
-from workers.scene.make_scene import Scene, lay_scene, render_scene
+from workers.scene.make_scene import Scene, render_scene
 from workers.scene.rows import record_scene
-from workers.store.images import encode_png
 
 KEPT = 12
 """Casts kept of a scene, some 0.3 MB each: the last ones used. Every setting uses the input camera's; the mirror camera moves
@@ -294,48 +288,3 @@ def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | 
         rgb = _input_alone(context, Setting((("truth", "edges"),), finest), scene_id)[1].pairs[0].input.rgb
         return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))
     return None
-
-
-# ---------------------------------------------------------------------------------------------- what an error looks like
-
-LOOK_MM = 2.0
-"""The difference in depth that is drawn brightest."""
-
-
-def measure_look(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
-    """Two PNGs in base64 by the settings' names: `rgb` and `off`.
-
-    The first is the objects' crop of the first input view, the second how far its depth is from the job's own in the same
-    pixels, from 0 to `LOOK_MM`. A setting that changes how objects rest makes the scene anew.
-    """
-
-    def look(setting: Setting, meter: Meter) -> Answer:
-        crop, own_m = _own_look(context, scene_id)
-        worker = context_for(context, setting)
-        again = any(key.startswith(AT_REST) for key in setting.changes)
-        laid = lay_scene(worker, scene_id, Stopwatch()) if again else laid_for(context, worker, scene_id)
-        view = render_scene(worker, laid, Stopwatch()).pairs[0].input
-        assert view.rgb is not None
-        off_mm = np.abs(_depth_m(worker, view, crop) - own_m) * 1e3
-        shades = np.minimum(off_mm / LOOK_MM * 255.0, 255.0).astype(np.uint8)
-        heat = np.array(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS)[..., ::-1], np.uint8)
-        pictures = {"rgb": crop_colour(view.rgb, crop), "off": heat}
-        return {name: base64.b64encode(encode_png(picture, 9)).decode() for name, picture in pictures.items()}
-
-    return {setting.name: answer_for(partial(look, setting)) for setting in settings}
-
-
-@lru_cache(maxsize=1)
-def _own_look(context: WorkerContext, scene_id: int) -> tuple[Crop, Array]:
-    """The crop, and the job's own depth in it. Raises SceneError where no object is visible."""
-    scene = render_scene(context, laid_for(context, context, scene_id), Stopwatch())
-    if (crop := crop_of(scene)) is None:
-        raise ViewError("object_not_seen", "no object is in the first view")
-    return crop, _depth_m(context, scene.pairs[0].input, crop)
-
-
-def _depth_m(worker: WorkerContext, view: View, crop: Crop) -> Array:
-    """[h, w] depth in the crop's pixels, nearest where the image has another size."""
-    sized = cv2.resize(view.depth, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
-    here = np.asarray(sized[crop.top : crop.bottom, crop.left : crop.right], np.uint16)
-    return dequantise_depth(here, worker.job.images)

@@ -1,8 +1,9 @@
-"""The knobs that a study turns, of scenes and of captures, and the settings made of them. Pure."""
+"""The knobs that a study turns, of scenes and of captures, the settings made of them, and the parts that these change. Pure."""
 
 import copy
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, get_args
 
@@ -15,35 +16,12 @@ from schemas.job.job import PRESETS, Job, kind_of
 from schemas.job.keys import set_key
 from schemas.job.views import ViewTarget
 from services.job.job_file import describe_fault
-from services.study.model import OWN, Changes, Knob, Setting, Value
+from services.study.model import ERRORS, OWN, Changes, Group, Knob, Setting, Value
 
 OTHER_WORLD = frozenset(
     {"friction", "density", "if_lost", "depth_noise", "rgb_noise", "distortion", "exposure", "targets"}
 )
 """Knobs whose cost is shown and which are never recommended: they make another world, another camera or other files."""
-
-FREE: Mapping[str, str] = {
-    "verso name seed scenes first_scene preset": "says which scenes",
-    "run output check": "costs no setting of a scene anything, or is not measured",
-    "pairs_per_scene objects_per_scene categories": "what is in a scene: twice as much takes about twice as long",
-    "assets.objects assets.tables assets.split assets.limits assets.shell_kg_m2": "which shapes",
-    "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m": "where things begin",
-    "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
-    "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
-    "targets.smooth targets.layers targets.shape targets.points": "which files; their time is in the table of timings",
-    "cameras.orbit cameras.depth cameras.mirror.enabled cameras.mirror.T_z_m": "where cameras stand",
-    "images.depth_range_m images.patch images.projection.enabled": "which files",
-    "render.rgb render.path_bounces": "a whole image, or of the path-traced tier alone",
-    "captures.folders captures.board": "what is captured",
-    "captures.simulate.distance_m captures.simulate.inclination_rad": "where views are",
-    "captures.simulate.tier captures.simulate.depth_noise captures.simulate.rgb_noise captures.simulate.motion_blur "
-    "captures.simulate.exposure captures.simulate.distortion captures.simulate.hidden_markers captures.simulate.print_scale "
-    "captures.simulate.registration_error captures.simulate.tone_curve captures.simulate.sharpen "
-    "captures.simulate.rolling_shutter captures.simulate.jpeg": "the simulated camera, which a real one has anyway",
-    "captures.estimation.compare captures.estimation.corner_px captures.estimation.trust captures.estimation.calibrate "
-    "captures.fusion.board_clearance_m captures.fusion.min_views": "no time",
-}
-"""Keys of a job, or branches of keys, that no knob turns, and why. Every other key that costs time is a row of `knobs_of`."""
 
 VIEWS = (4, 6, 10, 20, 40)
 """Numbers of views, as far as the job's captures have as many."""
@@ -74,7 +52,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
             "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
             "image_scale": _values("captures.simulate.image_scale", (0.25, 0.5, 1.0)),
         }
-        return tuple(Knob(name, "capture", tuple(values)) for name, values in simulated.items())
+        return tuple(Knob(name, tuple(values)) for name, values in simulated.items())
     physics = {
         "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
         "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
@@ -101,15 +79,15 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         for size, removed in itertools.product((1, 3, 5), (False, True))
     ]
     return (
-        *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
-        Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
-        Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
-        Knob("pivot_depth", "mirror", tuple(_values("cameras.mirror.percentile", (50.0, 10.0, 5.0, 2.0, 0.5, 0.0)))),
-        Knob("splat", "mirror", tuple(splats)),
-        *(Knob(name, "labels", values) for name, values in sensors.items()),
-        Knob("targets", "labels", tuple(_targets())),
-        Knob("png_level", "labels", tuple(_values("images.png_level", (0, 1, 2, 6, 9)))),
-        Knob("colour", "colour", _tiers()),
+        *(Knob(name, tuple(values)) for name, values in physics.items()),
+        Knob("size", tuple(size_value(job, width) for width in WIDTHS)),
+        Knob("units", tuple(_values("images.depth_units_per_m", units))),
+        Knob("pivot_depth", tuple(_values("cameras.mirror.percentile", (50.0, 10.0, 5.0, 2.0, 0.5, 0.0)))),
+        Knob("splat", tuple(splats)),
+        *(Knob(name, values) for name, values in sensors.items()),
+        Knob("targets", tuple(_targets())),
+        Knob("png_level", tuple(_values("images.png_level", (0, 1, 2, 6, 9)))),
+        Knob("colour", _tiers()),
     )
 
 
@@ -215,3 +193,73 @@ def job_tree_with(changes: Changes, tree: Mapping[str, Any] | None = None) -> di
     for path, value in changes.items():
         set_key(made, path, to_jsonable_python(value))
     return made
+
+
+# ---------------------------------------------------------------------------------------------- parts of a scene
+
+Part = str
+"""rest, again, draw, colour or capture."""
+
+_PART_OF: Mapping[Group, Part] = {
+    "physics": "rest",
+    "labels": "draw",
+    "mirror": "draw",
+    "colour": "colour",
+    "capture": "capture",
+}
+
+AGAIN = frozenset({"moved_mm", "turned_deg"})
+"""Errors that only another release tells, which takes a hundred times as long as the fall: measured where a target asks."""
+
+TIMED: Mapping[Part, Part] = {"colour": "draw", "again": "rest"}
+"""Parts that measure errors and no time, and the part that has the time of their settings."""
+
+AT_REST = ("physics.", "start.", "assets.")
+"""Keys that change how objects rest; every other one changes what is drawn."""
+
+
+def part_of(error: str) -> Part:
+    """The part that measures an error."""
+    return "again" if error in AGAIN else _PART_OF[ERRORS[error].group]
+
+
+def changes_by_part(changes: Mapping[str, Any], parts: Iterable[Part]) -> dict[Part, dict[str, Any]]:
+    """A setting's changes by the parts of a scene, or of a capture, that they change."""
+    belongs = {
+        "rest": lambda key: key.startswith(AT_REST),
+        "again": lambda key: key.startswith(AT_REST),
+        "draw": lambda key: not key.startswith(AT_REST),
+        "colour": lambda key: key.startswith("render."),
+        "capture": lambda key: True,
+    }
+    return {part: {key: value for key, value in changes.items() if belongs[part](key)} for part in parts}
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What is measured: by part the settings, the job itself first, and of each setting of the table its settings by part."""
+
+    measured: Mapping[Part, tuple[Setting, ...]]
+    of: Mapping[str, Mapping[Part, Setting]]
+
+    @classmethod
+    def split(cls, settings: Iterable[Setting], captured: bool, again: bool = False) -> "Parts":
+        """Settings by part; equal changes are measured once, under the name of the first setting that has them."""
+        parts = ("capture",) if captured else ("rest", *(("again",) if again else ()), "draw", "colour")
+        known: dict[tuple[Part, str], Setting] = {}
+        measured: dict[Part, dict[str, Setting]] = {part: {OWN.name: OWN} for part in parts}
+        of: dict[str, dict[Part, Setting]] = {}
+        for setting in settings:
+            of[setting.name] = {}
+            for part, changes in changes_by_part(setting.changes, parts).items():
+                key = part, repr(sorted(changes.items()))
+                alike = known.setdefault(key, Setting(setting.parts, changes) if changes else OWN)
+                measured[part][alike.name] = of[setting.name][part] = alike
+        if not captured:
+            measured["rest"] |= {reference.name: reference for reference in REFERENCES}
+        return cls({part: tuple(some.values()) for part, some in measured.items()}, of)
+
+    @property
+    def timed(self) -> tuple[Part, ...]:
+        """The parts whose times make up a scene's."""
+        return tuple(part for part in self.measured if part not in TIMED)

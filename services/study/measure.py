@@ -1,21 +1,20 @@
 """Measures one scene with settings, each in turn: how it comes to rest, what is drawn of it, and the processor's time of both.
 
-What no code foresaw in a setting is a counted answer, `broken`, and never the end of a study. At the end of the file: how
-errors fall with the step where the truth is a formula.
+It runs in the pool's processes (workers/pool.py), each of which keeps the context of its job. What no code foresaw in a setting
+is a counted answer, `broken`, and never the end of a study.
 """
 
-import contextlib
-import dataclasses
 import itertools
+import json
 import math
 import os
 import pickle
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
-from functools import lru_cache, partial
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,28 +27,83 @@ from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Settled
 from services.study.knobs import apply
 from services.study.model import OWN, Setting
+from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import motion_between, transform
-from workers.physics.bullet import GRAVITY_M_S2, World, open_world
 from workers.physics.fall import FINEST
-from workers.physics.rigid_body import Body
 from workers.physics.settle import Rest, recheck_scene
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Laid, lay_scene, plan_with_effects
 from workers.shard.run_shard import describe, run_scene
 
-RELEASED = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
-"""Settings of physics, in steps 16 times shorter, with which objects at rest are released again."""
+# ---------------------------------------------------------------------------------------------- a process of the pool
 
-POSED = 48
-"""Scenes of which poses are kept, the first ones."""
 
-QUICK_S = {"rest": 2.0, "draw": 20.0}
-"""By part: a process's first answer of a setting that takes less is measured once more, because the first compiles code and
-shaders. What draws compiles for seconds on a busy machine; rest compiles before, and a second pile costs more than it tells."""
+@dataclass(frozen=True)
+class Unit:
+    """One scene to measure with these settings on top of a base setting.
 
-RESTS: dict[str, Path | None] = {"folder": None}
-"""Where the processes of a study keep how its slow scenes rest, for each other; None keeps nothing."""
+    `job`: the job as JSON, beside the folder that its paths are of; `scratch`: a folder that all processes share; `part`: one of
+    services/study/knobs.py; `number`: the scene's place among the measured ones; `limit_s`: seconds of processor
+    that one setting may take.
+    """
+
+    job: str
+    folder: str
+    scratch: str
+    part: str
+    scene_id: int
+    number: int
+    settings: tuple[Setting, ...]
+    base: Setting = OWN
+    limit_s: float = math.inf
+
+
+def answer_unit(unit: Unit) -> bytes:
+    """Answers by the settings' names, as JSON. The parts are imported here: captures load what scenes have no use for."""
+    context = _based(unit.job, unit.folder, json.dumps(dict(unit.base.changes)))
+    LIMIT["s"], RESTS["folder"] = unit.limit_s, Path(unit.scratch)
+    if unit.part == "capture":
+        from services.study.captures import measure_capture
+
+        measure: Callable[..., dict[str, Answer]] = partial(measure_capture, scratch=Path(unit.scratch))
+    else:
+        from services.study.images import measure_colour, measure_drawn
+
+        measure = {
+            "rest": measure_rest,
+            "again": measure_again,
+            "draw": measure_drawn,
+            "colour": measure_colour,
+        }[unit.part]
+    return json.dumps(measure(context, unit.settings, unit.scene_id, unit.number)).encode()
+
+
+@cache
+def _opened(job: str, folder: str) -> WorkerContext:
+    """The worker of the job itself, after scenes of one object that compile its loops and shaders."""
+    parsed = Job.model_validate_json(job)
+    context = open_worker(parsed, open_catalogue(parsed.assets, Path(folder), tuple(parsed.categories)))
+    if parsed.captures is None:
+        few = replace(context, job=apply(parsed, {"objects_per_scene": 1}))
+        for number in range(WARM_SCENES):
+            run_scene(few, WARM_SCENE + number, Stopwatch())
+    return context
+
+
+@cache
+def _based(job: str, folder: str, changes: str) -> WorkerContext:
+    """The job's worker, with a base setting's job: one object each, because caches know it."""
+    own, based = _opened(job, folder), json.loads(changes)
+    return replace(own, job=apply(own.job, based)) if based else own
+
+
+WARM_SCENES, WARM_SCENE = 2, 2_000_000
+"""How many scenes warm a process up, and the id of the first, which no study measures."""
+
+# ---------------------------------------------------------------------------------------------- one answer
+
+Answer = dict[str, Any]
 
 DIGITS = 6
 """Decimals of an error that are kept: a nanometre, a millionth of a share. What is less is rounding."""
@@ -57,16 +111,18 @@ DIGITS = 6
 SLEPT_S = 1.0
 """Times of what the machine slept in for longer are thrown away."""
 
-Answer = dict[str, Any]
+QUICK_S = {"rest": 2.0, "draw": 20.0}
+"""By part: a process's first answer of a setting that takes less is measured once more, because the first compiles code and
+shaders. What draws compiles for seconds on a busy machine; rest compiles before, and a second pile costs more than it tells."""
 
-_seen: set[int] = set()
-"""Scenes whose shapes this process has built."""
+LIMIT = {"s": math.inf}
+"""The seconds of processor that one answer of this process may take."""
 
 
 class Meter:
     """Within `with`, measures: `s` seconds of processor, None where the machine slept in between; `took` seconds by the clock."""
 
-    s: float | None
+    s: float | None = None
     took: float
 
     def __enter__(self) -> "Meter":
@@ -86,22 +142,17 @@ class TimeOut(SceneError):
     stage = "study"
 
 
-LIMIT = {"s": math.inf}
-"""The seconds of processor that one answer of this process may take."""
-
-
 def _out_of_time(*_: object) -> NoReturn:
     raise TimeOut("time_out", f"took more than {LIMIT['s']:.0f} s of processor")
 
 
 def answer_for(measure: Callable[[Meter], Answer]) -> Answer:
-    """What `measure` found, with its times: it gets a meter for what counts as the setting's time, the clock runs for all.
+    """What `measure` answers, with its times: it gets a meter for what counts as the setting's time, the clock runs for all.
 
     A scene that cannot be made, or takes longer than the limit, is `failed` with its reason; anything else that it raises is
     also `broken`.
     """
     meter = Meter()
-    meter.s = None
     with Meter() as whole:
         try:
             if LIMIT["s"] < math.inf:
@@ -135,41 +186,48 @@ def warm_answer_for(part: str, setting: Setting, measure: Callable[[Meter], Answ
 
 def context_for(context: WorkerContext, setting: Setting) -> WorkerContext:
     """The same worker with the setting's job. The settings' digest stays: nothing is stored under it."""
-    return dataclasses.replace(context, job=apply(context.job, setting.changes))
+    return replace(context, job=apply(context.job, setting.changes))
 
 
-def measure_rest(
-    context: WorkerContext,
-    settings: Sequence[Setting],
-    scene_id: int,
-    number: int,
-) -> dict[str, Answer]:
+def shuffled(settings: Sequence[Setting], scene_id: int) -> list[Setting]:
+    """Another order in each scene, so that what a process does first is no setting's disadvantage."""
+    return [settings[k] for k in np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))]
+
+
+# ---------------------------------------------------------------------------------------------- how a scene comes to rest
+
+POSED = 48
+"""Scenes of which poses are kept, the first ones."""
+
+_seen: set[int] = set()
+"""Scenes whose shapes this process has built."""
+
+
+def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
     """How the scene comes to rest, by the settings' names. `number`: its place among the measured scenes.
 
     `s` is the time to rest, without the plan. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm and rolled_deg
     (sideways travel of the centre of mass, and turn, since the object was released; the largest of several objects). Beside
     them `lost`, `planned` and `redrawn` objects, `corners`, mm, of each object's box in the world, and `planned_s`, the time
-    of a plan whose shapes are there. The job itself also has `plan_s`, that of its plan with new shapes.
+    of a plan whose shapes are there. The job itself also has `plan_s`, that of its plan with new shapes: a process's first
+    rest of a scene makes them, and is the job's answer only where it is too slow to be done again.
     """
-    new_s: float | None = None
-    cold_s: float | None = None
     answers: dict[str, Answer] = {}
+    new_s = cold_s = None
     if scene_id not in _seen:
         _seen.add(scene_id)
-        with Meter() as planning, contextlib.suppress(Exception):  # told by what is measured
+        with Meter() as planning, suppress(Exception):  # told by what is measured
             plan_with_effects(context, scene_id, Stopwatch())
         new_s = planning.s
-        if _kept_rest(context, scene_id) is None:
+        if not _rest_file(context, scene_id).exists():
             cold = answer_for(partial(_rest, context, scene_id, number, OWN))
             if cold["took"] < QUICK_S["rest"]:
                 cold_s = cold["s"]
             elif OWN in settings:
                 answers[OWN.name] = cold
-    order = np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))
-    for setting in (settings[k] for k in order):
-        if setting.name not in answers:
-            worker = context_for(context, setting)
-            answers[setting.name] = warm_answer_for("rest", setting, partial(_rest, worker, scene_id, number, setting))
+    for setting in shuffled([one for one in settings if one.name not in answers], scene_id):
+        measure = partial(_rest, context_for(context, setting), scene_id, number, setting)
+        answers[setting.name] = warm_answer_for("rest", setting, measure)
     own = answers.get(OWN.name)
     if own is not None and new_s is not None:
         own["plan_s"] = new_s + max(0.0, (cold_s or 0.0) - (own.get("planned_s") or 0.0) - (own["s"] or 0.0))
@@ -182,27 +240,23 @@ def _rest(worker: WorkerContext, scene_id: int, number: int, setting: Setting, m
     planned, before = len(plan.objects), sum(start.redraws for start in plan.objects)
     try:
         with meter:
-            laid = lay_scene(worker, scene_id, Stopwatch())
+            rest = lay_scene(worker, scene_id, Stopwatch()).rest
     except SceneError as error:
         return {"failed": error.reason, "lost": planned, "planned": planned, "redrawn": 0}
     finally:
         if meter.s is not None and planning.s is not None:
             meter.s -= planning.s
-    rest = laid.rest
     if setting == OWN:
         _keep_rest(worker, scene_id, rest, meter.took)
-    answer: Answer = {
+    moves = list(zip(rest.starts, rest.settled, strict=True))
+    return {
         "planned_s": planning.s,
         "errors": _errors_of(rest),
         "lost": planned - len(rest.settled),
         "planned": planned,
         "redrawn": max(0, sum(start.redraws for start in rest.starts) - before),
+        **({"corners": [_corners_mm(*move).tolist() for move in moves]} if number < POSED else {}),
     }
-    if number < POSED:
-        answer["corners"] = [
-            _corners_mm(start, end).tolist() for start, end in zip(rest.starts, rest.settled, strict=True)
-        ]
-    return answer
 
 
 def _errors_of(rest: Rest) -> dict[str, float]:
@@ -212,9 +266,9 @@ def _errors_of(rest: Rest) -> dict[str, float]:
         slid.append(float(np.linalg.norm(after - before)) * 1e3)
         rolled.append(math.degrees(motion_between(start.hull.vertices, start.T_world_obj, end.T_world_obj)[1]))
     return {
-        "penetration_mm": max(one.penetration_mm for one in rest.settled),
-        "gap_mm": max(one.hover_gap_mm for one in rest.settled),
-        "unbalanced_share": max(one.equilibrium_residual for one in rest.settled),
+        "penetration_mm": max(end.penetration_mm for end in rest.settled),
+        "gap_mm": max(end.hover_gap_mm for end in rest.settled),
+        "unbalanced_share": max(end.equilibrium_residual for end in rest.settled),
         "slid_mm": max(slid),
         "rolled_deg": max(rolled),
     }
@@ -223,9 +277,12 @@ def _errors_of(rest: Rest) -> dict[str, float]:
 def _corners_mm(start: ObjectStart, end: Settled) -> Array:
     """[8, 3] the corners of the object's own box in the world, mm, to a nanometre."""
     low, high = start.hull.vertices.min(axis=0), start.hull.vertices.max(axis=0)
-    return np.round(
-        1e3 * transform(end.T_world_obj, np.array(list(itertools.product(*zip(low, high, strict=True))))), DIGITS
-    )
+    corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    return np.round(1e3 * transform(end.T_world_obj, corners), DIGITS)
+
+
+RELEASED = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
+"""Settings of physics, in steps 16 times shorter, with which objects at rest are released again."""
 
 
 def measure_again(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
@@ -242,10 +299,17 @@ def _again(worker: WorkerContext, scene_id: int, meter: Meter) -> Answer:
     return {"errors": {"moved_mm": max(moved), "turned_deg": max(turned)}}
 
 
+# ---------------------------------------------------------------------------------------------- the job's own rest
+
+RESTS = {"folder": Path(os.devnull)}
+"""Where the processes of a study keep how its slow scenes rest, for each other: a bin settles for half a minute, and is drawn in
+a fifth of a second."""
+
+
 @lru_cache(maxsize=2)
 def own_rest(context: WorkerContext, scene_id: int) -> Rest:
     """How the job's own scene rests, kept for what is drawn of it. Raises SceneError."""
-    if (file := _kept_rest(context, scene_id)) is not None:
+    if (file := _rest_file(context, scene_id)).exists():
         return pickle.loads(file.read_bytes())
     with Meter() as meter:
         rest = lay_scene(context, scene_id, Stopwatch()).rest
@@ -254,22 +318,16 @@ def own_rest(context: WorkerContext, scene_id: int) -> Rest:
 
 
 def _keep_rest(context: WorkerContext, scene_id: int, rest: Rest, took: float) -> None:
-    """Keeps how a slow scene rests for all processes: a bin settles for half a minute, and is drawn in a fifth of a second."""
-    if took >= QUICK_S["rest"] and (file := _rest_file(context, scene_id)) is not None:
+    if took >= QUICK_S["rest"] and RESTS["folder"].is_dir():
+        file = _rest_file(context, scene_id)
         fresh = file.with_suffix(f".{os.getpid()}")
         fresh.write_bytes(pickle.dumps(rest))
         fresh.replace(file)
 
 
-def _kept_rest(context: WorkerContext, scene_id: int) -> Path | None:
-    file = _rest_file(context, scene_id)
-    return file if file is not None and file.exists() else None
-
-
-def _rest_file(context: WorkerContext, scene_id: int) -> Path | None:
+def _rest_file(context: WorkerContext, scene_id: int) -> Path:
     """By the scene and its settings, because a recommendation is proved with its own; the context's digest is of the job's."""
-    folder = RESTS["folder"]
-    return folder and folder / f"rest-{scene_id}-{settings_digest(context.job, context.catalogue.digest)}"
+    return RESTS["folder"] / f"rest-{scene_id}-{settings_digest(context.job, context.catalogue.digest)}"
 
 
 def laid_for(context: WorkerContext, worker: WorkerContext, scene_id: int) -> Laid:
@@ -277,72 +335,3 @@ def laid_for(context: WorkerContext, worker: WorkerContext, scene_id: int) -> La
     rest = own_rest(context, scene_id)
     plan, effects = plan_with_effects(worker, scene_id, Stopwatch())
     return Laid(replace(plan, objects=rest.starts), effects, rest)
-
-
-WARM_SCENES, WARM_SCENE = 2, 2_000_000
-"""How many scenes warm a process up, and the id of the first, which no study measures."""
-
-
-def warm_up(context: WorkerContext) -> None:
-    """Makes scenes of one object, untimed: the first run compiles code and shaders."""
-    few = dataclasses.replace(context, job=apply(context.job, {"objects_per_scene": 1}))
-    for number in range(WARM_SCENES):
-        run_scene(few, WARM_SCENE + number, Stopwatch())
-
-
-# ---------------------------------------------------------------------------------------------- where the truth is a formula
-
-RATES_HZ = (3840, 7680, 15360)
-"""An order shows in the limit: in longer steps a sliding block loses contacts for single steps, and stops a little later."""
-
-FALL_S, HEIGHT_M = 0.5, 3.0
-SLIDE_M_S, FRICTION = 1.0, 0.6
-
-SIDES_M, MARGIN_M = (0.2, 0.2, 0.01), 1e-4
-"""Of the block that falls and slides, and the margin of its shape."""
-
-
-def slopes() -> dict[str, float]:
-    """Order in the step of each case, by least squares of log error over log step.
-
-    Semi-implicit Euler, which is what Bullet integrates with, is of the first order (Hairer, Lubich and Wanner 2006, I.1).
-    """
-    found = {}
-    for name, error in (("free fall", _fall_error_m), ("sliding to rest", _slide_error_m)):
-        errors = [abs(error(rate)) for rate in RATES_HZ]
-        found[name] = float(np.polyfit(-np.log(RATES_HZ), np.log(errors), 1)[0])
-    return found
-
-
-@contextmanager
-def _block_at(height_m: float, rate_hz: int) -> Iterator[World]:
-    """A world with the block at a height."""
-    physics = Job(name="convergence").physics.model_copy(update={"step_hz": rate_hz, "friction": math.sqrt(FRICTION)})
-    squares = np.square(SIDES_M)
-    corners = np.array(list(itertools.product(*((-side, side) for side in SIDES_M)))) / 2
-    T = np.eye(4)
-    T[2, 3] = height_m
-    with open_world([(Body(1.0, (squares.sum() - squares) / 12, (corners,), MARGIN_M), T)], 0.0, physics, 1) as world:
-        yield world
-
-
-def _fall_error_m(rate_hz: int) -> float:
-    """Error of a free fall against half g t squared."""
-    with _block_at(HEIGHT_M, rate_hz) as world:
-        _advance(world, round(FALL_S * rate_hz))
-        return float(HEIGHT_M - world.pose()[0][2] - GRAVITY_M_S2 * FALL_S**2 / 2)
-
-
-def _slide_error_m(rate_hz: int) -> float:
-    """Error of a sliding distance against v squared / 2 mu g (Coulomb friction); the block first settles for a second."""
-    with _block_at(SIDES_M[2] / 2 + MARGIN_M, rate_hz) as world:
-        _advance(world, rate_hz)
-        before = world.pose()[0][0]
-        world.set_velocity((SLIDE_M_S, 0.0, 0.0))
-        _advance(world, rate_hz)
-        return float(world.pose()[0][0] - before - SLIDE_M_S**2 / (2.0 * FRICTION * GRAVITY_M_S2))
-
-
-def _advance(world: World, steps: int) -> None:
-    for _ in range(steps):
-        world.advance()

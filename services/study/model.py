@@ -4,7 +4,7 @@ An error names the truth that it is held against, which is never the setting und
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from schemas.errors import number
 from schemas.job.job import Job
 
 Group = Literal["physics", "labels", "mirror", "colour", "capture"]
-"""The part of a scene that a knob or an error belongs to: how objects come to rest; depth and masks; the mirror pose and the
+"""The part of a scene that an error belongs to: how objects come to rest; depth and masks; the mirror pose and the
 projection into its view; RGB; or a capture as a whole."""
 
 Changes = Mapping[str, Any]
@@ -33,7 +33,6 @@ class Knob:
     """One property that is turned; its values go from coarse to fine where they have an order."""
 
     name: str
-    group: Group
     values: tuple[Value, ...]
 
 
@@ -66,13 +65,16 @@ OWN = Setting()
 """The job as it is."""
 
 
+Verdict = Literal["meets", "misses", "open"]
+
+
 @dataclass(frozen=True)
 class Figure:
     """An error of a setting: its value, its 95 % interval by bootstrap over these scenes, and their number.
 
     The bootstrap knows no scene worse than the worst of its own, so that its upper end tells settings of the same scenes
-    apart, and says little of other scenes: `most` is the bound for those (services/study/table.py), None where there is no
-    better one than `high`. `less`: whether it is surely less than the job's own in most scenes, None where nothing tells.
+    apart, and says little of other scenes: `least` and `most` are the bounds for those (services/study/table.py), None where
+    there are no better ones. `less`: whether it is surely less than the job's own in most scenes, None where nothing tells.
     """
 
     value: float
@@ -82,11 +84,22 @@ class Figure:
     scenes: int
     most: float | None = None
     less: bool | None = None
+    least: float | None = None
 
     @property
     def bound(self) -> float:
         """What the error of as many scenes as one likes is at most, with 95 % confidence."""
         return max(self.value, self.high if self.most is None else self.most)
+
+    def verdict(self, target: float) -> Verdict:
+        """Whether the error of as many scenes as one likes is surely (95 %) at most a target, or surely above it."""
+        least = self.low if self.least is None else self.least
+        return "meets" if self.bound <= target else "misses" if least > target else "open"
+
+    def scaled(self, times: float, most: float) -> "Figure":
+        """Times a factor, and at most `most`."""
+        ends = {name: getattr(self, name) for name in ("value", "low", "high", "median", "most", "least")}
+        return replace(self, **{name: min(most, end * times) for name, end in ends.items() if end is not None})
 
 
 @dataclass(frozen=True)
@@ -133,7 +146,7 @@ class Proof:
 
 @dataclass(frozen=True)
 class Study:
-    """The content of a report: the machine, the command, the table, and the slopes of smooth cases.
+    """The content of a report: the machine, the command, and the table.
 
     `scenes` is the most that a setting was measured in; `job_scenes` is the size of the whole job, 0 where its cost is not
     told; `seconds` were spent of a budget of `budget_s`; `answer` is the answer in words and `chosen` the name of the
@@ -146,7 +159,6 @@ class Study:
     machine: Mapping[str, Any]
     scenes: int
     rows: tuple[Row, ...]
-    slopes: Mapping[str, float] = field(default_factory=dict)
     preset: str = "balanced"
     job_scenes: int = 0
     notes: tuple[str, ...] = ()
@@ -165,11 +177,10 @@ class Study:
 
 @dataclass(frozen=True)
 class Plan:
-    """The job that is measured, its knobs and settings, the presets, the targets, the seconds to spend, and processes."""
+    """The job that is measured, its settings, the presets, the targets, the seconds to spend, and processes."""
 
     job: Job
     job_folder: Path
-    knobs: tuple[Knob, ...]
     settings: tuple[Setting, ...]
     presets: tuple[Setting, ...]
     targets: Mapping[str, float] | None

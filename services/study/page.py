@@ -2,14 +2,12 @@
 
 import base64
 import json
-import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from string import Template
-from types import MappingProxyType
 from typing import Any
 
 import pyarrow as pa
@@ -103,32 +101,25 @@ GROUPS = {
 }
 
 
-Looks = Mapping[str, Mapping[str, str]]
-"""By setting: `rgb` and `off`, PNGs in base64 (services/study/images.py)."""
-
-
-def write_page(study: Study, plots: Sequence[Path], file: Path, looks: Looks | None = None) -> None:
-    """Write the page with the pictures in it: the first of `plots` on top, then what errors look like, then one a knob."""
+def write_page(study: Study, plots: Sequence[Path], file: Path) -> None:
+    """Write the page with the pictures in it: the first of `plots` on top, then one a knob."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(page_of(study, plots, looks or {}), encoding="utf-8")
+    file.write_text(page_of(study, plots), encoding="utf-8")
 
 
-def page_of(study: Study, plots: Sequence[Path], looks: Looks = MappingProxyType({})) -> str:
+def page_of(study: Study, plots: Sequence[Path]) -> str:
     """The whole page."""
     tables = {name: table for group, name in GROUPS.items() if (table := _group_table(study, group))}
     knobs = [_picture(plot, f"Errors over time along the knob {plot.stem.removeprefix('knob_')}") for plot in plots[1:]]
     summary = '<details open class="knobs"><summary>Each knob by itself</summary>'
-    slopes = _table([(name, number(order)) for name, order in study.slopes.items()], ("case", "order in the step"))
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
         job=escape(study.job),
         answer=escape(study.answer),
         proof=_proofs(study),
-        looks=_looks(study, looks),
         doubts="".join(f'<p class="doubt">Not decided: {escape(line)}.</p>' for line in study.doubts),
         tradeoff="".join(_picture(plot, "Errors over processor time, a point for each setting") for plot in plots[:1]),
         groups="\n".join(f"<h2>{name}</h2>{table}" for name, table in tables.items()),
         errors=_errors(study),
-        slopes="<h2>How errors fall with the step on smooth cases</h2>" + slopes if study.slopes else "",
         notes="".join(f"<li>{escape(line)}</li>" for line in _notes(study) or ["Nothing was left out."]),
         machine=_machine(study),
         knobs=f"{summary}\n{''.join(knobs)}</details>" if knobs else "",
@@ -162,34 +153,6 @@ def describe_proof(proof: Proof) -> str:
     ]
     end = "holds" if proof.holds else "does not hold: withdrawn"
     return f"{proof.setting} on {proof.scenes} fresh scenes: {'; '.join(words)}: {end}"
-
-
-def _most_changed(row: Row, own: Row) -> str:
-    """The error that is farthest from the job's own by its ratio; empty where none differs."""
-    pairs = {name: (one.value, own.errors[name].value) for name, one in row.errors.items() if name in own.errors}
-    ratios = {name: abs(math.log(a / b)) if a > 0 and b > 0 else math.inf for name, (a, b) in pairs.items() if a != b}
-    return max(ratios, key=lambda name: ratios[name], default="")
-
-
-def _looks(study: Study, looks: Looks) -> str:
-    """The same crop of one scene with each setting, and how far its depth is from the job's."""
-    rows = {row.setting.name: row for row in study.rows}
-    cells = []
-    for name, pictures in looks.items():
-        if "rgb" not in pictures or name not in rows:
-            continue
-        error = _most_changed(rows[name], own_row(study.rows))
-        figure = rows[name].errors[error].value if error else 0.0
-        told = f"<br><small>{escape(short(error))} {escape(amount(error, figure))}</small>" if error else ""
-        images = "".join(
-            f'<img alt="{what} with {escape(name)}" src="data:image/png;base64,{pictures[kind]}">'
-            for kind, what in (("rgb", "the scene"), ("off", "depth off"))
-        )
-        cells.append(f"<figure>{images}<figcaption>{escape(name)}{told}</figcaption></figure>")
-    if not cells:
-        return ""
-    about = "One scene with the settings whose errors are largest and least; below, how far depth is from the job's, 0 to 2 mm."
-    return f'<h2>What the error looks like</h2><p>{about}</p><div class="looks">{"".join(cells)}</div>'
 
 
 def _proofs(study: Study) -> str:

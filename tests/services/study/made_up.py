@@ -30,7 +30,7 @@ def row(
 def study(*rows: Row, job_scenes: int = 64, notes: tuple[str, ...] = ()) -> Study:
     machine = {"cpu": "A made-up processor", "cores": 2, "gl_renderer": "llvmpipe", "versions": {"numpy": "2.4.6"}}
     command = "verso tradeoff deploy/jobs/tabletop.yaml --out data/tradeoff"
-    made = Study("tabletop", command, machine, 48, rows, {"step": 1.02}, "balanced", job_scenes, notes, 900.0, 871.5)
+    made = Study("tabletop", command, machine, 48, rows, "balanced", job_scenes, notes, 900.0, 871.5)
     return replace(made, answer="Use step=60.", doubts=("whether step=30 (4 scenes)",), proofs=(PROOF,))
 
 

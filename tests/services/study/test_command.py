@@ -17,19 +17,32 @@ from services.job.job_file import load_job
 from services.study import command
 from services.study.captures import check_captures, errors_of, fewer_views, measure_capture
 from services.study.choose import refuse_unmeasured
-from services.study.lanes import DIED, JOURNAL_FILE, Journal, Lanes, Unit
+from services.study.measure import Unit, answer_unit
 from services.study.model import Setting
-from services.study.study import SPENT
+from services.study.study import HEADER, JOURNAL_FILE, OTHERS, SPENT, Journal
 from tests.services.cli.test_commands import TABLETOP, told
 from tests.services.study.made_up import read_study
 from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import open_folder
+from workers.pool import run_pool
 from workers.scene.context import open_worker
 
 SMALL = [
     *("--budget", "60s", "--workers", "1", "--knobs", "exact_rest,units", "--target", "depth_mm=0.11"),
     *("--set", "cameras.sensor={width: 160, height: 120, fx: 131.25, fy: 131.25, cx: 80, cy: 60}"),
 ]
+
+
+def unit_of(job: Job, part: str, scene_id: int, scratch: Path) -> Unit:
+    where = job.model_dump_json(), str(Path(TABLETOP).parent), str(scratch)
+    return Unit(*where, part, scene_id, scene_id, (Setting(),))
+
+
+def units_of(folder: Path) -> list[str]:
+    """The keys of answers, in their order, each as often as it was kept."""
+    lines = (folder / JOURNAL_FILE).read_bytes().split(b"\n@")[1:]
+    keys = [line.partition(b"\n")[0].split(b" ", 2)[2].decode() for line in lines]
+    return [key for key in keys if key not in (HEADER, SPENT, OTHERS)]
 
 
 @pytest.fixture(scope="module")
@@ -39,24 +52,23 @@ def measured(tmp_path_factory) -> Path:
     One scene comes first: the first on a machine compiles for longer than the small study may take.
     """
     out = tmp_path_factory.mktemp("study")
-    with Lanes(load_job(Path(TABLETOP), SMALL[-1:]), Path(TABLETOP).parent, 1, out) as lanes:
-        assert len(list(lanes.run([Unit(part, 0, 0, (Setting(),)) for part in ("rest", "draw")], float("inf")))) == 2
+    job = load_job(Path(TABLETOP), SMALL[-1:])
+    assert len(list(run_pool(answer_unit, [unit_of(job, part, 0, out) for part in ("rest", "draw")]))) == 2
     real, calls = Journal.add, []
 
     def stopped(journal, *entry):
         calls.append(entry)
-        if len(calls) == 3:
+        if len(calls) == 4:
             raise KeyboardInterrupt
         real(journal, *entry)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Journal, "add", stopped)
         assert main(["tradeoff", TABLETOP, "--out", str(out), *SMALL]) == 1
-    kept = (out / JOURNAL_FILE).read_text()
-    # The last lines are the clock and what other processes took.
-    assert len(kept.splitlines()) == 1 + 2 + 2 and not (out / "tradeoff.parquet").exists()
+    kept = (out / JOURNAL_FILE).read_bytes()
+    assert len(units_of(out)) == 2 and not (out / "tradeoff.parquet").exists()
     assert main(["tradeoff", TABLETOP, "--out", str(out), *SMALL]) == 0
-    assert (out / JOURNAL_FILE).read_text().startswith(kept)
+    assert (out / JOURNAL_FILE).read_bytes().startswith(kept)
     return out
 
 
@@ -80,16 +92,13 @@ def test_a_study_has_every_setting_with_its_errors_its_plots_its_proof_and_its_p
 
 @pytest.mark.minute
 def test_the_same_command_measures_nothing_twice_and_a_longer_budget_goes_on(measured, capsys):
-    def units() -> list[str]:
-        lines = (measured / JOURNAL_FILE).read_text().splitlines()[1:]
-        return [name for line in lines if (name := json.loads(line)["unit"]) not in (SPENT, command.OTHERS)]
-
-    before = units()
+    before = units_of(measured)
     code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--target", "depth_mm=0.01")
     assert code == 1 and "units=8000" in text and "depth_mm" in text and "0.06" in text
-    assert (len(set(before)) == len(before) and "not decided" in text) or "convergence" in text
+    assert len(set(before)) == len(before)
     code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--budget", "66s")
-    assert code == 0 and units()[: len(before)] == before and len(set(units())) == len(units())
+    after = units_of(measured)
+    assert code == 0 and after[: len(before)] == before and len(set(after)) == len(after)
     code, text = told(capsys, "tradeoff", TABLETOP, "--out", str(measured), *SMALL, "--set", "seed=5")
     assert code == 2 and "another study" in text and "--out" in text
 
@@ -149,23 +158,11 @@ def test_a_job_of_which_nothing_can_be_made_and_a_budget_that_is_too_short_are_t
 
 
 @pytest.mark.minute
-def test_a_process_that_dies_is_a_broken_answer_and_what_is_under_way_at_the_end_has_none(tmp_path):
-    """Scene 0 of an unknown part ends its process by an error; the next unit has a new one."""
-    job = Job(name="t", seed=2024)
-    units = [Unit("no such part", 0, 0, (Setting(),)), Unit("rest", 1, 1, (Setting(),))]
-    with Lanes(job, Path(), 1, tmp_path) as lanes:
-        found = {unit.part: answers["the job"] for unit, answers in lanes.run(units, float("inf"))}
-        assert found["no such part"]["broken"] == DIED and found["rest"]["errors"]["penetration_mm"] < 1e-6
-        assert list(lanes.run(units[1:], 0.0)) == []
-
-
-@pytest.mark.minute
 def test_files_from_outside_are_read_by_processes_of_their_own_also_in_a_study(tmp_path):
     job = load_job(Path(TABLETOP).with_name("real_meshes.yaml"), [])
-    with Lanes(job, Path(TABLETOP).parent, 1, tmp_path) as lanes:
-        units = [Unit("rest", scene, scene, (Setting(),)) for scene in range(4)]
-        found = [answers["the job"] for _, answers in lanes.run(units, float("inf"))]
-    assert not [one["broken"] for one in found if "broken" in one] and any("errors" in one for one in found)
+    units = [unit_of(job, "rest", scene, tmp_path) for scene in range(4)]
+    answers = [json.loads(answer)["the job"] for _, answer in run_pool(answer_unit, units, processes=1)]
+    assert not [one["broken"] for one in answers if "broken" in one] and any("errors" in one for one in answers)
 
 
 # ---------------------------------------------------------------------------------------------- captures

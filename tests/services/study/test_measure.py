@@ -18,7 +18,6 @@ from services.study.measure import (
     measure_again,
     measure_rest,
     own_rest,
-    slopes,
     warm_answer_for,
 )
 from services.study.model import Setting
@@ -106,12 +105,6 @@ def test_what_breaks_a_measure_is_a_counted_answer_and_a_machine_that_sleeps_has
     with Meter() as meter:
         time.sleep(0.01)
     assert meter.s is None and meter.took < 60.0
-
-
-def test_errors_of_smooth_cases_fall_with_the_step_in_the_order_of_the_integrator():
-    found = slopes()
-    assert found["free fall"] == pytest.approx(1.0, abs=1e-3)
-    assert found["sliding to rest"] == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_process_measures_its_first_answer_of_a_setting_again_unless_that_takes_long(monkeypatch):

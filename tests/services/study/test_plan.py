@@ -1,6 +1,6 @@
 """What is measured: knobs, presets, rounds of settings, promising combinations, and the journal of what is done."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -13,11 +13,10 @@ from schemas.job.identity import settings_digest
 from schemas.job.job import PRESETS, Job, JobKind, kind_of
 from services.study import knobs as study_knobs
 from services.study.choose import error_of, own_row
-from services.study.knobs import FREE, REFERENCES, apply, choose_knobs, joined, knobs_of, settings_of
-from services.study.lanes import JOURNAL_FILE, Journal
+from services.study.knobs import REFERENCES, apply, choose_knobs, joined, knobs_of, settings_of
 from services.study.model import ERRORS, NEGLIGIBLE, Figure, Proof, Row, Setting
-from services.study.race import promising
-from services.study.study import telling, without
+from services.study.rounds import promising
+from services.study.study import JOURNAL_FILE, Journal, without
 from tests.services.study.made_up import row, stored
 
 JOB = Job(name="t", seed=2024, first_scene=100)
@@ -40,7 +39,6 @@ def test_every_value_makes_a_job_that_is_allowed_and_is_not_the_job_itself():
     for knob in knobs_of(JOB):  # of each the defaults have a value, which is not measured twice
         own = [value.label for value in knob.values if apply(JOB, value.changes) == JOB]
         assert own and f"{knob.name}={own[0]}" not in {setting.name for setting in settings_of(JOB, [knob])[0]}
-    assert {knob.group for knob in (*knobs_of(JOB), *knobs_of(CAPTURES))} == {kind.group for kind in ERRORS.values()}
 
 
 def test_a_knob_has_the_values_that_mean_something_for_the_job(tmp_path):
@@ -56,7 +54,7 @@ def test_a_knob_has_the_values_that_mean_something_for_the_job(tmp_path):
 
 
 def test_the_reference_is_finer_than_anything_that_a_knob_can_be():
-    values = [value.changes for knob in knobs_of(JOB) if knob.group == "physics" for value in knob.values]
+    values = [value.changes for knob in knobs_of(JOB) for value in knob.values]
     for finer in (reference.changes for reference in REFERENCES):
         assert all(v.get("physics.step_hz", 0) < finer["physics.step_hz"] for v in values)
         travel = "physics.max_step_travel_mm"
@@ -95,6 +93,30 @@ def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
             yield from leaves(branch, f"{prefix}{name}.")
 
 
+FREE: Mapping[str, str] = {
+    "verso name seed scenes first_scene preset": "says which scenes",
+    "run output check": "costs no setting of a scene anything, or is not measured",
+    "pairs_per_scene objects_per_scene categories": "what is in a scene: twice as much takes about twice as long",
+    "assets.objects assets.tables assets.split assets.limits assets.shell_kg_m2": "which shapes",
+    "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m": "where things begin",
+    "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
+    "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
+    "targets.smooth targets.layers targets.shape targets.points": "which files; their time is in the table of timings",
+    "cameras.orbit cameras.depth cameras.mirror.enabled cameras.mirror.T_z_m": "where cameras stand",
+    "images.depth_range_m images.patch images.projection.enabled": "which files",
+    "render.rgb render.path_bounces": "a whole image, or of the path-traced tier alone",
+    "captures.folders captures.board": "what is captured",
+    "captures.simulate.distance_m captures.simulate.inclination_rad": "where views are",
+    "captures.simulate.tier captures.simulate.depth_noise captures.simulate.rgb_noise captures.simulate.motion_blur "
+    "captures.simulate.exposure captures.simulate.distortion captures.simulate.hidden_markers captures.simulate.print_scale "
+    "captures.simulate.registration_error captures.simulate.tone_curve captures.simulate.sharpen "
+    "captures.simulate.rolling_shutter captures.simulate.jpeg": "the simulated camera, which a real one has anyway",
+    "captures.estimation.compare captures.estimation.corner_px captures.estimation.trust captures.estimation.calibrate "
+    "captures.fusion.board_clearance_m captures.fusion.min_views": "no time",
+}
+"""Keys of a job, or branches of keys, that no knob turns, and why. Every other key is turned."""
+
+
 def test_every_key_of_a_job_is_turned_by_a_knob_or_listed_as_free():
     turned = {
         key for job in (JOB, CAPTURES) for knob in knobs_of(job) for value in knob.values for key in value.changes
@@ -118,7 +140,7 @@ SLACK = 0.1
 
 BY_EFFORT = {key for kind in PRESETS.values() for key in kind["balanced"]} | {
     *("physics.max_step_travel_mm", "physics.solver_iterations", "physics.collision"),
-    *("physics.rest.speed_mm_s", "physics.rest.spin_rad_s", "physics.exact_rest", "render.path_samples"),
+    *("physics.rest.speed_mm_s", "physics.exact_rest", "render.path_samples"),
 }
 """The keys that presets choose or could. Settings that change other keys store other things, and are no rivals."""
 
@@ -222,41 +244,33 @@ def test_a_proof_that_fails_withdraws_all_that_share_what_failed():
     failed, held = (Proof("step=60, s=5", 8, targets | loose, off, {}) for loose in ({}, {"hidden_share": 0.9}))
     assert (failed.missed, held.missed, held.holds) == (("hidden_share",), (), True)
     assert [one.setting.name for one in without(rows, [failed])] == ["the job", "step=60"]
-    assert without(rows, [held]) == rows
+    assert without(rows, [held]) == list(rows)
     assert replace(held, measured={}).missed == tuple(targets)
-
-
-def test_pictures_show_settings_whose_errors_are_to_be_seen():
-    rows = [OWN, row("step=60", gap_mm=1e-5, flip=0.3), row("step=120", gap_mm=1e-9), row("units=1", depth_mm=0.5)]
-    assert telling(rows) == ["units=1", "the job"]  # gaps differ by much, and none is to be seen; one FLIP has no other
-    assert telling([*rows, row("step=30", gap_mm=1.0)]) == ["step=30", "step=120", "units=1", "the job"]
 
 
 # ---------------------------------------------------------------------------------------------- the journal
 
-HEADER = {"job": "abc", "sizes": {"scenes": 4}}
+HEADER = {"job": "abc", "code": "def"}
 
 
-def test_what_was_added_is_there_when_the_journal_is_opened_again_but_for_a_line_that_was_cut_off(tmp_path):
+def test_what_was_added_is_there_when_the_journal_is_opened_again_but_for_an_answer_that_was_cut_off(tmp_path):
     answer = {"whole": {"the job": 0.1 + 0.2}}
-    with Journal(tmp_path / "study", HEADER) as first:
-        first.add("time/0/3", answer)
-        first.add("time/0/4", 2)
+    first = Journal(tmp_path / "study", HEADER)
+    first.add("rest/3/the job", answer)
+    first.add("rest/4/the job", 2)
     file = tmp_path / "study" / JOURNAL_FILE
-    file.write_text(file.read_text()[:-5])
-    with Journal(tmp_path / "study", HEADER) as second:
-        assert second == {"time/0/3": answer}
-        second.add("time/0/4", 3)
-    with Journal(tmp_path / "study", HEADER) as last:
-        assert last == {"time/0/3": answer, "time/0/4": 3}
+    file.write_bytes(file.read_bytes()[:-2])
+    second = Journal(tmp_path / "study", HEADER)
+    assert second == {"study": HEADER, "rest/3/the job": answer}
+    second.add("rest/4/the job", 3)
+    assert Journal(tmp_path / "study", HEADER) == {**second, "rest/4/the job": 3}
 
 
 def test_a_journal_of_another_study_and_a_folder_that_cannot_be_written_are_refused(tmp_path):
-    with Journal(tmp_path, HEADER) as journal:
-        journal.add("a", 1)
+    Journal(tmp_path, HEADER).add("a", 1)
     before = (tmp_path / JOURNAL_FILE).read_bytes()
-    with pytest.raises(OutputError, match=r"another study \(other sizes\): choose another --out"):
-        Journal(tmp_path, {**HEADER, "sizes": {"scenes": 8}})
+    with pytest.raises(OutputError, match=r"another study \(other code\): choose another --out"):
+        Journal(tmp_path, {**HEADER, "code": "ghi"})
     assert (tmp_path / JOURNAL_FILE).read_bytes() == before
     with pytest.raises(OutputError, match="choose another --out"):
         Journal(tmp_path / JOURNAL_FILE / "study", HEADER)

@@ -199,7 +199,7 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
         best = choose_sources(
             {source.number: source.camera.T_world_cam[:3, 2] for source in ready}, camera, Synthesis()
         )
-        view = synthesize_view([ready[number] for number in best], camera, Synthesis().fill_px)
+        view = synthesize_view([ready[number] for number in best], camera)
         depth, mask, rgb = cast(THING, camera)
         both = (view.depth_m > 0) & view.mask & mask
         worst = max(worst, float(np.median(np.abs(view.depth_m - depth)[both])) * 1e3)
@@ -210,7 +210,7 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
     assert worst < 1.0
     away = Camera(K, frozen_array(look_at(np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.0, 2.0]))))
     with pytest.raises(CaptureError, match="shows anything to this camera") as refusal:
-        synthesize_view(ready[:4], away, 0)
+        synthesize_view(ready[:4], away)
     assert refusal.value.reason == "nothing_seen"
     down = Camera(K, frozen_array(look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))))  # ranked by the cosine of the axes
     axes = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, -0.8], [0.0, 0.0, -1.0], [-0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])

@@ -13,7 +13,7 @@ from schemas.errors import CaptureError
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
 from schemas.scene.view import Camera
-from workers.capture.pictures import pinhole_maps, remap
+from workers.door.recordings.pictures import pinhole_maps, remap
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
