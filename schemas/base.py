@@ -1,7 +1,7 @@
 """The base of every configuration model, and the value types that they share."""
 
 import unicodedata
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,6 @@ class Frozen(BaseModel):
     """A model that cannot change and that refuses keys it does not know."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
-
-def left_out(keys: dict[str, Any], **usual: object) -> dict[str, Any]:
-    """The keys of a model without those at these values, which later versions have added: older digests hold."""
-    return {name: value for name, value in keys.items() if name not in usual or value != usual[name]}
 
 
 class Range(NamedTuple):

@@ -66,7 +66,10 @@ def board(options: argparse.Namespace) -> int:
     elif kind != ".json":
         raise InputError(f"{path}: name a file that ends in .pdf, .png or .json")
     described, new = _describe_board(path, spec, data)
-    answer: dict[str, Any] = {"board_file": str(described), "board": spec.model_dump(mode="json")}
+    answer: dict[str, Any] = {
+        "board_file": str(described),
+        "board": spec.model_dump(mode="json", exclude=spec.unwritten),
+    }
     size = "" if spec.markers else f" of {spec.marker_m * 1000:g} mm"
     if data is not None:
         told = "A4 pages to glue" if options.tiles else "print at 100 %"
@@ -135,7 +138,8 @@ def _describe_board(path: Path, spec: Board, data: bytes | None) -> tuple[Path, 
         if data is not None:
             path.write_bytes(data)
         if new:
-            described.write_text(spec.model_copy(update=printed).model_dump_json(indent=1) + "\n", encoding="utf-8")
+            text = spec.model_copy(update=printed).model_dump_json(indent=1, exclude=spec.unwritten)
+            described.write_text(f"{text}\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}") from error
     return described, new

@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import IMAGES, asset_path, file_pose_id, image_path, input_pose_id, patch_path
-from schemas.dataset.tables import NOT_IN_DIGEST
+from schemas.dataset.tables import OF_TARGETS
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from schemas.scene.view import MODALITIES
 from workers.store.attempt import Attempt, begin_attempt
@@ -186,7 +186,7 @@ def _object(view: dict, region: int, category: str, instance: str) -> dict[str, 
         | {"region_id": region, "category": category, "instance_id": instance, "u": 300 + region, "v": -1}
         | {"T_cam_obj": matrix_of(view["scene_id"], 4, region), "bbox_xywh": [1, 2, 3, 4], "pixels": 500}
         | {"visible_fraction": 0.9, "patch_object_fraction": None if region == 2 else 0.3}
-        | dict.fromkeys(NOT_IN_DIGEST["objects"])
+        | dict.fromkeys(OF_TARGETS["objects"])
     )
 
 
@@ -196,5 +196,5 @@ def _asset(category: str, instance: str, shapes: bool) -> dict[str, object]:
         | {"path": f"models/{instance}.obj" if shapes else None, "extents_m": [0.1, 0.2, 1 / 3], "volume_m3": None}
         | {"sha256": hashlib.sha256(instance.encode()).hexdigest(), "watertight": False, "scale": 1.0}
         | {"T_source_to_object": matrix_of(len(instance)), "split": "train", "notes": []}
-        | dict.fromkeys(NOT_IN_DIGEST["assets"])
+        | dict.fromkeys(OF_TARGETS["assets"])
     )

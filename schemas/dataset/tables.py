@@ -338,10 +338,10 @@ NOT_OF_CAPTURES = tuple(column.path for column in COLUMNS["scenes"] if column.of
 ALWAYS_OF_SCENES = tuple(column.path for column in COLUMNS["scenes"] if column.of == "scenes" and not column.null)
 """Those of them that every simulated scene has."""
 
-NOT_IN_DIGEST = {
+OF_TARGETS = {
     table: frozenset(column.path for column in columns if column.of == "targets") for table, columns in COLUMNS.items()
 }
-"""Columns that are left out of a table's digest where no row has a value: so a job without targets has the digest of before."""
+"""Columns of image targets and of samples of shapes, null in jobs without them."""
 
 SHAPE_FILE_COLUMNS = (pa.field("file_bytes", pa.int64()), pa.field("file_sha256", pa.string()))
 """More columns of `assets` in a range's own file: the size and the SHA-256 of the asset's GLB, null where none is

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, Field, field_validator, model_serializer, model_validator
-from pydantic import SerializerFunctionWrapHandler as Dump
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight, left_out
+from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight
 from schemas.errors import did_you_mean
 
 
@@ -197,11 +196,6 @@ class ProceduralSource(Frozen):
     kind: TableKind = "table"
     """Of tables: a tray has a rim of 2 to 6 cm, a bin walls of 12 to 26 cm."""
 
-    @model_serializer(mode="wrap")
-    def _leave_out_kind(self, dump: Dump) -> dict[str, Any]:
-        """A source is written, and digested, as it was before there were kinds."""
-        return left_out(dump(self), kind="table")
-
     def named(self, category: str) -> str:
         """The row of `BUILT_IN` that makes its instances of a category."""
         return self.kind if category == TABLE else category
@@ -320,13 +314,6 @@ class MeshLimits(Frozen):
     """Most processor time for reading an asset, seconds."""
     max_memory_mb: Annotated[int, Field(ge=1024)] = 2048
     """Most memory for reading an asset, MiB."""
-
-    @model_serializer(mode="wrap")
-    def _leave_out_later(self, dump: Dump) -> dict[str, Any]:
-        """Limits are written, and digested, as they were when there were four, but for those with another value."""
-        first = ("max_file_mb", "max_vertices", "max_faces", "max_texture_px")
-        fields = type(self).model_fields.items()
-        return left_out(dump(self), **{name: field.default for name, field in fields if name not in first})
 
 
 class Assets(Frozen):

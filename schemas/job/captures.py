@@ -7,8 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_serializer, model_validator
-from pydantic import SerializerFunctionWrapHandler as Dump
+from pydantic import Field, model_validator
 
 from schemas.base import (
     Folder,
@@ -21,7 +20,6 @@ from schemas.base import (
     Range,
     Share,
     Text,
-    left_out,
 )
 from schemas.job.assets import CategoryName
 from schemas.job.keys import with_defaults
@@ -94,18 +92,17 @@ class Board(Frozen):
         """How many markers there are: `7 x 5 markers`, or `12 markers`."""
         return f"{len(self.markers) or f'{self.columns} x {self.rows}'} markers"
 
-    @model_serializer(mode="wrap")
-    def _leave_out_later(self, dump: Dump) -> dict[str, Any]:
-        """A grid is written, and digested, as it was when every board was one; of other boards there is no grid."""
-        keys = left_out(dump(self), border_bits=1)
-        left = GRID_KEYS if self.markers else ("markers", "squares")
-        return {name: value for name, value in keys.items() if name not in left}
+    @property
+    def unwritten(self) -> set[str]:
+        """Keys that board.json leaves out: those of the other kind of board, and a border of the usual width."""
+        return {*(GRID_KEYS if self.markers else ("markers", "squares")), *(("border_bits",) * (self.border_bits == 1))}
 
     @model_validator(mode="before")
     @classmethod
     def _is_one_kind(cls, keys: Any) -> Any:
         if isinstance(keys, Mapping):
-            grid = [name for name in GRID_KEYS if name in keys]
+            usual = {name: cls.model_fields[name].default for name in GRID_KEYS}
+            grid = [name for name in GRID_KEYS if keys.get(name, usual[name]) != usual[name]]
             if keys.get("markers") and grid:
                 raise ValueError(f"{grid[0]} is of a grid, and markers are given one by one: leave one of both out")
             if keys.get("squares") and not keys.get("markers"):
@@ -273,11 +270,6 @@ class Simulate(Frozen):
     """True size of the print over its nominal size."""
     registration_error: RegistrationError | None = None
     """Error of the depth camera's assumed pose."""
-
-    @model_serializer(mode="wrap")
-    def _leave_out_later(self, dump: Dump) -> dict[str, Any]:
-        """Without a rolling shutter, settings are written, and digested, as they were before there was one."""
-        return left_out(dump(self), rolling_shutter=None)
 
 
 class Estimation(Frozen):

@@ -1,57 +1,75 @@
-"""The identity of a job: which of its keys decide the dataset, which decide a scene, and their digests.
+"""The identity of a job: the digest of its keys that differ from their defaults, for a dataset and for a scene.
 
-The path of a folder of assets or of a capture is never part of it: the catalogue's digest covers the files.
+A key that a later version adds has its default in every older job, and leaves their digests as they are. A default that changes
+makes another dataset of an older job: it is a new version of that key. The path of a folder of assets or of captures is never
+part of a digest: the catalogue's digest covers the files.
 """
 
 import hashlib
 import json
+from collections.abc import Collection
 from typing import Any
 
-from schemas.job.assets import FILES, FORMER
+from pydantic import BaseModel
+
 from schemas.job.job import Job
 
-RUN_KEYS = frozenset({"scenes", "run"})
-"""Keys that may change from one run on a folder to the next: more scenes, and how the work is driven."""
+PATHS = frozenset({"assets.objects.folder", "assets.tables.folder", "captures.folders"})
+"""Keys that name places, where the same files may lie elsewhere."""
 
-NOT_IN_A_SCENE = RUN_KEYS | {"name", "first_scene", "output", "verso", "preset"}
+NOT_OF_A_DATASET = PATHS | {"scenes", "run", "preset"}
+"""Keys that may change from one run on a folder to the next: more scenes, how the work is driven, and what filled other keys."""
+
+NOT_OF_A_SCENE = NOT_OF_A_DATASET | {"name", "first_scene", "output"}
 """Keys that do not change what a scene is."""
 
 
 def job_digest(job: Job, catalogue_digest: str) -> str:
     """SHA-256, hex, of all that must stay the same on one output folder."""
-    return _digest(dataset_keys(job), catalogue_digest)
+    return _digest(job, NOT_OF_A_DATASET, catalogue_digest)
 
 
 def settings_digest(job: Job, catalogue_digest: str) -> str:
-    """SHA-256, hex, of all that decides what a scene is. A sensor effect that is off decides nothing and is left out."""
-    keys = dataset_keys(job)
-    settings = {name: value for name, value in keys.items() if name not in NOT_IN_A_SCENE}
-    settings["sensor"] = {name: effect for name, effect in settings["sensor"].items() if effect is not None}
-    if not settings["sensor"]:
-        del settings["sensor"]
-    return _digest(settings, catalogue_digest)
+    """SHA-256, hex, of all that decides what a scene is."""
+    return _digest(job, NOT_OF_A_SCENE, catalogue_digest)
 
 
 def compare_jobs(before: Job, now: Job) -> list[tuple[str, Any, Any]]:
     """(dotted key, value before, value now) of every key that must stay the same and does not."""
-    return _differences(dataset_keys(before), dataset_keys(now))
+    return _differences(*(_keys_of(job, NOT_OF_A_DATASET, all_keys=True) for job in (before, now)))
 
 
-def dataset_keys(job: Job) -> dict[str, Any]:
-    """The job's keys and values, as JSON holds them, that must stay the same on one output folder."""
-    keys = job.model_dump(mode="json", exclude=set(RUN_KEYS))
-    for source in (*keys["assets"]["objects"], *keys["assets"]["tables"]):
-        source.pop("folder", None)
-        source["source"] = FORMER if source["source"] == FILES else source["source"]  # as the first datasets have it
-    if job.captures is not None:
-        for unused in ("folders", "simulate", "board") if job.captures.folders else ("folders", "category"):
-            del keys["captures"][unused]
-    return keys
+def differing_keys(model: BaseModel, without: Collection[str] = ()) -> dict[str, Any]:
+    """The keys of a model, as JSON holds them, whose values differ from their fields' defaults.
+
+    Inside a branch or an item of a list too; keys without a default, such as the kind of a source, are always there. `without`:
+    dotted keys that are left out; items of a list have no position in them.
+    """
+    return _keys_of(model, without)
 
 
-def _digest(keys: dict[str, Any], catalogue_digest: str) -> str:
+def _digest(job: Job, without: Collection[str], catalogue_digest: str) -> str:
+    keys = {"verso": job.verso, **differing_keys(job, without)}
     text = json.dumps([keys, catalogue_digest], sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _keys_of(model: BaseModel, without: Collection[str], all_keys: bool = False) -> dict[str, Any]:
+    def walk(value: Any, plain: Any, path: str) -> Any:
+        """What stays of `plain`, which is `value` as JSON holds it."""
+        if isinstance(plain, list):
+            return [walk(*both, path) for both in zip(value, plain, strict=True)]
+        if not isinstance(value, BaseModel):
+            return plain
+        kept = {}
+        for name, field in type(value).model_fields.items():
+            key, inside = f"{path}{name}", getattr(value, name)
+            usual = not field.is_required() and inside == field.get_default(call_default_factory=True)
+            if key not in without and (all_keys or not usual):
+                kept[name] = walk(inside, plain[name], f"{key}.")
+        return kept
+
+    return dict(walk(model, model.model_dump(mode="json"), ""))
 
 
 def _differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:

@@ -8,8 +8,7 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_serializer, model_validator
-from pydantic import SerializerFunctionWrapHandler as Dump
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight
 from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknown, offered_by, with_categories
@@ -229,15 +228,6 @@ class Job(Frozen):
             told = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
             raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {told}")
         return self
-
-    @model_serializer(mode="wrap")
-    def _leave_out_absent_branches(self, dump: Dump) -> dict[str, Any]:
-        """A job without captures, or without targets, is written, and digested, as it was before there were any."""
-        keys: dict[str, Any] = dump(self)
-        for name, absent in (("captures", self.captures is None), ("targets", self.targets == Targets())):
-            if absent:
-                keys.pop(name, None)
-        return keys
 
     @property
     def drawn(self) -> Render:

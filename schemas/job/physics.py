@@ -1,11 +1,10 @@
 """The `start` and `physics` branches of a job: how objects begin, and how they come to rest."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, model_serializer, model_validator
-from pydantic import SerializerFunctionWrapHandler as Dump
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
-from schemas.base import Counts, Frozen, Interval, NonNegative, NonNegativeInt, Positive, Range, Share, left_out
+from schemas.base import Counts, Frozen, Interval, NonNegative, NonNegativeInt, Positive, Range, Share
 
 MOST_OBJECTS = 50
 """Largest number of objects in a scene."""
@@ -48,11 +47,6 @@ class Start(Frozen):
     """Most redraws of a position that is not over the table or has no room, and of `if_lost`."""
     if_lost: Literal["redraw", "remove", "fail"] = "redraw"
     """An object that leaves the table, or finds no balance: dropped again from a new start, removed, or a failure."""
-
-    @model_serializer(mode="wrap")
-    def _leave_out_if_lost(self, dump: Dump) -> dict[str, Any]:
-        """A start is written, and digested, as it was before objects were drawn again."""
-        return left_out(dump(self), if_lost="redraw")
 
 
 Collision = Literal["planned", "box", "hull", "parts"]

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import ARTICLE, PixelKind, stored_images, stored_roles
-from schemas.dataset.tables import NOT_IN_DIGEST, SCHEMAS
+from schemas.dataset.tables import OF_TARGETS, SCHEMAS
 from schemas.errors import plural
 from schemas.job.job import Job
 from schemas.scene.view import MODALITIES, Role
@@ -90,7 +90,7 @@ def schema_of_pairs(job: Job) -> pa.Schema:
     for role in stored_roles(job):
         fields += [pa.field(f"{role}_{image.pixels}", _type_of(image.pixels)) for image in stored_images(role, job)]
         fields.append(pa.field(f"{role}_view", views))
-    absent = () if job.targets.views else NOT_IN_DIGEST["objects"]
+    absent = () if job.targets.views else OF_TARGETS["objects"]
     objects = pa.struct([field for field in SCHEMAS["objects"] if field.name not in (*_NOT_OF_OBJECTS, *absent)])
     schema = pa.schema([*fields, pa.field("objects", pa.list_(objects))])
     return schema.with_metadata(features_metadata(schema))

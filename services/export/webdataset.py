@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from schemas.dataset.codec import Row
-from schemas.dataset.tables import NOT_IN_DIGEST
+from schemas.dataset.tables import OF_TARGETS
 from schemas.scene.view import MODALITIES, ROLES
 from services.export.formats import OF_SCENE, Added, ShardedWriter, encode_npz
 from services.export.source import ExportPair, ExportScene
@@ -80,7 +80,7 @@ def _json(scene: ExportScene, pair: ExportPair) -> bytes:
 
 def label_of(row: Row) -> Row:
     """A row of `objects` without what is stored elsewhere in the sample, and without columns of targets that are not there."""
-    targets = NOT_IN_DIGEST["objects"]
+    targets = OF_TARGETS["objects"]
     return {
         key: value
         for key, value in row.items()

@@ -25,8 +25,9 @@ NOBODYS = {"lost+found"}
 HEADER = """\
 # The job as it was run, every default filled in. Written by the first run on this folder; `verso run` on the same
 # folder goes on where it stopped, and refuses a job that differs in anything but `scenes` (more of them) and `run`.
-# `digest` covers what the dataset is: all other keys and the files of the asset folders (`catalogue`). `folder` is where
-# the job file lay: relative asset folders start there. `seal` is the SHA-256 of all bytes above it.
+# `digest` covers what the dataset is: all other keys that differ from their defaults, and the files of the asset folders
+# (`catalogue`). `folder` is where the job file lay: relative asset folders start there. `seal` is the SHA-256 of all bytes
+# above it.
 """
 
 SEAL = "seal: "

@@ -5,9 +5,11 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from schemas.job.assets import CATEGORIES, FolderSource, matches, offered_by
-from schemas.job.identity import compare_jobs, dataset_keys, job_digest, settings_digest
+from schemas.job.assets import CATEGORIES, Assets, FolderSource, ProceduralSource, matches, offered_by
+from schemas.job.identity import PATHS, compare_jobs, differing_keys, job_digest, settings_digest
 from schemas.job.job import PRESETS, Job, with_preset
+from schemas.job.physics import Start
+from schemas.job.views import Targets
 from tests.datasets import overlaid
 
 FRUIT = {"source": "urdf", "folder": "fruit", "category_map": {"*.obj": "banana", "*.glb": "Pear-2", "t.obj": "table"}}
@@ -134,7 +136,6 @@ def test_what_follows_from_captures_unless_the_job_says_otherwise():
     assert job(SIMULATED, run={"range_size": 4}).run.range_size == 4
     for base in (FOLDERS, SIMULATED):
         assert Job.model_validate(job(base).model_dump(mode="json")) == job(base)
-    assert "captures" not in job().model_dump(mode="json") and "captures" not in job().model_dump_json()
 
 
 def test_what_a_capture_cannot_have_is_refused_with_its_key():
@@ -165,7 +166,7 @@ def test_a_key_belongs_to_the_dataset_to_its_scenes_or_to_neither():
         ({"name": "u"}, False, True),
         ({"first_scene": 4}, False, True),
         ({"output": {"layout": "tar"}}, False, True),
-        ({"preset": "exact", "physics": {"step_hz": 960}, "render": {"samples": 1}}, False, True),
+        ({"preset": "exact", "physics": {"step_hz": 960}, "render": {"samples": 1}}, True, True),
         ({"seed": 1}, False, False),
         ({"cameras": {"mirror": {"T_z_m": 1.4}}}, False, False),
         ({"sensor": {"rgb_noise": {}}}, False, False),
@@ -182,21 +183,54 @@ def test_a_key_belongs_to_the_dataset_to_its_scenes_or_to_neither():
     assert differing == [("seed", 0, 2), ("start.pose", "upright", "tumbled")]
 
 
-def test_settings_of_captures_belong_to_the_dataset_and_paths_and_what_the_source_does_not_use_do_not():
+def test_settings_of_captures_belong_to_the_dataset_and_paths_do_not():
     before, moved = job(FOLDERS), job(FOLDERS, captures={"folders": ["x/a", "x/b", "x/c"]})
     assert compare_jobs(before, moved) == [] and job_digest(before, "c") == job_digest(moved, "c")
     finer = job(FOLDERS, captures={"fusion": {"voxel_m": 0.001}})
     assert compare_jobs(before, finer) == [("captures.fusion.voxel_m", 0.002, 0.001)]
     assert settings_digest(before, "c") != settings_digest(finer, "c")
-    assert "folders" not in dataset_keys(before)["captures"]
-    views = {"simulate": {"views": 9}}
-    assert job_digest(before, "c") == job_digest(job(FOLDERS, captures=views), "c")
-    assert job_digest(job(SIMULATED), "c") != job_digest(job(SIMULATED, captures=views), "c")
 
 
-def test_digests_of_jobs_are_those_of_datasets_that_were_made_before():
-    assert job_digest(job(), "c")[:16] == "d3ee8e0fe9559a68"
-    assert settings_digest(job(), "c")[:16] == "938ee36c17800eba"
-    mapped = {"source": "urdf", "folder": "m", "category_map": {"*.obj": "mug"}, "up": "y"}
-    before_maps_of_axes = job_digest(Job(name="j", assets={"objects": [mapped]}), "c" * 64)
-    assert before_maps_of_axes == "2a98cd36192d5711e6a2502d718b8a394dcd9aed87ac5985e007aab10ed1d3f3"
+class _LongerStart(Start):
+    spin: float = 1.0
+
+
+class _LongerSource(ProceduralSource):
+    gloss: float = 0.5
+
+
+class _LongerAssets(Assets):
+    objects: tuple[_LongerSource, ...] = (_LongerSource(source="procedural"),)
+
+
+class _LongerJob(Job):
+    start: _LongerStart = _LongerStart()
+    assets: _LongerAssets = _LongerAssets()
+    targets: Targets | None = None
+    views: tuple[int, ...] = (1, 2)
+
+
+def test_a_key_that_a_later_version_adds_leaves_the_digests_of_older_jobs_and_counts_where_it_is_set():
+    keys = {"name": "t", "start": {"pose": "tumbled"}, "assets": {"objects": [{"source": "procedural", "seed": 3}]}}
+    older, newer = (kind.model_validate(keys) for kind in (Job, _LongerJob))
+    for digest in (job_digest, settings_digest):
+        assert digest(newer, "c") == digest(older, "c")
+        for changes in (
+            {"start": {"spin": 2.0}},
+            {"views": [1]},
+            {"targets": {}},
+            {"assets": {"objects": [{"source": "procedural", "seed": 3, "gloss": 0.4}]}},
+        ):
+            assert digest(_LongerJob.model_validate(overlaid(keys, changes)), "c") != digest(older, "c"), changes
+    assert differing_keys(older) == {**keys}
+
+
+def test_a_digest_is_that_of_what_differs_from_the_defaults_of_the_keys_whatever_filled_them():
+    exact = job(preset="exact")
+    assert differing_keys(exact)["physics"] == {"step_hz": 1920} and differing_keys(job(seed=0)) == {"name": "t"}
+    assert job_digest(exact, "c") == job_digest(job(physics={"step_hz": 1920}, render={"samples": 4}), "c")
+    assert job_digest(exact, "c") != job_digest(job(), "c")
+    noisy = job(sensor={"depth_noise": {}})
+    assert differing_keys(noisy)["sensor"] == {"depth_noise": {}}, "a branch that is there differs from none"
+    sources = differing_keys(job(BASE), PATHS)["assets"]["objects"]
+    assert sources == [{"source": "files"}], "the kind of a source stays, the path of its folder does not"

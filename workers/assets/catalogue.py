@@ -20,8 +20,6 @@ from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
     BUILT_IN,
-    FILES,
-    FORMER,
     TABLE,
     VERSION,
     Assets,
@@ -32,6 +30,7 @@ from schemas.job.assets import (
     SplitShares,
     instance_id,
 )
+from schemas.job.identity import differing_keys
 from schemas.scene.shape import Asset
 from workers.assets.external.listing import Listing, Watch, find_files, find_models, ignore
 from workers.geometry.frames import add_up
@@ -261,8 +260,7 @@ def _digest(
     record = []
     for settings, listing in zip((*assets.objects, *assets.tables), (*objects, *tables), strict=True):
         # The folder's path is left out: the same files elsewhere are the same catalogue.
-        plain = settings.model_dump(mode="json", exclude={"folder"})
-        plain["source"] = FORMER if settings.source == FILES else settings.source  # as the first datasets have it
+        plain = differing_keys(settings, {"folder"})
         files: dict[str, Any] | None = None
         if listing is not None:
             files = {
@@ -272,7 +270,7 @@ def _digest(
             if any(listing.refused.values()):
                 files["refused"] = {category: sorted(numbers) for category, numbers in listing.refused.items()}
         record.append({"settings": plain, "generator": VERSION if listing is None else None, "files": files})
-    scalars = assets.model_dump(mode="json", exclude={"objects", "tables"})
+    scalars = differing_keys(assets, {"objects", "tables"})
     whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": scalars}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
 

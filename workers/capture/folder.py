@@ -269,7 +269,7 @@ def write_view(path: Path, view: CapturedView) -> None:
 def write_description(path: Path, about: CaptureFile, camera: CaptureCamera, board: Board) -> None:
     """Writes camera.json, board.json and capture.json; the principal point with pixel centres at 0, as the Kinect has it."""
     for name, model in ((CAMERA_FILE, describe_camera(camera)), (BOARD_FILE, board), (CAPTURE_FILE, about)):
-        (path / name).write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        (path / name).write_text(model.model_dump_json(indent=1, exclude=board.unwritten) + "\n", encoding="utf-8")
 
 
 def describe_camera(camera: CaptureCamera) -> CameraFile:

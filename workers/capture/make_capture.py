@@ -85,7 +85,8 @@ def board_asset(board: Board, settings: Assets) -> Asset:
     shape = Shape((Part("board", corners, frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)),))
     size = f"{board.columns}x{board.rows}-{1e3 * board.scale * board.marker_m:g}mm-from-{board.first_id}"
     if board.markers:
-        size = f"{len(board.markers)}-markers-{hashlib.sha256(board.model_dump_json().encode()).hexdigest()[:8]}"
+        keys = board.model_dump_json(exclude=board.unwritten)
+        size = f"{len(board.markers)}-markers-{hashlib.sha256(keys.encode()).hexdigest()[:8]}"
     names = CaptureNames(f"{board.dictionary}-{size}", BOARD, "CC0-1.0", BOARD)
     return _asset(names, shape, settings, frozen_array(np.eye(4)), ("its markers are not drawn",))
 

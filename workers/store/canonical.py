@@ -4,8 +4,8 @@ Each column is hashed as a few streams: which values are present (one byte each)
 values themselves (doubles as IEEE-754 little-endian, so -0.0 is not 0.0; integers as 8 bytes little-endian; booleans as
 one byte; strings as UTF-8). A missing value counts as absent and as zero or empty; items below an absent list are left
 out. A column's digest is the hash of its streams' digests, a table's digest the hash of its name, its number of rows
-and its columns in the order of the schema; columns of image targets count only where a row has a value. It does not
-depend on how rows were cut into batches.
+and its columns in the order of the schema, but for those without any value: a later column leaves older digests as they are. It
+does not depend on how rows were cut into batches.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.dataset.tables import DETERMINISTIC_TABLES, NOT_IN_DIGEST, SCHEMAS
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS
 
 _PRIMITIVES: dict[pa.DataType, tuple[str, float | bool]] = {
     pa.float64(): ("<f8", 0.0),
@@ -85,9 +85,8 @@ class TableDigest:
         """64 hex characters: of all rows so far."""
         total = hashlib.sha256(f"verso rows 1\n{self._name}\n{self.rows}\n".encode())
         for stream, field in zip(self._streams, self._schema, strict=True):
-            if field.name in NOT_IN_DIGEST[self._name] and not stream.some:
-                continue
-            total.update(f"{field.name}\n{_tag(field.type)}\n".encode() + stream.digest())
+            if stream.some:
+                total.update(f"{field.name}\n{_tag(field.type)}\n".encode() + stream.digest())
         return total.hexdigest()
 
 
