@@ -11,11 +11,11 @@ from pathlib import Path
 from schemas.errors import AssetSourceError, MeshError, plain_line
 from schemas.job.assets import Assets, FolderSource, MeshLimits
 from services.init.copies import COPY, PART, Item, LeftOut, Reading, find_copies
-from workers.assets.external.formats import FORMATS
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.placement import read_measured
 from workers.assets.external.reader import Kind, Request, Task, ask_all
-from workers.assets.external.urdf import POSED
+from workers.door.meshes.formats import FORMATS
+from workers.door.meshes.urdf import POSED
 
 SUFFIXES = (*POSED, *FORMATS)
 """What is read; of one mesh in several formats, the first."""

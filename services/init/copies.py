@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from workers.assets.external.placement import Measured
-from workers.assets.external.urdf import POSED
+from workers.door.meshes.urdf import POSED
 
 PART, COPY = "part", "copy"
 """The reasons why a mesh is not an object by itself: a file names it; it is a collision shape, a coarser level, a double."""

@@ -10,7 +10,7 @@ from statistics import median
 
 from schemas.job.assets import UpAxis, matches
 from services.init.copies import Item
-from workers.assets.external.urdf import POSED
+from workers.door.meshes.urdf import POSED
 
 METRIC = frozenset({".glb", ".gltf", ".dae", *POSED})
 """Formats whose specification says metres."""

@@ -20,8 +20,8 @@ from services.init.copies import Item, LeftOut
 from services.init.guess import ON_TABLE_M, length
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import AnySource, Catalogue, InstanceRef
-from workers.assets.external.mesh import transform_shape
 from workers.assets.external.placement import FLAT
+from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose, translation
 from workers.render.raster.gbuffer import Renderer
 

@@ -27,8 +27,8 @@ from schemas.errors import InputError, plain_line
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.score.pose import is_rigid
-from workers.assets.external.formats import load_shape, read_bytes
-from workers.assets.external.plain import count_ply
+from workers.door.meshes.formats import load_shape, read_bytes
+from workers.door.meshes.plain import count_ply
 from workers.store.images import decode_png
 
 SUFFIXES: Final = {

@@ -16,9 +16,9 @@ from trimesh.registration import procrustes
 from schemas.base import Array, Pose
 from schemas.scene.shape import Mesh
 from services.score.images import Alignment
-from workers.assets.external.mesh import is_solid, merge_points
 from workers.assets.mass import unite_bodies
 from workers.assets.winding import winding_numbers
+from workers.door.meshes.mesh import is_solid, merge_points
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import transform
 from workers.geometry.mesh import face_areas, face_normals, solid_of, weld

@@ -29,8 +29,8 @@ from services.cli.main import build_parser
 from services.queue.queue import RESTARTS, JobState
 from services.queue.supervise import PAUSES_S
 from tests.services.init.own_meshes import cup, write_mesh
-from tests.workers.capture.recordings import recording
-from tests.workers.capture.test_readers import write_realsense
+from tests.workers.door.recordings import recording
+from tests.workers.door.test_readers import write_realsense
 from workers.assets.builtin.make import make_asset
 from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.simulate.simulate import simulate_capture

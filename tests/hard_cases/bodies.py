@@ -12,7 +12,7 @@ from schemas.job.assets import ProceduralSource
 from schemas.scene.shape import Asset
 from tests.hard_cases.drops import EDGE_M, Drop, X, drop, level, turn, with_peg
 from tests.kit.shapes import asset_of, box
-from tests.workers.assets.oracles import hits
+from tests.workers.door.oracles import hits
 from workers.assets.builtin.make import make_asset
 
 

@@ -15,7 +15,7 @@ from tests.hard_cases.groups import DOMINO_M, LEAN_DEG, PLANK_M, PLANK_THICK_M, 
 from tests.hard_cases.measures import apart, both, heights, tilts
 from tests.hard_cases.outside import enter
 from tests.kit.shapes import box
-from tests.workers.assets.oracles import write
+from tests.workers.door.oracles import write
 
 SIDE_M = 0.05
 

@@ -14,7 +14,7 @@ import numpy as np
 from schemas.job.captures import Board
 from tests.hard_cases.camera_cases import HOLD
 from tests.hard_cases.case import refuse
-from tests.workers.capture.recordings import (
+from tests.workers.door.recordings import (
     PERIOD_US,
     START_US,
     TAGS,

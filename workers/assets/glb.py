@@ -20,7 +20,7 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Array
 from schemas.scene.shape import Asset, Material, Part
-from workers.geometry.colour import decode_srgb, encode_srgb
+from workers.geometry.colour import attribute_colors, decode_srgb, encode_srgb
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
@@ -121,21 +121,6 @@ def join_glb(tree: dict[str, Any], binary: bytes) -> bytes:
     return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
-def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The JSON tree of a binary glTF file, and the bytes of its buffer, with up to 3 that fill it up.
-
-    Raises struct.error or ValueError where it is none.
-    """
-    magic, version, _, length, kind = _HEADER.unpack_from(data)
-    if magic == b"glTF" and version != 2:
-        raise ValueError(f"binary glTF of version {version}: only 2 is read")
-    if magic != b"glTF" or kind != b"JSON":
-        raise ValueError("no glTF header")
-    text = data[_HEADER.size : _HEADER.size + length]
-    tree: dict[str, Any] = json.loads(text.rstrip(b"\0"))  # some exporters fill up with NUL
-    return tree, data[_HEADER.size + length + 8 :]
-
-
 def _material(writer: _Writer, part: Part, rgb: list[float], watertight: bool) -> dict[str, Any]:
     """The material of a part whose colour is `rgb`, linear: glTF's factors are, ours are sRGB; textures are sRGB in both."""
     material = part.material
@@ -207,24 +192,6 @@ def show_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         colors = attribute_colors(visual.vertex_attributes["color"], len(mesh.vertices))
         mesh.visual = ColorVisuals(mesh, vertex_colors=colors)
     return mesh
-
-
-def attribute_colors(values: NDArray | None, count: int, linear: bool = False) -> NDArray[np.uint8] | None:
-    """Vertex colours, floats in [0, 1] or integers that use the whole range of their type, as [V, 4] uint8 sRGB.
-
-    `linear`: they are linear, as those of a stored GLB. None where they cannot be used.
-    """
-    if values is None or np.shape(values) not in ((count, 3), (count, 4)):
-        return None
-    whole = np.issubdtype(values.dtype, np.integer)
-    share = np.ones((count, 4))
-    share[:, : values.shape[1]] = values / np.iinfo(values.dtype).max if whole else values
-    if not np.isfinite(share).all():
-        return None
-    share = np.clip(share, 0.0, 1.0)
-    if linear:
-        share[:, :3] = encode_srgb(share[:, :3])
-    return np.round(255.0 * share).astype(np.uint8)
 
 
 def part_of_mesh(name: str, mesh: trimesh.Trimesh) -> Part:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import MassProperties, Mesh, Shape
-from workers.assets.external.mesh import find_bodies, find_repeated, is_solid, merge_points
+from workers.door.meshes.mesh import find_bodies, find_repeated, is_solid, merge_points
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of, mesh_of, piece_of, solid_of
 

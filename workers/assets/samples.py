@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.job.views import ShapeTarget, Targets
 from schemas.scene.shape import Asset, Mesh, Part, Shape
-from workers.assets.external.mesh import merge_points
 from workers.assets.mass import unite_bodies
 from workers.assets.winding import winding_numbers, winding_of_closed
+from workers.door.meshes.mesh import merge_points
 from workers.geometry.colour import SRGB_STEPS, decode_srgb, encode_codes
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.mesh import face_areas, face_normals, mix, sample_texture

@@ -17,7 +17,6 @@ from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, SceneOutput
 from schemas.scene.shape import Asset, Material, Part, Shape
 from workers.assets.builtin.make import shape_digest
-from workers.assets.external.mesh import is_solid
 from workers.assets.mass import mass_properties
 from workers.capture.folder import CaptureFolder, open_folder, read_receipt, read_truth
 from workers.capture.reconstruct import estimate_surface, given_files
@@ -34,6 +33,7 @@ from workers.capture.rows import (
 from workers.capture.score import read_whole_truth, score_capture
 from workers.capture.simulate.simulate import load_object, simulate_capture
 from workers.capture.views import CaptureViews
+from workers.door.meshes.mesh import is_solid
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import translation
 from workers.scene.chance import SceneChance

@@ -48,3 +48,21 @@ HOLE_ALPHA = 128
 def has_holes(texture: NDArray[np.uint8] | None) -> bool:
     """Whether a texture [h, w, 3 or 4] has holes."""
     return texture is not None and texture.shape[2] == 4 and bool((texture[..., 3] < HOLE_ALPHA).any())
+
+
+def attribute_colors(values: NDArray | None, count: int, linear: bool = False) -> NDArray[np.uint8] | None:
+    """Vertex colours, floats in [0, 1] or integers that use the whole range of their type, as [V, 4] uint8 sRGB.
+
+    `linear`: they are linear, as those of a stored GLB. None where they cannot be used.
+    """
+    if values is None or np.shape(values) not in ((count, 3), (count, 4)):
+        return None
+    whole = np.issubdtype(values.dtype, np.integer)
+    share = np.ones((count, 4))
+    share[:, : values.shape[1]] = values / np.iinfo(values.dtype).max if whole else values
+    if not np.isfinite(share).all():
+        return None
+    share = np.clip(share, 0.0, 1.0)
+    if linear:
+        share[:, :3] = encode_srgb(share[:, :3])
+    return np.round(255.0 * share).astype(np.uint8)

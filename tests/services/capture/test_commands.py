@@ -9,8 +9,8 @@ import trimesh
 from schemas.errors import CaptureError, InputError, JobError, OutputError
 from services.capture import capture_job, capture_settings
 from services.cli.main import main
-from tests.workers.capture.recordings import recording
 from tests.workers.capture.simulated import VIEWS, box, copy_of, processed
+from tests.workers.door.recordings import recording
 from workers.capture.folder import open_folder, read_board, read_truth
 
 

@@ -35,10 +35,10 @@ from services.init.shown import (
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import load_job
 from tests.services.init.own_meshes import cup, mixed_folder, write_mesh
-from tests.workers.assets.oracles import write
+from tests.workers.door.oracles import write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
-from workers.assets.external.mesh import transform_shape
+from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
 from workers.render.raster.gbuffer import shared_renderer
 

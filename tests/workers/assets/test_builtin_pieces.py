@@ -8,7 +8,7 @@ import trimesh
 from shapely.geometry import Polygon
 
 from schemas.scene.shape import Material
-from tests.workers.assets.oracles import faulty_rays, welded
+from tests.workers.door.oracles import faulty_rays, welded
 from workers.assets.builtin import materials
 from workers.assets.builtin import solid as solid_module
 from workers.assets.builtin.parts import Surface, cut_into_parts, turn_about_z

@@ -15,7 +15,7 @@ import trimesh
 from shapely.geometry import Polygon
 
 from schemas.job.assets import CATEGORIES, ProceduralSource, instance_id
-from tests.workers.assets.oracles import faulty_rays, hits, support_margin, welded
+from tests.workers.door.oracles import faulty_rays, hits, support_margin, welded
 from workers.assets.builtin import bottle, box, camera, can, crockery, laptop, table
 from workers.assets.builtin.make import make_asset, make_model, shape_digest
 from workers.assets.builtin.solid import Solid, union

@@ -12,7 +12,7 @@ import trimesh
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import CATEGORIES, Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
 from tests.kit.shapes import asset_of
-from tests.workers.assets.oracles import CUBE, textured_obj, write, write_all
+from tests.workers.door.oracles import CUBE, textured_obj, write, write_all
 from workers.assets import catalogue as catalogue_file
 from workers.assets.catalogue import (
     Catalogue,

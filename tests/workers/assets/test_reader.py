@@ -23,7 +23,7 @@ from schemas.base import frozen_array
 from schemas.errors import AssetSourceError, MachineError, MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
-from tests.workers.assets.oracles import CUBE, picture, textured_cube, write
+from tests.workers.door.oracles import CUBE, picture, textured_cube, write
 from workers.assets.external import reader
 from workers.assets.external import verdicts as verdict_file
 from workers.assets.external.listing import Entry, SourceFile, hash_files

@@ -17,7 +17,7 @@ from schemas.scene.shape import Asset, Material, Mesh, Part, Shape
 from tests.judge.nearest import distances_to_faces
 from tests.judge.nearest import winding_numbers as exact_winding_numbers
 from tests.kit.shapes import asset_of, box
-from tests.workers.assets.oracles import welded
+from tests.workers.door.oracles import welded
 from workers.assets.builtin.make import make_asset
 from workers.assets.samples import draw_samples, encode_samples
 from workers.assets.winding import winding_numbers

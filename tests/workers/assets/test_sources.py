@@ -8,7 +8,7 @@ from schemas.dataset.tables import SCHEMAS
 from schemas.errors import AssetSourceError
 from schemas.job.assets import BUILT_IN, Assets, FolderSource, MeshLimits, ShapeNetSource
 from schemas.job.job import Job
-from tests.workers.assets.oracles import (
+from tests.workers.door.oracles import (
     CUBE,
     gltf,
     picture,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import CaptureError
-from tests.workers.capture.recordings import (
+from tests.workers.door.recordings import (
     BOARD,
     COLOR,
     COLOR_LENS,

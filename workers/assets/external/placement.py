@@ -19,13 +19,13 @@ from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset, Hull, Shape
-from workers.assets.external.caps import MOST_NOTES, one_line
-from workers.assets.external.dae import find_up
-from workers.assets.external.formats import FORMATS, list_mesh_files, load_shape
 from workers.assets.external.listing import HEAD_BYTES, Entry, check_unchanged, mesh_root, refuse_other
-from workers.assets.external.mesh import DEFAULT, LoadedMesh, transform_shape
-from workers.assets.external.urdf import POSED, list_seen, load_posed
 from workers.assets.mass import weigh
+from workers.door.meshes.caps import MOST_NOTES, one_line
+from workers.door.meshes.dae import find_up
+from workers.door.meshes.formats import FORMATS, list_mesh_files, load_shape
+from workers.door.meshes.mesh import DEFAULT, LoadedMesh, transform_shape
+from workers.door.meshes.urdf import POSED, list_seen, load_posed
 from workers.geometry.frames import pose
 
 UP_AXES: Mapping[str, Array] = {

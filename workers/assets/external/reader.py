@@ -37,7 +37,6 @@ from schemas.base import frozen_array
 from schemas.errors import MachineError, MeshError
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource
 from schemas.scene.shape import Asset, Hull, MassProperties, Material, Part, Shape
-from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, hash_files
 from workers.assets.external.placement import (
     THINNEST,
@@ -47,7 +46,8 @@ from workers.assets.external.placement import (
     measure_asset,
     measure_thinness,
 )
-from workers.assets.external.urdf import list_named
+from workers.door.meshes.caps import describe_error, one_line
+from workers.door.meshes.urdf import list_named
 from workers.geometry.hull import convex_hull
 
 Kind = Literal["list", "check", "load", "measure", "names"]

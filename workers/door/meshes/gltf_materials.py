@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver
-from workers.assets.external.mesh import MIN_TINT, MeshVisual, make_material
+from workers.door.meshes.caps import FolderResolver
+from workers.door.meshes.mesh import MIN_TINT, MeshVisual, make_material
 from workers.geometry.colour import encode_srgb
 
 Tree = dict[str, Any]

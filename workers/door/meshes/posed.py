@@ -13,8 +13,8 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
-from workers.assets.external.caps import check_nodes
-from workers.assets.external.mesh import DEFAULT
+from workers.door.meshes.caps import check_nodes
+from workers.door.meshes.mesh import DEFAULT
 from workers.geometry.frames import pose, rotation_about
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")

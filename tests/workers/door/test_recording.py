@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import CaptureError
-from tests.workers.capture.recordings import (
+from tests.workers.door.recordings import (
     TAGS,
     calibration,
     camera_entry,
@@ -19,7 +19,7 @@ from tests.workers.capture.recordings import (
     write_recording,
 )
 from tests.workers.geometry.made_up_kinect import COLOR_LENS, T_COLOR_DEPTH
-from workers.capture.recording import (
+from workers.door.recordings.kinect import (
     COLOR_SIZES,
     DEPTH_MODES,
     FORMATS,

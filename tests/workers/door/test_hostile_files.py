@@ -14,16 +14,16 @@ from schemas.errors import MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.job.job import Job
 from schemas.scene.shape import Asset
-from tests.workers.assets.mutants import mutant
-from tests.workers.assets.oracles import CUBE, glb, gltf, picture, textured_cube, urdf, visual, write, write_all
-from tests.workers.assets.test_statements import dae
+from tests.workers.door.mutants import mutant
+from tests.workers.door.oracles import CUBE, glb, gltf, picture, textured_cube, urdf, visual, write, write_all
+from tests.workers.door.test_statements import dae
 from workers.assets.catalogue import open_catalogue
-from workers.assets.external import urdf as urdf_file
-from workers.assets.external.formats import load_shape
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.reader import Request, Task, ask_all, unpack_asset
-from workers.assets.external.urdf import load_posed
 from workers.assets.external.verdicts import Verdicts
+from workers.door.meshes import urdf as urdf_file
+from workers.door.meshes.formats import load_shape
+from workers.door.meshes.urdf import load_posed
 from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, open_worker
 from workers.scene.plan import draw_scene

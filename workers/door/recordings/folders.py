@@ -21,7 +21,7 @@ from schemas.base import frozen_array
 from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
-from workers.capture.pictures import PictureError, Size, decode_depth, decode_rgb, decode_small, head_size
+from workers.door.recordings.pictures import PictureError, Size, decode_depth, decode_rgb, decode_small, head_size
 
 MOST_BYTES = 256_000_000
 """Of one file or one member of an archive."""

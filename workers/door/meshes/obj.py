@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver
-from workers.assets.external.mesh import (
+from workers.door.meshes.caps import FolderResolver
+from workers.door.meshes.mesh import (
     DEFAULT,
     WHITE,
     Indices,

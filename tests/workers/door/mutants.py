@@ -14,8 +14,8 @@ import trimesh
 from PIL import Image
 
 from tests.mutations import mutated_bytes, mutated_tree, places
-from tests.workers.assets.oracles import CUBE, Files, glb, gltf, picture, textured_obj
-from tests.workers.assets.test_statements import SHOWN, dae, off
+from tests.workers.door.oracles import CUBE, Files, glb, gltf, picture, textured_obj
+from tests.workers.door.test_statements import SHOWN, dae, off
 
 Change = Callable[[random.Random, bytes], bytes]
 

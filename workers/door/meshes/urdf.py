@@ -16,7 +16,7 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.external.caps import (
+from workers.door.meshes.caps import (
     LONGEST_NAME,
     Budget,
     FolderResolver,
@@ -24,10 +24,10 @@ from workers.assets.external.caps import (
     check_nodes,
     find_inside,
 )
-from workers.assets.external.formats import load_shape, with_jpeg
-from workers.assets.external.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
-from workers.assets.external.mjcf import read_mjcf
-from workers.assets.external.posed import MOST_ABOVE, Model, Visual, numbers, parse_xml, read_body, scaled, turned
+from workers.door.meshes.formats import load_shape, with_jpeg
+from workers.door.meshes.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
+from workers.door.meshes.mjcf import read_mjcf
+from workers.door.meshes.posed import MOST_ABOVE, Model, Visual, numbers, parse_xml, read_body, scaled, turned
 
 
 def find_named(name: str, path: Path, root: Path) -> Path:

@@ -18,8 +18,8 @@ from trimesh.visual.material import PBRMaterial
 from schemas.job.assets import CATEGORIES, MeshLimits, ProceduralSource
 from schemas.scene.shape import Material, Part, Shape
 from tests.kit.shapes import asset_of
-from tests.workers.assets.mutants import exported, png_of
-from tests.workers.assets.oracles import (
+from tests.workers.door.mutants import exported, png_of
+from tests.workers.door.oracles import (
     CUBE,
     gltf,
     picture,
@@ -32,11 +32,12 @@ from tests.workers.assets.oracles import (
     write_all,
 )
 from workers.assets.builtin.make import make_asset
-from workers.assets.external.formats import list_mesh_files, load_shape
-from workers.assets.external.mesh import is_solid
 from workers.assets.external.reader import pack_asset, unpack_asset
-from workers.assets.external.urdf import load_posed
-from workers.assets.glb import asset_glb, split_glb
+from workers.assets.glb import asset_glb
+from workers.door.meshes.formats import list_mesh_files, load_shape
+from workers.door.meshes.gltf import split_glb
+from workers.door.meshes.mesh import is_solid
+from workers.door.meshes.urdf import load_posed
 
 NORMALS = "not drawn: normalTexture"
 """The note on the map of the glTF cube that nothing reads."""

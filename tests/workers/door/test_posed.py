@@ -9,12 +9,12 @@ import trimesh
 
 from schemas.errors import MeshError
 from schemas.job.assets import FolderSource, MeshLimits
-from tests.workers.assets.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
-from tests.workers.assets.test_statements import dae, geometry
-from workers.assets.external.dae import find_up
-from workers.assets.external.formats import load_shape
+from tests.workers.door.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
+from tests.workers.door.test_statements import dae, geometry
 from workers.assets.external.placement import list_files
-from workers.assets.external.urdf import find_named, list_named, list_seen, load_posed
+from workers.door.meshes.dae import find_up
+from workers.door.meshes.formats import load_shape
+from workers.door.meshes.urdf import find_named, list_named, list_seen, load_posed
 
 FOLDER = FolderSource(source="files", folder=".")
 LIMITS = MeshLimits()

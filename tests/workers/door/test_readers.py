@@ -17,8 +17,9 @@ from schemas.capture import DepthCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
 from workers.capture.folder import CaptureFile, open_folder, read_view
-from workers.capture.import_recording import import_recording, open_any
-from workers.capture.pictures import PictureError
+from workers.capture.import_recording import import_recording
+from workers.door.recordings.formats import open_any
+from workers.door.recordings.pictures import PictureError
 
 W, H, COUNT = 64, 48, 3
 RNG = np.random.default_rng(5)

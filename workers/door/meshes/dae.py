@@ -22,8 +22,8 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import UpAxis
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver, check_counts, check_nodes, unreadable
-from workers.assets.external.mesh import (
+from workers.door.meshes.caps import FolderResolver, check_counts, check_nodes, unreadable
+from workers.door.meshes.mesh import (
     DEFAULT,
     WHITE,
     Indices,
@@ -36,7 +36,7 @@ from workers.assets.external.mesh import (
     make_material,
     roughness_of,
 )
-from workers.assets.external.posed import MOST_ABOVE, parse_tree
+from workers.door.meshes.posed import MOST_ABOVE, parse_tree
 from workers.geometry.frames import pose, rotation_about
 
 _MALFORMED = (ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError)

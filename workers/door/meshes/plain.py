@@ -22,8 +22,8 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.assets.external.caps import FolderResolver, decode_names, decode_picture, unreadable
-from workers.assets.external.mesh import (
+from workers.door.meshes.caps import FolderResolver, decode_names, decode_picture, unreadable
+from workers.door.meshes.mesh import (
     DEFAULT,
     WHITE,
     Indices,
@@ -33,8 +33,7 @@ from workers.assets.external.mesh import (
     cut_strip,
     make_material,
 )
-from workers.assets.glb import attribute_colors
-from workers.geometry.colour import encode_srgb
+from workers.geometry.colour import attribute_colors, encode_srgb
 
 _TEXTURE = re.compile(rb"^comment TextureFile[ \t]+([^\r\n]+)", re.MULTILINE)
 _ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)

@@ -12,13 +12,13 @@ from pathlib import Path
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
-from workers.assets.external import plain
-from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes
-from workers.assets.external.dae import named_by_dae, read_dae
-from workers.assets.external.gltf import named_by_gltf, read_gltf
-from workers.assets.external.mesh import LoadedMesh, RawMesh, clean_shape, place_mesh
-from workers.assets.external.mjcf import count_msh, read_msh
-from workers.assets.external.obj import count_obj, named_by_mtl, named_by_obj, read_obj
+from workers.door.meshes import plain
+from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
+from workers.door.meshes.dae import named_by_dae, read_dae
+from workers.door.meshes.gltf import named_by_gltf, read_gltf
+from workers.door.meshes.mesh import LoadedMesh, RawMesh, clean_shape, place_mesh
+from workers.door.meshes.mjcf import count_msh, read_msh
+from workers.door.meshes.obj import count_obj, named_by_mtl, named_by_obj, read_obj
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from PIL import Image
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
-from tests.workers.assets.oracles import glb, welded, write_all
-from workers.assets.external.formats import load_shape
+from tests.workers.door.oracles import glb, welded, write_all
+from workers.door.meshes.formats import load_shape
 
 CORNERS = np.array([[x, y, z] for z in (0, 0.2) for x, y in ((-0.1, -0.1), (0.1, -0.1), (0.1, 0.1), (-0.1, 0.1))])
 SIDES = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))

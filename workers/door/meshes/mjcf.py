@@ -15,9 +15,9 @@ import numpy as np
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
-from workers.assets.external.caps import FolderResolver
-from workers.assets.external.mesh import DEFAULT, MeshVisual, RawMesh
-from workers.assets.external.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled
+from workers.door.meshes.caps import FolderResolver
+from workers.door.meshes.mesh import DEFAULT, MeshVisual, RawMesh
+from workers.door.meshes.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled
 from workers.geometry.frames import half_turn, pose, rotation_about, rotation_between, rotation_from_quaternion
 
 Attributes = Mapping[str, str]

@@ -10,19 +10,19 @@ from shapely import Polygon
 
 from schemas.job.assets import CATEGORIES, TABLE, Assets, FolderSource, MeshLimits, ProceduralSource
 from tests.kit.shapes import shape_of
-from tests.workers.assets.oracles import CUBE, support_margin, welded, write
+from tests.workers.door.oracles import CUBE, support_margin, welded, write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
-from workers.assets.external.formats import load_shape
 from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.mesh import (
+from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand, place_asset
+from workers.assets.mass import mass_properties, shell_mass, weigh
+from workers.door.meshes.formats import load_shape
+from workers.door.meshes.mesh import (
     LoadedMesh,
     find_flips,
     is_solid,
     transform_shape,
 )
-from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand, place_asset
-from workers.assets.mass import mass_properties, shell_mass, weigh
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 
