@@ -60,7 +60,11 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     "import": command(
         "make a capture from a recording of an RGB-D camera, without its SDK",
         "recording.mkv --out data/mug-1 --frames 40 --board board.json --name mug-1 --category mug",
-        path("recording", "RECORDING", "a file or folder: .mkv, .bag, .r3d, TUM, BOP, Open3D, Polycam, ARKitScenes"),
+        path(
+            "recording",
+            "RECORDING",
+            "a file or folder: .mkv, .bag, .db3, .mcap, .r3d, TUM, BOP, Open3D, Polycam, ARKitScenes",
+        ),
         NEW_DIR,
         number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
         BOARD,

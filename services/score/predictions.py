@@ -20,7 +20,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
 
 from schemas.base import Array, Pose
 from schemas.errors import InputError, plain_line
@@ -28,7 +27,8 @@ from schemas.job.assets import MeshLimits
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.score.pose import is_rigid
 from workers.door.meshes.formats import load_shape, read_bytes
-from workers.door.meshes.plain import count_ply
+from workers.door.meshes.ply import count_ply, parse_ply
+from workers.door.opening import as_refusal
 from workers.store.images import decode_png
 
 SUFFIXES: Final = {
@@ -171,11 +171,9 @@ def _read_points(path: Path) -> Array:
 
 
 def _read_cloud(path: Path) -> Array:
-    try:
-        vertices = PlyData.read(str(path))["vertex"]
+    with as_refusal(path.name):
+        vertices = parse_ply(read_bytes(path, LIMITS))["vertex"]
         return np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
-    except (PlyParseError, ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} cannot be read: {str(error).splitlines()[0][:200]}") from error
 
 
 def _checked(points: Array) -> Array:

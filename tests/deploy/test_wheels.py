@@ -39,11 +39,11 @@ HEAVY = {
 }
 HEAVY |= {
     "scipy",
-    "plyfile",
     "mapbox_earcut",
     "clarabel",
     "daqp",
     "reportlab",
+    "rosbags",
     "prometheus_client",
     "networkx",
     "pyglet",

@@ -9,7 +9,7 @@ from schemas.scene.scene import EffectPlan, ScenePlan, Settled
 from services.read.audit import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop
-from workers.physics.fall import Outcome, StepSizes, fall, falls_below
+from workers.physics.fall import Outcome, StepSizes, Watch, fall, falls_below
 from workers.physics.release import moved_by, release_again
 from workers.physics.rigid_body import make_body
 from workers.physics.settle import Rest, settle_scene
@@ -71,4 +71,4 @@ def drop_on(case: Drop, slab: bool) -> Outcome:
     ground = case.table.top.height_m if slab else case.table.mesh
     steps = StepSizes(physics.step_hz, physics.max_step_travel_mm / 1e3)
     stops = {"below": falls_below(case.table.top.height_m - 0.2)}
-    return fall([make_body(case.start)], [case.start.T_world_obj], ground, physics, steps, 0.0, stops)
+    return fall([make_body(case.start)], [case.start.T_world_obj], ground, physics, steps, 0.0, Watch(stops))

@@ -15,8 +15,9 @@ from schemas.errors import CaptureError
 from schemas.job.captures import Board
 from schemas.scene.view import Intrinsics
 from workers.capture.folder import CaptureFile, write_description, write_view
+from workers.door.opening import as_refusal
 from workers.door.recordings.formats import open_any
-from workers.door.recordings.pictures import PictureError, change_camera
+from workers.door.recordings.pictures import change_camera
 from workers.geometry.zbuffer import register_depth
 
 Stamps = NDArray[np.int64]
@@ -234,12 +235,9 @@ def _measure(recording: Recorded) -> tuple[Stamps, list[FrameMeasure], Stamps, i
 
 
 def _load(recording: Recorded, frame: RecordedFrame, small: bool) -> NDArray | None:
-    try:
+    what = "depth" if frame.is_depth else "colour"
+    with as_refusal(f"{recording.path}: {what} at {frame.stamp_us / 1e6:.3f} s", CaptureError):
         return frame.load(small)
-    except PictureError as error:
-        what = "depth" if frame.is_depth else "colour"
-        told = f"{recording.path}: {what} at {frame.stamp_us / 1e6:.3f} s {error}"
-        raise CaptureError("unreadable", told) from error
 
 
 def _write_views(recording: Recorded, views: tuple[ImportedView, ...], out: Path) -> None:

@@ -8,33 +8,33 @@ A file that process.json does not name, or that has other bytes, is the user's: 
 """
 
 import hashlib
-import io
 import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from schemas.base import Array
 from schemas.capture import CaptureListing
-from schemas.errors import AssetSourceError, CaptureError
+from schemas.errors import AssetSourceError, CaptureError, InputError
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.assets.external.listing import Watch, ignore
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW, TRUTH
+from workers.door.meshes.ply import Element, encode_ply, parse_ply
+from workers.door.opening import as_refusal
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
 _PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 _CLOUD = np.dtype([*((name, "<f4") for name in _PLACE + _NORMAL), *((name, "u1") for name in _COLOR), ("views", "<u2")])
 _VERTEX = np.dtype([*((name, "<f4") for name in _PLACE), *((name, "u1") for name in _COLOR)])
-_FACE = np.dtype([("vertex_indices", "<i4", (3,))])
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
@@ -82,23 +82,18 @@ def cloud_ply(points: Array, normals: Array, colors: NDArray[np.uint8], views: N
 
 def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
     """A binary PLY of a mesh with coloured vertices."""
-    triangles = np.empty(len(faces), _FACE)
-    triangles["vertex_indices"] = faces
-    return _ply(_VERTEX, *vertices.T, *colors.T, faces=triangles)
+    return _ply(_VERTEX, *vertices.T, *colors.T, face={"vertex_indices": faces.astype(np.int32)})
 
 
-def _ply(kind: np.dtype, *columns: NDArray, faces: NDArray | None = None) -> bytes:
-    rows, stream = np.empty(len(columns[0]), kind), io.BytesIO()
-    for name, column in zip(kind.names or (), columns, strict=True):
-        rows[name] = column
-    elements = [PlyElement.describe(rows, "vertex"), *([] if faces is None else [PlyElement.describe(faces, "face")])]
-    PlyData(elements, byte_order="<", comments=["board frame, metres"]).write(stream)
-    return stream.getvalue()
+def _ply(kind: np.dtype, *columns: NDArray, **faces: Element) -> bytes:
+    names = kind.names or ()
+    vertex = {name: np.asarray(column, kind[name]) for name, column in zip(names, columns, strict=True)}
+    return encode_ply("board frame, metres", vertex=vertex, **faces)
 
 
 def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
     """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
-    rows = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"].data
+    rows = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"]
     places, normals = (_columns(rows, names).astype(np.float64) for names in (_PLACE, _NORMAL))
     return places, normals, _columns(rows, _COLOR), rows["views"].astype(np.int32)
 
@@ -106,23 +101,23 @@ def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.
 def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
     """(vertices, faces, colours) of mesh.ply. Raises CaptureError where it is not there or another's."""
     found = _read_ply(path / MESH_FILE, _VERTEX)
-    rows, faces = found["vertex"].data, found["face"].data["vertex_indices"]
+    rows, faces = found["vertex"], found["face"]["vertex_indices"]
     return _columns(rows, _PLACE).astype(np.float64), faces.astype(np.int32), _columns(rows, _COLOR)
 
 
-def _columns(rows: NDArray, names: Sequence[str]) -> NDArray:
+def _columns(rows: Element, names: Sequence[str]) -> NDArray:
     return np.stack([rows[name] for name in names], axis=1)
 
 
-def _read_ply(file: Path, kind: np.dtype) -> PlyData:
-    try:
-        found = PlyData.read(str(file), known_list_len={"face": {"vertex_indices": 3}})
-        if found["vertex"].data.dtype.names == kind.names:
-            return found
-    except FileNotFoundError:
-        raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`") from None
-    except (PlyParseError, UnicodeDecodeError, KeyError, ValueError):
-        pass
+def _read_ply(file: Path, kind: np.dtype) -> dict[str, Element]:
+    with suppress(InputError), as_refusal(file):
+        elements = parse_ply(file.read_bytes())
+        if {name: column.dtype for name, column in elements["vertex"].items()} == {
+            name: kind[name] for name in kind.names or ()
+        }:
+            return elements
+    if not file.exists():
+        raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`")
     raise CaptureError("unreadable", f"{file} is not what `verso capture process` wrote, or ends early: delete it")
 
 

@@ -6,7 +6,7 @@ What is watched is the bodies' energy, and the conditions that end a simulation 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -232,6 +232,20 @@ def free_fall_m(points: Array, table: Table, flat: bool) -> float:
     return max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
 
 
+@dataclass(frozen=True)
+class Watch:
+    """What a simulation looks at beside rest.
+
+    stops: conditions by name, of which one ends it. leaves: what holds of an object that is put away, while the others go on.
+    standing: ends the fall of a single object sooner. sleeping: what rests costs no time until something that moves touches it.
+    """
+
+    stops: Mapping[str, StopCondition] = field(default_factory=dict)
+    leaves: StopCondition | None = None
+    standing: StandingCondition | None = None
+    sleeping: bool = False
+
+
 def fall(
     bodies: Sequence[Body],
     poses: Sequence[Pose],
@@ -239,31 +253,25 @@ def fall(
     physics: Physics,
     steps: StepSizes,
     free_m: float,
-    stops: Mapping[str, StopCondition] | None = None,
-    sleeping: bool = False,
-    standing: StandingCondition | None = None,
+    watch: Watch = Watch(),
     reach_m: float = math.inf,
-    leaves: StopCondition | None = None,
 ) -> Outcome:
     """Release objects at `poses` (`T_world_obj`) until all rest, `physics.max_settle_s` is over, or a stop condition holds.
 
-    The first `free_m` metres are fallen in closed form, which is exact: nothing turns in the air. sleeping: what rests costs no
-    time until something that moves touches it. standing: ends the fall of a single object sooner. reach_m: contact distance, if
-    less than Bullet's own; on a mesh it follows from the steps. leaves: what holds of an object that is put away, while the
-    others go on.
+    The first `free_m` metres are fallen in closed form, which is exact: nothing turns in the air. reach_m: contact distance, if
+    less than Bullet's own; on a mesh it follows from the steps.
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)
-    placed = [(one, translation(0, 0, -fallen_m) @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
+    placed = [(body, translation(0, 0, -fallen_m) @ T @ body.T_obj_body) for body, T in zip(bodies, poses, strict=True)]
     speed_m_s = math.sqrt(2.0 * GRAVITY_M_S2 * fallen_m)
     fallen_s = speed_m_s / GRAVITY_M_S2
-    end_s = physics.max_settle_s - fallen_s
     if isinstance(ground, Mesh | tuple):
         reach_m = min(reach_m, REACH_STEPS * max(steps.max_travel_m, speed_m_s / (FINEST * physics.step_hz)))
     with open_world(placed, ground, physics, steps.looked, reach_m, steps.kept) as world:
         for number in range(len(bodies)):
             world.set_velocity((0.0, 0.0, -speed_m_s), body=number)
-        outcome = _simulate(world, bodies, physics, steps, end_s, stops or {}, sleeping, standing, leaves)
-    ended = tuple(T @ invert(one.T_obj_body) for T, one in zip(outcome.poses, bodies, strict=True))
+        outcome = _Simulation(world, bodies, physics, steps, watch).run(physics.max_settle_s - fallen_s)
+    ended = tuple(T @ invert(body.T_obj_body) for T, body in zip(outcome.poses, bodies, strict=True))
     return dataclasses.replace(outcome, poses=ended, seconds=outcome.seconds + fallen_s)
 
 
@@ -298,90 +306,128 @@ class _Late:
         return stays and calm and abs(r) >= SPIN_KEPT * abs(self.spin_rad_s)
 
 
-def _simulate(
-    world: World,
-    bodies: Sequence[Body],
-    physics: Physics,
-    steps: StepSizes,
-    end_s: float,
-    stops: Mapping[str, StopCondition],
-    sleeping: bool,
-    standing: StandingCondition | None,
-    leaves: StopCondition | None,
-) -> Outcome:
-    """Step until all rest, the time is over or a stop condition holds; the poses are those of the body frames.
+class _Simulation:
+    """Bodies in a world, stepped until they rest; the poses are those of the body frames.
 
-    end_s: the time to simulate. A body rests when for the whole window no point moved further than
-    the rest speed allows, it turned no further than the rest spin allows, and no point was faster than `CALM_M_S`. Displacement
-    decides and not speed: Bullet's contact points flicker between the many vertices of a round rim, and an object at rest may
-    rattle by micrometres at some millimetres per second for ever.
+    A body rests when for the whole window no point moved further than the rest speed allows, it turned no further than the rest
+    spin allows, and no point was faster than `CALM_M_S`. Displacement decides and not speed: Bullet's contact points flicker
+    between the many vertices of a round rim, and an object at rest may rattle by micrometres at some millimetres per second for
+    ever.
     """
-    rest = physics.rest
-    drift_m, turn_rad = rest.speed_mm_s / 1e3 * rest.window_s, rest.spin_rad_s * rest.window_s
-    still = [_Stillness(world.pose(k)) for k in range(len(bodies))]
-    late = list[_Late]()
-    time, rate, bounces, asked = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0, -1.0
-    moving = [world.velocity(k) for k in range(len(bodies))]
-    speeds, energy = _speeds(bodies, moving), EnergyRecord(bodies, [one.anchor for one in still], moving)
-    lost, thrown, thrown_m_s = list[int](), set[int](), 0.0
-    heights = [one.anchor[0][2] for one in still]
-    low_m, top_m = min(heights), max(heights) + min(math.hypot(*v) for v, _ in moving) ** 2 / (2.0 * GRAVITY_M_S2)
 
-    def ended(speed_m_s: float, rested: bool, name: str | None = None, face: Face | None = None) -> Outcome:
-        by = tuple(lost), frozenset(thrown), thrown_m_s
-        rise = (
-            energy.rise() if name in (None, "below") else 0.0
-        )  # others begin anew, or are let go again where they stop
-        return Outcome(tuple(map(as_pose, at)), speed_m_s, time, rested, name, rise, face, *by)
+    def __init__(self, world: World, bodies: Sequence[Body], physics: Physics, steps: StepSizes, watch: Watch) -> None:
+        self.world, self.bodies, self.physics, self.steps, self.watch = world, bodies, physics, steps, watch
+        self.time, self.rate_hz, self.bounces = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0
+        self._read()
+        self.speeds = _speeds(bodies, self.moving)
+        self.still = [_Stillness(pose) for pose in self.at]
+        self.energy = EnergyRecord(bodies, self.at, self.moving)
+        heights = [pose[0][2] for pose in self.at]
+        slowest = min(math.hypot(*v) for v, _ in self.moving)
+        self.low_m, self.top_m = min(heights), max(heights) + slowest**2 / (2.0 * GRAVITY_M_S2)
+        self.lost, self.thrown, self.thrown_m_s = list[int](), set[int](), 0.0
+        self.asked_s = -1.0
+        self.late = list[_Late]()
 
-    while True:
-        wanted = steps.rate_hz(max(speeds))
-        if bounces and max(speeds) < BOUNCES_M_S:
-            world.set_restitution(0.0)
-            bounces, rate = False, 0.0
-        if wanted != rate:
-            world.set_rate(wanted)
-            rate = wanted
-        for _ in range(SAMPLE_STEPS // steps.looked):
-            world.advance()
-            at, moving = [world.pose(k) for k in range(len(bodies))], [world.velocity(k) for k in range(len(bodies))]
-            energy.add(at, moving)
-        time += SAMPLE_STEPS / rate
-        for number in range(len(bodies)) if len(bodies) > 1 else ():
-            speed = math.hypot(*moving[number][0])
-            fallen_m = top_m - min(low_m, at[number][0][2])
+    def run(self, end_s: float) -> Outcome:
+        """Step until all rest, `end_s` seconds are over or a stop condition holds."""
+        while True:
+            self._set_pace()
+            self._advance()
+            if len(self.bodies) > 1:
+                self._find_thrown()
+                self._put_away()
+            self.speeds = _speeds(self.bodies, self.moving)
+            for name, stop in self.watch.stops.items():
+                if any(stop(number, pose) for number, pose in enumerate(self.at)):
+                    return self._outcome(max(self.speeds), False, name)
+            self._follow_stillness()
+            face = self._face_stood_on()
+            if face is not None or all(self._rests(each) for each in self.still):
+                drift_m_s = max(each.moved_m / (self.time - each.since) for each in self.still)
+                return self._outcome(drift_m_s, True, face=face)
+            if self.time >= end_s:
+                return self._out_of_time()
+            if not self.late and self.time >= end_s - self.physics.rest.window_s:
+                self.late = [_Late(pose, w[2]) for pose, (_, w) in zip(self.at, self.moving, strict=True)]
+
+    def _read(self) -> None:
+        numbers = range(len(self.bodies))
+        self.at, self.moving = [self.world.pose(k) for k in numbers], [self.world.velocity(k) for k in numbers]
+
+    def _set_pace(self) -> None:
+        """Steps as short as the speeds ask for, and no more bounces once all is slow."""
+        wanted_hz = self.steps.rate_hz(max(self.speeds))
+        if self.bounces and max(self.speeds) < BOUNCES_M_S:
+            self.world.set_restitution(0.0)
+            self.bounces, self.rate_hz = False, 0.0
+        if wanted_hz != self.rate_hz:
+            self.world.set_rate(wanted_hz)
+            self.rate_hz = wanted_hz
+
+    def _advance(self) -> None:
+        for _ in range(SAMPLE_STEPS // self.steps.looked):
+            self.world.advance()
+            self._read()
+            self.energy.add(self.at, self.moving)
+        self.time += SAMPLE_STEPS / self.rate_hz
+
+    def _find_thrown(self) -> None:
+        """Notes bodies that are faster than a fall from the highest start makes them."""
+        for number, (pose, (v, _)) in enumerate(zip(self.at, self.moving, strict=True)):
+            speed, fallen_m = math.hypot(*v), self.top_m - min(self.low_m, pose[0][2])
             if speed > max(SLOW_M_S, THROWN * math.sqrt(2.0 * GRAVITY_M_S2 * fallen_m)):
-                thrown.add(number)
-                thrown_m_s = max(thrown_m_s, speed)
-            if leaves is not None and number not in lost and leaves(number, at[number]):
-                world.put_away(number)
-                lost.append(number)
-                at[number], moving[number] = world.pose(number), world.velocity(number)
-        speeds = _speeds(bodies, moving)
-        for name, stop in stops.items():
-            if any(stop(number, one) for number, one in enumerate(at)):
-                return ended(max(speeds), False, name)
-        for number, (one, now, body, speed) in enumerate(zip(still, at, bodies, speeds, strict=True)):
-            turned = _angle(one.anchor[1], now[1])
-            one.moved_m = math.dist(one.anchor[0], now[0]) + turned * body.reach_m
-            if speed > CALM_M_S or one.moved_m > drift_m or turned > turn_rad:
-                one.anchor, one.since = now, time
-            elif sleeping and time - one.since >= rest.window_s:
-                world.let_sleep(number)
-        face = None
-        if standing is not None and asked < still[0].since <= time - STANDING_SHARE * rest.window_s:
-            asked, face = time, standing(at[0], moving[0])
-        if face is not None or all(time - one.since >= rest.window_s for one in still):
-            return ended(max(one.moved_m / (time - one.since) for one in still), True, face=face)
-        if time >= end_s:
-            moves = [k for k, one in enumerate(still) if time - one.since < rest.window_s]
-            if late and all(late[k].spins_on(at[k], moving[k], rest, bodies[k].reach_m) for k in moves):
-                return dataclasses.replace(ended(max(speeds), True), spinning=tuple(moves))
-            fastest = max(moves, key=lambda k: speeds[k])
-            v, w = (math.hypot(*each) for each in moving[fastest])
-            return dataclasses.replace(ended(max(speeds), False), moves=(fastest, v, w))
-        if not late and time >= end_s - rest.window_s:
-            late = [_Late(pose, w[2]) for pose, (_, w) in zip(at, moving, strict=True)]
+                self.thrown.add(number)
+                self.thrown_m_s = max(self.thrown_m_s, speed)
+
+    def _put_away(self) -> None:
+        leaves = self.watch.leaves
+        if leaves is None:
+            return
+        for number in range(len(self.bodies)):
+            if number not in self.lost and leaves(number, self.at[number]):
+                self.world.put_away(number)
+                self.lost.append(number)
+                self.at[number], self.moving[number] = self.world.pose(number), self.world.velocity(number)
+
+    def _follow_stillness(self) -> None:
+        """Since when each body has stayed where it is; what has for a whole window may sleep."""
+        rest = self.physics.rest
+        drift_m, turn_rad = rest.speed_mm_s / 1e3 * rest.window_s, rest.spin_rad_s * rest.window_s
+        for number, (still, pose, body) in enumerate(zip(self.still, self.at, self.bodies, strict=True)):
+            turned = _angle(still.anchor[1], pose[1])
+            still.moved_m = math.dist(still.anchor[0], pose[0]) + turned * body.reach_m
+            if self.speeds[number] > CALM_M_S or still.moved_m > drift_m or turned > turn_rad:
+                still.anchor, still.since = pose, self.time
+            elif self.watch.sleeping and self._rests(still):
+                self.world.let_sleep(number)
+
+    def _rests(self, still: _Stillness) -> bool:
+        return self.time - still.since >= self.physics.rest.window_s
+
+    def _face_stood_on(self) -> Face | None:
+        """The face that a single calm object stands on; asked once after each time that it moved."""
+        standing, since = self.watch.standing, self.still[0].since
+        if standing is None or not self.asked_s < since <= self.time - STANDING_SHARE * self.physics.rest.window_s:
+            return None
+        self.asked_s = self.time
+        return standing(self.at[0], self.moving[0])
+
+    def _out_of_time(self) -> Outcome:
+        """The time is over and something moves: all of it may do nothing but spin, which counts as rest."""
+        rest, moves = self.physics.rest, [k for k, still in enumerate(self.still) if not self._rests(still)]
+        reach_m = [body.reach_m for body in self.bodies]
+        if self.late and all(self.late[k].spins_on(self.at[k], self.moving[k], rest, reach_m[k]) for k in moves):
+            return dataclasses.replace(self._outcome(max(self.speeds), True), spinning=tuple(moves))
+        fastest = max(moves, key=lambda k: self.speeds[k])
+        v, w = (math.hypot(*each) for each in self.moving[fastest])
+        return dataclasses.replace(self._outcome(max(self.speeds), False), moves=(fastest, v, w))
+
+    def _outcome(self, speed_m_s: float, rested: bool, name: str | None = None, face: Face | None = None) -> Outcome:
+        # What others stop begins anew, or is let go again where it stops
+        rise = self.energy.rise() if name in (None, "below") else 0.0
+        away = tuple(self.lost), frozenset(self.thrown), self.thrown_m_s
+        return Outcome(tuple(map(as_pose, self.at)), speed_m_s, self.time, rested, name, rise, face, *away)
 
 
 def _speeds(bodies: Sequence[Body], moving: Sequence[Velocity]) -> list[float]:

@@ -31,6 +31,7 @@ from workers.physics.fall import (
     THIN_SHARE,
     Outcome,
     StepSizes,
+    Watch,
     choose_steps,
     fall,
     falls_below,
@@ -208,8 +209,8 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
         ground = _parts_of_vessel(table)
     if math.isfinite(drop.room_m):
         stops["room"] = strays((poses[0] @ bodies[0].T_obj_body)[None, :2, 3], drop.room_m)
-    leaves = below if goes_on else None
-    return fall(bodies, poses, ground, physics, steps, free_m, stops, drop.many, standing, leaves=leaves)
+    watch = Watch(stops, below if goes_on else None, standing, sleeping=drop.many)
+    return fall(bodies, poses, ground, physics, steps, free_m, watch)
 
 
 def _parts_of_vessel(table: Table) -> list[Array]:
@@ -358,8 +359,8 @@ def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: floa
     if level:
         ground = top.height_m - bodies[0].margin_m * (1.0 - SLOP_SHARE)
     begun = np.stack([(T @ body.T_obj_body)[:3, 3] for T, body in zip(poses, bodies, strict=True)])
-    stops = {"far": strays(begun, far_m)}
-    return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, stops, reach_m=SKIN_M)
+    watch = Watch({"far": strays(begun, far_m)})
+    return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, watch, reach_m=SKIN_M)
 
 
 def _skins(placement: Placement, poses: Sequence[Pose], near_m: float, level_m: float) -> list[tuple[Array, ...]]:

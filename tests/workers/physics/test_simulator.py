@@ -33,6 +33,7 @@ from workers.physics.fall import (
     SLIDE_M,
     EnergyRecord,
     StepSizes,
+    Watch,
     fall,
     stays_standing,
 )
@@ -278,7 +279,7 @@ def test_the_part_of_a_fall_that_is_not_simulated_is_exact_and_the_rest_half_a_s
 def test_a_stop_condition_ends_the_fall_and_is_named():
     start = start_at(BOX, translation(0.0, 0.0, 1.0))
     stops = {"never": lambda _, at: False, "below": lambda _, at: at[0][2] < 0.9}
-    motion = fall([make_body(start)], [start.T_world_obj], 0.0, for_seconds(8.0), COARSE, 0.0, stops)
+    motion = fall([make_body(start)], [start.T_world_obj], 0.0, for_seconds(8.0), COARSE, 0.0, Watch(stops))
     assert (motion.stopped_by, motion.rested) == ("below", False)
     assert 0.9 - 8 * 2.0 / PHYSICS.step_hz <= motion.poses[0][2, 3] < 0.9
     after = motion.speed_m_s - math.sqrt(2 * GRAVITY_M_S2 * 0.1)

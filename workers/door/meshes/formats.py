@@ -12,13 +12,15 @@ from pathlib import Path
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
-from workers.door.meshes import plain
+from workers.door import opening
 from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.dae import named_by_dae, read_dae
 from workers.door.meshes.gltf import named_by_gltf, read_gltf
 from workers.door.meshes.mesh import LoadedMesh, RawMesh, clean_shape, place_mesh
 from workers.door.meshes.mjcf import count_msh, read_msh
 from workers.door.meshes.obj import count_obj, named_by_mtl, named_by_obj, read_obj
+from workers.door.meshes.plain import count_stl, read_off, read_stl
+from workers.door.meshes.ply import count_ply, named_by_ply, read_ply
 
 
 @dataclass(frozen=True)
@@ -39,10 +41,10 @@ FORMATS: Mapping[str, Format] = {
     ".gltf": Format(named_by_gltf, read_gltf),
     ".dae": Format(named_by_dae, read_dae),
     ".obj": Format(named_by_obj, read_obj, count_obj),
-    ".ply": Format(plain.named_by_ply, plain.read_ply, plain.count_ply),
+    ".ply": Format(named_by_ply, read_ply, count_ply),
     ".msh": Format(lambda *_: [], read_msh, count_msh),
-    ".off": Format(lambda *_: [], plain.read_off),
-    ".stl": Format(lambda *_: [], plain.read_plain, plain.count_stl),
+    ".off": Format(lambda *_: [], read_off),
+    ".stl": Format(lambda *_: [], read_stl, count_stl),
 }
 """The formats of mesh files by suffix, the one that says most about a thing first."""
 
@@ -95,18 +97,17 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
 
 
 def read_bytes(path: Path, limits: MeshLimits) -> bytes:
-    """A mesh file's bytes; MeshError `missing`, `format` or `too_large`."""
+    """A mesh file's bytes; MeshError `missing`, `irregular`, `format` or `too_large`."""
     if path.suffix.lower() not in FORMATS:
         raise MeshError(
             "format", f"{path}: {path.suffix or 'no suffix'} is not one of {', '.join(FORMATS)}: export it as .glb"
         )
-    try:
-        size = path.stat().st_size
-        if size > limits.max_file_mb * 1e6:
-            raise MeshError("too_large", f"{path} has {size / 1e6:.1f} MB, over max_file_mb = {limits.max_file_mb:g}")
-        return path.read_bytes()
-    except OSError as error:
-        raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
+
+    def refuse(reason: str, sentence: str) -> MeshError:
+        large = f"{path} is over max_file_mb = {limits.max_file_mb:g}"
+        return MeshError(reason, large if reason == "too_large" else sentence)
+
+    return opening.read_bytes(path, int(limits.max_file_mb * 1e6), refuse)
 
 
 def _find(resolver: FolderResolver, names: Iterable[str]) -> list[Path]:

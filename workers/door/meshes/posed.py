@@ -15,6 +15,7 @@ from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
 from workers.door.meshes.caps import check_nodes
 from workers.door.meshes.mesh import DEFAULT
+from workers.door.opening import read_bytes
 from workers.geometry.frames import pose, rotation_about
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
@@ -55,12 +56,7 @@ class Model:
 
 def parse_xml(path: Path, limits: MeshLimits, tag: str, kind: str) -> ElementTree.Element:
     """The root element of a file that poses others; MeshError `missing`, `too_large` or as `parse_tree`."""
-    try:
-        if path.stat().st_size > MAX_XML_BYTES:
-            raise MeshError("too_large", f"{path} has {path.stat().st_size} bytes, over {MAX_XML_BYTES}")
-        data = path.read_bytes()
-    except OSError as error:
-        raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
+    data = read_bytes(path, MAX_XML_BYTES, MeshError)
     root = parse_tree(path, data, tag, kind)
     for what, many in (
         ("link", "links"),

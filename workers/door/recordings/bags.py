@@ -1,158 +1,157 @@
-"""ROS bags (format 2.0) of a RealSense: what its SDK records, and what its ROS driver publishes with registered depth.
+"""ROS bags of a RealSense, by the library rosbags: its SDK's, and those of its ROS drivers with depth registered to colour.
 
-Written by the description of the format (wiki.ros.org/Bags/Format/2.0), of the messages sensor_msgs/Image, CameraInfo,
-geometry_msgs/Transform and std_msgs/Float32 (little-endian, strings and lists after their length), and by the SDK's
-sources: topics /device_0/sensor_N/Depth_0/image/data, .../info/camera_info, .../tf/0 (a transform that takes coordinates of
-the reference stream to the stream's), .../option/Depth Units/value.
+Of ROS 1 a .bag, of ROS 2 a .db3, a .mcap, or the folder that holds them. Four kinds of messages are read, by their published
+definitions; those in a bag are a stranger's, and would be compiled. What the topics mean is in the SDK's sources:
+/device_0/sensor_N/Depth_0/image/data, .../info/camera_info, .../tf/0 (a transform that takes coordinates of the reference
+stream to the stream's), .../option/Depth Units/value.
 """
 
 import bz2
-import struct
+import heapq
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import cv2
+import lz4.frame
 import numpy as np
-import pyarrow as pa
+from backports import zstd
 from numpy.typing import NDArray
+from rosbags.rosbag1 import reader as bag
+from rosbags.rosbag2 import storage_mcap as mcap
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.typesys import Stores, get_typestore
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
+from workers.door.opening import as_refusal, open_file
 from workers.geometry.frames import invert, pose, rotation_from_quaternion
 
-HEAD = b"#ROSBAG V2.0\n"
 MOST_BYTES = 512_000_000
-"""Of one record, packed or not."""
+"""Of one chunk, unpacked."""
 
-MESSAGE, CHUNK, CONNECTION = 2, 5, 7
-"""Kinds of records, `op` of their head."""
+LONGEST_SIDE = 20_000
+"""Of an image, pixels."""
+
+IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+TRANSFORM, FLOAT = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32"
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A format of bags: what opens a file, the method and the definitions that decode messages, what mends one that was cut."""
+
+    open: Callable[[Path], Any]
+    method: str
+    store: Stores
+    remedy: str
+
+    def decode(self, data: bytes, kind: str) -> Any:
+        """The message with its fields."""
+        return getattr(_definitions(self.store), self.method)(data, kind)
+
+
+_definitions = cache(get_typestore)
+
+KINDS = {
+    b"#ROSBAG V2.0\n": _Kind(
+        bag.Reader, "deserialize_ros1", Stores.ROS1_NOETIC, "`rosbag reindex FILE` mends a bag that was cut"
+    ),
+    b"SQLite format 3\0": _Kind(  # the library puts the path into a URI
+        lambda path: Sqlite3Reader(Path(quote(str(path)))),
+        *("deserialize_cdr", Stores.ROS2_HUMBLE, "`ros2 bag reindex FOLDER` mends a bag that was cut"),
+    ),
+    b"\x89MCAP0\r\n": _Kind(
+        mcap.McapReader, "deserialize_cdr", Stores.ROS2_HUMBLE, "`mcap recover FILE` mends a bag that was cut"
+    ),
+}
+"""Formats of bags by their first bytes."""
+
+
+def _unpack(open_decompressor: Callable[[], Any], data: bytes, *_: int) -> bytes:
+    """What a chunk holds, up to `MOST_BYTES`."""
+    decompressor = open_decompressor()
+    unpacked: bytes = decompressor.decompress(data, MOST_BYTES)
+    if not decompressor.eof:
+        raise ValueError(f"a chunk is cut, or unpacks to more than {MOST_BYTES // 1_000_000} MB")
+    return unpacked
+
+
+# The library unpacks whatever a few bytes stand for.
+bag.decompressors |= {
+    "bz2": partial(_unpack, bz2.BZ2Decompressor),
+    "lz4": partial(_unpack, lz4.frame.LZ4FrameDecompressor),
+}
+mcap.DECOMPRESSORS |= {
+    "lz4": partial(_unpack, lz4.frame.LZ4FrameDecompressor),
+    "zstd": partial(_unpack, zstd.ZstdDecompressor),
+}
+
+
+def _kind_of(path: Path) -> _Kind | None:
+    with open_file(path, CaptureError) as stream:
+        head = stream.read(16)
+    return next((kind for start, kind in KINDS.items() if head.startswith(start)), None)
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a bag: itself, or those in its folder by name."""
+    if not path.is_dir():
+        return [path]
+    return sorted(file for file in path.iterdir() if file.suffix in (".db3", ".mcap"))
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a file is a ROS bag, by its first bytes."""
-    if not path.is_file():
-        return False
-    with open(path, "rb") as stream:
-        return stream.read(len(HEAD)) == HEAD
-
-
-class _Cut(ValueError):
-    """Bytes that end before they should."""
-
-
-@dataclass
-class _Bytes:
-    """Takes values from bytes, one after the other. Raises _Cut at the end."""
-
-    data: bytes
-    at: int = 0
-
-    def take(self, size: int) -> bytes:
-        if size < 0 or self.at + size > len(self.data):
-            raise _Cut(f"{size} bytes at {self.at} of {len(self.data)}")
-        self.at += size
-        return self.data[self.at - size : self.at]
-
-    def values(self, layout: str) -> tuple:
-        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
-
-    def text(self) -> str:
-        return self.block().decode("utf-8", "replace")
-
-    def block(self) -> bytes:
-        return self.take(self.values("I")[0])
-
-
-def _head(data: bytes) -> dict[str, bytes]:
-    """Fields `name=value` of a record's head."""
-    found, source = {}, _Bytes(data)
-    while source.at < len(data):
-        name, _, value = source.block().partition(b"=")
-        found[name.decode("ascii", "replace")] = value
-    return found
-
-
-def _records(read: Callable[[int], bytes]) -> Iterator[tuple[dict[str, bytes], bytes]]:
-    """(head, data) of records as far as they are whole."""
-    while len(size := read(4)) == 4:
-        parts = []
-        for part in range(2):
-            if part:
-                size = read(4)
-            count = int.from_bytes(size, "little")
-            if len(size) < 4 or count > MOST_BYTES or len(data := read(count)) < count:
-                return
-            parts.append(data)
-        try:
-            yield _head(parts[0]), parts[1]
-        except _Cut:
-            return
-
-
-def _unpacked(head: dict[str, bytes], data: bytes) -> bytes:
-    """A chunk's records. Raises _Cut for one that is altered."""
-    how, size = head.get("compression", b"none"), int.from_bytes(head.get("size", b""), "little")
-    if size > MOST_BYTES:
-        raise _Cut(f"a chunk of {size} bytes")
-    try:
-        if how == b"lz4":
-            return bytes(pa.decompress(data, decompressed_size=size, codec="lz4", asbytes=True))
-        if how == b"bz2":
-            return bz2.BZ2Decompressor().decompress(data, max_length=size)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise _Cut(str(error)) from error
-    return data
+    """Whether a path is a ROS bag, by the first bytes of a file, or of a folder by the file that describes it."""
+    return (path / "metadata.yaml").is_file() if path.is_dir() else _kind_of(path) is not None
 
 
 @dataclass(frozen=True)
 class _Message:
+    """A message as stored; `content` decodes it."""
+
     topic: str
     kind: str
     stamp_us: int
-    data: bytes
+    content: Callable[[], Any]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[list[tuple[_Kind, Any]]]:
+    """The files of a bag, open. Raises CaptureError, with the command that mends it, whatever the library raises meanwhile."""
+    with ExitStack() as stack:
+        readers = []
+        for file in _files(path):
+            if (kind := _kind_of(file)) is None:
+                raise CaptureError("unreadable", f"{file} is no bag: copy it again")
+            stack.enter_context(as_refusal(file, CaptureError, kind.remedy))
+            reader = kind.open(file)
+            reader.open()
+            stack.callback(reader.close)
+            readers.append((kind, reader))
+        yield readers
 
 
 def _messages(path: Path) -> Iterator[_Message]:
-    """The messages of a bag as far as it can be read; damaged chunks are left out."""
-    topics: dict[bytes, tuple[str, str]] = {}
-    with open(path, "rb") as stream:
-        stream.read(len(HEAD))
-        for head, data in _records(stream.read):
-            try:
-                inner = [(head, data)]
-                if head.get("op") == bytes([CHUNK]):
-                    chunk = _Bytes(_unpacked(head, data))
-                    inner = list(_records(lambda count, c=chunk: c.take(min(count, len(c.data) - c.at))))  # type: ignore[misc]
-                yield from _of_records(inner, topics)
-            except (_Cut, struct.error):
-                continue
+    """The messages of the kinds that are read, in the order of time."""
+    with _opened(path) as readers:
+        yield from heapq.merge(*(_of_file(*pair) for pair in readers), key=lambda message: message.stamp_us)
 
 
-def _of_records(
-    records: list[tuple[dict[str, bytes], bytes]], topics: dict[bytes, tuple[str, str]]
-) -> Iterator[_Message]:
-    for head, data in records:
-        number = head.get("conn", b"")
-        if head.get("op") == bytes([CONNECTION]):
-            kind = _head(data).get("type", b"").decode("ascii", "replace")
-            topics[number] = head.get("topic", b"").decode("utf-8", "replace"), kind
-        elif head.get("op") == bytes([MESSAGE]) and number in topics:
-            seconds, nanoseconds = struct.unpack("<II", head.get("time", b"")[:8].ljust(8, b"\0"))
-            yield _Message(*topics[number], seconds * 1_000_000 + nanoseconds // 1000, data)
+def _of_file(kind: _Kind, reader: Any) -> Iterator[_Message]:
+    wanted = [one for one in reader.connections if one.msgtype in (IMAGE, INFO, TRANSFORM, FLOAT)]
+    for connection, stamp_ns, data in reader.messages(wanted) if wanted else ():
+        content = partial(kind.decode, bytes(data), connection.msgtype)
+        yield _Message(connection.topic, connection.msgtype, stamp_ns // 1000, content)
 
 
 # ---------------------------------------------------------------------------------------------- messages
-
-
-def _skip_header(source: _Bytes) -> int:
-    """Of std_msgs/Header: its time, microseconds."""
-    _, seconds, nanoseconds = source.values("III")
-    source.block()
-    return int(seconds) * 1_000_000 + int(nanoseconds) // 1000
-
 
 COLORS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
 PACKED = {"yuyv": cv2.COLOR_YUV2RGB_YUY2, "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2, "uyvy": cv2.COLOR_YUV2RGB_UYVY}
@@ -161,30 +160,22 @@ PACKED = {"yuyv": cv2.COLOR_YUV2RGB_YUY2, "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
 DEPTHS = {"mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
 
 
-def _image(data: bytes) -> tuple[str, NDArray]:
-    """(encoding, pixels [H, W] or [H, W, C]) of sensor_msgs/Image. Raises _Cut."""
-    source = _Bytes(data)
-    _skip_header(source)
-    height, width = source.values("II")
-    encoding = source.text()
-    big, step = source.values("BI")
-    rows = np.frombuffer(source.block(), np.uint8)
-    if height * step != len(rows) or not 0 < height <= 20_000 or not 0 < width <= 20_000:
-        raise _Cut(f"an image of {width} x {height} in {len(rows)} bytes")
-    rows = rows.reshape(height, step)
-    bytes_of = {**dict.fromkeys(COLORS, 3), "rgba8": 4, "bgra8": 4, **dict.fromkeys(PACKED, 2)}
-    if encoding in DEPTHS:
-        kind = np.dtype((">" if big else "<") + DEPTHS[encoding])
-        return encoding, rows[:, : width * kind.itemsize].copy().view(kind).reshape(height, width)
-    channels = bytes_of.get(encoding, 1)
-    if width * channels > step:
-        raise _Cut(f"rows of {step} bytes for {width} pixels of {encoding}")
-    return encoding, rows[:, : width * channels].reshape(height, width, channels)
+def _pixels(image: Any) -> NDArray:
+    """[H, W] or [H, W, C] of an Image in one of the encodings above. Raises ValueError or KeyError."""
+    height, width, step = image.height, image.width, image.step
+    if height * step != len(image.data) or not 0 < height <= LONGEST_SIDE or not 0 < width <= LONGEST_SIDE:
+        raise ValueError(f"an image of {width} x {height} in {len(image.data)} bytes")
+    rows = image.data.reshape(height, step)
+    if image.encoding in DEPTHS:
+        kind = np.dtype((">" if image.is_bigendian else "<") + DEPTHS[image.encoding])
+        return rows[:, : width * kind.itemsize].copy().view(kind).reshape(height, width)
+    channels = {**dict.fromkeys(COLORS, 3), "rgba8": 4, "bgra8": 4, **dict.fromkeys(PACKED, 2)}[image.encoding]
+    return np.ascontiguousarray(rows[:, : width * channels].reshape(height, width, channels))
 
 
 @dataclass(frozen=True, eq=False)
 class _Info:
-    """sensor_msgs/CameraInfo: size (width, height), K [3, 3], D, and its model."""
+    """Of a CameraInfo: size (width, height), K [3, 3], D, and the model of the lens."""
 
     size: tuple[int, int]
     K: Array
@@ -192,14 +183,19 @@ class _Info:
     model: str
 
 
-def _info(data: bytes) -> _Info:
-    source = _Bytes(data)
-    _skip_header(source)
-    height, width = source.values("II")
-    model = source.text()
-    (count,) = source.values("I")
-    D = np.array(source.values(f"{min(count, 64)}d"))
-    return _Info((int(width), int(height)), np.array(source.values("9d")).reshape(3, 3), D, model)
+def _info(content: Any) -> _Info:
+    K, D = (content.K, content.D) if hasattr(content, "K") else (content.k, content.d)
+    return _Info((content.width, content.height), np.reshape(K, (3, 3)), np.asarray(D), content.distortion_model)
+
+
+def _transform(content: Any) -> Pose:
+    """[4, 4]. Raises ValueError where a number is none or the quaternion is not one of a rotation."""
+    shift, turn = content.translation, content.rotation
+    q = np.array([turn.x, turn.y, turn.z, turn.w])
+    T = pose(rotation_from_quaternion(q), np.array([shift.x, shift.y, shift.z]))
+    if not np.isfinite(T).all() or not 0.99 < np.linalg.norm(q) < 1.01:
+        raise ValueError(f"the quaternion {q.tolist()}")
+    return T
 
 
 # ---------------------------------------------------------------------------------------------- what a bag holds
@@ -207,13 +203,18 @@ def _info(data: bytes) -> _Info:
 
 @dataclass
 class _Stream:
-    """One of the two streams: the topic of its images and what is told of its camera."""
+    """One of the two streams: the topic of its images, their encoding, and what is told of its camera."""
 
     topic: str = ""
-    info: _Info | None = None
     encoding: str = ""
+    info: _Info | None = None
     T_stream_ref: Pose | None = None
     reference: str = ""
+
+    @property
+    def is_registered(self) -> bool:
+        """Of depth, whether it is in the image of the colour camera."""
+        return "aligned_depth" in self.topic or "/depth_registered/" in self.topic
 
 
 @dataclass
@@ -221,37 +222,54 @@ class _Contents:
     color: _Stream = field(default_factory=_Stream)
     depth: _Stream = field(default_factory=_Stream)
     units_per_m: float = 1000.0
-    seen: set[tuple[str, str]] = field(default_factory=set)
     stamps_us: dict[str, list[int]] = field(default_factory=dict)
+    infos: dict[str, _Info] = field(default_factory=dict)
+    transforms: dict[str, Pose] = field(default_factory=dict)
+
+    def take(self, message: _Message) -> None:
+        """Learns what a message says of cameras and streams; of an image no more than its time, once its stream is known."""
+        topic = message.topic
+        if message.kind == IMAGE:
+            stream = self.depth if "depth" in topic.lower() else self.color
+            better = not stream.topic or (not stream.is_registered and _Stream(topic).is_registered)
+            if better and "infra" not in topic.lower():
+                stream.topic, stream.encoding = topic, message.content().encoding
+            self.stamps_us.setdefault(topic, []).append(message.stamp_us)
+        elif message.kind == INFO:
+            self.infos[topic.removesuffix("/camera_info").removesuffix("/info")] = _info(message.content())
+        elif message.kind == TRANSFORM and "/tf/" in topic:
+            self.transforms[topic] = _transform(message.content())
+        elif topic.replace("_", " ").endswith("/option/Depth Units/value"):
+            metres = message.content().data
+            if 1e-6 <= metres <= 0.01:
+                self.units_per_m = round(1.0 / metres, 3)
 
 
 def open_bag(path: Path) -> Recorded:
     """The recording of a bag. Raises CaptureError that says what it holds and what is missing."""
-    found = _Contents()
-    infos: dict[str, _Info] = {}
-    transforms: dict[str, Pose] = {}
+    contents = _Contents()
     for message in _messages(path):
-        found.seen.add((message.topic, message.kind))
-        try:
-            _look_at(message, found, infos, transforms)
-        except (_Cut, struct.error):
-            continue
-    for stream in (found.color, found.depth):
-        stream.info = infos.get(_base(stream.topic))
-        place = next((t for t in transforms if t.startswith(f"{_base(stream.topic)}/tf/")), None)
+        with suppress(CaptureError), as_refusal(message.topic, CaptureError):  # a damaged message is passed over
+            contents.take(message)
+    for stream in (contents.color, contents.depth):
+        base = _base(stream.topic)
+        stream.info = contents.infos.get(base)
+        place = next((topic for topic in contents.transforms if topic.startswith(f"{base}/tf/")), None)
         if place:
-            stream.T_stream_ref, stream.reference = transforms[place], place.rpartition("/")[2]
-    _check(path, found)
-    color, depth = _cameras(path, found)
-    stamps = sorted(found.stamps_us[found.color.topic])
+            stream.T_stream_ref, stream.reference = contents.transforms[place], place.rpartition("/")[2]
+    _check(path, contents)
+    color, depth = _cameras(path, contents)
+    stamps = contents.stamps_us[contents.color.topic]
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 33_333.0
 
     def frames() -> Iterator[RecordedFrame]:
         for message in _messages(path):
-            if message.topic in (found.color.topic, found.depth.topic):
-                yield _frame(message, found)
+            if message.topic in (contents.color.topic, contents.depth.topic):
+                is_depth = message.topic == contents.depth.topic
+                yield RecordedFrame(is_depth, message.stamp_us, partial(_load, message, is_depth, contents))
 
-    return Recorded(path, color, depth, max(period, 1.0), frames, float(stamps[-1]), told={"topic": found.color.topic})
+    told = {"topic": contents.color.topic}
+    return Recorded(path, color, depth, max(period, 1.0), frames, float(stamps[-1]), told=told)
 
 
 def _base(topic: str) -> str:
@@ -259,55 +277,31 @@ def _base(topic: str) -> str:
     return topic.removesuffix("/image/data").rpartition("/image_")[0] or topic.removesuffix("/image/data")
 
 
-def _look_at(message: _Message, found: _Contents, infos: dict[str, _Info], transforms: dict[str, Pose]) -> None:
-    topic, kind = message.topic, message.kind
-    if kind == "sensor_msgs/Image":
-        stream = found.depth if "depth" in topic.lower() else found.color
-        aligned = "aligned_depth" in topic or "/depth_registered/" in topic
-        if (not stream.topic or (aligned and "aligned_depth" not in stream.topic)) and "infra" not in topic.lower():
-            stream.topic, stream.encoding = topic, _image(message.data)[0]
-        found.stamps_us.setdefault(topic, []).append(message.stamp_us)
-    elif kind == "sensor_msgs/CameraInfo":
-        infos[topic.removesuffix("/camera_info").removesuffix("/info")] = _info(message.data)
-    elif kind == "geometry_msgs/Transform" and "/tf/" in topic:
-        x, y, z, qx, qy, qz, qw = _Bytes(message.data).values("7d")
-        q = np.array([qx, qy, qz, qw])
-        if not np.isfinite([x, y, z, *q]).all() or not 0.99 < np.linalg.norm(q) < 1.01:
-            raise _Cut("a transform that is none")
-        transforms[topic] = pose(rotation_from_quaternion(q), np.array([x, y, z]))
-    elif topic.replace("_", " ").endswith("/option/Depth Units/value") and kind == "std_msgs/Float32":
-        (metres,) = _Bytes(message.data).values("f")
-        if 1e-6 <= metres <= 0.01:
-            found.units_per_m = round(1.0 / metres, 3)
-
-
-def _check(path: Path, found: _Contents) -> None:
-    kinds = {kind for _, kind in found.seen}
-    for name, stream in (("colour", found.color), ("depth", found.depth)):
+def _check(path: Path, contents: _Contents) -> None:
+    """Raises CaptureError where a stream, its encoding or what is told of its camera is not what can be used."""
+    for name, stream in (("colour", contents.color), ("depth", contents.depth)):
         if not stream.topic:
-            packed = "sensor_msgs/CompressedImage" in kinds
+            with _opened(path) as readers:
+                kinds = {one.topic: one.msgtype for _, reader in readers for one in reader.connections}
+            packed = any("CompressedImage" in kind for kind in kinds.values())
             why = "its images are compressed: convert them (rosrun image_transport republish compressed raw)"
-            topics = ", ".join(sorted(topic for topic, kind in found.seen if "Image" in kind)) or "no topic of images"
-            raise CaptureError(name, f"{path} has no images of {name}; {why if packed else f'it has {topics}'}")
+            topics = ", ".join(sorted(topic for topic, kind in kinds.items() if "Image" in kind))
+            more = why if packed else f"it has {topics or 'no topic of images'}"
+            raise CaptureError(name, f"{path} has no images of {name}; {more}")
         usable = (*COLORS, *PACKED) if name == "colour" else tuple(DEPTHS)
         if stream.encoding not in usable:
-            raise CaptureError(
-                "format",
-                f"{path}: {name} is {stream.encoding!r}, not one of {', '.join(usable)}: record it as one of those",
-            )
+            wanted = f"not one of {', '.join(usable)}: record it as one of those"
+            raise CaptureError("format", f"{path}: {name} is {stream.encoding!r:.60}, {wanted}")
         if stream.info is None:
             raise CaptureError("calibration", f"{path} has no camera_info for {stream.topic}: record it as well")
 
 
-def _cameras(path: Path, found: _Contents) -> tuple[CaptureCamera, DepthCamera | None]:
-    color, depth = found.color, found.depth
+def _cameras(path: Path, contents: _Contents) -> tuple[CaptureCamera, DepthCamera | None]:
+    color, depth = contents.color, contents.depth
     assert color.info is not None and depth.info is not None
-    camera = CaptureCamera(
-        _intrinsics(path, color.info),
-        _lens(path, color.info),
-        found.units_per_m if found.units_per_m <= 10_000 else 1000.0,
-    )
-    if "aligned_depth" in depth.topic or "/depth_registered/" in depth.topic:
+    units_per_m = contents.units_per_m if contents.units_per_m <= 10_000 else 1000.0
+    camera = CaptureCamera(_intrinsics(path, color.info), _lens(path, color.info), units_per_m)
+    if depth.is_registered:
         return camera, None
     if color.T_stream_ref is None or depth.T_stream_ref is None or color.reference != depth.reference:
         raise CaptureError(
@@ -333,38 +327,30 @@ FORWARD = ("plumb_bob", "rational_polynomial", "brown conrady", "modified brown 
 def _lens(path: Path, info: _Info) -> Array:
     """[8]; raises CaptureError for a lens of another kind whose numbers are not all 0."""
     if not np.isfinite(info.D).all() or (np.any(info.D) and (info.model.lower() not in FORWARD or len(info.D) > 8)):
-        raise CaptureError(
-            "calibration", f"{path}: the lens {info.model!r} with {info.D.tolist()} is not read: export frames"
-        )
-    lens = np.zeros(8)
-    lens[: min(len(info.D), 8)] = info.D[:8]
-    return frozen_array(lens)
+        told = f"the lens {info.model!r:.60} with {info.D[:16].tolist()} is not read: export frames"
+        raise CaptureError("calibration", f"{path}: {told}")
+    return frozen_array(np.append(info.D[:8], np.zeros(8))[:8])
 
 
-def _frame(message: _Message, found: _Contents) -> RecordedFrame:
-    is_depth = message.topic == found.depth.topic
-    stream = found.depth if is_depth else found.color
-
-    def load(small: bool) -> NDArray | None:
-        try:
-            encoding, pixels = _image(message.data)
-        except (_Cut, struct.error):
-            return None
-        if encoding != stream.encoding or stream.info is None or pixels.shape[1::-1] != stream.info.size:
-            return None
-        if is_depth:
-            scale = found.units_per_m if encoding != "32FC1" else 1.0
-            depth = np.nan_to_num(pixels.astype(np.float64) / scale, nan=0.0, posinf=0.0, neginf=0.0)
-            return depth if not small else np.zeros(0)
-        how = {**COLORS, **PACKED}[encoding]
-        rgb = (
-            np.ascontiguousarray(pixels) if how is None else np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), how))
-        )
-        if not small:
-            return rgb
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        return np.asarray(
-            cv2.resize(gray, (rgb.shape[1] // 2, rgb.shape[0] // 2), interpolation=cv2.INTER_AREA), np.uint8
-        )
-
-    return RecordedFrame(is_depth, message.stamp_us, load)
+def _load(message: _Message, is_depth: bool, contents: _Contents, small: bool) -> NDArray | None:
+    """As `RecordedFrame.load`."""
+    stream = contents.depth if is_depth else contents.color
+    image = pixels = None
+    with suppress(CaptureError), as_refusal(message.topic, CaptureError):
+        image = message.content()
+        pixels = _pixels(image)
+    if image is None or pixels is None or stream.info is None:
+        return None
+    if image.encoding != stream.encoding or pixels.shape[1::-1] != stream.info.size:
+        return None
+    if is_depth:
+        scale = contents.units_per_m if image.encoding != "32FC1" else 1.0
+        depth = np.nan_to_num(pixels.astype(np.float64) / scale, nan=0.0, posinf=0.0, neginf=0.0)
+        return depth if not small else np.zeros(0)
+    conversion = {**COLORS, **PACKED}[image.encoding]
+    rgb = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+    if not small:
+        return rgb
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    half = (rgb.shape[1] // 2, rgb.shape[0] // 2)
+    return np.asarray(cv2.resize(gray, half, interpolation=cv2.INTER_AREA), np.uint8)

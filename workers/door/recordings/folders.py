@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from schemas.base import frozen_array
 from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
-from workers.door.recordings.pictures import PictureError, Size, decode_depth, decode_rgb, decode_small, head_size
+from workers.door.opening import as_refusal, read_bytes
+from workers.door.recordings.pictures import Size, decode_depth, decode_rgb, decode_small, head_size
 
 MOST_BYTES = 256_000_000
 """Of one file or one member of an archive."""
@@ -40,23 +40,13 @@ def _wrong(path: Path, what: str) -> CaptureError:
 
 
 def _bytes_of(path: Path) -> bytes:
-    """Of a file. Raises CaptureError where it is missing or far too large."""
-    try:
-        with open(path, "rb") as stream:
-            data = stream.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise _wrong(path, f"cannot be read: {error.strerror}") from error
-    if len(data) > MOST_BYTES:
-        raise _wrong(path, f"is larger than {MOST_BYTES // 1_000_000} MB")
-    return data
+    return read_bytes(path, MOST_BYTES, CaptureError)
 
 
 def _tree_of(path: Path, data: bytes) -> Any:
     """Of JSON without NaN. Raises CaptureError."""
-    try:
+    with as_refusal(path, CaptureError):
         return json.loads(data, parse_constant=_refuse)
-    except (ValueError, RecursionError) as error:
-        raise _wrong(path, f"is no JSON: {error}") from error
 
 
 def _refuse(name: str) -> float:
@@ -65,22 +55,18 @@ def _refuse(name: str) -> float:
 
 def _size_of(path: Path) -> Size:
     """Width and height in the head of an image. Raises CaptureError."""
-    try:
+    with as_refusal(path, CaptureError):
         return head_size(_bytes_of(path))
-    except PictureError as error:
-        raise _wrong(path, str(error)) from error
 
 
 def _intrinsics(path: Path, size: Size, numbers: Iterable[Any], centre: float) -> Intrinsics:
     """Of fx, fy, cx, cy, whose first pixel's centre is at `centre`. Raises CaptureError."""
-    try:
+    with as_refusal(f"{path}: its intrinsics", CaptureError):
         fx, fy, cx, cy = (float(x) for x in numbers)
         if not np.isfinite([fx, fy, cx, cy]).all() or min(fx, fy) <= 0 or max(abs(cx), abs(cy)) > 1e6:
             raise ValueError(f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}")
         shift = 0.5 - centre
         return Intrinsics(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx + shift, cy=cy + shift)
-    except (TypeError, ValueError, ValidationError) as error:
-        raise _wrong(path, f"has no usable intrinsics ({error})") from error
 
 
 def _scaled(k: Intrinsics, size: Size) -> DepthCamera:
@@ -259,17 +245,13 @@ def _open_record3d(path: Path) -> Recorded:
     with zipfile.ZipFile(path) as archive:
         names = set(archive.namelist())
     numbers = sorted(int(found[1]) for name in names if (found := re.fullmatch(r"rgbd/([0-9]{1,9})\.jpg", name)))
-    try:
+    with as_refusal(f"{path}: its metadata", CaptureError):
         size, depth_size = ((int(tree[w]), int(tree[h])) for w, h in (("w", "h"), ("dw", "dh")))
         K = tree.get("K") or [0] * 9
         own = tree.get("perFrameIntrinsicCoeffs") or []
         times = tree.get("frameTimestamps") or [n / float(tree.get("fps", 30)) for n in range(len(numbers))]
         stamps = [round(float(times[n]) * 1e6) for n in numbers]
         cameras = [own[n] if n < len(own) else (K[0], K[4], K[6], K[7]) for n in numbers]
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError, ZeroDivisionError, AttributeError) as error:
-        raise _wrong(
-            path, f"its metadata lacks sizes, intrinsics or times of {len(numbers)} frames ({error!r})"
-        ) from error
     if not all(0 < side <= 20_000 for side in (*size, *depth_size)):
         raise _wrong(path, f"images of {size} and depth of {depth_size} cannot be")
     frames = []
@@ -282,27 +264,15 @@ def _open_record3d(path: Path) -> Recorded:
 
 
 def _member(path: Path, name: str) -> Read:
-    """Of an archive, read when it is asked for; a bomb is refused by what it says of itself, and by what comes out."""
+    """Of an archive, read when it is asked for; a bomb is refused by what comes out."""
 
     def read() -> bytes:
-        try:
+        with as_refusal(f"{path}: {name}", CaptureError):
             with zipfile.ZipFile(path) as archive, archive.open(name) as stream:
                 data = stream.read(MOST_BYTES + 1)
-        except (
-            KeyError,
-            zipfile.BadZipFile,
-            zipfile.LargeZipFile,
-            OSError,
-            EOFError,
-            RuntimeError,
-            ValueError,
-        ) as error:
-            raise _wrong(path, f"{name} cannot be read ({error}): copy it again") from error
-        except (NotImplementedError, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
-            raise _wrong(path, f"{name} cannot be unpacked ({error}): copy it again") from error
-        if len(data) > MOST_BYTES:
-            raise _wrong(path, f"{name} unpacks to more than {MOST_BYTES // 1_000_000} MB")
-        return data
+            if len(data) > MOST_BYTES:
+                raise ValueError(f"unpacks to more than {MOST_BYTES // 1_000_000} MB")
+            return data
 
     return read
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from schemas.capture import Recorded
 from schemas.errors import CaptureError
+from workers.door.opening import as_refusal, open_file
 from workers.door.recordings.bags import is_bag, open_bag
 from workers.door.recordings.folders import FOLDERS
 from workers.door.recordings.kinect import is_kinect, open_kinect
-from workers.door.recordings.pictures import PictureError
 
 
 @dataclass(frozen=True)
@@ -23,37 +23,29 @@ class Reader:
 
 READERS = (
     Reader("an Azure Kinect recording (.mkv)", is_kinect, open_kinect),
-    Reader("a ROS bag of a RealSense (.bag)", is_bag, open_bag),
+    Reader("a ROS bag of a RealSense (.bag, .db3, .mcap)", is_bag, open_bag),
     *(Reader(name, *row) for name, row in FOLDERS.items()),
 )
 """Formats that are read, in the order in which they are tried."""
 
-NOT_READ = {
-    b"SQLite format 3": "a ROS 2 bag: convert it (rosbags-convert) to a ROS 1 .bag, or export its frames",
-    b"\x89MCAP": "an MCAP file: convert it (rosbags-convert) to a ROS 1 .bag, or export its frames",
-    b"\0\0\0": "a video alone: depth is in other files, import the folder that holds both",
-}
-"""First bytes of formats that are known, and not read."""
+VIDEO = b"\0\0\0"
+"""First bytes of a video, which is known, and not read."""
 
 
 def open_any(path: Path) -> Recorded:
     """The recording at a path. Raises CaptureError that names the formats that are read."""
     if not path.exists():
         raise CaptureError("missing", f"{path}: no such file or folder")
-    if path.is_file() and path.stat().st_size == 0:
-        raise CaptureError("empty", f"{path} has no bytes: copy it again")
-    try:
+    head = b""
+    if not path.is_dir():
+        with open_file(path, CaptureError) as stream:
+            head = stream.read(len(VIDEO))
+        if not head:
+            raise CaptureError("empty", f"{path} has no bytes: copy it again")
+    with as_refusal(path, CaptureError):
         for reader in READERS:
             if reader.sniff(path):
                 return reader.open(path)
-        head = b""
-        if path.is_file():
-            with open(path, "rb") as stream:
-                head = stream.read(16)
-    except PictureError as error:
-        raise CaptureError("unreadable", f"{path} {error}") from error
-    except OSError as error:
-        raise CaptureError("unreadable", f"{path} cannot be read: {error.strerror or error}") from error
-    told = next((f"{path} is {what}" for start, what in NOT_READ.items() if head.startswith(start)), "")
-    known = "; ".join(reader.name for reader in READERS)
-    raise CaptureError("format", told or f"{path} is none of the formats that are read: {known}")
+    known = f"none of the formats that are read: {'; '.join(reader.name for reader in READERS)}"
+    video = "a video alone: depth is in other files, import the folder that holds both"
+    raise CaptureError("format", f"{path} is {video if head == VIDEO else known}")

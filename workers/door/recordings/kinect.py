@@ -119,10 +119,6 @@ class TrackFrame:
 
 def open_recording(path: Path) -> Recording:
     """Reads the head of a recording. Raises CaptureError that names what is missing and what to do."""
-    if not path.is_file():
-        raise CaptureError("missing", f"{path} is no file")
-    if path.stat().st_size == 0:
-        raise CaptureError("empty", f"{path} has no bytes: copy it again")
     with _open(path) as container:
         color = _track(container, "COLOR")
         depth = _track(container, "DEPTH")
