@@ -1,19 +1,22 @@
 """Verso in Python: `import verso; dataset = verso.open("data/tabletop")`.
 
-Reading loads neither Ray, OpenGL nor PyBullet; `make_scene` loads what making a scene needs when it is called.
+Reading loads neither Ray, OpenGL nor PyBullet; `make_scene` loads what making a scene needs when it is called. What reads is
+loaded when a name is first asked for: every command of an installed reader imports this file.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Union
 
 from schemas.errors import CorruptError, InputError, OutputError, SceneError, VersoError, needs_making
-from schemas.job.job import Job
-from services.dataset.correspondence import Correspondence
-from services.dataset.dataset import Dataset
-from services.dataset.dataset import open_dataset as open
-from services.dataset.pair import Pair
-from services.dataset.view import Box, Cloud, Pixels, View
+
+if TYPE_CHECKING:
+    from schemas.job.job import Job
+    from services.dataset.correspondence import Correspondence
+    from services.dataset.dataset import Dataset
+    from services.dataset.dataset import open_dataset as open
+    from services.dataset.pair import Pair
+    from services.dataset.view import Box, Cloud, Pixels, View
 
 __all__ = [
     "Box",
@@ -34,9 +37,28 @@ __all__ = [
 ]
 
 
+def __getattr__(name: str) -> Any:
+    """Loads the names of reading, all at once. Raises AttributeError for any other."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from schemas.job.job import Job
+    from services.dataset.correspondence import Correspondence
+    from services.dataset.dataset import Dataset, open_dataset
+    from services.dataset.pair import Pair
+    from services.dataset.view import Box, Cloud, Pixels, View
+
+    names = {kind.__name__: kind for kind in (Box, Cloud, Correspondence, Dataset, Job, Pair, Pixels, View)}
+    globals().update(names, open=open_dataset)
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 def make_scene(
-    job: str | Path | Mapping[str, Any] | Job, scene_id: int, changes: Sequence[str] = ()
-) -> tuple[Pair, ...]:
+    job: Union[str, Path, Mapping[str, Any], "Job"], scene_id: int, changes: Sequence[str] = ()
+) -> tuple["Pair", ...]:
     """The pairs of one scene, made in this process and kept in memory, with the bytes that a run would store.
 
     `job` is a job file, its keys, or a parsed job; `changes` are `KEY=VALUE` as in `--set`. Raises SceneError where the scene

@@ -174,8 +174,8 @@ _SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (48 * 3600.0, 3600.0, "h"), (
 
 def describe_seconds(seconds: float) -> str:
     """Seconds in one unit, with two digits or whole: "0.12 s", "8 s", "2.5 min", "31 h", "9 d"."""
-    _, one, name = next(span for span in _SPANS if seconds < span[0])
-    value = seconds / one
+    _, second, name = next(span for span in _SPANS if seconds < span[0])
+    value = seconds / second
     return f"{float(f'{value:.2g}') if value < 100.0 else round(value):g} {name}"
 
 
@@ -202,5 +202,5 @@ _SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1
 
 def size(kilobytes: float) -> str:
     """The size of a job's files: "15 MB"."""
-    value, name = next((kilobytes / one, name) for most, one, name in _SIZES if kilobytes < most)
+    value, name = next((kilobytes / unit, name) for most, unit, name in _SIZES if kilobytes < most)
     return f"{number(float(f'{value:.2g}') if value < 100.0 else round(value))} {name}"

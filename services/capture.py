@@ -153,7 +153,7 @@ def simulate(options: argparse.Namespace) -> int:
     """
     keys = {"seed": options.seed, "categories": [options.category], "captures.simulate.views": options.views}
     if options.views is not None:
-        keys["captures.most_views"] = options.views  # of a dataset, which this folder is not
+        keys["pairs_per_scene"] = options.views  # of a dataset, which this folder is not
     job = capture_job(options.changes, keys)
     assert job.captures is not None
     path, begun = Path(options.out), time.perf_counter()
@@ -170,7 +170,7 @@ def simulate(options: argparse.Namespace) -> int:
     catalogue = open_catalogue(job.assets, Path.cwd(), job.categories)
     asset = load_object(job, catalogue, chance)
     plan = plan_capture(settings)
-    truth = simulate_capture(settings, job.captures.board, asset, chance, path)
+    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, path)
     seconds, ran = time.perf_counter() - begun, [name for name in CAPTURE_EFFECTS if plan.runs(name)]
     views = len(truth.T_board_cam)
     print(

@@ -51,7 +51,8 @@ SMALL_CAPTURES: dict[str, Any] = {
     "scenes": 2,
     "categories": ["mug"],
     "images": {"patch": {"width": 32, "height": 24}},
-    "captures": {"simulate": {"views": 3}, "most_views": 4},
+    "pairs_per_scene": 4,
+    "captures": {"simulate": {"views": 3}},
 }
 CAMERA = Intrinsics(width=192, height=108, fx=91.2, fy=91.2, cx=96.2, cy=54.8)
 PLAIN = EffectPlan(("floor", "table", "rgb"), {})

@@ -95,7 +95,7 @@ NO_EXTRA = f"import sys; sys.modules.update(dict.fromkeys({sorted(PACKAGES)!r}))
 
 STARTS = (
     (
-        (f"import services.cli.main\n{HELP}", HEAVY),
+        (f"import verso, services.cli.main\n{HELP}", HEAVY | {"yaml", "schemas.job", "asyncio"}),
         (
             f"import {', '.join(SCHEMAS)}",
             {"OpenGL", "pyrender", "pyglet", "pybullet", "ray", "cv2", "trimesh", "scipy"},

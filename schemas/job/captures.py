@@ -21,7 +21,6 @@ from schemas.base import (
     Share,
     Text,
 )
-from schemas.job.assets import CategoryName
 from schemas.job.keys import with_defaults
 from schemas.job.views import Distortion, Exposure, RgbNoise
 
@@ -29,6 +28,9 @@ Estimate = Literal["markers", "article", "joint"]
 BoardFrame = Literal["centre", "opencv", "opencv_old"]
 """Where a board pose has its origin: `centre` as board.json has it, y up the print, z out; OpenCV's since 4.6 at the top left,
 y down, z into the board; OpenCV's before, and Kalibr's, at the bottom left, y up, z out."""
+UNNAMED = "object"
+"""The category of a capture whose capture.json names none."""
+
 ESTIMATES: tuple[Estimate, ...] = ("markers", "article", "joint")
 
 
@@ -48,12 +50,8 @@ class Marker(Frozen):
 GRID_KEYS = ("columns", "rows", "marker_m", "gap_m", "first_id")
 
 
-class Board(Frozen):
-    """The markers beside the object (board.json): a grid of unique ArUco markers on a flat board, or `markers` anywhere.
-
-    Board frame: z = 0 is the surface that the object stands on, z up, metres. Of a grid, origin at its centre, x along the rows
-    to the right, y up the print; marker `first_id` is at the top left, and ids run along the rows.
-    """
+class Grid(Frozen):
+    """A grid of unique ArUco markers on a flat board: what virtual captures have beside their object."""
 
     dictionary: Text = "DICT_4X4_50"
     """A predefined dictionary of OpenCV, or the name of a file beside board.json in OpenCV's dictionary format."""
@@ -69,6 +67,23 @@ class Board(Frozen):
     """Width of the whole board about the origin."""
     height_m: Annotated[float, Field(gt=0, le=100)] = 0.40
     """Height of the whole board."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Grid":
+        for name, count, size in (("width_m", self.columns, self.width_m), ("height_m", self.rows, self.height_m)):
+            needed = count * self.marker_m + (count - 1) * self.gap_m
+            if needed > size + 1e-9 and not getattr(self, "markers", ()):
+                raise ValueError(f"{name} is {size:g}, and {count} markers with their gaps need {needed:g}")
+        return self
+
+
+class Board(Grid):
+    """The markers beside an object (board.json): a grid, or `markers` anywhere.
+
+    Board frame: z = 0 is the surface that the object stands on, z up, metres. Of a grid, origin at its centre, x along the rows
+    to the right, y up the print; marker `first_id` is at the top left, and ids run along the rows.
+    """
+
     first_id: NonNegativeInt = 0
     """Id of the marker at the top left; ids run along the rows."""
     ruler_m: Positive = 0.20
@@ -110,11 +125,7 @@ class Board(Frozen):
         return keys
 
     @model_validator(mode="after")
-    def _fits(self) -> "Board":
-        for name, count, size in (("width_m", self.columns, self.width_m), ("height_m", self.rows, self.height_m)):
-            needed = count * self.marker_m + (count - 1) * self.gap_m
-            if needed > size + 1e-9 and not self.markers:
-                raise ValueError(f"{name} is {size:g}, and {count} markers with their gaps need {needed:g}")
+    def _has_true_size(self) -> "Board":
         if not 0.5 <= self.scale <= 2.0:
             raise ValueError(f"measured_ruler_m over ruler_m is {self.scale:g}: must be between 0.5 and 2")
         return self
@@ -166,37 +177,6 @@ class KinectDepthNoise(Frozen):
     """Further systematic error, metres."""
 
 
-class MotionBlur(Frozen):
-    """Movement of the hand-held camera during an exposure."""
-
-    exposure_s: Positive = 0.008
-    """Time that the shutter is open."""
-    speed_m_s: NonNegative = 0.15
-    """Speed of the camera."""
-    turn_deg_s: NonNegative = 8.0
-    """And its turning."""
-
-
-class RollingShutter(Frozen):
-    """Rows that are read one after the other while the camera moves; a view's pose is that of its middle row."""
-
-    readout_s: Positive = 0.02
-    """First row to last."""
-    speed_m_s: NonNegative = 0.15
-    """As of `motion_blur`."""
-    turn_deg_s: NonNegative = 8.0
-    """As of `motion_blur`."""
-
-
-class Sharpen(Frozen):
-    """Sharpening in the camera: an unsharp mask on encoded values."""
-
-    amount: NonNegative = 1.0
-    """Share of the difference from the blurred image that is added."""
-    radius_px: Positive = 1.0
-    """Standard deviation of that blur."""
-
-
 class ToneCurve(Frozen):
     """What the camera stores in place of sRGB."""
 
@@ -204,20 +184,6 @@ class ToneCurve(Frozen):
     """Codes are linear light."""
     contrast: Share = 0.3
     """Steepening of the middle of an S-curve through black, middle grey and white."""
-
-
-class Jpeg(Frozen):
-    """Loss of a JPEG file; what it decodes to is stored."""
-
-    quality: Annotated[int, Field(ge=1, le=100)] = 85
-    """As in libjpeg."""
-
-
-class HiddenMarkers(Frozen):
-    """Patches of paper that cover markers in part."""
-
-    share: Share = 0.15
-    """Share of the markers that are covered in part."""
 
 
 class RegistrationError(Frozen):
@@ -240,8 +206,6 @@ class Simulate(Frozen):
     """Of the camera to the middle of the object."""
     inclination_rad: Interval = Range(0.5, 1.2)
     """Angle of the optical axis below the horizontal."""
-    roll_deg: NonNegative = 12.0
-    """Standard deviation of the roll of the hand-held camera."""
     image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Size of all images over the Azure Kinect's (1920 x 1080 and 640 x 576)."""
     tier: Literal["raster", "pathtraced"] = "raster"
@@ -250,22 +214,22 @@ class Simulate(Frozen):
     """Noise of the Azure Kinect's depth; nothing: exact depth."""
     rgb_noise: RgbNoise | None = None
     """Shot noise and read noise of RGB."""
-    motion_blur: MotionBlur | None = None
-    """Movement of the camera while it exposes."""
-    rolling_shutter: RollingShutter | None = None
-    """Rows read in turn."""
+    motion_blur: Positive | None = None
+    """Seconds that the shutter is open, such as 0.008, while the camera moves at 0.15 m/s and turns at 8 degrees a second."""
+    rolling_shutter: Positive | None = None
+    """Seconds from the first row to the last, such as 0.02, while the camera moves as much; a pose is that of the middle row."""
     exposure: Exposure | None = None
     """Exposure of every view."""
     tone_curve: ToneCurve | None = None
     """Tone curve of the camera; nothing: sRGB."""
-    sharpen: Sharpen | None = None
-    """Sharpening in the camera."""
-    jpeg: Jpeg | None = None
-    """Photographs that were JPEG files."""
+    sharpen: NonNegative | None = None
+    """Share of the difference from the image blurred by a pixel that the camera adds to encoded values, such as 1."""
+    jpeg: Annotated[int, Field(ge=1, le=100)] | None = None
+    """Quality, as in libjpeg, of the JPEG files that photographs were, such as 85; what they decode to is stored."""
     distortion: Distortion | None = None
     """Lens of the colour camera; nothing: a pinhole."""
-    hidden_markers: HiddenMarkers | None = None
-    """Patches of paper on the board."""
+    hidden_markers: Share | None = None
+    """Share of the markers that patches of paper cover in part, such as 0.15."""
     print_scale: Annotated[float, Field(gt=0.5, lt=2)] | None = None
     """True size of the print over its nominal size."""
     registration_error: RegistrationError | None = None
@@ -281,14 +245,8 @@ class Estimation(Frozen):
     """Compute the other two as well."""
     max_iterations: PositiveInt = 100
     """Most iterations of `article` and of `joint`."""
-    min_markers: PositiveInt = 1
-    """A view with fewer markers is not used."""
-    max_reprojection_px: Positive = 3.0
-    """A view whose median reprojection error is larger is flagged and not used."""
     corner_px: Positive = 0.2
     """Standard deviation of a detected corner, which weighs corners against depth."""
-    depth_sigma_m: Positive = 0.003
-    """Standard deviation of depth at 1 m, which grows with the square of the distance; measured anew from the capture."""
     calibrate: bool = False
     """Take the camera from the markers of all views where camera.json does not fit them."""
     trust: Literal["print", "depth"] = "print"
@@ -300,8 +258,6 @@ class Fusion(Frozen):
 
     voxel_m: Annotated[float, Field(ge=0.0005, le=0.02)] = 0.002
     """Distance of the points of the cloud."""
-    max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 84.0
-    """Pixels beyond this angle of incidence are left out."""
     board_clearance_m: NonNegative = 0.003
     """What is nearer to the board's plane than this is the board's, but for floors; more where depth is uneven."""
     min_views: PositiveInt = 2
@@ -313,21 +269,15 @@ class Synthesis(Frozen):
 
     views: PositiveInt = 6
     """Captured views that are merged: those with the nearest optical axes."""
-    fill_px: NonNegativeInt = 3
-    """Holes up to about this size are filled, and counted as not measured."""
 
 
 class Captures(Frozen):
     """Captures in place of scenes."""
 
-    source: Literal["simulate", "folders"] = "simulate"
-    """Virtual captures with known truth, or folders of photographs."""
     folders: Annotated[list[Folder], Field(max_length=10_000)] = Field(default_factory=list)
-    """For source `folders`: one folder a capture, in order; relative to the job file."""
-    category: CategoryName = "object"
-    """For source `folders`: the category of captures whose capture.json names none."""
-    board: Board = Board()
-    """The marker board of simulated captures; a folder has its own board.json."""
+    """Folders of photographs, one a capture, in order; relative to the job file. None: virtual captures with known truth."""
+    board: Grid = Grid()
+    """The marker board of virtual captures; a folder has its own board.json."""
     simulate: Simulate = Simulate()
     """Virtual captures."""
     estimation: Estimation = Estimation()
@@ -336,30 +286,23 @@ class Captures(Frozen):
     """How the views are merged."""
     synthesis: Synthesis = Synthesis()
     """How mirror views are made."""
-    most_views: Annotated[int, Field(ge=1, le=1000)] = 64
-    """Views of a capture that are stored: fixes the arithmetic of pose ids."""
 
-    @model_validator(mode="after")
-    def _has_folders(self) -> "Captures":
-        if (self.source == "folders") != bool(self.folders):
-            raise ValueError("folders must be named for source: folders, and for it alone")
-        if self.source == "simulate" and self.simulate.views > self.most_views:
-            told = f"simulate.views is {self.simulate.views}, and most_views is {self.most_views}: raise most_views"
-            raise ValueError(told)
-        return self
+    @property
+    def printed_board(self) -> Board:
+        """The marker board of virtual captures, as board.json has it."""
+        return Board(**self.board.model_dump())
 
 
 def with_capture_keys(tree: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of a job's keys, with those that follow from `captures` where the job does not give them.
 
-    `scenes` is the number of folders, `pairs_per_scene` is `most_views`, and there are no aligned views: depth of a capture
-    is registered to its colour camera. A capture takes as long as dozens of scenes, so each is committed by itself.
+    `scenes` is the number of folders, of each capture 64 views are stored at most, and there are no aligned views: depth of a
+    capture is registered to its colour camera. A capture takes as long as dozens of scenes, so each is committed by itself.
     """
     captures = tree.get("captures")
     if not isinstance(captures, Mapping):
         return with_defaults(tree, {})
-    usual = {"pairs_per_scene": captures.get("most_views", Captures.model_fields["most_views"].default)}
-    usual |= {"cameras.depth.enabled": False, "run.range_size": 1, "run.scene_timeout_s": 1800.0}
+    usual = {"pairs_per_scene": 64, "cameras.depth.enabled": False, "run.range_size": 1, "run.scene_timeout_s": 1800.0}
     if isinstance(folders := captures.get("folders"), list) and folders:
         usual["scenes"] = len(folders)
     return with_defaults(tree, usual)

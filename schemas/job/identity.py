@@ -36,7 +36,8 @@ def settings_digest(job: Job, catalogue_digest: str) -> str:
 
 def compare_jobs(before: Job, now: Job) -> list[tuple[str, Any, Any]]:
     """(dotted key, value before, value now) of every key that must stay the same and does not."""
-    return _differences(*(_keys_of(job, NOT_OF_A_DATASET, all_keys=True) for job in (before, now)))
+    there, here = (_keys_of(job, NOT_OF_A_DATASET, all_keys=True) for job in (before, now))
+    return _differences(there, here)
 
 
 def differing_keys(model: BaseModel, without: Collection[str] = ()) -> dict[str, Any]:

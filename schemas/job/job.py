@@ -112,7 +112,9 @@ def kind_of(tree: Keys) -> JobKind:
         return "piles"
     assets = tree.get("assets")
     sources = assets.get("objects") if isinstance(assets, Mapping) else None
-    kinds = [one.get("source") for one in sources if isinstance(one, Mapping)] if isinstance(sources, list) else []
+    kinds = (
+        [source.get("source") for source in sources if isinstance(source, Mapping)] if isinstance(sources, list) else []
+    )
     return "singles" if all(kind == "procedural" for kind in kinds) else "meshes"
 
 
@@ -156,7 +158,7 @@ class Job(Frozen):
     first_scene: NonNegativeInt = 0
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Input and mirror poses of each scene."""
+    """Input and mirror poses of each scene, or views of a capture that are stored at most (default 64)."""
     objects_per_scene: ObjectCount = ONE_OBJECT
     """Number of objects on the table; a range is drawn from evenly. The first gives the scene's category."""
     categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
@@ -205,8 +207,8 @@ class Job(Frozen):
     @model_validator(mode="after")
     def _has_ids(self) -> "Job":
         if self.stop_scene > MOST_SCENE_IDS:
-            told = f"and names of files have room for ids below {MOST_SCENE_IDS}"
-            raise ValueError(f"first_scene + scenes is {self.stop_scene}, {told}")
+            limit = f"and names of files have room for ids below {MOST_SCENE_IDS}"
+            raise ValueError(f"first_scene + scenes is {self.stop_scene}, {limit}")
         return self
 
     @model_validator(mode="after")
@@ -222,11 +224,11 @@ class Job(Frozen):
         if self.captures is not None and (unfit := _unfit_for_captures(self, self.captures)):
             raise ValueError(unfit)
         if self.images.projection.enabled and not self.cameras.mirror.enabled:
-            told = "what is projected is what the mirror camera would see; set images.projection.enabled: false too"
-            raise ValueError(f"images.projection.enabled is true and cameras.mirror.enabled is false: {told}")
+            remedy = "what is projected is what the mirror camera would see; set images.projection.enabled: false too"
+            raise ValueError(f"images.projection.enabled is true and cameras.mirror.enabled is false: {remedy}")
         if self.sensor.changes_rgb and not self.render.rgb:
-            told = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
-            raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {told}")
+            remedy = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
+            raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {remedy}")
         return self
 
     @property
@@ -261,8 +263,8 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
             f"captures.folders names {folders} folders, and captures {job.first_scene} to {job.stop_scene - 1} are asked for: "
             f"first_scene must be 0 and scenes at most {folders}"
         )
-    if job.pairs_per_scene != captures.most_views:
-        return f"pairs_per_scene is {job.pairs_per_scene}: leave it out, captures.most_views ({captures.most_views}) decides it"
+    if not folders and captures.simulate.views > job.pairs_per_scene:
+        return f"captures.simulate.views is {captures.simulate.views}, and pairs_per_scene is {job.pairs_per_scene}: raise that"
     if job.cameras.depth.enabled:
         return "cameras.depth.enabled is true: leave it out, depth of a capture is registered to its colour camera"
     if job.objects_per_scene != ONE_OBJECT:
@@ -270,6 +272,6 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
     if job.sensor != SensorEffects():
         return "sensor has effects: leave them out, those of a virtual capture are keys of captures.simulate"
     if unfit := [name for name in job.targets.views if name in ("albedo", "amodal")] + list(job.targets.shape):
-        told = "a capture has no shape but what its photographs saw; left are normals, coordinates and layers"
-        return f"targets asks for {', '.join(unfit)}: {told}"
+        why = "a capture has no shape but what its photographs saw; left are normals, coordinates and layers"
+        return f"targets asks for {', '.join(unfit)}: {why}"
     return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"

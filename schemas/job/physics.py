@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
-from schemas.base import Counts, Frozen, Interval, NonNegative, NonNegativeInt, Positive, Range, Share
+from schemas.base import Counts, Frozen, Interval, NonNegative, Positive, Range, Share
 
 MOST_OBJECTS = 50
 """Largest number of objects in a scene."""
@@ -43,8 +43,6 @@ class Start(Frozen):
     """Offset of each further object of a pile from the first, along x and y."""
     clearance_m: Interval = Range(0.005, 0.05)
     """Height of the lowest point above what is below it, at the start of a drop."""
-    max_redraws: NonNegativeInt = 20
-    """Most redraws of a position that is not over the table or has no room, and of `if_lost`."""
     if_lost: Literal["redraw", "remove", "fail"] = "redraw"
     """An object that leaves the table, or finds no balance: dropped again from a new start, removed, or a failure."""
 
@@ -52,15 +50,22 @@ class Start(Frozen):
 Collision = Literal["planned", "box", "hull", "parts"]
 
 
+SPIN_PER_SPEED = 0.01
+"""rad/s for each mm/s: what turns so slowly moves so slowly 100 mm from its middle."""
+
+
 class Rest(Frozen):
     """When an object counts as resting: it drifts and turns more slowly than this for the whole window."""
 
     speed_mm_s: Annotated[float, Field(ge=0.01)] = 1.0
-    """Bound on the drift of the object's farthest point."""
-    spin_rad_s: Annotated[float, Field(ge=1e-4)] = 0.01
-    """Bound on the rate at which it turns."""
+    """Bound on the drift of the object's farthest point; it turns at most at 0.01 rad/s for each mm/s of it."""
     window_s: Positive = 0.25
     """Time for which both must hold; a fifth of it for a single object on a flat top."""
+
+    @property
+    def spin_rad_s(self) -> float:
+        """Bound on the rate at which an object turns."""
+        return SPIN_PER_SPEED * self.speed_mm_s
 
 
 class Physics(Frozen):

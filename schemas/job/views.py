@@ -61,10 +61,8 @@ class Mirror(Frozen):
     """Whether there are mirror views; without them camPoses.csv has one row a pair, with an even id."""
     T_z_m: Reach = 1.3
     """Distance of the mirror camera from its pivot, the point it looks at."""
-    pivot_depth: Literal["percentile", "median", "nearest"] = "percentile"
-    """Estimator of d_z, the distance to the object's front surface, from the object's stored input depth."""
     percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
-    """Percentile of the object's depth pixels, for `pivot_depth: percentile`."""
+    """d_z, the distance to the object's front surface, is this percentile of the object's stored input depth; 0: the nearest."""
 
 
 class Cameras(Frozen):
@@ -128,10 +126,10 @@ class Images(Frozen):
     def _fits_16_bits(self) -> "Images":
         units = self.depth_range_m.high * self.depth_units_per_m
         if units > 65_535:
-            told = (
+            bound = (
                 f"{units:.0f} units of depth_units_per_m {self.depth_units_per_m:g}: a 16-bit image holds at most 65535"
             )
-            raise ValueError(f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {told}")
+            raise ValueError(f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {bound}")
         return self
 
 
@@ -155,26 +153,22 @@ class Render(Frozen):
 
 
 class DepthNoise(Frozen):
-    """Noise of a time-of-flight depth camera. Every default is the preset `azure_kinect`.
+    """Noise of a time-of-flight depth camera. Every default is the Azure Kinect's in mode NFOV unbinned.
 
     What is published: Microsoft's specification (Azure Kinect DK hardware specifications) gives a random error of at
     most 17 mm standard deviation, a systematic error below 11 mm + 0.1 % of the distance, and 0.5 to 3.86 m of operating
     range in the mode NFOV unbinned; Tolgyessy et al. 2021 (Sensors 21(2):413) confirm the standard deviation of at most
     17 mm and the distance error below 11 mm up to 3.5 m, and describe flying pixels at depth edges.
 
-    What is assumed: that the random error reaches those 17 mm at the far end of the range, so that the preset is an upper
+    What is assumed: that the random error reaches those 17 mm at the far end of the range, so that the defaults are an upper
     bound and not a typical device; that it grows with the square of the distance and with 1 / cos of the angle of
     incidence, as the returned light falls; and every number that says so below.
     """
 
-    preset: Literal["azure_kinect"] = "azure_kinect"
-    """Names the defaults of this branch: mode NFOV unbinned."""
     axial_m: NonNegative = 0.0
     """Standard deviation along the optical axis at distance 0, metres [assumed]."""
     axial_per_m: NonNegative = 17e-3 / 3.86**2
     """The standard deviation grows by this times z squared."""
-    incidence_power: NonNegative = 1.0
-    """The standard deviation is divided by the cosine of the angle of incidence to this power [assumed]."""
     grazing_deg: Annotated[float, Field(gt=0, le=90)] = 80.0
     """Pixels beyond this angle of incidence have no depth [assumed]."""
     offset_m: float = 0.0
@@ -183,8 +177,6 @@ class DepthNoise(Frozen):
     """Systematic error as a share of the distance; the specification bounds it by 0.001."""
     lateral_px: NonNegative = 0.4
     """Standard deviation, pixels, of the shift of a pixel's sample near a depth edge [assumed]."""
-    edge_step_m: Positive = 0.03
-    """Smallest second difference of 1/depth, times depth squared, metres, that counts as an edge [assumed]."""
     edge_px: Annotated[int, Field(ge=1, le=8)] = 1
     """Reach of an edge's effects, pixels [assumed]."""
     flying_share: Share = 0.3
@@ -233,7 +225,7 @@ class SensorEffects(Frozen):
     """What the sensors add to exact images; masks and labels stay exact."""
 
     depth_noise: DepthNoise | None = None
-    """Noise of a time-of-flight camera in depth; `{}` for the preset. d_z and the projection follow stored depth."""
+    """Noise of a time-of-flight camera in depth; `{}` for the Azure Kinect's. d_z and the projection follow stored depth."""
     distortion: Distortion | None = None
     """Lens distortion of stored RGB."""
     rgb_noise: RgbNoise | None = None

@@ -26,36 +26,93 @@ class Parser(argparse.ArgumentParser):
         super().error(plain_line(message, 400))
 
 
-def refusal(text: str, told: str) -> argparse.ArgumentTypeError:
+def refusal(text: str, why: str) -> argparse.ArgumentTypeError:
     """What was typed, short and printable, and what is wrong with it."""
-    return argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}{told}")
+    return argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}{why}")
 
 
-def read_index(text: str) -> int:
-    """A whole number from 0 up. Raises argparse.ArgumentTypeError."""
-    if not (text.isdecimal() and len(text) <= 18):
-        raise refusal(text, " is not a whole number from 0 up")
-    return int(text)
+def reader(
+    pattern: str, why: str, make: Callable[[re.Match[str]], Any] = lambda match: match[0]
+) -> Callable[[str], Any]:
+    """What reads the values that match a pattern, as `make` has them; None refuses one too. `why`: what is wrong with others."""
+
+    def read(text: str) -> Any:
+        match = re.fullmatch(pattern, text, re.ASCII)
+        value = None if match is None else make(match)
+        if value is None:
+            raise refusal(text, why)
+        return value
+
+    return read
 
 
-def read_count(text: str) -> int:
-    """A whole number from 1 up. Raises argparse.ArgumentTypeError."""
-    if not read_index(text):
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 up")
-    return int(text)
+HOST: Final = r"(?:[\w-]{1,63}(?:\.[\w-]{1,63})*|\[[0-9a-fA-F:.]{2,45}\])"
+
+read_index = reader(r"\d{1,18}", " is not a whole number from 0 up", lambda match: int(match[0]))
+read_count = reader(r"0*[1-9]\d{0,17}", " is not a whole number from 1 up", lambda match: int(match[0]))
+read_counts = reader(
+    r"[1-9]\d{0,8}(?:,[1-9]\d{0,8})*",
+    " are not whole numbers from 1 up with commas between",
+    lambda match: [int(count) for count in match[0].split(",")],
+)
+read_duration = reader(
+    r"(?=.*[1-9])(\d{1,6}(?:\.\d{1,3})?)(s|m|h)",
+    " is not a time such as 90s, 15m or 2h",
+    lambda match: float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]],
+)
+read_size = reader(
+    r"([1-9]\d{0,2})x([1-9]\d{0,2})",
+    " is no size: write COLUMNSxROWS, such as 8x6",
+    lambda match: (int(match[1]), int(match[2])),
+)
+read_length = reader(
+    r"\d*\.?\d+(?:e-?\d+)?",
+    " is no length in metres up to 10, such as 0.03",
+    lambda match: length if 0.0 < (length := float(match[0])) <= 10.0 else None,
+)
+read_port = reader(
+    r"\d{1,5}", " is not a port from 0 to 65535", lambda match: port if (port := int(match[0])) < 65536 else None
+)
+read_priority = reader(
+    r"[+-]?(?:1000|\d{1,3})", " is not a whole number from -1000 to 1000", lambda match: int(match[0])
+)
+read_job_id = reader(
+    JOB_ID, ": an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
+)
+read_host = reader(
+    rf"{HOST}|[0-9a-fA-F:.]{{2,45}}",
+    ": write a name or an address without a port, such as 127.0.0.1 or 0.0.0.0",
+    lambda match: match[0].strip("[]"),
+)
+read_http = reader(
+    r"(https?://[^\s/?#@]+(?:/[^\s?#]*)?)",
+    ": write it as http://HOST:PORT, as `ray start` prints it for the dashboard (port 8265 by default)",
+    lambda match: match[0].rstrip("/"),
+)
 
 
-def read_counts(text: str) -> list[int]:
-    """Whole numbers from 1 up, with commas between. Raises argparse.ArgumentTypeError."""
-    return [read_count(one) for one in text.split(",")]
+def _with_port(match: re.Match[str]) -> str | None:
+    """An address whose port, if it has one, can be."""
+    return match[0] if match[1] is None or 0 < int(match[1]) < 65536 else None
 
 
-def read_duration(text: str) -> float:
-    """Seconds, of a number with s, m or h behind it. Raises argparse.ArgumentTypeError."""
-    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)(s|m|h)", text, re.ASCII)
-    if found is None or not float(found[1]):
-        raise refusal(text, " is not a time such as 90s, 15m or 2h")
-    return float(found[1]) * {"s": 1, "m": 60, "h": 3600}[found[2]]
+read_listener = reader(
+    rf"{HOST}:(\d{{1,5}})",
+    ": write it as HOST:PORT, such as 127.0.0.1:9464 (0.0.0.0 listens on every address)",
+    _with_port,
+)
+_read_cluster = reader(
+    rf"auto|{HOST}:(\d{{1,5}})", ": write it as HOST:PORT, as `ray start` prints it (port 6379 by default)", _with_port
+)
+
+
+def read_address(text: str) -> str:
+    """Where a Ray listens. Raises argparse.ArgumentTypeError."""
+    if text.startswith("ray://"):
+        remedy = "Verso runs beside a node of the cluster and not through Ray's client: write HOST:PORT (port 6379 by default) on"
+        remedy += " a machine of the cluster, or `ray submit CLUSTER.yaml deploy/submit.py JOB` from elsewhere"
+        raise refusal(text, f": {remedy}")
+    return str(_read_cluster(text))
 
 
 def read_span(text: str) -> tuple[int, int]:
@@ -65,20 +122,6 @@ def read_span(text: str) -> tuple[int, int]:
     if span[1] < span[0]:
         raise argparse.ArgumentTypeError(f"{text} ends before it begins: write FIRST-LAST, such as 0-63")
     return span
-
-
-def read_size(text: str) -> tuple[int, int]:
-    """Two counts, 8x6. Raises argparse.ArgumentTypeError."""
-    if not (found := re.fullmatch(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", text, re.ASCII)):
-        raise refusal(text, " is no size: write COLUMNSxROWS, such as 8x6")
-    return int(found[1]), int(found[2])
-
-
-def read_length(text: str) -> float:
-    """A length in metres, up to 10. Raises argparse.ArgumentTypeError."""
-    if not re.fullmatch(r"[0-9]*\.?[0-9]+(e-?[0-9]+)?", text, re.ASCII) or not 0.0 < float(text) <= 10.0:
-        raise refusal(text, " is no length in metres, such as 0.03")
-    return float(text)
 
 
 def read_path(text: str) -> Path:
@@ -99,70 +142,6 @@ def read_place(text: str) -> str:
     if hostile or not 0 < len(text) <= MOST_PATH_CHARACTERS:
         raise refusal(text, " cannot be the name of a file, folder or bucket")
     return text
-
-
-def read_address(text: str) -> str:
-    """Where a Ray listens. Raises argparse.ArgumentTypeError."""
-    if text.startswith("ray://"):
-        told = "Verso runs beside a node of the cluster and not through Ray's client: write HOST:PORT (port 6379 by default) on"
-        told += " a machine of the cluster, or `ray submit CLUSTER.yaml deploy/submit.py JOB` from elsewhere"
-        raise refusal(text, f": {told}")
-    host = r"[\w-]{1,63}(?:\.[\w-]{1,63})*|\[[0-9a-fA-F:.]{2,45}\]"
-    found = re.fullmatch(rf"(?:{host}):(\d{{1,5}})", text, re.ASCII)
-    if text != "auto" and not (found and 0 < int(found[1]) < 65536):
-        told = "write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
-        raise refusal(text, f": {told}")
-    return text
-
-
-def read_listener(text: str) -> str:
-    """An address of this machine and a port to listen on, HOST:PORT. Raises argparse.ArgumentTypeError."""
-    told = "write it as HOST:PORT, such as 127.0.0.1:9464 (0.0.0.0 listens on every address)"
-    if text == "auto" or text.startswith("ray://"):
-        raise argparse.ArgumentTypeError(f"{text}: {told}")
-    try:
-        return read_address(text)
-    except argparse.ArgumentTypeError:
-        raise refusal(text, f": {told}") from None
-
-
-def read_port(text: str) -> int:
-    """A port, or 0 for any that is free. Raises argparse.ArgumentTypeError."""
-    if read_index(text) > 65535:
-        raise argparse.ArgumentTypeError(f"{text} is not a port from 0 to 65535")
-    return int(text)
-
-
-def read_host(text: str) -> str:
-    """A name or an address to listen on, without a port. Raises argparse.ArgumentTypeError."""
-    bare = text.removeprefix("[").removesuffix("]")
-    if not re.fullmatch(r"[\w-]{1,63}(?:\.[\w-]{1,63})*|[0-9a-fA-F:.]{2,45}", bare, re.ASCII):
-        told = "write a name or an address without a port, such as 127.0.0.1 or 0.0.0.0"
-        raise refusal(text, f": {told}")
-    return bare
-
-
-def read_http(text: str) -> str:
-    """The address of an HTTP server. Raises argparse.ArgumentTypeError."""
-    if not re.fullmatch(r"https?://[^\s/?#@]+(?:/[^\s?#]*)?", text, re.ASCII):
-        told = "write it as http://HOST:PORT, as `ray start` prints it for the dashboard (port 8265 by default)"
-        raise refusal(text, f": {told}")
-    return text.rstrip("/")
-
-
-def read_job_id(text: str) -> str:
-    """The id of a job in a queue. Raises argparse.ArgumentTypeError."""
-    if not re.fullmatch(JOB_ID, text, re.ASCII):
-        told = "an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
-        raise refusal(text, f": {told}")
-    return text
-
-
-def read_priority(text: str) -> int:
-    """A whole number from -1000 to 1000. Raises argparse.ArgumentTypeError."""
-    if not re.fullmatch(r"[+-]?[0-9]{1,4}", text, re.ASCII) or abs(int(text)) > 1000:
-        raise refusal(text, " is not a whole number from -1000 to 1000")
-    return int(text)
 
 
 Option = tuple[tuple[str, ...], dict[str, Any]]

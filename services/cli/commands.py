@@ -35,14 +35,9 @@ def extra(options: argparse.Namespace) -> int:
     )
 
 
-def test(options: argparse.Namespace) -> int:
-    """`verso test`. Raises InputError: the tests are no part of the installed package, and the launcher runs them."""
-    raise InputError("test runs the tests of a checkout: type ./verso test there")
-
-
-def lock(options: argparse.Namespace) -> int:
-    """`verso lock`. Raises InputError: only the launcher of a checkout can do it."""
-    raise InputError("lock makes a checkout's lock files: type ./verso lock there")
+def checkout(options: argparse.Namespace) -> int:
+    """`verso test` and `verso lock`. Raises InputError: only the launcher of a checkout does them, before it starts Python."""
+    raise InputError(f"{options.command} is a command of a checkout's launcher: type ./{options.command} there")
 
 
 def wheels(options: argparse.Namespace) -> int:
@@ -90,12 +85,12 @@ def tell_result(out: str, job: Job, result: "RunResult") -> tuple[bool, dict[str
     print(f"{out}{host_place(out)}: dataset digest {merged.digest}")
     print(f'next: verso report {out} · verso query {out} "select category, count(*) from scenes group by category"')
     if again := merged.scenes["environmental"]:
-        told = f"{plural(again, 'scene')} failed for environmental reasons: try again with --retry-failed"
-        print(f"verso: {told}", file=sys.stderr)
+        why = f"{plural(again, 'scene')} failed for environmental reasons: try again with --retry-failed"
+        print(f"verso: {why}", file=sys.stderr)
     elif not complete:
-        told = f"{share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}"
+        why = f"{share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}"
         asks = f'verso query {out} "select reason, count(*) from failures group by reason"'
-        print(f"verso: {told}: `{asks}` says why", file=sys.stderr)
+        print(f"verso: {why}: `{asks}` says why", file=sys.stderr)
     return complete, {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
 
 
@@ -129,9 +124,9 @@ def status(options: argparse.Namespace) -> int:
     if now.scenes_per_s:
         print(f"  rate: {now.scenes_per_s:.2f} scenes/s")
     lives = now.holder is not None and shows_life(store, now.holder)
-    for one in now.running:
-        doing = "no scene in progress" if one.scene_id is None else f"scene {one.scene_id}"
-        print(f"  {'running' if lives else 'was running'}: range from {one.start}, {doing} ({one.attempt})")
+    for attempt in now.running:
+        doing = "no scene in progress" if attempt.scene_id is None else f"scene {attempt.scene_id}"
+        print(f"  {'running' if lives else 'was running'}: range from {attempt.start}, {doing} ({attempt.attempt})")
     if now.holder is not None:
         gone = "" if lives else ", which is gone: start the run again, what is committed is kept"
         print(f"  held by process {now.holder.pid} on {now.holder.host}{gone}")
@@ -158,15 +153,15 @@ def verify(options: argparse.Namespace) -> int:
         if count := getattr(options, name):
             try:
                 with explain_damage(store):
-                    found = _with_progress(count, name, partial(check, store, count))
+                    report = _with_progress(count, name, partial(check, store, count))
             except RunError as error:
                 if not faults:
                     raise
                 print(f"--{name} {count} was not possible: {error}")
                 continue
-            print("\n".join(describe(found)))
-            faults += found.faults
-            answer[name] = dataclasses.asdict(found)
+            print("\n".join(describe(report)))
+            faults += report.faults
+            answer[name] = dataclasses.asdict(report)
     return finish(options, not faults, **answer)
 
 
@@ -248,12 +243,12 @@ def _repair(options: argparse.Namespace) -> int:
 
     store = _committed(options.out)
     with explain_damage(store):
-        found = _with_progress(_scenes_asked(store), "verify", partial(repair, store, options.scene))
-    for line in (*found.done, *found.left):
+        repaired = _with_progress(_scenes_asked(store), "verify", partial(repair, store, options.scene))
+    for line in (*repaired.done, *repaired.left):
         print(line)
-    off = _tell_faults(found.verdict)
-    print(f"{options.out}: {plural(len(found.done), 'file')} put back or written again; {off or 'nothing'} off")
-    return finish(options, not off, done=found.done, left=found.left, faults=found.verdict.faults)
+    off = _tell_faults(repaired.verdict)
+    print(f"{options.out}: {plural(len(repaired.done), 'file')} put back or written again; {off or 'nothing'} off")
+    return finish(options, not off, done=repaired.done, left=repaired.left, faults=repaired.verdict.faults)
 
 
 def _dataset(out: str) -> Store:
@@ -282,7 +277,7 @@ def report(options: argparse.Namespace) -> int:
         f"{target}: {plural(made.figures.scenes, 'scene')}, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB"
     )
     answer = {"file": str(target), "bytes": size, "seconds": round(seconds, 2), "scenes": made.figures.scenes}
-    return finish(options, True, **answer, shown=[one.scene_id for one in made.sample.scenes])
+    return finish(options, True, **answer, shown=[scene.scene_id for scene in made.sample.scenes])
 
 
 def serve(options: argparse.Namespace) -> int:

@@ -43,8 +43,8 @@ def main(options: argparse.Namespace) -> int:
 
 def _python() -> Finding:
     ok = (3, 11) <= sys.version_info[:2] <= (3, 13) and platform.machine() == "x86_64"
-    found = f"CPython {platform.python_version()} on {platform.machine()}, glibc {platform.libc_ver()[1] or 'unknown'}"
-    return Finding("python", ok, found, "use CPython 3.11 to 3.13 on x86-64, or docker compose")
+    python = f"CPython {platform.python_version()} on {platform.machine()}, glibc {platform.libc_ver()[1] or 'unknown'}"
+    return Finding("python", ok, python, "use CPython 3.11 to 3.13 on x86-64, or docker compose")
 
 
 def _cores() -> Finding:
@@ -53,15 +53,15 @@ def _cores() -> Finding:
 
 def _memory() -> Finding:
     available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    found = f"{available / 2**30:.1f} GiB free"
-    return Finding("memory", available > 2**30, found, "a worker takes up to 0.7 GiB: free some")
+    free = f"{available / 2**30:.1f} GiB free"
+    return Finding("memory", available > 2**30, free, "a worker takes up to 0.7 GiB: free some")
 
 
 def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
     # A scene with one pair takes about 3.5 MB.
-    found = f"{free / 2**30:.0f} GiB free here, room for about {free // 3_500_000:,} scenes"
-    return Finding("disk", free > 2**30, found, "free some")
+    room = f"{free / 2**30:.0f} GiB free here, room for about {free // 3_500_000:,} scenes"
+    return Finding("disk", free > 2**30, room, "free some")
 
 
 def _shared_memory() -> Finding:
@@ -116,5 +116,5 @@ def _stack() -> Finding:
         stack = take_fingerprint(shared_renderer(), "raster")
     except VersoError as error:
         return Finding("fingerprint", False, "the canary scene could not be made", str(error))
-    found = f"{stack.digest[:16]} (canary {stack.canary[:16]}, numpy up to {stack.simd.split()[-1]})"
-    return Finding("fingerprint", True, found)
+    fingerprint = f"{stack.digest[:16]} (canary {stack.canary[:16]}, numpy up to {stack.simd.split()[-1]})"
+    return Finding("fingerprint", True, fingerprint)

@@ -40,8 +40,8 @@ def typed_program() -> str:
     The launcher and the containers' file say it in $VERSO_TYPED.
     """
     typed = os.environ.get("VERSO_TYPED") or (sys.argv[0] if Path(sys.argv[0]).name == "verso" else "verso")
-    found = shutil.which("verso")
-    same = found is not None and os.path.isfile(typed) and os.path.samefile(found, typed)
+    program = shutil.which("verso")
+    same = program is not None and os.path.isfile(typed) and os.path.samefile(program, typed)
     return "verso" if same else typed
 
 

@@ -26,8 +26,8 @@ def submit(options: argparse.Namespace) -> int:
     """`verso submit`."""
     changes = [*([f"scenes={options.scenes}"] if options.scenes else []), *options.changes]
     job = load_job(options.job, changes)
-    told = "a job of the queue runs on a cluster: write the whole path, from / on, as all its hosts see it"
-    refuse_folders(job, name_of(options.job), lambda folder: folder.startswith("/") or "://" in folder, told)
+    remedy = "a job of the queue runs on a cluster: write the whole path, from / on, as all its hosts see it"
+    refuse_folders(job, name_of(options.job), lambda folder: folder.startswith("/") or "://" in folder, remedy)
     queue = make_queue(_place(options))
     request = JobRequest(
         id=new_id(),

@@ -68,7 +68,9 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
             yield from _describe(command.commands, f"{words} ")
             continue
         yield from (f"\n##{'#' * bool(above)} {words}\n", what, "", f"    ./verso {words} {command.example}".rstrip())
-        if options := [f"`{written}`" for one in (*command.options, *command.one_of) if (written := _written(one))]:
+        if options := [
+            f"`{written}`" for option in (*command.options, *command.one_of) if (written := _written(option))
+        ]:
             yield from ("", f"Options: {', '.join(options)}.")
 
 

@@ -395,6 +395,7 @@ COMMANDS: Final[dict[str, Command]] = {
         flag("--all", "also that, and what takes minutes"),
         path("--figures", "FILE", "write what the tests measured there, as JSON"),
         option("-k", "EXPR", "only tests whose name matches, as in pytest"),
+        handler="cli.commands:checkout",
     ),
     **STUDY_COMMANDS,
     "doctor": command("what this machine has, and what is missing", "", handler="cli.doctor:main"),
@@ -409,7 +410,11 @@ COMMANDS: Final[dict[str, Command]] = {
         "pathtraced",
         choice("name", ("pathtraced", "audit", "study")),
     ),
-    "lock": command("make the lock files of a checkout anew, with the newest versions that pyproject.toml allows", ""),
+    "lock": command(
+        "make the lock files of a checkout anew, with the newest versions that pyproject.toml allows",
+        "",
+        handler="cli.commands:checkout",
+    ),
     "wheels": command(
         "build a checkout's wheels: verso-data, all of it, and verso-read, which reads datasets",
         "dist",

@@ -70,8 +70,8 @@ def parse_yaml(text: str, most_values: int = MOST_VALUES) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        told = " ".join(part for part in (error.context, error.problem) if part)
-        raise JobError(f"not YAML: {where}{plain_line(told, 200)}") from error
+        problem = " ".join(part for part in (error.context, error.problem) if part)
+        raise JobError(f"not YAML: {where}{plain_line(problem, 200)}") from error
     except (yaml.YAMLError, UnicodeEncodeError) as error:
         raise JobError(f"not YAML: {plain_line(str(error), 200)}") from error
 

@@ -136,19 +136,19 @@ def folders_of(job: Job) -> dict[str, str]:
     return sources | {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
 
 
-def refuse_folders(job: Job, name: str, fits: Callable[[str], bool], told: str) -> None:
+def refuse_folders(job: Job, name: str, fits: Callable[[str], bool], why: str) -> None:
     """Raises JobError for a folder of the job that does not fit where the job is to run; `told` says why, and the remedy."""
     from workers.assets.external.listing import PYBULLET_DATA
 
     for key, folder in folders_of(job).items():
         if folder not in ("", PYBULLET_DATA) and not fits(folder):
-            raise JobError(f"{name}: {key}: {plain_line(repr(folder))}: {told}")
+            raise JobError(f"{name}: {key}: {plain_line(repr(folder))}: {why}")
 
 
 def _check_absolute(job: Job, name: str) -> None:
     """Raises JobError for a folder that is meant from the job file's own, which a packed job has not."""
-    told = "a packed job has no folder of its own: write the whole path, the same on every node"
-    refuse_folders(job, name, lambda folder: folder.startswith(("/", "~")), told)
+    why = "a packed job has no folder of its own: write the whole path, the same on every node"
+    refuse_folders(job, name, lambda folder: folder.startswith(("/", "~")), why)
 
 
 def _check_homes(job: Job, name: str) -> None:
@@ -172,8 +172,8 @@ def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
     except JobError as error:
         raise JobError(f"{name}: {error}") from error
     if not isinstance(tree, dict):
-        found = type(tree).__name__ if tree is not None else "nothing"
-        raise JobError(f"{name}: holds {found}, and must hold keys and values")
+        kind = type(tree).__name__ if tree is not None else "nothing"
+        raise JobError(f"{name}: holds {kind}, and must hold keys and values")
     if sum(map(len, changes)) > MOST_BYTES:
         raise JobError(f"--set: the changes have over {MOST_BYTES} characters: put them into the job file")
     for change in changes:
@@ -219,10 +219,10 @@ def validate_job(tree: dict[str, Any], name: str) -> Job:
     except ValidationError as error:
         faults = error.errors()
         # An invalid item of a list makes the list itself count as too short: that line would confuse.
-        told = [fault for fault in faults if fault["type"] != "too_short" or len(faults) == 1]
-        lines = [f"{name}: {describe_fault(fault)}" for fault in told[:MOST_FAULTS]]
-        if len(told) > MOST_FAULTS:
-            lines.append(f"{name}: and {len(told) - MOST_FAULTS} faults more")
+        shown = [fault for fault in faults if fault["type"] != "too_short" or len(faults) == 1]
+        lines = [f"{name}: {describe_fault(fault)}" for fault in shown[:MOST_FAULTS]]
+        if len(shown) > MOST_FAULTS:
+            lines.append(f"{name}: and {len(shown) - MOST_FAULTS} faults more")
         raise JobError("\n".join(lines)) from error
 
 
@@ -235,10 +235,6 @@ _SEVERAL: tuple[str, Acts] = ("objects_per_scene is 1", lambda job: job.objects_
 _PILE: tuple[str, Acts] = ("start.arrange is spread", lambda job: job.start.arrange == "pile")
 _RASTER: tuple[str, Acts] = ("render.tier is not raster", lambda job: job.render.tier == "raster")
 _TRACED: tuple[str, Acts] = ("render.tier is not pathtraced", lambda job: job.render.tier == "pathtraced")
-_PERCENTILE: tuple[str, Acts] = (
-    "cameras.mirror.pivot_depth is not percentile",
-    lambda job: job.cameras.mirror.pivot_depth == "percentile",
-)
 _PARTS: tuple[str, Acts] = (
     "physics.collision makes no convex parts",
     lambda job: job.physics.collision in ("planned", "parts"),
@@ -250,8 +246,7 @@ NEEDS: dict[str, tuple[tuple[str, Acts], ...]] = {
     "render.path_samples": (_COLOUR, _TRACED),
     "render.path_bounces": (_COLOUR, _TRACED),
     "cameras.mirror.T_z_m": (_MIRROR,),
-    "cameras.mirror.pivot_depth": (_MIRROR,),
-    "cameras.mirror.percentile": (_MIRROR, _PERCENTILE),
+    "cameras.mirror.percentile": (_MIRROR,),
     "cameras.depth.offset_m": (_DEPTH,),
     "images.projection.splat": (_PROJECTION,),
     "images.projection.hidden_point_removal": (_PROJECTION,),
@@ -266,12 +261,12 @@ def describe_idle(job: Job) -> list[str]:
     """A line for each key that has another value than its default and cannot act."""
     if job.captures is not None:
         return []
-    told = []
+    lines = []
     for key, needs in NEEDS.items():
         branch, _, name = key.rpartition(".")
         model = reduce(getattr, branch.split("."), job)
         value, usual = getattr(model, name), type(model).model_fields[name].default
         why = next((phrase for phrase, acts in needs if not acts(job)), None)
         if value != usual and why is not None:
-            told.append(f"{key} is {value} and has no effect: {why}")
-    return told
+            lines.append(f"{key} is {value} and has no effect: {why}")
+    return lines

@@ -85,8 +85,8 @@ def record_job(
 
 
 def encode_job(record: JobRecord) -> bytes:
-    """OUT/job.yaml."""
-    job = record.job.model_dump(mode="json")
+    """OUT/job.yaml; without the preset, which has filled its keys, and would fill those that a later version adds to it."""
+    job = record.job.model_dump(mode="json", exclude={"preset"})
     tree: dict[str, Any] = {"digest": record.digest, "catalogue": record.catalogue, "folder": record.folder}
     tree |= {"inputs": list(record.inputs)} if record.inputs else {}
     tree["job"] = job
@@ -120,11 +120,11 @@ def decode_job(data: bytes, name: str) -> JobRecord:
             raise TypeError(f"folder: {folder!r} is not an absolute path")
         return JobRecord(job, **texts, inputs=inputs)
     except JobError as error:
-        told = str(error).splitlines()[0].removeprefix(f"{name}: ")
-        raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
+        problem = str(error).splitlines()[0].removeprefix(f"{name}: ")
+        raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        told = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
+        problem = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
 
 
 def is_job_sealed(data: bytes) -> bool:

@@ -1,6 +1,5 @@
 """Writes docs/job.md: every key of a job file with its type, default and meaning, from the models."""
 
-import re
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -11,7 +10,6 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from schemas.base import Counts, Range
-from schemas.job.assets import FORMER
 from schemas.job.job import Job
 from schemas.job.physics import MOST_OBJECTS
 
@@ -25,32 +23,45 @@ After each key: what is allowed; the default. `null` stands for nothing.
 """
 
 
-def list_keys(model: type[BaseModel] = Job, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """(path, field) of every key, depth first; keys of a source have its kind in brackets after the list's name."""
+def list_keys(
+    model: type[BaseModel] = Job, prefix: str = "", firsts: dict[type[BaseModel], str] | None = None
+) -> Iterator[tuple[str, FieldInfo, str]]:
+    """(path, field, path of the same branch before) of every key, depth first; the keys of a branch come once, where it is first.
+
+    Keys of a source have its kind in brackets after the list's name, which stands for the key `source`.
+    """
+    firsts = {} if firsts is None else firsts
     for name, field in model.model_fields.items():
-        path = f"{prefix}{name}"
-        yield path, field
-        for kind, branch in _branches(field.annotation):
-            yield from list_keys(branch, f"{path}{kind}.")
+        path, branches = f"{prefix}{name}", list(_branches(field.annotation))
+        before = firsts.get(branches[0], "") if branches else ""
+        if name != "source":
+            yield path, field, before
+        firsts |= dict.fromkeys(() if before else branches, path)
+        for branch in () if before else branches:
+            yield from list_keys(branch, f"{path}{_kind(branch)}.", firsts)
 
 
-def _branches(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
+def _branches(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models in an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        source = annotation.model_fields.get("source")
-        kinds = [kind for kind in typing.get_args(source.annotation) if kind != FORMER] if source is not None else []
-        kind = f"[{kinds[0]}]" if len(kinds) == 1 else ""
-        yield kind, annotation
+        yield annotation
         return
     for argument in typing.get_args(annotation):
-        if argument is not Ellipsis:
-            yield from _branches(argument)
+        yield from _branches(argument)
+
+
+def _kind(branch: type[BaseModel]) -> str:
+    source = branch.model_fields.get("source")
+    return "" if source is None else f"[{typing.get_args(source.annotation)[0]}]"
 
 
 def allowed_keys(path: Sequence[str]) -> list[str]:
     """Names of the keys that are siblings of a path's last part; the path may hold positions in lists."""
-    parent = ".".join(part for part in path[:-1] if not part.isdigit())
-    plain = (re.sub(r"\[\w+\]", "", key).rpartition(".") for key, _ in list_keys())
-    return sorted({name for above, _, name in plain if above == parent})
+    models: list[type[BaseModel]] = [Job]
+    for name in (part for part in path[:-1] if not part.isdigit()):
+        fields = [model.model_fields[name] for model in models if name in model.model_fields]
+        models = [branch for field in fields for branch in _branches(field.annotation)]
+    return sorted({name for model in models for name in model.model_fields})
 
 
 def describe_allowed(field: FieldInfo) -> str:
@@ -110,23 +121,10 @@ def _default(field: FieldInfo) -> str:
 def write_doc() -> str:
     """The whole page."""
     rows: dict[str, list[str]] = {}
-    told: dict[Any, str] = {}
-    again: list[str] = []
-    for path, field in list_keys():
-        if path.endswith(".source") and len(typing.get_args(field.annotation)) == 1:
-            continue
-        if path.startswith("assets.tables["):
-            continue  # the same keys as those of objects
-        meaning = " ".join((field.description or "").split())
-        if path == "assets.tables":
-            meaning += " Each has the keys of a source of objects."
-        if path.startswith(tuple(again)):
-            continue  # told where the same branch stands first
-        if field.annotation is not None and (branch := [kind for _, kind in _branches(field.annotation)]):
-            first = told.setdefault(tuple(branch), path)
-            if first != path and path != "assets.tables":
-                again.append(f"{path}.")
-                meaning += f" Its keys are those of `{first}`."
+    for path, field, before in list_keys():
+        meaning = " ".join(
+            [*(field.description or "").split(), *([f"Its keys are those of `{before}`."] if before else ())]
+        )
         allowed = "" if (default := _default(field)) == "below" else f" ({describe_allowed(field)}; {default})"
         rows.setdefault(f"{allowed}: {meaning}\n", []).append(f"`{path}`")
     return HEADER + "".join(f"- {', '.join(paths)}{row}" for row, paths in rows.items())

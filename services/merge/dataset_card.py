@@ -85,7 +85,7 @@ y down, z forward), metres.
 
 def _describe_captures(captures: Captures, catalogue: "Catalogue") -> str:
     """The section on where photographs come from and what was done to them."""
-    board = captures.board
+    board = captures.printed_board
     origin = f"{len(catalogue.captures)} folders of photographs with registered depth, each with the board in its board.json."
     if not captures.folders:
         shapes = "\n".join(f"- {line}" for line in describe_sources(catalogue) if not line.startswith("tables"))

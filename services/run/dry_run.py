@@ -50,7 +50,9 @@ def describe_scenes(job: Job) -> str:
     if job.captures is None:
         return f"scenes {ids}, {job.pairs_per_scene} pair{'s' * (job.pairs_per_scene > 1)} each"
     virtual = f"virtual, of {job.captures.simulate.views} views"
-    return f"captures {ids}, {'in folders' if job.captures.folders else virtual}, at most {job.captures.most_views} pairs each"
+    return (
+        f"captures {ids}, {'in folders' if job.captures.folders else virtual}, at most {job.pairs_per_scene} pairs each"
+    )
 
 
 def _require_writable(store: Store) -> None:

@@ -116,7 +116,7 @@ def errors_of(score: CaptureScore) -> dict[str, float]:
 
 def check_captures(job: Job) -> None:
     """Raises InputError where a job's captures cannot be studied."""
-    if job.captures is None or job.captures.source != "simulate":
+    if job.captures is None or job.captures.folders:
         raise InputError(
-            "captures.source is folders: a study needs truth, which simulated captures alone have; use captures.source: simulate"
+            "captures.folders names folders: a study needs truth, which virtual captures alone have; leave it out"
         )

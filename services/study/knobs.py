@@ -27,32 +27,26 @@ FREE: Mapping[str, str] = {
     "run output check": "costs no setting of a scene anything, or is not measured",
     "pairs_per_scene objects_per_scene categories": "what is in a scene: twice as much takes about twice as long",
     "assets.objects assets.tables assets.split assets.limits assets.shell_kg_m2": "which shapes",
-    "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m start.max_redraws": "where things begin",
+    "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m": "where things begin",
     "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
     "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
     "targets.smooth targets.layers targets.shape targets.points": "which files; their time is in the table of timings",
     "cameras.orbit cameras.depth cameras.mirror.enabled cameras.mirror.T_z_m": "where cameras stand",
     "images.depth_range_m images.patch images.projection.enabled": "which files",
     "render.rgb render.path_bounces": "a whole image, or of the path-traced tier alone",
-    "captures.source captures.folders captures.category captures.board captures.most_views": "what is captured",
-    "captures.simulate.distance_m captures.simulate.inclination_rad captures.simulate.roll_deg": "where views are",
+    "captures.folders captures.board": "what is captured",
+    "captures.simulate.distance_m captures.simulate.inclination_rad": "where views are",
     "captures.simulate.tier captures.simulate.depth_noise captures.simulate.rgb_noise captures.simulate.motion_blur "
     "captures.simulate.exposure captures.simulate.distortion captures.simulate.hidden_markers captures.simulate.print_scale "
     "captures.simulate.registration_error captures.simulate.tone_curve captures.simulate.sharpen "
     "captures.simulate.rolling_shutter captures.simulate.jpeg": "the simulated camera, which a real one has anyway",
-    "captures.estimation.compare captures.estimation.min_markers captures.estimation.max_reprojection_px "
-    "captures.estimation.corner_px captures.estimation.depth_sigma_m captures.estimation.trust "
-    "captures.estimation.calibrate": "no time",
-    "captures.fusion.max_edge_deg captures.fusion.board_clearance_m captures.fusion.min_views "
-    "captures.synthesis.fill_px": "no time",
+    "captures.estimation.compare captures.estimation.corner_px captures.estimation.trust captures.estimation.calibrate "
+    "captures.fusion.board_clearance_m captures.fusion.min_views": "no time",
 }
 """Keys of a job, or branches of keys, that no knob turns, and why. Every other key that costs time is a row of `knobs_of`."""
 
 VIEWS = (4, 6, 10, 20, 40)
 """Numbers of views, as far as the job's captures have as many."""
-
-SPIN_PER_SPEED = 0.01
-"""rad/s of `physics.rest.spin_rad_s` for each mm/s of `physics.rest.speed_mm_s`: their defaults' ratio."""
 
 _FINE = {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400}
 _FINEST = {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400}
@@ -81,12 +75,11 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
             "image_scale": _values("captures.simulate.image_scale", (0.25, 0.5, 1.0)),
         }
         return tuple(Knob(name, "capture", tuple(values)) for name, values in simulated.items())
-    speed, spin = "physics.rest.speed_mm_s", "physics.rest.spin_rad_s"
     physics = {
         "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
         "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
         "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
-        "rest": [Value(f"{v:g}", {speed: v, spin: SPIN_PER_SPEED * v}) for v in (30.0, 10.0, 3.0, 1.0, 0.3)],
+        "rest": _values("physics.rest.speed_mm_s", (30.0, 10.0, 3.0, 1.0, 0.3)),
         "collision": _collisions(job),
         "concavity": _values("physics.concavity", (0.2, 0.1, 0.05, 0.02)),
         "friction": _values("physics.friction", (0.3, 0.5, 0.7, 1.0)),
@@ -111,7 +104,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
         Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
         Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
-        Knob("pivot_depth", "mirror", _pivot_depths()),
+        Knob("pivot_depth", "mirror", tuple(_values("cameras.mirror.percentile", (50.0, 10.0, 5.0, 2.0, 0.5, 0.0)))),
         Knob("splat", "mirror", tuple(splats)),
         *(Knob(name, "labels", values) for name, values in sensors.items()),
         Knob("targets", "labels", tuple(_targets())),
@@ -149,12 +142,6 @@ def size_value(job: Job, width: int) -> Value:
     scaled = {name: value * scale for name, value in sensor}
     values = scaled | {"width": width, "height": max(1, round(scaled["height"]))}
     return Value(str(width), {f"cameras.sensor.{name}": value for name, value in values.items()})
-
-
-def _pivot_depths() -> tuple[Value, ...]:
-    key, percentile = "cameras.mirror.pivot_depth", "cameras.mirror.percentile"
-    shares = [Value(f"{p:g}%", {key: "percentile", percentile: p}) for p in (10.0, 5.0, 2.0, 0.5)]
-    return Value("median", {key: "median"}), *shares, Value("nearest", {key: "nearest"})
 
 
 def _tiers() -> tuple[Value, ...]:

@@ -180,7 +180,8 @@ CAPTURES = {
     "scenes": 4,
     "categories": ["box", "mug"],
     "assets": {"objects": [{"source": "procedural", "size": "metric"}]},
-    "captures": {"most_views": 8, "simulate": {"views": 5, "image_scale": 0.25, "depth_noise": {}}},
+    "pairs_per_scene": 8,
+    "captures": {"simulate": {"views": 5, "image_scale": 0.25, "depth_noise": {}}},
 }
 
 

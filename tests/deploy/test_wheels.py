@@ -72,7 +72,7 @@ def test_reading_loads_what_the_wheel_names_and_nothing_that_makes_data():
     rooms = {".".join(name.split(".")[:2]) for name in modules}
     assert not rooms & {"workers.physics", "workers.render", "workers.capture", "workers.shard", "services.queue"}
     assert len(modules) < 105  # nine export formats are thirteen of them
-    code = "import sys, verso; print(*sys.modules)"
+    code = "import sys, verso; verso.open; print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.split()

@@ -47,10 +47,10 @@ def leaves(field: pa.Field, path: str):
 
 @pytest.mark.parametrize("table", TABLES)
 def test_the_schema_has_every_column_in_order_and_every_quantity_a_unit(table):
-    found = [leaf for field in SCHEMAS[table] for leaf in leaves(field, field.name)]
-    assert [path for path, _, _ in found] == [column.path for column in COLUMNS[table]]
+    columns = [leaf for field in SCHEMAS[table] for leaf in leaves(field, field.name)]
+    assert [path for path, _, _ in columns] == [column.path for column in COLUMNS[table]]
     assert set(SORT_KEYS[table]) <= set(SCHEMAS[table].names)
-    for column, (_, kind, nullable) in zip(COLUMNS[table], found, strict=True):
+    for column, (_, kind, nullable) in zip(COLUMNS[table], columns, strict=True):
         assert nullable == column.nullable, column
         assert column.meaning.endswith(".") and len(column.meaning) > 4 and "|" not in column.meaning, column
         item = kind.value_type if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) else kind

@@ -12,7 +12,7 @@ from schemas.base import Pose, frozen_array
 from schemas.capture import DepthCorrection, ProcessedCapture, Reconstruction
 from schemas.errors import CaptureError, ViewError
 from schemas.job.assets import Assets
-from schemas.job.captures import Board, Captures
+from schemas.job.captures import UNNAMED, Board, Captures
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, SceneOutput
 from schemas.scene.shape import Asset, Material, Part, Shape
@@ -162,7 +162,7 @@ def run_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scen
         folder = open_folder(opened.path)
         done = process_capture(folder, captures, watch)
         done = replace(done, name=opened.name or done.name)
-        category = done.category if "category" in folder.about.model_fields_set else captures.category
+        category = done.category if "category" in folder.about.model_fields_set else UNNAMED
         with watch.stage("labels"):
             source = SOURCE if read_truth(opened.path) is None else SIMULATED
             thing = place_capture(job, scene_id, done, category, source)
@@ -181,7 +181,7 @@ def place_capture(job: Job, scene_id: int, done: ProcessedCapture, category: str
 def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Iterator[Opened]:
     """The folder of a capture: one of the job's, or a simulated one that is gone afterwards."""
     captures = require_captures(context.job)
-    if captures.source == "folders":
+    if captures.folders:
         listing = context.catalogue.captures[scene_id]
         with watch.stage("read"):
             if digest_inputs(listing.folder) != listing.sha256:
@@ -200,7 +200,7 @@ def simulate_one(context: WorkerContext, scene_id: int, path: Path) -> str:
     """Simulates a capture of the job into an empty folder; the instance id of its object."""
     captures, chance = require_captures(context.job), SceneChance(context.job.seed, scene_id)
     asset = load_object(context.job, context.catalogue, chance)
-    simulate_capture(captures.simulate, captures.board, asset, chance, path)
+    simulate_capture(captures.simulate, captures.printed_board, asset, chance, path)
     return asset.instance_id
 
 
@@ -222,7 +222,7 @@ def make_pairs(
             one = LeftOut(number, "no_pair", error.detail)
         yield one
     for number in sorted(set(used) - set(chosen)):
-        yield LeftOut(number, "spare", f"captures.most_views is {context.job.pairs_per_scene}")
+        yield LeftOut(number, "spare", f"pairs_per_scene is {context.job.pairs_per_scene}")
     if not made:
         raise CaptureError(
             "no_pair", f"none of {len(chosen)} used views sees the object and has a view from the other side"

@@ -230,7 +230,7 @@ def settings_of(drop: Drop, pace: Pace) -> Physics:
     """
     physics, rest = drop.physics, drop.physics.rest
     iterations = math.ceil(math.sqrt(_unevenness(drop.starts)))
-    rates = {"speed_mm_s": pace.speed * rest.speed_mm_s, "spin_rad_s": pace.speed * rest.spin_rad_s}
+    rates = {"speed_mm_s": pace.speed * rest.speed_mm_s}
     changes: dict[str, object] = {
         "rest": rest.model_copy(update=rates | {"window_s": pace.window * rest.window_s}),
         "step_hz": max(1, round(pace.rate * physics.step_hz)),

@@ -30,8 +30,8 @@ def check_stored_scene(scene: Row) -> list[str]:
     where, captured = f"scene {scene['scene_id']}", _is_captured(scene)
     wrong = [name for name in ALWAYS_OF_SCENES if (scene[name] is None) != captured]
     if wrong:
-        told = "are there in a capture" if captured else "are missing"
-        return [f"{where}: {', '.join(wrong)} {told}"]
+        what = "are there in a capture" if captured else "are missing"
+        return [f"{where}: {', '.join(wrong)} {what}"]
     if captured:
         return []
     bodies = scene["bodies"]
@@ -73,8 +73,8 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
 def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faults: list[str]) -> View:
     """A stored view; images of a wrong size or type are added to the faults."""
     role: Role = row["role"]
-    own = [one for one in objects if (one["pose_id"], one["role"]) == (row["pose_id"], role)]
-    count = sum(one["region_id"] >= REGION_FIRST_OBJECT for one in own)
+    rows = [label for label in objects if (label["pose_id"], label["role"]) == (row["pose_id"], role)]
+    count = sum(label["region_id"] >= REGION_FIRST_OBJECT for label in rows)
     images: dict[str, NDArray] = {}
     for image in stored_images(role, job):
         modality, pose_id = MODALITIES[image.pixels], file_pose_id(role, row["parent_id"])
@@ -84,10 +84,10 @@ def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faul
         shape = modality.shape(row["height"], row["width"])
         wrong = [n for n, pixels in enumerate(planes) if pixels.shape != shape or pixels.dtype != modality.dtype]
         for n in wrong:
-            told = f"is {planes[n].dtype} {planes[n].shape}, and must be {modality.dtype} {shape}"
-            faults.append(f"{paths[n]}: {told}")
+            wanted = f"is {planes[n].dtype} {planes[n].shape}, and must be {modality.dtype} {shape}"
+            faults.append(f"{paths[n]}: {wanted}")
         images[image.pixels] = np.stack(planes) if modality.each and not wrong else planes[0]
-    labels = tuple(read_label(one) for one in sorted(own, key=lambda one: one["region_id"]))
+    labels = tuple(read_label(label) for label in sorted(rows, key=lambda label: label["region_id"]))
     camera, ids = read_camera(row), (row["pose_id"], row["parent_id"])
     rgb, depth, region = (images.pop(name, None) for name in ("rgb", "depth", "region"))
     assert depth is not None
@@ -100,9 +100,11 @@ def _check_amodal(view: View, objects: Sequence[Row]) -> list[str]:
     rows = {row["region_id"]: row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)}
     for region_id, mask in enumerate(masks, start=REGION_FIRST_OBJECT):
         expected = amodal_columns(mask)
-        told = {name: rows[region_id][name] for name in expected}
-        if told != expected:
-            faults.append(f"{_named(view)}, region {region_id}: its image amodal gives {expected}, objects says {told}")
+        stored = {name: rows[region_id][name] for name in expected}
+        if stored != expected:
+            faults.append(
+                f"{_named(view)}, region {region_id}: its image amodal gives {expected}, objects says {stored}"
+            )
     return faults
 
 
@@ -119,15 +121,15 @@ def _check_labels(job: Job, view: View, objects: Sequence[Row], scene: Row) -> l
     assert view.region is not None
     T_world = read_world_poses(scene)
     if {label.region_id for label in view.labels} != set(T_world):
-        found = [label.region_id for label in view.labels]
-        return [f"{_named(view)}: objects has the regions {found}, scenes {list(T_world)}"]
-    own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
-    shares = {row["region_id"]: row["patch_object_fraction"] for row in own}
+        regions = [label.region_id for label in view.labels]
+        return [f"{_named(view)}: objects has the regions {regions}, scenes {list(T_world)}"]
+    rows = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
+    shares = {row["region_id"]: row["patch_object_fraction"] for row in rows}
     extents, faults = measure_regions(view.region), []
     for label in view.labels:
         pixels, box = extents[label.region_id]
         name = f"{_named(view)}, region {label.region_id}"
-        told, share = shares[label.region_id], patch_object_fraction(view, label, job.images.patch)
+        stored_share, share = shares[label.region_id], patch_object_fraction(view, label, job.images.patch)
         if pixels != label.pixels:
             faults.append(f"{name}: the mask has {pixels} pixels, objects says {label.pixels}")
         if box != label.bbox_xywh:
@@ -138,8 +140,8 @@ def _check_labels(job: Job, view: View, objects: Sequence[Row], scene: Row) -> l
             faults.append(f"{name}: T_cam_obj does not follow from the camera's and the object's poses")
         if not 0.0 <= label.visible_fraction <= 1.0:
             faults.append(f"{name}: visible_fraction {label.visible_fraction} is no share")
-        if label.region_id >= REGION_FIRST_OBJECT and share != told:
-            faults.append(f"{name}: fills {share} of its patch, objects says {told}")
+        if label.region_id >= REGION_FIRST_OBJECT and share != stored_share:
+            faults.append(f"{name}: fills {share} of its patch, objects says {stored_share}")
     return faults
 
 
@@ -205,10 +207,12 @@ def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, R
     """Compare the agreement of the two views."""
     mirror = stored["mirror"]
     agreement = compare_views(stored["input"], mirror, job.images, job.check.mirror_agreement_mm)
-    told = views["mirror"]["mirror_agreement"]
-    found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
-    if (told is None) != (found is None) or (found and _differs(np.array(found), [told["median_mm"], told["share"]])):
-        return [f"pose {mirror.pose_id} (mirror): the two views agree to {found}, views says {told}"]
+    row = views["mirror"]["mirror_agreement"]
+    derived = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
+    if (row is None) != (derived is None) or (
+        derived and _differs(np.array(derived), [row["median_mm"], row["share"]])
+    ):
+        return [f"pose {mirror.pose_id} (mirror): the two views agree to {derived}, views says {row}"]
     return []
 
 

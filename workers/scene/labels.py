@@ -153,12 +153,12 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     """
     assert source.region is not None and mirror.region is not None
     bounds = Bounds(FACING, (SMOOTH_INPUT_M, SMOOTH_MIRROR_M), HIDDEN_M)
-    one, other = Seen(source.depth, source.region, source.camera), Seen(mirror.depth, mirror.region, mirror.camera)
+    here, there = Seen(source.depth, source.region, source.camera), Seen(mirror.depth, mirror.region, mirror.camera)
     chosen = source.region >= REGION_FIRST_OBJECT
     chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
-    difference_m, own = compare_covisible(one, other, np.flatnonzero(chosen), bounds, images.depth_units_per_m)
+    difference_m, regions = compare_covisible(here, there, np.flatnonzero(chosen), bounds, images.depth_units_per_m)
     difference_mm = difference_m * 1e3
-    object_mm = difference_mm[own >= REGION_FIRST_OBJECT]
+    object_mm = difference_mm[regions >= REGION_FIRST_OBJECT]
     enough = len(object_mm) >= FEWEST_POINTS
     return Agreement(
         median_mm=float(np.median(object_mm)) if enough else None,

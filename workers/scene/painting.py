@@ -26,10 +26,10 @@ def paint_faces(face: NDArray[np.int32], codes: NDArray[np.uint16], image: NDArr
     """Writes the code [F, 3] of each pixel's face into an image [H, W, 3]."""
     for row in range(face.shape[0]):
         for column in range(face.shape[1]):
-            own = face[row, column]
-            if own >= 0:
+            number = face[row, column]
+            if number >= 0:
                 for channel in range(3):
-                    image[row, column, channel] = codes[own, channel]
+                    image[row, column, channel] = codes[number, channel]
 
 
 @compiled_for("Tuple((i4[:,::1], f8[:,::1])), u1[::1], u1, f8[:,::1], UniTuple(f8, 4), f8, f8[::1], u2[:,:,::1]")
@@ -47,8 +47,8 @@ def paint_points(
     face, depth = seen
     for row in range(face.shape[0]):
         for column in range(face.shape[1]):
-            own = face[row, column]
-            if own < 0 or regions[own] != region_id:
+            number = face[row, column]
+            if number < 0 or regions[number] != region_id:
                 continue
             z = depth[row, column]
             x, y = (column + 0.5 - k[2]) / k[0] * z, (row + 0.5 - k[3]) / k[1] * z
@@ -97,23 +97,23 @@ def _paint_albedo(
     for row in range(height):
         end = 0
         while end < width:
-            first, own = end, face[row, end]
-            while end < width and face[row, end] == own:
+            first, number = end, face[row, end]
+            while end < width and face[row, end] == number:
                 end += 1
-            if own < 0:
+            if number < 0:
                 continue
-            count, part, colours = end - first, skin.part[own], image[row, first:end]
+            count, part, colours = end - first, skin.part[number], image[row, first:end]
             texture, base = skin.places[part], skin.base[part]
-            alike = _follow_corners(skin.points, skin.corners[own], skin.values, weights_by_ray, by_ray)
+            alike = _follow_corners(skin.points, skin.corners[number], skin.values, weights_by_ray, by_ray)
             if alike and texture[1] * texture[2] == 1:
                 for channel in range(3):
-                    light = base[channel] * skin.values[skin.corners[own, 0], 2 + channel]
+                    light = base[channel] * skin.values[skin.corners[number, 0], 2 + channel]
                     colours[:, channel] = codes[np.uint64(light * FULL + 0.5)]
                 continue
             ray = (first + 0.5 - k[2]) / k[0], (row + 0.5 - k[3]) / k[1], 1.0 / k[0]
             z = depth[row, first:end]
             _interpolate(by_ray, ray, z, values)
-            _keep_inside(skin, own, weights_by_ray, ray, z, values)
+            _keep_inside(skin, number, weights_by_ray, ray, z, values)
             for channel in range(3):
                 for j in range(count):
                     tint[channel, j] = base[channel] * values[2 + channel, j]
@@ -133,7 +133,7 @@ def _interpolate(by_ray: Array, ray: tuple[float, float, float], z: Array, value
 
 @compiled
 def _keep_inside(
-    skin: Skin, own: int, weights_by_ray: Array, ray: tuple[float, float, float], z: Array, values: Array
+    skin: Skin, number: int, weights_by_ray: Array, ray: tuple[float, float, float], z: Array, values: Array
 ) -> None:
     """Overwrites values [5, N] of what is beyond the face, or whose plane goes through the camera: the nearest of its edges."""
     two, three, inside = weights_by_ray[1], weights_by_ray[2], True
@@ -144,7 +144,7 @@ def _keep_inside(
         inside &= (second >= 0.0) & (third >= 0.0) & (second + third <= 1.0)
     if inside:
         return
-    point, weights, corners = np.empty(3), np.empty(3), skin.corners[own]
+    point, weights, corners = np.empty(3), np.empty(3), skin.corners[number]
     for j in range(len(z)):
         second, third = z[j] * (begin[0] + more[0] * np.float64(j)), z[j] * (begin[1] + more[1] * np.float64(j))
         if not (second >= 0.0 and third >= 0.0 and second + third <= 1.0):
@@ -227,8 +227,8 @@ def _weights_by_ray(points: Array, corners: NDArray[np.int32], by_ray: Array) ->
     for corner in range(3):
         b, c = points[corners[(corner + 1) % 3]], points[corners[(corner + 2) % 3]]
         for axis in range(3):
-            one, two = (axis + 1) % 3, (axis + 2) % 3
-            by_ray[corner, axis] = b[one] * c[two] - b[two] * c[one]
+            second, third = (axis + 1) % 3, (axis + 2) % 3
+            by_ray[corner, axis] = b[second] * c[third] - b[third] * c[second]
     a = points[corners[0]]
     volume = a[0] * by_ray[0, 0] + a[1] * by_ray[0, 1] + a[2] * by_ray[0, 2]
     for corner in range(3):

@@ -72,10 +72,6 @@ def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, 
     z = depth_m[object_pixels & (depth_m > 0.0)]
     if z.size == 0:
         raise ViewError("object_not_seen", "the input view has no depth pixel of the object: narrow start.offset_m")
-    if mirror.pivot_depth == "nearest":
-        return float(z.min())
-    if mirror.pivot_depth == "median":
-        return float(np.median(z))
     return float(np.percentile(z, mirror.percentile))
 
 

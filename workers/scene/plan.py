@@ -46,6 +46,9 @@ def columns_apart(points: Array, others: Array) -> bool:
     return bool(gap.max() >= APART_M)
 
 
+MOST_REDRAWS = 20
+"""Of a position that is not over the table or has no room, and of an object that was lost: hardly a scene needs five."""
+
 RECESS_M = 0.05
 """Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
 
@@ -113,7 +116,7 @@ def draw_start(
     object begins above all earlier ones, about the place of the first.
     """
     number = len(earlier)
-    others = [points_of(one) for one in earlier]
+    others = [points_of(start) for start in earlier]
     middle = earlier[0].T_world_obj[:2, 3] if earlier and spec.arrange == "pile" else np.zeros(2)
     rng = chance.object_stream(Stream.START, number)
     return _find_place(
@@ -136,7 +139,7 @@ def pouring_of(spec: Start, chance: SceneChance, plan: ScenePlan) -> Pouring:
         again = _find_place(spec, (rng, lambda: rng), (start.asset, number), plan.table, others, middle)
         return replace(again, redraws=start.redraws + again.redraws + 1)
 
-    return Pouring(piled, draw if spec.if_lost == "redraw" else None, spec.max_redraws, spec.if_lost == "remove")
+    return Pouring(piled, draw if spec.if_lost == "redraw" else None, MOST_REDRAWS, spec.if_lost == "remove")
 
 
 Streams = tuple[np.random.Generator, Callable[[], np.random.Generator]]
@@ -155,7 +158,7 @@ def _find_place(
     R = uniform_rotation(rng) if spec.pose == "tumbled" else rotation_about(UP, yaw)
     hull = hull_of(asset.shape)
     over_table, redraw_rng = False, None
-    for redraws in range(spec.max_redraws + 1):
+    for redraws in range(MOST_REDRAWS + 1):
         com_xy = (R @ asset.mass.com)[:2] + xy
         if sample_elevation(com_xy[None, :], table.mesh)[0] >= table.top.height_m - RECESS_M:  # nan compares false
             over_table = True
@@ -177,13 +180,13 @@ def _no_start(spec: Start, number: int, over_table: bool) -> StartError:
     if over_table:
         return StartError(
             "no_room",
-            f"none of {spec.max_redraws + 1} positions in {list(spec.offset_m)} m had room for object {number} beside the "
-            "others: raise start.max_redraws, widen start.offset_m, ask for fewer or smaller objects, or set "
+            f"none of {MOST_REDRAWS + 1} positions in {list(spec.offset_m)} m had room for object {number} beside the "
+            "others: widen start.offset_m, ask for fewer or smaller objects, or set "
             "start.arrange: pile",
         )
     return StartError(
         "no_table_below",
-        f"none of {spec.max_redraws + 1} positions in {list(spec.offset_m)} m had table under the centre of mass: "
+        f"none of {MOST_REDRAWS + 1} positions in {list(spec.offset_m)} m had table under the centre of mass: "
         "narrow start.offset_m or use larger tables",
     )
 

@@ -88,7 +88,7 @@ def _compare(
     """
     (z_drawn, region_drawn), (z_cast, region_cast, cosine), (low, high, steepest) = drawn, cast, bounds
     width = z_cast.shape[1]
-    differ, found = np.empty(z_cast.size, np.int64), 0
+    differ, differing = np.empty(z_cast.size, np.int64), 0
     compared = np.zeros(z_cast.shape, np.uint8)
     count, large = np.zeros(256, np.int64), np.zeros(256, np.int64)
     for row in range(z_cast.shape[0]):
@@ -97,13 +97,13 @@ def _compare(
             error_mm = abs(np.float64(z_drawn[row, column]) - z) * 1e3
             if region != region_drawn[row, column]:
                 if error_mm > ONE_SURFACE_MM:
-                    differ[found] = row * width + column
-                    found += 1
+                    differ[differing] = row * width + column
+                    differing += 1
             elif region > 0 and low < z < high and cosine[row, column] > steepest:
                 compared[row, column] = region
                 count[region] += 1
                 large[region] += error_mm > LEAST_BOUND_MM
-    return differ[:found].copy(), compared, count, large
+    return differ[:differing].copy(), compared, count, large
 
 
 def _intersects(
@@ -120,13 +120,13 @@ def _intersects(
     nearest, touching = first_hit(scene.things, origins, rays), np.zeros(len(rows), bool)
     named, drawn = buffer.region[rows, columns], buffer.depth_m[rows, columns].astype(np.float64)
     for thing in scene.things:
-        own = np.flatnonzero(named == thing.region_id)
-        hit = first_hit([thing], origins[own], rays[own])
-        met = np.isfinite(hit.distance) & np.isfinite(nearest.distance[own])
-        own, z, cosine = own[met], hit.distance[met], hit.incidence_cos[met]
-        slant = np.minimum(cosine, nearest.incidence_cos[own]) * np.linalg.norm(rays[own], axis=1)
-        faithful = np.abs(drawn[own] - z) * 1e3 * slant < ONE_SURFACE_MM
-        touching[own] = (np.abs(z - nearest.distance[own]) * 1e3 * slant < TOUCHING_MM) & faithful
+        pixels = np.flatnonzero(named == thing.region_id)
+        hit = first_hit([thing], origins[pixels], rays[pixels])
+        met = np.isfinite(hit.distance) & np.isfinite(nearest.distance[pixels])
+        pixels, z, cosine = pixels[met], hit.distance[met], hit.incidence_cos[met]
+        slant = np.minimum(cosine, nearest.incidence_cos[pixels]) * np.linalg.norm(rays[pixels], axis=1)
+        faithful = np.abs(drawn[pixels] - z) * 1e3 * slant < ONE_SURFACE_MM
+        touching[pixels] = (np.abs(z - nearest.distance[pixels]) * 1e3 * slant < TOUCHING_MM) & faithful
     return touching
 
 
@@ -150,11 +150,11 @@ def _check_depth(
     if len(error_mm) == 0:
         return
     for percentile, bound in bounds:
-        found = float(np.percentile(error_mm, percentile))
-        if found > bound:
+        error = float(np.percentile(error_mm, percentile))
+        if error > bound:
             raise LabelError(
                 "depth_disagrees",
-                f"region {region_id}: {percentile:g} % of depths are within {found:.4f} mm of the ray's, the bound is {bound} mm",
+                f"region {region_id}: {percentile:g} % of depths are within {error:.4f} mm of the ray's, the bound is {bound} mm",
             )
 
 

@@ -80,15 +80,15 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
     with watch.stage("encode"):
         for pair in scene.pairs:
             for view in pair.views:
-                own = encode_view(view, pair, context.job.images)
-                files += own
-                views.append(view_row(scene.plan.scene_id, pair, view, own, context.job))
+                encoded = encode_view(view, pair, context.job.images)
+                files += encoded
+                views.append(view_row(scene.plan.scene_id, pair, view, encoded, context.job))
         every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
         assets = list({asset.instance_id: asset for asset in every}.values())
         files += [shape_file(asset) for asset in assets if asset.shareable]
     # Of objects alone: a table takes as long and as much room, and no network is trained to complete it.
     sampled = [NO_SAMPLES, *sample_assets(assets[1:], context.job.targets, watch)]
-    files += [one.file for one in sampled if one.file is not None]
+    files += [samples.file for samples in sampled if samples.file is not None]
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,
@@ -98,7 +98,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
             for view in pair.views
             for row in object_rows(scene.plan.scene_id, view, context.job, scene.posed.things)
         ],
-        "assets": [asset_row(asset, context.job, one) for asset, one in zip(assets, sampled, strict=True)],
+        "assets": [asset_row(asset, context.job, samples) for asset, samples in zip(assets, sampled, strict=True)],
         "failures": [],
     }
     return SceneOutput(scene.plan.scene_id, tuple(files), rows)
@@ -272,15 +272,16 @@ def asset_row(asset: Asset, job: Job, samples: StoredSamples = NO_SAMPLES) -> Ro
 
 def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int = 1) -> SceneOutput:
     """The output of a scene that cannot be made: no files, one row in `failures`."""
-    told = {name: getattr(error, name) for name in ("stage", "kind", "reason", "detail")}
-    row: Row = {"scene_id": scene_id, "category": category, **told, "attempts": attempts}
+    columns = {name: getattr(error, name) for name in ("stage", "kind", "reason", "detail")}
+    row: Row = {"scene_id": scene_id, "category": category, **columns, "attempts": attempts}
     return SceneOutput(scene_id, (), {"failures": [row]})
 
 
 def timing_row(scene_id: int, category: str, watch: Stopwatch) -> Row:
     """The row of `timings`, which alone is no function of job and seed."""
     stages, effects = (
-        [{"name": name, "seconds": seconds} for name, seconds in one.items()] for one in (watch.seconds, watch.effects)
+        [{"name": name, "seconds": seconds} for name, seconds in clock.items()]
+        for clock in (watch.seconds, watch.effects)
     )
     return {
         "scene_id": scene_id,

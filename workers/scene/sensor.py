@@ -24,6 +24,9 @@ from workers.geometry.colour import decode_codes, encode_codes
 from workers.geometry.lens import undistort
 from workers.geometry.pixels import dequantise_depth, facing_cosine, quantise_depth
 
+EDGE_STEP_M = 0.03
+"""Smallest second difference of 1/depth, times depth squared, that counts as an edge [assumed]."""
+
 
 def sense_depth(
     depth_m: Array, region: NDArray[np.uint8], camera: Camera, noise: DepthNoise, rng: np.random.Generator
@@ -50,12 +53,12 @@ def sense_depth(
 
 
 def axial_sigma(z: Array, cosine: Array, noise: DepthNoise) -> Array:
-    """Standard deviation along the optical axis, metres: (axial_m + axial_per_m z^2) / cos^incidence_power.
+    """Standard deviation along the optical axis, metres: (axial_m + axial_per_m z^2) / cos of the angle of incidence.
 
     The angle of incidence is limited to `grazing_deg`, beyond which nothing is measured.
     """
     steepest = max(math.cos(math.radians(noise.grazing_deg)), 1e-3)
-    return (noise.axial_m + noise.axial_per_m * z * z) / np.maximum(cosine, steepest) ** noise.incidence_power
+    return (noise.axial_m + noise.axial_per_m * z * z) / np.maximum(cosine, steepest)
 
 
 def incidence_cosine(depth_m: Array, region: NDArray[np.uint8], camera: Camera) -> Array:
@@ -71,7 +74,7 @@ def incidence_cosine(depth_m: Array, region: NDArray[np.uint8], camera: Camera) 
 def near_edge(depth_m: Array, noise: DepthNoise) -> NDArray[np.bool_]:
     """[H, W] bool: pixels at most `edge_px` from the far side of a depth edge.
 
-    On every plane 1/z is linear in the image. At an edge its second difference, times z squared, exceeds `edge_step_m`: a
+    On every plane 1/z is linear in the image. At an edge its second difference, times z squared, exceeds `EDGE_STEP_M`: a
     floor seen at a flat angle has none. Pixels without depth make no edge.
     """
     edge = np.zeros(depth_m.shape, bool)
@@ -80,7 +83,7 @@ def near_edge(depth_m: Array, noise: DepthNoise) -> NDArray[np.bool_]:
     along_rows, down_columns = (edge.T, known.T, inverse.T, depth_m.T), (edge, known, inverse, depth_m)
     for marked, has, inv, z in (down_columns, along_rows):
         bend = inv[:-2] + inv[2:] - 2.0 * inv[1:-1]
-        marked[1:-1] |= has[:-2] & has[2:] & has[1:-1] & (np.abs(bend) * z[1:-1] ** 2 > noise.edge_step_m)
+        marked[1:-1] |= has[:-2] & has[2:] & has[1:-1] & (np.abs(bend) * z[1:-1] ** 2 > EDGE_STEP_M)
     side = 2 * (noise.edge_px - 1) + 1
     grown: NDArray = cv2.dilate(edge.astype(np.uint8), np.ones((side, side), np.uint8))
     return grown.astype(bool) & known

@@ -212,12 +212,12 @@ def _nearest_faces(
         area, a, b, c = _oriented(corners, faces, face)
         if area == 0 or (area > 0 and kinds[1][face]):
             continue
-        own, span = kinds[0][face], _span(points, faces, face)
+        kind, span = kinds[0][face], _span(points, faces, face)
         first, last, upper, lower = _box(a, b, c, width, height)
         for row in range(upper, lower + 1):
             left, right = _columns(a, b, c, row, first, last)
             for column in range(left, right + 1):
-                if region[row, column] != own:
+                if region[row, column] != kind:
                     continue
                 z = _depth(face, column, row, grid, planes, span)
                 if best[row, column] < 0 or z < depth[row, column]:
@@ -306,10 +306,10 @@ def _all_surfaces(
             left, right = _columns(a, b, c, row, first, last)
             for column in range(left, right + 1):
                 pixel = row * width + column
-                own, place = _depth(face, column, row, grid, planes, span), start[pixel] + filled[pixel]
+                depth, place = _depth(face, column, row, grid, planes, span), start[pixel] + filled[pixel]
                 filled[pixel] += 1
-                while place > start[pixel] and z[place - 1] > own:
+                while place > start[pixel] and z[place - 1] > depth:
                     z[place], owner[place] = z[place - 1], owner[place - 1]
                     place -= 1
-                z[place], owner[place] = own, face
+                z[place], owner[place] = depth, face
     return start, z, owner

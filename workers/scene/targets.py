@@ -110,8 +110,8 @@ def draw_normals(seen: Seen, targets: Targets) -> NDArray[np.uint16]:
                     smooth = mix(part.normals, corners, weights) @ turn.T
                     smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
                     # To the side that the face shows: at an outline a shading normal may look away a little.
-                    own = towards[seen.face.reshape(-1)[some]]
-                    smooth *= np.where((smooth * own).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+                    shown = towards[seen.face.reshape(-1)[some]]
+                    smooth *= np.where((smooth * shown).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
                     flat[some] = _sixteen_bits((smooth + 1.0) / 2.0)
     return image
 
@@ -140,10 +140,10 @@ def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     part_of, corners = np.empty(len(triangles.face), np.int32), np.empty((len(triangles.face), 3), np.int32)
     points, parts, vertices = list[Array](), list[Part](), 0
     for thing in seen.things:
-        own, shape = triangles.region == thing.region_id, thing.shape
+        faces, shape = triangles.region == thing.region_id, thing.shape
         ends = np.cumsum([len(part.faces) for part in shape.parts])
-        part_of[own] = len(parts) + np.searchsorted(ends, triangles.face[own], side="right")
-        corners[own] = shape.faces[triangles.face[own]] + vertices
+        part_of[faces] = len(parts) + np.searchsorted(ends, triangles.face[faces], side="right")
+        corners[faces] = shape.faces[triangles.face[faces]] + vertices
         points.append(transform(invert(seen.camera.T_world_cam) @ thing.T_world_shape, shape.vertices))
         vertices += len(shape.vertices)
         parts += shape.parts
@@ -156,18 +156,18 @@ def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
 
 def _textures_of(parts: Sequence[Part]) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
     """(texels, places) of `painting.Skin`; a texture that several parts have is there once."""
-    found, places, total = dict[int, tuple[int, NDArray[np.uint16]]](), [], 0
+    kept, places, total = dict[int, tuple[int, NDArray[np.uint16]]](), [], 0
     for part in parts:
         material = WHITE if part.uv is None else part.material
         key = id(material.texture)
-        if key not in found:
+        if key not in kept:
             small = material.texture is None or material.texture.size <= MOST_KEPT
             texels = (_kept_texels if small else _texels_of)(material)
-            found[key] = total, texels
+            kept[key] = total, texels
             total += texels.shape[0] * texels.shape[1]
-        start, texels = found[key]
+        start, texels = kept[key]
         places.append((start, texels.shape[0] - 1, texels.shape[1] - 1))
-    return np.concatenate([texels.reshape(-1, 3) for _, texels in found.values()]), np.array(places)
+    return np.concatenate([texels.reshape(-1, 3) for _, texels in kept.values()]), np.array(places)
 
 
 def _texels_of(material: Material) -> NDArray[np.uint16]:
@@ -223,8 +223,8 @@ def _parts_of(
         inside = np.flatnonzero((face >= start) & (face < start + len(part.faces)))
         if len(inside):
             points = transform(T_shape_cam, seen.points_at(pixels[inside]))
-            own = corner_weights(points, Mesh(part.vertices, part.faces), face[inside] - start)
-            yield part, pixels[inside], *own
+            weighed = corner_weights(points, Mesh(part.vertices, part.faces), face[inside] - start)
+            yield part, pixels[inside], *weighed
         start += len(part.faces)
 
 

@@ -27,6 +27,7 @@ from schemas.dataset.commit import Span, summarize
 from schemas.dataset.layout import FINGERPRINT_FILE, LOG_FOLDER, staging_path
 from schemas.dataset.shard import Blame, Fingerprint, JobChange, ShardOrder, ShardReport, SpanReport
 from schemas.errors import FingerprintError, SceneError, VersoError
+from schemas.job.captures import UNNAMED
 from schemas.job.views import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
@@ -234,7 +235,7 @@ def _category(context: WorkerContext, scene_id: int) -> str:
     """The category of a scene before it is made; a capture in a folder may turn out to have another."""
     captures = context.job.captures
     if captures is not None and captures.folders:
-        return captures.category
+        return UNNAMED
     return choose_category(context.job, SceneChance(context.job.seed, scene_id))
 
 

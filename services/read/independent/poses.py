@@ -73,13 +73,12 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
 
 
 def _derive_d_z(pair: StoredPair) -> float:
-    """Metres: a percentile (interpolated linearly), the median or the least of the object's stored input depth."""
+    """Metres: a percentile (interpolated linearly) of the object's stored input depth."""
     mirror, depth = pair.job["cameras"]["mirror"], pair.images["input", "depth"]
     z = np.sort(depth[(pair.images["input", "region"] >= FIRST_OBJECT) & (depth > 0)])
     if not len(z):
         return math.nan
-    percentile = {"nearest": 0.0, "median": 50.0, "percentile": mirror["percentile"]}[mirror["pivot_depth"]]
-    units = np.interp(percentile / 100.0 * (len(z) - 1), np.arange(len(z)), z)
+    units = np.interp(mirror["percentile"] / 100.0 * (len(z) - 1), np.arange(len(z)), z)
     return float(units / pair.job["images"]["depth_units_per_m"])
 
 

@@ -71,15 +71,15 @@ def test_commands_are_printed_as_they_are_typed_here(tmp_path, monkeypatch):
     ):
         monkeypatch.setenv("VERSO_TYPED", typed)
         monkeypatch.setenv("PATH", path)
-        told = (
+        printed = (
             f"run `{called} status OUT`, {called} verify x; /opt/verso run, verso: no, my-verso run, {called} COMMAND"
         )
-        assert as_typed(text) == told
+        assert as_typed(text) == printed
     monkeypatch.undo()
     done = verso("logs", "j0a1b2c3d", "--queue", str(tmp_path / "none"), VERSO_TYPED="./verso")
     assert done.returncode == 2 and "`./verso submit` or `./verso supervise` makes a new queue" in done.stderr
-    told = verso("run", "--help", VERSO_TYPED="./verso").stdout
-    assert told.startswith("usage: ./verso run") and "example: ./verso run deploy" in told
+    printed = verso("run", "--help", VERSO_TYPED="./verso").stdout
+    assert printed.startswith("usage: ./verso run") and "example: ./verso run deploy" in printed
 
 
 # ------------------------------------------------------------------------------------------------ what is refused
@@ -192,12 +192,12 @@ def made(tmp_path_factory) -> LocalStore:
 
 
 def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
-    code, lines, found = answer(capsys, "status", made.name)
-    assert (code, found["ok"], found["made"], found["missing"]) == (0, True, 2, 0)
-    assert lines[0] == f"{made.name}: 2 of 2 scenes done, 0 missing" and lines[-1] == f"  digest: {found['digest']}"
-    code, lines, found = answer(capsys, "verify", made.name, "--independent", "1")
-    assert (code, found["ok"], found["scenes"], found["pairs"]) == (0, True, 2, 2)
-    assert (found["independent"]["scenes"], found["independent"]["faults"]) == (1, [])
+    code, lines, tree = answer(capsys, "status", made.name)
+    assert (code, tree["ok"], tree["made"], tree["missing"]) == (0, True, 2, 0)
+    assert lines[0] == f"{made.name}: 2 of 2 scenes done, 0 missing" and lines[-1] == f"  digest: {tree['digest']}"
+    code, lines, tree = answer(capsys, "verify", made.name, "--independent", "1")
+    assert (code, tree["ok"], tree["scenes"], tree["pairs"]) == (0, True, 2, 2)
+    assert (tree["independent"]["scenes"], tree["independent"]["faults"]) == (1, [])
     assert "2 scenes, labels of 2 pairs derived again: nothing off" in lines[0]
     assert lines[1].startswith("labels of 1 pair of 1 scene derived from the article's definitions, and ")
     assert "their rest from contact forces: nothing off" in lines[1]
@@ -208,10 +208,10 @@ def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
         "1",
     ]
     assert answer(capsys, "replay", made.name, "1")[2]["differences"] == []
-    found = answer(capsys, "report", made.name, "--scenes", "1")[2]
+    tree = answer(capsys, "report", made.name, "--scenes", "1")[2]
     page = Path(f"{made.name}-report.html")
-    assert (found["file"], found["bytes"]) == (str(page), page.stat().st_size) and default_page(f"{made.name}/") == page
-    assert (found["scenes"], len(found["shown"])) == (2, 1)
+    assert (tree["file"], tree["bytes"]) == (str(page), page.stat().st_size) and default_page(f"{made.name}/") == page
+    assert (tree["scenes"], len(tree["shown"])) == (2, 1)
     assert str(default_page("s3://bucket/sets/small")) == "small-report.html"
 
 
@@ -240,7 +240,7 @@ def test_a_missing_part_is_told_with_its_remedy_and_exits_1(monkeypatch, capsys)
 def test_every_gpu_is_listed_with_its_device_and_the_one_that_would_be_drawn_on(monkeypatch):
     gpus = tuple(GraphicsDevice(1 - number, f"card{number}", True, number) for number in range(2))
     software = GraphicsDevice(2, "Mesa's software")
-    for listed, visible, told in (
+    for listed, visible, words in (
         ((*gpus, software), None, "drawn on device 0 (the first)"),
         ((*gpus, software), "0", "drawn on device 1 (CUDA_VISIBLE_DEVICES is '0')"),
         ((*gpus, software), "9", "drawn on device 2 (CUDA_VISIBLE_DEVICES is '9', and EGL has"),
@@ -252,7 +252,7 @@ def test_every_gpu_is_listed_with_its_device_and_the_one_that_would_be_drawn_on(
         monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
         monkeypatch.setattr(devices, "visible_gpus", lambda visible=visible: visible)
         finding = doctor._gpus()
-        assert told in finding.found and finding.ok == (told != "none that may be drawn on"), finding
+        assert words in finding.found and finding.ok == (words != "none that may be drawn on"), finding
         if software in listed:
             assert "EGL device 1 (card0, CUDA 0); EGL device 0 (card1, CUDA 1); EGL device 2 (Mesa's" in finding.found
         if not finding.ok:

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[3]
 def commands() -> Iterator[tuple[list[str], Command]]:
     """Every command that has a handler, with its words."""
     for name, command in COMMANDS.items():
-        yield from (([name, below], one) for below, one in command.commands.items())
+        yield from (([name, below], inner) for below, inner in command.commands.items())
         yield from () if command.commands else (([name], command),)
 
 
@@ -44,9 +44,9 @@ def test_every_example_is_accepted_its_handler_exists_and_its_help_shows_it(caps
         assert callable(getattr(importlib.import_module(module), function)), words
         with pytest.raises(SystemExit) as caught:
             parse(*words, "--help")
-        told = " ".join(capsys.readouterr().out.split())
-        assert caught.value.code == 0 and "--json" in told
-        assert f"example: verso {' '.join(words)} {command.example}".rstrip() in told
+        shown = " ".join(capsys.readouterr().out.split())
+        assert caught.value.code == 0 and "--json" in shown
+        assert f"example: verso {' '.join(words)} {command.example}".rstrip() in shown
 
 
 def test_the_page_is_the_one_that_the_table_makes():
@@ -62,7 +62,7 @@ HOSTILE = (
     (["run", "j", "--workers", "0"], "whole number"),
     (["replay", "o", "x"], "whole number"),
     (["verify", "o", "--audit", "x"], "whole number"),
-    (["report", "o", "--scenes", "0"], "0 is not a whole number from 1 up"),
+    (["report", "o", "--scenes", "0"], "'0' is not a whole number from 1 up"),
     (["run", "j", "--out", "a\0b"], "'a\\x00b'"),
     (["run", "j", "--out", ""], "''"),
     (["run", "j", "--out", "\x1b[31m"], "\\x1b[31m"),
@@ -101,9 +101,9 @@ HOSTILE = (
 
 
 def test_what_cannot_be_meant_is_refused_in_a_short_line(capsys):
-    for words, told in HOSTILE:
+    for words, why in HOSTILE:
         line = refusal(capsys, words)
-        assert told in line, words
+        assert why in line, words
         assert line.isprintable() and len(line) < 500, line
     for text in ("", "-", "3-", "5-3", "a-b", "1-2-3"):
         with pytest.raises(argparse.ArgumentTypeError):

@@ -61,9 +61,6 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("physics: 3", ["physics: 3: must hold keys with values"]),
     ("physics: {step_hz: abc}", ["physics.step_hz: 'abc': must be a whole number"]),
     ("physics: {max_settle_s: .inf}", ["physics.max_settle_s", "finite"]),
-    ("physics: {friction: 100}", ["physics.friction: 100: must be at most 5"]),
-    ("physics: {rolling_friction: 0.05}", ["physics.rolling_friction: 0.05: must be at most 0.01"]),
-    ("physics: {rest: {speed_mm_s: 0.001}}", ["physics.rest.speed_mm_s: 0.001: must be at least 0.01"]),
     (
         "physics: {max_settle_s: 0.2}",
         ["physics", "rest.window_s is 0.25 s and max_settle_s 0.2 s: nothing"],
@@ -89,6 +86,10 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ('assets: {objects: [{source: "\\e[31m"}]}', ["assets.objects.0", "\\x1b[31m"]),
     ("assets: {objects: [{source: urdf}]}", ["assets.objects.0.folder: is missing"]),
     ("assets: {objects: [{source: urdf, folder: 3}]}", ["assets.objects.0.folder: 3: must be text"]),
+    (
+        f"assets: {{objects: [{{source: procedural, instances: {10**13}}}]}}",
+        ["instances: 10000000000000: must be at most"],
+    ),
     ("assets: {objects: [{source: urdf, folder: ., urdf: 3}]}", ["assets.objects.0.urdf: there is no such key"]),
     ('assets: {objects: [{source: urdf, folder: "a\\0b"}]}', ["assets.objects.0.folder", "'a\\x00b'", "control"]),
     ("assets: {objects: [{source: urdf, folder: ~nobody7/b}]}", ["objects.0.folder", "~nobody7/b", "no such user"]),
@@ -109,15 +110,10 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     (f"#{'x' * 400_000}", ["250000 bytes"]),
     ("cameras: {mirror: {enabled: false}}", ["set images.projection.enabled: false too"]),
     ("render: {rgb: false}\nsensor: {rgb_noise: {}}", ["sensor.rgb_noise"]),
-    *(
-        (f"assets: {{objects: [{{source: procedural, instances: {value}}}]}}", ["instances"])
-        for value in (0, -3, 10**13, 1.5, "few")
-    ),
-    *(
+    *(  # what float32 on the GPU would make infinite
         (f"cameras: {{{branch}: {{{name}: {value}}}}}", [f"cameras.{branch}.{name}"])
         for branch, name, value in (
             *(("sensor", "fx", "1.0e+300"), ("sensor", "fy", "1.0e-300"), ("sensor", "cx", "1.0e+300")),
-            *(("sensor", "cy", "-1.0e+300"), ("sensor", "width", 4097), ("sensor", "height", 0)),
             *(("orbit", "radius_m", "1.0e+300"), ("mirror", "T_z_m", "1.0e+300")),
             ("depth", "offset_m", "[0, 1.0e+300, 0]"),
         )
@@ -216,7 +212,7 @@ def test_a_count_of_objects_is_a_number_or_a_range_and_is_written_as_it_was():
 
 
 def test_every_key_is_documented_and_the_page_is_current():
-    keys = dict(list_keys())
+    keys = {path: field for path, field, _ in list_keys()}
     assert [path for path, field in keys.items() if not field.description] == []
     assert (ROOT / "docs" / "job.md").read_text() == write_doc()
     for key, words in (
@@ -247,10 +243,10 @@ def test_a_packed_job_is_the_same_job_with_whole_paths(tmp_path):
     file = write(tmp_path, ODD)
     assert load_job(Path(pack_job(file)), ["scenes=9"]) == load_job(file, ["scenes=9"])
     meshes = "name: meshes\nscenes: 2\ncategories: [mug]\nassets: {objects: [{source: urdf, folder: %s}]}\n"
-    told = r"assets\.objects\.0\.folder: 'meshes': a packed job has no folder of its own"
-    with pytest.raises(JobError, match=told):
+    why = r"assets\.objects\.0\.folder: 'meshes': a packed job has no folder of its own"
+    with pytest.raises(JobError, match=why):
         pack_job(write(tmp_path, meshes % "meshes"))
-    with pytest.raises(JobError, match=told):
+    with pytest.raises(JobError, match=why):
         load_job(Path(pack((meshes % "meshes").encode())))
     assert is_packed(pack_job(write(tmp_path, meshes % "/srv/meshes")))
 
@@ -306,15 +302,15 @@ def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path,
             job = load_job(path)
             assert Job.model_validate(job.model_dump(mode="json")) == job
             # Others name folders of meshes, whose reading has tests of its own.
-            built_in = all(isinstance(one, ProceduralSource) for one in (*job.assets.objects, *job.assets.tables))
+            built_in = all(isinstance(source, ProceduralSource) for source in (*job.assets.objects, *job.assets.tables))
             outcomes["job"] += 1
         except JobError as error:
             check_lines(str(error), path)
             outcomes["refused"] += 1
         if built_in:
             assert main(["run", str(path), "--dry-run", "--out", out]) in (0, 2), number
-            told = capsys.readouterr()
-            assert "Traceback" not in told.out + told.err and "\x1b" not in told.out + told.err
+            printed = capsys.readouterr()
+            assert "Traceback" not in printed.out + printed.err and "\x1b" not in printed.out + printed.err
         assert time.process_time() - started < MOST_SECONDS, number
     assert sorted(tmp_path.iterdir()) == [path]
     assert peak_mb() - before < MOST_MB
@@ -329,8 +325,7 @@ OFF = {
     "render.path_samples": (64, {}, "render.tier is not pathtraced"),
     "render.path_bounces": (2, {}, "render.tier is not pathtraced"),
     "cameras.mirror.T_z_m": (0.8, {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled is false"),
-    "cameras.mirror.pivot_depth": ("median", {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled"),
-    "cameras.mirror.percentile": (9.0, {"cameras": {"mirror": {"pivot_depth": "median"}}}, "pivot_depth is not"),
+    "cameras.mirror.percentile": (9.0, {"cameras": {"mirror": {"enabled": False}}}, "cameras.mirror.enabled is false"),
     "cameras.depth.offset_m": ([0.0, 0.0, 0.0], {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled"),
     "images.projection.splat": (3, {"images": {"projection": {"enabled": False}}}, "projection.enabled is false"),
     "images.projection.hidden_point_removal": (

@@ -11,7 +11,7 @@ from schemas.job.job import Job
 from services.job.record import JobRecord, encode_job, is_job_sealed, read_job, record_job, refuse_foreign, require_job
 from workers.store.local import LocalStore
 
-CAPTURES = {"source": "folders", "folders": ["shots/mug", "shots/box"]}
+CAPTURES = {"folders": ["shots/mug", "shots/box"]}
 
 
 @pytest.fixture
@@ -30,6 +30,10 @@ def test_a_record_reads_back_as_it_was_written(store):
         assert require_job(store) == written
         assert is_job_sealed(store.read(JOB_FILE)) and not is_job_sealed(store.read(JOB_FILE)[1:])
     assert written.folder == str(Path("jobs").resolve())
+    store.put(JOB_FILE, encode_job(record(preset="exact")))
+    kept = require_job(store)  # what a preset sets later is no key of a dataset that was made before
+    assert (kept.job.preset, kept.job.physics.step_hz, kept.digest) == ("balanced", 1920, record(preset="exact").digest)
+    assert record(preset="exact", scenes=70, out=store).digest == kept.digest
     assert list(yaml.safe_load(encode_job(record()))) == ["digest", "catalogue", "folder", "job", "seal"]
 
 

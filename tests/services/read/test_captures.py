@@ -102,7 +102,7 @@ def test_geometry_of_a_capture_is_its_board_and_its_mesh_where_they_are(virtual)
 def test_folders_are_captures_and_one_that_cannot_be_used_is_a_row_of_failures(tmp_path, monkeypatch):
     for n in range(2):
         write_folder(tmp_path / "shots" / str(n), f"mug-{n}", truth=False)
-    job = captures_job(captures={"source": "folders", "folders": ["shots/0", "shots/1"]})
+    job = captures_job(captures={"folders": ["shots/0", "shots/1"]})
     usual, unusable = make_capture.process_capture, {"mug-1"}
 
     def process(folder, captures, watch):

@@ -31,9 +31,9 @@ HEALTHY = {
     "several": {
         "objects_per_scene": 3,
         "pairs_per_scene": 2,
-        "cameras": {"mirror": {"T_z_m": 1.1, "pivot_depth": "nearest"}},
+        "cameras": {"mirror": {"T_z_m": 1.1, "percentile": 0.0}},
     },
-    "median, tar": {"cameras": {"mirror": {"pivot_depth": "median"}}, "output": {"layout": "tar"}},
+    "median, tar": {"cameras": {"mirror": {"percentile": 50.0}}, "output": {"layout": "tar"}},
     "no mirror": {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}},
     "no colour": {"cameras": {"depth": {"enabled": False}}, "render": {"rgb": False}},
     "noise": {"sensor": {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}},
@@ -161,7 +161,7 @@ WRONG = {
     "T_z": (pairs.mirror_pose, farther_mirror, "T_world_cam of mirror is off by 0.0"),
     "nearest for percentile": (
         pairs.front_distance,
-        lambda f: lambda z, own, mirror: f(z, own, mirror.model_copy(update={"pivot_depth": "nearest"})),
+        lambda f: lambda z, own, mirror: f(z, own, mirror.model_copy(update={"percentile": 0.0})),
         "the object's input depth gives",
     ),
     "offset": (pairs.place_beside, other_offset, "T_world_cam of aligned is off by 0.1"),

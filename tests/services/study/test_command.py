@@ -204,8 +204,8 @@ def test_what_was_not_scored_is_left_out():
 
 
 def test_captures_without_truth_and_targets_that_a_job_cannot_have_are_refused():
-    with pytest.raises(InputError, match=r"captures\.source"):
-        check_captures(job_of({"source": "folders", "folders": ["a", "b"]}))
+    with pytest.raises(InputError, match=r"captures\.folders"):
+        check_captures(job_of({"folders": ["a", "b"]}))
     with pytest.raises(InputError, match="the job is one of captures"):
         refuse_unmeasured(job_of({}), {"depth_mm": 0.1}, None)
     with pytest.raises(InputError, match=r"extra pathtraced"):

@@ -180,7 +180,7 @@ def with_corner_depth(
 
 def evidence_of(views: list[Observation]) -> Evidence:
     """What the estimates are made from."""
-    poses = [fit_markers(view, PINHOLE, Estimation()) for view in views]
+    poses = [fit_markers(view, PINHOLE) for view in views]
     return Evidence.of(Setup(PINHOLE, Board(), Estimation()), views, poses)
 
 

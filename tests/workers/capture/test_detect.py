@@ -26,6 +26,7 @@ from workers.capture.folder import CaptureFile, read_board, write_description, w
 from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
+from workers.capture.simulate.camera import HAND_DEG_S, HAND_M_S
 from workers.capture.simulate.photograph import build_studio, mark_object, place_object, take_light
 from workers.capture.simulate.simulate import plan_path
 from workers.geometry.colour import encode_codes, encode_srgb
@@ -328,18 +329,17 @@ def test_the_axes_stand_on_the_print_in_the_picture(estimated):
 NEAR = {"views": 1, "image_scale": 0.5, "distance_m": [0.4, 0.45]}
 
 
-@pytest.mark.parametrize("settings", [{}, {"distortion": {"k1": 0.08, "k2": -0.05}}, {"motion_blur": {}}])
+@pytest.mark.parametrize("settings", [{}, {"distortion": {"k1": 0.08, "k2": -0.05}}, {"motion_blur": 0.008}])
 def test_each_row_is_seen_from_where_the_camera_is_when_it_is_read(settings):
     """Corners by OpenCV from the pose of their own row, which a few steps find; from the middle row's they are off by pixels."""
-    rolling = {"readout_s": 0.05, "speed_m_s": 0.3, "turn_deg_s": 20.0}
-    view, camera, T = take_one(**NEAR, **settings, rolling_shutter=rolling)
+    view, camera, T = take_one(**NEAR, **settings, rolling_shutter=0.1)
     (way, axis), points = SceneChance(11, 0).stream(Stream.MOTION, 0).standard_normal((2, 3)), marker_corners(Board())
     way, axis, points = way / np.linalg.norm(way), axis / np.linalg.norm(axis), points.reshape(-1, 3)
     true = middle = project(points, T, camera)
     for _ in range(8):
-        time_s = 0.05 * (true[:, 1] / camera.intrinsics.height - 0.5)
-        turns = Rotation.from_rotvec(np.radians(20.0) * time_s[:, None] * axis).as_matrix()
-        poses = [T @ pose(R, 0.3 * t * way) for R, t in zip(turns, time_s, strict=True)]
+        time_s = 0.1 * (true[:, 1] / camera.intrinsics.height - 0.5)
+        turns = Rotation.from_rotvec(np.radians(HAND_DEG_S) * time_s[:, None] * axis).as_matrix()
+        poses = [T @ pose(R, HAND_M_S * t * way) for R, t in zip(turns, time_s, strict=True)]
         true = np.concatenate([project(p[None], own, camera) for p, own in zip(points, poses, strict=True)])
     errors, off = (corner_errors_at(view, camera, places)[0] for places in (true, middle))
     assert len(errors) >= 40 and np.median(np.abs(errors)) < 0.05 and np.abs(errors.mean(axis=0)).max() < 0.03

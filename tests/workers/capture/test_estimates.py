@@ -221,7 +221,7 @@ def test_a_view_that_does_not_fit_is_flagged_and_takes_no_part(capture):
     corners = evidence.observations[4].corners
     wrong = dataclasses.replace(corners, board=corners.board * np.array([0.5, 1.3, 1]))
     seen = list(changed(evidence, 4, corners=wrong).observations)
-    found = estimate_joint(Evidence.of(evidence, seen, [fit_markers(o, evidence.camera, evidence.spec) for o in seen]))
+    found = estimate_joint(Evidence.of(evidence, seen, [fit_markers(o, evidence.camera) for o in seen]))
     assert found.views[4].status in ("flagged", "refused")
     assert median_errors(found, truth, [n for n in range(10) if n != 4])[0] < 0.5
     patches = evidence.observations[5].board_patches
@@ -264,7 +264,7 @@ def seen_as(given, true, truth, rng, corner_px=0.1):
         rays = rays_of_pixels(one.corners.pixels, given.intrinsics, given.lens)
         seen.append(dataclasses.replace(one, corners=dataclasses.replace(one.corners, rays=rays)))
     setup = Setup(given, Board(), Estimation(corner_px=corner_px))
-    return Evidence.of(setup, seen, [fit_markers(o, given, setup.spec) for o in seen])
+    return Evidence.of(setup, seen, [fit_markers(o, given) for o in seen])
 
 
 def with_numbers(camera, **numbers):
@@ -324,7 +324,7 @@ def test_a_focal_length_is_told_before_the_print_is_blamed_for_it():
 
     seen = [read(o) for o in evidence.observations]
     setup = Setup(given, evidence.board, evidence.spec)
-    found = estimate_joint(Evidence.of(setup, seen, [fit_markers(o, given, setup.spec) for o in seen]))
+    found = estimate_joint(Evidence.of(setup, seen, [fit_markers(o, given) for o in seen]))
     assert abs(1 / found.depth.scale - 1) > 0.01 and found.notes[0].startswith("camera.json does not fit")
     assert not any("print" in note for note in found.notes)
 

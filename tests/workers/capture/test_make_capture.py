@@ -223,7 +223,7 @@ def test_quality_columns_are_those_of_the_used_views_and_errors_are_absent_witho
     assert {row["capture"]["pose_mm"] for row in unknown["views"]} == {None}
     told = {row["role"]: (row["capture"]["sources"], row["capture"]["measured_share"]) for row in scored["views"]}
     assert told == {"input": (None, None), "mirror": ([1, 2], 0.97), "projected": (None, None)}
-    spare = rows_of(context, more=(LeftOut(1, "spare", "captures.most_views is 4"),))["scenes"][0]["capture"]
+    spare = rows_of(context, more=(LeftOut(1, "spare", "pairs_per_scene is 4"),))["scenes"][0]["capture"]
     assert [(one["number"], one["status"]) for one in spare["left_out"]] == [(0, "flagged"), (1, "spare")]
     assert spare["views"] == 1
 
@@ -244,8 +244,8 @@ def made(job: Job, folder: Path = Path(), scene_id: int = 0) -> SceneOutput:
     return run_capture(open_worker(job, open_sources(job, folder)), scene_id, Stopwatch())
 
 
-def folders_job(*names: str, **captures) -> Job:
-    return captures_job(scenes=1, captures={"source": "folders", "folders": list(names), **captures})
+def folders_job(*names: str, **changes) -> Job:
+    return captures_job(scenes=1, captures={"folders": list(names)}, **changes)
 
 
 @pytest.fixture
@@ -256,7 +256,7 @@ def folders(tmp_path) -> Path:
 
 def test_views_beyond_the_most_that_are_stored_are_left_out_evenly(monkeypatch, folders):
     monkeypatch.setattr(make_capture, "process_capture", lambda *_: exact_capture(views=6))
-    rows = made(folders_job("shots/mug", most_views=3), folders).rows
+    rows = made(folders_job("shots/mug", pairs_per_scene=3), folders).rows
     assert sorted({row["capture"]["number"] for row in rows["views"]}) == [1, 3, 5]
     told = [(one["number"], one["status"]) for one in rows["scenes"][0]["capture"]["left_out"]]
     assert told == [(0, "flagged"), (2, "spare"), (4, "spare")]
@@ -294,7 +294,7 @@ def test_a_simulated_capture_leaves_files_and_rows_of_the_schema_and_nothing_in_
 
 def test_a_folder_is_a_capture_and_one_that_changed_since_it_was_listed_is_refused(monkeypatch, folders):
     use_exact_captures(monkeypatch)
-    job = folders_job("shots/mug", category="cup")
+    job = folders_job("shots/mug")
     context = open_worker(job, open_sources(job, folders))
     (scene,) = run_capture(context, 0, Stopwatch()).rows["scenes"]
     assert (scene["source"], scene["category"]) == ("capture", "mug")
@@ -304,10 +304,10 @@ def test_a_folder_is_a_capture_and_one_that_changed_since_it_was_listed_is_refus
         run_capture(context, 0, Stopwatch())
     for name in ("capture.json", "rgb_00001.png"):
         (folders / "shots/mug" / name).unlink()
-    (folders / "shots/mug").rename(folders / "shots/mug-1")  # without capture.json the category is the job's
-    output = made(folders_job("shots/mug-1", category="cup"), folders)
-    assert {row["category"] for row in output.rows["views"]} == {"cup"}
-    assert all(file.path.startswith(("cup/", "assets/cup/")) for file in output.files)
+    (folders / "shots/mug").rename(folders / "shots/mug-1")  # without capture.json it has no category
+    output = made(folders_job("shots/mug-1"), folders)
+    assert {row["category"] for row in output.rows["views"]} == {"object"}
+    assert all(file.path.startswith(("object/", "assets/object/")) for file in output.files)
 
 
 def test_folders_are_relative_to_the_job_file_and_their_files_decide_the_digest(tmp_path):

@@ -194,9 +194,9 @@ def test_a_wrong_camera_of_an_independent_capture_is_told(file, number, right, t
 # ---------------------------------------------------------------------------------------------- what a camera does to edges
 
 EDGES = {
-    "sharpen": {"sharpen": {}},
+    "sharpen": {"sharpen": 1.0},
     "tone curve": {"tone_curve": {}},
-    "jpeg": {"jpeg": {}},
+    "jpeg": {"jpeg": 85},
     "linear": {"tone_curve": {"linear": True, "contrast": 0.0}},
 }
 
@@ -218,7 +218,7 @@ def test_what_a_camera_does_to_edges_moves_no_pose_of_an_independent_capture(nam
 @pytest.mark.minute
 @pytest.mark.parametrize("seed", SEEDS)
 def test_sharpening_moves_the_cameras_of_single_views_and_not_of_all_together(seed):
-    kept = made(seed, views=VIEWS, image_scale=0.5, depth_noise=KinectDepthNoise(), sharpen={})
+    kept = made(seed, views=VIEWS, image_scale=0.5, depth_noise=KinectDepthNoise(), sharpen=1.0)
     found = estimate_poses(opened(kept.folder.path), Estimation()).by_name
     joint, markers = (median_errors(found[name], kept.truth.T_board_cam)[0] for name in ("joint", "markers"))
     assert joint < 0.25 * markers and found["joint"].camera is None

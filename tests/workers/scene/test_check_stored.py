@@ -15,11 +15,11 @@ from workers.scene.check_stored import check_stored_pair, check_stored_scene
 def stored(tmp_path_factory):
     """(job, row of scenes, rows of views by role, rows of objects, images by path) of one pair with two objects."""
     store, _ = make_dataset(tmp_path_factory.mktemp("pair"), scenes=1, objects_per_scene=2)
-    found = find_scene(store, 0)
-    ((views, objects),) = found.pairs(0)
-    read = file_reader(store.read, found)
+    scene = find_scene(store, 0)
+    ((views, objects),) = scene.pairs(0)
+    read = file_reader(store.read, scene)
     images = {file["path"]: read_image(read, file["path"]) for view in views.values() for file in view["files"]}
-    return require_job(store).job, found.scene(0), views, objects, images
+    return require_job(store).job, scene.scene(0), views, objects, images
 
 
 @pytest.fixture

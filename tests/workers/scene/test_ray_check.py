@@ -93,7 +93,7 @@ def test_a_pixel_at_an_edge_of_a_small_thing_may_show_either_side_and_one_amid_i
     shape = shape_of(box(0.01, 0.06, 0.12), box(0.012, 0.012, 0.12, (0.06, 0.0, 0.0)))
     thing = Placed(3, shape, pose(rotation_about(UP, 1.0), np.array([0.0, 0.0, 0.76])))
     scene = dataclasses.replace(scene, things=(*scene.things[:2], thing))
-    found = []
+    cases = []
     for step in range(400):
         k = CAMERA.intrinsics.model_copy(update={"cx": 80.0 + 0.011 * step})
         views = [
@@ -102,10 +102,10 @@ def test_a_pixel_at_an_edge_of_a_small_thing_may_show_either_side_and_one_amid_i
         ]
         (depth, region, cosine), (moved, moved_region, _) = views
         flips = (region == 3) & (moved_region == 3) & (np.abs(depth - moved) > 0.01) & (cosine > 0.3)
-        found += [(k, tuple(at), depth, moved, region) for at in np.argwhere(flips)]
-        if found:
+        cases += [(k, tuple(at), depth, moved, region) for at in np.argwhere(flips)]
+        if cases:
             break
-    k, at, depth, moved, region = found[0]
+    k, at, depth, moved, region = cases[0]
     assert (region == 3).sum() < 100
     camera = Camera(k, CAMERA.T_world_cam)
     other = depth.copy()
@@ -147,6 +147,6 @@ def test_views_that_disagree_are_a_failure_that_says_by_how_much():
         (None, None, ""),
     ):
         pair = SimpleNamespace(exact_agreement=Agreement(object_mm, 1.0, 100, scene_mm))
-        told = f"of {what} carried into the mirror view is off by 1.500 mm"
-        with pytest.raises(LabelError, match=told) if what else contextlib.nullcontext():
+        words = f"of {what} carried into the mirror view is off by 1.500 mm"
+        with pytest.raises(LabelError, match=words) if what else contextlib.nullcontext():
             check_pair(pair, check)

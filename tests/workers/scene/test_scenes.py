@@ -13,7 +13,6 @@ import pytest
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import SettleError
-from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.views import Images, Patch
 from schemas.scene.view import Camera, Intrinsics, ObjectLabel, Pair, View
@@ -71,8 +70,8 @@ def test_a_scenes_figures_are_the_worst_of_its_objects_and_a_projected_view_has_
     assert all(row["patch_object_fraction"] is None for (_, region), row in labels.items() if region == 2)
     for view in three.scene.pairs[0].views[:3]:
         row = next(row for row in three.rows["views"] if row["role"] == view.role)
-        own = labels[view.role, 3]
-        assert all(row[name] == own[name] for name in ("visible_fraction", "patch_object_fraction"))
+        label = labels[view.role, 3]
+        assert all(row[name] == label[name] for name in ("visible_fraction", "patch_object_fraction"))
         for region in (3, 4, 5):
             u, v, share = (labels[view.role, region][name] for name in ("u", "v", "patch_object_fraction"))
             assert share in (None, (view.region[v - 12 : v + 12, u - 16 : u + 16] == region).mean())
@@ -100,7 +99,7 @@ def test_stages_and_effects_add_up_also_of_a_block_that_raises_and_a_row_has_the
     assert watch.seconds == {"render": 3.0, "check": 3.0}
     assert watch.effects == {"projection": 3.0, "mirror": 13.0}
     (row,) = table_of_rows("timings", [timing_row(3, "mug", watch)]).to_pylist()
-    assert row["total_s"] == 6.0 and {one["name"]: one["seconds"] for one in row["effects"]} == watch.effects
+    assert row["total_s"] == 6.0 and {effect["name"]: effect["seconds"] for effect in row["effects"]} == watch.effects
     total = Stopwatch({"render": 1.0})
     total.add(watch)
     assert total.seconds == {"render": 4.0, "check": 3.0}
@@ -189,13 +188,3 @@ def test_opencv_of_a_worker_has_one_thread():
         assert cv2.getNumThreads() == 1
     finally:
         cv2.setNumThreads(before)
-
-
-def test_what_changes_a_scene_is_in_the_digest_of_its_settings_and_nothing_else():
-    def digest(catalogue: str = "assets", **changes) -> str:
-        return settings_digest(Job.model_validate({"name": "t", **changes}), catalogue)
-
-    for same in ({"name": "o"}, {"scenes": 7}, {"first_scene": 3}, {"run": {"scene_timeout_s": 5.0}}, {"sensor": {}}):
-        assert digest(**same) == digest()
-    others = ({"seed": 1}, {"sensor": {"rgb_noise": {}}}, {"physics": {"restitution": 0.5}}, {"catalogue": "others"})
-    assert len({digest(), *(digest(**changes) for changes in others)}) == 5

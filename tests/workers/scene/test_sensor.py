@@ -76,42 +76,42 @@ def test_noise_on_a_plane_has_the_spread_of_the_preset_which_grows_with_distance
     spreads = {}
     for at in ((0.8, 0.0), (1.5, 0.0), (3.0, 0.0), (1.5, 40.0), (1.5, 60.0)):
         z, cosine = plane(*at)
-        found = sense(z, PRESET)
-        kept = (found > 0.0)[INNER] & (z < 3.6)[INNER] & (z > 0.6)[INNER]
-        score = ((found - z) * cosine / (0.017 * (z / 3.86) ** 2))[INNER][kept]
+        sensed = sense(z, PRESET)
+        kept = (sensed > 0.0)[INNER] & (z < 3.6)[INNER] & (z > 0.6)[INNER]
+        score = ((sensed - z) * cosine / (0.017 * (z / 3.86) ** 2))[INNER][kept]
         n = len(score)
         assert n > 5000
         assert abs((score**2).sum() - n) < 4.5 * math.sqrt(2 * n)
         assert abs(score.mean()) < 4.5 / math.sqrt(n)
-        spreads[at] = (found - z)[55:65, 5:-5].std()
+        spreads[at] = (sensed - z)[55:65, 5:-5].std()
     assert spreads[1.5, 0.0] * 3.0 < spreads[3.0, 0.0]  # four times, by the square
     assert spreads[1.5, 0.0] * 1.6 < spreads[1.5, 60.0]  # twice, by the cosine
 
 
 def test_grazing_surfaces_and_what_is_out_of_range_have_no_depth_and_others_keep_theirs():
     z, cosine = plane(1.5, 70.0)
-    found = sense(z, grazing_deg=65.0)
+    sensed = sense(z, grazing_deg=65.0)
     known = (slice(2, -2), slice(2, -2))
     degrees = np.degrees(np.arccos(cosine))[known]
     assert (degrees > 65.5).any() and (degrees < 64.5).any()
-    assert (found[known][degrees > 65.5] == 0.0).all()
-    assert np.array_equal(found[known][degrees < 64.5], z[known][degrees < 64.5])
+    assert (sensed[known][degrees > 65.5] == 0.0).all()
+    assert np.array_equal(sensed[known][degrees < 64.5], z[known][degrees < 64.5])
     assert (sense(step(0.45, 4.2), PRESET)[:, AWAY] == 0.0).all()
     hole = step()
     hole[30:60, 60:100] = 0.0
-    found = sense(hole, DepthNoise(offset_m=0.5, lateral_px=3.0, flying_share=0.9, edge_px=3))
-    assert (found[30:60, 60:100] == 0.0).all() and (found > 0.0).any()
+    sensed = sense(hole, DepthNoise(offset_m=0.5, lateral_px=3.0, flying_share=0.9, edge_px=3))
+    assert (sensed[30:60, 60:100] == 0.0).all() and (sensed > 0.0).any()
 
 
 def test_flying_lost_and_shifted_pixels_lie_at_an_edge_and_have_the_shares_asked_for():
     depth, n = step(), 2 * 120
     for reach in (1, 3):
-        found = sense(depth, flying_share=1.0, edge_px=reach)
-        changed = found != depth
+        sensed = sense(depth, flying_share=1.0, edge_px=reach)
+        changed = sensed != depth
         columns = np.flatnonzero(changed.any(axis=0))
         assert columns.tolist() == list(range(80 - reach, 80 + reach)) and changed[:, columns].all()
-        assert found[changed].min() > 1.0 and found[changed].max() < 2.0
-        assert is_uniform(found[changed] - 1.0)  # the mixture is uniform between the two
+        assert sensed[changed].min() > 1.0 and sensed[changed].max() < 2.0
+        assert is_uniform(sensed[changed] - 1.0)  # the mixture is uniform between the two
     swapped = sense(depth, lateral_px=0.5)
     assert set(np.unique(swapped)) == {1.0, 2.0}
     assert set(np.flatnonzero((swapped != depth).any(axis=0))) == {79, 80}
@@ -126,18 +126,18 @@ def test_flying_lost_and_shifted_pixels_lie_at_an_edge_and_have_the_shares_asked
 
 
 def test_the_systematic_error_is_an_offset_and_a_share_of_the_distance_and_without_effects_depth_is_the_same():
-    found = sense(np.full((120, 160), 2.0), offset_m=0.011, offset_share=0.001)
-    assert found == pytest.approx(np.full((120, 160), 2.0 * 1.001 + 0.011), abs=1e-12)
+    sensed = sense(np.full((120, 160), 2.0), offset_m=0.011, offset_share=0.001)
+    assert sensed == pytest.approx(np.full((120, 160), 2.0 * 1.001 + 0.011), abs=1e-12)
     for depth in (plane(1.5, 40.0)[0], step()):
         assert np.array_equal(sense(depth), depth)
 
 
 def test_one_seed_is_one_image_and_switching_an_effect_off_moves_no_other_noise():
-    found = sense(step(), PRESET)
-    assert np.array_equal(found, sense(step(), PRESET))
-    assert not np.array_equal(found, sense(step(), PRESET, seed=2))
+    sensed = sense(step(), PRESET)
+    assert np.array_equal(sensed, sense(step(), PRESET))
+    assert not np.array_equal(sensed, sense(step(), PRESET, seed=2))
     calm = sense(step(), PRESET, flying_share=0.0, edge_dropout=0.0, lateral_px=0.0)
-    assert np.array_equal(found[:, AWAY], calm[:, AWAY])
+    assert np.array_equal(sensed[:, AWAY], calm[:, AWAY])
 
 
 # ---------------------------------------------------------------------------------------------- colour

@@ -74,14 +74,14 @@ def test_normals_point_at_the_camera_and_coordinates_are_the_points_of_a_ball():
     seen = drawn["layer1_region"] == 4
     points = drawn["coordinates"][seen] / 65535.0
     scale = np.linalg.norm(ball.extents)
-    own = points * scale - scale / 2 + ball.bounds.mean(axis=0)
-    assert np.abs(np.linalg.norm(own, axis=1) - 0.05).max() < 2e-4  # within the chords of its faces
-    world = own + np.array([0.02, 0.0, 0.01])
+    places = points * scale - scale / 2 + ball.bounds.mean(axis=0)
+    assert np.abs(np.linalg.norm(places, axis=1) - 0.05).max() < 2e-4  # within the chords of its faces
+    world = places + np.array([0.02, 0.0, 0.01])
     camera = (world - CAMERA.T_world_cam[:3, 3]) @ CAMERA.T_world_cam[:3, :3]
     assert np.abs(camera / camera[:, 2:] - rays()[seen]).max() < 1e-4
     normals = drawn["normals"][seen] / 65535.0 * 2.0 - 1.0
     assert np.abs(np.linalg.norm(normals, axis=1) - 1.0).max() < 1e-4 and ((normals * camera).sum(axis=1) < 0.0).all()
-    outward = own / np.linalg.norm(own, axis=1, keepdims=True) @ CAMERA.T_world_cam[:3, :3]
+    outward = places / np.linalg.norm(places, axis=1, keepdims=True) @ CAMERA.T_world_cam[:3, :3]
     assert np.degrees(np.linalg.norm(normals - outward, axis=1)).max() < 3.0
     assert not drawn["normals"][~seen].any() and not drawn["coordinates"][~seen].any()
     vertex_normals = frozen_array(ball.vertices / 0.05)

@@ -101,11 +101,11 @@ def test_the_front_distance_is_read_from_the_depth_of_whichever_object_is_seen()
     depth = np.concatenate([np.linspace(1.0, 2.0, 101), np.full(500, 0.3), [0.0]])[None, :]
     mask = np.zeros(depth.shape, bool)
     mask[0, :101] = mask[0, -1] = True  # the last pixel has no depth and must not count as nearest
-    for estimator, expected in (("percentile", 1.02), ("median", 1.5), ("nearest", 1.0)):
-        found = front_distance(depth, mask, mirror.model_copy(update={"pivot_depth": estimator}))
-        assert found == pytest.approx(expected)
-    for own in ([2.0], [2.0, 2.1]):
-        assert 2.0 <= front_distance(np.array([own]), np.ones((1, len(own)), bool), mirror) <= 2.1
+    for percentile, expected in ((2.0, 1.02), (50.0, 1.5), (0.0, 1.0)):
+        distance = front_distance(depth, mask, mirror.model_copy(update={"percentile": percentile}))
+        assert distance == pytest.approx(expected)
+    for depths in ([2.0], [2.0, 2.1]):
+        assert 2.0 <= front_distance(np.array([depths]), np.ones((1, len(depths)), bool), mirror) <= 2.1
     region = np.full((10, 10), 1, np.uint8)  # the first object is hidden, the second stands at 2 m, the third at 3 m
     region[2:4], region[6:8] = 4, 5
     depth = np.where(region == 4, 10_000, np.where(region == 5, 15_000, 5_000)).astype(np.uint16)
@@ -137,7 +137,7 @@ def test_table_and_objects_are_labelled_in_order_the_floor_is_not_and_only_what_
     plan = draw_scene(JOB, SceneChance(0, 0), table(), CUBE)
     start = plan.objects[0]
     placed = ((1, plan.floor, np.eye(4)), (2, plan.table.asset.shape, plan.table.T_world_table))
-    things = tuple(Placed(*one) for one in (*placed, (3, CUBE.shape, start.T_world_obj)))
+    things = tuple(Placed(*thing) for thing in (*placed, (3, CUBE.shape, start.T_world_obj)))
     region = np.ones((K.height, K.width), np.uint8)
     region[40:80, 40:120], region[50:60, 60:70] = 2, 3
     posed = PosedScene(things, plan.appearance)
@@ -152,7 +152,7 @@ def test_table_and_objects_are_labelled_in_order_the_floor_is_not_and_only_what_
     region = np.zeros((K.height, K.width), np.uint8)
     region[0, :5], region[1, :8] = 2, 4
     names, counts = dict.fromkeys((2, 3, 4), ("box", "b")), {2: 10, 4: 32}
-    labels = label_things(things, names, HERE, region, lambda seen, camera: [counts[one.region_id] for one in seen])
+    labels = label_things(things, names, HERE, region, lambda seen, camera: [counts[thing.region_id] for thing in seen])
     assert [label.visible_fraction for label in labels] == [0.5, 0.0, 0.25]
     nothing = label_things(things, names, HERE, np.zeros_like(region), nothing_left)
     assert [label.pixels for label in nothing] == [0, 0, 0]
@@ -162,7 +162,7 @@ def test_what_the_processor_cannot_count_is_counted_by_the_renderer():
     near, far = (Placed(n, CUBE.shape, HERE.T_world_cam @ translation(0, 0, n)) for n in (0, 2))
     asked = []
     counts = count_unoccluded(
-        [far, near, far], HERE, lambda things, camera: [asked.append(one) or 77 for one in things]
+        [far, near, far], HERE, lambda things, camera: [asked.append(thing) or 77 for thing in things]
     )
     assert counts == [36, 77, 36] and asked == [near]  # its side is 6.7 pixels
     assert count_unoccluded([far], HERE, nothing_left) == [36]
@@ -177,13 +177,13 @@ def test_a_patch_is_centred_on_the_object_left_out_where_it_would_leave_the_imag
     assert crop_box(label(80, 60), HERE, patch) == (slice(12, 108), slice(16, 144))
     assert crop_box(label(64, 48), HERE, patch) == (slice(0, 96), slice(0, 128))
     hidden = dataclasses.replace(label(80, 60), pixels=0)
-    for one in (label(63, 60), label(97, 60), label(80, 73), label(-1, -1), hidden):
-        assert crop_box(one, HERE, patch) is None
+    for labelled in (label(63, 60), label(97, 60), label(80, 73), label(-1, -1), hidden):
+        assert crop_box(labelled, HERE, patch) is None
     region = np.full_like(SOURCE.region, 2)
     region[:60] = 3
     view, patch = dataclasses.replace(SOURCE, region=region), Patch(width=32, height=24)
-    for one, share in ((label(80, 60), 0.5), (label(80, 40), 1.0), (label(5, 60), None)):
-        assert patch_object_fraction(view, one, patch) == share
+    for labelled, share in ((label(80, 60), 0.5), (label(80, 40), 1.0), (label(5, 60), None)):
+        assert patch_object_fraction(view, labelled, patch) == share
     assert patch_object_fraction(dataclasses.replace(view, region=None), label(80, 60), patch) is None
 
 
@@ -236,8 +236,8 @@ def test_hidden_points_splats_and_the_lens_are_as_the_plan_has_them():
 def test_behind_a_lens_a_depth_pixel_has_the_colour_of_the_pixel_that_its_centre_is_drawn_in():
     """A radial lens leaves the centre of the image where it is, moves the corner, and may move it out of the image."""
     centre = K.height // 2 * K.width + K.width // 2
-    found = pixels_behind(Distortion(k1=-0.2), np.array([centre, 0, -1]), K)
+    pixels = pixels_behind(Distortion(k1=-0.2), np.array([centre, 0, -1]), K)
     u, v = distort(np.array([0.5]), np.array([0.5]), Distortion(k1=-0.2), K)
-    assert found.tolist() == [centre, int(v[0]) * K.width + int(u[0]), -1]
-    assert found[1] > K.width
+    assert pixels.tolist() == [centre, int(v[0]) * K.width + int(u[0]), -1]
+    assert pixels[1] > K.width
     assert pixels_behind(Distortion(k1=0.2), np.array([0]), K).tolist() == [-1]

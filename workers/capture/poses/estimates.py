@@ -17,6 +17,7 @@ from workers.capture.poses.camera_fit import CameraFit, camera_note, fit_camera
 from workers.capture.poses.joint import Joint, Views, gather, measure_corners, solve_jointly
 from workers.capture.poses.markers import (
     AMBIGUOUS,
+    MOST_REPROJECTION_PX,
     Evidence,
     Fit,
     Judged,
@@ -28,7 +29,7 @@ from workers.capture.poses.markers import (
     median_reprojection,
     moved,
 )
-from workers.capture.poses.observation import Corners, Observation, no_patches
+from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
 from workers.capture.poses.terms import (
     NAMES,
     POSE,
@@ -384,7 +385,7 @@ def _start(index: int, evidence: Evidence) -> Start | None:
     if found.fit is None:
         return None
     off = median_reprojection(observation, found.fit.T_board_cam, evidence.camera, 1.0)
-    if off is None or off > evidence.spec.max_reprojection_px:
+    if off is None or off > MOST_REPROJECTION_PX:
         return None
     fit, ambiguous = _told_apart(observation, found, evidence)
     covariance = evidence.corner_px**2 * np.linalg.pinv(fit.information, hermitian=True)
@@ -409,7 +410,7 @@ def _tilt_misfit(observation: Observation, T: Pose, evidence: Evidence) -> float
     if len(patches) < MIN_PATCHES:
         return 0.0
     height = transform(T, patches.ray_z)[:, 2]
-    sigma = evidence.spec.depth_sigma_m * patches.ray_z[:, 2] ** 2
+    sigma = DEPTH_SIGMA_M * patches.ray_z[:, 2] ** 2
     return float((np.minimum(np.abs(height - np.median(height)) / sigma, 5.0) ** 2).sum())
 
 

@@ -19,7 +19,7 @@ from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
 from workers.capture.poses.corners import CornerTerm, Rolling
 from workers.capture.poses.markers import focal_lengths, moved
-from workers.capture.poses.observation import Observation, Patches
+from workers.capture.poses.observation import DEPTH_SIGMA_M, Observation, Patches
 from workers.capture.poses.terms import (
     GROW_M,
     GROW_PX,
@@ -315,7 +315,7 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
     corners, held = views.corner_term(), np.ones(len(views.poses), bool)
     shared, board = Shared(), None
     if len(on_board):
-        board = BoardTerm(board_view, on_board, spec.depth_sigma_m * on_board.ray_z[:, 2] ** 2, np.ones(len(on_board)))
+        board = BoardTerm(board_view, on_board, DEPTH_SIGMA_M * on_board.ray_z[:, 2] ** 2, np.ones(len(on_board)))
         start = Problem([corners, board] if spec.trust == "depth" else [board], prior, held)
         if spec.trust == "depth":  # a print of another size moves the cameras: they must be free
             start = dataclasses.replace(start, fixed=views.fixed)

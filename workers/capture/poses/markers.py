@@ -161,6 +161,8 @@ FLOOR_PX = 0.02
 AMBIGUOUS = 9.0
 """The two poses of a planar target are told apart by at least this difference of their chi-square: three sigma."""
 SAME_RAD = 0.02
+MOST_REPROJECTION_PX = 3.0
+"""Median reprojection error beyond which a view is flagged: fifteen times that of a detected corner."""
 """Two poses that differ by less than this are one."""
 PRIOR_RESIDUALS = 2
 """The expected sigma of a corner counts as much as so many measured residuals."""
@@ -179,14 +181,11 @@ class MarkerPose:
     reason: str = ""
 
 
-def fit_markers(observation: Observation, camera: CaptureCamera, spec: Estimation) -> MarkerPose:
+def fit_markers(observation: Observation, camera: CaptureCamera) -> MarkerPose:
     """The pose of one view: both solutions of the planar problem (IPPE), each refined with a robust loss, the better first."""
     corners, number = observation.corners, observation.number
-    if observation.markers < spec.min_markers:
-        found = observation.markers or "no"
-        return MarkerPose(
-            number, None, reason=f"{found} markers of the board found, and min_markers is {spec.min_markers}"
-        )
+    if not observation.markers:
+        return MarkerPose(number, None, reason="no markers of the board found")
     focal = focal_lengths(camera)
     fits = [fit_pose(start, corners.board, corners.rays, focal, FLOOR_PX) for start in first_poses(corners)]
     above = [fit for fit in fits if np.isfinite(fit.T_board_cam).all() and fit.T_board_cam[2, 3] > 0]
@@ -344,7 +343,7 @@ def check_depth(evidence: "Evidence") -> None:
 
 def _fits(seen: Observation, T: Pose, evidence: "Evidence") -> bool:
     off_px = median_reprojection(seen, T, evidence.camera, 1.0)
-    return off_px is not None and off_px <= evidence.spec.max_reprojection_px
+    return off_px is not None and off_px <= MOST_REPROJECTION_PX
 
 
 def _depth_of(seen: Observation, T: Pose) -> Array:
@@ -373,7 +372,7 @@ def observe_view(
 ) -> tuple[Observation, MarkerPose]:
     """(the view's corners, and samples of its depth [H, W] where it has any; its pose from markers)."""
     seen = Observation(detection.number, corners_of(detection, setup.board, setup.camera))
-    found = fit_markers(seen, setup.camera, setup.spec)
+    found = fit_markers(seen, setup.camera)
     return (seen if depth is None else _with_depth(seen, depth, detection, found, setup)), found
 
 
@@ -438,14 +437,13 @@ def judge(
         reasons = pose.faults or ("no pose was found",)
         return ViewEstimate(number, "refused", None, None, markers, None, None, reasons)
     reprojection_px = median_reprojection(observation, T, evidence.camera, print_scale)
-    most_px = evidence.spec.max_reprojection_px
     covariance = pose.covariance
     if pose.by_corners:
         covariance = _widened(covariance, reprojection_px, len(observation.corners.board), evidence.corner_px)
     faults = [*pose.faults, *_doubts(covariance)]
-    if reprojection_px is not None and reprojection_px > most_px:
+    if reprojection_px is not None and reprojection_px > MOST_REPROJECTION_PX:
         faults.append(
-            f"median reprojection error {reprojection_px:.2f} px, above max_reprojection_px {most_px:g}: "
+            f"median reprojection error {reprojection_px:.2f} px, above {MOST_REPROJECTION_PX:g}: "
             "the markers do not lie as board.json says, or the view is blurred"
         )
     status: ViewStatus = "flagged" if faults else "used"

@@ -221,6 +221,8 @@ TALLEST_M = 0.5
 """A patch lies so far above the board, as depth has the board."""
 MIN_COSINE = 0.35
 """Patches that are seen at more than 70 degrees from their normal are left out: their depth is mixed."""
+DEPTH_SIGMA_M = 0.003
+"""Standard deviation of depth at 1 m, which grows with the square of the distance; measured anew from the capture."""
 NOISY = 3.0
 """A patch with so many times the expected noise is no piece of plane."""
 MOST = 200
@@ -272,7 +274,7 @@ def _blocks_over_board(T_board_cam: Pose, board: Board, camera: CaptureCamera, s
 def _on_object(found: Patches, height: Array, T_board_cam: Pose, setup: Setup) -> NDArray[np.bool_]:
     """[P]: patches of a smooth surface, not seen at a grazing angle, within the space over the board; height [P] over it."""
     cosine = -(found.normal * found.ray).sum(axis=1) / np.linalg.norm(found.ray, axis=1)
-    smooth = found.sigma_m <= NOISY * setup.spec.depth_sigma_m * np.maximum(found.ray_z[:, 2], 0.5) ** 2
+    smooth = found.sigma_m <= NOISY * DEPTH_SIGMA_M * np.maximum(found.ray_z[:, 2], 0.5) ** 2
     half = 0.5 * setup.board.scale * np.array([setup.board.width_m, setup.board.height_m])
     inside = (np.abs(transform(T_board_cam, found.ray_z)[:, :2]) < half).all(axis=1)
     on_object: NDArray[np.bool_] = (

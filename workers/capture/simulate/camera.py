@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import CaptureError
-from schemas.job.captures import Board, HiddenMarkers, KinectDepthNoise, MotionBlur, RollingShutter, Simulate
+from schemas.job.captures import Board, KinectDepthNoise, Simulate
 from schemas.job.views import DepthNoise, Distortion
 from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Intrinsics
@@ -82,14 +82,19 @@ class Motion:
     turn_rad: float
 
 
+SHARPEN_PX = 1.0
+"""Standard deviation of the blur of the unsharp mask, as cameras have it."""
+
+HAND_M_S, HAND_DEG_S = 0.15, 8.0
+"""How fast a hand moves and turns a camera that it holds still."""
+
 AT_REST = Motion(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
 
-def draw_motion(moving: MotionBlur | RollingShutter, rng: np.random.Generator) -> Motion:
-    """A motion with the speeds of `moving` in its exposure or readout, in a uniform direction and about a uniform axis."""
+def draw_motion(time_s: float, rng: np.random.Generator) -> Motion:
+    """A motion of the hand in its exposure or readout, in a uniform direction and about a uniform axis."""
     direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    time_s = moving.exposure_s if isinstance(moving, MotionBlur) else moving.readout_s
-    return Motion(moving.speed_m_s * time_s * direction, axis, math.radians(moving.turn_deg_s) * time_s)
+    return Motion(HAND_M_S * time_s * direction, axis, math.radians(HAND_DEG_S) * time_s)
 
 
 def pose_at(T_world_cam: Pose, motion: Motion, moment: float) -> Pose:
@@ -126,10 +131,10 @@ def develop(light: Array, simulate: Simulate) -> NDArray[np.uint8]:
         if tone is not None:
             value = value - tone.contrast * np.sin(2 * math.pi * value) / (2 * math.pi)
         if sharpen is not None:
-            value = value + sharpen.amount * (value - cv2.GaussianBlur(value, (0, 0), sharpen.radius_px))
+            value = value + sharpen * (value - cv2.GaussianBlur(value, (0, 0), SHARPEN_PX))
         codes = np.rint(255 * np.clip(value, 0.0, 1.0)).astype(np.uint8)
     if jpeg is not None:
-        _, data = cv2.imencode(".jpg", np.ascontiguousarray(codes[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, jpeg.quality])
+        _, data = cv2.imencode(".jpg", np.ascontiguousarray(codes[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, jpeg])
         codes = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
     return codes
 
@@ -173,11 +178,11 @@ YELLOW = (0.93, 0.86, 0.45, 1.0)
 """sRGB."""
 
 
-def cover_markers(hidden: HiddenMarkers, board: Board, rng: np.random.Generator) -> Shape | None:
+def cover_markers(share: float, board: Board, rng: np.random.Generator) -> Shape | None:
     """Level slips in the board frame, metres, one over a part of each chosen marker; None where none is chosen."""
     corners = marker_corners(board)
     corners = corners[np.abs(corners[..., 2]).max(axis=1) == 0.0]  # those that lie on the board
-    chosen = np.sort(rng.permutation(len(corners))[: round(hidden.share * len(corners))])
+    chosen = np.sort(rng.permutation(len(corners))[: round(share * len(corners))])
     if not len(chosen):
         return None
     slips = np.stack([_slip(corners[m], rng) for m in chosen])

@@ -312,8 +312,8 @@ def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     """[H, W, 3]: linear light of one exposure; T_world_cam is the pose at its middle, and of its middle row."""
     k, simulate = studio.rig.color, studio.simulate
     blur, rolling = (
-        AT_REST if moving is None else draw_motion(moving, studio.chance.stream(Stream.MOTION, number))
-        for moving in (simulate.motion_blur, simulate.rolling_shutter)
+        AT_REST if time_s is None else draw_motion(time_s, studio.chance.stream(Stream.MOTION, number))
+        for time_s in (simulate.motion_blur, simulate.rolling_shutter)
     )
     samples, render = plan_pictures(studio)
     total, light_of = np.zeros((k.height, k.width, 3)), SRGB_STEPS / len(samples)

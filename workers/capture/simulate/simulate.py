@@ -58,6 +58,9 @@ VIEWS_PER_TURN = 14
 
 MOST_TURNS = 3
 
+ROLL_DEG = 12.0
+"""Standard deviation of the roll of the hand-held camera."""
+
 AIM_M = 0.02
 """Standard deviation of the point that the camera looks at about the object's middle."""
 
@@ -71,7 +74,7 @@ def plan_path(simulate: Simulate, target: Array, rng: np.random.Generator) -> Ar
     """[V, 4, 4] float64: poses in the frame of `target` [3], whose z points up, optical frame.
 
     The camera goes around the target up to three times, higher each time, looks at it and rolls. Its distance and its
-    inclination stay within the intervals of `simulate`; the roll is normal with the standard deviation that it gives.
+    inclination stay within the intervals of `simulate`; the roll is normal.
     """
     views = simulate.views
     turns = min(max(round(views / VIEWS_PER_TURN), 1), MOST_TURNS)
@@ -82,7 +85,7 @@ def plan_path(simulate: Simulate, target: Array, rng: np.random.Generator) -> Ar
     level = (_climb(time, turns) + 0.5 * _sway(time, rng)) / turns
     inclination = _within(simulate.inclination_rad, level)
     distance = _within(simulate.distance_m, 0.5 + 0.5 * _sway(time, rng))
-    roll = np.radians(simulate.roll_deg) * _normal_sway(time, rng)
+    roll = np.radians(ROLL_DEG) * _normal_sway(time, rng)
     aim = target + AIM_M * rng.standard_normal((views, 3))
     rolls = [pose(rotation_about(OPTICAL_AXIS, float(angle)), np.zeros(3)) for angle in roll]
     return np.stack([orbit_pose(aim[n], inclination[n], yaw[n], distance[n]) @ rolls[n] for n in range(views)])

@@ -18,6 +18,7 @@ from workers.capture.surface.object_mask import ObjectRegion
 from workers.capture.surface.posed_view import PosedView, visible_points
 from workers.capture.surface.tsdf import (
     FRONT_VOXELS,
+    MOST_EDGE_DEG,
     SurfaceDepth,
     cut_below,
     empty_volume,
@@ -280,11 +281,11 @@ STEPS = 2
 
 def sight_object(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -> list[Sight]:
     """Each view's depth about the object, fitted; views that see nothing of it are left out."""
-    least_cos = math.cos(math.radians(spec.max_edge_deg))
+    least_cos = math.cos(math.radians(MOST_EDGE_DEG))
     sights = []
     for view in views:
         window = object_window(region, view.depth_camera)
-        fitted = fit_object(view, region, spec.max_edge_deg, window)
+        fitted = fit_object(view, region, MOST_EDGE_DEG, window)
         if fitted.inverse.any():
             sights.append(Sight(view, fitted, least_cos))
     return sights

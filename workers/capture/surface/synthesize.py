@@ -28,6 +28,9 @@ SAME_SURFACE = 0.012
 EDGE_SLACK = 1e-6
 """Share of a triangle's area by which a pixel's centre may lie beyond its edge: coordinates are float32."""
 
+FILL_PX = 3
+"""Holes up to about this size are filled, and counted as not measured."""
+
 FEATHER_PX = 15
 """Width over which a view's weight falls towards the edges of what it measured, at a focal length of 912 px."""
 
@@ -315,7 +318,7 @@ def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) 
             f"none of the {len(numbers)} nearest views ({', '.join(map(str, numbers))}) shows anything to this camera",
         )
     rgb, depth_m, mask = merge_layers(layers, camera)
-    filled = fill_holes(rgb, depth_m, mask, spec.fill_px)
+    filled = fill_holes(rgb, depth_m, mask, FILL_PX)
     measured = depth_m > 0.0
     return SynthesizedView(
         rgb=filled[0],

@@ -27,6 +27,9 @@ from workers.geometry.jit import compiled
 REACHES = (2, 1)
 """Samples to each side: 5 x 5, and 3 x 3 where those do not lie on a plane, as at a rim."""
 
+MOST_EDGE_DEG = 84.0
+"""Angle of incidence beyond which pixels are left out: their depth is a guess."""
+
 SMALL_EDGE_DEG = 60.0
 """Largest angle of incidence of a fit to 3 x 3 samples: three samples across an edge always lie on some steep plane."""
 
