@@ -9,9 +9,8 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight
+from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Weight
 from schemas.errors import did_you_mean
-
 
 TABLE = "table"
 """The category of tables, in `category_map` and in the tables of a dataset."""
@@ -106,6 +105,7 @@ def _of_objects(name: str) -> str:
 
 CategoryName = Annotated[str, Field(max_length=1000), AfterValidator(_of_objects)]
 """A category of objects: any name that can be a folder's."""
+
 
 def is_usable(name: str) -> bool:
     """Whether a category may have this name."""

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
+from workers.assets.external.listing import Entry, hash_files
+from workers.assets.external.placement import place_asset
 
 from schemas.base import Array
 from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.scene.shape import Asset
 from tests.kit.shapes import box
 from tests.workers.door.oracles import textured_cube, write
-from workers.assets.external.listing import Entry, hash_files
-from workers.assets.external.placement import place_asset
 from workers.door.meshes.formats import load_shape
 
 SIDE_M = 0.1

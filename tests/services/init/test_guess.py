@@ -3,15 +3,16 @@
 from dataclasses import replace
 from glob import escape
 
-from schemas.job.assets import FolderSource
 from services.init.categories import is_category, map_categories, name_categories
 from services.init.collection import SUFFIXES
-from services.init.command import describe_guess, make_guess, write_job
 from services.init.copies import Item, Reading, find_copies, find_doubles
 from services.init.guess import Guess, guess_groups, guess_ups, plain_axis
+from workers.assets.external.placement import Measured
+
+from schemas.job.assets import FolderSource
+from services.init.command import describe_guess, make_guess, write_job
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import validate_job
-from workers.assets.external.placement import Measured
 
 CATEGORIES = (
     (None, {"mug/a.obj": "mug"}),

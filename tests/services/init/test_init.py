@@ -14,12 +14,12 @@ import pyarrow.dataset as ds
 import pytest
 import trimesh
 from PIL import Image
+from services.init.collection import SUFFIXES, LeftOut, read_folder, walk_folder
 
 from schemas.errors import AssetSourceError, MachineError
 from schemas.job.assets import Assets, FolderSource, ProceduralSource
 from services.cli.main import main
 from services.init import collection, command, shown
-from services.init.collection import SUFFIXES, LeftOut, read_folder, walk_folder
 from services.init.shown import (
     HEADINGS,
     MOST_ROWS,

@@ -12,6 +12,7 @@ import pyarrow.dataset as ds
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from workers.assets.external.listing import Listing
 
 from schemas.dataset.tables import SCHEMAS, SORT_KEYS, TABLES
 from schemas.errors import CorruptError
@@ -24,7 +25,6 @@ from services.merge.tables import escaped, object_lines, shortest
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
 from tests.made_up_scenes import failed_scene, fails, made_scene, scene
 from workers.assets.catalogue import Catalogue
-from workers.assets.external.listing import Listing
 from workers.store.manifest import table_of_rows
 
 pytestmark = pytest.mark.usefixtures("unflushed")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from workers.assets.external.verdicts import Verdicts
 
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import CATEGORIES, Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
@@ -24,7 +25,6 @@ from workers.assets.catalogue import (
     open_catalogue,
     split_of,
 )
-from workers.assets.external.verdicts import Verdicts
 
 BUILT_IN = ProceduralSource(source="procedural")
 NET = ShapeNetSource(source="shapenet", folder="net")

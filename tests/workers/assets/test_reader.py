@@ -18,12 +18,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-
-from schemas.base import frozen_array
-from schemas.errors import AssetSourceError, MachineError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits
-from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
-from tests.workers.door.oracles import CUBE, picture, textured_cube, write
 from workers.assets.external import reader
 from workers.assets.external import verdicts as verdict_file
 from workers.assets.external.listing import Entry, SourceFile, hash_files
@@ -38,6 +32,12 @@ from workers.assets.external.reader import (
     unpack_asset,
 )
 from workers.assets.external.verdicts import Verdicts, check_listing, load_asset_file, read_listing, verdict_key
+
+from schemas.base import frozen_array
+from schemas.errors import AssetSourceError, MachineError, MeshError
+from schemas.job.assets import Assets, FolderSource, MeshLimits
+from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
+from tests.workers.door.oracles import CUBE, picture, textured_cube, write
 
 SETTINGS = FolderSource(source="urdf", folder=".")
 ROOT = Path(__file__).resolve().parents[3]

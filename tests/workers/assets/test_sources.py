@@ -3,6 +3,9 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from workers.assets.external.listing import find_files, find_licence, list_licences, locate_folder
+from workers.assets.external.placement import load_entry
+from workers.assets.external.verdicts import Verdicts, check_listing
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import AssetSourceError
@@ -20,9 +23,6 @@ from tests.workers.door.oracles import (
     write_all,
 )
 from workers.assets.catalogue import list_source
-from workers.assets.external.listing import find_files, find_licence, list_licences, locate_folder
-from workers.assets.external.placement import load_entry
-from workers.assets.external.verdicts import Verdicts, check_listing
 from workers.scene.rows import asset_row
 
 LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)

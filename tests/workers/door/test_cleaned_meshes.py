@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 from shapely import Polygon
+from workers.assets.external.listing import Entry, SourceFile
+from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand, place_asset
 
 from schemas.job.assets import CATEGORIES, TABLE, Assets, FolderSource, MeshLimits, ProceduralSource
 from tests.kit.shapes import shape_of
 from tests.workers.door.oracles import CUBE, support_margin, welded, write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
-from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand, place_asset
 from workers.assets.mass import mass_properties, shell_mass, weigh
 from workers.door.meshes.formats import load_shape
 from workers.door.meshes.mesh import (

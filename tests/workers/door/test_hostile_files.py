@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from workers.assets.external.listing import Entry, SourceFile
+from workers.assets.external.reader import Request, Task, ask_all, unpack_asset
+from workers.assets.external.verdicts import Verdicts
 
 from schemas.errors import MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits
@@ -18,9 +21,6 @@ from tests.workers.door.mutants import mutant
 from tests.workers.door.oracles import CUBE, glb, gltf, picture, textured_cube, urdf, visual, write, write_all
 from tests.workers.door.test_statements import dae
 from workers.assets.catalogue import open_catalogue
-from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.reader import Request, Task, ask_all, unpack_asset
-from workers.assets.external.verdicts import Verdicts
 from workers.door.meshes import urdf as urdf_file
 from workers.door.meshes.formats import load_shape
 from workers.door.meshes.urdf import load_posed

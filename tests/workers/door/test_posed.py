@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from workers.assets.external.placement import list_files
 
 from schemas.errors import MeshError
 from schemas.job.assets import FolderSource, MeshLimits
 from tests.workers.door.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
 from tests.workers.door.test_statements import dae, geometry
-from workers.assets.external.placement import list_files
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.formats import load_shape
 from workers.door.meshes.urdf import find_named, list_named, list_seen, load_posed

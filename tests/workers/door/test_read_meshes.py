@@ -14,6 +14,7 @@ import pytest
 import trimesh
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
+from workers.assets.external.reader import pack_asset, unpack_asset
 
 from schemas.job.assets import CATEGORIES, MeshLimits, ProceduralSource
 from schemas.scene.shape import Material, Part, Shape
@@ -32,7 +33,6 @@ from tests.workers.door.oracles import (
     write_all,
 )
 from workers.assets.builtin.make import make_asset
-from workers.assets.external.reader import pack_asset, unpack_asset
 from workers.assets.glb import asset_glb
 from workers.door.meshes.formats import list_mesh_files, load_shape
 from workers.door.meshes.gltf import split_glb

@@ -1,21 +1,22 @@
-"""Edge: the files of a folder that may be objects: found, read in limited processes, doubles and parts left out."""
+"""Edge: the files of a folder that may be objects: found, and read in limited processes, each once for ever."""
 
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from schemas.errors import AssetSourceError, MeshError, plain_line
-from schemas.job.assets import Assets, FolderSource, MeshLimits
-from services.init.copies import COPY, PART, Item, LeftOut, Reading, find_copies
-from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import read_measured
-from workers.assets.external.reader import Kind, Request, Task, ask_all
+from schemas.job.assets import MeshLimits
+from workers.assets.library.copies import LeftOut
+from workers.assets.library.placement import Measured, read_measured
+from workers.assets.library.reading import Question, ask, digest_of
+from workers.assets.library.table import UNKNOWN, SourceFile
 from workers.door.meshes.formats import FORMATS
 from workers.door.meshes.urdf import POSED
+from workers.pool import Answers
 
 SUFFIXES = (*POSED, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
@@ -31,9 +32,6 @@ _REMEDIES = {
 }
 FOREIGN: Mapping[str, str] = {suffix: remedy for remedy, suffixes in _REMEDIES.items() for suffix in suffixes.split()}
 """Other files that may hold objects, and what to do with them."""
-
-MOST_FILES = 100_000
-"""More files are no folder of meshes that a person looks at."""
 
 
 def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
@@ -67,8 +65,6 @@ def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
                 left_out.append(LeftOut(_relative(str(path), root), *why))
             else:
                 paths[path.resolve().relative_to(root).as_posix()] = None
-        if len(paths) + len(left_out) > MOST_FILES:
-            raise AssetSourceError(f"{name} has over {MOST_FILES} meshes: name a smaller folder")
     if not paths and not left_out:
         what = "is empty" if empty else f"has no mesh ({', '.join(SUFFIXES)})"
         raise AssetSourceError(f"{name} {what}: name a folder that has some")
@@ -101,50 +97,111 @@ def _relative(path: str, root: Path) -> str:
     return plain_line(os.path.relpath(path, root), 300)
 
 
-ANY_SIZE = MeshLimits(min_size_m=1e-12, max_size_m=1e12)
-"""Sizes are judged when the unit is known."""
-
-DONE: Mapping[Kind, str] = {"names": "models read", "list": "files listed", "measure": "meshes read"}
+DONE = "meshes read"
 """What progress says."""
 
 Watch = Callable[[str, int, int], None]
+"""Is told what is being done, and with how many of how many files."""
 
 
-def read_folder(folder: Path, paths: Sequence[str], watch: Watch, beside: Sequence[str] = ()) -> Reading:
-    """What every file is, by its path below the folder, in the order given; `folder` is resolved.
+def ignore(what: str, done: int, asked: int) -> None:
+    """A watch that says nothing."""
 
-    `beside`: meshes that are not read, of which others may be copies.
+
+@dataclass(frozen=True)
+class Survey:
+    """What a candidate is: its files, the meshes that it names, and its measures, or why it cannot be used."""
+
+    path: str
+    files: tuple[SourceFile, ...]
+    named: tuple[str, ...]
+    measured: Measured | None
+    refused: tuple[str, str] = ("", "")
+
+    @property
+    def digest(self) -> str:
+        """Of its files' bytes."""
+        return hashlib.sha256("".join(file.sha256 for file in self.files).encode()).hexdigest()
+
+
+def survey_folder(folder: Path, paths: Sequence[str], limits: MeshLimits, kept: Answers, watch: Watch) -> list[Survey]:
+    """What every candidate is, in the order given; `folder` is resolved. What `kept` has of unchanged files is not asked again.
+
+    Raises AssetSourceError where a file changes meanwhile.
     """
-    request = Request(FolderSource(source="files", folder=str(folder)), folder, Assets(limits=ANY_SIZE), ())
-
-    def ask(kind: Kind, entries: Mapping[str, Entry | None]) -> Iterator[tuple[str, bytes | MeshError]]:
-        tasks = tuple(Task(kind, folder / path, "", entry) for path, entry in entries.items())
-        answers = ask_all(replace(request, tasks=tasks), partial(watch, DONE[kind]))
-        return zip(entries, (answer for _, answer in answers), strict=True)
-
-    left_out, known = dict[str, LeftOut](), set(paths)
-    for posed, answer in ask("names", {path: None for path in paths if path.lower().endswith(tuple(POSED))}):
-        for part in known & set([] if isinstance(answer, MeshError) else json.loads(answer)):
-            left_out.setdefault(part, LeftOut(part, PART, f"part of {posed}"))
-    copies = find_copies(paths, [*paths, *beside])
-    left_out = {path: LeftOut(path, COPY, why) for path, why in copies.items()} | left_out
-    entries, items, refused = dict[str, Entry | None](), list[Item](), list[LeftOut]()
-    digests: dict[str, str] = {}
-    for path, answer in ask("list", {path: None for path in paths if path not in left_out}):
+    names = hashlib.sha256("\n".join(_all_files(folder)).encode()).hexdigest()[:16]
+    surveys = dict[str, Survey]()
+    for path in paths:
+        message = kept.get(_key(folder, path, limits))
+        if message is not None and (survey := _still_true(folder, path, json.loads(message), names)) is not None:
+            surveys[path] = survey
+    questions = [Question(folder, path, limits) for path in paths if path not in surveys]
+    for done, (question, answer) in enumerate(ask(questions, limits), 1):
+        path = question.path
         if isinstance(answer, MeshError):
-            refused.append(_refusal(path, folder, answer))
-        else:
-            files = tuple(SourceFile(*file) for file in json.loads(answer))
-            entries[path] = Entry("", files, "")
-            digests[path] = hashlib.sha256("".join(file.sha256 for file in files).encode()).hexdigest()
-    for path, answer in ask("measure", entries):
-        if isinstance(answer, MeshError):
-            refused.append(_refusal(path, folder, answer))
-        else:
-            items.append(Item(path, read_measured(answer), digests[path]))
-    return Reading(tuple(items), (*refused, *left_out.values()), frozenset(one.path for one in refused))
+            if answer.kind == "environmental":
+                raise AssetSourceError(answer.detail)
+            answer = json.dumps(
+                {"files": [], "named": [], "refused": [answer.reason, answer.detail, answer.kind]}
+            ).encode()
+        tree = json.loads(answer)
+        if "refused" in tree and tree["refused"][2] == "environmental":
+            raise AssetSourceError(tree["refused"][1])
+        surveys[path] = _survey(folder, path, tree)
+        kept.put(_key(folder, path, limits), json.dumps({**tree, "names": names}).encode())
+        watch(DONE, done, len(questions))
+    return [surveys[path] for path in paths]
 
 
-def _refusal(path: str, folder: Path, error: MeshError) -> LeftOut:
-    why = error.detail.replace(f"{folder}/", "").removeprefix(path).lstrip(": ")
-    return LeftOut(path, error.reason, plain_line(why, 1000))
+def _key(folder: Path, path: str, limits: MeshLimits) -> str:
+    return f"{folder}/{path} {limits.model_dump_json(exclude_defaults=True)}"
+
+
+def _still_true(folder: Path, path: str, tree: dict[str, Any], names: str) -> Survey | None:
+    """A kept survey whose files are as they were: by size and time or, where those moved, by their bytes.
+
+    One that misses a file is true as long as no file came or went.
+    """
+    survey = _survey(folder, path, tree)
+    notes = (survey.refused[1],) if survey.measured is None else survey.measured.notes
+    if not survey.files or (tree["names"] != names and any("missing" in note for note in notes)):
+        return None
+    files = []
+    for file in survey.files:
+        try:
+            stat = (folder / file.path).stat()
+            if stat.st_size != file.bytes:
+                return None
+            if stat.st_mtime_ns != file.mtime_ns and digest_of(folder / file.path) != file.sha256:
+                return None
+        except OSError:
+            return None
+        files.append(replace(file, mtime_ns=stat.st_mtime_ns))
+    return replace(survey, files=tuple(files))
+
+
+def _survey(folder: Path, path: str, tree: dict[str, Any]) -> Survey:
+    files = tuple(SourceFile(*file) for file in tree["files"])
+    if "refused" in tree:
+        reason, detail, _ = tree["refused"]
+        why = plain_line(detail.replace(f"{folder}/", "").removeprefix(path).lstrip(": "), 1000)
+        return Survey(path, files, (), None, (reason, why))
+    return Survey(path, files, tuple(tree["named"]), read_measured(tree["measured"]))
+
+
+def _all_files(folder: Path) -> list[str]:
+    return sorted(
+        os.path.relpath(os.path.join(parent, file), folder) for parent, _, files in os.walk(folder) for file in files
+    )
+
+
+def list_licences(folder: Path) -> list[Path]:
+    """The licence files below a folder."""
+    return sorted(path for path in folder.rglob("*") if path.stem.lower() in ("license", "licence", "copying"))
+
+
+def find_licence(path: Path, folder: Path, licences: Collection[Path]) -> str:
+    """The nearest licence file from the mesh's folder up to the source's."""
+    nearest = (file for parent in path.parents for file in licences if file.parent == parent)
+    file = next(nearest, None)
+    return UNKNOWN if file is None else f"see {file.relative_to(folder).as_posix()}"

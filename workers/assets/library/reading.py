@@ -7,7 +7,7 @@ import errno
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -159,7 +159,9 @@ def make_glb(question: Question, row: Row) -> bytes:
     asset = place_asset(loaded, row, question.limits)
     if row.category != TABLE:
         hull_vertices = check_body(asset.shape, path)
-        fits = find_upright(hull_vertices @ asset.T_source_to_object[:3, :3], asset.mass.com @ asset.T_source_to_object[:3, :3])
+        fits = find_upright(
+            hull_vertices @ asset.T_source_to_object[:3, :3], asset.mass.com @ asset.T_source_to_object[:3, :3]
+        )
     else:
         fits = None
     mass = asset.mass
@@ -274,9 +276,7 @@ def hash_files(paths: Iterable[Path], folder: Path) -> tuple[SourceFile, ...]:
     files = []
     for path in paths:
         stat = path.stat()
-        files.append(
-            SourceFile(path.relative_to(folder).as_posix(), stat.st_size, stat.st_mtime_ns, digest_of(path))
-        )
+        files.append(SourceFile(path.relative_to(folder).as_posix(), stat.st_size, stat.st_mtime_ns, digest_of(path)))
     return tuple(files)
 
 
@@ -291,7 +291,9 @@ def check_unchanged(folder: Path, files: Iterable[SourceFile]) -> None:
     for file in files:
         stat = (folder / file.path).stat()
         if (stat.st_size, stat.st_mtime_ns) != (file.bytes, file.mtime_ns):
-            raise environmental("changed", f"{folder / file.path} changes while it is read: start again when nobody writes")
+            raise environmental(
+                "changed", f"{folder / file.path} changes while it is read: start again when nobody writes"
+            )
 
 
 def environmental(reason: str, detail: str) -> MeshError:

@@ -6,6 +6,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -98,15 +99,16 @@ MOST_LETTERS = 150
 
 SHAPENET_LICENCE = "ShapeNet terms of use: non-commercial research"
 
-_FILE = pa.struct(
-    [("path", pa.string()), ("bytes", pa.int64()), ("mtime_ns", pa.int64()), ("sha256", pa.string())]
-)
+_FILE = pa.struct([("path", pa.string()), ("bytes", pa.int64()), ("mtime_ns", pa.int64()), ("sha256", pa.string())])
 _KINDS = {str: pa.string(), bool: pa.bool_(), float: pa.float64(), int: pa.int64()}
 _TYPES = {
-    **dict.fromkeys("path sha256 licence category up reason why guessed shape_up glb glb_sha256".split(), pa.string()),
-    **dict.fromkeys("use watertight sure".split(), pa.bool_()),
-    **dict.fromkeys("unit scale mass_kg volume_m3".split(), pa.float64()),
-    **dict.fromkeys("faces pictures parts glb_bytes picture".split(), pa.int64()),
+    **dict.fromkeys(
+        ["path", "sha256", "licence", "category", "up", "reason", "why", "guessed", "shape_up", "glb", "glb_sha256"],
+        pa.string(),
+    ),
+    **dict.fromkeys(["use", "watertight", "sure"], pa.bool_()),
+    **dict.fromkeys(["unit", "scale", "mass_kg", "volume_m3"], pa.float64()),
+    **dict.fromkeys(["faces", "pictures", "parts", "glb_bytes", "picture"], pa.int64()),
     "extents_m": pa.list_(pa.float64()),
     "mended": pa.list_(pa.string()),
     "files": pa.list_(_FILE),
@@ -158,7 +160,7 @@ class Library:
         return {row.path: str(row.shape_up) for row in self.rows if row.use and row.sure and row.shape_up != row.up}
 
     @property
-    def licences(self) -> Mapping[str, int]:
+    def licences(self) -> Counter[str]:
         """How many shapes that may be used have a licence."""
         return Counter(row.licence for row in self.rows if row.use and row.category)
 
@@ -179,7 +181,11 @@ EXAMPLES = 3
 
 def write_table(library: Library) -> None:
     """Writes the table, whole or not at all. Raises OutputError where it cannot be written."""
-    about = {"version": VERSION, "folder": str(library.source), "limits": library.limits.model_dump(exclude_defaults=True)}
+    about = {
+        "version": VERSION,
+        "folder": str(library.source),
+        "limits": library.limits.model_dump(exclude_defaults=True),
+    }
     text = json.dumps(about, sort_keys=True)
     columns = {name: [getattr(row, name) for row in library.rows] for name in _TYPES if name != "files"}
     columns["files"] = [[vars(file) for file in row.files] for row in library.rows]
@@ -198,10 +204,8 @@ def write_whole(path: Path, data: bytes) -> None:
         part.write_bytes(data)
         part.replace(path)
     except OSError as error:
-        try:
+        with suppress(OSError):
             part.unlink(missing_ok=True)
-        except OSError:
-            pass
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
@@ -222,7 +226,9 @@ def read_table(folder: Path) -> Library:
         told = plain_line(str(error).splitlines()[0] if str(error) else repr(error), 200)
         raise AssetSourceError(f"{name} is no table of a library: {told}; `verso init` makes it again") from error
     if version != VERSION:
-        raise AssetSourceError(f"{name} is of version {version!r:.20}, and this program reads {VERSION}: `verso init` again")
+        raise AssetSourceError(
+            f"{name} is of version {version!r:.20}, and this program reads {VERSION}: `verso init` again"
+        )
     try:
         limits = MeshLimits.model_validate(about["limits"])
         made = tuple(_row(row) for row in rows)
