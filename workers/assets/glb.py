@@ -224,7 +224,7 @@ def read_shape(data: bytes) -> tuple[Shape, dict[str, Any]]:
 
 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_TYPES = {_FLOAT: np.dtype("<f4"), _USHORT: np.dtype("<u2"), _UINT: np.dtype("<u4")}
+_TYPES: dict[int, np.dtype[Any]] = {_FLOAT: np.dtype("<f4"), _USHORT: np.dtype("<u2"), _UINT: np.dtype("<u4")}
 
 
 def _read_part(

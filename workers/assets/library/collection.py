@@ -129,7 +129,7 @@ def survey_folder(folder: Path, paths: Sequence[str], limits: MeshLimits, kept: 
 
     Raises AssetSourceError where a file changes meanwhile.
     """
-    names = hashlib.sha256("\n".join(_all_files(folder)).encode()).hexdigest()[:16]
+    names = hashlib.sha256("\n".join(_all_files(folder)).encode(errors="surrogateescape")).hexdigest()[:16]
     surveys = dict[str, Survey]()
     for path in paths:
         message = kept.get(_key(folder, path, limits))

@@ -8,7 +8,6 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from workers.door.meshes.mesh import LoadedMesh, transform_shape
 from workers.door.meshes.urdf import POSED, list_named, list_seen, load_posed
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
-from workers.pool import Ended, Limits, run_pool
+from workers.pool import Ended, Limits, Pool
 
 UP_AXES: Mapping[str, Array] = {
     "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
@@ -69,8 +68,8 @@ def ask(questions: Iterable[Question], limits: MeshLimits) -> Iterator[tuple[Que
     Raises MachineError where no process can be started, or one was killed from outside.
     """
     bounds = Limits(memory_mb=limits.max_memory_mb, cpu_s=limits.max_cpu_s)
-    with closing(run_pool(answer, questions, limits=bounds, batch=BATCH)) as answers:
-        for question, message in answers:
+    with Pool(answer, limits=bounds, batch=BATCH) as pool:
+        for question, message in pool.run(questions):
             if isinstance(message, Ended):
                 yield question, _refuse_end(message, question)
             elif message.startswith(REFUSAL):
@@ -116,11 +115,11 @@ def answer(question: Question) -> bytes:
             raise MemoryError from error
         refusal = MeshError("unreadable", f"{path} cannot be read: {describe_error(error)}")
     detail = refusal.detail if path.name in refusal.detail else f"{path}: {refusal.detail}"
-    error = MeshError(refusal.reason, detail)
-    error.kind = refusal.kind
+    named = MeshError(refusal.reason, detail)
+    named.kind = refusal.kind
     if question.row is not None:
-        return describe_refusal(error)
-    reason = [error.reason, one_line(error.detail), error.kind]
+        return describe_refusal(named)
+    reason = [named.reason, one_line(named.detail), named.kind]
     return json.dumps({"files": _stat_of(path, question.folder), "named": [], "refused": reason}).encode()
 
 
@@ -140,8 +139,8 @@ def survey(question: Question) -> bytes:
     files = hash_files(list_files(folder, path, limits), folder)
     loaded = load_file(folder, path, limits)
     hull_vertices = check_body(loaded.shape, path)
-    mass, common = weigh(loaded.shape, 1.0, 1.0)
-    notes = tuple(one_line(note) for note in [*_note_shared(common), *loaded.notes][:MOST_NOTES])
+    mass, _ = weigh(loaded.shape, 1.0, 1.0)
+    notes = tuple(one_line(note) for note in loaded.notes[:MOST_NOTES])
     measured = measure_shape(loaded.shape, mass, hull_vertices, notes, path)
     check_unchanged(folder, files)
     answer = {"files": [list(vars(file).values()) for file in files], "named": named, "measured": asdict(measured)}
@@ -225,7 +224,7 @@ def _note_shared(common_m3: float | None) -> list[str]:
     """What to say of the volume that bodies share (`weigh`)."""
     if common_m3 is None:
         return ["bodies weigh twice what they share, if anything: they are too many to look for it"]
-    return ["bodies overlap: what they share weighs once"] if common_m3 else []
+    return [f"bodies overlap: {1e6 * common_m3:.3g} cm^3 that they share weigh once"] if common_m3 else []
 
 
 def _check_size(name: str, diagonal_m: float, limits: MeshLimits) -> None:
