@@ -114,7 +114,6 @@ WRONG = (
     (("good", "--out", "file/lib"), "cannot be written"),
     (("good", "--limit", "max_fases=3"), "--limit max_fases: write NAME=VALUE: max_file_mb, max_vertices"),
     (("good", "--limit", "max_faces=x"), "--limit max_faces: write NAME=VALUE: Input should be"),
-    (("good", "--unit", "0"), "is no unit: write metres"),
     (("good", "--licence", " "), "--licence: write some words"),
 )
 

@@ -176,7 +176,7 @@ def test_a_library_without_its_source_is_used_and_a_shape_that_is_gone_or_change
         assert "\n" not in str(refusal.value)
 
 
-NONSENSE = (
+NONSENSE: tuple[tuple[dict[str, object], str], ...] = (
     ({"up": "w"}, "a.obj: up 'w': must be x, y or z"),
     ({"unit": -1.0}, "unit -1.0: must be a positive number"),
     ({"unit": float("nan")}, "must be a positive number"),

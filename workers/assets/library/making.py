@@ -277,9 +277,12 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
     known = [survey for survey in surveys if survey.path not in left_out]
     items = [Item(s.path, s.measured, s.digest) for s in known if s.measured is not None]
     of = {path: group for group in guess_groups(items) for path in group.paths}
-    doubles = {
-        one.path: one for one in find_doubles(items, lambda item: of[item.path].unit(item) * item.diagonal, SUFFIXES)
-    }
+
+    def size_m(item: Item) -> float:
+        return (making.unit or of[item.path].unit(item)) * item.diagonal
+
+    fit = [item for item in items if SMALLEST_M <= size_m(item) <= LARGEST_M]
+    doubles = {one.path: one for one in find_doubles(fit, size_m, SUFFIXES)}
     different = [item for item in items if item.path not in doubles]
     of = {path: group for group in guess_groups(different) for path in group.paths}
     ups = guess_ups(different)
