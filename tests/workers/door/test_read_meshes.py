@@ -32,7 +32,7 @@ from tests.workers.door.oracles import (
     write_all,
 )
 from workers.assets.builtin.make import make_asset
-from workers.assets.glb import asset_glb
+from workers.assets.glb import asset_glb, read_shape
 from workers.door.meshes.formats import list_mesh_files, load_shape
 from workers.door.meshes.gltf import split_glb
 from workers.door.meshes.mesh import is_solid
