@@ -97,7 +97,7 @@ FREE: Mapping[str, str] = {
     "verso name seed scenes first_scene preset": "says which scenes",
     "run output check": "costs no setting of a scene anything, or is not measured",
     "pairs_per_scene objects_per_scene categories": "what is in a scene: twice as much takes about twice as long",
-    "assets.objects assets.tables assets.split assets.limits assets.shell_kg_m2": "which shapes",
+    "assets.objects assets.tables assets.split assets.shell_kg_m2": "which shapes",
     "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m": "where things begin",
     "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
     "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
