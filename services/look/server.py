@@ -125,8 +125,9 @@ def _cookies(header: str, name: str) -> list[str]:
 MOST_REQUESTS = 64
 """Connections that are answered at once; more are closed."""
 
-STALLED_S = 20.0
-"""A connection on which nothing comes for so long is closed."""
+STALLED_S, ANSWER_S = 20.0, 120.0
+"""A connection whose request has not come whole in so long is closed, however it trickles; and so is one that takes its answer
+for so long."""
 
 STATIC = {
     "/page.css": "text/css",
@@ -260,12 +261,30 @@ class _Handler(BaseHTTPRequestHandler):
 
     def handle_one_request(self) -> None:
         """Reads one request and answers it, whatever its method."""
-        self.raw_requestline = self.rfile.readline(65_537)
-        if not self.raw_requestline or len(self.raw_requestline) > 65_536:
-            self.close_connection = True
-            return
-        if self.parse_request():
-            self._answer()
+        with self._hangs_up_after(STALLED_S):
+            self.raw_requestline = self.rfile.readline(65_537)
+            if not self.raw_requestline or len(self.raw_requestline) > 65_536:
+                self.close_connection = True
+                return
+            is_request = self.parse_request()
+        if is_request:
+            with self._hangs_up_after(ANSWER_S):
+                self._answer()
+
+    @contextlib.contextmanager
+    def _hangs_up_after(self, seconds: float) -> Iterator[None]:
+        """Closes the connection if the block takes longer: a limit of each read would begin anew with each byte."""
+        timer = threading.Timer(seconds, self._hang_up)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+
+    def _hang_up(self) -> None:
+        with contextlib.suppress(OSError):  # it is closed already
+            self.connection.shutdown(socket.SHUT_RDWR)
 
     def _answer(self) -> None:
         try:

@@ -344,6 +344,26 @@ def test_a_taken_port_is_told_connections_beyond_the_most_are_closed_and_stalled
         assert ask(place.port, "/page.css")[0].status == 200
 
 
+def test_a_connection_that_trickles_its_request_is_closed_at_the_deadline_of_the_request(follower, monkeypatch):
+    monkeypatch.setattr(server, "STALLED_S", 1.0)
+    monkeypatch.setattr(server, "MOST_REQUESTS", 1)
+    begun = time.monotonic()
+    with serving(follower, Place("127.0.0.1", 0, None)) as place:
+        with socket.create_connection(("127.0.0.1", place.port), 20) as link:
+            link.settimeout(0.1)
+            while time.monotonic() < begun + 30.0:
+                try:
+                    link.sendall(b"G")
+                    if link.recv(1) == b"":
+                        break
+                except TimeoutError:
+                    continue
+                except OSError:
+                    break
+        assert 0.9 < time.monotonic() - begun < 20.0
+        assert ask(place.port, "/page.css")[0].status == 200
+
+
 @pytest.mark.minute
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_says_where_it_listens_and_ends_at_a_signal(shown, number):
