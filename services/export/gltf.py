@@ -14,7 +14,7 @@ from services.export.formats import Added, Writer
 from services.export.source import OPENGL_FROM_OPTICAL, ExportScene
 from services.read.scene_geometry import Sources, pose_shapes
 from workers.assets.glb import join_glb
-from workers.door.meshes.gltf import split_glb
+from workers.door.opening import split_glb
 
 NO_SOURCES = "the sources of the shapes are not here, or have changed"
 

@@ -172,7 +172,9 @@ def read_shape(path: Path) -> Mesh | Array:
         points = _read_points(path, data)
     elif suffix == ".ply" and not count_ply(data)[1]:
         with as_refusal(path.name):
-            vertices = parse_ply(data)["vertex"]
+            vertices = parse_ply(data).get("vertex", {})
+            if not {*"xyz"} <= vertices.keys():
+                raise InputError(f"{path.name} has no vertices with x, y and z")
             points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
     else:
         return load_shape(path, LIMITS).shape.mesh

@@ -21,7 +21,7 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Array
 from schemas.scene.shape import Asset, Material, Part, Shape
-from workers.door.meshes.gltf import split_glb
+from workers.door.opening import split_glb
 from workers.geometry.colour import attribute_colors, decode_srgb, encode_srgb
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125

@@ -4,13 +4,15 @@ A refusal is made by a `Refuse`, from a short stable word and a sentence: `refus
 command line, the class MeshError or CaptureError where it is one item of many.
 """
 
+import json
 import os
 import re
 import stat
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from schemas.errors import InputError, VersoError, plain_line
 
@@ -103,3 +105,22 @@ def describe_error(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return plain_line(_ADDRESS.sub("", repr(error)), 200)
+
+
+_HEADER = struct.Struct("<4sIII4s")
+"""Magic, version and length of the file; length and kind of its first chunk."""
+
+
+def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON tree of a binary glTF file, and the bytes of its buffer, with up to 3 that fill it up.
+
+    Raises struct.error or ValueError where it is none.
+    """
+    magic, version, _, length, kind = _HEADER.unpack_from(data)
+    if magic == b"glTF" and version != 2:
+        raise ValueError(f"binary glTF of version {version}: only 2 is read")
+    if magic != b"glTF" or kind != b"JSON":
+        raise ValueError("no glTF header")
+    text = data[_HEADER.size : _HEADER.size + length]
+    tree: dict[str, Any] = json.loads(text.rstrip(b"\0"))  # some exporters fill up with NUL
+    return tree, data[_HEADER.size + length + 8 :]

@@ -34,9 +34,9 @@ from tests.workers.door.oracles import (
 from workers.assets.builtin.make import make_asset
 from workers.assets.glb import asset_glb, read_shape
 from workers.door.meshes.formats import list_mesh_files, load_shape
-from workers.door.meshes.gltf import split_glb
 from workers.door.meshes.mesh import is_solid
 from workers.door.meshes.urdf import load_posed
+from workers.door.opening import split_glb
 
 NORMALS = "not drawn: normalTexture"
 """The note on the map of the glTF cube that nothing reads."""

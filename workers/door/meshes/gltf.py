@@ -26,6 +26,7 @@ from schemas.errors import MeshError
 from workers.door.meshes.caps import LONGEST_NAME, FolderResolver, check_counts, check_nodes, unreadable
 from workers.door.meshes.gltf_materials import Materials, image_of, read_references
 from workers.door.meshes.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, cut_strip
+from workers.door.opening import split_glb
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import rotation_from_quaternion
 
@@ -38,8 +39,6 @@ _REQUIRED = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_texture_basi
 _HARMLESS = ("KHR_materials_", "EXT_texture_", "MSFT_texture_", "KHR_xmp", "KHR_animation_")
 """Beginnings of names of extensions that leave the shape as it is."""
 
-_HEADER = struct.Struct("<4sIII4s")
-"""Magic, version and length of a binary file; length and kind of its first chunk."""
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -83,21 +82,6 @@ def _parse(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
     if not str(tree["asset"].get("version", "")).startswith("2"):
         raise ValueError(f"glTF version {tree['asset'].get('version')!r:.20}: only 2.x is read")
     return tree, binary
-
-
-def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The JSON tree of a binary glTF file, and the bytes of its buffer, with up to 3 that fill it up.
-
-    Raises struct.error or ValueError where it is none.
-    """
-    magic, version, _, length, kind = _HEADER.unpack_from(data)
-    if magic == b"glTF" and version != 2:
-        raise ValueError(f"binary glTF of version {version}: only 2 is read")
-    if magic != b"glTF" or kind != b"JSON":
-        raise ValueError("no glTF header")
-    text = data[_HEADER.size : _HEADER.size + length]
-    tree: dict[str, Any] = json.loads(text.rstrip(b"\0"))  # some exporters fill up with NUL
-    return tree, data[_HEADER.size + length + 8 :]
 
 
 def _refuse_extensions(path: Path, tree: dict[str, Any]) -> None:
