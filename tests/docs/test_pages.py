@@ -37,7 +37,7 @@ from workers.capture.simulate.simulate import simulate_capture
 from workers.scene.chance import SceneChance
 
 ROOT = Path(__file__).resolve().parents[2]
-DIGEST = "724b3dddcac8b293848aa243cc456f058255ce99e4018df878151f3ca5da96e3"
+DIGEST = "b303d85c6dfab8bd410e5279ff917e5084a55b4b35abd3c06585001e9a88c3d0"
 FIRST = "./verso run deploy/jobs/tabletop.yaml"
 
 ELSEWHERE = {
