@@ -22,12 +22,13 @@ from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
-from services.run.joining import EnterShard, Pattern
+from services.run.joining import Pattern
 from services.run.machine import Process, send
 from services.run.metrics import Tally
 from services.run.progress import log_event, say
 from services.run.ray_cluster import Slots
 from services.run.watchdog import AttemptName, Sight, end_worker_here, find_own_workers, scenes_in_progress, watch
+from services.run.worker_entry import enter_shard
 from workers.store.attempt import TIMED_OUT, attempts_at, blamed_scene, host_part, retry_of_attempt, sweep_attempt
 from workers.store.commit import read_record
 from workers.store.ledger import read_summary
@@ -148,11 +149,11 @@ class Limits:
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
-def _shard_task(enter: EnterShard, env_vars: dict[str, str], num_gpus: float) -> Any:
+def _shard_task(env_vars: dict[str, str], num_gpus: float) -> Any:
     """The task that makes a shard, as Ray's remote function; a new one asks for workers of its own."""
     # Ray would end a process after each task with a GPU, unless max_calls is given
     on_gpu: dict[str, Any] = {"num_gpus": num_gpus, "max_calls": 0} if num_gpus else {}
-    task = ray.remote(num_cpus=1, max_retries=0, **on_gpu)(enter)
+    task = ray.remote(num_cpus=1, max_retries=0, **on_gpu)(enter_shard)
     return task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
 
 
@@ -164,8 +165,8 @@ class Coordinator:
         self._order = pattern.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
         self._terms = pattern.terms
         self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
-        self._enter, self._env_vars = pattern.enter, dict(pattern.env_vars)
-        self._task = _shard_task(self._enter, self._env_vars, limits.num_gpus)
+        self._env_vars = dict(pattern.env_vars)
+        self._task = _shard_task(self._env_vars, limits.num_gpus)
         self._limits = limits
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()
@@ -267,7 +268,7 @@ class Coordinator:
         log_event("nodes lost", logging.WARNING, hosts=sorted(hosts))
         say(f"lost {', '.join(sorted(hosts))}: what was in progress there is made again elsewhere")
         # A task shares its requests for workers, and some of these wait for lost hosts.
-        self._task = _shard_task(self._enter, self._env_vars, self._limits.num_gpus)
+        self._task = _shard_task(self._env_vars, self._limits.num_gpus)
         for ref, spans in list(self._running.items()):
             had = hosts_of(self._store, self._order.label, spans)
             if had and not had <= hosts:

@@ -7,7 +7,7 @@ that a processor that cannot have it is told instead of crashed.
 import os
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 
 import ray
@@ -16,17 +16,14 @@ from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from schemas.dataset.layout import FINGERPRINT_FILE, LOCK_FILE
-from schemas.dataset.shard import ShardOrder, ShardReport
+from schemas.dataset.shard import ShardOrder
 from services.run import worker_entry
 from services.run.lock import Lock
 from services.run.progress import say
-from services.run.worker_entry import WorkerTerms, enter_shard, refusal_of, worker_environment
+from services.run.worker_entry import WorkerTerms, refusal_of, worker_environment
 from workers.assets.catalogue import Catalogue
 from workers.source import code_digest
 from workers.store.store import Store
-
-EnterShard = Callable[[WorkerTerms, bytes, bytes], ShardReport]
-"""Makes the shard of a pickled order with a pickled catalogue, in a worker."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,6 @@ class Pattern:
     catalogue: Catalogue
     terms: WorkerTerms
     env_vars: Mapping[str, str] = field(default_factory=dict)
-    enter: EnterShard = enter_shard
-    """What a worker is given to do; simulations give something else."""
 
 
 ANSWER_S = 60.0

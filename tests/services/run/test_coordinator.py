@@ -94,7 +94,7 @@ def handed_out(monkeypatch, tmp_path):
             return name
 
     monkeypatch.setattr(module.ray, "put", lambda value: "catalogue")
-    monkeypatch.setattr(module, "_shard_task", lambda enter, env_vars, num_gpus: Task)
+    monkeypatch.setattr(module, "_shard_task", lambda env_vars, num_gpus: Task)
     order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
     pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
     slots = [1]
