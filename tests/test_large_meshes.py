@@ -10,6 +10,7 @@ import trimesh
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part, Shape
 from tests.kit.shapes import asset_of
+from tests.workers.assets.libraries import library_of
 from workers.assets.builtin.solid import circle, lathe
 from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb
@@ -49,7 +50,7 @@ def test_a_mesh_of_two_million_faces_makes_a_scene_within_the_time_that_a_scene_
     part = fine_egg()
     assert len(part.faces) > 2_000_000
     volume = write_part(part, tmp_path / f"egg.{suffix}")
-    source = {"source": "urdf", "folder": ".", "category_map": {"egg.*": "mug"}}
+    source = library_of(tmp_path)
     job = Job.model_validate({"name": "t", "categories": ["mug"], "assets": {"objects": [source]}})
     catalogue = open_catalogue(job.assets, tmp_path, ("mug",))
     stopwatch = Stopwatch()

@@ -113,7 +113,11 @@ class Answers:
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one item: address space and size of files in MiB, processor time and time by the clock in seconds. None: no limit."""
+    """Limits of one item; None: no limit.
+
+    Memory is MiB of address space beyond that of a child that has begun, and of each file. Times are processor seconds and
+    seconds by the clock.
+    """
 
     memory_mb: int | None = None
     cpu_s: float | None = None
@@ -436,6 +440,9 @@ def _set_limits(limits: Limits, quiet: bool) -> None:
         for standard in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), standard)
     if limits.memory_mb is not None:
-        for limit in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE):
-            resource.setrlimit(limit, (limits.memory_mb << 20, limits.memory_mb << 20))
+        most = limits.memory_mb << 20
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+        with open("/proc/self/statm") as pages:  # what was loaded before the item is not the item's
+            most += int(pages.read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -74,7 +74,7 @@ class Column:
 _SHARED = {
     "category": "What the object is: mug, can, ...; in `scenes` and `views` the first object.",
     "instance": "Which shape of its category it is: the key of `assets`; in `scenes` the first object.",
-    "source": "Kind of source of the shape: procedural, shapenet, urdf, or of a capture.",
+    "source": "Kind of source of the shape: procedural, library, or of a capture.",
     "scene_id": "The scene, or the capture; ids count from the job's first_scene.",
     "pose_id": "The view's pose: even of input, aligned and projected views, odd of mirror views.",
     "role": "Which view of its pair: input, aligned (the depth camera), mirror, or projected.",

@@ -5,32 +5,12 @@ import math
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight
+from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Weight
 from schemas.errors import did_you_mean
-
-
-def matches(path: str, pattern: str) -> bool:
-    """Whether `Path.glob(pattern)` finds the file of this path, both relative with `/` between; `**`: any folders, or none.
-
-    A `**` at the end finds no file, as in Python 3.11 and 3.12.
-    """
-    *folders, file = path.split("/")
-    *wanted, name = [part for part in pattern.split("/") if part not in ("", ".")] or ["**"]
-    if name == "**" or not fnmatchcase(file, name):  # `**` alone finds folders
-        return False
-    reached = {0}
-    for part in wanted:
-        if part == "**":
-            reached = {place for start in reached for place in range(start, len(folders) + 1)}
-        else:
-            reached = {place + 1 for place in reached if place < len(folders) and fnmatchcase(folders[place], part)}
-    return len(folders) in reached
-
 
 TABLE = "table"
 """The category of tables, in `category_map` and in the tables of a dataset."""
@@ -76,9 +56,6 @@ TABLE_KINDS: tuple[str, ...] = get_args(TableKind)
 
 CATEGORIES = tuple(name for name in BUILT_IN if name not in TABLE_KINDS)
 """The built-in categories of objects; the first eight are the article's."""
-
-IN_SHAPENET = tuple(name for name in CATEGORIES if BUILT_IN[name].synset)
-"""Those of them that ShapeNetCore has."""
 
 VERSION = 2
 """Version of the built-in shapes, part of a catalogue's digest: raise it with every change to a vertex or colour."""
@@ -129,22 +106,19 @@ def _of_objects(name: str) -> str:
 CategoryName = Annotated[str, Field(max_length=1000), AfterValidator(_of_objects)]
 """A category of objects: any name that can be a folder's."""
 
-MappedName = Annotated[str, Field(max_length=1000), AfterValidator(_usable)]
-"""The same, or `table`."""
+
+def is_usable(name: str) -> bool:
+    """Whether a category may have this name."""
+    try:
+        _usable(name)
+    except ValueError:
+        return False
+    return True
 
 
 def offered_by(sources: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
-    """The categories that sources of objects offer by their keys as a job file has them, the built-in ones first.
-
-    Nothing of a source of files without a `category_map`. What is malformed is skipped: it is refused elsewhere.
-    """
-    names: dict[str, None] = {}
-    for source in sources:
-        kind, mapped = source.get("source"), source.get("category_map")
-        names |= dict.fromkeys({"procedural": CATEGORIES, "shapenet": IN_SHAPENET}.get(str(kind), ()))
-        if kind in (FILES, FORMER) and isinstance(mapped, dict):
-            names |= dict.fromkeys(name for name in mapped.values() if isinstance(name, str) and name != TABLE)
-    return tuple(names)
+    """The categories that sources of objects are known to offer by their keys alone: those of built-in shapes, or none."""
+    return CATEGORIES if any(source.get("source") == "procedural" for source in sources) else ()
 
 
 def with_categories(tree: dict[str, Any]) -> dict[str, Any]:
@@ -168,8 +142,8 @@ def describe_unknown(names: Iterable[str], offered: Sequence[str]) -> str:
     for name in names:
         if name not in known:
             return (
-                f"categories.{name}: no source offers it; {did_you_mean(name, known)}offered: {', '.join(some)}. A source of "
-                "files offers what its category_map names"
+                f"categories.{name}: no source offers it; {did_you_mean(name, known)}offered: {', '.join(some)}. A library "
+                "offers what its table names"
             )
     return ""
 
@@ -201,74 +175,23 @@ class ProceduralSource(Frozen):
         return self.kind if category == TABLE else category
 
 
-class ShapeNetSource(Frozen):
-    """A folder with the user's own copy of ShapeNetCore, version 1 or 2."""
+class LibrarySource(Frozen):
+    """A library of shapes that `verso init` made, or a folder of which a run makes one in the user's cache."""
 
-    source: Literal["shapenet"]
+    source: Literal["library"]
     """Which kind of source this is."""
     weight: Weight = 1.0
     """Share among the sources that offer a scene's category."""
     folder: Folder
-    """Folder of the synset folders (02876657, ...), relative to the job file."""
-    scale: Positive | None = None
-    """Multiplies the normalised units; default 0.25 for objects and 1.5 for tables, as in the article."""
-    licence: Text = "ShapeNet terms of use: non-commercial research"
-    """Licence of these shapes, for the `assets` table."""
-    copy_assets: bool = False
-    """Whether the cleaned shapes may be written into the dataset."""
-
-
-FILES, FORMER = "files", "urdf"
-"""The kind of a source that is a folder, and its former name, which means the same."""
-
-
-class FolderSource(Frozen):
-    """A folder of meshes and of URDFs, with a map from file patterns to categories."""
-
-    source: Literal["files", "urdf"]
-    """Which kind of source this is."""
-    weight: Weight = 1.0
-    """Share among the sources that offer a scene's category."""
-    folder: Folder
-    """A folder relative to the job file, or `pybullet_data` for the meshes inside that package."""
-    category_map: dict[Folder, MappedName] = Field(default_factory=dict)
-    """Category, or `table`, by file pattern (glob relative to `folder`); the first match wins. Empty: the map for
-    `pybullet_data`."""
-    up: UpAxis | dict[Folder, UpAxis] = "z"
-    """Which axis of the files points up: one for all, or a map from file patterns, such as `{"*.glb": y}`; the first match
-    wins, else z."""
-    scale: Positive = 1.0
-    """Multiplies the source's coordinates: 0.001 for millimetres."""
+    """A library, or a folder of meshes, URDFs or ShapeNetCore models, relative to the job file; `pybullet_data`: the meshes
+    inside that package."""
     diagonal_m: Positive | None = None
-    """Bounding-box diagonal that every object is resized to."""
-    licence: Text = "unknown"
-    """Licence of these shapes, for the `assets` table."""
+    """Bounding-box diagonal that every object is resized to; without it each keeps its own size."""
     copy_assets: bool = False
-    """Whether the cleaned shapes may be written into the dataset."""
-
-    @field_validator("source")
-    @classmethod
-    def _renamed(cls, value: str) -> str:
-        return FILES
-
-    @field_validator("up", mode="before")
-    @classmethod
-    def _names_axes(cls, value: object) -> object:
-        axes = value.values() if isinstance(value, dict) else (value,)
-        if not all(isinstance(axis, str) and axis in ("x", "y", "z") for axis in axes) or value == {}:
-            raise ValueError(
-                'must be x, y or z, or a map from file patterns to them, such as {"*.glb": y, "**/*.obj": z}'
-            )
-        return value
-
-    def up_of(self, path: str) -> UpAxis:
-        """Which axis of a file points up; `path` is relative to the folder."""
-        if isinstance(self.up, str):
-            return self.up
-        return next((axis for pattern, axis in self.up.items() if matches(path, pattern)), "z")
+    """Whether the shapes may be written into the dataset."""
 
 
-Source = Annotated[ProceduralSource | ShapeNetSource | FolderSource, Field(discriminator="source")]
+Source = Annotated[ProceduralSource | LibrarySource, Field(discriminator="source")]
 
 
 class SplitShares(Frozen):
@@ -290,7 +213,7 @@ class SplitShares(Frozen):
 
 
 class MeshLimits(Frozen):
-    """Caps on meshes from outside: one that is over a cap is left out and counted."""
+    """Caps on meshes from outside, which `verso init --limit` changes: one that is over a cap is left out and counted."""
 
     max_file_mb: Positive = 256.0
     """Largest mesh file, MB."""
@@ -325,8 +248,6 @@ class Assets(Frozen):
     """Sources of tables."""
     split: SplitShares = SplitShares()
     """Shares of instances in train, val and test."""
-    limits: MeshLimits = MeshLimits()
-    """Caps on meshes from outside."""
     density_kg_m3: Positive = 600.0
     """Density of a watertight solid."""
     shell_kg_m2: Positive = 3.0

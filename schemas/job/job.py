@@ -214,8 +214,8 @@ class Job(Frozen):
     @model_validator(mode="after")
     def _offers_categories(self) -> "Job":
         sources = [source.model_dump() for source in self.assets.objects]
-        mapped = all(source.get("category_map", True) for source in sources)  # else known where files are listed
-        if mapped and (unknown := describe_unknown(self.categories, offered_by(sources))):
+        built_in = all(source["source"] == "procedural" for source in sources)  # else known where a library is opened
+        if built_in and (unknown := describe_unknown(self.categories, offered_by(sources))):
             raise ValueError(unknown)
         return self
 

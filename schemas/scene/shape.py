@@ -173,7 +173,7 @@ class MassProperties:
 class Asset:
     """A shape ready for a scene: cleaned, metric, in the object frame (dataset.md section 1).
 
-    `source`: `procedural`, `shapenet` or `files`; `path`: the file within that source or None; `sha256`: digest of the
+    `source`: `procedural` or `library`; `path`: the file within that source or None; `sha256`: digest of the
     source file, or of the generated arrays. `T_source_to_object` takes the source's coordinates, multiplied by `scale`, to
     the object frame. `shareable`: whether the cleaned mesh may be written into the dataset. `volume_m3` is None where the
     mesh is not watertight. `notes`: what was repaired or left out. `lofted`: the lofts that the shape is the union of, where

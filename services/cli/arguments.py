@@ -74,6 +74,11 @@ read_priority = reader(
 read_job_id = reader(
     JOB_ID, ": an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
 )
+read_unit = reader(
+    r"\d{1,9}(?:\.\d{1,12})?(?:e-?\d)?",
+    " is no unit: write metres, such as 0.001 for millimetres",
+    lambda match: float(match[0]) or None,
+)
 read_host = reader(
     rf"{HOST}|[0-9a-fA-F:.]{{2,45}}",
     ": write a name or an address without a port, such as 127.0.0.1 or 0.0.0.0",

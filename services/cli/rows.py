@@ -249,16 +249,30 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
 
 COMMANDS: Final[dict[str, Command]] = {
     "init": command(
-        "write a job file for a folder of your own meshes, with pictures of what was read",
-        "~/my_meshes --out my_meshes.yaml",
+        "make a library of a folder of your own meshes: clean metric shapes, a table, pictures, and the job that uses it",
+        "~/my_meshes --out my_library",
         path("folder", "FOLDER"),
-        path("--out", "JOB.yaml", "default: the folder's name, here; never overwritten"),
-        path("--sheet", "FILE", "the pictures, .jpg or .png (default: beside the job)"),
+        path(
+            "--out",
+            "LIBRARY",
+            "default: the folder's name with _library, here; one that is there is brought up to date",
+        ),
         option(
             "--category-from",
             "folder|parent|file|NAME",
             "name categories after the first folder that not all share, the folder that a file lies in, or the file without "
             "its number, or call all NAME (default: the folder that holds one object or several of a kind)",
+        ),
+        option(
+            "--unit",
+            "METRES",
+            "of all files, such as 0.001 for millimetres (default: a guess)",
+            read.read_unit,
+        ),
+        choice("--up", ("x", "y", "z"), "the axis that points up in all files (default: a guess)"),
+        option("--licence", "TEXT", "of the shapes (default: the nearest licence file)"),
+        option(
+            "--limit", "NAME=VALUE", "another cap on files, such as max_faces=10000000", action="append", default=[]
         ),
         handler="init.command:main",
     ),

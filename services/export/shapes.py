@@ -1,5 +1,6 @@
 """Shapes of a dataset's instances, and silhouettes of objects: what is seen, what others hide, what is outside the image."""
 
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -15,8 +16,8 @@ from schemas.scene.shape import Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics
 from services.export.source import ExportScene
 from services.job.record import JobRecord
-from services.read.scene_geometry import Sources, load_glb
-from workers.assets.glb import part_of_mesh
+from services.read.scene_geometry import Sources
+from workers.assets.glb import read_shape
 from workers.geometry.camera import NEAR_M, project_bounds
 from workers.geometry.frames import transform
 
@@ -59,7 +60,10 @@ class Shapes:
             except (VersoError, OSError):
                 return None
             return asset.shape if asset.sha256 == row["sha256"] else None
-        return Shape(tuple(part_of_mesh(name, mesh) for name, mesh in load_glb(data, path).items()))
+        try:
+            return read_shape(data)[0]
+        except (ValueError, LookupError, TypeError, OSError, struct.error) as error:
+            raise CorruptError(f"{path} cannot be read: {error}; `verso verify OUT` says what to do") from error
 
 
 def color_vertices(shape: Shape) -> ColoredShape:

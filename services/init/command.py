@@ -1,4 +1,4 @@
-"""`verso init`: a commented job file for a folder of meshes, with a page of pictures of what was read."""
+"""`verso init`: a library of a folder of meshes, with a page of pictures of what was read and the job that uses it."""
 
 import argparse
 import io
@@ -8,31 +8,39 @@ import re
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
-from schemas.errors import AssetSourceError, InputError, MachineError, OutputError, plain_line
-from schemas.job.assets import matches
-from schemas.job.job import Job
-from schemas.scene.shape import Asset
-from services.init.categories import BY_FILE, BY_FOLDER, BY_PARENT, is_category, map_categories, name_categories
-from services.init.collection import SUFFIXES, read_folder, walk_folder
-from services.init.copies import COPY, PART, Item, LeftOut, Reading, find_doubles
-from services.init.guess import Group, Guess, guess_groups, guess_ups, length, plain_axis
-from services.init.shown import Shown, draw_left_out, draw_sheet, draw_table, plural, show_items
+from pydantic import ValidationError
+
+from schemas.errors import AssetSourceError, InputError, MachineError, MeshError, OutputError, plain_line
+from schemas.job.assets import TABLE, Assets, LibrarySource, MeshLimits, is_usable
+from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_table, plural
 from services.job.bounded_yaml import parse_yaml
-from services.job.job_file import MOST_BYTES, MOST_KEYS, validate_job
-from services.run.progress import ProgressLine
-from workers.assets.catalogue import open_catalogue
+from services.job.job_file import MOST_KEYS, validate_job
+from services.run.progress import show_counts
+from workers.assets.catalogue import Watch
+from workers.assets.library.categories import BY_FILE, BY_FOLDER, BY_PARENT
+from workers.assets.library.copies import COPY, PART
+from workers.assets.library.making import Making, locked, make_library
+from workers.assets.library.shapes import load_shape, make_shapes, with_shape
+from workers.assets.library.table import TABLE_FILE, Library, Row, write_table, write_whole
 from workers.render.raster.gbuffer import shared_renderer
 
 SCENES = 64
 
+JOB_FILE, SHEET_FILE = "job.yaml", "sheet.jpg"
+"""Beside the table."""
+
+MOST_MADE = 5000
+"""Shapes up to which all are made at once; of more, those of the sheet: the others are made when a scene first uses them."""
+
 HEAD = """\
 # A dataset of your own meshes: {objects} in {categories}, from {folder}
-# Written by `verso init`. What it guessed is said beside each key: look at the pictures{sheet}, and change what is wrong.
+# Written by `verso init`. What it decided stands in library.parquet, a row a file: look at the pictures ({sheet}), change
+# what is wrong there (category, use, unit, up), and run `verso init` again.
 #
 #   ./verso run {job} --scenes 8        a first look, then
 #   ./verso run {job} --scenes 10000    goes on from there
@@ -52,78 +60,131 @@ categories:
 
 assets:
   objects:
-{sources}
-  # What they stand on: tables made from a seed.
-  tables:
-    - source: procedural
-
+    - source: library
+      folder: . # this one
+      # Objects keep their own size; in place of that, `diagonal_m: 0.25` makes each as large as the article's objects are,
+      # for which the cameras stand where they do. Or move them: cameras.orbit.radius_m and cameras.mirror.T_z_m.
+      # With `copy_assets: true` the dataset holds the shapes too: see `licence` in the table.
+      copy_assets: false
+  # What they stand on{tables}
 start:
   # upright: as it stands in the pictures, at any yaw; tumbled: dropped in any rotation.
   pose: upright
 """
-
-SOURCE = """\
-    - source: files # a folder of meshes, and of what poses them
-      folder: {folder}
-      weight: {weight} # its number of files
-
-{scale_why}
-      # Objects keep their own size; in place of that, `diagonal_m: 0.25` makes each as large as the article's objects are,
-      # for which the cameras stand where they do. Or move them: cameras.orbit.radius_m and cameras.mirror.T_z_m.
-{scale}
-
-      # Which axis of the files points up.
-{up}
-
-      # Category by file pattern; the first match wins. Rename them as you like, and the keys of `categories` with them.
-      category_map:
-{category_map}
-
-      # State the licence of the shapes; with `copy_assets: true` the dataset holds the shapes too.
-      licence: unknown
-      copy_assets: false
-"""
+BUILT_IN_TABLES = ": tables made from a seed.\n  tables:\n    - source: procedural\n"
+OWN_TABLES = ": the library's own tables.\n  tables:\n    - source: library\n      folder: .\n"
 
 
-def write_job(name: str, job: str, folder: str, sheet: str | None, categories: Mapping[str, str], guess: Guess) -> str:
-    """The text of the job file.
+def main(options: argparse.Namespace) -> int:
+    """`verso init`."""
+    folder: Path = options.folder
+    out: Path = options.out or Path(f"{dataset_name(folder)}_library")
+    making = read_making(options)
+    _check_target(out)
+    with show_counts("meshes") as watch:
+        library = make_library(folder, out, making, watch, edited=True)
+        with locked(out, wait=False):
+            library = fill_library(library, watch)
+    used = [row for row in library.rows if row.use and row.category]
+    left_out = sorted(
+        (row for row in library.rows if row not in used), key=lambda row: (row.reason in (PART, COPY), row.path)
+    )
+    # What goes to a file or another program is not folded.
+    width = shutil.get_terminal_size((100, 24)).columns if sys.stdout.isatty() else None
+    if not used:
+        print("\n".join(draw_left_out(left_out, width)), file=sys.stderr)
+        raise AssetSourceError(
+            f"{plain_line(str(folder), 300)}: none of its meshes can be used: {len(left_out)} left out"
+        )
+    print("\n".join([*draw_table([cells_of(row) for row in used], width), *draw_left_out(left_out, width)]))
+    title = f"{folder}: {plural(len(used), 'object')}"
+    sheet = out / SHEET_FILE if _draw(out / SHEET_FILE, title, library, used, left_out) else None
+    categories = sorted({row.category for row in used} - {TABLE})
+    _write_job(out, folder, used)
+    print(f"{out}: {plural(len(used), 'object')} in {plural(len(categories), 'category')}")
+    print("\n".join(f"  {line}" for line in describe_decisions(used)))
+    look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
+    print(look, f"verso run {out / JOB_FILE} --scenes 8")
+    if options.json:
+        tree = {
+            "library": str(out),
+            "job": str(out / JOB_FILE),
+            "sheet": sheet and str(sheet),
+            "categories": categories,
+        }
+        objects, others = [_plain(row) for row in used], [_plain(row) for row in left_out]
+        print(json.dumps({"ok": True, **tree, "objects": objects, "left_out": others}))
+    return 0
 
-    name: of the dataset; job: what the file will be called; folder: as the job file names it; categories: by path.
-    """
-    counts = Counter(categories.values())
-    return HEAD.format(
+
+def _plain(row: Row) -> dict[str, object]:
+    return {name: value for name, value in asdict(row).items() if name not in ("files", "guessed")}
+
+
+def read_making(options: argparse.Namespace) -> Making:
+    """What the command line says of the folder. Raises InputError."""
+    by = options.category_from
+    if by not in (None, BY_FOLDER, BY_FILE, BY_PARENT, TABLE) and not is_usable(by):
+        raise InputError(
+            f"--category-from {plain_line(by)}: write folder, parent, file, or a name of letters, digits, - and _"
+        )
+    try:
+        changes = dict(limit.partition("=")[::2] for limit in options.limit)
+        limits = MeshLimits.model_validate(changes)
+    except ValidationError as error:
+        first = error.errors()[0]
+        what = ", ".join(MeshLimits.model_fields) if first["type"] == "extra_forbidden" else first["msg"]
+        raise InputError(f"--limit {plain_line(str(first['loc'][0]))}: write NAME=VALUE: {what}") from error
+    if options.licence is not None and not (options.licence.strip() and options.licence.isprintable()):
+        raise InputError("--licence: write some words")
+    return Making(by, options.unit, options.up, options.licence, limits)
+
+
+def _check_target(out: Path) -> None:
+    if not out.exists() or (out / TABLE_FILE).is_file():
+        return
+    if not out.is_dir() or any(path.name != ".lock" for path in out.iterdir()):
+        raise OutputError(f"{out} is there already, and no library: remove it, or choose another --out")
+
+
+def fill_library(library: Library, watch: Watch) -> Library:
+    """The library with its shapes made, all or of a large one those of the sheet, and its table written again."""
+    used = [row for row in library.rows if row.use and row.category]
+    rows = used if len(used) <= MOST_MADE else used[:MOST]
+    made = dict[str, Row]()
+    for done, (row, shape) in enumerate(make_shapes(library, rows, must_keep=True), 1):
+        watch("made", done, len(rows))
+        if isinstance(shape, MeshError) and shape.kind == "environmental":
+            raise AssetSourceError(shape.detail)
+        made[row.path] = with_shape(library, row, shape)
+    numbers = {path: k for k, path in enumerate([row.path for row in used if made.get(row.path, row).use][:MOST], 1)}
+    rows = [replace(made.get(row.path, row), picture=numbers.get(row.path)) for row in library.rows]
+    library = replace(library, rows=tuple(rows))
+    write_table(library)
+    return library
+
+
+def _write_job(out: Path, folder: Path, used: Sequence[Row]) -> None:
+    """Writes the job beside the table, unless there is one, which a person may have changed."""
+    counts = Counter(row.category for row in used)
+    tables = counts.pop(TABLE, 0)
+    if (out / JOB_FILE).exists() or not counts:
+        return
+    text = HEAD.format(
         objects=plural(counts.total(), "object"),
         categories=plural(len(counts), "category"),
-        folder=_comment(folder),
-        sheet=f" ({_comment(sheet)})" if sheet else "",
-        job=_comment(job),
-        name=name,
+        folder=_comment(str(folder)),
+        sheet=SHEET_FILE,
+        job=_comment(str(out / JOB_FILE)),
+        name=dataset_name(folder),
         scenes=SCENES,
         weights="\n".join(
             f"  {_quoted(category)}: 1 # {plural(count, 'file')}" for category, count in sorted(counts.items())
         ),
-        sources="\n".join(_source(folder, group, guess) for group in guess.groups),
+        tables=OWN_TABLES if tables else BUILT_IN_TABLES,
     )
-
-
-def _source(folder: str, group: Group, guess: Guess) -> str:
-    """The source of the files of one scale."""
-    rules = [rule for rule in guess.ups if any(matches(path, rule.pattern) for path in group.paths)]
-    if (axis := plain_axis(rules)) is not None:
-        up = [*(f"      # {_comment(rule.pattern)}: {_comment(rule.why)}." for rule in rules), f"      up: {axis}"]
-    else:
-        by_pattern = (f"        # {_comment(rule.why)}\n        {_quoted(rule.pattern)}: {rule.axis}" for rule in rules)
-        up = ["      up: # by file pattern; the first match wins", *by_pattern]
-    patterns = (f"        {_quoted(pattern)}: {_quoted(category)}" for pattern, category in group.category_map.items())
-    return SOURCE.format(
-        folder=_quoted(folder),
-        weight=len(group.paths),
-        scale_why="\n".join(f"      # {_comment(why)}." for why in group.why),
-        scale=f"      scale: {group.factor:g}"
-        + (f"\n      diagonal_m: {group.diagonal_m:g}" if group.diagonal_m else ""),
-        up="\n".join(up),
-        category_map="\n".join(patterns),
-    )
+    validate_job(parse_yaml(text, MOST_KEYS), "the new job")
+    write_whole(out / JOB_FILE, text.encode())
 
 
 def _quoted(text: str) -> str:
@@ -136,81 +197,15 @@ def _comment(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
-SMALLEST_M, LARGEST_M = 0.008, 20.0
-"""Sizes of what a job of defaults can show: 2.5 m away, some cameras see no pixel of a smaller thing."""
-
 MOST_NAMED = 5
-"""Files with another axis than their neighbours that are named; the job has them all."""
-
-MOST_UPS = 2
-"""Levels by which the job file may lie beside the folder for the folder to be named from it."""
+"""Reasons that are told; the table has them all."""
 
 
-def main(options: argparse.Namespace) -> int:
-    """`verso init`."""
-    folder: Path = options.folder
-    by = options.category_from
-    if by not in (None, BY_FOLDER, BY_FILE, BY_PARENT) and not is_category(by):
-        raise InputError(
-            f"--category-from {plain_line(by)}: write folder, parent, file, or a name of letters, digits, - and _"
-        )
-    out: Path = options.out or Path(f"{dataset_name(folder)}.yaml")
-    sheet: Path = options.sheet or out.with_suffix(".jpg")
-    _check_targets(out, sheet)
-    paths, unusable = walk_folder(folder)
-    reading = _read(folder.resolve(), paths, [one.path for one in unusable])
-    guess, items, more = make_guess(reading, by)
-    left_out = sorted((*unusable, *reading.left_out, *more), key=lambda one: (one.reason in (PART, COPY), one.path))
-    # What goes to a file or another program is not folded.
-    width = shutil.get_terminal_size((100, 24)).columns if sys.stdout.isatty() else None
-    if not items:
-        print("\n".join(draw_left_out(left_out, width)), file=sys.stderr)
-        raise AssetSourceError(
-            f"{plain_line(str(folder), 300)}: none of its meshes can be used: {len(left_out)} left out"
-        )
-    near = os.path.relpath(folder.resolve(), out.parent.resolve())
-    far = near.split("/")[: MOST_UPS + 1] == [".."] * (MOST_UPS + 1)
-    categories = {item.path: item.category for item in items}
-    text = write_job(
-        dataset_name(folder), str(out), str(folder.resolve()) if far else near, sheet.name, categories, guess
-    )
-    job = check_text(text)
-    catalogue = open_catalogue(job.assets, out.parent, tuple(job.categories))
-    shown = show_items(catalogue, items)
-    print("\n".join([*draw_table([one.row for one, _ in shown], width), *draw_left_out(left_out, width)]))
-    pictured = [(one, partial(catalogue.load, ref)) for one, ref in shown]
-    drawn = _draw(sheet, options.sheet is not None, f"{folder}: {plural(len(items), 'object')}", pictured, left_out)
-    _write(out, text.encode(), "--out")
-    print(f"{out}: {plural(len(items), 'object')} in {plural(len(job.categories), 'category')}")
-    print("\n".join(f"  {line}" for line in describe_guess(guess)))
-    look = f"  look at {sheet}, and change in {out} what is wrong; then" if drawn else "then"
-    print(look, f"verso run {out} --scenes 8")
-    if options.json:
-        told = {"job": str(out), "sheet": str(sheet) if drawn else None, "categories": list(job.categories)}
-        objects, others = [asdict(one) for one, _ in shown], [asdict(one) for one in left_out]
-        print(json.dumps({"ok": True, **told, "objects": objects, "left_out": others}))
-    return 0
-
-
-def describe_guess(guess: Guess) -> list[str]:
-    """A line for each unit and each axis that was guessed."""
-    ups = [f"up: {rule.axis} in {rule.pattern}: {rule.why}" for rule in guess.ups if rule.pattern.startswith("**/")]
-    others: dict[str, list[str]] = {}
-    for rule in guess.ups:
-        if not rule.pattern.startswith("**/"):
-            others.setdefault(rule.why, []).append(f"{rule.pattern} {rule.axis}")
-    for why, names in others.items():
-        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-        ups.append(f"up differs: {', '.join(names[:MOST_NAMED])}{more}: {why}")
-    return [why for group in guess.groups for why in group.why] + ups
-
-
-def _check_targets(out: Path, sheet: Path) -> None:
-    if sheet.suffix.lower() not in (".jpg", ".jpeg", ".png"):
-        raise InputError(f"--sheet {sheet}: must end in .jpg or .png")
-    for path, asked in ((out, "--out"), (sheet, "--sheet")):
-        if path.exists():
-            raise OutputError(f"{path} is there already: remove it, or choose another {asked}")
+def describe_decisions(used: Sequence[Row]) -> list[str]:
+    """A line for each unit and axis that was decided, with how many files it is of."""
+    reasons = Counter(part for row in used for part in row.why.split("; "))
+    lines = [f"{why} ({plural(count, 'file')})" for why, count in reasons.most_common(MOST_NAMED)]
+    return [*lines, f"and {len(reasons) - MOST_NAMED} more: see the table"] if len(reasons) > MOST_NAMED else lines
 
 
 def dataset_name(folder: Path) -> str:
@@ -218,89 +213,16 @@ def dataset_name(folder: Path) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64] or "meshes"
 
 
-def make_guess(reading: Reading, category_from: str | None) -> tuple[Guess, list[Item], list[LeftOut]]:
-    """What the job says, the files that it uses, and those that are another one again, or of no size for a table."""
-    of = {path: group for group in guess_groups(reading.items) for path in group.paths}
-    doubles = find_doubles(reading.items, lambda item: of[item.path].size_m(item), SUFFIXES)
-    dropped = {one.path for one in doubles}
-    different = [item for item in reading.items if item.path not in dropped]
-    groups, kept, left_out = guess_groups(different), dict[str, Item](), list[LeftOut]()
-    of = {path: group for group in groups for path in group.paths}
-    for item in different:
-        size = of[item.path].size_m(item)
-        if SMALLEST_M <= size <= LARGEST_M:
-            kept[item.path] = item
-        else:
-            how = "small to be seen on" if size < SMALLEST_M else "large for"
-            why = f"is too {how} a table: {length(size)} at scale {of[item.path].factor:g}; put it into a folder of its own, "
-            left_out.append(LeftOut(item.path, "size", f"{why}and init that"))
-    categories = name_categories(kept, category_from)
-    items = [replace(item, category=categories[path]) for path, item in kept.items()]
-    others = {one.path for one in (*reading.left_out, *left_out, *doubles)}
-    return (
-        Guess(tuple(_map_groups(groups, categories, others, reading.refused)), tuple(guess_ups(items))),
-        items,
-        [*left_out, *doubles],
-    )
-
-
-def _map_groups(
-    groups: Sequence[Group], categories: Mapping[str, str], others: Collection[str], refused: Collection[str]
-) -> Iterator[Group]:
-    """The groups with the files that are used, and patterns that find exactly these."""
-    for group in groups:
-        mine = {path: categories[path] for path in group.paths if path in categories}
-        if mine:
-            patterns = map_categories(mine, {*others, *(categories.keys() - mine.keys())}, refused)
-            yield replace(group, paths=tuple(mine), category_map=patterns)
-
-
-def check_text(text: str) -> Job:
-    """The job of the text. InputError where it is longer than a job file may be."""
-    if len(text.encode()) > MOST_BYTES:
-        raise InputError(
-            f"the job would have {len(text.encode())} bytes, because the files of a category do not lie together: put each "
-            "category into a folder of its own, or name one with --category-from NAME"
-        )
-    return validate_job(parse_yaml(text, MOST_KEYS), "the new job")
-
-
-def _read(folder: Path, paths: Sequence[str], beside: Sequence[str]) -> Reading:
-    lines = dict[str, ProgressLine]()
-
-    def watch(what: str, done: int, asked: int) -> None:
-        lines.setdefault(what, ProgressLine(asked, what, "file")).show(done)
-
+def _draw(sheet: Path, title: str, library: Library, used: Sequence[Row], left_out: Sequence[Row]) -> bool:
+    """Writes the pictures; whether it could."""
     try:
-        return read_folder(folder, paths, watch, beside)
-    finally:
-        for line in lines.values():
-            line.close()
-
-
-def _draw(
-    sheet: Path, asked: bool, title: str, shown: Sequence[tuple[Shown, Callable[[], Asset]]], left_out: list[LeftOut]
-) -> bool:
-    """Writes the pictures; whether it could. MachineError where they were asked for by name and cannot be drawn."""
-    try:
-        page = draw_sheet(title, shown, draw_left_out(left_out, None), shared_renderer())
+        renderer = shared_renderer()
     except MachineError as error:
-        if asked:
-            raise
         print(f"verso: no pictures: {error}", file=sys.stderr)
         return False
-    data = io.BytesIO()
-    page.save(data, "PNG" if sheet.suffix.lower() == ".png" else "JPEG", quality=88)
-    _write(sheet, data.getvalue(), "--sheet")
+    settings = LibrarySource(source="library", folder=os.curdir)
+    drawn = [(row, partial(load_shape, library, row, settings, Assets(), row.instance_id)) for row in used]
+    page, data = draw_sheet(title, drawn, draw_left_out(left_out, None), renderer), io.BytesIO()
+    page.save(data, "JPEG", quality=88)
+    write_whole(sheet, data.getvalue())
     return True
-
-
-def _write(path: Path, data: bytes, option: str) -> None:
-    """Writes a new file. OutputError where it cannot be written, or is there by now."""
-    try:
-        if not path.parent.is_dir():
-            path.parent.mkdir(parents=True)
-        with path.open("xb") as file:
-            file.write(data)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another {option}") from error

@@ -4,23 +4,19 @@ import math
 import unicodedata
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.base import frozen_array
-from schemas.job.assets import FolderSource
 from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics
-from services.init.copies import Item, LeftOut
-from services.init.guess import ON_TABLE_M, length
 from workers.assets.appearance import draw_appearance
-from workers.assets.catalogue import AnySource, Catalogue, InstanceRef
-from workers.assets.external.placement import FLAT
+from workers.assets.library.guess import ON_TABLE_M, length
+from workers.assets.library.table import Row
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose, translation
 from workers.render.raster.gbuffer import Renderer
@@ -52,21 +48,21 @@ def draw_table(rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
     return lines
 
 
-def draw_left_out(left_out: Sequence[LeftOut], width: int | None) -> list[str]:
+def draw_left_out(left_out: Sequence[Row], width: int | None) -> list[str]:
     """A line for each reason why files are not used, with the first of them, and how many there are."""
     if not left_out:
         return []
     by_reason: dict[tuple[str, str], list[str]] = {}
-    for one in left_out:
-        by_reason.setdefault((one.reason, one.why), []).append(one.path)
-    told = list(by_reason.items())
-    shown = told if width is None else told[:MOST_ROWS]
+    for row in left_out:
+        by_reason.setdefault((row.reason, row.why), []).append(row.path)
+    reasons = list(by_reason.items())
+    shown = reasons if width is None else reasons[:MOST_ROWS]
     lines = [f"left out: {plural(len(left_out), 'file')}"]
     for (reason, why), paths in shown:
         more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
         first, *rest = fold(f"{paths[0]}{more} ({reason}): {why}", width and width - 4)
         lines += [f"  {first}", *(f"    {line}" for line in rest)]
-    hidden = sum(len(paths) for _, paths in told[len(shown) :])
+    hidden = sum(len(paths) for _, paths in reasons[len(shown) :])
     return [*lines, f"  and {hidden} more: --json lists all"] if hidden else lines
 
 
@@ -88,101 +84,52 @@ def plural(count: int, word: str) -> str:
     return f"{count} {word}"
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A file as the table, the pictures and `--json` have it. size_m: width, depth and height as it will stand.
-
-    missing_textures: pictures or material files that are missing or cannot be read, by the notes on the file; up: the axis
-    that the job has up; shape_says, confidence: what the shape tells about it.
-    """
-
-    path: str
-    category: str
-    size_m: tuple[float, float, float]
-    vertices: int
-    faces: int
-    watertight: bool
-    textures: int
-    missing_textures: int
-    up: str
-    shape_says: str | None
-    confidence: str | None
-    notes: tuple[str, ...]
-
-    @property
-    def told(self) -> tuple[str, str, str, str]:
-        """Size as width x depth x height in centimetres; whether it is closed; pictures found, of how many; up, as judged."""
-        size = " x ".join(f"{100 * extent:.3g}" for extent in self.size_m)
-        pictures = f"{self.textures}" + (
-            f" of {self.textures + self.missing_textures}" if self.missing_textures else ""
+def describe_row(row: Row) -> tuple[str, str, str, str]:
+    """Size as width x depth x height in centimetres; whether it is closed; pictures, of how many; up, as judged."""
+    size = "?" if row.extents_m is None else " x ".join(f"{100 * extent:.3g}" for extent in row.extents_m)
+    missing = sum(note.endswith("plain base colour used") for note in row.mended)
+    pictures = "?" if row.pictures is None else f"{row.pictures}" + (f" of {row.pictures + missing}" if missing else "")
+    if row.shape_up is None:
+        up = f"{row.up}?"
+    else:
+        up = (
+            f"{row.up} {'sure' if row.sure else 'likely'}"
+            if row.shape_up == row.up
+            else f"{row.up} (or {row.shape_up})"
         )
-        if self.shape_says is None:
-            up = f"{self.up}?"
-        else:
-            up = f"{self.up} {self.confidence}" if self.shape_says == self.up else f"{self.up} (or {self.shape_says})"
-        return size, "yes" if self.watertight else "no", pictures, up
-
-    @property
-    def row(self) -> tuple[str, ...]:
-        """Its line of the table."""
-        size, closed, pictures, up = self.told
-        return self.path, self.category, size, str(self.faces), closed, pictures, up, "; ".join(self.notes)
-
-    @property
-    def caption(self) -> tuple[str, ...]:
-        """Its lines below the picture."""
-        size, _, pictures, up = self.told
-        closed = "closed" if self.watertight else "not closed"
-        return (
-            self.path,
-            f"{self.category}, {size} cm, up: {up}",
-            f"{self.faces} faces, {closed}, pictures: {pictures}",
-        )
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The lines that ask for attention."""
-        if self.shape_says is None:
-            return "which way is up is not known", *self.notes
-        doubt = f"by its shape {self.shape_says} is up ({self.confidence})"
-        return (doubt,) * (self.shape_says != self.up) + self.notes
+    return size, "?" if row.watertight is None else "yes" if row.watertight else "no", pictures, up
 
 
-def show_items(catalogue: Catalogue, items: Sequence[Item]) -> list[tuple[Shown, InstanceRef]]:
-    """The items as the job's catalogue has them, and how each is loaded."""
-    refs = {
-        entry.files[0].path: catalogue.refer(source, category, index)
-        for source, listing in enumerate(catalogue.objects)
-        for category, entries in (listing.entries.items() if listing is not None else ())
-        for index, entry in enumerate(entries)
-    }
-    return [(_show(item, catalogue.settings(refs[item.path])), refs[item.path]) for item in items]
+def cells_of(row: Row) -> tuple[str, ...]:
+    """Its line of the table."""
+    size, closed, pictures, up = describe_row(row)
+    return row.path, row.category, size, str(row.faces or "?"), closed, pictures, up, "; ".join(notes_of(row))
 
 
-def _show(item: Item, settings: AnySource) -> Shown:
-    measured = item.measured
-    assert isinstance(settings, FolderSource)
-    up = settings.up_of(item.path)
-    scale = settings.scale if settings.diagonal_m is None else settings.diagonal_m / item.diagonal
-    x, y, z = (scale * extent for extent in measured.extents)
-    notes = [f"flat: {length(measured.thin * scale * item.diagonal)} thick"] if measured.thin < FLAT else []
-    if not ON_TABLE_M[0] <= scale * item.diagonal <= ON_TABLE_M[1]:
-        how = "small" if scale * item.diagonal < ON_TABLE_M[0] else "large"
-        notes.append(f"{length(scale * item.diagonal)} across, {how} for a table: see `scale`")
-    return Shown(
-        path=item.path,
-        category=item.category,
-        size_m={"x": (z, y, x), "y": (x, z, y), "z": (x, y, z)}[up],
-        vertices=measured.vertices,
-        faces=measured.faces,
-        watertight=measured.watertight,
-        textures=measured.textures,
-        missing_textures=sum(note.endswith("plain base colour used") for note in measured.notes),
-        up=up,
-        shape_says=measured.up,
-        confidence=measured.confidence,
-        notes=(*notes, *measured.notes),
-    )
+def notes_of(row: Row) -> tuple[str, ...]:
+    """What asks for attention."""
+    if row.extents_m is None:
+        return row.mended
+    size = math.hypot(*row.extents_m)
+    if ON_TABLE_M[0] <= size <= ON_TABLE_M[1]:
+        return row.mended
+    how = "small" if size < ON_TABLE_M[0] else "large"
+    return f"{length(size)} across, {how} for a table: see `unit`", *row.mended
+
+
+def _caption_of(row: Row) -> tuple[str, ...]:
+    """Its lines below the picture."""
+    size, _, pictures, up = describe_row(row)
+    closed = "closed" if row.watertight else "not closed"
+    return row.path, f"{row.category}, {size} cm, up: {up}", f"{row.faces} faces, {closed}, pictures: {pictures}"
+
+
+def _warnings_of(row: Row) -> tuple[str, ...]:
+    """The lines that ask for attention."""
+    if row.shape_up is None:
+        return "which way is up is not known", *notes_of(row)
+    doubt = f"by its shape {row.shape_up} is up ({'sure' if row.sure else 'likely'})"
+    return (doubt,) * (row.shape_up != row.up) + notes_of(row)
 
 
 MOST = 60
@@ -203,7 +150,7 @@ WARNING = "#b03000"
 
 
 def draw_sheet(
-    title: str, objects: Sequence[tuple[Shown, Callable[[], Asset]]], notes: Sequence[str], renderer: Renderer
+    title: str, objects: Sequence[tuple[Row, Callable[[], Asset]]], notes: Sequence[str], renderer: Renderer
 ) -> Image.Image:
     """The page: a title, up to `MOST` objects, each loaded when it is drawn, and notes below them."""
     drawn = objects[:MOST]
@@ -214,7 +161,7 @@ def draw_sheet(
     inside = columns * step - MARGIN
     head = [(line, "black", large) for line in fold(_letters(title), inside, large.getlength)]
     foot = [(line, "black", font) for note in notes for line in fold(_letters(note), inside, font.getlength)]
-    captions = [_caption(one, font) for one, _ in drawn]
+    captions = [_caption(row, font) for row, _ in drawn]
     rows = [range(k, min(k + columns, len(drawn))) for k in range(0, len(drawn), columns)]
     heights = [TILE[1] + LINE * max(len(captions[k]) for k in row) + 2 * MARGIN for row in rows]
     page = Image.new(
@@ -235,8 +182,8 @@ Line = tuple[str, str, ImageFont.FreeTypeFont | ImageFont.ImageFont]
 """Text, colour and font."""
 
 
-def _caption(one: Shown, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[Line]:
-    told = [(line, "black") for line in one.caption] + [(line, WARNING) for line in one.warnings]
+def _caption(row: Row, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[Line]:
+    told = [(line, "black") for line in _caption_of(row)] + [(line, WARNING) for line in _warnings_of(row)]
     return [(line, colour, font) for text, colour in told for line in fold(_letters(text), TILE[0], font.getlength)]
 
 

@@ -138,7 +138,7 @@ def folders_of(job: Job) -> dict[str, str]:
 
 def refuse_folders(job: Job, name: str, fits: Callable[[str], bool], why: str) -> None:
     """Raises JobError for a folder of the job that does not fit where the job is to run; `told` says why, and the remedy."""
-    from workers.assets.external.listing import PYBULLET_DATA
+    from workers.assets.library.making import PYBULLET_DATA
 
     for key, folder in folders_of(job).items():
         if folder not in ("", PYBULLET_DATA) and not fits(folder):

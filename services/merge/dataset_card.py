@@ -108,14 +108,23 @@ def _count(count: Counts) -> str:
     return str(count.low) if count.low == count.high else f"{count.low} to {count.high}"
 
 
+MOST_LICENCES = 10
+"""Licences of a library that the card names, with how many shapes have them."""
+
+
 def describe_sources(catalogue: "Catalogue") -> list[str]:
     """One line for each source of objects and of tables with its licence, and those of `Catalogue.describe_left_out`."""
     lines = []
-    for what, sources in (("objects", catalogue.assets.objects), ("tables", catalogue.assets.tables)):
-        for source in sources:
+    for what, sources, libraries in (
+        ("objects", catalogue.assets.objects, catalogue.objects),
+        ("tables", catalogue.assets.tables, catalogue.tables),
+    ):
+        for source, library in zip(sources, libraries, strict=True):
             if isinstance(source, ProceduralSource):
                 origin = f"made from seed {source.seed}, licence CC0-1.0"
             else:
-                origin = f"{source.source} folder {source.folder}, licence {source.licence}"
+                assert library is not None
+                most = ", ".join(f"{name} ({count})" for name, count in library.licences.most_common(MOST_LICENCES))
+                origin = f"library {source.folder}, licences {most}"
             lines.append(f"{what}, weight {source.weight:g}: {origin}")
     return lines + catalogue.describe_left_out()

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,12 @@ import trimesh
 from PIL import Image
 
 from schemas.base import Array
-from schemas.job.assets import Assets, FolderSource, MeshLimits
+from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Asset
 from tests.kit.shapes import box
 from tests.workers.door.oracles import textured_cube, write
-from workers.assets.external.listing import Entry, hash_files
-from workers.assets.external.placement import place_asset
+from workers.assets.library.reading import hash_files, place_asset
+from workers.assets.library.table import Row
 from workers.door.meshes.formats import load_shape
 
 SIDE_M = 0.1
@@ -26,9 +27,10 @@ def enter(make_file: Callable[[Path], Path], scale: float = 1.0) -> Asset:
     with tempfile.TemporaryDirectory() as folder:
         path = make_file(Path(folder))
         loaded = load_shape(path, MeshLimits())
-        entry = Entry("outside", hash_files([path], Path(folder)), "CC0-1.0")
-        settings = FolderSource(source="urdf", folder=".", scale=scale, copy_assets=True)
-        return place_asset(loaded, entry, "box", settings, Assets())
+        files = hash_files([path], Path(folder))
+        row = Row(path.name, category="box", unit=scale, licence="CC0-1.0", files=files, sha256=files[0].sha256)
+        asset = place_asset(loaded, row, MeshLimits())
+        return replace(asset, shareable=True, volume_m3=asset.mass.mass_kg / 600.0 if asset.watertight else None)
 
 
 def obj(vertices: Array, faces: Array, more: str = "") -> Callable[[Path], Path]:

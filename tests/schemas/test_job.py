@@ -5,16 +5,15 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from schemas.job.assets import CATEGORIES, Assets, FolderSource, ProceduralSource, matches, offered_by
+from schemas.job.assets import CATEGORIES, Assets, ProceduralSource, offered_by
 from schemas.job.identity import PATHS, compare_jobs, differing_keys, job_digest, settings_digest
 from schemas.job.job import PRESETS, Job, with_preset
 from schemas.job.physics import Start
 from schemas.job.views import Targets
 from tests.datasets import overlaid
 
-FRUIT = {"source": "urdf", "folder": "fruit", "category_map": {"*.obj": "banana", "*.glb": "Pear-2", "t.obj": "table"}}
-URDF = {"source": "urdf", "folder": "/somewhere"}
-BASE = {"name": "t", "assets": {"objects": [URDF]}}
+LIBRARY = {"source": "library", "folder": "/somewhere"}
+BASE = {"name": "t", "assets": {"objects": [LIBRARY]}}
 FOLDERS = {"name": "t", "captures": {"folders": ["a", "b", "c"]}}
 SIMULATED = {"name": "t", "captures": {}}
 
@@ -28,24 +27,17 @@ def job(base: dict | None = None, **changes) -> Job:
 
 def test_without_categories_a_job_has_all_that_its_sources_offer_once():
     assert tuple(job().categories) == CATEGORIES
-    assert job(assets={"objects": [FRUIT]}).categories == {"banana": 1.0, "Pear-2": 1.0}
-    mixed = {"objects": [FRUIT, {"source": "procedural"}, FRUIT]}
-    assert list(job(assets=mixed).categories) == ["banana", "Pear-2", *CATEGORIES]
-    assert "box" not in job(assets={"objects": [{"source": "shapenet", "folder": "s"}]}).categories
-    packaged = {"source": "urdf", "folder": "pybullet_data"}  # may offer anything until it is listed
-    assert tuple(job(assets={"objects": [packaged]}).categories) == CATEGORIES
-    assert job(assets={"objects": [packaged]}, categories=["brick"]).categories == {"brick": 1.0}
-    assert {
-        job(assets={"objects": [{**URDF, "source": name}]}).assets.objects[0].source for name in ("files", "urdf")
-    } == {"files"}
-    assert offered_by([{}, {"source": 3}, {"source": "urdf", "category_map": 7}, {"source": "urdf"}]) == ()
+    mixed = {"objects": [LIBRARY, {"source": "procedural"}, LIBRARY]}  # a library may offer anything until it is opened
+    assert list(job(assets=mixed).categories) == list(CATEGORIES)
+    assert job(assets={"objects": [LIBRARY]}, categories=["brick"]).categories == {"brick": 1.0}
+    assert offered_by([{}, {"source": 3}, {"source": "library"}]) == ()
 
 
 def test_a_name_that_cannot_be_is_refused_with_the_remedy():
-    sources = {"objects": [FRUIT, {"source": "procedural"}]}
+    sources = {"objects": [{"source": "procedural"}]}
     for name, words in (
-        ("mugg", "no source offers it; did you mean 'mug'[?] offered: banana, Pear-2, bottle"),
-        ("zebra", "no source offers it; offered: banana"),
+        ("mugg", "no source offers it; did you mean 'mug'[?] offered: bottle, camera"),
+        ("zebra", "no source offers it; offered: bottle"),
         ("../x", "1 to 64 letters, digits, - and _"),
         ("a b", "1 to 64 letters"),
         ("\u202emug", "1 to 64 letters"),
@@ -60,41 +52,6 @@ def test_a_name_that_cannot_be_is_refused_with_the_remedy():
         with pytest.raises(ValidationError, match=words) as refusal:
             job(assets=sources, categories=[name])
         assert "[A-Za-z" not in str(refusal.value)
-    with pytest.raises(ValidationError, match="names a folder"):
-        job(assets={"objects": [{**FRUIT, "category_map": {"*.obj": "a b"}}]})
-
-
-FILES = ("a.obj", "b.OBJ", "x/a.obj", "x/y/a.obj", "x/y/z/b.obj", "x[1]/a b.obj", ".h/a.obj", "x/ü.glb", "xy/a.obj")
-PATTERNS = (
-    *("*.obj", "**/*.obj", "x/*.obj", "x/**/*.obj", "*/*.obj", "**/y/**/*.obj", "x*/*", "**/*", "**", "x/**", "?.obj"),
-    *("[ab].obj", "[!a].*", "x[[]1]/*", "x[1]/*", "./a.obj", "x//a.obj", "**/**/a.obj", "*", "x/?.glb", "X/a.obj"),
-)
-
-
-def test_a_pattern_matches_what_pathlibs_glob_finds_and_many_stars_take_no_time(tmp_path):
-    for name in FILES:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-    for pattern in PATTERNS:
-        paths = () if pattern.endswith("**") else tmp_path.glob(pattern)  # files, from Python 3.13 on
-        names = {path.relative_to(tmp_path).as_posix() for path in paths if path.is_file()}
-        assert {name for name in FILES if matches(name, pattern)} == names, pattern
-    assert not matches("a/" * 200 + "b", "**/a/" * 100 + "*/c")
-
-
-def test_the_axis_that_is_up_is_one_letter_or_that_of_the_first_pattern():
-    def source(**keys):
-        return FolderSource(source="urdf", folder="m", **keys)
-
-    mixed = source(up={"odd/a.glb": "x", "**/*.glb": "y"})
-    assert [mixed.up_of(name) for name in ("odd/a.glb", "odd/b.glb", "c.glb", "c.obj")] == ["x", "y", "y", "z"]
-    assert [source(up="y").up_of(name) for name in ("a.obj", "b/c.glb")] == ["y", "y"]
-    assert source().up_of("a.obj") == "z"
-    for up in ("w", "Y", {}, {"*.glb": "up"}, {"*.glb": None}, ["y"], 3, None, {"*.glb": ["y"]}):
-        with pytest.raises(ValidationError) as caught:
-            source(up=up)
-        (fault,) = caught.value.errors()
-        assert "must be x, y or z, or a map" in fault["msg"]
 
 
 # ------------------------------------------------------------------------------------------------ ranges, presets
@@ -159,7 +116,7 @@ def test_a_key_belongs_to_the_dataset_to_its_scenes_or_to_neither():
     for changes, same_dataset, same_scene in (
         ({"scenes": 7}, True, True),
         ({"run": {"workers": 3, "fingerprint": "record"}}, True, True),
-        ({"assets": {"objects": [{**URDF, "folder": "/elsewhere"}]}}, True, True),
+        ({"assets": {"objects": [{**LIBRARY, "folder": "/elsewhere"}]}}, True, True),
         ({"name": "u"}, False, True),
         ({"first_scene": 4}, False, True),
         ({"output": {"layout": "tar"}}, False, True),
@@ -167,7 +124,7 @@ def test_a_key_belongs_to_the_dataset_to_its_scenes_or_to_neither():
         ({"seed": 1}, False, False),
         ({"cameras": {"mirror": {"T_z_m": 1.4}}}, False, False),
         ({"sensor": {"rgb_noise": {}}}, False, False),
-        ({"assets": {"objects": [{**URDF, "scale": 2.0}]}}, False, False),
+        ({"assets": {"objects": [{**LIBRARY, "diagonal_m": 2.0}]}}, False, False),
     ):
         before, after = job(BASE), job(BASE, **changes)
         assert (job_digest(before, "c") == job_digest(after, "c")) is same_dataset, changes
@@ -230,4 +187,4 @@ def test_a_digest_is_that_of_what_differs_from_the_defaults_of_the_keys_whatever
     noisy = job(sensor={"depth_noise": {}})
     assert differing_keys(noisy)["sensor"] == {"depth_noise": {}}, "a branch that is there differs from none"
     sources = differing_keys(job(BASE), PATHS)["assets"]["objects"]
-    assert sources == [{"source": "files"}], "the kind of a source stays, the path of its folder does not"
+    assert sources == [{"source": "library"}], "the kind of a source stays, the path of its folder does not"

@@ -7,39 +7,41 @@ a command's start, and a coordinator of built-in shapes needs none of it.
 import hashlib
 import json
 import sys
-from collections import Counter
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from cachetools import LRUCache
 
 from schemas.capture import CaptureListing
-from schemas.errors import AssetSourceError
+from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import (
     BUILT_IN,
     TABLE,
     VERSION,
     Assets,
-    FolderSource,
-    MeshLimits,
+    LibrarySource,
     ProceduralSource,
-    ShapeNetSource,
     SplitShares,
     instance_id,
 )
 from schemas.job.identity import differing_keys
 from schemas.scene.shape import Asset
-from workers.assets.external.listing import Listing, Watch, find_files, find_models, ignore
 from workers.geometry.frames import add_up
 
 if TYPE_CHECKING:
-    from workers.assets.external.verdicts import Verdicts
+    from workers.assets.library.table import Library
+
+AnySource = ProceduralSource | LibrarySource
+
+Watch = Callable[[str, int, int], None]
+"""Is told what is being done, and with how many of how many files."""
 
 
-AnySource = ProceduralSource | ShapeNetSource | FolderSource
+def ignore(what: str, done: int, asked: int) -> None:
+    """A watch that says nothing."""
 
 
 DOUBTS = 3
@@ -58,43 +60,48 @@ class InstanceRef:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Every asset that a job can choose from. It pickles small; choosing needs no files, loading does.
+    """Every asset that a job can choose from. It pickles small.
 
-    objects, tables: a listing for each source, None for a procedural one; skipped: how many instances were left out,
-    by source folder and reason; digest: SHA-256 of everything that the choice and the shapes depend on. Files that cannot
-    be read are known from the start and never drawn.
+    objects, tables: a library for each source, None for a procedural one; digest: SHA-256 of everything that the choice and
+    the shapes depend on. A shape that cannot be made is known where it is first drawn, and another is drawn in its place.
     """
 
     assets: Assets
-    objects: "tuple[Listing | None, ...]"
-    tables: "tuple[Listing | None, ...]"
+    objects: "tuple[Library | None, ...]"
+    tables: "tuple[Library | None, ...]"
     digest: str
-    skipped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     captures: tuple[CaptureListing, ...] = ()
     """Folders of captures, in order; the digest covers their files too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""
         offers: list[tuple[int, AnySource, int]] = []
-        for number, (settings, listing) in enumerate(self._sources(category)):
+        for number, (settings, library) in enumerate(self._sources(category)):
             if isinstance(settings, ProceduralSource):
                 if category in BUILT_IN:
                     offers.append((number, settings, settings.instances))
-            elif listing is not None and (count := listing.count(category)):
+            elif library is not None and (count := library.count(category)):
                 offers.append((number, settings, count))
         return offers
 
     def draw(self, number: int, category: str, rng: np.random.Generator) -> InstanceRef:
-        """One of a source's instances of a category, uniformly. A refused one is drawn again: the others stay as they are."""
-        settings, listing = self._sources(category)[number]
+        """One of a source's instances of a category, uniformly. A refused one is drawn again: the others stay as they are.
+
+        Raises MeshError where all are refused.
+        """
+        settings, library = self._sources(category)[number]
         if isinstance(settings, ProceduralSource):
             return self.refer(number, category, int(rng.integers(settings.instances)))
-        assert listing is not None
-        refused, count = listing.refused.get(category, frozenset()), len(listing.entries[category])
-        index = int(rng.integers(count))
-        while index in refused:
-            index = int(rng.integers(count))
-        return self.refer(number, category, index)
+        from workers.assets.library.shapes import is_fit
+
+        assert library is not None
+        rows, unfit = library.entries[category], set[int]()
+        while len(unfit) < len(rows):
+            index = int(rng.integers(len(rows)))
+            if index not in unfit and is_fit(library, rows[index]):
+                return self.refer(number, category, index)
+            unfit.add(index)
+        raise MeshError("no_shape", f"none of {len(rows)} shapes for {category!r} in {library.source} can be made")
 
     def settings(self, ref: InstanceRef) -> AnySource:
         """The settings of the source of an instance."""
@@ -102,111 +109,83 @@ class Catalogue:
 
     def refer(self, number: int, category: str, index: int) -> InstanceRef:
         """Instance `index` of a category in a source, by its number among those of objects or of tables."""
-        settings, listing = self._sources(category)[number]
+        settings, library = self._sources(category)[number]
         if isinstance(settings, ProceduralSource):
             name = instance_id(settings.named(category), settings.seed, index)
             return InstanceRef(number, category, index, name)
-        assert listing is not None
-        return InstanceRef(number, category, index, listing.entries[category][index].instance_id)
+        assert library is not None
+        name = library.entries[category][index].instance_id
+        if settings.diagonal_m is not None and category != TABLE:
+            name += f"-{1000 * settings.diagonal_m:g}mm".replace(".", "_")
+        return InstanceRef(number, category, index, name)
 
-    def examples(self, folder: str) -> tuple[str, ...]:
-        """Sentences on the first files that were left out of a source's folder."""
-        listings = (listing for listing in (*self.objects, *self.tables) if listing is not None)
-        return next((x.examples for x in listings if x.examples and str(x.folder) == folder), ())
+    def libraries(self) -> "list[Library]":
+        """Those of all sources, each once."""
+        opened = [library for library in (*self.objects, *self.tables) if library is not None]
+        return list({library.source: library for library in opened}.values())
 
     def describe_left_out(self) -> list[str]:
         """One line for each folder with files that were left out: how many, and why, with the first of them."""
         return [
-            f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
-            + (f"; {'; '.join(examples)}" if (examples := self.examples(folder)) else "")
-            for folder, reasons in self.skipped.items()
+            f"left out of {library.source}: {', '.join(f'{count} {reason}' for reason, count in library.skipped.items())}; "
+            f"{'; '.join(library.examples)}"
+            for library in self.libraries()
+            if library.skipped
         ]
 
     def describe_doubts(self) -> list[str]:
-        """One line for each folder with files that stand on another axis than `up` says."""
+        """One line for each folder with files that stand on another axis than was decided."""
         lines = []
-        for listing in (*self.objects, *self.tables):
-            if listing is None or not listing.doubts:
+        for library in self.libraries():
+            if not library.doubts:
                 continue
-            doubts = sorted(listing.doubts.items())
-            told = ", ".join(f"{path} on {axis}" for path, axis in doubts[:DOUBTS])
+            doubts = sorted(library.doubts.items())
+            message = ", ".join(f"{path} on {axis}" for path, axis in doubts[:DOUBTS])
             more = f" and {len(doubts) - DOUBTS} more" if len(doubts) > DOUBTS else ""
-            first = f"{{{json.dumps(doubts[0][0], ensure_ascii=False)}: {doubts[0][1]}}}"
-            remedy = (
-                f"if they lie on their side, set `up` of the source, such as {first}; `verso init` shows how they stand"
-            )
-            lines.append(f"{listing.folder}: files stand on another axis than `up` says: {told}{more}; {remedy}")
+            remedy = "if they lie on their side, `verso init` it and change `up` in its table"
+            lines.append(f"{library.source}: files stand on another axis than `up` says: {message}{more}; {remedy}")
         return lines
 
     def load(self, ref: InstanceRef) -> Asset:
-        """An instance, made, or read in a limited process; MeshError where its mesh is refused or has changed."""
-        settings, listing = self._sources(ref.category)[ref.source]
+        """An instance, made, or read from its library; MeshError where its mesh is refused or has changed."""
+        settings, library = self._sources(ref.category)[ref.source]
         if isinstance(settings, ProceduralSource):
             from workers.assets.builtin.make import make_asset
 
             return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
-        from workers.assets.external.verdicts import load_asset_file
+        from workers.assets.library.shapes import load_shape
 
-        assert listing is not None
-        entry = listing.entries[ref.category][ref.index]
-        return load_asset_file(settings, listing.folder, entry, ref.category, self.assets)
+        assert library is not None
+        row = library.entries[ref.category][ref.index]
+        return load_shape(library, row, settings, self.assets, ref.instance_id)
 
-    def _sources(self, category: str) -> "list[tuple[AnySource, Listing | None]]":
+    def _sources(self, category: str) -> "list[tuple[AnySource, Library | None]]":
         if category == TABLE:
             return list(zip(self.assets.tables, self.tables, strict=True))
         return list(zip(self.assets.objects, self.objects, strict=True))
 
 
-def list_source(
-    settings: AnySource, job_folder: Path, categories: Collection[str], limits: MeshLimits, watch: Watch = ignore
-) -> "Listing | None":
-    """What a source of files offers, None for built-in shapes; AssetSourceError where the folder cannot be used."""
-    if isinstance(settings, ProceduralSource):
-        return None
-    from workers.assets.external.verdicts import read_listing
-
-    if isinstance(settings, ShapeNetSource):
-        return read_listing(settings, *find_models(settings, job_folder, categories), limits, watch)
-    return read_listing(settings, *find_files(settings, job_folder, categories), limits, watch)
-
-
-def open_catalogue(
-    assets: Assets, job_folder: Path, categories: Collection[str], watch: Watch = ignore, kept: "Verdicts | None" = None
-) -> Catalogue:
-    """Lists every source and finds out which files can be read, or looks that up in `kept` (default: the user's cache).
+def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str], watch: Watch = ignore) -> Catalogue:
+    """Opens every library, and makes one of each source that is none yet.
 
     `watch` is told now and then how far it is. Raises AssetSourceError where a folder cannot be used, no source has a
-    category, or a source has nothing of it that can be read.
-
-    Cost: every mesh and texture of the categories asked for is read to hash it, about two seconds a gigabyte where disks
-    allow, and once for ever to see whether it can be used; nothing for procedural sources. Workers take the opened
-    catalogue and read only what they load.
+    category, or a source has nothing of it that can be read. Workers take the opened catalogue and read only what they load.
     """
+    opened: dict[str, Library] = {}
 
-    def open_source(settings: AnySource, wanted: Collection[str]) -> "Listing | None":
-        listing = list_source(settings, job_folder, wanted, assets.limits, watch)
-        if isinstance(settings, ProceduralSource) or listing is None:
+    def open_source(settings: AnySource) -> "Library | None":
+        if isinstance(settings, ProceduralSource):
             return None
-        from workers.assets.external.verdicts import check_listing
+        from workers.assets.library.making import open_library
 
-        assert kept is not None
-        return check_listing(settings, listing, assets, kept, watch)
+        if settings.folder not in opened:
+            opened[settings.folder] = open_library(settings.folder, job_folder, watch)
+        return opened[settings.folder]
 
-    if kept is None and any(not isinstance(source, ProceduralSource) for source in (*assets.objects, *assets.tables)):
-        from workers.assets.external.verdicts import USUAL_FOLDER, Verdicts
-
-        kept = Verdicts(USUAL_FOLDER)
-    objects = tuple(open_source(source, categories) for source in assets.objects)
-    tables = tuple(open_source(source, (TABLE,)) for source in assets.tables)
+    objects = tuple(open_source(source) for source in assets.objects)
+    tables = tuple(open_source(source) for source in assets.tables)
     _refuse_ambiguous(assets)
-    skipped: dict[str, Counter[str]] = {}
-    for listing in (*objects, *tables):
-        if listing is not None and listing.skipped:
-            skipped.setdefault(str(listing.folder), Counter()).update(listing.skipped)
-    digest = _digest(assets, objects, tables, categories)
-    catalogue = Catalogue(
-        assets, objects, tables, digest, {folder: dict(reasons) for folder, reasons in skipped.items()}
-    )
+    catalogue = Catalogue(assets, objects, tables, _digest(assets, objects, tables, categories))
     for category in (*sorted(categories), TABLE):
         _check_offered(catalogue, category)
     return catalogue
@@ -225,51 +204,52 @@ def _refuse_ambiguous(assets: Assets) -> None:
 
 
 def _check_offered(catalogue: Catalogue, category: str) -> None:
-    offers = catalogue.offers(category)
-    for listing in catalogue.tables if category == TABLE else catalogue.objects:
-        if listing is not None and listing.entries.get(category) and not listing.count(category):
-            most = f"none of {len(listing.entries[category])} meshes for {category!r} in {listing.folder} can be used"
-            raise AssetSourceError(f"{most}: {'; '.join(listing.examples)}")
+    libraries = catalogue.tables if category == TABLE else catalogue.objects
+    for library in libraries:
+        if library is not None and library.entries.get(category) and not library.count(category):
+            most = f"none of {len(library.entries[category])} meshes for {category!r} in {library.source} can be used"
+            raise AssetSourceError(f"{most}: {'; '.join(library.examples)}")
+    if catalogue.offers(category):
+        return
     where = "assets.tables" if category == TABLE else "assets.objects"
-    if not offers:
-        listings = catalogue.tables if category == TABLE else catalogue.objects
-        seen = [_describe(listing) for listing in listings if listing is not None]
-        foreign = category in BUILT_IN and BUILT_IN[category].synset is None
-        hint = f" ShapeNetCore has no {category}." if foreign else ""
-        raise AssetSourceError(
-            f"no source in {where} offers {category!r}: {'; '.join(seen)}.{hint} Add `- source: procedural` there, "
-            + (f"or leave {category!r} out of `categories`." if category != TABLE else "or a folder that has tables.")
-        )
-
-
-def _describe(listing: "Listing") -> str:
-    found = (
-        ", ".join(f"{len(entries)} {category}" for category, entries in listing.entries.items()) or "nothing asked for"
+    seen = [_describe(library) for library in libraries if library is not None]
+    foreign = category in BUILT_IN and BUILT_IN[category].synset is None
+    hint = f" ShapeNetCore has no {category}." if foreign else ""
+    raise AssetSourceError(
+        f"no source in {where} offers {category!r}: {'; '.join(seen)}.{hint} Add `- source: procedural` there, "
+        + (f"or leave {category!r} out of `categories`." if category != TABLE else "or a library that has tables.")
     )
-    left = ", ".join(f"{count} {reason}" for reason, count in listing.skipped.items())
-    return f"{listing.folder} has {found}" + (f" (skipped: {left})" if left else "")
+
+
+MOST_TOLD = 20
+"""Categories of a library that a message names."""
+
+
+def _describe(library: "Library") -> str:
+    names = [f"{library.count(category)} {category}" for category in library.entries]
+    more = f" and {len(names) - MOST_TOLD} more" if len(names) > MOST_TOLD else ""
+    left = ", ".join(f"{count} {reason}" for reason, count in library.skipped.items())
+    return f"{library.source} has {', '.join(names[:MOST_TOLD]) or 'nothing'}{more}" + (
+        f" (skipped: {left})" if left else ""
+    )
 
 
 def _digest(
     assets: Assets,
-    objects: "tuple[Listing | None, ...]",
-    tables: "tuple[Listing | None, ...]",
+    objects: "tuple[Library | None, ...]",
+    tables: "tuple[Library | None, ...]",
     categories: Collection[str],
 ) -> str:
-    """SHA-256 over the settings of every source and, for files, what was found: paths, sizes and digests."""
-    record = []
-    for settings, listing in zip((*assets.objects, *assets.tables), (*objects, *tables), strict=True):
+    """SHA-256 over the settings of every source and, for libraries, over their rows."""
+    record = [
         # The folder's path is left out: the same files elsewhere are the same catalogue.
-        plain = differing_keys(settings, {"folder"})
-        files: dict[str, Any] | None = None
-        if listing is not None:
-            files = {
-                category: [(e.instance_id, e.licence, [(f.path, f.size, f.sha256) for f in e.files]) for e in entries]
-                for category, entries in listing.entries.items()
-            }
-            if any(listing.refused.values()):
-                files["refused"] = {category: sorted(numbers) for category, numbers in listing.refused.items()}
-        record.append({"settings": plain, "generator": VERSION if listing is None else None, "files": files})
+        {
+            "settings": differing_keys(settings, {"folder"}),
+            "generator": VERSION if library is None else None,
+            "files": None if library is None else library.digest,
+        }
+        for settings, library in zip((*assets.objects, *assets.tables), (*objects, *tables), strict=True)
+    ]
     scalars = differing_keys(assets, {"objects", "tables"})
     whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": scalars}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()

@@ -5,6 +5,7 @@ says so in `asset.extras`. Written by hand because it is short, and because othe
 order of parts or the compression of images, hence no bytes; the tests read it back with trimesh.
 """
 
+import hashlib
 import io
 import json
 import struct
@@ -19,7 +20,8 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Array
-from schemas.scene.shape import Asset, Material, Part
+from schemas.scene.shape import Asset, Material, Part, Shape
+from workers.door.opening import split_glb
 from workers.geometry.colour import attribute_colors, decode_srgb, encode_srgb
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
@@ -77,10 +79,12 @@ class _Writer:
         return self._numbers[id(pixels)]
 
 
-def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> bytes:
+def asset_glb(
+    asset: Asset, encode_opaque: EncodeImage = encode_with_pillow, library: dict[str, Any] | None = None
+) -> bytes:
     """The asset's shape with its materials: positions and normals float32, one primitive for each part.
 
-    `encode_opaque` makes the PNGs of images without alpha.
+    `encode_opaque` makes the PNGs of images without alpha. `library`: what a library keeps of the asset.
     """
     writer = _Writer(encode_opaque)
     colors = decode_srgb(np.array([part.material.base_color[:3] for part in asset.shape.parts])).tolist()
@@ -88,12 +92,14 @@ def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> 
         _material(writer, part, rgb, asset.watertight) for part, rgb in zip(asset.shape.parts, colors, strict=True)
     ]
     primitives = [_primitive(writer, part, number) for number, part in enumerate(asset.shape.parts)]
-    extras = {
+    extras: dict[str, Any] = {
         "frame": "object frame: metres, z up, origin at the centre of the bounding box",
         "category": asset.category,
         "source": asset.source,
         "sha256": asset.sha256,
     }
+    if library is not None:
+        extras["library"] = {**library, "bytes_sha256": hashlib.sha256(writer.binary).hexdigest()}
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "verso", "copyright": asset.licence, "extras": extras},
         "scene": 0,
@@ -194,27 +200,65 @@ def show_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh
 
 
-def part_of_mesh(name: str, mesh: trimesh.Trimesh) -> Part:
-    """A mesh of a stored GLB, as trimesh loads it, in our terms: colours are sRGB again."""
-    visual: Any = mesh.visual
-    material, uv, colors = Material((1.0, 1.0, 1.0, 1.0)), None, None
-    if visual.kind == "texture":
-        uv, source = visual.uv, visual.material
-        factor = np.ones(4) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
-        red, green, blue = encode_srgb(factor[:3]).tolist()
-        image = source.baseColorTexture
-        texture = None if image is None else np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
-        metallic, roughness = (1.0 if x is None else float(x) for x in (source.metallicFactor, source.roughnessFactor))
-        material = Material((red, green, blue, float(factor[3])), metallic, roughness, texture)
-        colors = visual.vertex_attributes.get("color")
-    elif visual.kind == "vertex":
-        colors = np.asarray(visual.vertex_colors)
-    return Part(
-        name,
-        np.asarray(mesh.vertices, dtype=np.float64),
-        np.asarray(mesh.faces, dtype=np.int32),
-        material,
-        np.asarray(mesh.vertex_normals, dtype=np.float64),
-        None if uv is None else np.asarray(uv, dtype=np.float64),
-        attribute_colors(colors, len(mesh.vertices), linear=True),
+def read_shape(data: bytes) -> tuple[Shape, dict[str, Any]]:
+    """The shape of a stored GLB, and what its library keeps of it (empty for other GLBs), the inverse of `asset_glb`.
+
+    Raises ValueError, LookupError, TypeError, struct.error or OSError where the bytes are not such.
+    """
+    tree, binary = split_glb(data)
+    kept = tree["asset"]["extras"].get("library", {})
+    end = max(view["byteOffset"] + view["byteLength"] for view in tree["bufferViews"])
+    if kept and hashlib.sha256(binary[:end]).hexdigest() != kept["bytes_sha256"]:
+        raise ValueError("its buffer was changed")
+    images: list[tuple[NDArray[np.uint8], bytes | None]] = []
+    for image in tree.get("images", ()):
+        view = tree["bufferViews"][image["bufferView"]]
+        encoded = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        with Image.open(io.BytesIO(encoded)) as opened:
+            pixels = np.asarray(opened.convert("RGBA" if "A" in opened.getbands() else "RGB"))
+        images.append((pixels, encoded if image["mimeType"] == "image/jpeg" else None))
+    (mesh,) = tree["meshes"]
+    opaque = not any(material.get("doubleSided") for material in tree["materials"])
+    parts = tuple(_read_part(tree, binary, primitive, images) for primitive in mesh["primitives"])
+    return Shape(parts, bool(kept.get("closed", opaque))), kept
+
+
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_TYPES: dict[int, np.dtype[Any]] = {_FLOAT: np.dtype("<f4"), _USHORT: np.dtype("<u2"), _UINT: np.dtype("<u4")}
+
+
+def _read_part(
+    tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], images: list[tuple[NDArray[np.uint8], bytes | None]]
+) -> Part:
+    def array(number: int) -> NDArray:
+        accessor = tree["accessors"][number]
+        width, start = _WIDTHS[accessor["type"]], tree["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        values = np.frombuffer(binary, _TYPES[accessor["componentType"]], accessor["count"] * width, start)
+        if not np.isfinite(values).all():
+            raise ValueError("a number that is not finite")
+        return values.reshape(-1, width)
+
+    given = {name: array(number) for name, number in primitive["attributes"].items()}
+    vertices = given["POSITION"].astype(np.float64)
+    faces = array(primitive["indices"]).reshape(-1, 3).astype(np.int32)
+    if not len(faces) or int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        raise ValueError("a face names a vertex that is not there")
+    if any(len(values) != len(vertices) for values in given.values()):
+        raise ValueError("attributes of unlike lengths")
+    uv = given["TEXCOORD_0"].astype(np.float64) if "TEXCOORD_0" in given else None
+    if uv is not None:
+        uv[:, 1] = 1.0 - uv[:, 1]
+    stored = tree["materials"][primitive["material"]]
+    rough = stored["pbrMetallicRoughness"]
+    red, green, blue = encode_srgb(np.array(rough["baseColorFactor"][:3], np.float64)).tolist()
+    texture, jpeg = images[rough["baseColorTexture"]["index"]] if "baseColorTexture" in rough else (None, None)
+    color = red, green, blue, float(rough["baseColorFactor"][3])
+    material = Material(
+        color, float(rough["metallicFactor"]), float(rough["roughnessFactor"]), texture=texture, jpeg=jpeg
     )
+    normals = given["NORMAL"].astype(np.float64) if "NORMAL" in given else None
+    colors = attribute_colors(given.get("COLOR_0"), len(vertices), linear=True)
+    for values in (vertices, faces, normals, uv, colors):
+        if values is not None:
+            values.setflags(write=False)
+    return Part(str(stored["name"]), vertices, faces, material, normals, uv, colors)

@@ -24,8 +24,7 @@ from schemas.base import Array
 from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError, CaptureError, InputError
 from schemas.job.job import Job
-from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.assets.external.listing import Watch, ignore
+from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW, TRUTH
 from workers.door.meshes.ply import Element, encode_ply, parse_ply
 from workers.door.opening import as_refusal

@@ -88,8 +88,8 @@ REFUSED = (
     (["run", "nowhere.yaml"], ["nowhere.yaml", "no such file", "deploy/jobs"]),
     (["run", TABLETOP, "--set", "physcs.step_hz=3"], ["physcs", "did you mean 'physics'"]),
     (["run", TABLETOP, "--set", "categories=[sofa]"], ["categories.sofa", "laptop, mug, bowl"]),
-    (["run", TABLETOP, "--set", "assets.objects.0={source: urdf, folder: /nowhere/at/all}"], ["/nowhere/at/all"]),
-    (["run", TABLETOP, "--set", "assets.objects.0={source: shapenet, folder: .}"], ["deploy/jobs", "synset folders"]),
+    (["run", TABLETOP, "--set", "assets.objects.0={source: library, folder: /nowhere/at/all}"], ["/nowhere/at/all"]),
+    (["run", TABLETOP, "--set", "assets.objects.0={source: library, folder: .}"], ["deploy/jobs has no mesh"]),
     (["run", TABLETOP, "--address", "nonsense"], ["HOST:PORT"]),
     (["query", "nowhere", "select 1"], ["nowhere", "job.yaml"]),
     (["verify", "nowhere"], ["nowhere", "job.yaml"]),
@@ -112,8 +112,8 @@ def test_bad_input_is_told_by_key_value_and_remedy(capsys, tmp_path, monkeypatch
 
 def test_a_folder_without_a_usable_mesh_is_refused_with_what_was_found(capsys, tmp_path):
     (tmp_path / "broken.obj").write_text("f 1 2 3\n")
-    source = f"assets.objects.0={{source: urdf, folder: {tmp_path}, category_map: {{'*.obj': mug}}}}"
-    asked = ["run", TABLETOP, "--set", source, "--set", "categories=[mug]", "--out", str(tmp_path / "out")]
+    source = f"assets.objects.0={{source: library, folder: {tmp_path}}}"
+    asked = ["run", TABLETOP, "--set", source, "--set", "categories=[broken]", "--out", str(tmp_path / "out")]
     code, text = told(capsys, *asked)
     assert code == 2 and (str(tmp_path) in text or "broken" in text)
     assert not (tmp_path / "out").exists()

@@ -51,10 +51,10 @@ REFUSED = (
     (["nowhere.yaml"], ["nowhere.yaml", "no such file"]),
     ([TABLETOP, "--set", "physcs.step_hz=3"], ["physcs", "did you mean 'physics'"]),
     (
-        [TABLETOP, "--set", "assets.objects.0={source: urdf, folder: meshes}"],
+        [TABLETOP, "--set", "assets.objects.0={source: library, folder: meshes}"],
         ["folder: 'meshes'", "write the whole path"],
     ),
-    ([TABLETOP, "--set", "assets.objects.0={source: urdf, folder: ~/meshes}"], ["0.folder", "write the whole path"]),
+    ([TABLETOP, "--set", "assets.objects.0={source: library, folder: ~/meshes}"], ["0.folder", "write the whole path"]),
 )
 
 

@@ -16,6 +16,7 @@ from services.job.job_file import validate_job
 from services.job.record import encode_job, read_job
 from tests.datasets import SMALL, make_dataset, overlaid
 from tests.services.conftest import TWO_PAIRS
+from tests.workers.assets.libraries import library_of
 from workers.store.local import LocalStore
 
 KEYS = overlaid(SMALL, TWO_PAIRS)
@@ -90,7 +91,7 @@ def test_colours_of_vertices_are_shown_by_a_mesh_and_by_a_stored_file_read_as_th
     ball.visual.vertex_colors = np.where(ball.vertices[:, 2:] < 0, [200, 0, 0, 255], [0, 200, 0, 255])
     (tmp_path / "ply").mkdir()
     ball.export(tmp_path / "ply/a.ply")
-    source = {"source": "files", "folder": str(tmp_path / "ply"), "category_map": {"*": "mug"}, "copy_assets": True}
+    source = {**library_of(tmp_path / "ply"), "copy_assets": True}
     folder = tmp_path / "out"
     make_dataset(folder, scenes=1, categories={"mug": 1.0}, assets={"objects": [source]})
     (pair,) = open_dataset(folder).pairs()
@@ -124,7 +125,7 @@ def test_a_shape_that_is_not_stored_comes_from_the_source_and_one_that_is_gone_i
         for number in (2, 3):
             assert made.mesh(number).bounds == pytest.approx(stored.mesh(number).bounds, abs=1e-6)
     record = read_job(files)
-    gone = {"objects": [{"source": "urdf", "folder": "/nowhere", "category_map": {"*": "mug"}}]}
+    gone = {"objects": [{"source": "library", "folder": "/nowhere"}]}
     job = type(record.job).model_validate({**record.job.model_dump(mode="json"), "assets": gone})
     LocalStore(copy).put("job.yaml", encode_job(type(record)(job, record.digest, record.catalogue, record.folder)))
     (pair, *_) = open_dataset(copy).pairs()

@@ -365,7 +365,7 @@ def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_p
     extents = next(row["extents_m"] for row in source_rows(files.root, "assets") if row["category"] != "table")
     assert np.ptp(stored.shape.vertices, axis=0).max() < 2 * max(extents)
     record = require_job(copy)
-    gone = {"objects": [{"source": "urdf", "folder": "gone", "category_map": {"*.obj": "mug"}}]}
+    gone = {"objects": [{"source": "library", "folder": "gone"}]}
     job = Job.model_validate({"name": "t", "assets": gone})
     sources = Sources(dataclasses.replace(record, job=job, folder=str(tmp_path)))
     with pytest.raises(InputError, match="gone"):

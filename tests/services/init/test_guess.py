@@ -1,17 +1,13 @@
-"""Categories by pattern, copies, units and the axis that is up, guessed for a folder of meshes; and the job that says so."""
+"""Categories, copies, units and the axis that is up, guessed for a folder of meshes."""
 
 from dataclasses import replace
-from glob import escape
 
-from schemas.job.assets import FolderSource
-from services.init.categories import is_category, map_categories, name_categories
-from services.init.collection import SUFFIXES
-from services.init.command import describe_guess, make_guess, write_job
-from services.init.copies import Item, Reading, find_copies, find_doubles
-from services.init.guess import Guess, guess_groups, guess_ups, plain_axis
-from services.job.bounded_yaml import parse_yaml
-from services.job.job_file import validate_job
-from workers.assets.external.placement import Measured
+from schemas.job.assets import is_usable
+from workers.assets.library.categories import name_categories
+from workers.assets.library.collection import SUFFIXES
+from workers.assets.library.copies import Item, find_copies, find_doubles
+from workers.assets.library.guess import guess_groups, guess_ups
+from workers.assets.library.placement import Measured
 
 CATEGORIES = (
     (None, {"mug/a.obj": "mug"}),
@@ -43,38 +39,12 @@ CATEGORIES = (
         {"k/mugs/a.obj": "mugs", "k/mugs/b.obj": "mugs", "k/jars/c.obj": "jars", "k/jars/d.obj": "jars", "e.obj": "e"},
     ),
 )
-FOLDERS = {
-    "one folder each": ({"mug/a.obj": "mug", "mug/b.obj": "mug", "can/a.obj": "can"}, (), ()),
-    "deep": ({"mug/1/m.obj": "mug", "mug/2/m.obj": "mug", "mug/2/x/n.obj": "mug"}, (), ()),
-    "flat": ({"mug_1.obj": "mug", "mug_2.obj": "mug", "mugtree.obj": "mugtree"}, (), ()),
-    "two formats": ({"a/m.obj": "a", "a/n.OBJ": "a", "a/m.glb": "a"}, (), ()),
-    "beside what is left out": ({"a/m.obj": "a", "a/n.obj": "a"}, ("a/dup.obj", "a/x.stl"), ()),
-    "beside what is broken": ({"a/m.obj": "a", "a/n.obj": "a"}, ("a/torn.obj",), ("a/torn.obj",)),
-    "strange names": ({"[a]/*.obj": "a", "[a]/b?.obj": "a", "b'\"/ü #.obj": "b"}, ("a/c.obj",), ()),
-    "urdfs": ({"x/model.urdf": "x", "y/model.urdf": "y", "z/q/model.urdf": "z"}, ("x/textured.obj",), ()),
-    "one category": ({"a/m.obj": "t", "b/c/n.obj": "t", "o.obj": "t"}, (), ()),
-    "one category, some out": ({"a/m.obj": "t", "b/c/n.obj": "t", "o.obj": "t"}, ("b/p.obj",), ()),
-}
 
 
 def test_categories_follow_from_where_files_lie_and_what_they_and_their_folders_are_called():
     for source, categories in CATEGORIES:
         assert name_categories(categories, source) == categories
-        assert all(is_category(name) for name in categories.values())
-
-
-def test_patterns_find_the_files_of_their_category_and_no_others(tmp_path):
-    for name, (items, others, harmless) in FOLDERS.items():
-        folder = tmp_path / name
-        for path in (*items, *others):
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (folder / path).touch()
-        found: dict[str, str] = {}
-        for pattern, category in map_categories(items, others, harmless).items():
-            for path in folder.glob(pattern):
-                if path.is_file():
-                    found.setdefault(path.relative_to(folder).as_posix(), category)
-        assert {path: category for path, category in found.items() if path not in harmless} == items, name
+        assert all(is_usable(name) for name in categories.values())
 
 
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure", **more):
@@ -137,39 +107,37 @@ def test_the_unit_is_what_a_file_says_or_what_things_on_a_table_have_by_folder()
 
 def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_all_files_speak_against_it():
     def ups(*items):
-        return {rule.pattern: rule.axis for rule in guess_ups(items)}
+        return {path: axis for path, (axis, _) in guess_ups(items).items()}
 
     sure = [item(f"{k}.obj", up="y") for k in range(5)]
-    assert ups(*sure, item("box.obj")) == {"**/*.obj": "y"} and plain_axis(guess_ups(sure)) == "y"
-    assert ups(*sure, item("odd [1].obj", up="z")) == {"odd [[]1].obj": "z", "**/*.obj": "y"}
+    assert ups(*sure, item("box.obj"), item("odd.obj", up="z")) == {
+        **dict.fromkeys([f"{k}.obj" for k in range(5)], "y"),
+        "box.obj": "y",
+        "odd.obj": "z",
+    }
     for suffix in (".obj", ".glb"):
         z, y = (
             [item(f"{name}/{k}{suffix}", up=up) for k in range(n)] for name, up, n in (("a", "z", 9), ("b", "y", 3))
         )
-        found = ups(*z, *y, item(f"b/box{suffix}"))
-        line = {"b/**/*.obj": "y"} if suffix == ".obj" else {"b/**/*.glb": "y"}
-        assert found == {**line, f"**/*{suffix}": "z"}, "a folder has a line"
-    assert ups(item("box.glb"), item("a.gltf", up="z", confidence="likely")) == {"**/*.glb": "y", "**/*.gltf": "y"}
-    assert ups(item("mug.glb", up="z")) == {"**/*.glb": "z"}, "most of all files are sure"
+        fits = ups(*z, *y, item(f"b/box{suffix}"), item(f"box{suffix}"))
+        assert (fits[f"a/0{suffix}"], fits[f"b/box{suffix}"], fits[f"box{suffix}"]) == ("z", "y", "z"), "by folder"
+    assert ups(item("box.glb"), item("a.gltf", up="z", confidence="likely")) == {"box.glb": "y", "a.gltf": "y"}
+    assert ups(item("mug.glb", up="z")) == {"mug.glb": "z"}, "most of all files are sure"
     for suffix, axis in ((".glb", "y"), (".urdf", "z"), (".xml", "z")):
-        boxes = [item(f"{k}{suffix}") for k in range(3)]
-        *files, rule = guess_ups([*boxes, *(item(f"s{k}{suffix}", up="x") for k in range(3))])
-        assert rule.axis == axis and "3 of 6 stand on x alone" in rule.why, "half of them are not most"
-        assert len(files) == (0 if suffix == ".glb" else 3), "but a robot's file may lie on its side"
+        fits = guess_ups([item(f"{k}{suffix}", up="x" if k > 2 else None) for k in range(6)])
+        assert fits[f"0{suffix}"][0] == axis and "3 of 6 stand on x alone" in fits[f"0{suffix}"][1], "half are not most"
+        assert fits[f"5{suffix}"][0] == ("y" if suffix == ".glb" else "x"), "but a robot's file may lie on its side"
     stated = [item(f"{k}.dae", stated_up="y") for k in range(3)]
-    assert ups(*stated, item("z.dae", stated_up="z")) == {"z.dae": "z", "**/*.dae": "y"}, "as each file says"
-    lines = describe_guess(
-        Guess((), tuple(guess_ups([*stated, item("z.dae", stated_up="z"), *sure, item("odd.obj", up="z")])))
-    )
-    assert [line for line in lines if "differs" in line] == [
-        "up differs: z.dae z: as the file says",
-        "up differs: odd.obj z: stands on this axis alone, unlike its neighbours",
-    ]
-    assert ups(*stated, item("s.dae", up="x", stated_up="y")) == {"**/*.dae": "y"}, "one file alone may be mistaken"
-    assert ups(item("a.obj", up="y"), item("b.obj", up="x")) == {"a.obj": "y", "b.obj": "x", "**/*.obj": "z"}
+    assert ups(*stated, item("z.dae", stated_up="z"))["z.dae"] == "z", "as each file says"
+    assert ups(*stated, item("s.dae", up="x", stated_up="y"))["s.dae"] == "y", "one file alone may be mistaken"
+    assert ups(item("a.obj", up="y"), item("b.obj", up="x"), item("c.obj")) == {
+        "a.obj": "y",
+        "b.obj": "x",
+        "c.obj": "z",
+    }
     for confidence, axis, why in (("likely", "y", "likely: 1 of 2"), (None, "z", "not known")):
-        (rule,) = guess_ups([item("a.obj", up=confidence and "y", confidence=confidence), item("b.obj")])
-        assert rule.axis == axis and rule.why.startswith(why)
+        fits = guess_ups([item("a.obj", up=confidence and "y", confidence=confidence), item("b.obj")])
+        assert fits["b.obj"][0] == axis and fits["b.obj"][1].startswith(why)
 
 
 COPIES = {
@@ -244,48 +212,3 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
     ):
         assert find_doubles([first, second], lambda item: item.diagonal, SUFFIXES) == []
     assert len(find_doubles([item("a.obj"), replace(item("b.obj"), digest="a.obj")], lambda one: 1.0, SUFFIXES)) == 1
-
-
-# ------------------------------------------------------------------------------------------------ the text of the job
-
-
-def job_of(items, folder="meshes", by="thing"):
-    guess, kept, _ = make_guess(Reading(tuple(items), ()), by)
-    text = write_job("mine", "mine.yaml", folder, "s.jpg", {one.path: one.category for one in kept}, guess)
-    return text, validate_job(parse_yaml(text), "j")
-
-
-def test_it_is_a_job_with_its_guesses_and_the_reasons_beside_them():
-    text, job = job_of(cubes(250.0, 300.0))
-    (source,) = job.assets.objects
-    assert isinstance(source, FolderSource)
-    assert (source.scale, source.up, source.folder, source.copy_assets) == (0.001, "z", "meshes", False)
-    assert job.categories == {"thing": 1.0} and job.scenes == 64
-    assert "# .obj: 275 units across (the middle one): taken for millimetres, 27.5 cm" in text
-    assert "# **/*.obj: not known: the shapes stand on several axes or on none" in text
-    assert "look at the pictures (s.jpg)" in text
-
-
-def test_axes_that_differ_are_a_map_by_pattern_and_units_that_differ_are_sources_of_their_own():
-    items = [item(f"{k}.obj", up="z") for k in range(4)] + [item("odd: {1}.obj", up="y"), item("a.glb", up="y")]
-    text, job = job_of(items)
-    assert job.assets.objects[0].up == {"odd: {1}.obj": "y", "**/*.glb": "y", "**/*.obj": "z"}
-    assert '# stands on this axis alone, unlike its neighbours\n        "odd: {1}.obj": y' in text
-    _, job = job_of([*cubes(250.0, 260.0), *cubes(0.2, suffix=".glb", folder="g/")])
-    maps = {tuple(source.category_map): (source.scale, source.weight) for source in job.assets.objects}
-    assert maps == {("g/0.glb",): (1.0, 1.0), ("*.obj",): (0.001, 2.0)}, "which weigh as many as they have"
-    _, job = job_of([*cubes(0.4, 0.3, folder="a/"), *cubes(400.0, 350.0, folder="b/")], by=None)
-    maps = [(source.scale, dict(source.category_map), source.up) for source in job.assets.objects]
-    assert maps == [(1.0, {"a/*.obj": "a"}, "z"), (0.001, {"b/*.obj": "b"}, "z")]
-    _, kept, left_out = make_guess(Reading((*cubes(0.2, 0.3, 0.006),), ()), None)
-    assert len(kept) == 2 and left_out[0].why.startswith("is too small to be seen on a table: 6 mm at scale 1;")
-
-
-def test_strange_names_are_written_as_they_are():
-    for name in ("~", "null", "a b", "ü", "a'b\"c", "[x]", "#1", "yes", "a\\b", "- x", "1e3", "%x", "&a", "*", "0_1"):
-        _, job = job_of([item(f"{name}.obj")], folder=name)
-        assert job.assets.objects[0].folder == name and list(job.assets.objects[0].category_map) == [
-            escape(f"{name}.obj")
-        ]
-    for category in ("no", "null", "0_1e", "1_000a", "on", "1e3", "thing", "杯子"):
-        assert list(job_of(cubes(0.2), by=category)[1].categories) == [category]

@@ -1,4 +1,4 @@
-"""`verso init`: a folder of meshes becomes a job and a page of pictures; and docs/own_meshes.md, whose commands are run."""
+"""`verso init`: a folder of meshes becomes a library, a page of pictures and a job; and docs/own_meshes.md, which is run."""
 
 import json
 import os
@@ -12,32 +12,31 @@ from pathlib import Path
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
-import trimesh
 from PIL import Image
 
 from schemas.errors import AssetSourceError, MachineError
-from schemas.job.assets import Assets, FolderSource, ProceduralSource
+from schemas.job.assets import ProceduralSource
 from services.cli.main import main
-from services.init import collection, command, shown
-from services.init.collection import SUFFIXES, LeftOut, read_folder, walk_folder
+from services.init import command, shown
 from services.init.shown import (
     HEADINGS,
     MOST_ROWS,
     TILE,
-    Shown,
+    cells_of,
     draw_left_out,
     draw_object,
     draw_sheet,
     draw_table,
     plural,
-    show_items,
 )
-from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import load_job
 from tests.services.init.own_meshes import cup, mixed_folder, write_mesh
 from tests.workers.door.oracles import write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
+from workers.assets.library import collection
+from workers.assets.library.collection import SUFFIXES, walk_folder
+from workers.assets.library.table import Row, read_table
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
 from workers.render.raster.gbuffer import shared_renderer
@@ -52,48 +51,56 @@ def init(*words, capsys):
 
 
 @pytest.mark.minute
-def test_a_mixed_folder_becomes_a_job_that_offers_exactly_what_was_shown(tmp_path, capsys):
-    folder, out = mixed_folder(tmp_path / "mixed meshes"), tmp_path / "mine.yaml"
+def test_a_mixed_folder_becomes_a_library_and_a_job_that_offers_exactly_what_was_shown(tmp_path, capsys):
+    folder, out = mixed_folder(tmp_path / "mixed meshes"), tmp_path / "lib"
     code, told, _ = init(folder, "--out", out, "--json", capsys=capsys)
     answer = json.loads(told.splitlines()[-1])
-    assert (code, answer["ok"], answer["job"], answer["sheet"]) == (0, True, str(out), str(tmp_path / "mine.jpg"))
-    assert f"verso run {out} --scenes 8" in told and "robot/collision.obj and 1 more (part): part of robot" in told
+    assert (code, answer["ok"], answer["job"], answer["sheet"]) == (
+        0,
+        True,
+        str(out / "job.yaml"),
+        str(out / "sheet.jpg"),
+    )
+    assert (
+        f"verso run {out}/job.yaml --scenes 8" in told
+        and "robot/collision.obj and 1 more (part): part of robot" in told
+    )
 
-    job = load_job(out)
-    catalogue = open_catalogue(job.assets, out.parent, tuple(job.categories))
-    offered = {
-        entry.files[0].path: category
-        for listing in catalogue.objects
-        for category, entries in listing.entries.items()
-        for number, entry in enumerate(entries)
-        if number not in listing.refused.get(category, ())
-    }
+    job = load_job(out / "job.yaml")
+    catalogue = open_catalogue(job.assets, out, tuple(job.categories))
+    (library,) = catalogue.libraries()
+    offered = {row.path: row.category for row in library.rows if row.use and row.category}
     assert offered == {one["path"]: one["category"] for one in answer["objects"]} and len(offered) == 10
     categories = {"002_can", "bottles", "gltf-cup", "mugs", "robot", "standing", "table_mesh"}
     assert set(offered.values()) == set(job.categories) == categories
-    doubts = {path: axis for listing in catalogue.objects for path, axis in listing.doubts.items()}
-    assert doubts == {"standing.glb": "z"}, "one against the specification, which is told"
-    assert job.assets.objects[0].folder == "mixed meshes", "relative to the job file"
-    heights = {one["path"]: one["size_m"][2] for one in answer["objects"]}
+    assert library.doubts == {"standing.glb": "z"}, "one against the specification, which is told"
+    heights = {row.path: row.extents_m[2] for row in library.rows if row.extents_m}
     true = {"mugs/mug_2.glb": 0.12, "standing.glb": 0.08, "bottles/bottle 0.stl": 0.2, "gltf cup/model.gltf": 0.1}
     assert {path: heights[path] for path in true} == pytest.approx(true, abs=1e-6)
+    loaded = {
+        row.path: catalogue.load(catalogue.refer(0, row.category, k))
+        for c in library.entries.values()
+        for k, row in enumerate(c)
+        if row.use
+    }
+    assert all(loaded[row.path].mass.mass_kg == row.mass_kg for row in library.rows if row.use and row.category)
     left_out = {one["path"]: (one["reason"], one["why"]) for one in answer["left_out"]}
     assert left_out.pop("broken.obj")[0] == "index_out_of_range"
+    assert left_out.pop("huge.stl")[1].startswith("is too large for a table: 1.73e+03 m at 0.001 m a unit; change")
     assert left_out == {
         "002_can/google_16k/nontextured.ply": ("copy", "double of 002_can/copy/textured.obj"),
         "002_can/google_16k/textured.obj": ("copy", "double of 002_can/copy/textured.obj"),
-        "huge.stl": (
-            "size",
-            "is too large for a table: 1.73e+03 m at scale 0.001; put it into a folder of its own, and init that",
-        ),
         "mugs/out.glb": ("link", "leads out of the folder: copy it there"),
         "robot/collision.obj": ("part", "part of robot/model.urdf"),
         "robot/textured.obj": ("part", "part of robot/model.urdf"),
         "scene.fbx": ("format", ".fbx is not read: run `assimp export FILE FILE.glb`, or use Blender"),
         "torn.gltf": ("missing", "its buffer gone.bin is missing"),
     }
-    with Image.open(tmp_path / "mine.jpg") as page:
+    with Image.open(out / "sheet.jpg") as page:
         assert page.size[0] > 1500 and np.asarray(page).std() > 20
+    before = {path: path.read_bytes() for path in (*out.glob("shapes/*"), out / "job.yaml", out / "library.parquet")}
+    assert init(folder, "--out", out, capsys=capsys)[0] == 0
+    assert before == {path: path.read_bytes() for path in before}, "once more, the same"
 
 
 WRONG = (
@@ -101,13 +108,13 @@ WRONG = (
     (("file",), "file is a file"),
     (("empty",), "empty is empty"),
     (("other",), "other has no mesh"),
-    (("broken",), "none of its meshes can be used: 1 left out"),
     (("good", "--category-from", "a/b"), "--category-from a/b: write folder, parent, file, or a name"),
-    (("good", "--category-from", "table"), "--category-from table"),
-    (("good", "--sheet", "a.gif"), "must end in .jpg or .png"),
-    (("good", "--out", "file/a.yaml"), "cannot be written"),
-    (("good", "--out", "mine.yaml"), "mine.yaml is there already"),
-    (("good", "--sheet", "mine.jpg"), "mine.jpg is there already"),
+    (("good", "--out", "file"), "file is there already, and no library"),
+    (("good", "--out", "other"), "other is there already, and no library"),
+    (("good", "--out", "file/lib"), "cannot be written"),
+    (("good", "--limit", "max_fases=3"), "--limit max_fases: write NAME=VALUE: max_file_mb, max_vertices"),
+    (("good", "--limit", "max_faces=x"), "--limit max_faces: write NAME=VALUE: Input should be"),
+    (("good", "--licence", " "), "--licence: write some words"),
 )
 
 
@@ -115,45 +122,40 @@ def test_wrong_input_is_one_clear_line_and_leaves_and_overwrites_nothing(tmp_pat
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()
     write_mesh(Path("good/a.stl"), cup())
-    for name, text in (("broken/a.obj", "v 0 0 0\n"), ("other/readme.txt", ""), ("file", ""), ("mine.yaml", "mine")):
+    for name, text in (("broken/a.obj", "v 0 0 0\n"), ("other/readme.txt", ""), ("file", "")):
         write(Path(name), text)
-    write(Path("mine.jpg"), "mine")
     before = {path: path.is_file() and path.read_bytes() for path in sorted(tmp_path.rglob("*"))}
     for words, says in WRONG:
         code, _, err = init(*words, capsys=capsys)
-        assert code == 2 and says in err.splitlines()[-1] and err.splitlines()[-1].startswith("verso: "), words
+        assert code == 2 and says in err, (words, err)
         assert len(err.splitlines()) <= 3 and "Traceback" not in err
-        for path in set(tmp_path.rglob("*")) - set(before):
-            assert path.suffix == ".jpg" and "cannot be written" in says  # the pictures were drawn before the job
-            path.unlink()
-        assert before == {path: path.is_file() and path.read_bytes() for path in sorted(tmp_path.rglob("*"))}
+        assert before == {path: path.is_file() and path.read_bytes() for path in sorted(tmp_path.rglob("*"))}, words
+    code, _, err = init("broken", capsys=capsys)
+    assert code == 2 and "none of its meshes can be used: 1 left out" in err
 
 
-def test_without_opengl_there_is_a_job_and_no_picture_unless_one_was_asked_for(tmp_path, capsys, monkeypatch):
+def test_without_opengl_there_is_a_library_and_no_picture(tmp_path, capsys, monkeypatch):
     def no_gl():
         raise MachineError("no OpenGL here: install libegl1")
 
     monkeypatch.setattr(command, "shared_renderer", no_gl)
     write_mesh(tmp_path / "m/x/cup_1.stl", cup())
-    words = tmp_path / "m", "--category-from", "thing"
-    code, _, err = init(*words, "--out", tmp_path / "a.yaml", capsys=capsys)
+    code, _, err = init(tmp_path / "m", "--category-from", "thing", "--out", tmp_path / "a", capsys=capsys)
     assert code == 0 and err == "verso: no pictures: no OpenGL here: install libegl1\n"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.yaml", "m"]
-    assert set(load_job(tmp_path / "a.yaml").categories) == {"thing"}
-    code, _, err = init(*words, "--out", tmp_path / "b.yaml", "--sheet", tmp_path / "b.png", capsys=capsys)
-    assert code == 1 and "install libegl1" in err
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == [".lock", "job.yaml", "library.parquet", "shapes"]
+    assert set(load_job(tmp_path / "a/job.yaml").categories) == {"thing"}
 
 
 @pytest.mark.minute
 @pytest.mark.shared_data
 def test_scanned_meshes_offer_their_urdfs_and_a_bottle_that_lies_is_stood_up(tmp_path, capsys):
-    code, told, _ = init(ROOT.parent / "shared/data/meshes", "--out", tmp_path / "j.yaml", "--json", capsys=capsys)
+    code, told, _ = init(ROOT.parent / "shared/data/meshes", "--out", tmp_path / "lib", "--json", capsys=capsys)
     objects = {one["category"]: one for one in json.loads(told.splitlines()[-1])["objects"]}
     assert code == 0 and set(objects) == {"blue_cup", "bowl", "cracker_box", "mug", "shampoo"}
     assert {name: one["up"] for name, one in objects.items()} == dict.fromkeys(objects, "z") | {"shampoo": "y"}
-    assert objects["shampoo"]["size_m"][2] == pytest.approx(0.1686, abs=1e-3)
+    assert objects["shampoo"]["extents_m"][2] == pytest.approx(0.1686, abs=1e-3)
     assert "20000" in told and "0 of 1" in told
-    assert objects["mug"]["missing_textures"] == 1 and objects["blue_cup"]["textures"] == 1
+    assert "plain base colour used" in str(objects["mug"]["mended"]) and objects["blue_cup"]["pictures"] == 1
 
 
 # ------------------------------------------------------------------------------------------------ what is found and shown
@@ -188,29 +190,14 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
         walk_folder(tmp_path / "in")
 
 
-def test_sizes_are_those_of_the_asset_that_is_loaded_and_of_another_library(tmp_path):
-    mesh = cup(0.12, 0.03)
-    mesh.apply_scale((1, 0.8, 1))
-    for up in "yz":
-        path = write_mesh(tmp_path / up / "cup.stl", mesh, turned=up == "y", scale=1000)
-        (item,) = read_folder(path.parent, [path.name], lambda *_: None).items
-        theirs = trimesh.load_mesh(path)
-        assert item.measured.extents == pytest.approx(tuple(theirs.extents))
-        assert (item.measured.faces, item.measured.watertight) == (len(theirs.faces), theirs.is_watertight)
-        assert item.diagonal == pytest.approx(float((theirs.extents**2).sum() ** 0.5))
-        source = FolderSource(source="files", folder=str(path.parent), category_map={"*": "cup"}, up=up, scale=0.001)
-        catalogue = open_catalogue(Assets(objects=(source,)), tmp_path, ("cup",))
-        ((one, ref),) = show_items(catalogue, [replace(item, category="cup")])
-        assert one.size_m == pytest.approx(tuple(catalogue.load(ref).extents_m)), "the loaded asset is the judge"
-        assert one.up == up and one.shape_says == ("y" if up == "y" else "z") and one.confidence == "sure"
-        assert one.row[:2] == ("cup.stl", "cup") and one.row[4] == "yes"
-        assert any("up: " in line for line in one.caption)
-
-
 ROW = (
     *("a_folder/of_a_long_name/and_a_mesh.obj", "category", "12.3 x 4.5 x 67.8", "20000", "yes", "1", "y sure"),
     "note " * 30 + "word" * 40,
 )
+
+
+def left_row(path, reason, why):
+    return Row(path, use=False, reason=reason, why=why)
 
 
 def test_tables_fit_the_terminal_and_no_name_or_reason_is_ever_cut():
@@ -221,16 +208,16 @@ def test_tables_fit_the_terminal_and_no_name_or_reason_is_ever_cut():
         lines = draw_table([ROW], width)
         assert all(len(line) <= (width or 1000) for line in lines) and (len(lines) == 2) == (width is None)
         assert sorted(letters("".join(lines))) == sorted(letters("".join((*HEADINGS, *ROW)))), "nothing is left out"
-        left = draw_left_out([LeftOut(ROW[0], "size", ROW[-1].strip())], width)
+        left = draw_left_out([left_row(ROW[0], "size", ROW[-1].strip())], width)
         assert all(len(line) <= (width or 1000) for line in left)
         assert letters("".join(left)) == letters(f"left out: 1 file{ROW[0]}(size):{ROW[-1]}")
     assert draw_table([ROW] * (MOST_ROWS + 5), 100)[-1] == "and 5 more: --json lists all"
     assert len(draw_table([ROW] * (MOST_ROWS + 5), None)) == MOST_ROWS + 6, "a pipe has all"
-    left = [LeftOut(f"{k}.obj", "missing", f"why {k}") for k in range(MOST_ROWS + 3)]
+    left = [left_row(f"{k}.obj", "missing", f"why {k}") for k in range(MOST_ROWS + 3)]
     lines = draw_left_out(left, 100)
     assert lines[0] == f"left out: {MOST_ROWS + 3} files" and lines[1] == "  0.obj (missing): why 0"
     assert lines[-1] == "  and 3 more: --json lists all" and len(draw_left_out(left, None)) == MOST_ROWS + 4
-    alike = [LeftOut(f"{k}.fbx", "format", ".fbx is not read") for k in range(40)]
+    alike = [left_row(f"{k}.fbx", "format", ".fbx is not read") for k in range(40)]
     assert draw_left_out(alike, 100)[1:] == ["  0.fbx and 39 more (format): .fbx is not read"], "a line each kind"
     assert draw_left_out([], 100) == []
     words = ("object", "1 object 2 objects"), ("mesh", "1 mesh 2 meshes"), ("category", "1 category 2 categories")
@@ -258,8 +245,9 @@ def test_an_object_of_any_size_fills_its_picture_and_stands_in_it_or_is_seen_to_
 def test_as_many_as_fit_are_drawn_and_the_rest_is_counted(monkeypatch):
     monkeypatch.setattr(shown, "MOST", 2)
     loaded = []
-    one = Shown("näme", "mug", (1, 1, 1), 8, 12, True, 0, 0, "z", None, None, ("a warning " * 20,))
+    one = Row("näme", category="mug", extents_m=(1, 1, 1), faces=12, watertight=True, pictures=0, mended=("a " * 99,))
     tiles = [(one, lambda: loaded.append(1) or bottle())] * 5
+    assert cells_of(one)[:3] == ("näme", "mug", "100 x 100 x 100")
     page, two = (draw_sheet("title", some, ["left out: x"], shared_renderer()) for some in (tiles, tiles[:2]))
     assert len(loaded) == 4 and page.height > two.height, "a line says how many are not drawn"
     assert page.width >= 2 * TILE[0] and (np.asarray(page) < 128).any()
@@ -272,10 +260,9 @@ LINES = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for l
 COMMANDS = [shlex.split(line)[1:] for line in LINES]
 
 
-def test_every_format_that_is_read_has_its_line_and_the_example_of_up_is_one():
+def test_every_format_that_is_read_has_its_line():
     rows = "".join(line.split("|")[1] for line in PAGE.splitlines() if line.startswith("| `."))
     assert set(re.findall(r"`(\.\w+)`", rows)) == set(SUFFIXES)
-    assert parse_yaml(re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0])["up"]["**/*.glb"] == "y"
 
 
 @pytest.mark.ray
@@ -284,14 +271,15 @@ def test_its_commands_run_as_printed_and_make_a_dataset_in_which_everything_stan
     mixed_folder(tmp_path / "meshes")
     monkeypatch.chdir(tmp_path)
     assert len(COMMANDS) == 5
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     for words in COMMANDS:
         if words[0] == "init" or "--dry-run" in words:
             assert main(words) == 0, words
     assert "categories: 002_can 1, bottles 1" in capsys.readouterr().out
-    names = "meshes", "meshes.yaml", "meshes.jpg", "by_file.yaml", "by_file.jpg", "one.yaml", "one.png"
-    assert {path.name for path in tmp_path.iterdir()} == set(names)
-    assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    edit = PAGE.split("```python\n")[1].split("```")[0]
+    subprocess.run([sys.executable, "-c", edit], check=True)
+    assert main(COMMANDS[0]) == 0
+    assert {row.up for row in read_table(tmp_path / "meshes_library").rows if row.path == "standing.glb"} == {"z"}
     whole = [sys.executable, "-m", "services.cli.main", *COMMANDS[2]]
     subprocess.run(whole, env=environment, check=True, capture_output=True)
     tables = [
@@ -299,7 +287,7 @@ def test_its_commands_run_as_printed_and_make_a_dataset_in_which_everything_stan
     ]
     scenes, assets = (table.to_table().to_pylist() for table in tables)
     assert len(scenes) == 8 and len({row["category"] for row in scenes}) > 2
-    heights = {row["path"]: row["extents_m"][2] for row in assets if row["source"] == "files"}
+    heights = {row["path"]: row["extents_m"][2] for row in assets if row["source"] == "library"}
     true = {"mugs/mug_0.glb": 0.08, "mugs/mug_1.glb": 0.1, "mugs/mug_2.glb": 0.12, "gltf cup/model.gltf": 0.1}
     drawn = {path: height for path, height in heights.items() if path in true}
     assert drawn == pytest.approx({path: true[path] for path in drawn}, abs=1e-6)

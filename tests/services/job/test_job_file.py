@@ -82,18 +82,18 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("assets: {objects: 3}", ["assets.objects: 3: must be a list"]),
     ("assets: {objects: [3]}", ["assets.objects.0: 3: must hold keys with values"]),
     ("assets: {objects: [{}]}", ["assets.objects.0: {}: must have a key 'source'"]),
-    ("assets: {objects: [{source: urd}]}", ["assets.objects.0", "did you mean 'urdf'? must be 'procedural', "]),
+    ("assets: {objects: [{source: librar}]}", ["assets.objects.0", "did you mean 'library'? must be 'procedural', "]),
     ('assets: {objects: [{source: "\\e[31m"}]}', ["assets.objects.0", "\\x1b[31m"]),
-    ("assets: {objects: [{source: urdf}]}", ["assets.objects.0.folder: is missing"]),
-    ("assets: {objects: [{source: urdf, folder: 3}]}", ["assets.objects.0.folder: 3: must be text"]),
+    ("assets: {objects: [{source: library}]}", ["assets.objects.0.folder: is missing"]),
+    ("assets: {objects: [{source: library, folder: 3}]}", ["assets.objects.0.folder: 3: must be text"]),
     (
         f"assets: {{objects: [{{source: procedural, instances: {10**13}}}]}}",
         ["instances: 10000000000000: must be at most"],
     ),
-    ("assets: {objects: [{source: urdf, folder: ., urdf: 3}]}", ["assets.objects.0.urdf: there is no such key"]),
-    ('assets: {objects: [{source: urdf, folder: "a\\0b"}]}', ["assets.objects.0.folder", "'a\\x00b'", "control"]),
-    ("assets: {objects: [{source: urdf, folder: ~nobody7/b}]}", ["objects.0.folder", "~nobody7/b", "no such user"]),
-    (f"assets: {{objects: [{{source: urdf, folder: {'x' * 9000}}}]}}", ["assets.objects.0.folder", "4000"]),
+    ("assets: {objects: [{source: library, folder: ., up: 3}]}", ["assets.objects.0.up: there is no such key"]),
+    ('assets: {objects: [{source: library, folder: "a\\0b"}]}', ["assets.objects.0.folder", "'a\\x00b'", "control"]),
+    ("assets: {objects: [{source: library, folder: ~nobody7/b}]}", ["objects.0.folder", "~nobody7/b", "no such user"]),
+    (f"assets: {{objects: [{{source: library, folder: {'x' * 9000}}}]}}", ["assets.objects.0.folder", "4000"]),
     ("assets: {objects: [{source: procedural, weight: 1.0e+308}]}", ["assets.objects.0.weight", "1e+308"]),
     (f"assets: {{objects: [{'{source: procedural},' * 101}]}}", ["assets.objects", "at most 100"]),
     ("assets: {split: {train: 0.5}}", ["assets.split", "0.7"]),
@@ -220,7 +220,7 @@ def test_every_key_is_documented_and_the_page_is_current():
         ("start.offset_m", "[low, high]"),
         ("cameras.depth.offset_m", "3 numbers"),
         ("run.workers", "integer >=1,<=100000 or `null`"),
-        ("assets.objects[files].up", "`x`/`y`/`z` or map"),
+        ("assets.objects[library].diagonal_m", "number >0 or `null`"),
     ):
         assert describe_allowed(keys[key]) == words
     assert allowed_keys(["assets", "split", "trian"]) == ["test", "train", "val"]
@@ -242,7 +242,7 @@ def test_what_is_packed_comes_back_from_a_word_that_no_shell_changes(data):
 def test_a_packed_job_is_the_same_job_with_whole_paths(tmp_path):
     file = write(tmp_path, ODD)
     assert load_job(Path(pack_job(file)), ["scenes=9"]) == load_job(file, ["scenes=9"])
-    meshes = "name: meshes\nscenes: 2\ncategories: [mug]\nassets: {objects: [{source: urdf, folder: %s}]}\n"
+    meshes = "name: meshes\nscenes: 2\ncategories: [mug]\nassets: {objects: [{source: library, folder: %s}]}\n"
     why = r"assets\.objects\.0\.folder: 'meshes': a packed job has no folder of its own"
     with pytest.raises(JobError, match=why):
         pack_job(write(tmp_path, meshes % "meshes"))

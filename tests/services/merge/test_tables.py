@@ -5,6 +5,7 @@ import dataclasses
 import math
 import urllib.parse
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from schemas.dataset.tables import SCHEMAS, SORT_KEYS, TABLES
 from schemas.errors import CorruptError
-from schemas.job.assets import Assets
+from schemas.job.assets import Assets, LibrarySource, MeshLimits, ProceduralSource
 from services.merge import reading
 from services.merge import tables as merge_tables
 from services.merge.dataset_card import describe_sources
@@ -24,7 +25,7 @@ from services.merge.tables import escaped, object_lines, shortest
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
 from tests.made_up_scenes import failed_scene, fails, made_scene, scene
 from workers.assets.catalogue import Catalogue
-from workers.assets.external.listing import Listing
+from workers.assets.library.table import Library, Row
 from workers.store.manifest import table_of_rows
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -125,26 +126,21 @@ def test_every_double_is_written_as_python_writes_it(numbers):
 
 
 def test_the_card_names_every_source_with_its_licence_and_what_was_left_out_of_it_or_is_doubtful():
-    objects = [
-        {"source": "procedural", "weight": 2.0, "seed": 7},
-        {"source": "files", "folder": "meshes", "licence": "CC-BY-4.0"},
-    ]
-    assets = Assets.model_validate({"objects": objects})
-    catalogue = Catalogue(assets, (None, None), (None,), "d" * 64, {"meshes": {"too large": 2, "torn": 1}})
+    bad = Row("a.obj", category="mug", use=False, reason="no_faces", why="has no triangles")
+    rows = [Row(f"{name}.glb", category="mug", licence="MIT", shape_up="y", sure=True) for name in "dcba"]
+    library = Library(Path("/l"), Path("/meshes"), MeshLimits(), (bad, replace(bad, path="b.obj", why="..."), *rows))
+    assets = Assets(
+        objects=(LibrarySource(source="library", folder="l"), ProceduralSource(source="procedural", seed=7))
+    )
+    catalogue = Catalogue(assets, (library, None), (None,), "d" * 64)
+    said = "left out of /meshes: 2 no_faces; a.obj (no_faces: has no triangles); b.obj (no_faces: ...)"
     lines = describe_sources(catalogue)
     assert lines[:2] == [
-        "objects, weight 2: made from seed 7, licence CC0-1.0",
-        "objects, weight 1: files folder meshes, licence CC-BY-4.0",
+        "objects, weight 1: library l, licences MIT (4)",
+        "objects, weight 1: made from seed 7, licence CC0-1.0",
     ]
-    assert lines[2].startswith("tables, weight 1: made from seed")
-    assert lines[3:] == ["left out of meshes: 2 too large, 1 torn"]
-    doubts = {f"{name}.glb": "y" for name in "dcba"}
-    examples = ("a.obj (no_faces: has no triangles)", "b.obj (...)")
-    listing = Listing(Path("/meshes"), {}, {"no_faces": 4}, examples=examples, doubts=doubts)
-    catalogue = Catalogue(Assets(), (listing, None), (None,), "d" * 64, {"/meshes": {"no_faces": 4}})
-    said = "left out of /meshes: 4 no_faces; a.obj (no_faces: has no triangles); b.obj (...)"
-    assert describe_sources(catalogue)[-1] == said
+    assert lines[2].startswith("tables, weight 1: made from seed") and lines[3:] == [said]
     (line,) = catalogue.describe_doubts()
     told = "/meshes: files stand on another axis than `up` says: a.glb on y, b.glb on y, c.glb on y and 1 more"
-    assert line.startswith(told) and 'such as {"a.glb": y}' in line
+    assert line.startswith(told) and "change `up` in its table" in line
     assert Catalogue(Assets(), (None,), (None,), "d" * 64).describe_doubts() == []

@@ -9,6 +9,7 @@ from schemas.errors import MachineError
 from services.job.job_file import validate_job
 from services.run import parts
 from tests.services.init.own_meshes import cup, write_mesh
+from tests.workers.assets.libraries import library_of
 from workers.capture.results import open_sources
 
 
@@ -19,8 +20,8 @@ def job_of(tmp_path):
     write_mesh(tmp_path / "meshes" / "box.stl", trimesh.creation.box((0.1, 0.1, 0.1)))
 
     def make(**changes):
-        files = {"source": "files", "folder": "meshes", "category_map": {"*.stl": "thing"}}
-        tree = {"verso": 1, "name": "t", "categories": ["thing"], "assets": {"objects": [files]}, **changes}
+        source = library_of(tmp_path / "meshes", "thing")
+        tree = {"verso": 1, "name": "t", "categories": ["thing"], "assets": {"objects": [source]}, **changes}
         job = validate_job(tree, "t")
         return job, open_sources(job, tmp_path)
 
@@ -56,7 +57,7 @@ def killed(*_):
 def test_a_process_that_is_killed_is_told_and_its_mesh_is_looked_at_again(job_of, tmp_path, monkeypatch):
     several = job_of(objects_per_scene=2)
     with monkeypatch.context() as patch:
-        patch.setattr(parts, "_cut", killed)
-        with pytest.raises(MachineError, match="killed from outside"):
+        patch.setattr(parts, "cut_shape", killed)
+        with pytest.raises(MachineError, match="what is cut stays"):
             parts.find_parts(*several, tmp_path / "kept")
     assert looked_at(monkeypatch, *several, tmp_path / "kept") == ["box.stl", "cup.stl"]

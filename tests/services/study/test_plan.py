@@ -43,7 +43,7 @@ def test_every_value_makes_a_job_that_is_allowed_and_is_not_the_job_itself():
 
 def test_a_knob_has_the_values_that_mean_something_for_the_job(tmp_path):
     far = apply(JOB, {"images.depth_range_m": [0.2, 20.0], "images.depth_units_per_m": 1000})
-    outside = apply(JOB, {"assets.objects": [{"source": "urdf", "folder": str(tmp_path)}]})
+    outside = apply(JOB, {"assets.objects": [{"source": "library", "folder": str(tmp_path)}]})
     assert labels(far, "units") == ["1000", "2000"]  # more units than 16 bits hold are no values
     assert labels(JOB, "collision") == ["box", "hull", "planned", "parts"]
     assert labels(outside, "collision") == ["box", "hull", "planned", "parts to 0.1", "parts to 0.05", "parts to 0.02"]
@@ -97,7 +97,7 @@ FREE: Mapping[str, str] = {
     "verso name seed scenes first_scene preset": "says which scenes",
     "run output check": "costs no setting of a scene anything, or is not measured",
     "pairs_per_scene objects_per_scene categories": "what is in a scene: twice as much takes about twice as long",
-    "assets.objects assets.tables assets.split assets.limits assets.shell_kg_m2": "which shapes",
+    "assets.objects assets.tables assets.split assets.shell_kg_m2": "which shapes",
     "start.pose start.offset_m start.arrange start.pile_offset_m start.clearance_m": "where things begin",
     "physics.max_settle_s physics.rest.window_s": "a bound that few scenes reach",
     "physics.rolling_friction physics.spinning_friction physics.restitution": "the world's, as friction is",
@@ -177,8 +177,8 @@ def test_no_measured_setting_is_better_than_a_preset_by_more_than_the_slack(kind
 
 OF_KIND: dict[JobKind, dict[str, Any]] = {
     "singles": {"objects_per_scene": [1, 1], "assets": {"objects": [{"source": "procedural"}]}, "captures": None},
-    "piles": {"objects_per_scene": [1, 3], "assets": {"objects": [{"source": "files", "folder": "x"}]}},
-    "meshes": {"assets": {"objects": [{"source": "procedural"}, {"source": "urdf", "folder": "x"}]}},
+    "piles": {"objects_per_scene": [1, 3], "assets": {"objects": [{"source": "library", "folder": "x"}]}},
+    "meshes": {"assets": {"objects": [{"source": "procedural"}, {"source": "library", "folder": "x"}]}},
     "captures": {"captures": {}},
 }
 

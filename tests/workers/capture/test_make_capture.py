@@ -20,7 +20,7 @@ from schemas.scene.view import Camera, Intrinsics, Pair, View
 from tests.captures import captures_job, exact_capture, rolled_pose, use_exact_captures, write_folder
 from tests.workers.capture.simulated import box, copy_of
 from workers.assets.catalogue import open_catalogue, split_of
-from workers.assets.glb import asset_glb, part_of_mesh
+from workers.assets.glb import asset_glb, read_shape
 from workers.capture import make_capture
 from workers.capture.folder import open_folder, read_truth, write_pose
 from workers.capture.make_capture import (
@@ -118,7 +118,8 @@ def test_the_reconstructed_object_stands_at_the_middle_of_its_box_and_reads_back
     scene = trimesh.load_scene(io.BytesIO(asset_glb(asset)), file_type="glb", process=False)
     (mesh,) = scene.geometry.values()
     np.testing.assert_allclose(mesh.extents, [0.1, 0.2, 0.3], atol=1e-7)
-    assert {tuple(color) for color in part_of_mesh("", mesh).colors.tolist()} == {(200, 10, 20, 255)}
+    (part,) = read_shape(asset_glb(asset))[0].parts
+    assert {tuple(color) for color in part.colors.tolist()} == {(200, 10, 20, 255)}
 
 
 def test_a_board_has_its_true_size_and_a_name_that_tells_it_from_others():

@@ -8,13 +8,14 @@ import pytest
 import trimesh
 from shapely import Polygon
 
-from schemas.job.assets import CATEGORIES, TABLE, Assets, FolderSource, MeshLimits, ProceduralSource
+from schemas.job.assets import CATEGORIES, TABLE, MeshLimits, ProceduralSource
 from tests.kit.shapes import shape_of
+from tests.workers.assets.libraries import open_folder
 from tests.workers.door.oracles import CUBE, support_margin, welded, write
 from workers.assets.builtin.make import make_asset
-from workers.assets.catalogue import open_catalogue
-from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand, place_asset
+from workers.assets.library.placement import Upright, find_upright, measure_stand
+from workers.assets.library.reading import UP_AXES, place_asset
+from workers.assets.library.table import Row
 from workers.assets.mass import mass_properties, shell_mass, weigh
 from workers.door.meshes.formats import load_shape
 from workers.door.meshes.mesh import (
@@ -253,9 +254,9 @@ def test_bodies_that_share_points_or_edges_and_overlap_weigh_as_their_union_and_
     for apart in (cube((1, 1, 1), (2, 2, 2)), cube((1, 1, 0), (2, 2, 1)), cube((1, 0, 0), (2, 1, 1))):
         mass, common = weigh(shape_of(hollow[0], apart), 1.0, 3.0)
         assert mass.mass_kg == pytest.approx(2.0, rel=1e-12) and common == 0.0
-    asset = place(trimesh.util.concatenate(MEETING["an edge"]), scale=0.1)
+    asset = place(trimesh.util.concatenate(MEETING["an edge"]), unit=0.1)
     assert asset.notes == ("bodies overlap: 250 cm^3 that they share weigh once",)
-    assert asset.volume_m3 == pytest.approx(0.001, rel=1e-9) and not place(hollow[0]).notes
+    assert asset.mass.mass_kg == pytest.approx(0.6, rel=1e-9) and not place(hollow[0]).notes
 
 
 def test_bodies_shown_more_than_once_weigh_once_and_very_many_that_meet_are_said():
@@ -294,28 +295,22 @@ def test_shells_weigh_as_their_plates_and_a_spherical_one_has_two_thirds_m_r_squ
 
 
 def place(mesh, **placement):
-    entry, settings = Entry("id", (SourceFile("a.obj", 1, "0" * 64),), "MIT"), FolderSource(source="urdf", folder=".")
-    assets = Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
-    loaded = LoadedMesh(shape_of(mesh), ())
-    return place_asset(loaded, entry, "mug", settings.model_copy(update=placement), assets)
+    return place_asset(LoadedMesh(shape_of(mesh), ()), Row("a.obj", category="mug", **placement), MeshLimits())
 
 
 def test_an_asset_is_centred_scaled_and_weighed_and_its_matrix_takes_scaled_source_points_there():
     mesh = trimesh.creation.box((1, 2, 3))
     mesh.apply_translation((7, 8, 9))
-    asset = place(mesh, up="y", scale=0.1)
+    asset = place(mesh, up="y", unit=0.1)
     assert asset.shape.bounds == pytest.approx(np.array([[-0.05, -0.15, -0.1], [0.05, 0.15, 0.1]]))
     scaled = np.c_[0.1 * mesh.vertices, np.ones(8)]
     assert (asset.T_source_to_object @ scaled.T).T[:, :3] == pytest.approx(asset.shape.vertices, abs=1e-12)
-    assert (asset.volume_m3, asset.mass.mass_kg) == (pytest.approx(0.006), pytest.approx(3.6))
+    assert asset.watertight and asset.mass.mass_kg == pytest.approx(3.6)
     assert welded(asset.shape).volume == pytest.approx(0.006), "still the right way out"
-    asset = place(trimesh.creation.box((3, 4, 12)), scale=5.0, diagonal_m=0.26)
-    assert float(np.linalg.norm(asset.extents_m)) == pytest.approx(0.26, rel=1e-12), "a diagonal wins over a scale"
-    assert asset.scale == pytest.approx(0.02)
     mesh = trimesh.creation.box((1, 1, 1))
     mesh.update_faces(np.arange(12) > 1)
     asset = place(mesh)
-    assert (asset.watertight, asset.volume_m3) == (False, None), "an open mesh weighs as a shell"
+    assert not asset.watertight, "an open mesh weighs as a shell"
     assert asset.mass.mass_kg == pytest.approx(15.0)
 
 
@@ -323,11 +318,9 @@ def test_a_can_that_lies_as_the_job_has_it_names_the_axis_of_its_file_that_it_st
     can = trimesh.creation.cylinder(0.04, 0.1, sections=48)
     can.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
     write(tmp_path / "can.stl", can.export(file_type="stl"))
-    for up, doubt in (("y", None), ("z", "y"), ("x", "y"), ({"*.stl": "y"}, None), ({"*.stl": "z"}, "y")):
-        source = FolderSource(source="urdf", folder=str(tmp_path), category_map={"*.stl": "can"}, up=up)
-        for _ in range(2):  # found out, and known
-            catalogue = open_catalogue(Assets(objects=(source,)), tmp_path, ("can",))
-            assert dict(catalogue.objects[0].doubts) == ({"can.stl": doubt} if doubt else {})
+    for up, doubt in (("y", None), ("z", "y"), ("x", "y")):
+        catalogue = open_folder(tmp_path, "can", up=up)
+        assert dict(catalogue.objects[0].doubts) == ({"can.stl": doubt} if doubt else {})
         stands = catalogue.load(catalogue.refer(0, "can", 0)).extents_m[2] == pytest.approx(0.1)
         assert stands == (doubt is None)
         assert ("can.stl on y" in "".join(catalogue.describe_doubts())) == (doubt is not None)

@@ -1,6 +1,5 @@
 """Hostile and broken files: each is refused with its reason, or does no harm, beside a good one; and thousands of mutants."""
 
-import json
 import time
 from collections import Counter
 from pathlib import Path
@@ -11,19 +10,22 @@ import trimesh
 from PIL import Image
 
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits
+from schemas.job.assets import Assets, LibrarySource, MeshLimits
 from schemas.job.job import Job
 from schemas.scene.shape import Asset
+from tests.workers.assets.libraries import library_of, open_folder
 from tests.workers.door.mutants import mutant
 from tests.workers.door.oracles import CUBE, glb, gltf, picture, textured_cube, urdf, visual, write, write_all
 from tests.workers.door.test_statements import dae
-from workers.assets.catalogue import open_catalogue
-from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.reader import Request, Task, ask_all, unpack_asset
-from workers.assets.external.verdicts import Verdicts
+from workers.assets.catalogue import ignore, open_catalogue
+from workers.assets.library.collection import SUFFIXES, survey_folder
+from workers.assets.library.shapes import load_shape as load_shape_of
+from workers.assets.library.shapes import make_shapes
+from workers.assets.library.table import Library, Row
 from workers.door.meshes import urdf as urdf_file
 from workers.door.meshes.formats import load_shape
 from workers.door.meshes.urdf import load_posed
+from workers.pool import Answers
 from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, open_worker
 from workers.scene.plan import draw_scene
@@ -209,21 +211,24 @@ def hostile_folder(folder: Path) -> Path:
     return inside
 
 
-def outcomes(folder: Path, paths: list[Path], limits: MeshLimits) -> list[bytes | MeshError]:
-    """Each file listed, checked and loaded as the catalogue does: why it is refused, or the asset."""
-    settings, assets = FolderSource(source="urdf", folder="."), Assets(limits=limits)
-    found: dict[Path, bytes | MeshError] = {}
-    tasks = [Task("list", path, "mug") for path in paths]
-    for kind in ("check", "load", None):
-        request, tasks = Request(settings, folder, assets, tuple(tasks)), []
-        for task, answer in ask_all(request, lambda *_: None):
-            found[task.path], entry = answer, task.entry
-            if isinstance(answer, bytes) and kind is not None:
-                if entry is None:
-                    entry = Entry("a", tuple(SourceFile(*file) for file in json.loads(answer)), "MIT")
-                    assert all((folder / file.path).resolve().is_relative_to(folder.resolve()) for file in entry.files)
-                tasks.append(Task(kind, task.path, "mug", entry))
-    return [found[path] for path in paths]
+def outcomes(folder: Path, paths: list[Path], limits: MeshLimits) -> list[Asset | MeshError]:
+    """Each file surveyed and made as a library does: why it is refused, or the asset that is read of its GLB."""
+    names = [path.relative_to(folder).as_posix() for path in paths]
+    surveys = survey_folder(folder, names, limits, Answers(None), ignore)
+    library = Library(folder.parent / "made", folder, limits, ())
+    rows, answers = dict[str, Row](), dict[str, Asset | MeshError]()
+    for survey in surveys:
+        assert all((folder / file.path).resolve().is_relative_to(folder.resolve()) for file in survey.files)
+        if survey.measured is None:
+            answers[survey.path] = MeshError(survey.refused[0], f"{survey.path}: {survey.refused[1]}")
+        else:
+            rows[survey.path] = Row(survey.path, category="mug", files=survey.files)
+    settings = LibrarySource(source="library", folder=".")
+    for row, made in make_shapes(library, rows.values()):
+        answers[row.path] = (
+            made if isinstance(made, MeshError) else load_shape_of(library, row, settings, Assets(), row.instance_id)
+        )
+    return [answers[name] for name in names]
 
 
 def check_refusal(error: MeshError, what: str) -> None:
@@ -235,22 +240,17 @@ def check_refusal(error: MeshError, what: str) -> None:
 def test_every_hostile_file_is_refused_with_its_reason_in_one_line(tmp_path):
     folder = hostile_folder(tmp_path)
     answers = outcomes(folder, [folder / name for name in (*HOSTILE, "cube.obj")], MeshLimits())
-    assert isinstance(answers.pop(), bytes), "the good one beside them"
+    assert isinstance(answers.pop(), Asset), "the good one beside them"
     for (name, (_, reason, says)), answer in zip(HOSTILE.items(), answers, strict=True):
         assert isinstance(answer, MeshError), name
         assert answer.reason == reason and says in answer.detail and name in answer.detail, (name, str(answer))
         check_refusal(answer, name)
 
 
-def opened(folder: Path, *names: str, limits: MeshLimits | None = None):
-    source = FolderSource(source="urdf", folder=str(folder), category_map=dict.fromkeys(names, "mug"))
-    return open_catalogue(Assets(objects=(source,), limits=limits or MeshLimits()), folder, ("mug",))
-
-
 def scene_of(catalogue, path):
     """The asset, and the plan of a scene with it, without which an asset is of no use."""
     entries = catalogue.objects[0].entries["mug"]
-    (index,) = (k for k, entry in enumerate(entries) if entry.files[0].path == path)
+    (index,) = (k for k, entry in enumerate(entries) if entry.path == path)
     asset, table = catalogue.load(catalogue.refer(0, "mug", index)), catalogue.load(catalogue.refer(0, "table", 0))
     return asset, draw_scene(Job(name="t", categories={"mug": 1}), SceneChance(1, 0), table, asset)
 
@@ -258,12 +258,14 @@ def scene_of(catalogue, path):
 def test_what_is_refused_is_left_out_of_a_job_by_name_and_the_good_one_beside_it_is_used(tmp_path):
     folder = hostile_folder(tmp_path)
     (folder / "bad\udcff.obj").write_text(CUBE)
-    catalogue = opened(folder, "*")
-    reasons = Counter(reason for content, reason, _ in HOSTILE.values() if content is not None)
-    others = Counter(format=sum(path.suffix in (".png", ".bin") for path in folder.iterdir()), name=1)
-    assert catalogue.skipped == {str(folder): dict(sorted((reasons + others).items()))}
+    catalogue = open_folder(folder)
+    (library,) = catalogue.libraries()
+    left_out = {row.path: row.reason for row in library.rows if not row.use}
+    read = {name for name, (content, _, _) in HOSTILE.items() if content is not None and Path(name).suffix in SUFFIXES}
+    assert all(left_out[name] in (HOSTILE[name][1], "part", "copy", "name", "link") for name in read)
+    assert left_out["bad\\udcff.obj"] == "name"
     (told,) = catalogue.describe_left_out()
-    assert told.isprintable() and "bad\\udcff.obj (name: " in told and len(catalogue.examples(str(folder))) == 3
+    assert told.isprintable() and len(library.examples) == 3
     draws = {catalogue.draw(0, "mug", np.random.default_rng(seed)).instance_id[:5] for seed in range(20)}
     assert draws == {"cube-"}
     scene_of(catalogue, "cube.obj")
@@ -314,16 +316,16 @@ def test_all_files_and_all_textures_of_an_asset_together_have_caps(tmp_path):
     assert load_shape(mesh, MeshLimits()).notes == ()
     write(tmp_path / "skin0.png", picture(size=(500, 500), colour=None))
     write(tmp_path / "good.obj", CUBE)
-    catalogue = opened(tmp_path, "cube.obj", "good.obj", limits=MeshLimits(max_asset_mb=0.5))
-    assert catalogue.skipped == {str(tmp_path): {"too_large": 1}}
-    assert "over max_asset_mb = 0.5" in catalogue.examples(str(tmp_path))[0]
+    (library,) = open_folder(tmp_path, limits=MeshLimits(max_asset_mb=0.5)).libraries()
+    (cube,) = [row for row in library.rows if row.path == "cube.obj"]
+    assert (cube.use, cube.reason) == (False, "too_large") and "over max_asset_mb = 0.5" in cube.why
 
 
 def test_strange_names_of_material_files_are_notes_in_one_line_or_nothing(tmp_path):
     names = ("a" * 100_000, "a/" * 50_000, "/dev/zero", "..", "a\x01b", "~root/x.mtl")
     for number, library in enumerate(names):
         write(tmp_path / f"{number}.obj", f"mtllib {library}\nusemtl x\n" + CUBE)
-    catalogue = opened(tmp_path, "*.obj")
+    catalogue = open_folder(tmp_path)
     for number in range(len(names)):
         asset, _ = scene_of(catalogue, f"{number}.obj")
         assert asset.watertight and all(note.isprintable() and len(note) < 1100 for note in asset.notes)
@@ -343,7 +345,7 @@ def test_a_material_file_that_names_pictures_without_end_is_read_for_as_long_as_
     """Took 30 s of processor time and more."""
     textured_cube(tmp_path, more=text)
     Image.new("RGB", (8, 8)).save(tmp_path / "skin.png")
-    asset, _ = scene_of(opened(tmp_path, "cube.obj", limits=MeshLimits(max_cpu_s=8)), "cube.obj")
+    asset, _ = scene_of(open_folder(tmp_path, limits=MeshLimits(max_cpu_s=8)), "cube.obj")
     assert len(asset.notes) <= 20
 
 
@@ -392,8 +394,8 @@ def read_mutants(folder: Path, indices: range) -> Counter[str]:
             assert path.name in answer.detail or str(path.parent) in answer.detail, (what, answer)
             assert answer.reason in REASONS, f"nothing is too slow, or unknown: {path}, {what}, {answer}"
         else:
-            check_asset(unpack_asset(answer), what)
-        found["read" if isinstance(answer, bytes) else answer.reason] += 1
+            check_asset(answer, what)
+        found["read" if isinstance(answer, Asset) else answer.reason] += 1
     return found
 
 
@@ -420,10 +422,10 @@ def test_thousands_of_mutants_are_read_or_refused_and_nothing_else(tmp_path, par
 )
 def test_scenes_of_accepted_mutants_are_made_or_say_why_not(tmp_path, mutants, scenes):
     for index in range(mutants):
-        write_all(tmp_path / f"{index:04}", mutant(index)[1])
-    source = {"source": "urdf", "folder": str(tmp_path), "category_map": {"*/a.*": "mug"}}
+        write_all(tmp_path / "in" / f"{index:04}", mutant(index)[1])
+    source = library_of(tmp_path / "in")
     job = Job.model_validate({"name": "t", "categories": {"mug": 1}, "seed": 5, "assets": {"objects": [source]}})
-    context = open_worker(job, open_catalogue(job.assets, tmp_path, ("mug",), kept=Verdicts(None)))
+    context = open_worker(job, open_catalogue(job.assets, tmp_path, ("mug",)))
     found: Counter[str] = Counter()
     for scene_id in range(scenes):
         rows = run_scene(context, scene_id, Stopwatch()).rows.get("failures", [])

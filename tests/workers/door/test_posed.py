@@ -8,15 +8,14 @@ import pytest
 import trimesh
 
 from schemas.errors import MeshError
-from schemas.job.assets import FolderSource, MeshLimits
+from schemas.job.assets import MeshLimits
 from tests.workers.door.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
 from tests.workers.door.test_statements import dae, geometry
-from workers.assets.external.placement import list_files
+from workers.assets.library.reading import list_files
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.formats import load_shape
 from workers.door.meshes.urdf import find_named, list_named, list_seen, load_posed
 
-FOLDER = FolderSource(source="files", folder=".")
 LIMITS = MeshLimits()
 
 BODY = """
@@ -251,7 +250,7 @@ def test_collada_in_a_urdf_is_in_metres_and_not_turned_up(tmp_path):
     files = dae(asset='<unit meter="0.5"/><up_axis>Y_UP</up_axis>', shapes=geometry(size=2.0, stretch=(1, 2, 3)))
     write_all(tmp_path / "meshes/visual", files)
     path = write(tmp_path / "a.urdf", urdf(visual('<mesh filename="package://r/meshes/visual/a.dae" scale="1 1 2"/>')))
-    assert [file.name for file in list_files(FOLDER, tmp_path, path, LIMITS)] == ["a.urdf", "a.dae", "t.png"]
+    assert [file.name for file in list_files(tmp_path, path, LIMITS)] == ["a.urdf", "a.dae", "t.png"]
     shape = load_posed(path, LIMITS, tmp_path).shape
     assert np.ptp(shape.vertices, axis=0) == pytest.approx([0.2, 0.4, 1.2])
     assert shape.parts[0].material.texture is not None

@@ -32,8 +32,7 @@ from tests.workers.door.oracles import (
     write_all,
 )
 from workers.assets.builtin.make import make_asset
-from workers.assets.external.reader import pack_asset, unpack_asset
-from workers.assets.glb import asset_glb
+from workers.assets.glb import asset_glb, read_shape
 from workers.door.meshes.formats import list_mesh_files, load_shape
 from workers.door.meshes.mesh import is_solid
 from workers.door.meshes.urdf import load_posed
@@ -188,9 +187,8 @@ def test_a_jpeg_is_stored_as_it_is_and_once(tmp_path):
     )
     parts = load(path).shape.parts
     assert [part.material.jpeg for part in parts] == [data, data]
-    asset = unpack_asset(pack_asset(replace(asset_of(trimesh.creation.box((1, 1, 1))), shape=Shape(parts[:1]))))
-    assert asset.shape.parts[0].material.jpeg == data
-    stored = asset_glb(asset)
+    stored = asset_glb(replace(asset_of(trimesh.creation.box((1, 1, 1))), shape=Shape(parts[:1])))
+    assert read_shape(stored)[0].parts[0].material.jpeg == data
     assert data in stored and split_glb(stored)[0]["images"][0]["mimeType"] == "image/jpeg"
     again = load(write(tmp_path / "b.glb", stored)).shape.parts[0].material
     assert again.texture.tolist() == parts[0].material.texture.tolist() and again.jpeg == data

@@ -1,146 +1,19 @@
-"""Loads an instance of a source of files as an asset: z up, metric, centred on its bounding box, weighed.
+"""Pure but for a file's head: what a person asks about a mesh: its sizes, its unit, which axis points up (`find_upright`)."""
 
-Beside it: which axis of a shape points up, as far as its geometry tells (`find_upright`), and what a person asks about a
-file (`measure_asset`).
-"""
-
-import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.base import Array, frozen_array
-from schemas.errors import MeshError
-from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
-from schemas.scene.shape import Asset, Hull, Shape
-from workers.assets.external.listing import HEAD_BYTES, Entry, check_unchanged, mesh_root, refuse_other
-from workers.assets.mass import weigh
-from workers.door.meshes.caps import MOST_NOTES, one_line
+from schemas.base import Array
+from schemas.job.assets import UpAxis
+from schemas.scene.shape import MassProperties, Shape
 from workers.door.meshes.dae import find_up
-from workers.door.meshes.formats import FORMATS, list_mesh_files, load_shape
-from workers.door.meshes.mesh import DEFAULT, LoadedMesh, transform_shape
-from workers.door.meshes.urdf import POSED, list_seen, load_posed
-from workers.geometry.frames import pose
-
-UP_AXES: Mapping[str, Array] = {
-    "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
-    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "z": np.eye(3),
-}
-"""The rotation [3, 3] that takes a source's upward axis to z."""
-OBJECT_SCALE, TABLE_SCALE = 0.25, 1.5
-"""The article's factors on ShapeNetCore's normalised units."""
-
-
-def list_files(
-    settings: ShapeNetSource | FolderSource, folder: Path, path: Path, limits: MeshLimits
-) -> tuple[Path, ...]:
-    """A candidate and every file that it refers to, each once; MeshError where one of them, or all together, is refused."""
-    if path.suffix.lower() in (*POSED, *FORMATS):
-        refuse_other(path)
-    if path.suffix.lower() in POSED:
-        meshes, pictures = list_seen(path, folder, limits)
-        files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits)), *pictures]
-    else:
-        files = list_mesh_files(path, mesh_root(settings, folder, path), limits)
-    files = list(dict.fromkeys(files))
-    size, cap = sum(file.stat().st_size for file in files), limits.max_asset_mb
-    if size > cap * 1e6:
-        raise MeshError("too_large", f"{path} and its files have {size / 1e6:.1f} MB, over max_asset_mb = {cap:g}")
-    for file in files:
-        if not str(file).isprintable():
-            raise MeshError("name", f"{file!s:.200} has a name that is not printable UTF-8, so no table can hold it")
-    return tuple(files)
-
-
-def load_entry(
-    settings: ShapeNetSource | FolderSource, folder: Path, entry: Entry, category: str, assets: Assets
-) -> Asset:
-    """One instance, cleaned, z up, scaled; MeshError where its mesh is refused or has changed."""
-    check_unchanged(folder, entry)
-    path = folder / entry.files[0].path
-    if path.suffix.lower() in POSED:
-        loaded = load_posed(path, assets.limits, folder)
-    else:
-        loaded = load_shape(path, assets.limits, mesh_root(settings, folder, path))
-    return place_asset(loaded, entry, category, settings, assets)
-
-
-def place_asset(
-    loaded: LoadedMesh, entry: Entry, category: str, settings: ShapeNetSource | FolderSource, assets: Assets
-) -> Asset:
-    """The asset of a cleaned shape in its source's frame; MeshError `no_size` or `size` where its extent is not allowed."""
-    path = entry.files[0].path
-    if isinstance(settings, ShapeNetSource):
-        axes, scale = UP_AXES["y"], settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE)
-    else:
-        axes, scale = UP_AXES[settings.up_of(path)], settings.scale
-    rotated = transform_shape(loaded.shape, pose(axes, np.zeros(3)))
-    lower, upper = rotated.bounds
-    diagonal = float(np.linalg.norm(upper - lower))
-    if diagonal == 0.0:
-        raise MeshError("no_size", f"{path} has no extent")
-    if not np.isfinite(diagonal):
-        raise MeshError("not_finite", f"{path} is too large for floating-point numbers")
-    if isinstance(settings, FolderSource) and settings.diagonal_m is not None and category != TABLE:
-        scale = settings.diagonal_m / diagonal
-    _check_size(path, scale * diagonal, assets.limits)
-    centre = 0.5 * (lower + upper) * scale
-    shape = transform_shape(rotated, pose(scale * np.eye(3), -centre))
-    mass, common_m3 = weigh(shape, assets.density_kg_m3, assets.shell_kg_m2)
-    return Asset(
-        instance_id=entry.instance_id,
-        category=category,
-        source=settings.source,
-        licence=entry.licence,
-        path=path,
-        sha256=entry.files[0].sha256,
-        shape=shape,
-        mass=mass,
-        T_source_to_object=frozen_array(pose(axes, -centre)),
-        scale=scale,
-        watertight=mass.solid,
-        volume_m3=mass.mass_kg / assets.density_kg_m3 if mass.solid else None,
-        shareable=settings.copy_assets,
-        notes=tuple(one_line(note) for note in [*_note_shared(common_m3), *loaded.notes][:MOST_NOTES]),
-    )
-
-
-def _note_shared(common_m3: float | None) -> list[str]:
-    """What to say of the volume that bodies share (`weigh`)."""
-    if common_m3 is None:
-        return ["bodies weigh twice what they share, if anything: they are too many to look for it"]
-    return [f"bodies overlap: {1e6 * common_m3:.3g} cm^3 that they share weigh once"] if common_m3 else []
-
-
-def find_doubt(asset: Asset, settings: ShapeNetSource | FolderSource, hull_vertices: Array) -> UpAxis | None:
-    """The axis of its file on which alone an asset stands, where `up` names another; None where nothing speaks against `up`.
-
-    hull_vertices [H, 3] of the asset's convex hull, object frame.
-    """
-    if isinstance(settings, ShapeNetSource) or asset.path is None or not settings.category_map:
-        return None  # what pybullet_data's own map names lies as it happens to
-    R_object_source = asset.T_source_to_object[:3, :3]
-    found = find_upright(hull_vertices @ R_object_source, asset.mass.com @ R_object_source)
-    sure = found is not None and found.confidence == "sure" and found.axis != settings.up_of(asset.path)
-    return found.axis if found is not None and sure else None
-
-
-def _check_size(name: str, diagonal_m: float, limits: MeshLimits) -> None:
-    """MeshError `size` where a body is so small or large that nothing about it could be simulated or seen."""
-    if limits.min_size_m <= diagonal_m <= limits.max_size_m:
-        return
-    small = diagonal_m < limits.min_size_m
-    cap = f"under min_size_m = {limits.min_size_m:g}" if small else f"over max_size_m = {limits.max_size_m:g}"
-    remedy = "set `scale` (0.001 for millimetres) or `diagonal_m` of its source"
-    raise MeshError("size", f"{name} is {diagonal_m:.3g} m across, {cap}: {remedy}")
-
+from workers.door.meshes.mesh import DEFAULT
 
 FLAT_SHARE, ROUGH_SHARE = 0.004, 0.016
 """Shares of the diagonal within which points count as touching the ground: of smooth bottoms, and of scanned ones, which
@@ -288,35 +161,35 @@ class Measured:
     stated_up: UpAxis | None = None
 
 
-def measure_asset(asset: Asset, hull: Hull | None, path: Path) -> str:
-    """The measures of an asset whose source has z up, read from a file at `path`, as JSON."""
-    x, y, z = (float(extent) for extent in asset.extents_m)
-    textures = [part.material.texture for part in asset.shape.parts if part.material.texture is not None]
-    found = None if hull is None else find_upright(hull.vertices, asset.mass.com)
-    a, b, c = (asset.shape.vertices[asset.shape.faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
-    measured = Measured(
+def measure_shape(
+    shape: Shape, mass: MassProperties, hull_vertices: Array, notes: tuple[str, ...], path: Path
+) -> Measured:
+    """The measures of a shape in the frame and the units of its file at `path`; hull_vertices [H, 3] of its convex hull."""
+    lower, upper = shape.bounds
+    x, y, z = (float(extent) for extent in upper - lower)
+    textures = [part.material.texture for part in shape.parts if part.material.texture is not None]
+    fits = find_upright(hull_vertices, mass.com)
+    a, b, c = (shape.vertices[shape.faces[:, k]] - 0.5 * (lower + upper) for k in range(3))
+    return Measured(
         extents=(x, y, z),
-        vertices=sum(len(part.vertices) for part in asset.shape.parts),
-        faces=sum(len(part.faces) for part in asset.shape.parts),
-        watertight=asset.watertight,
+        vertices=len(shape.vertices),
+        faces=len(shape.faces),
+        watertight=mass.solid,
         textures=len({id(texture) for texture in textures if max(texture.shape[:2]) > PLACEHOLDER_PX}),
-        notes=asset.notes,
-        up=None if found is None else found.axis,
-        confidence=None if found is None else found.confidence,
-        area=0.5 * float(np.linalg.norm(across, axis=1).sum()),
+        notes=notes,
+        up=None if fits is None else fits.axis,
+        confidence=None if fits is None else fits.confidence,
+        area=0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()),
         volume=abs(float((a * np.cross(b, c)).sum())) / 6.0,
-        thin=1.0 if hull is None else measure_thinness(hull.vertices),
-        look=_mean_colour(asset.shape),
+        thin=measure_thinness(hull_vertices),
+        look=_mean_colour(shape),
         unit_m=find_unit(path),
         stated_up=find_up(_head(path)) if path.suffix.lower() == ".dae" else None,
     )
-    return json.dumps(asdict(measured))
 
 
-def read_measured(data: bytes) -> Measured:
-    """The measures of `measure_asset`'s JSON. Raises ValueError, TypeError or KeyError where it is none."""
-    tree = json.loads(data)
+def read_measured(tree: dict[str, Any]) -> Measured:
+    """The measures of `asdict`'s tree from JSON. Raises TypeError or KeyError where it is none."""
     look = None if tree["look"] is None else tuple(tree["look"])
     return Measured(**{**tree, "extents": tuple(tree["extents"]), "notes": tuple(tree["notes"]), "look": look})
 
@@ -338,6 +211,9 @@ def _mean_colour(shape: Shape) -> tuple[float, float, float] | None:
     return (float(red), float(green), float(blue)) if weight else None
 
 
+HEAD_BYTES = 65_536
+"""Bytes of a file that are looked at for a remark on its unit."""
+
 _UNIT = re.compile(rb"^#[^\n]*\bunits?\b[\s=:]*(?:(?:is|are|in)\b)?[\s=:]*([a-z]+)", re.IGNORECASE | re.MULTILINE)
 """A remark in an OBJ file, as SketchUp's `# File units = inches`."""
 _UNITS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, "centimetre": 0.01, "mm": 0.001}
@@ -354,4 +230,4 @@ def find_unit(path: Path) -> float | None:
 
 def _head(path: Path) -> bytes:
     with path.open("rb") as stream:
-        return stream.read(16 * HEAD_BYTES)
+        return stream.read(HEAD_BYTES)

@@ -1,15 +1,14 @@
-"""Pure: what a job says about a folder of meshes: units, and the axis that is up."""
+"""Pure: of the files of a folder, their units, and the axis that is up."""
 
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from glob import escape
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 from statistics import median
 
-from schemas.job.assets import UpAxis, matches
-from services.init.copies import Item
+from schemas.job.assets import UpAxis
+from workers.assets.library.copies import Item
 from workers.door.meshes.urdf import POSED
 
 METRIC = frozenset({".glb", ".gltf", ".dae", *POSED})
@@ -21,7 +20,7 @@ SPECIFIED_UP: Mapping[str, UpAxis] = {".glb": "y", ".gltf": "y", **dict.fromkeys
 
 @dataclass(frozen=True)
 class Group:
-    """Files with one scale, a source of the job: `factor` to metres, or to `diagonal_m` where sizes are normalised.
+    """Files with one scale: `factor` to metres, or to `diagonal_m` where sizes are normalised.
 
     why: a line for each format.
     """
@@ -30,29 +29,10 @@ class Group:
     factor: float
     why: tuple[str, ...]
     diagonal_m: float | None = None
-    category_map: Mapping[str, str] = field(default_factory=dict)
-    """Category by pattern; the first match wins."""
 
-    def size_m(self, item: Item) -> float:
-        """The diagonal of one of its files, metres."""
-        return self.diagonal_m or self.factor * item.diagonal
-
-
-@dataclass(frozen=True)
-class UpRule:
-    """The axis that is up in the files that a pattern finds, and why."""
-
-    pattern: str
-    axis: UpAxis
-    why: str
-
-
-@dataclass(frozen=True)
-class Guess:
-    """What a job says of a folder: its sources, and the axes that are up (the first rule that matches)."""
-
-    groups: tuple[Group, ...]
-    ups: tuple[UpRule, ...]
+    def unit(self, item: Item) -> float:
+        """Metres in a unit of one of its files."""
+        return self.factor if self.diagonal_m is None else self.diagonal_m / item.diagonal
 
 
 UNITS = ((1.0, "metres"), (0.01, "centimetres"), (0.001, "millimetres"))
@@ -208,36 +188,28 @@ def length(metres: float) -> str:
     return f"{metres / unit:.3g} {name}"
 
 
-def guess_ups(items: Sequence[Item]) -> list[UpRule]:
-    """Rules by pattern, the first that matches holds: of single files, of first folders, and of each format at the end."""
-    files, folders, formats = list[UpRule](), list[UpRule](), list[UpRule]()
-    for suffix in sorted({PurePosixPath(item.path).suffix for item in items}):
-        group = [item for item in items if item.path.endswith(suffix)]
+def guess_ups(items: Sequence[Item]) -> dict[str, tuple[UpAxis, str]]:
+    """For each file the axis that is up, and why: what it says itself, what its first folder shows, or its whole format."""
+    ups = dict[str, tuple[UpAxis, str]]()
+    for suffix in sorted({item.suffix for item in items}):
+        group = [item for item in items if item.suffix == suffix]
         stated = Counter(item.measured.stated_up for item in group).most_common(1)[0][0]
-        specified = stated or SPECIFIED_UP.get(suffix.lower())
+        specified = stated or SPECIFIED_UP.get(suffix)
         odd = [item for item in group if item.measured.stated_up != stated]
-        files += [UpRule(escape(item.path), item.measured.stated_up or "y", "as the file says") for item in odd]
+        ups |= {item.path: (item.measured.stated_up or "y", "as the file says") for item in odd}
         group = [item for item in group if item not in odd]
-        whole = UpRule(f"**/*{escape(suffix)}", *_decide(group, specified))
-        formats.append(whole)
+        whole = _decide(group, specified)
+        ups |= {item.path: whole for item in group}
         for first in sorted({item.path.split("/")[0] for item in group if "/" in item.path}):
-            axis, count, told = _majority([item for item in group if item.path.startswith(f"{first}/")], specified)
-            if axis is not None and axis != whole.axis and count > (1 if specified is None else 2):
-                pattern = f"{escape(first)}/**/*{escape(suffix)}"
-                folders.append(UpRule(pattern, axis, f"{told}, unlike other {suffix} files"))
+            inside = [item for item in group if item.path.startswith(f"{first}/")]
+            axis, count, message = _majority(inside, specified)
+            if axis is not None and axis != whole[0] and count > (1 if specified is None else 2):
+                ups |= {item.path: (axis, f"{message}, unlike other {suffix} files") for item in inside}
         for item in group if not stated and specified != "y" else ():  # in robots' files z is up by use alone
-            held = next((rule.axis for rule in folders if matches(item.path, rule.pattern)), whole.axis)
-            if item.measured.confidence == "sure" and item.measured.up not in (None, held):
+            if item.measured.confidence == "sure" and item.measured.up not in (None, ups[item.path][0]):
                 assert item.measured.up is not None
-                why = "stands on this axis alone, unlike its neighbours"
-                files.append(UpRule(escape(item.path), item.measured.up, why))
-    return [*files, *folders, *formats]
-
-
-def plain_axis(rules: Sequence[UpRule]) -> UpAxis | None:
-    """The axis that all rules name; None where they differ."""
-    axes = {rule.axis for rule in rules}
-    return axes.pop() if len(axes) == 1 else None
+                ups[item.path] = item.measured.up, "stands on this axis alone, unlike its neighbours"
+    return ups
 
 
 def _decide(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis, str]:

@@ -1,16 +1,13 @@
-"""Pure: the categories of a folder's objects, by where they lie and what they are called, and the patterns that say so."""
+"""Pure: the categories of a folder's objects, by where they lie and what they are called."""
 
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from glob import escape
+from collections.abc import Iterable, Sequence
 from pathlib import PurePosixPath
 from typing import TypeVar
 
-from pydantic import TypeAdapter, ValidationError
-
-from schemas.job.assets import LONGEST, LONGEST_BYTES, CategoryName, is_letter, matches
+from schemas.job.assets import LONGEST, LONGEST_BYTES, TABLE, is_letter, is_usable
 
 BY_FOLDER, BY_FILE, BY_PARENT = "folder", "file", "parent"
 """The ways to name a category; any other word names them all."""
@@ -23,7 +20,6 @@ _GENERIC = re.compile(
 """Names of folders that say what files are, and not what things are."""
 
 Names = TypeVar("Names", str, tuple[str, ...])
-_NAME: TypeAdapter[str] = TypeAdapter(CategoryName)
 _NUMBER = re.compile(r"[\s_.-]*\d+$")
 _IDENTIFIER = re.compile(r"[\d_.-]+|(?=.*\d)[0-9a-f-]{6,}|(?=.*\d)[A-Z0-9]{8,}")
 """A name that a database gave: digits, hexadecimal digits, or capitals and digits."""
@@ -78,59 +74,7 @@ def usable_name(text: str) -> str:
     name = name.lstrip("".join(c for c in name if not c.isalnum())) or "object"
     if name.isdigit():
         name = f"n{name}"[:LONGEST]
-    return name if is_category(name) else f"{name[: LONGEST - 5]}_mesh"  # a name that is taken
-
-
-def is_category(name: str) -> bool:
-    """Whether a category of objects may have this name."""
-    try:
-        _NAME.validate_python(name)
-    except ValidationError:
-        return False
-    return True
-
-
-def map_categories(items: Mapping[str, str], others: Collection[str], harmless: Collection[str]) -> dict[str, str]:
-    """Category by pattern: together they find exactly the files of `items`, a category by path.
-
-    `others` are further files of the folder, which no pattern finds, but for the `harmless` ones, which a job leaves out by
-    itself.
-    """
-    everything = sorted({*items, *others})
-    groups: dict[tuple[str, str], list[str]] = {}
-    for path, category in items.items():
-        groups.setdefault((category, PurePosixPath(path).suffix), []).append(path)
-    found: dict[str, str] = {}
-    for (category, _), paths in sorted(groups.items()):
-        allowed = {*paths, *harmless} - (items.keys() - set(paths))
-        found |= dict.fromkeys(_cover(sorted(paths), everything, allowed), category)
-    return found
-
-
-def _cover(paths: Sequence[str], everything: Iterable[str], allowed: Collection[str]) -> list[str]:
-    """One pattern that finds all of the paths and otherwise only what is allowed; else a pattern for each."""
-    if len(paths) > 1:
-        start = _common_start(paths)
-        folder = start[: start.rfind("/") + 1]
-        near = [path for path in everything if path.startswith(folder)]
-        for pattern in _patterns(paths, escape(folder)):
-            hit = {path for path in near if matches(path, pattern)}
-            if set(paths) <= hit <= set(allowed):
-                return [pattern]
-    return [escape(path) for path in paths]
-
-
-def _patterns(paths: Sequence[str], folder: str) -> Iterator[str]:
-    """Patterns below a folder that may find the paths, the plainest first."""
-    suffix, names = escape(PurePosixPath(paths[0]).suffix), [PurePosixPath(path).name for path in paths]
-    start = escape(_common_start([PurePosixPath(name).stem for name in names]))
-    for between in ("", "*/", "**/"):
-        if len(set(names)) == 1:
-            yield f"{folder}{between}{escape(names[0])}"
-        else:
-            yield f"{folder}{between}*{suffix}"
-            yield f"{folder}{between}{start}*{suffix}"
-            yield f"{folder}{between}{start}*[0-9]{suffix}"
+    return name if is_usable(name) and name.lower() != TABLE else f"{name[: LONGEST - 5]}_mesh"  # a name that is taken
 
 
 def _common_start(words: Sequence[Names]) -> Names:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from workers.assets.external.placement import Measured
+from workers.assets.library.placement import Measured
 from workers.door.meshes.urdf import POSED
 
 PART, COPY = "part", "copy"
@@ -42,15 +42,6 @@ class LeftOut:
     path: str
     reason: str
     why: str
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Everything that a folder has. `refused`: those left out because they cannot be read, which a job leaves out too."""
-
-    items: tuple[Item, ...]
-    left_out: tuple[LeftOut, ...]
-    refused: frozenset[str] = frozenset()
 
 
 _COLLIDES = "col|coll|collisions?|colliders?|v-?hacd|coacd|convex|hulls?|ch|physics|phys"
