@@ -260,10 +260,10 @@ def _decompose(loft: Loft, size: float, tolerance: float) -> list[Array]:
 
 def _join_rings(rings: Array) -> list[Array]:
     """Parts of a loft whose rings may lie askew: from ring to ring, or over several where that is as convex."""
-    parts, volume = [rings[:2]], _hull_volume(rings[:2])
-    for number in range(2, len(rings)):
-        link, longer = rings[number - 1 : number + 1], np.concatenate([parts[-1], rings[number : number + 1]])
-        separate, joined = _hull_volume(link), _hull_volume(longer)
+    parts, volume = [rings[:2]], _hull_of(rings[:2]).volume()
+    for link in (rings[number - 1 : number + 1] for number in range(2, len(rings))):
+        longer = np.concatenate([parts[-1], link[1:]])
+        separate, joined = _hull_of(link).volume(), _hull_of(longer).volume()
         if joined <= (volume + separate) * (1.0 + 1e-9):
             parts[-1], volume = longer, joined
         else:
@@ -274,10 +274,6 @@ def _join_rings(rings: Array) -> list[Array]:
 
 def _hull_of(points: Array) -> manifold3d.Manifold:
     return manifold3d.Manifold.hull_points(np.ascontiguousarray(points.reshape(-1, 3)))
-
-
-def _hull_volume(points: Array) -> float:
-    return float(_hull_of(points).volume())
 
 
 def _decompose_lathed(profiles: Array, columns: Array, size: float, tolerance: float) -> list[Array]:
