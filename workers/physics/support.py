@@ -1,6 +1,5 @@
 """What objects stand on: the elevation of meshes, rest poses on a level support, and the level top of a table. Pure."""
 
-import math
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -227,21 +226,12 @@ def inside_margin(points_xy: Array, outline: Array) -> Array:
 
     The least signed distance to the polygon's edge lines.
     """
-    return _least_distances(np.ascontiguousarray(points_xy), outline)
-
-
-@compiled_for("f8[:,::1], const(f8[:,::1])")
-def _least_distances(points: Array, outline: Array) -> Array:
-    """The least signed distance [N] of points to the lines through the edges of a polygon, those without length left out."""
-    least = np.full(len(points), np.inf)
-    for m in range(len(outline)):
-        start, end = outline[m], outline[(m + 1) % len(outline)]
-        x, y = end[0] - start[0], end[1] - start[1]
-        length = math.sqrt(x * x + y * y)
-        if length > 0.0:
-            for n in range(len(points)):
-                depth = (x * (points[n, 1] - start[1]) - y * (points[n, 0] - start[0])) / length
-                least[n] = min(least[n], depth)
+    x, y = (np.roll(outline, -1, axis=0) - outline).T
+    length = np.sqrt(x * x + y * y)
+    right, up = (points_xy[:, axis, None] - outline[:, axis] for axis in (0, 1))
+    with np.errstate(invalid="ignore"):
+        depth = (x * up - y * right) / length
+    least: Array = depth[:, length > 0.0].min(axis=1, initial=np.inf)
     return least
 
 
