@@ -54,7 +54,10 @@ def key_of(*inputs: str | bytes) -> str:
     return whole.hexdigest()
 
 
-@cached(LRUCache(CAPACITY_BYTES, lambda parts: sum(cloud.nbytes for cloud in parts.clouds)), key=lambda key, _: key)
+_MEMORY: LRUCache[str, Parts] = LRUCache(CAPACITY_BYTES, lambda parts: sum(cloud.nbytes for cloud in parts.clouds))
+
+
+@cached(_MEMORY, key=lambda key, _: key)
 def _kept(key: str, make: Callable[[], Parts]) -> Parts:
     """The parts of this key from memory, else made: those used last stay that fit `CAPACITY_BYTES` together."""
     return make()
