@@ -100,7 +100,7 @@ def test_differences_are_told_by_their_path_and_an_absent_value_is_no_difference
         (stored, {**stored, "new": 3}, ["new"]),
         ({**stored, "a": True}, stored, ["a"]),
         ({**stored, "f": 0.0}, stored, ["f"]),
-        ({**stored, "b": {"c": [1.0], "d": None}}, stored, ["b.c"]),
+        ({**stored, "b": {"c": [1.0], "d": None}}, stored, ["b.c.1"]),
         ({**stored, "b": {"c": [1.0, 3.0], "e": 1}}, stored, ["b.c.1", "b.e"]),
     ):
         assert list(label_differences(mine, derived)) == paths
