@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import json
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -31,6 +31,9 @@ from schemas.dataset.layout import (
 from schemas.errors import CommitConflict, CorruptError, OutputError, plain_line
 from workers.store.manifest import listed_files
 from workers.store.store import Store
+
+ReadTable = Callable[[Store, CommitRecord, str], bytes]
+"""Gives the bytes of a range's table at a path."""
 
 _HEX = 64
 
@@ -207,16 +210,16 @@ def check_retries(start: int, retries: Sequence[int]) -> None:
         )
 
 
-def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
+def committed_files(store: Store, record: CommitRecord, read: ReadTable | None = None) -> tuple[FileEntry, ...]:
     """Every file of a commit, sorted by path: images or tars, shapes and the range's tables.
 
-    The record names tables and tars. The range's `views` and `assets` name the others; they are read in place or staged.
-    Raises CorruptError naming a table that is missing, damaged, or lists a file that is not the range's own.
+    The record names tables and tars. The range's `views` and `assets` name the others; `read` gives their bytes in place of
+    `read_range_file`. Raises CorruptError naming a table that is missing, damaged, or lists a file that is not the range's own.
     """
     files = {entry.path: entry for entry in record.files}
     for table in ("assets", "views") if record.terms.layout == "files" else ("assets",):
         path = range_table_path(record.span.start, table, record.span.retry)
-        listed = listed_files(table, read_range_file(store, record, path), path)
+        listed = listed_files(table, (read or read_range_file)(store, record, path), path)
         if (foreign := foreign_path(listed, record.span, record.terms.pairs_per_scene)) is not None:
             raise CorruptError(f"{path} lists {foreign!r}, which is not a file of its range")
         files |= {entry.path: entry for entry in listed}

@@ -22,7 +22,7 @@ from schemas.dataset.commit import join_rows as join_summaries
 from schemas.dataset.layout import LEDGER_FILE, MAX_RETRIES, range_table_path
 from schemas.dataset.tables import SORT_KEYS
 from schemas.errors import CorruptError, MachineError, RunError
-from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
+from workers.store.commit import ReadTable, check_retries, list_codes, read_range_file, require_record, split_code
 from workers.store.manifest import PARQUET_OPTIONS, decode_table, join_rows
 from workers.store.store import Store, map_ahead
 
@@ -64,15 +64,16 @@ def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[lis
         raise RunError(_gap(awaited, stop_scene))
 
 
-def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.Table:
+def range_rows(
+    store: Store, records: Sequence[CommitRecord], table: str, read: ReadTable = read_range_file
+) -> pa.Table:
     """The rows of one range, sorted by key; a retry's rows replace those of the scenes that it tried again.
 
     Rows of `assets` come from all records and may be repeated. Raises CorruptError naming a file that does not match its
     commit.
     """
     paths = [range_table_path(record.span.start, table, record.span.retry) for record in records]
-    read = (read_range_file(store, *which) for which in zip(records, paths, strict=True))
-    parts = [decode_table(table, data, path) for data, path in zip(read, paths, strict=True)]
+    parts = [decode_table(table, read(store, record, path), path) for record, path in zip(records, paths, strict=True)]
     if len(parts) == 1:
         return parts[0]
     if "scene_id" in parts[0].column_names:

@@ -202,19 +202,19 @@ def sorted_rows(table: str, rows: pa.Table) -> pa.Table:
         distinct = {json.dumps(row): index for index, row in enumerate(rows.to_pylist())}
         if len(distinct) < rows.num_rows:
             rows = rows.take(pa.array(distinct.values(), pa.int64()))
-    keys = _keys(rows, names)
+    keys = row_keys(table, rows)
     if keys != sorted(keys):
         rows = rows.sort_by([(name, "ascending") for name in names])
-        keys = _keys(rows, names)
+        keys = row_keys(table, rows)
     for key, following in pairwise(keys):
         if key == following:
             raise ValueError(f"{table}: two rows have the key {', '.join(names)} = {', '.join(map(str, key))}")
     return rows
 
 
-def _keys(rows: pa.Table, names: Sequence[str]) -> list[tuple[Any, ...]]:
-    """The values of these columns, a tuple for each row."""
-    return list(zip(*(rows.column(name).to_pylist() for name in names), strict=True))
+def row_keys(table: str, rows: pa.Table) -> list[tuple[Any, ...]]:
+    """The key of each row."""
+    return list(zip(*(rows.column(name).to_pylist() for name in SORT_KEYS[table]), strict=True))
 
 
 def encode_table(rows: pa.Table) -> bytes:
