@@ -84,8 +84,8 @@ class Store(Protocol):
 
     def size(self, key: str) -> int | None:
         """Bytes of the file at `key`, None where there is none."""
-        found = self.stat(key)
-        return found.bytes if found else None
+        entry = self.stat(key)
+        return entry.bytes if entry else None
 
     def files(self, prefix: str, sizes: bool = True) -> Iterator[Entry]:
         """Every file at any depth below the folder `prefix` (all there are for ""), in any order, one at a time.
@@ -157,9 +157,9 @@ def is_live(store: Store, staging: str) -> bool:
 
 def stat_all(store: Store, folders: Iterable[str], keys: Iterable[str]) -> dict[str, Entry]:
     """By key: every file at any depth below the folders, and those of `keys` that are there."""
-    asked: list[tuple[bool, str]] = [*((True, folder) for folder in folders), *((False, key) for key in keys)]
-    found = map_ahead(store, lambda one: [*store.files(one[1])] if one[0] else [store.stat(one[1])], asked)
-    return {entry.key: entry for entries in found for entry in entries if entry is not None}
+    asked = [*((True, folder) for folder in folders), *((False, key) for key in keys)]
+    answers = map_ahead(store, lambda item: [*store.files(item[1])] if item[0] else [store.stat(item[1])], asked)
+    return {entry.key: entry for entries in answers for entry in entries if entry is not None}
 
 
 def map_ahead(store: Store, function: Callable[[A], B], items: Iterable[A], at_once: int | None = None) -> Iterator[B]:
