@@ -25,7 +25,7 @@ from schemas.queue import (
 )
 from workers.door.opening import read_bytes
 from workers.store.local import open_store
-from workers.store.store import Events, Store, event_path, retry_if_swept
+from workers.store.store import Events, Store, retry_if_swept
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
 """waiting: for its output folder. lost: drivers died more often than they are started again."""
@@ -143,12 +143,10 @@ def _read_entry(store: Store, key: str) -> bytes:
 
 
 class _JobEvents(Events):
-    """The events of a job."""
+    """The events of a job, of which what is no file is refused."""
 
-    def _read(self, number: int) -> bytes:
-        if number not in self._known:
-            self._known[number] = _read_entry(self._store, event_path(self._folder, number))
-        return self._known[number]
+    def _read(self, key: str) -> bytes:
+        return _read_entry(self._store, key)
 
 
 class Queue:
