@@ -51,7 +51,7 @@ def find_parts(job: Job, catalogue: Catalogue, folder: Path | None = USUAL_FOLDE
         return
     line, deep = ProgressLine(len(cuts), "meshes cut into convex parts", "mesh"), list[str]()
     for done, (cut, answer) in enumerate(run_pool(cut_shape, cuts, key=lambda cut: cut.key, kept=kept), 1):
-        line.show(done, name=cut.path)
+        line.show(done)
         if isinstance(answer, Ended):
             raise MachineError(
                 f"a process that cuts {cut.path} into convex parts ended: {answer.detail}: start again, what is cut stays"

@@ -1,40 +1,47 @@
-"""The Ray that runs the work: a private one on this machine, or a running cluster; and how many shards it runs at once.
+"""The Ray that runs the work: a private one on this machine, or a running cluster; its slots, and what its nodes must have.
 
-A private Ray listens on loopback alone and answers who shows its token. Its folder is closed to other users, has a name that
-is short enough for sockets, and is removed once its owner is gone. On a cluster the slots change as nodes come and go.
+A private Ray listens on loopback alone, answers who shows its token, and leaves nothing. On a cluster the slots change as
+nodes come and go. Its nodes are asked what they have before the first scene: the question travels whole, so that a node
+without this project can answer, and it comes without the run's environment, so that a processor that cannot have it is told
+instead of crashed.
 """
 
 import contextlib
-import fcntl
 import math
 import os
 import secrets
 import shutil
 import socket
-import stat
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray import cloudpickle
 from ray._private import ray_constants, utils
 from ray._private.node import Node
 from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
 from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from schemas.dataset.layout import FINGERPRINT_FILE, LOCK_FILE
+from schemas.dataset.shard import ShardOrder
 from schemas.errors import MachineError
 from schemas.job.job import Run
-from services.run.machine import usable_cores
+from services.run import worker_entry
+from services.run.machine import private_folder, usable_cores
+from services.run.progress import say
 from services.run.supervisor import core_stderr, tell
+from services.run.worker_entry import Pattern, WorkerTerms, refusal_of
+from workers.store.store import Store
 
 PREFETCH = 2
 """Shards given to Ray for each slot: one that runs and one that waits, so that no slot is idle between two."""
 
 LOOK_EVERY_S = 2.0
-"""How often a cluster is asked for its cores."""
+"""How often a cluster is asked for its cores, or its nodes."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +111,15 @@ def share_gpus(nodes: Sequence[tuple[int, int]], running: int, run: Run) -> floa
     return RAY_PARTS // (run.workers_per_gpu or fewest) / RAY_PARTS
 
 
+def alive_nodes() -> list[dict[str, Any]]:
+    """The nodes of the Ray that this process is connected to, as Ray describes them."""
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
 def nodes_here() -> list[tuple[int, int]]:
-    """(cores, GPUs) of each node of the Ray that this process is connected to."""
-    found = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    return [(int(one.get("CPU", 0)), int(one.get("GPU", 0))) for one in found]
+    """(cores, GPUs) of each node."""
+    resources = [node["Resources"] for node in alive_nodes()]
+    return [(int(node.get("CPU", 0)), int(node.get("GPU", 0))) for node in resources]
 
 
 def private_environment() -> dict[str, str]:
@@ -131,109 +143,6 @@ def private_environment() -> dict[str, str]:
 NOT_INHERITED = ("RAY_REDIS_ADDRESS",)
 """Variables of the user's that would tie a private Ray to another one."""
 
-
-PREFIX = "vr-"
-
-OWNER = "owner"
-"""A file that the owner keeps locked. The kernel unlocks it when the process ends, however that happens."""
-
-INNER = "r"
-"""What Ray gets. It opens its own folder to every user (0777), so it gets one inside a folder that nobody else enters."""
-
-SOCKET_BYTES = 107
-"""The longest name of a Unix socket on Linux."""
-
-SESSION_BYTES = len("/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store")
-"""What Ray puts behind the name of its folder; 4194304 is the largest process id."""
-
-MAX_BASE_BYTES = SOCKET_BYTES - SESSION_BYTES - len(f"/{PREFIX}12345678/{INNER}")
-"""The longest temporary folder that has room for a private Ray's."""
-
-OTHERS = (Path("/tmp"), Path("/var/tmp"), Path("/dev/shm"))
-"""Where to go when the user's temporary folder has too long a name."""
-
-
-@contextlib.contextmanager
-def private_folder() -> Iterator[Path]:
-    """An empty folder that no other user can enter; removed when the block ends.
-
-    Folders of processes that are gone are removed first. Raises MachineError where no place has a name short enough.
-    """
-    places = _places()
-    for place in places:
-        remove_dead(place)
-    folder, owner = _make(places)
-    try:
-        yield folder / INNER
-    finally:
-        _remove(folder)
-        os.close(owner)
-
-
-def living_folders() -> list[Path]:
-    """This user's private folders on this machine, those of processes that are gone removed first."""
-    found = []
-    for place in _places():
-        remove_dead(place)
-        for folder in place.glob(f"{PREFIX}*"):
-            with contextlib.suppress(OSError):
-                if folder.lstat().st_uid == os.geteuid() and (folder / OWNER).exists():
-                    found.append(folder / INNER)
-    return found
-
-
-def remove_dead(place: Path) -> None:
-    """Removes this user's folders below `place` whose owner does not live."""
-    for folder in place.glob(f"{PREFIX}*"):
-        # Locked by a process that lives, or not one of these folders, or removed by another process meanwhile.
-        with contextlib.suppress(OSError):
-            status = folder.lstat()
-            if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid():
-                with open(os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)) as owner:
-                    fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    _remove(folder)
-
-
-def _places() -> list[Path]:
-    """The user's temporary folder if its name is short enough, then the others. Raises MachineError if none exists."""
-    try:
-        wanted = Path(tempfile.gettempdir())
-    except FileNotFoundError as error:
-        raise MachineError(f"{error.strerror}: set TMPDIR to one that can be written") from error
-    places = [place for place in (wanted, *OTHERS) if len(os.fsencode(place)) <= MAX_BASE_BYTES]
-    return list(dict.fromkeys(places))
-
-
-def _make(places: Sequence[Path]) -> tuple[Path, int]:
-    """A folder in the first place that takes one, and the open file that shows that its owner lives."""
-    errors = []
-    for place in places:
-        try:
-            folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
-            (folder / INNER).mkdir()
-            # It gets its name when it is locked, so nobody ever finds it unlocked before
-            unnamed = folder / f"{OWNER}.new"
-            owner = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            unnamed.rename(folder / OWNER)
-            return folder, owner
-        except OSError as error:
-            errors.append(f"{place} ({error.strerror or error})")
-    wanted = tempfile.gettempdir()
-    tried = f"; cannot be written: {', '.join(errors)}" if errors else ""
-    raise MachineError(
-        f"no place for Ray's sockets: the name of {wanted} has {len(os.fsencode(wanted))} bytes, at most {MAX_BASE_BYTES} "
-        f"fit{tried}: set TMPDIR to a writable folder with a short name"
-    )
-
-
-def _remove(folder: Path) -> None:
-    """Removes a folder, the owner's file last: what a process that is just ending wrote meanwhile is found again."""
-    shutil.rmtree(folder / INNER, ignore_errors=True)
-    if not (folder / INNER).exists():
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 OBJECT_STORE_BYTES = 128 * 2**20
 """Images never cross Ray, so its shared memory can be small."""
 
@@ -241,9 +150,11 @@ CONNECT_S = 10.0
 """Time for a cluster's head to accept a connection."""
 
 
-def open_ray(address: str | None, workers: int | None) -> contextlib.AbstractContextManager[Slots]:
-    """The cluster at `address`, or a private Ray, by default with a worker for each usable core."""
-    return private_ray(workers or usable_cores()) if address is None else cluster_ray(address, workers)
+def open_ray(
+    address: str | None, workers: int | None, sharing: Callable[[], int] | None = None
+) -> contextlib.AbstractContextManager[Slots]:
+    """The cluster at `address`, shared with so many jobs, or a private Ray, by default with a worker for each usable core."""
+    return private_ray(workers or usable_cores()) if address is None else cluster_ray(address, workers, sharing)
 
 
 @contextlib.contextmanager
@@ -261,26 +172,28 @@ def private_ray(workers: int) -> Iterator[Slots]:
 @contextlib.contextmanager
 def ray_in(folder: Path, workers: int) -> Iterator[Slots]:
     """A private Ray as above, in a private folder."""
-    with kept_private():
+    shared = Path("/dev/shm")
+    # A container often has 64 MiB of shared memory only. In a folder Ray warns of slow storage, which reports can bear.
+    roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
+    settings = {
+        "num_cpus": workers,
+        "include_dashboard": False,
+        "object_store_memory": OBJECT_STORE_BYTES,
+        "_temp_dir": str(folder),
+        "_plasma_directory": str(shared if roomy else folder),
+        "_node_ip_address": "127.0.0.1",
+        "_system_config": {"enable_metrics_collection": False},  # they would be served without asking for the token
+    }
+    with kept_private(), contextlib.ExitStack() as stack:
         tell(folder=str(folder.parent))  # the supervisor removes it where this process cannot
-        settings = {
-            "num_cpus": workers,
-            "include_dashboard": False,
-            "object_store_memory": OBJECT_STORE_BYTES,
-            "_temp_dir": str(folder),
-            "_plasma_directory": _object_store_folder(str(folder)),
-            "_node_ip_address": "127.0.0.1",
-            "_system_config": {"enable_metrics_collection": False},  # they would be served without asking for the token
-        }
-        with contextlib.ExitStack() as stack:
-            try:
-                stack.enter_context(connection("local", **settings))
-            except Exception as error:  # Ray raises plain ones, after half a minute where the machine is overloaded
-                said = next(iter(str(error).splitlines()), type(error).__name__)
-                raise MachineError(
-                    f"Ray did not start on this machine ({said}): see `verso doctor`, or start again when less is running here"
-                ) from error
-            yield Slots(workers, PREFETCH * workers)
+        try:
+            stack.enter_context(connection("local", **settings))
+        except Exception as error:  # Ray raises plain ones, after half a minute where the machine is overloaded
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise MachineError(
+                f"Ray did not start on this machine ({reason}): see `verso doctor`, or start again when less is running here"
+            ) from error
+        yield Slots(workers, PREFETCH * workers)
 
 
 @contextlib.contextmanager
@@ -344,19 +257,9 @@ def address_here() -> str:
     return str(ray.get_runtime_context().gcs_address)
 
 
-def _object_store_folder(temporary: str) -> str:
-    """Shared memory where there is enough of it, otherwise the temporary folder.
-
-    A container often has 64 MiB only. Ray then warns of slow storage, which does not matter for reports of a kilobyte.
-    """
-    shared = Path("/dev/shm")
-    roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
-    return str(shared) if roomy else temporary
-
-
 @contextlib.contextmanager
-def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
-    """A running cluster: as many slots as it has cores at the moment, or `workers` where that is less.
+def cluster_ray(address: str, workers: int | None, sharing: Callable[[], int] | None = None) -> Iterator[Slots]:
+    """A running cluster: as many slots as it has cores at the moment, or `workers` where that is less, shared by jobs.
 
     The user's own settings of authentication (RAY_AUTH_MODE, RAY_AUTH_TOKEN) count. Raises MachineError where no Ray
     answers at the address, or where it wants another token.
@@ -372,7 +275,8 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
             ) from error
         if _count_cores() < 1:
             raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-        yield cluster_slots(_count_cores, workers)
+        slots = cluster_slots(_count_cores, workers)
+        yield share_slots(slots, sharing) if sharing else slots
 
 
 def _count_cores() -> int:
@@ -414,3 +318,79 @@ def _check_reachable(address: str) -> None:
             f"--address {address}: no Ray answers there ({error.strerror or error}); start one with `ray start --head`, or "
             "leave --address out to run on this machine"
         ) from error
+
+
+# ------------------------------------------------------------------------------------------------ who may work
+
+ANSWER_S = 60.0
+"""Time for a node's answer: it may have to start a process for it. One that is silent is asked again by its workers."""
+
+
+def on_node(task: Any, node: str) -> Any:
+    """A remote function that runs on the node with this id."""
+    return task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False))
+
+
+def join_cluster(store: Store, token: str, pattern: Pattern) -> Pattern:
+    """The pattern for workers on other hosts. Raises VersoError where a node of the cluster cannot work on the run.
+
+    `token` is what the lock's file in the output folder holds.
+    """
+    terms = pattern.terms
+    if store.root is not None:
+        terms = replace(terms, out=str(store.root), proof=str(store.root / LOCK_FILE), token=token)
+    check_nodes(terms)
+    return replace(pattern, order=with_own_stack(store, pattern.order), terms=terms, env_vars=dict(terms.environment))
+
+
+def with_own_stack(store: Store, order: ShardOrder) -> ShardOrder:
+    """The order of a strict job without commits, with this process's fingerprint, which every worker must then have.
+
+    Left as it is where the job has commits, or wants a GPU and this host draws in software: then the first worker decides.
+    """
+    if order.terms.fingerprint_mode != "strict" or order.terms.fingerprint:
+        return order
+    from workers.render.raster.context import is_software
+    from workers.render.raster.gbuffer import shared_renderer
+    from workers.shard.fingerprint import take_fingerprint  # loads GL
+
+    renderer = shared_renderer()
+    if order.job.run.device == "gpu" and is_software(renderer.name):
+        return order
+    mine = take_fingerprint(renderer, order.job.drawn.tier)
+    store.put(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
+    return order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": mine.digest})})
+
+
+def check_nodes(terms: WorkerTerms) -> None:
+    """Raises the refusal of the first node that cannot work on the run; nothing where the driver's node is the only one.
+
+    A node that does not answer is said and left out.
+    """
+    nodes = [node["NodeID"] for node in alive_nodes() if node["Resources"].get("CPU")]
+    if len(nodes) < 2:
+        return
+    deadline = time.monotonic() + ANSWER_S
+    for node, answer in [(node, _ask(node, terms)) for node in nodes]:
+        try:
+            sight = worker_entry.Sight(**ray.get(answer, timeout=max(0.1, deadline - time.monotonic())))
+        except RayError as error:
+            say(
+                f"node {node[:12]} does not say what it has ({type(error).__name__}): its workers are asked before they begin"
+            )
+            continue
+        if (refusal := refusal_of(terms, sight)) is not None:
+            raise refusal
+
+
+def _ask(node: str, terms: WorkerTerms) -> ray.ObjectRef:
+    """What the node will tell of itself."""
+
+    def look(proof: str, token: str) -> dict:
+        return asdict(worker_entry.see((), proof, token))
+
+    cloudpickle.register_pickle_by_value(worker_entry)
+    try:
+        return on_node(ray.remote(num_cpus=0, max_retries=0)(look), node).remote(terms.proof, terms.token)
+    finally:
+        cloudpickle.unregister_pickle_by_value(worker_entry)

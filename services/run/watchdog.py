@@ -68,12 +68,13 @@ def find_stalls(seen: Mapping[AttemptName, Sight], scene_timeout_s: float) -> di
 
     Of several attempts at one range, the one that changed last is the one that counts: workers of others were lost.
     """
-    latest = {one.start: one for one in sorted(seen, key=lambda one: (seen[one].idle_s, one), reverse=True)}
+    by_age = sorted(seen.items(), key=lambda item: (item[1].idle_s, item[0]), reverse=True)
+    latest = {attempt.start: (attempt, sight) for attempt, sight in by_age}
     factors = {True: COMMIT_FACTOR, False: SCENE_FACTOR}
     return {
-        attempt: seen[attempt]
-        for attempt in latest.values()
-        if seen[attempt].idle_s > factors[seen[attempt].scene_id is None] * scene_timeout_s
+        attempt: sight
+        for attempt, sight in latest.values()
+        if sight.idle_s > factors[sight.scene_id is None] * scene_timeout_s
     }
 
 
@@ -99,7 +100,7 @@ def watch(store: Store, label: str, scene_timeout_s: float) -> Iterator[Callable
     """
     stalls: deque[Stall] = deque()
     over = threading.Event()
-    settings = (store, label, scene_timeout_s, stalls, over)
+    settings = store, label, scene_timeout_s, stalls, over
     threading.Thread(target=_watch, args=settings, name="watchdog", daemon=True).start()
     try:
         yield lambda: [stalls.popleft() for _ in range(len(stalls))]
@@ -128,8 +129,8 @@ def _watch(store: Store, label: str, scene_timeout_s: float, stalls: deque[Stall
 
 def scenes_in_progress(store: Store, label: str) -> dict[AttemptName, int | None]:
     """The scene in progress (None between scenes) of every attempt with this label that has not ended."""
-    own = (AttemptName(start, name) for start, name in staged_attempts(store) if label in name)
-    return {attempt: blamed_scene(store, attempt.start, attempt.name) for attempt in own}
+    staged = staged_attempts(store)
+    return {AttemptName(start, name): blamed_scene(store, start, name) for start, name in staged if label in name}
 
 
 def find_own_workers() -> list[Process]:

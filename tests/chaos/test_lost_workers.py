@@ -17,11 +17,10 @@ from services.job.job_file import validate_job
 from services.merge.merge import merge
 from services.run import coordinator as module
 from services.run.coordinator import Coordinator, Limits
-from services.run.joining import Pattern
-from services.run.metrics import Tally
+from services.run.progress import Tally
 from services.run.range_planner import plan_ranges
 from services.run.ray_cluster import Slots
-from services.run.worker_entry import WorkerTerms
+from services.run.worker_entry import Pattern, WorkerTerms
 from tests.kit.faults import REQUESTS, check_published, requests
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.assets.catalogue import Catalogue

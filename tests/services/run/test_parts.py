@@ -29,11 +29,16 @@ def job_of(tmp_path):
 
 
 def looked_at(monkeypatch, job, catalogue, folder):
-    """The files that are cut, by the lines that are shown."""
-    shown = []
-    monkeypatch.setattr(parts.ProgressLine, "show", lambda self, done, **more: shown.append(more["name"]))
+    """The files that are cut."""
+    paths, run = [], parts.run_pool
+
+    def noted(work, cuts, **settings):
+        paths.extend(cut.path for cut in cuts)
+        return run(work, cuts, **settings)
+
+    monkeypatch.setattr(parts, "run_pool", noted)
     parts.find_parts(job, catalogue, folder)
-    return sorted(shown)
+    return sorted(paths)
 
 
 @pytest.mark.minute

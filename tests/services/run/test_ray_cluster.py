@@ -18,23 +18,25 @@ import ray
 from ray._private.authentication.authentication_utils import is_token_auth_enabled
 
 from schemas.errors import MachineError
-from services.run import ray_cluster as module
-from services.run.ray_cluster import (
-    LOOK_EVERY_S,
+from services.run import machine as module
+from services.run.machine import (
     MAX_BASE_BYTES,
-    NOT_INHERITED,
     OWNER,
-    PREFETCH,
     PREFIX,
     SESSION_BYTES,
     SOCKET_BYTES,
+    private_folder,
+    remove_dead,
+)
+from services.run.ray_cluster import (
+    LOOK_EVERY_S,
+    NOT_INHERITED,
+    PREFETCH,
     Slots,
     cluster_slots,
     open_ray,
     private_environment,
-    private_folder,
     private_ray,
-    remove_dead,
     slots_of,
 )
 from tests.kit.network import (
@@ -160,9 +162,9 @@ def short(monkeypatch):
 
 def killed_owner(place: Path) -> Path:
     """The folder of a process that was killed while it had one below `place`."""
-    program = "import os, sys, tempfile\nfrom pathlib import Path\nfrom services.run import ray_cluster\n"
-    program += "tempfile.tempdir, ray_cluster.OTHERS = sys.argv[1], ()\n"
-    program += "with ray_cluster.private_folder() as folder:\n    (folder / 'log').touch(); os.kill(os.getpid(), 9)"
+    program = "import os, sys, tempfile\nfrom pathlib import Path\nfrom services.run import machine\n"
+    program += "tempfile.tempdir, machine.OTHERS = sys.argv[1], ()\n"
+    program += "with machine.private_folder() as folder:\n    (folder / 'log').touch(); os.kill(os.getpid(), 9)"
     before = set(place.iterdir())
     done = subprocess.run([sys.executable, "-c", program, str(place)], check=False)
     assert done.returncode == -signal.SIGKILL

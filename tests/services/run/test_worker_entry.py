@@ -20,9 +20,10 @@ from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_
 from schemas.errors import FingerprintError, MachineError, OutputError
 from services.job.job_file import validate_job
 from services.run import worker_entry as module
-from services.run.joining import Pattern, terms_of_driver, with_own_stack
+from services.run.ray_cluster import with_own_stack
 from services.run.worker_entry import (
     DRAIN,
+    Pattern,
     Sight,
     WorkerTerms,
     check_worker,
@@ -33,7 +34,7 @@ from services.run.worker_entry import (
     refusal_of,
     see,
     start_environment,
-    worker_environment,
+    terms_of_driver,
 )
 from workers.assets.catalogue import Catalogue
 from workers.render.raster.gbuffer import shared_renderer
@@ -160,10 +161,10 @@ GOOD = Sight("h2", X86_64_V3 | {"sse2"}, ENVIRONMENT, "c" * 64)
 
 def test_a_driver_gives_what_it_has_of_the_stacks_variables_and_no_other(monkeypatch):
     mine = {**ENVIRONMENT, "OMP_NUM_THREADS": "4", "AWS_SECRET_ACCESS_KEY": "secret"}
-    assert worker_environment(mine) == {**ENVIRONMENT, "OMP_NUM_THREADS": "4"}
-    assert {*STACK_ENVIRONMENT, *ON_X86_64_V3} == set(worker_environment(mine))
-    assert worker_environment(FOR_SPEED) == dict(FOR_SPEED)
-    assert worker_environment({}) == worker_environment({"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}) == {}
+    assert dict(terms_of_driver(mine).environment) == {**ENVIRONMENT, "OMP_NUM_THREADS": "4"}
+    assert {*STACK_ENVIRONMENT, *ON_X86_64_V3} == {name for name, _ in terms_of_driver(mine).environment}
+    for others, expected in (({}, {}), ({"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}, {}), (FOR_SPEED, FOR_SPEED)):
+        assert dict(terms_of_driver(others).environment) == expected
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     terms = terms_of_driver()
