@@ -123,12 +123,12 @@ class Limits:
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
-def _shard_task(env_vars: dict[str, str], num_gpus: float) -> Any:
+def _shard_task(env_vars: Mapping[str, str], num_gpus: float) -> Any:
     """The task that makes a shard, as Ray's remote function; a new one asks for workers of its own."""
     # Ray would end a process after each task with a GPU, unless max_calls is given
     on_gpu: dict[str, Any] = {"num_gpus": num_gpus, "max_calls": 0} if num_gpus else {}
     task = ray.remote(num_cpus=1, max_retries=0, **on_gpu)(enter_shard)
-    return task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
+    return task.options(runtime_env={"env_vars": dict(env_vars)}) if env_vars else task
 
 
 class Coordinator:
@@ -139,7 +139,7 @@ class Coordinator:
         self._order = pattern.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
         self._terms = pattern.terms
         self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
-        self._env_vars = dict(pattern.env_vars)
+        self._env_vars = pattern.env_vars
         self._task = _shard_task(self._env_vars, limits.num_gpus)
         self._limits = limits
         self._tally = tally
@@ -159,8 +159,8 @@ class Coordinator:
         Raises CommitConflict where two attempts made other bytes, RunError where a worker cannot be kept alive or too
         many scenes fail. On KeyboardInterrupt, committed ranges stay and running shards are ended.
         """
-        try:
-            with watch(self._store, self._order.label, self._order.job.run.scene_timeout_s) as take_stalls:
+        with watch(self._store, self._order.label, self._order.job.run.scene_timeout_s) as take_stalls:
+            try:
                 while self._fill_slots(shards):
                     ready, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
                     for ref in ready:
@@ -172,9 +172,11 @@ class Coordinator:
                     if self._env_vars and (lost := self._take_lost_hosts()):
                         self._give_up_on(lost)
                     progress(self._tally)
-        except BaseException:
-            self._cancel()
-            raise
+            finally:  # what still runs after an error is made again by the next run
+                for ref in self._running:
+                    ray.cancel(ref, force=True)
+                if self._running:
+                    ray.wait(list(self._running), num_returns=len(self._running), timeout=5.0)
 
     def _count_under_way(self) -> int:
         """Scenes made in shards that have not reported; 0 where a look costs much: on an object store, or of many shards."""
@@ -193,13 +195,6 @@ class Coordinator:
             order = self._order.model_copy(update={"spans": spans, "blamed": self._deaths.blamed_in(spans)})
             self._running[self._task.remote(self._terms, pickle.dumps(order), self._catalogue)] = spans
         return bool(self._running)
-
-    def _cancel(self) -> None:
-        """Ends running shards; what is not committed is made again by the next run."""
-        for ref in self._running:
-            ray.cancel(ref, force=True)
-        if self._running:
-            ray.wait(list(self._running), num_returns=len(self._running), timeout=5.0)
 
     def _collect(self, ref: "ray.ObjectRef", spans: tuple[Span, ...]) -> None:
         try:
@@ -269,10 +264,10 @@ class Coordinator:
         if attempt is None:
             return self._end_stopped(sight.idle_s, [worker for worker in workers.values() if worker.stopped])
         key = attempt.start, retry_of_attempt(attempt.name)
-        refs = (ref for ref, spans in self._running.items() if key in [(span.start, span.retry) for span in spans])
-        if (ref := next(refs, None)) is None:
+        refs = {ref for ref, spans in self._running.items() if key in [(span.start, span.retry) for span in spans]}
+        if not refs:
             return
-        self._stalled.add(ref)
+        self._stalled |= refs
         start, pid, host = attempt.start, attempt.pid, attempt.host
         log_event("worker stalled", logging.WARNING, range=start, scene=sight.scene_id, pid=pid, host=host)
         doing = "committing" if sight.scene_id is None else f"scene {sight.scene_id}"
@@ -303,13 +298,13 @@ class Coordinator:
 
         Raises RunError where workers die before they begin a scene.
         """
-        left = list(spans)
+        left = deque(spans)
         while left and self._store.size(commit_path(left[0].start, left[0].retry)) is not None:
-            summary = read_summary(self._store, left[0].start, left[0].retry)
+            span = left.popleft()
+            summary = read_summary(self._store, span.start, span.retry)
             self._tally.made += summary.made
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
             self._tally.add_commit(summary)
-            left.pop(0)
         if not left:
             return
         span, scene, timed_out = self._find_evidence(left)

@@ -44,16 +44,13 @@ class ProgressLine:
     """Shows on standard error how many scenes, or other units, are done out of those asked, at what rate, and the time left."""
 
     def __init__(self, asked: int, what: str, unit: str = "scene") -> None:
-        self._asked = asked
-        self._what = what
-        self._unit = unit
+        self._asked, self._what, self._unit = asked, what, unit
         self._bar = (
             tqdm(total=asked, unit=unit, desc=what, file=sys.stderr, ncols=_columns(), nrows=USUAL_ROWS)
             if sys.stderr.isatty()
             else None
         )
-        self._begun = time.monotonic()
-        self._lines = 0
+        self._begun, self._next_s = time.monotonic(), FIRST_LINES_S[0]
 
     def expect(self, asked: int) -> None:
         """Sets the number to be done, where more is known than at first."""
@@ -68,9 +65,9 @@ class ProgressLine:
             self._bar.set_postfix({} if failed is None else {"failed": failed}, refresh=True)
             return
         passed_s = time.monotonic() - self._begun
-        if passed_s >= _line_s(self._lines):
-            while passed_s >= _line_s(self._lines):
-                self._lines += 1
+        if passed_s >= self._next_s:
+            soon = (second for second in FIRST_LINES_S if second > passed_s)
+            self._next_s = next(soon, (passed_s // LINE_EVERY_S + 1) * LINE_EVERY_S)
             print(f"{self._what}: {_describe(done, self._asked, self._unit, failed, passed_s)}", file=sys.stderr)
 
     def close(self) -> None:
@@ -102,12 +99,6 @@ def _columns() -> int:
         return os.get_terminal_size(sys.stderr.fileno()).columns or USUAL_COLUMNS
     except OSError:
         return USUAL_COLUMNS
-
-
-def _line_s(number: int) -> float:
-    """Seconds from the start after which a log has this line, from 0."""
-    more = number - len(FIRST_LINES_S) + 1
-    return FIRST_LINES_S[number] if more <= 0 else LINE_EVERY_S * more
 
 
 def _describe(done: int, asked: int, unit: str, failed: int | None, passed_s: float) -> str:

@@ -13,7 +13,7 @@ import secrets
 import shutil
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -57,52 +57,41 @@ class Slots:
         return self.look() if self.look else self
 
 
-def slots_of(cores: int, workers: int | None) -> Slots:
-    """The slots of a cluster with that many cores, at least one: `workers` where that is less.
+def slots_of(cores: int, workers: int | None, jobs: int = 1) -> Slots:
+    """The slots of a cluster with that many cores, at least one: `workers` where that is less; an even share of several jobs.
 
-    Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
+    Any free core would start a waiting shard, so none may wait where there are fewer workers than cores, or other jobs.
     """
     cores = max(1, cores)
-    return Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
+    running = math.ceil(min(workers or cores, cores) / max(1, jobs))
+    alone = jobs <= 1 and running == cores
+    return Slots(running, PREFETCH * running if alone else running)
 
 
-def cluster_slots(
-    count_cores: Callable[[], int], workers: int | None, clock: Callable[[], float] = time.monotonic
-) -> Slots:
+def cluster_slots(count_cores: Callable[[], int], workers: int | None, count_jobs: Callable[[], int]) -> Slots:
     """The slots of a cluster, at least one also while it has no node; `count_cores` is asked every few seconds."""
-    known, at_s = slots_of(count_cores(), workers), clock()
+    cores, at_s = count_cores(), time.monotonic()
 
     def look() -> Slots:
-        nonlocal known, at_s
-        if clock() - at_s >= LOOK_EVERY_S:
-            known, at_s = slots_of(count_cores(), workers), clock()
-        return known
+        nonlocal cores, at_s
+        if time.monotonic() - at_s >= LOOK_EVERY_S:
+            cores, at_s = count_cores(), time.monotonic()
+        return slots_of(cores, workers, count_jobs())
 
-    return replace(known, look=look)
-
-
-def share_slots(whole: Slots, jobs: Callable[[], int]) -> Slots:
-    """With other jobs an even share of all, rounded up, of which none waits in Ray: it would take another job's turn."""
-
-    def look() -> Slots:
-        now, sharing = whole.now(), jobs()
-        share = math.ceil(now.running / max(1, sharing))
-        return now if sharing <= 1 else Slots(share, share)
-
-    return replace(whole, look=look)
+    return replace(look(), look=look)
 
 
 RAY_PARTS = 10_000
 """Ray counts parts of a resource in so many steps. Rounded down, all parts of a GPU fit."""
 
 
-def share_gpus(nodes: Sequence[tuple[int, int]], running: int, run: Run) -> float:
-    """The part of a GPU that a shard asks for: by (cores, GPUs) of each node, shards that run at once, and the job.
+def share_gpus(resources: Iterable[Mapping[str, float]], running: int, run: Run) -> float:
+    """The part of a GPU that a shard asks for: by what each node has, shards that run at once, and the job.
 
     By default as few workers have a GPU together as leave no shard waiting: Ray fills one GPU before it takes the next.
     0 where no node has one, and where some have none and the job takes any device: those would stand idle.
     """
-    working = [(cores, gpus) for cores, gpus in nodes if cores > 0]
+    working = [(int(node["CPU"]), int(node.get("GPU", 0))) for node in resources if node.get("CPU")]
     with_gpu = [(cores, gpus) for cores, gpus in working if gpus > 0]
     if not with_gpu or (run.device == "any" and len(with_gpu) < len(working)):
         return 0.0
@@ -114,12 +103,6 @@ def share_gpus(nodes: Sequence[tuple[int, int]], running: int, run: Run) -> floa
 def alive_nodes() -> list[dict[str, Any]]:
     """The nodes of the Ray that this process is connected to, as Ray describes them."""
     return [node for node in ray.nodes() if node["Alive"]]
-
-
-def nodes_here() -> list[tuple[int, int]]:
-    """(cores, GPUs) of each node."""
-    resources = [node["Resources"] for node in alive_nodes()]
-    return [(int(node.get("CPU", 0)), int(node.get("GPU", 0))) for node in resources]
 
 
 def private_environment() -> dict[str, str]:
@@ -159,11 +142,9 @@ def open_ray(
 
 @contextlib.contextmanager
 def private_ray(workers: int) -> Iterator[Slots]:
-    """A private Ray with `workers` slots, shut down when the block ends.
+    """A private Ray with `workers` slots, shut down when the block ends. Raises MachineError where Ray does not start.
 
-    Never joins another Ray on this machine and contacts no other host. Its processes listen on loopback and on sockets in
-    a folder that no other user can enter, and answer those that show its token, which no file and no log holds. Raises
-    MachineError where Ray does not start.
+    It never joins another Ray on this machine, contacts no other host, and has a token that no file and no log holds.
     """
     with private_folder() as folder, ray_in(folder, workers) as slots:
         yield slots
@@ -171,7 +152,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
 
 @contextlib.contextmanager
 def ray_in(folder: Path, workers: int) -> Iterator[Slots]:
-    """A private Ray as above, in a private folder."""
+    """The same, in a private folder."""
     shared = Path("/dev/shm")
     # A container often has 64 MiB of shared memory only. In a folder Ray warns of slow storage, which reports can bear.
     roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
@@ -231,7 +212,7 @@ def kept_private() -> Iterator[None]:
 
 
 def _note_that_there_is_no_dashboard(node: Node, **_: Any) -> None:
-    """What the dashboard's process does where it serves nothing; Ray's agent would ask for the address every second."""
+    """Ray's agent would ask for the address every second."""
     node._webui_url = ""
     address, namespace = ray_constants.DASHBOARD_ADDRESS, ray_constants.KV_NAMESPACE_DASHBOARD
     node.get_gcs_client().internal_kv_put(address.encode(), b"none", True, namespace)
@@ -275,8 +256,7 @@ def cluster_ray(address: str, workers: int | None, sharing: Callable[[], int] | 
             ) from error
         if _count_cores() < 1:
             raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-        slots = cluster_slots(_count_cores, workers)
-        yield share_slots(slots, sharing) if sharing else slots
+        yield cluster_slots(_count_cores, workers, sharing or (lambda: 1))
 
 
 def _count_cores() -> int:
@@ -288,9 +268,8 @@ def connection(address: str, **settings: Any) -> Iterator[None]:
     """A connection to a Ray, shut down when the block ends.
 
     Ray's messages about dead workers go where its C++ core writes (to the user, or to a supervisor, which keeps them for
-    the logs), because standard output is for the command's answer, and what they mean is told by us. Ray puts the
-    current folder first on its workers' search path. It is the project's for that moment, because the packages have
-    generic names: a `services` folder in the user's working folder must not be found instead.
+    the logs): standard output is for the command's answer. Ray puts the current folder first on its workers' search path. It
+    is the project's for that moment: a `services` folder in the user's working folder must not be found instead.
     """
     with core_stderr() as stream, contextlib.redirect_stdout(stream):
         # While it starts, Ray asks Python to dump its stack to standard error where it crashes.

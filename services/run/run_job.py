@@ -22,8 +22,8 @@ from services.run.lock import Lock, explain_lost_folder, hold_lock, read_holder,
 from services.run.machine import usable_cores
 from services.run.parts import find_parts
 from services.run.progress import Meter, ProgressLine, Tally, event_log, log_event, serve, show_counts
-from services.run.range_planner import MAX_SHARD, SpanPlan, deal_shards, find_lost, group_shards, plan_spans
-from services.run.ray_cluster import Slots, join_cluster, nodes_here, open_ray, share_gpus
+from services.run.range_planner import MAX_SHARD, SpanPlan, deal_shards, find_lost, plan_spans
+from services.run.ray_cluster import Slots, alive_nodes, join_cluster, open_ray, share_gpus
 from services.run.worker_entry import Pattern, terms_of_driver
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
@@ -55,7 +55,7 @@ class RunRequest:
 
 @dataclass(frozen=True)
 class RunResult:
-    """The merged dataset, the seconds that it took, and the scenes made in this run."""
+    """The merged dataset, the seconds that the run took, and the scenes made in it."""
 
     merged: MergeResult
     seconds: float
@@ -81,7 +81,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         record = record_inputs(request.job, request.job_folder, catalogue, store)
         sweep(store, fenced=None)
         ledger = list_commits(store)
-        for line in find_lost(store, ledger):
+        for line in find_lost(ledger):
             print(f"verso: {line}", file=sys.stderr)
         plan = plan_spans(record.job, ledger, request.retry_failed)
         with contextlib.closing(LedgerKeeper(store, ledger)) as keeper:
@@ -173,12 +173,9 @@ def make_missing(
     """Gives the missing ranges to Ray, and shows how many scenes are done. The number of scenes made."""
     job, tally = pattern.order.job, Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
-    num_gpus = share_gpus(nodes_here(), slots.running, job.run)
+    num_gpus = share_gpus([node["Resources"] for node in alive_nodes()], slots.running, job.run)
     limits = Limits(slots, job.run.max_attempts, int(job.run.max_failure_share * job.scenes), num_gpus)
-    if job.run.shard_size is not None:
-        shards = group_shards(plan, job.run.shard_size)
-    else:
-        shards = deal_shards(plan, plan.scenes, job.range_size, lambda: slots.now().running)
+    shards = deal_shards(plan, plan.scenes, job.range_size, lambda: slots.now().running, job.run.shard_size)
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
 
         def show(now: Tally) -> None:

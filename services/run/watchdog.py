@@ -1,7 +1,6 @@
-"""The watchdog: looks at what workers note about their scenes, and ends those that show no change. Edge.
+"""The watchdog: finds workers that show no change for longer than a scene may take, by what they note. Edge.
 
-It stands outside the workers, so it also sees one that was stopped, or that hangs while it writes or commits. Which attempts
-have stalled is decided by pure functions above it: no change for longer than a scene may take.
+It stands outside the workers, so it also sees one that was stopped, or that hangs while it writes or commits.
 """
 
 import contextlib
@@ -84,10 +83,6 @@ LOOKS = 12
 MOST_LOOKS_AT_ONCE = 3
 """A pause between two looks counts as at most this many: in a longer one this process was suspended itself."""
 
-
-_WORKER_TITLE = b"ray::"
-
-
 Stall = tuple[AttemptName | None, Sight]
 """An attempt that shows no change, and what is the same for so long; None: in that time there was no attempt at all."""
 
@@ -134,21 +129,21 @@ def scenes_in_progress(store: Store, label: str) -> dict[AttemptName, int | None
 
 
 def find_own_workers() -> list[Process]:
-    """Workers of this process's own Ray: descendants that Ray gave a title."""
-    return [process for process in descendants(os.getpid()) if _title(process.pid).startswith(_WORKER_TITLE)]
+    """Workers of this process's own Ray."""
+    return [process for process in descendants(os.getpid()) if _is_worker(process.pid)]
 
 
 def end_worker_here(pid: int) -> bool:
     """Kills a Ray worker of this machine; False where the id is none of a Ray worker. To be run on the worker's node."""
     process = read_process(pid)
-    if process is None or pid == os.getpid() or not _title(pid).startswith(_WORKER_TITLE):
+    if process is None or pid == os.getpid() or not _is_worker(pid):
         return False
     send(process, signal.SIGKILL)
     return True
 
 
-def _title(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""
+def _is_worker(pid: int) -> bool:
+    """Whether Ray gave the process a title."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::")
+    return False

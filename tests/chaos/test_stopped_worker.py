@@ -87,6 +87,6 @@ def test_a_folder_that_is_removed_under_way_is_told_as_that(cluster, tmp_path):
 
     remover = threading.Thread(target=remove)
     remover.start()
-    with pytest.raises(MachineError, match=f"{out} was removed while the run worked in it"):
+    with pytest.raises(MachineError, match=f"{out} was removed or moved while the run worked in it"):
         make(out, scenes=4000)
     remover.join()

@@ -282,19 +282,14 @@ def test_a_removed_or_a_moved_folder_is_told_even_where_parts_of_it_were_made_an
             (out / "manifest").mkdir(parents=True)
         raise error
 
-    for number, (how, error, told) in enumerate(
-        [
-            ("removed", swept, "was removed while the run worked in it"),
-            ("removed", FileNotFoundError("x"), "was removed while the run worked in it"),
-            ("made anew", swept, "was removed while the run worked in it"),
-            ("moved", FileNotFoundError("x"), r"was moved .* move it back"),
-        ]
+    gone = FileNotFoundError("x")
+    for number, (how, error) in enumerate(
+        (("removed", swept), ("removed", gone), ("made anew", swept), ("moved", gone))
     ):
         out = tmp_path / str(number)
         out.mkdir()
-        with pytest.raises(MachineError, match=told) as caught, explain_lost_folder(out):
+        with pytest.raises(MachineError, match=f"^{out} was removed or moved"), explain_lost_folder(out):
             lose(out, how, error)
-        assert str(out) in str(caught.value) and "another coordinator" not in str(caught.value)
 
 
 def test_other_errors_stay_what_they_are(tmp_path, monkeypatch):

@@ -121,7 +121,7 @@ def test_each_run_has_a_token_of_its_own_that_nobody_guesses_and_the_rest_is_the
     assert first == second and first["RAY_AUTH_MODE"] == "token" and not set(NOT_INHERITED) & set(first)
 
 
-def test_slots_follow_the_cores_of_the_cluster_which_is_asked_now_and_then():
+def test_slots_follow_the_cores_of_the_cluster_which_is_asked_now_and_then(monkeypatch):
     assert Slots(2, 4).now() == Slots(2, 4)
     for cores, workers, slots in (
         (6, None, Slots(6, 6 * PREFETCH)),
@@ -136,7 +136,8 @@ def test_slots_follow_the_cores_of_the_cluster_which_is_asked_now_and_then():
         asked.append(now[0])
         return cores[0]
 
-    slots = cluster_slots(count, None, clock=lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    slots = cluster_slots(count, None, lambda: 1)
     assert (slots.running, slots.in_flight) == (2, 2 * PREFETCH)
     seen = []
     for cores[0] in (2, 8, 0, 3):
