@@ -60,22 +60,6 @@ def test_64_open_files_no_home_and_1_mb_of_shared_memory_are_enough(tmp_path):
     assert json.loads(done.stdout.splitlines()[-1])["scenes"] == {"made": 4, "intrinsic": 0, "environmental": 0}
 
 
-@pytest.mark.root
-def test_without_a_temporary_folder_a_run_says_so(tmp_path):
-    """Every place that Python looks at, the working folder among them, is read-only."""
-    places = " && ".join(
-        f"mount --bind {place} {place} && mount -o remount,ro,bind {place}" for place in ("/tmp", "/var/tmp")
-    )
-    here = f"mount --bind {tmp_path} {tmp_path} && mount -o remount,ro,bind {tmp_path} && mount -t tmpfs none out"
-    (tmp_path / "out").mkdir()
-    done = run(tmp_path, f"{places} && {here}", TMPDIR=None)
-    assert done.returncode == 1, done.stderr
-    begun, line = done.stderr.splitlines()
-    assert "scenes to make; starting the workers" in begun
-    assert line.startswith("verso: No usable temporary directory found")
-    assert line.endswith("set TMPDIR to one that can be written")
-
-
 def test_nothing_is_decided_by_a_wall_clock_that_may_be_set_back():
     reading = set()
     for package in ("schemas", "services", "workers"):
