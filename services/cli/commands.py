@@ -57,14 +57,16 @@ def run(options: argparse.Namespace) -> int:
     named |= {"run.workers": options.workers, "run.shard_size": options.shard_size}
     changes = [f"{key}={value}" for key, value in named.items() if value is not None]
     job = load_job(options.job, [*changes, *options.changes])
-    from services.run.run_job import RunRequest, run_job  # takes seconds: a job file that is wrong is told before
+    from services.run.run_job import (  # takes seconds: a job file that is wrong is told before
+        RunRequest,
+        describe_plan,
+        run_job,
+    )
 
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
     request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed, options.metrics)
     if options.dry_run:
-        from services.run.dry_run import describe_plan
-
         print("\n".join(describe_plan(request)))
         return 0
     result = run_job(request)

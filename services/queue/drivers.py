@@ -29,8 +29,8 @@ from schemas.errors import InputError, InUseError, MachineError, RunError, Verso
 from schemas.queue import JobRequest
 from services.queue.queue import Queue
 from services.queue.supervise import Driver, Drivers
-from services.run.machine import usable_cores
-from services.run.ray_cluster import address_here, living_folders, private_folder, ray_in
+from services.run.machine import living_folders, private_folder, usable_cores
+from services.run.ray_cluster import address_here, ray_in
 from services.run.supervisor import STOP_S
 
 ANSWER_S: Final = 30.0

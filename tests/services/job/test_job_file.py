@@ -21,7 +21,7 @@ from services.cli.main import main
 from services.job.job_file import NEEDS, describe_idle, load_job, pack_job, validate_job
 from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
 from services.job.reference import allowed_keys, describe_allowed, list_keys, write_doc
-from services.run import dry_run
+from services.run import run_job
 from tests.mutations import mutated_bytes, mutated_tree
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -291,7 +291,7 @@ def peak_mb() -> float:
 
 @pytest.mark.parametrize("numbers", [range(40), pytest.param(range(100, 2100), marks=pytest.mark.slow)], ids=len)
 def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(dry_run, "measure_scene", lambda job, catalogue: None)  # this is about reading jobs
+    monkeypatch.setattr(run_job, "measure_scene", lambda job, catalogue: None)  # this is about reading jobs
     path, out, outcomes = tmp_path / "job.yaml", str(tmp_path / "out"), Counter()
     main(["run", str(EXAMPLES[-1]), "--dry-run", "--out", out])  # loads what reading a job loads
     before = peak_mb()
