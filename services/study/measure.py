@@ -24,8 +24,7 @@ import numpy as np
 from schemas.base import Array
 from schemas.capture import SynthesizedView
 from schemas.errors import SceneError
-from schemas.job.identity import settings_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, settings_digest
 from schemas.scene.scene import ObjectStart, Settled
 from schemas.scene.view import Camera
 from services.study.model import OWN, Setting, apply

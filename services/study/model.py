@@ -13,10 +13,10 @@ from typing import Any, Literal
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
+from schemas.base import set_key
 from schemas.errors import InputError, did_you_mean, number
 from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job, kind_of
-from schemas.job.keys import set_key
 from services.job.job_file import describe_fault
 
 Changes = Mapping[str, Any]

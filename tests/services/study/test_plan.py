@@ -7,8 +7,7 @@ import pytest
 
 from schemas.errors import InputError, OutputError
 from schemas.job.captures import ESTIMATES
-from schemas.job.identity import settings_digest
-from schemas.job.job import PRESETS, Job, JobKind, kind_of
+from schemas.job.job import PRESETS, Job, JobKind, kind_of, settings_digest
 from services.study import model
 from services.study.choose import error_of, own_row
 from services.study.model import (
