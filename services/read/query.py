@@ -18,7 +18,7 @@ from services.read.stored_tables import StoredTables
 from services.read.verdict import explain_damage
 from workers.store.store import Store
 
-_LOCKED = {
+LOCKED = {
     "enable_external_access": "false",
     "python_enable_replacements": "false",
     "autoinstall_known_extensions": "false",
@@ -43,7 +43,7 @@ def ask(store: Store, sql: str) -> Iterator[pa.RecordBatchReader]:
     the first try's. Raises, also while the reader is read, InputError with the database's message where the SQL is wrong,
     OutputError where there is no dataset, CorruptError where a file is damaged.
     """
-    with duckdb.connect(":memory:", config=dict(_LOCKED)) as connection:
+    with duckdb.connect(":memory:", config=dict(LOCKED)) as connection:
         with _explained(store):
             _register(connection, store)
             connection.execute("SET enable_progress_bar = false")  # it goes to standard output, into the answer

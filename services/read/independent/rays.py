@@ -59,6 +59,14 @@ class Faces:
         return normal / np.maximum(twice_area, 1e-300)[:, None], twice_area / np.maximum(longest, 1e-300)
 
 
+def bare_faces(points: Array) -> Faces:
+    """Faces of these corners [F, 3, 3], metres, without a look: of region 0 and of no body, exact."""
+    count = len(points)
+    none, every = np.full(count, -1), np.zeros(count, int)
+    colors, uv = np.full(points.shape, np.nan), np.zeros((count, 3, 2))
+    return Faces(points, np.zeros(points.shape), colors, uv, none, (), every, np.zeros(count, bool), np.zeros(count))
+
+
 def read_shape(data: bytes) -> Faces:
     """The faces of a binary glTF file of one node, object frame, region 0. Raises ValueError or KeyError where it is another."""
     length, kind = struct.unpack_from("<I4s", data, 12)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.read.independent.derive import FIRST_OBJECT, FLOOR, TABLE, Array, Kind, Row, StoredPair, matrix
-from services.read.independent.rays import Faces, Hits, cast, place_shapes, read_shape
+from services.read.independent.rays import Faces, Hits, bare_faces, cast, place_shapes, read_shape
 
 STEP = 1.0 / 65_535.0
 """Of images of 16 bits."""
@@ -97,10 +97,8 @@ def faces_of(pair: StoredPair, view: Row) -> Faces:
 def _plane() -> Faces:
     """A floor or a board, without a colour."""
     corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    points, some = corners[[[0, 1, 2], [0, 2, 3]]], np.zeros(2)
-    normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    none = np.full(2, -1), (), np.zeros(2, int), np.zeros(2, bool)
-    return Faces(points, normals, np.full(points.shape, np.nan), points[..., :2], *none, some)
+    points = corners[[[0, 1, 2], [0, 2, 3]]]
+    return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
 
 
 def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
