@@ -84,6 +84,15 @@ def describe_os_error(error: OSError) -> str:
     return f"cannot be read ({error.strerror or error})"
 
 
+def read_or_tell(store: Store, key: str, verdict: Verdict, remedy: str, part: Part) -> bytes | None:
+    """The bytes of a file; None where it cannot be read, which is told."""
+    try:
+        return store.read(key)
+    except OSError as error:
+        verdict.tell(f"{key}: {describe_os_error(error)}", remedy, part)
+        return None
+
+
 @contextlib.contextmanager
 def explain_damage(store: Store) -> Iterator[None]:
     """Raises CorruptError with one line where the block meets a file that cannot be read as what it should be."""

@@ -7,12 +7,11 @@ by one: memory does not grow with the dataset.
 import contextlib
 import errno
 import sqlite3
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-from pydantic import ValidationError
 
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import (
@@ -34,7 +33,7 @@ from schemas.job.identity import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
 from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
-from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error
+from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error, read_or_tell
 from services.read.verify_files import (
     Known,
     Success,
@@ -44,7 +43,15 @@ from services.read.verify_files import (
     read_stored_success,
     tell_strays,
 )
-from services.read.verify_range import RangeCheck, ReadRange, Spans, commit_groups, read_records
+from services.read.verify_range import (
+    CheckScene,
+    Reading,
+    ReadRange,
+    Spans,
+    commit_groups,
+    find_label_check,
+    read_records,
+)
 from workers.store.commit import commits_digest
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
@@ -60,11 +67,11 @@ class Remerge:
         self._waiting: list[ReadRange] = []
         self._rows = 0
 
-    def add(self, one: ReadRange) -> None:
+    def add(self, read: ReadRange) -> None:
         """Takes the next range, with its rows. Raises CorruptError where rows do not join."""
-        assert one.rows is not None
-        self._waiting.append(one)
-        self._rows += sum(map(len, one.rows.values()))
+        assert read.rows is not None
+        self._waiting.append(read)
+        self._rows += sum(map(len, read.rows.values()))
         if len(self._waiting) >= RANGES_PER_BLOCK or self._rows >= ROWS_PER_BLOCK:
             self._flush()
 
@@ -81,16 +88,12 @@ class Remerge:
         waiting, self._waiting, self._rows = self._waiting, [], 0
         if not waiting:
             return
-        files = [(one.records[0], entry) for one in waiting for entry in one.files if pose_of_image(entry.path) is None]
-        rows = {
-            table: join_rows(table, [one.rows[table] for one in waiting if one.rows]).combine_chunks()
-            for table in TABLES
-        }
-        self._merging.add(Block([one.records for one in waiting], files, rows))
-
-
-MOST_TOLD = 100
-"""Different jobs or stacks that are remembered with a commit of theirs."""
+        files = [
+            (read.records[0], entry) for read in waiting for entry in read.files if pose_of_image(entry.path) is None
+        ]
+        parts = {table: [read.rows[table] for read in waiting if read.rows] for table in TABLES}
+        rows = {table: join_rows(table, parts[table]).combine_chunks() for table in TABLES}
+        self._merging.add(Block([read.records for read in waiting], files, rows))
 
 
 @dataclass(frozen=True)
@@ -108,22 +111,19 @@ class StoredJob:
 
 def read_stored_job(store: Store, verdict: Verdict) -> StoredJob:
     """job.yaml, and what is wrong with it by itself."""
+    if (data := read_or_tell(store, JOB_FILE, verdict, COPY, "job")) is None:
+        return StoredJob()
     try:
-        data = store.read(JOB_FILE)
-        record = decode_job(data, JOB_FILE)
-    except OSError as error:
-        verdict.tell(f"{JOB_FILE}: {describe_os_error(error)}", COPY, "job")
-        return StoredJob()
+        job = StoredJob(decode_job(data, JOB_FILE), is_job_sealed(data))
     except CorruptError as error:
-        told = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
-        verdict.tell(f"{JOB_FILE}: {told}", COPY, "job")
+        fault = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
+        verdict.tell(f"{JOB_FILE}: {fault}", COPY, "job")
         return StoredJob()
-    found = StoredJob(record, is_job_sealed(data))
-    if not found.whole:
+    if not job.whole:
         verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", COPY, "job")
-    elif record.digest != found.digest:
+    elif job.record is not None and job.record.digest != job.digest:
         verdict.tell(f"{JOB_FILE}: its digest is not that of its keys", COPY, "job")
-    return found
+    return job
 
 
 @dataclass
@@ -138,13 +138,9 @@ class Terms:
     def take(self, record: CommitRecord) -> None:
         """Remembers what a commit says."""
         key, terms = commit_path(record.span.start, record.span.retry), record.terms
-        stack = (terms.fingerprint, terms.fingerprint_mode)
-        known: tuple[tuple[dict[Any, str], object], ...] = (
-            *((self.jobs, terms.job_digest), (self.range_sizes, terms.range_size), (self.stacks, stack)),
-        )
-        for commits, term in known:
-            if len(commits) < MOST_TOLD:
-                commits.setdefault(term, key)
+        self.jobs.setdefault(terms.job_digest, key)
+        self.range_sizes.setdefault(terms.range_size, key)
+        self.stacks.setdefault((terms.fingerprint, terms.fingerprint_mode), key)
 
 
 def check_terms(job: StoredJob, terms: Terms, verdict: Verdict) -> None:
@@ -153,41 +149,38 @@ def check_terms(job: StoredJob, terms: Terms, verdict: Verdict) -> None:
         return
     if job.digest not in terms.jobs:
         digest, key = next(iter(terms.jobs.items()))
-        told = f"{JOB_FILE}: its keys or asset files (digest {str(job.digest)[:12]}) are not those of {key} ({digest[:12]})"
-        verdict.tell(told, f"{COPY}, or change them back", "job")
+        what = f"its keys or asset files (digest {str(job.digest)[:12]}) are not those of {key} ({digest[:12]})"
+        verdict.tell(f"{JOB_FILE}: {what}", f"{COPY}, or change them back", "job")
     else:
         for digest, key in terms.jobs.items():
             if digest != job.digest:
                 verdict.tell(f"{key}: is a commit of another job ({digest[:12]}) than {JOB_FILE}", COPY)
     size = job.record.job.range_size
-    if size not in terms.range_sizes and terms.range_sizes:
-        told = f"{JOB_FILE}: run.range_size is {size}, that of the commits {next(iter(terms.range_sizes))}"
-        verdict.tell(told, f"{COPY}, or change it back", "job")
+    if size not in terms.range_sizes:
+        what = f"run.range_size is {size}, that of the commits {next(iter(terms.range_sizes))}"
+        verdict.tell(f"{JOB_FILE}: {what}", f"{COPY}, or change it back", "job")
 
 
 def check_fingerprint(store: Store, terms: Terms, verdict: Verdict) -> None:
     """Compares the stored fingerprint with those of the commits, to the byte."""
+    if (data := read_or_tell(store, FINGERPRINT_FILE, verdict, COPY, "job")) is None:
+        return
     try:
-        data = store.read(FINGERPRINT_FILE)
         stored = Fingerprint.model_validate_json(data)
-    except OSError as error:
-        verdict.tell(f"{FINGERPRINT_FILE}: {describe_os_error(error)}", COPY, "job")
-        return
-    except (ValidationError, ValueError):
+    except ValueError:
         verdict.tell(f"{FINGERPRINT_FILE}: is damaged: it is no fingerprint", COPY, "job")
-        return
-    if not terms.stacks:
         return
     if data != encode_fingerprint(stored):
         verdict.tell(f"{FINGERPRINT_FILE}: was altered after a worker wrote it", COPY, "job")
-    elif stored.digest not in {stack for stack, _ in terms.stacks} and not _is_in_card(store, stored):
-        told = f"{FINGERPRINT_FILE}: is the fingerprint {stored.digest[:12]}, which no commit has"
-        verdict.tell(told, COPY, "job")
+    elif stored.digest not in {stack for stack, _ in terms.stacks}:
+        if terms.stacks and not _is_in_card(store, stored):
+            what = f"{FINGERPRINT_FILE}: is the fingerprint {stored.digest[:12]}, which no commit has"
+            verdict.tell(what, COPY, "job")
     else:
         for (stack, mode), key in terms.stacks.items():
             if mode == "strict" and stack != stored.digest:
-                told = f"{key}: has the fingerprint {stack[:12]}, the dataset's is {stored.digest[:12]}"
-                verdict.tell(told, "two stacks made one dataset although run.fingerprint was strict; make it anew")
+                what = f"{key}: has the fingerprint {stack[:12]}, the dataset's is {stored.digest[:12]}"
+                verdict.tell(what, "two stacks made one dataset although run.fingerprint was strict; make it anew")
 
 
 def encode_fingerprint(fingerprint: Fingerprint) -> bytes:
@@ -226,15 +219,15 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
         (folder / "merged").mkdir()
         with contextlib.closing(Remerge(folder / "merged")) as merging:
-            check = RangeCheck(store, job.record, job.digest, index, verdict)
-            found = _read_ranges(store, _spans(job, success, verdict), check, merging, progress)
-            check_terms(job, found.terms, verdict)
-            check_fingerprint(store, found.terms, verdict)
-            remade = _merge_again(merging, found, verdict)
-        _check_finished(store, success, found, remade, index, verdict)
+            reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
+            ranges = _read_ranges(reading, _spans(job, success, verdict), merging, progress)
+            check_terms(job, ranges.terms, verdict)
+            check_fingerprint(store, ranges.terms, verdict)
+            remade = _merge_again(merging, ranges, verdict)
+        _check_finished(store, success, ranges, remade, index, verdict)
         _check_ledger(store, verdict)
         index.add_all(TOP_FILES)
-        lost = sorted([*found.spans.gaps, *found.spans.unreadable])
+        lost = sorted([*ranges.spans.gaps, *ranges.spans.unreadable])
         pairs = job.record.job.pairs_per_scene if job.record else 1
         tell_strays(store, Known(index, success.data is None, tuple(lost), 2 * pairs), verdict)
     return verdict
@@ -249,37 +242,47 @@ def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
     return Spans(asked, range_size, success.data is not None, verdict)
 
 
-def _read_ranges(
-    store: Store, spans: Spans, check: RangeCheck, merging: Remerge, progress: Callable[[Verdict], None]
-) -> Ranges:
+def _read_ranges(reading: Reading, spans: Spans, merging: Remerge, progress: Callable[[Verdict], None]) -> Ranges:
     """Reads every range in order, and merges it again."""
-    found = Ranges(spans, Terms())
-    for start, retries in commit_groups(store):
-        records = read_records(store, start, retries, check.verdict)
-        check.index.add_all(commit_path(start, retry) for retry in retries)
-        spans.take(start, records)
-        if not records:
-            continue
-        for record in records:
-            found.terms.take(record)
-        one = check.check(records)
-        found.staged += one.staged
-        if one.rows is None:
-            spans.unreadable.append((start, records[0].span.stop))
-        elif found.mergeable and spans.fits:
-            try:
-                merging.add(one)
-            except CorruptError as error:
-                found.mergeable = False
-                check.verdict.tell(str(error), COPY)
-        progress(check.verdict)
+    ranges, check_scene = Ranges(spans, Terms()), None
+    try:
+        check_scene = find_label_check()
+    except MachineError as error:
+        reading.verdict.not_derived = str(error)
+    groups = commit_groups(reading.store)
+    following = [*(start for start, _ in groups[1:]), sys.maxsize]
+    for (start, retries), next_start in zip(groups, following, strict=True):
+        reading.index.add_all(commit_path(start, retry) for retry in retries)
+        if records := read_records(reading.store, start, retries, reading.verdict):
+            spans.take(start, records[0].span.stop, True)
+            _read_range(ReadRange(reading, records), ranges, merging, check_scene)
+            progress(reading.verdict)
+        else:  # nothing says where it ends
+            spans.take(start, min(start + spans.range_size, next_start), False)
     spans.finish()
-    return found
+    return ranges
 
 
-def _merge_again(merging: Remerge, found: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
+def _read_range(read: ReadRange, ranges: Ranges, merging: Remerge, check_scene: CheckScene | None) -> None:
+    """Reads one range, and gives its rows to the merge."""
+    for record in read.records:
+        ranges.terms.take(record)
+    read.check(check_scene)
+    ranges.staged += read.staged
+    if read.rows is None:
+        span = read.records[0].span
+        ranges.spans.unreadable.append((span.start, span.stop))
+    elif ranges.mergeable and ranges.spans.fits:
+        try:
+            merging.add(read)
+        except CorruptError as error:
+            ranges.mergeable = False
+            read.verdict.tell(str(error), COPY)
+
+
+def _merge_again(merging: Remerge, ranges: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
     """`_SUCCESS` and the merged files as the commits give them; None where not every range can be read."""
-    if not (found.mergeable and found.spans.fits and found.spans.done):
+    if not (ranges.mergeable and ranges.spans.fits and ranges.spans.done):
         return None
     try:
         return merging.finish()
@@ -291,7 +294,7 @@ def _merge_again(merging: Remerge, found: Ranges, verdict: Verdict) -> tuple[dic
 def _check_finished(
     store: Store,
     success: Success,
-    found: Ranges,
+    ranges: Ranges,
     remade: tuple[dict[str, Any], dict[str, Path]] | None,
     index: PathIndex,
     verdict: Verdict,
@@ -301,16 +304,16 @@ def _check_finished(
         index.add_all(remade[1])
     index.add_all(success.files)
     if success.data is None:
-        _tell_unfinished(found, remade and remade[0], verdict)
+        _tell_unfinished(ranges, remade and remade[0], verdict)
         return
-    if found.staged:
-        verdict.tell(f"{found.staged} committed files are in _staging, and not in their places", verdict.run_again)
+    if ranges.staged:
+        verdict.tell(f"{ranges.staged} committed files are in _staging, and not in their places", verdict.run_again)
     digest = success.told.get("digest")
     if remade is None:
         check_merged(store, success, {}, verdict)
     else:
         expected, files = remade
-        first, stop = found.spans.asked or (0, 0)
+        first, stop = ranges.spans.asked or (0, 0)
         entries = check_merged(store, success, files, verdict)
         commits = success.told.get("commits")
         with contextlib.suppress(CorruptError):  # a foreign file among the commits is told as a stray
@@ -340,12 +343,12 @@ def _check_ledger(store: Store, verdict: Verdict) -> None:
             verdict.tell(f"{commit_path(int(start), int(retry))}: is missing, {LEDGER_FILE} names it", COPY)
 
 
-def _tell_unfinished(found: Ranges, remade: dict[str, Any] | None, verdict: Verdict) -> None:
+def _tell_unfinished(ranges: Ranges, remade: dict[str, Any] | None, verdict: Verdict) -> None:
     """Says why there is no `_SUCCESS`, which is a fault: a dataset is whole or it is not."""
     missing = f"{SUCCESS_FILE}: is missing, not finished:"
     if remade is None:
-        asked = found.spans.asked
-        told = f"{found.spans.done} of {asked[1] - asked[0]} scenes" if asked else f"{found.spans.done} scenes"
+        asked = ranges.spans.asked
+        told = f"{ranges.spans.done} of {asked[1] - asked[0]} scenes" if asked else f"{ranges.spans.done} scenes"
         verdict.tell(f"{missing} {told} are committed", verdict.run_again)
     elif again := remade["scenes"]["environmental"]:
         told = f"{again} scenes failed for environmental reasons"
@@ -361,14 +364,8 @@ def _temporary_folder() -> Iterator[Path]:
     with temporary_folder("verify") as folder:
         try:
             yield folder
-        except OSError as error:
-            if error.errno != errno.ENOSPC:
+        except (OSError, sqlite3.Error) as error:
+            if isinstance(error, OSError) and error.errno != errno.ENOSPC:
                 raise
-            raise MachineError(
-                f"{folder} is full: verify keeps the merged tables there; set TMPDIR to a folder with more room"
-            ) from error
-        except sqlite3.Error as error:
-            raise MachineError(
-                f"the list of a dataset's files could not be kept in the temporary folder: {error}; free some space there, "
-                "or set TMPDIR to a folder with more"
-            ) from error
+            keeps = "verify keeps the merged tables and the list of files there"
+            raise MachineError(f"{folder}: {error}; {keeps}: set TMPDIR to a folder with more room") from error

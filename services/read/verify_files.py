@@ -31,7 +31,7 @@ from schemas.dataset.layout import (
 )
 from services.merge.dataset_card import is_card_sealed
 from services.merge.merge import encode_success, file_entry
-from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable
+from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable, read_or_tell
 from workers.store.file_system import sha256_of
 from workers.store.store import Store
 
@@ -224,10 +224,7 @@ def check_merged(
 
 def check_card(store: Store, digest: str, verdict: Verdict) -> None:
     """DATASET.md: as it was written, and of this dataset."""
-    try:
-        data = store.read(README_FILE)
-    except OSError as error:
-        verdict.tell(f"{README_FILE}: {describe_os_error(error)}", verdict.merge_again, "card")
+    if (data := read_or_tell(store, README_FILE, verdict, verdict.merge_again, "card")) is None:
         return
     if not is_card_sealed(data):
         verdict.tell(
