@@ -135,7 +135,7 @@ def write_rows(rows: pa.RecordBatchReader, style: Format, sink: IO[bytes], wide:
         sink.write(_box(rows, wide).encode())
         return
     if style == "parquet":
-        with pq.ParquetWriter(_Counted(sink), rows.schema, compression="zstd") as writer:
+        with pq.ParquetWriter(pa.PythonFile(sink, mode="w"), rows.schema, compression="zstd") as writer:
             for group in _row_groups(rows):
                 writer.write_table(group)
         return
@@ -153,28 +153,6 @@ def _row_groups(rows: pa.RecordBatchReader) -> Iterator[pa.Table]:
             kept = []
     if kept:
         yield pa.Table.from_batches(kept)
-
-
-class _Counted(io.RawIOBase):
-    """A pipe that Parquet can be written to: it knows how many bytes went through."""
-
-    def __init__(self, sink: IO[bytes]) -> None:
-        self._sink = sink
-        self._written = 0
-
-    def writable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._written
-
-    def write(self, data: object) -> int:
-        count = self._sink.write(memoryview(data).cast("B"))  # type: ignore[arg-type]
-        self._written += count
-        return count
-
-    def close(self) -> None:
-        """Leaves the pipe open."""
 
 
 def _records(rows: pa.RecordBatchReader) -> Iterator[Record]:
