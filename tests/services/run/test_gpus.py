@@ -9,8 +9,7 @@ import pytest
 
 from schemas.job.job import Run
 from services.job.job_file import validate_job
-from services.run import ray_cluster, run_job
-from services.run.joining import Pattern
+from services.run import coordinator, ray_cluster, run_job
 from services.run.ray_cluster import RAY_PARTS, private_ray, share_gpus
 from services.run.run_job import RunRequest
 from services.run.worker_entry import enter_shard
@@ -68,7 +67,7 @@ def test_a_run_on_two_gpus_draws_on_both_and_makes_the_same_bytes(tmp_path, monk
     def enter(*arguments):
         return enter_on_simulated_gpus(noted, *arguments)
 
-    monkeypatch.setattr(run_job, "Pattern", partial(Pattern, enter=enter))
+    monkeypatch.setattr(coordinator, "enter_shard", enter)
     monkeypatch.setattr(ray_cluster, "connection", partial(ray_cluster.connection, num_gpus=2))
     result = run_job.run_job(RunRequest(job, Path(), str(tmp_path / "out")), private_ray(2))
     assert (result.merged.digest, result.made_now) == (alone, 12)
