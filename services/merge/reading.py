@@ -1,7 +1,7 @@
 """Reading of committed ranges for the merge, in blocks whose rows are joined, and the check that their files are published."""
 
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -53,16 +53,18 @@ class _RangeRead:
 
 
 def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Block]:
-    """All ranges of [first_scene, stop_scene) in order; of an object store some are read ahead.
+    """All ranges of [first_scene, stop_scene) in order. Raises as `iter_ranges` and `blocks_of`."""
+    return blocks_of(store, iter_ranges(store, first_scene, stop_scene))
 
-    Raises as `iter_ranges`, and CorruptError naming a table that is missing or altered, or a range that does not hold
-    each of its scenes once.
+
+def blocks_of(store: Store, ranges: Iterable[Range]) -> Iterator[Block]:
+    """Ranges, which are in order, with their rows; of an object store some are read ahead.
+
+    Raises CorruptError naming a table that is missing or altered, or a range that does not hold each of its scenes once.
     """
     block: list[_RangeRead] = []
     rows = 0
-    for read in map_ahead(
-        store, lambda records: _read_range(store, records), iter_ranges(store, first_scene, stop_scene)
-    ):
+    for read in map_ahead(store, lambda records: _read_range(store, records), ranges):
         block.append(read)
         rows += read.rows
         if len(block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:

@@ -24,15 +24,13 @@ from schemas.dataset.layout import (
     README_FILE,
     SUCCESS_FILE,
     commit_path,
-    pose_of_image,
 )
 from schemas.dataset.shard import Fingerprint
-from schemas.dataset.tables import TABLES
 from schemas.errors import CommitConflict, CorruptError, MachineError
 from schemas.job.identity import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
-from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
+from services.merge.reading import blocks_of
 from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error, read_or_tell
 from services.read.verify_files import (
     Known,
@@ -44,7 +42,6 @@ from services.read.verify_files import (
     tell_strays,
 )
 from services.read.verify_range import (
-    CheckScene,
     Reading,
     ReadRange,
     Spans,
@@ -52,48 +49,10 @@ from services.read.verify_range import (
     find_label_check,
     read_records,
 )
-from workers.store.commit import commits_digest
+from workers.store.commit import commits_digest, require_record
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
-from workers.store.manifest import join_rows
 from workers.store.store import Store
-
-
-class Remerge:
-    """Takes whole ranges in order, and joins their rows in blocks as the merge does."""
-
-    def __init__(self, folder: Path) -> None:
-        self._merging = Merging(folder)
-        self._waiting: list[ReadRange] = []
-        self._rows = 0
-
-    def add(self, read: ReadRange) -> None:
-        """Takes the next range, with its rows. Raises CorruptError where rows do not join."""
-        assert read.rows is not None
-        self._waiting.append(read)
-        self._rows += sum(map(len, read.rows.values()))
-        if len(self._waiting) >= RANGES_PER_BLOCK or self._rows >= ROWS_PER_BLOCK:
-            self._flush()
-
-    def finish(self) -> tuple[dict[str, Any], dict[str, Path]]:
-        """The contents of `_SUCCESS`, and the finished files by key. Raises CorruptError, CommitConflict."""
-        self._flush()
-        return self._merging.finish()
-
-    def close(self) -> None:
-        """Closes every file, finished or not."""
-        self._merging.close()
-
-    def _flush(self) -> None:
-        waiting, self._waiting, self._rows = self._waiting, [], 0
-        if not waiting:
-            return
-        files = [
-            (read.records[0], entry) for read in waiting for entry in read.files if pose_of_image(entry.path) is None
-        ]
-        parts = {table: [read.rows[table] for read in waiting if read.rows] for table in TABLES}
-        rows = {table: join_rows(table, parts[table]).combine_chunks() for table in TABLES}
-        self._merging.add(Block([read.records for read in waiting], files, rows))
 
 
 @dataclass(frozen=True)
@@ -206,8 +165,6 @@ class Ranges:
 
     spans: Spans
     terms: Terms
-    mergeable: bool = True
-    """Whether the rows of every range went into the merge."""
     staged: int = 0
     """Files that are committed and not published."""
 
@@ -217,13 +174,11 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     verdict = Verdict(store.name)
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
-        (folder / "merged").mkdir()
-        with contextlib.closing(Remerge(folder / "merged")) as merging:
-            reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
-            ranges = _read_ranges(reading, _spans(job, success, verdict), merging, progress)
-            check_terms(job, ranges.terms, verdict)
-            check_fingerprint(store, ranges.terms, verdict)
-            remade = _merge_again(merging, ranges, verdict)
+        reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
+        ranges = _read_ranges(reading, _spans(job, success, verdict), progress)
+        check_terms(job, ranges.terms, verdict)
+        check_fingerprint(store, ranges.terms, verdict)
+        remade = _merge_again(store, folder, ranges.spans, verdict)
         _check_finished(store, success, ranges, remade, index, verdict)
         _check_ledger(store, verdict)
         index.add_all(TOP_FILES)
@@ -242,8 +197,8 @@ def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
     return Spans(asked, range_size, success.data is not None, verdict)
 
 
-def _read_ranges(reading: Reading, spans: Spans, merging: Remerge, progress: Callable[[Verdict], None]) -> Ranges:
-    """Reads every range in order, and merges it again."""
+def _read_ranges(reading: Reading, spans: Spans, progress: Callable[[Verdict], None]) -> Ranges:
+    """Reads every range in order."""
     ranges, check_scene = Ranges(spans, Terms()), None
     try:
         check_scene = find_label_check()
@@ -253,39 +208,37 @@ def _read_ranges(reading: Reading, spans: Spans, merging: Remerge, progress: Cal
     following = [*(start for start, _ in groups[1:]), sys.maxsize]
     for (start, retries), next_start in zip(groups, following, strict=True):
         reading.index.add_all(commit_path(start, retry) for retry in retries)
-        if records := read_records(reading.store, start, retries, reading.verdict):
-            spans.take(start, records[0].span.stop, True)
-            _read_range(ReadRange(reading, records), ranges, merging, check_scene)
-            progress(reading.verdict)
-        else:  # nothing says where it ends
+        records = read_records(reading.store, start, retries, reading.verdict)
+        if not records:  # nothing says where it ends
             spans.take(start, min(start + spans.range_size, next_start), False)
+            continue
+        spans.take(start, records[0].span.stop, True)
+        for record in records:
+            ranges.terms.take(record)
+        read = ReadRange(reading, records)
+        read.check(check_scene)
+        ranges.staged += read.staged
+        if read.rows is None:
+            spans.unreadable.append((start, records[0].span.stop))
+        progress(reading.verdict)
     spans.finish()
     return ranges
 
 
-def _read_range(read: ReadRange, ranges: Ranges, merging: Remerge, check_scene: CheckScene | None) -> None:
-    """Reads one range, and gives its rows to the merge."""
-    for record in read.records:
-        ranges.terms.take(record)
-    read.check(check_scene)
-    ranges.staged += read.staged
-    if read.rows is None:
-        span = read.records[0].span
-        ranges.spans.unreadable.append((span.start, span.stop))
-    elif ranges.mergeable and ranges.spans.fits:
-        try:
-            merging.add(read)
-        except CorruptError as error:
-            ranges.mergeable = False
-            read.verdict.tell(str(error), COPY)
-
-
-def _merge_again(merging: Remerge, ranges: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
-    """`_SUCCESS` and the merged files as the commits give them; None where not every range can be read."""
-    if not (ranges.mergeable and ranges.spans.fits and ranges.spans.done):
+def _merge_again(
+    store: Store, folder: Path, spans: Spans, verdict: Verdict
+) -> tuple[dict[str, Any], dict[str, Path]] | None:
+    """`_SUCCESS` and the merged files, in `folder`, as the commits give them; None where not every range can be read."""
+    if not spans.fits or not spans.done:
         return None
+    (folder / "merged").mkdir()
     try:
-        return merging.finish()
+        with contextlib.closing(Merging(folder / "merged")) as merging:
+            groups = commit_groups(store)
+            ranges = ([require_record(store, start, retry) for retry in retries] for start, retries in groups)
+            for block in blocks_of(store, ranges):
+                merging.add(block)
+            return merging.finish()
     except (CorruptError, CommitConflict) as error:
         verdict.tell(str(error), COPY)
         return None
