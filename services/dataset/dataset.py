@@ -27,8 +27,7 @@ from services.dataset.pair import Pair, read_pair
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.dataset.view import Files
 from services.job.record import read_success, require_job
-from services.read.dataset_reader import find_records
-from services.read.stored_tables import StoredTables
+from services.read.dataset_reader import StoredTables, find_records
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store

@@ -19,7 +19,7 @@ from schemas.errors import InputError
 from schemas.job.views import Patch
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import FULL, LAYERS, MODALITIES, Camera, ObjectLabel, Role, crop_box
-from services.read.stored_tables import patch_paths, view_paths
+from services.read.dataset_reader import patch_paths, view_paths
 from workers.geometry.camera import project, unproject
 from workers.geometry.frames import invert, transform
 from workers.store.images import decode_png

@@ -20,7 +20,7 @@ from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import plural
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part, Shape
 from schemas.scene.view import DRAWN_ROLES, Role
-from services.export.formats import Added, Writer, encode_json
+from services.export.formats import LeftOut, Writer, encode_json
 from services.export.shapes import (
     Silhouette,
     box_of,
@@ -55,7 +55,7 @@ class Bop(Writer):
     FRESH: ClassVar = {"camera": None, "splits": {}, "images": 0, "instances": 0, "models": 0}
     HEADS: ClassVar = {_NAMES: "obj_id,category,instance_id,split,source,licence\n", _INFO: "{"}
 
-    def add(self, scene: ExportScene) -> Added:
+    def add(self, scene: ExportScene) -> LeftOut:
         """Writes the scene's folder with its pairs that are whole."""
         self._shots: list[_Shot] = []
         self._place = self.folder.temporary("scene")

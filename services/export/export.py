@@ -104,10 +104,11 @@ class _Export:
             stored = read_stored(store, records)
             chosen = [scene for scene in chooser.choose(stored) if scene >= self._next_scene]
             for scene in scenes_of(store, stored, chosen, splits):
-                added = self._writer.add(scene)
-                self._counts.update(scenes=int(added.pairs > 0), pairs=added.pairs, pairs_left_out=len(added.left_out))
-                for pose_id, reason in added.left_out:
-                    self._left_out[reason] += 1
+                left_out = self._writer.add(scene)
+                pairs = len(scene.pairs) - len(left_out)
+                self._counts.update(scenes=int(pairs > 0), pairs=pairs, pairs_left_out=len(left_out))
+                self._left_out.update(reason for _, reason in left_out)
+                for pose_id, reason in left_out:
                     self._folder.append_row(LEFT_OUT, (scene.scene_id, pose_id, reason))
                 self._checkpoint(scene.scene_id + 1)
             self._checkpoint(max(self._next_scene, stored.stop))

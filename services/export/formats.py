@@ -105,15 +105,8 @@ class ExportRequest:
     """Points that formats with shards draw on each shape."""
 
 
-@dataclass(frozen=True)
-class Added:
-    """What became of a scene: how many of its pairs were written, and (pose id, reason) of those that were left out.
-
-    A reason is the same words for every pair of a kind.
-    """
-
-    pairs: int
-    left_out: tuple[tuple[int, str], ...] = ()
+LeftOut = list[tuple[int, str]]
+"""(pose id, reason) of the pairs of a scene that are left out. A reason is the same words for every pair of a kind."""
 
 
 class Writer:
@@ -147,13 +140,12 @@ class Writer:
             for path, head in self.HEADS.items():
                 folder.append(path, head.encode())
 
-    def add(self, scene: ExportScene) -> Added:
+    def add(self, scene: ExportScene) -> LeftOut:
         """Takes the pairs of the next scene, and then the scene, unless all its pairs are left out."""
         left_out = [(pair.pose_id, reason) for pair in scene.pairs if (reason := self.take(scene, pair))]
-        pairs = len(scene.pairs) - len(left_out)
-        if pairs:
+        if len(left_out) < len(scene.pairs):
             self.end_scene(scene)
-        return Added(pairs, tuple(left_out))
+        return left_out
 
     def take(self, scene: ExportScene, pair: ExportPair) -> str:
         """Writes a pair; why it is left out, or nothing."""

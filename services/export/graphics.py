@@ -15,7 +15,7 @@ from schemas.dataset.codec import Row, read_matrix, read_world_poses
 from schemas.errors import CorruptError, SceneError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import DRAWN_ROLES, Role
-from services.export.formats import Added, Writer, encode_json
+from services.export.formats import LeftOut, Writer, encode_json
 from services.export.source import MM_PER_M, SIDES, ExportPair, ExportScene
 from services.read.scene_geometry import pose_shapes
 from workers.assets.glb import join_glb
@@ -35,21 +35,20 @@ class Gltf(Writer):
 
     FRESH: ClassVar = {"files": {}}
 
-    def add(self, scene: ExportScene) -> Added:
+    def add(self, scene: ExportScene) -> LeftOut:
         """Writes the scene's file."""
         try:
             posed = pose_shapes(self.request.store, scene.stored, scene.row, self.record, self.sources)
         except CorruptError:
             raise
-        except SceneError as error:
-            return _left_out(scene, f"its shapes cannot be made again: {error.reason}")
-        except (VersoError, OSError):
-            return _left_out(scene, NO_SOURCES)
+        except (VersoError, OSError) as error:
+            reason = f"its shapes cannot be made again: {error.reason}" if isinstance(error, SceneError) else NO_SOURCES
+            return [(pair.pose_id, reason) for pair in scene.pairs]
         views = [pair.views[role] for pair in scene.pairs for role in pair.drawn]
         seen = with_cameras(posed.export(file_type="glb"), views)
         self.folder.put(f"{scene.category}/{scene.scene_id:06d}.glb", seen)
         self.count("files", scene.category)
-        return Added(len(scene.pairs))
+        return []
 
     def describe(self) -> dict[str, Any]:
         """Files by category, and the frame."""
@@ -59,10 +58,6 @@ class Gltf(Writer):
             "frame": "metres; below the root node the world frame of the dataset, z up, turned to glTF's y up by that node",
             "cameras": "named by role and pose id; a field of view and an aspect ratio, without the principal point",
         }
-
-
-def _left_out(scene: ExportScene, reason: str) -> Added:
-    return Added(0, tuple((pair.pose_id, reason) for pair in scene.pairs))
 
 
 def with_cameras(glb: bytes, views: list[Row]) -> bytes:
@@ -95,7 +90,7 @@ class Nerf(Writer):
 
     FRESH: ClassVar = {"scenes": {}, "frames": 0}
 
-    def add(self, scene: ExportScene) -> Added:
+    def add(self, scene: ExportScene) -> LeftOut:
         """Writes the scene's folder; transforms.json comes last."""
         self._folder = f"{scene.split}/{scene.scene_id:06d}"
         self._frames: dict[Role, list[Row]] = {role: [] for role in DRAWN_ROLES}

@@ -258,14 +258,7 @@ def _feature(kind: pa.DataType) -> dict[str, Any]:
         return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
     if pa.types.is_list(kind):
         return {"feature": _feature(kind.value_type), "_type": "List"}
-    names = {
-        pa.int64(): "int64",
-        pa.float64(): "float64",
-        pa.string(): "string",
-        pa.bool_(): "bool",
-        pa.binary(): "binary",
-    }
-    return {"dtype": names[kind], "_type": "Value"}
+    return {"dtype": "float64" if kind == pa.float64() else str(kind), "_type": "Value"}
 
 
 def card_text(name: str, export: str, schema: pa.Schema, rows: Mapping[str, int], licences: Sequence[str]) -> str:

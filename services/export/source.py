@@ -19,8 +19,15 @@ from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import DRAWN_ROLES, Role
 from services.dataset.dataset import Splits, collect_ids, split_by_category
-from services.read.dataset_reader import ReadFile, StoredRange, decode_samples, file_reader, read_image
-from services.read.stored_tables import patch_paths, view_paths
+from services.read.dataset_reader import (
+    ReadFile,
+    StoredRange,
+    decode_samples,
+    file_reader,
+    patch_paths,
+    read_image,
+    view_paths,
+)
 from workers.store.commit import read_committed, split_code
 from workers.store.images import decode_png, encode_png
 from workers.store.ledger import range_rows, read_range

@@ -18,7 +18,7 @@ from schemas.dataset.layout import MANIFEST
 from schemas.dataset.tables import SCHEMAS
 from services.job.record import read_success
 from services.look.charts import Histogram
-from services.read.stored_tables import category_of
+from services.read.dataset_reader import category_of
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import range_rows, read_range
 from workers.store.store import Store

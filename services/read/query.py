@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, VersoError
-from services.read.stored_tables import StoredTables
+from services.read.dataset_reader import StoredTables
 from services.read.verdict import explain_damage
 from workers.store.store import Store
 

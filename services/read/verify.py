@@ -127,9 +127,8 @@ def check_fingerprint(store: Store, terms: Terms, verdict: Verdict) -> None:
     try:
         stored = Fingerprint.model_validate_json(data)
     except ValueError:
-        verdict.tell(f"{FINGERPRINT_FILE}: is damaged: it is no fingerprint", COPY, "job")
-        return
-    if data != encode_fingerprint(stored):
+        stored = None
+    if stored is None or data != encode_fingerprint(stored):
         verdict.tell(f"{FINGERPRINT_FILE}: was altered after a worker wrote it", COPY, "job")
     elif stored.digest not in {stack for stack, _ in terms.stacks}:
         if terms.stacks and not _is_in_card(store, stored):
@@ -159,30 +158,21 @@ TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE,
 """Files with one place each; whether they are whole is checked by name."""
 
 
-@dataclass
-class Ranges:
-    """What reading the ranges found."""
-
-    spans: Spans
-    terms: Terms
-    staged: int = 0
-    """Files that are committed and not published."""
-
-
 def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     """Reads everything back. Raises OutputError where a newer version wrote it, MachineError where TMPDIR is full."""
     verdict = Verdict(store.name)
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
         reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
-        ranges = _read_ranges(reading, _spans(job, success, verdict), progress)
-        check_terms(job, ranges.terms, verdict)
-        check_fingerprint(store, ranges.terms, verdict)
-        remade = _merge_again(store, folder, ranges.spans, verdict)
-        _check_finished(store, success, ranges, remade, index, verdict)
+        spans, terms = _spans(job, success, verdict), Terms()
+        _read_ranges(reading, spans, terms, progress)
+        check_terms(job, terms, verdict)
+        check_fingerprint(store, terms, verdict)
+        remade = _merge_again(store, folder, spans, verdict)
+        _check_finished(store, success, spans, remade, index, verdict)
         _check_ledger(store, verdict)
         index.add_all(TOP_FILES)
-        lost = sorted([*ranges.spans.gaps, *ranges.spans.unreadable])
+        lost = sorted([*spans.gaps, *spans.unreadable])
         pairs = job.record.job.pairs_per_scene if job.record else 1
         tell_strays(store, Known(index, success.data is None, tuple(lost), 2 * pairs), verdict)
     return verdict
@@ -197,9 +187,9 @@ def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
     return Spans(asked, range_size, success.data is not None, verdict)
 
 
-def _read_ranges(reading: Reading, spans: Spans, progress: Callable[[Verdict], None]) -> Ranges:
+def _read_ranges(reading: Reading, spans: Spans, terms: Terms, progress: Callable[[Verdict], None]) -> None:
     """Reads every range in order."""
-    ranges, check_scene = Ranges(spans, Terms()), None
+    check_scene = None
     try:
         check_scene = find_label_check()
     except MachineError as error:
@@ -214,15 +204,14 @@ def _read_ranges(reading: Reading, spans: Spans, progress: Callable[[Verdict], N
             continue
         spans.take(start, records[0].span.stop, True)
         for record in records:
-            ranges.terms.take(record)
+            terms.take(record)
         read = ReadRange(reading, records)
         read.check(check_scene)
-        ranges.staged += read.staged
+        spans.staged += read.staged
         if read.rows is None:
             spans.unreadable.append((start, records[0].span.stop))
         progress(reading.verdict)
     spans.finish()
-    return ranges
 
 
 def _merge_again(
@@ -247,7 +236,7 @@ def _merge_again(
 def _check_finished(
     store: Store,
     success: Success,
-    ranges: Ranges,
+    spans: Spans,
     remade: tuple[dict[str, Any], dict[str, Path]] | None,
     index: PathIndex,
     verdict: Verdict,
@@ -257,16 +246,16 @@ def _check_finished(
         index.add_all(remade[1])
     index.add_all(success.files)
     if success.data is None:
-        _tell_unfinished(ranges, remade and remade[0], verdict)
+        _tell_unfinished(spans, remade and remade[0], verdict)
         return
-    if ranges.staged:
-        verdict.tell(f"{ranges.staged} committed files are in _staging, and not in their places", verdict.run_again)
+    if spans.staged:
+        verdict.tell(f"{spans.staged} committed files are in _staging, and not in their places", verdict.run_again)
     digest = success.told.get("digest")
     if remade is None:
         check_merged(store, success, {}, verdict)
     else:
         expected, files = remade
-        first, stop = ranges.spans.asked or (0, 0)
+        first, stop = spans.asked or (0, 0)
         entries = check_merged(store, success, files, verdict)
         commits = success.told.get("commits")
         with contextlib.suppress(CorruptError):  # a foreign file among the commits is told as a stray
@@ -296,19 +285,19 @@ def _check_ledger(store: Store, verdict: Verdict) -> None:
             verdict.tell(f"{commit_path(int(start), int(retry))}: is missing, {LEDGER_FILE} names it", COPY)
 
 
-def _tell_unfinished(ranges: Ranges, remade: dict[str, Any] | None, verdict: Verdict) -> None:
+def _tell_unfinished(spans: Spans, remade: dict[str, Any] | None, verdict: Verdict) -> None:
     """Says why there is no `_SUCCESS`, which is a fault: a dataset is whole or it is not."""
     missing = f"{SUCCESS_FILE}: is missing, not finished:"
     if remade is None:
-        asked = ranges.spans.asked
-        told = f"{ranges.spans.done} of {asked[1] - asked[0]} scenes" if asked else f"{ranges.spans.done} scenes"
-        verdict.tell(f"{missing} {told} are committed", verdict.run_again)
+        asked = spans.asked
+        words = f"{spans.done} of {asked[1] - asked[0]} scenes" if asked else f"{spans.done} scenes"
+        verdict.tell(f"{missing} {words} are committed", verdict.run_again)
     elif again := remade["scenes"]["environmental"]:
-        told = f"{again} scenes failed for environmental reasons"
-        verdict.tell(f"{missing} {told}", f"{verdict.run_again} --retry-failed")
+        words = f"{again} scenes failed for environmental reasons"
+        verdict.tell(f"{missing} {words}", f"{verdict.run_again} --retry-failed")
     else:
-        told = "every scene is committed, and they were not merged, or the file was removed"
-        verdict.tell(f"{missing} {told}", verdict.run_again, "merge")
+        words = "every scene is committed, and they were not merged, or the file was removed"
+        verdict.tell(f"{missing} {words}", verdict.run_again, "merge")
 
 
 @contextlib.contextmanager

@@ -41,6 +41,8 @@ class Spans:
         """Scenes [start, stop) of damaged ranges."""
         self.done = 0
         """Committed scenes."""
+        self.staged = 0
+        """Files that are committed and not published."""
         self.range_size = range_size
         self._foreign = False
         """Whether scenes are committed twice, or outside of those asked."""

@@ -91,18 +91,15 @@ def read_shape(data: bytes) -> Faces:
         corners = array(primitive["indices"]).reshape(-1, 3).astype(np.int64)
         points = array(has["POSITION"]).astype(np.float64)[corners]
         flat = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-        normals = (
-            array(has["NORMAL"]).astype(np.float64)[corners] if "NORMAL" in has else np.repeat(flat[:, None], 3, axis=1)
-        )
-        colors = array(has["COLOR_0"])[corners][..., :3] if "COLOR_0" in has else np.ones(points.shape)
-        number = (
-            sources[look["baseColorTexture"]["index"]] if "baseColorTexture" in look and "TEXCOORD_0" in has else -1
-        )
-        uv = (
-            array(has["TEXCOORD_0"]).astype(np.float64)[corners]
-            if "TEXCOORD_0" in has
-            else np.zeros((*corners.shape, 2))
-        )
+
+        def corners_of(name: str, default: Array, has: dict = has, corners: NDArray = corners) -> Array:
+            return array(has[name])[corners].astype(np.float64) if name in has else default
+
+        normals = corners_of("NORMAL", np.repeat(flat[:, None], 3, axis=1))
+        colors = corners_of("COLOR_0", np.ones(points.shape))[..., :3]
+        uv = corners_of("TEXCOORD_0", np.zeros((*corners.shape, 2)))
+        textured = "baseColorTexture" in look and "TEXCOORD_0" in has
+        number = sources[look["baseColorTexture"]["index"]] if textured else -1
         base = look.get("baseColorFactor", [1.0] * 4)[:3]
         parts.append((points, normals, colors * np.array(base), uv, np.full(len(corners), number)))
     points, normals, colors, uv, texture = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -229,15 +226,8 @@ def _reach(faces: Faces, edges: Array, view: Row) -> tuple[NDArray[np.int64], ND
     u = view["fx"] * faces.points[..., 0] / safe + view["cx"]
     v = view["fy"] * faces.points[..., 1] / safe + view["cy"]
     # A face that reaches nearer has no box: its pixels may be anywhere.
-    left, right, top, bottom = (
-        np.where(whole, bound, beyond)
-        for bound, beyond in (
-            (u.min(axis=1), -np.inf),
-            (u.max(axis=1), np.inf),
-            (v.min(axis=1), -np.inf),
-            (v.max(axis=1), np.inf),
-        )
-    )
+    left, top = (np.where(whole, at.min(axis=1), -np.inf) for at in (u, v))
+    right, bottom = (np.where(whole, at.max(axis=1), np.inf) for at in (u, v))
     seen = z.max(axis=1) > NEAR_M
     first, last = _centres(top, bottom, view["height"])
     face, row = _ranges(first, np.where(seen, last, first - 1))

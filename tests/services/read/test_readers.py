@@ -17,11 +17,18 @@ from services.cli.main import main
 from services.job.record import encode_job, record_job
 from services.merge.merge import merge
 from services.read.columns_page import describe_columns, list_columns, write_page
-from services.read.dataset_reader import choose_evenly, choose_scenes, file_reader, find_scene, read_image
+from services.read.dataset_reader import (
+    choose_evenly,
+    choose_scenes,
+    file_reader,
+    find_scene,
+    patch_paths,
+    read_image,
+    view_paths,
+)
 from services.read.query import query
 from services.read.scene_geometry import posed_scene
 from services.read.status import read_status
-from services.read.stored_tables import patch_paths, view_paths
 from services.run.lock import hold_lock
 from tests.datasets import make_dataset
 from tests.made_up_scenes import attempt_at, failed_scene, scene
