@@ -250,14 +250,14 @@ def _check_finished(
         return
     if spans.staged:
         verdict.tell(f"{spans.staged} committed files are in _staging, and not in their places", verdict.run_again)
-    digest = success.told.get("digest")
+    digest = success.tree.get("digest")
     if remade is None:
         check_merged(store, success, {}, verdict)
     else:
         expected, files = remade
         first, stop = spans.asked or (0, 0)
         entries = check_merged(store, success, files, verdict)
-        commits = success.told.get("commits")
+        commits = success.tree.get("commits")
         with contextlib.suppress(CorruptError):  # a foreign file among the commits is told as a stray
             commits = commits_digest(store)
         asked = {"first_scene": first, "stop_scene": stop, "commits": commits}

@@ -1,7 +1,6 @@
 """Exports of any format: killed, repeated, narrowed, refused, of tars and buckets, or made while the dataset is."""
 
 import contextlib
-import dataclasses
 import hashlib
 import itertools
 import json
@@ -17,7 +16,6 @@ import pytest
 
 from schemas.errors import CorruptError, InputError, InUseError, OutputError
 from schemas.job.assets import SplitShares
-from schemas.job.job import Job
 from schemas.scene.shape import Material, Part
 from services.cli.main import main
 from services.dataset import dataset as splits
@@ -136,27 +134,6 @@ def test_a_folder_that_is_not_an_exports_is_refused(files, tmp_path):
         with pytest.raises(OutputError, match=told):
             export_to(files, target, "mirror-recon")
     assert contents(tmp_path / "mine") == {"thesis.tex": b""}
-
-
-def test_what_was_appended_after_the_last_checkpoint_is_taken_back(tmp_path):
-    folder, place = ExportFolder(tmp_path / "new"), tmp_path / "new"
-    with folder.claimed({"format": "x", "dataset_digest": None}) as progress:
-        assert progress is None
-        folder.append("a/list.txt", b"one\n")
-        folder.checkpoint({"next_scene": 1})
-        folder.append("a/list.txt", b"two\n")
-        folder.append("b.txt", b"b")
-    (part,) = (place / "_export" / "parts").iterdir()
-    part.write_bytes(part.read_bytes() + b"tw")
-    again = ExportFolder(place)
-    with again.claimed({"format": "x", "dataset_digest": "of the run that went on"}) as progress:
-        assert progress is not None and progress["next_scene"] == 1 and not (place / "a").exists()
-        again.append("a/list.txt", b"three\n")
-        again.checkpoint({"next_scene": 2})
-        again.finish({"pairs": 1})
-    assert (place / "a" / "list.txt").read_bytes() == b"one\nthree\n"
-    assert sorted(path.name for path in place.iterdir()) == ["a", "export.json"]
-    assert ExportFolder(place).finished() == {"pairs": 1}
 
 
 def test_an_unfinished_export_that_is_anothers_or_damaged_is_refused(tmp_path):
@@ -306,12 +283,6 @@ def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_p
     assert np.abs(colors[0].astype(int) - colors[1]).max() <= 1
     extents = next(row["extents_m"] for row in source_rows(files.root, "assets") if row["category"] != "table")
     assert np.ptp(stored.vertices, axis=0).max() < 2 * max(extents)
-    record = require_job(copy)
-    gone = {"objects": [{"source": "library", "folder": "gone"}]}
-    job = Job.model_validate({"name": "t", "assets": gone})
-    sources = Sources(dataclasses.replace(record, job=job, folder=str(tmp_path)))
-    with pytest.raises(InputError, match="gone"):
-        sources.asset(0, "mug", "x")
 
 
 def test_a_vertex_has_the_colour_of_its_texel_times_the_base_colour():
