@@ -5,7 +5,6 @@ Range by range or scene by scene, and as tables: pyarrow datasets.
 
 import io
 import itertools
-import urllib.parse
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -343,8 +342,3 @@ class StoredTables:
         """The rows of one table as one pyarrow dataset, as `parts`."""
         parts = [part if isinstance(part, ds.Dataset) else ds.dataset(part) for part in self.parts(table)]
         return parts[0] if len(parts) == 1 else ds.dataset(parts)
-
-
-def category_of(key: str) -> str:
-    """The category that a merged file's folder names."""
-    return urllib.parse.unquote(key.split("/")[-2].removeprefix("category="))

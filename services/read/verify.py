@@ -30,7 +30,7 @@ from schemas.errors import CommitConflict, CorruptError, MachineError
 from schemas.job.identity import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
-from services.merge.reading import blocks_of
+from services.merge.reading import RangeRows
 from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error, read_or_tell
 from services.read.verify_files import (
     Known,
@@ -49,7 +49,7 @@ from services.read.verify_range import (
     find_label_check,
     read_records,
 )
-from workers.store.commit import commits_digest, require_record
+from workers.store.commit import commits_digest
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
 from workers.store.store import Store
@@ -165,10 +165,12 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
         reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
         spans, terms = _spans(job, success, verdict), Terms()
-        _read_ranges(reading, spans, terms, progress)
+        (folder / "merged").mkdir()
+        with contextlib.closing(Merging(folder / "merged")) as merging:
+            _read_ranges(reading, spans, terms, merging, progress)
+            remade = _merge_again(merging, spans, verdict)
         check_terms(job, terms, verdict)
         check_fingerprint(store, terms, verdict)
-        remade = _merge_again(store, folder, spans, verdict)
         _check_finished(store, success, spans, remade, index, verdict)
         _check_ledger(store, verdict)
         index.add_all(TOP_FILES)
@@ -187,8 +189,10 @@ def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
     return Spans(asked, range_size, success.data is not None, verdict)
 
 
-def _read_ranges(reading: Reading, spans: Spans, terms: Terms, progress: Callable[[Verdict], None]) -> None:
-    """Reads every range in order."""
+def _read_ranges(
+    reading: Reading, spans: Spans, terms: Terms, merging: Merging, progress: Callable[[Verdict], None]
+) -> None:
+    """Reads every range in order, and merges it again, as long as all can be."""
     check_scene = None
     try:
         check_scene = find_label_check()
@@ -208,26 +212,24 @@ def _read_ranges(reading: Reading, spans: Spans, terms: Terms, progress: Callabl
         read = ReadRange(reading, records)
         read.check(check_scene)
         spans.staged += read.staged
+        if read.rows is not None and spans.fits:
+            try:
+                merging.add(RangeRows(records, read.files, read.rows))
+            except CorruptError as error:
+                reading.verdict.tell(str(error), COPY)
+                read.rows = None
         if read.rows is None:
             spans.unreadable.append((start, records[0].span.stop))
         progress(reading.verdict)
     spans.finish()
 
 
-def _merge_again(
-    store: Store, folder: Path, spans: Spans, verdict: Verdict
-) -> tuple[dict[str, Any], dict[str, Path]] | None:
-    """`_SUCCESS` and the merged files, in `folder`, as the commits give them; None where not every range can be read."""
+def _merge_again(merging: Merging, spans: Spans, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
+    """`_SUCCESS` and the merged files as the commits give them; None where not every range can be read."""
     if not spans.fits or not spans.done:
         return None
-    (folder / "merged").mkdir()
     try:
-        with contextlib.closing(Merging(folder / "merged")) as merging:
-            groups = commit_groups(store)
-            ranges = ([require_record(store, start, retry) for retry in retries] for start, retries in groups)
-            for block in blocks_of(store, ranges):
-                merging.add(block)
-            return merging.finish()
+        return merging.finish()
     except (CorruptError, CommitConflict) as error:
         verdict.tell(str(error), COPY)
         return None
