@@ -27,7 +27,7 @@ def _folder(room: str) -> Path:
 
 
 DOORS = (
-    *("verso", "services.dataset.correspondence", "services.dataset.dataset"),
+    *("verso", "services.dataset.dataset"),
     *("services.cli.commands", "services.cli.main", "services.cli.reference", "services.job.job_file"),
     *(
         f"{room}.{file.stem}"

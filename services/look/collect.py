@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from schemas.dataset.commit import CommitRecord
 from services.job.record import read_success
 from services.look.charts import Histogram
-from services.read.stored_tables import StoredTables
+from services.read.dataset_reader import StoredTables
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import range_rows, read_range
 from workers.store.manifest import join_rows

@@ -6,7 +6,7 @@ kind_metric_unit, for parts of an image kind_metric_part_unit: `depth_mae_m` is 
 the part of it that the input view does not see.
 
 Parts of the mirror view: `object`, all pixels of objects; `seen` and `hidden`, those of them whose surface the input view
-sees and does not (services/dataset/correspondence.py); `boundary`, within two pixels of an object's outline; `scene`, all
+sees and does not (services/dataset/pair.py); `boundary`, within two pixels of an object's outline; `scene`, all
 with truth. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they would
 drown it.
 """
@@ -25,8 +25,7 @@ from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
-from services.dataset.correspondence import carry
-from services.dataset.pair import Pair
+from services.dataset.pair import Pair, carry
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
 from services.score.pose import INVERTED, box_of, check_distance, score_pose, score_volume, symmetries_of
