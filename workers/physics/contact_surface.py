@@ -28,7 +28,7 @@ Index = NDArray[np.int64]
 )
 def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Array) -> tuple[Index, Array, Array]:
     """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
-    found, count = np.empty(len(features), np.int64), 0
+    numbers, count = np.empty(len(features), np.int64), 0
     least, most = np.empty((len(features), 3)), np.empty((len(features), 3))
     for f in range(len(features)):
         near = True
@@ -41,9 +41,9 @@ def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Ar
                 break
             least[count, k], most[count, k] = down, up
         if near:
-            found[count] = f
+            numbers[count] = f
             count += 1
-    return found[:count], least[:count], most[:count]
+    return numbers[:count], least[:count], most[:count]
 
 
 def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:

@@ -24,8 +24,7 @@ from tests.kit.contacts import mesh_of
 from tests.kit.shapes import box
 from workers.assets.builtin.make import make_asset
 from workers.geometry.distance import distance_to_mesh
-from workers.geometry.halving import wrap
-from workers.geometry.hull import convex_hull
+from workers.geometry.hull import convex_hull, wrap
 from workers.geometry.lathe_decomposition import COARSE, partition_outlines
 from workers.geometry.mesh import mesh_of as surface_of
 from workers.geometry.mesh import solid_of, weld

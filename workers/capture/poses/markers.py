@@ -29,7 +29,7 @@ from workers.capture.poses.observation import (
     pixels_of_points,
 )
 from workers.geometry.frames import angle_between, invert, pose, rotation_about, transform
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 
 def exponential(rotation_vector: Array) -> Array:

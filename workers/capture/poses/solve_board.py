@@ -25,7 +25,7 @@ from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
 from workers.capture.poses.markers import cross_matrix
 from workers.geometry.frames import invert, pose, transform
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 """Corners of a tag of side 1, clockwise from the upper left, as OpenCV's IPPE_SQUARE has them."""

@@ -348,7 +348,8 @@ class Renderer:
         gl.glReadPixels(0, 0, k.width, k.height, gl.GL_RED, gl.GL_FLOAT, depth)
         # OpenCV splits channels 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.
         rgb: NDArray | None = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB) if view.color else None
-        return rgb, depth, cv2.extractChannel(rgba, 3)
+        region: NDArray = cv2.extractChannel(rgba, 3)
+        return rgb, depth, region
 
 
 def _is_lit(render: Render, effects: EffectPlan) -> bool:
