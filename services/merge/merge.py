@@ -1,20 +1,17 @@
 """Merging of committed ranges into the finished dataset: strict, in constant memory, repeatable after a kill.
 
 Two coordinators may merge at once: the lock is advice, and one that was paused wakes up late. Each merge ends in one
-consistent dataset or in a refusal, because
+consistent dataset or in a refusal, because commits are only ever added, two merges of the same commits write the same, and
+whoever lost the lock, or finds other commits than it began with, stops: asked before the merge, before it replaces the first
+file and before it writes `_SUCCESS`. Should it be paused between question and step, the step itself fails.
 
-- commits are only ever added: a merge is a function of its commits, and two merges of the same commits write the same;
-- whoever lost the lock, or finds other commits than it began with, stops: asked before the merge, before it replaces the
-  first file and before it writes `_SUCCESS`;
-- should it be paused between question and step, the step itself fails. On a disk every file gets its name by a rename out of
-  the merge's own folder, and loses it by one into that folder, which the next merge takes away in one step before it reads a
-  commit. In an object store every put is conditional on what was listed before the question. A file that the later merge
-  does not have can still be put; the merge that put it is then refused at its next step, and empties it again.
-
-What is left in an object store: a merge that is paused just before a put, while another takes the lock and merges, and that
-is then killed right after this put. It may leave a file too many, or, where the other is killed too, its `_SUCCESS` over
-files of the other. Sizes and names in `_SUCCESS` do not agree then, so the next run merges again. Files above
-`objects.CONDITIONAL_BYTES` are asked for and then put, not in one step.
+- On a disk every file gets its name by a rename out of the merge's own folder, and loses it by one into that folder, which
+  the next merge takes away in one step before it reads a commit.
+- In an object store every put is conditional on what was listed before the question. A file that the later merge does not
+  have can still be put; the merge that put it is then refused at its next step, and empties it again. Where it is killed
+  right after this put, a file too many may stay, or, where the other is killed too, its `_SUCCESS` over files of the other:
+  sizes and names in `_SUCCESS` do not agree then, so the next run merges again. Files above `objects.CONDITIONAL_BYTES` are
+  asked for and then put, not in one step.
 """
 
 import contextlib

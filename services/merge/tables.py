@@ -30,6 +30,7 @@ from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
+from schemas.job.job import Job
 from schemas.scene.view import ROLES
 from services.job.record import JobRecord
 from workers.store.canonical import TableDigest
@@ -61,8 +62,6 @@ class MergedTable:
 
     def add(self, rows: pa.Table) -> None:
         """Takes the next rows, best some thousands, sorted by key. Raises CorruptError where a key does not rise."""
-        if not rows.num_rows:
-            return
         keys = row_keys(self._table, rows)
         for before, after in pairwise([*self._last_key, *keys]):
             if before >= after:
@@ -70,18 +69,17 @@ class MergedTable:
                     f"{self._table}: the key {after} comes after {before}: the ranges do not join; "
                     "`verso verify` lists what is damaged"
                 )
-        self._last_key = keys[-1:]
+        self._last_key = keys[-1:] or self._last_key
         self.digest.update(rows)
-        self._waiting.append(rows)
+        self._waiting += [rows] if keys else []
         if _bytes_of(self._waiting) >= WAITING_BYTES or sum(map(len, self._waiting)) >= ROWS_PER_GROUP:
             self._split()
 
     def finish(self, categories: list[str]) -> dict[str, Path]:
         """The finished files by key. An empty table gets one empty file under the first of `categories`."""
         self._split()
-        if not self._parts:
-            self._parts[categories[0]] = _Parts(self._table, categories[0], self._folder)
-        return {key: path for parts in self._parts.values() for key, path in parts.finish().items()}
+        parts = self._parts or {categories[0]: _Parts(self._table, categories[0], self._folder)}
+        return {key: path for part in parts.values() for key, path in part.finish().items()}
 
     @property
     def categories(self) -> set[str]:
@@ -111,18 +109,16 @@ class _Parts:
     """The files of one category of one table. As there may be hundreds, a file is open only while it is written."""
 
     def __init__(self, table: str, category: str, folder: Path) -> None:
-        self._table = table
-        self._category = category
+        self._path_of = lambda number: merged_table_path(table, category, number)
         self._folder = folder
-        schema = SCHEMAS[table]
-        self._schema = schema.remove(schema.get_field_index("category"))
+        self._empty = SCHEMAS[table].empty_table().drop_columns("category")
         self.waiting: list[pa.Table] = []
         """Rows without their category that are not yet written."""
+        self._files: dict[str, Path] = {}
         self._writer: pq.ParquetWriter | None = None
         self._sink = _Sink()
         self._room = 0
         """Rows that the open file still takes."""
-        self._files: dict[str, Path] = {}
 
     def finish(self) -> dict[str, Path]:
         """Ends the last file; the files by key."""
@@ -133,14 +129,14 @@ class _Parts:
 
     def flush(self) -> None:
         """Writes the rows that wait, or an empty file where there has been none."""
-        rows = pa.concat_tables([self._schema.empty_table(), *self.waiting])
+        rows = pa.concat_tables([self._empty, *self.waiting])
         self.waiting = []
         while rows.num_rows or not self._files:
             if self._writer is None:
-                key = merged_table_path(self._table, self._category, len(self._files))
+                key = self._path_of(len(self._files))
                 self._files[key] = self._folder / key
                 self._files[key].parent.mkdir(parents=True, exist_ok=True)
-                self._writer, self._room = pq.ParquetWriter(self._sink, self._schema, **PARQUET_OPTIONS), ROWS_PER_FILE
+                self._writer, self._room = pq.ParquetWriter(self._sink, rows.schema, **PARQUET_OPTIONS), ROWS_PER_FILE
             piece = rows.slice(0, self._room)
             self._writer.write_table(piece, row_group_size=ROWS_PER_GROUP)
             self._store()
@@ -238,11 +234,9 @@ def _word(value: float | str) -> str:
     return escaped(value) if isinstance(value, str) else repr(value)
 
 
-SHAPES_OF_CAPTURES = (
-    "- reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing\n"
-    "- boards: a rectangle, CC0-1.0"
-)
-
+SHAPES_OF_CAPTURES = """\
+- reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing
+- boards: a rectangle, CC0-1.0"""
 SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
 """The ends of the card's last line."""
 
@@ -265,9 +259,6 @@ def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: "MergeRe
     sources = "\n".join(f"- {line}" for line in describe_sources(catalogue))
     captured = job.captures is not None
     counts = ", ".join(f"{merged.scenes[outcome]} {outcome}" for outcome in ("made", "intrinsic", "environmental"))
-    regions = (
-        "neither board nor object, 2 board, 3 object" if captured else "nothing, 1 floor, 2 table, 3 and up objects"
-    )
     return f"""# {job.name}
 
 View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the
@@ -296,7 +287,13 @@ other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
 
 Every shape, with its licence and its split by instance, is a row of the `assets` table.
 
-## Reading it
+{_describe_reading(job)}"""
+
+
+def _describe_reading(job: Job) -> str:
+    objects = "nothing, 1 floor, 2 table, 3 and up objects"
+    regions = objects if job.captures is None else "neither board nor object, 2 board, 3 object"
+    return f"""## Reading it
 
 `pyarrow.dataset.dataset("manifest/views", partitioning="hive")` has a row for each camera and the names and checksums of
 its images, `manifest/objects` one for each thing that it may see; `bodies` in `manifest/scenes` says where each object lies.
