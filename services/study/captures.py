@@ -20,7 +20,7 @@ from services.study.model import OWN, Setting
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.make_capture import require_captures, simulate_one
 from workers.capture.process import CaptureViews
-from workers.capture.reconstruct import ProcessorClock, estimate_surface, given_files
+from workers.capture.reconstruct import estimate_surface, given_files, processor_clock
 from workers.capture.score import read_whole_truth, score_capture
 from workers.geometry.camera import spread_evenly
 from workers.scene.context import WorkerContext
@@ -86,15 +86,15 @@ class TimedViews(CaptureViews):
 
 
 def _process(context: WorkerContext, scene_id: int, scratch: Path, setting: Setting, meter: Meter) -> Answer:
-    worker, watch = context_for(context, setting), ProcessorClock()
+    worker, watch = context_for(context, setting), processor_clock()
     captures, whole = require_captures(worker.job), _simulated(context, worker, scene_id, scratch)
     folder = fewer_views(whole, captures.simulate.views)
     with watch.stage("read"):
         given = given_files(folder, captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
-    views = TimedViews(given, estimates.estimate, captures, merged.body)
     truth, surface = read_whole_truth(folder), merged.surface
-    score = None if truth is None else score_capture(estimates.estimate, surface, views, truth, HELD_OUT).summary
+    views = TimedViews(given, captures, estimates.estimate, surface, merged.body)
+    score = None if truth is None else score_capture(views, truth, HELD_OUT).summary
     mirrors_s = fmean(views.seconds) * len(estimates.estimate.used) if views.seconds else 0.0
     meter.s = sum(watch.seconds.values()) + mirrors_s
     points, vertices, faces = map(len, (surface.points, surface.vertices, surface.faces))
