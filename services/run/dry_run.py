@@ -7,7 +7,7 @@ from schemas.dataset.commit import Ledger
 from schemas.errors import OutputError, describe_seconds
 from schemas.job.job import Job
 from services.job.record import record_job, refuse_foreign
-from services.merge.dataset_card import describe_sources
+from services.merge.tables import describe_sources
 from services.run.lock import read_holder, shows_life
 from services.run.machine import usable_cores
 from services.run.range_planner import MAX_SHARD, plan_spans

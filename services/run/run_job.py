@@ -15,8 +15,8 @@ from schemas.errors import FingerprintError, plural
 from schemas.job.job import Job
 from services.job.job_file import describe_idle
 from services.job.record import JobRecord, encode_job, record_job, refuse_foreign
-from services.merge.dataset_card import write_card
 from services.merge.merge import MergeResult, merge
+from services.merge.tables import write_card
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import Pattern, join_cluster, terms_of_driver, with_own_stack
 from services.run.lock import Lock, explain_lost_folder, hold_lock

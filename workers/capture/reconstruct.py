@@ -17,7 +17,7 @@ from schemas.scene.shape import Mesh
 from workers.capture.board import frame_in_board, open_dictionary
 from workers.capture.detect import detect_markers, other_dictionaries
 from workers.capture.folder import CaptureFolder, read_pose, read_view
-from workers.capture.poses.camera_fit import compare_cameras
+from workers.capture.poses.corners import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
 from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, observe_view
 from workers.capture.poses.observation import Observation, Setup

@@ -18,8 +18,8 @@ from services.bench.command import refuse_unmatched
 from services.dataset.dataset import open_dataset
 from services.job.job_file import validate_job
 from services.job.record import read_success, require_job
-from services.merge.dataset_card import describe_dataset
 from services.merge.merge import MergeResult
+from services.merge.tables import describe_dataset
 from services.read.query import query
 from services.read.replay import open_context, replay_scene
 from services.read.scene_geometry import posed_scene
@@ -238,7 +238,7 @@ def test_what_a_job_switches_off_is_not_there_and_nothing_else_changes(full, nam
     assert all(name in row["effects"] for row in rows(full, "select effects from scenes"))
     record, success = require_job(store), read_success(store)
     fingerprint = Fingerprint.model_validate_json(store.read("manifest/_fingerprint.json"))
-    merged = MergeResult(digest, True, dict(success["scenes"]), dict(success["rows"]))
+    merged = MergeResult(digest, dict(success["scenes"]), dict(success["rows"]))
     card = describe_dataset(record, open_context(record).catalogue, merged, fingerprint)
     assert told in next(line for line in card.splitlines() if line.startswith("| views of each pair"))
     with pytest.raises(InputError, match="compares whole pairs"):
