@@ -9,6 +9,7 @@ Tibshirani 1993, section 8); they are null for a single scene.
 
 import re
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -95,9 +96,11 @@ def _worst(table: pa.Table, name: str, scored: Array) -> Array:
 
 
 def summarise(table: pa.Table) -> dict[str, Any]:
-    """Counts, also by kind, and `metrics` of all items."""
+    """Counts, also by kind; `metrics` of all items; `by` category and quarter of the visible fraction, the headlines alone."""
     names = metrics_of(table)
+    shown = [place for place, name in enumerate(names) if name in HEADLINES]
     values = np.stack([values_of(table, name) for name in names], axis=1) if names else np.zeros((table.num_rows, 0))
+    scenes, groups = _scenes(table), {"category": _categories(table), "visible_fraction": _quarters(table)}
     statuses = [_equal(table, "status", word) for word in ("ok", "missing", "refused")]
     return {
         "items": table.num_rows,
@@ -109,7 +112,16 @@ def summarise(table: pa.Table) -> dict[str, Any]:
             }
             for kind in pc.unique(table["kind"]).to_pylist()
         },
-        "metrics": dict(zip(names, figures(values, _scenes(table)), strict=True)),
+        "metrics": dict(zip(names, figures(values, scenes), strict=True)),
+        "by": {
+            group: {
+                word: dict(
+                    zip([names[place] for place in shown], figures(values[mask][:, shown], scenes[mask]), strict=True)
+                )
+                for word, mask in masks.items()
+            }
+            for group, masks in groups.items()
+        },
     }
 
 
@@ -185,3 +197,21 @@ def _equal(table: pa.Table, name: str, word: str) -> NDArray[np.bool_]:
 def _scenes(table: pa.Table) -> NDArray[np.int64]:
     """[N] numbers of scenes from 0 up; items without a scene are one together."""
     return np.unique(_numbers(table, "scene_id"), return_inverse=True)[1].reshape(-1)
+
+
+def _categories(table: pa.Table) -> dict[str, NDArray[np.bool_]]:
+    names = sorted(name for name in pc.unique(table["category"]).to_pylist() if name is not None)
+    return {name: np.asarray(pc.equal(table["category"], name).fill_null(False).to_numpy(), np.bool_) for name in names}
+
+
+def _quarters(table: pa.Table) -> dict[str, NDArray[np.bool_]]:
+    """Items by quarters of the visible fraction, as far as it differs."""
+    seen = _numbers(table, "visible_fraction")
+    known = seen[np.isfinite(seen)]
+    edges = np.unique(np.percentile(known, (0, 25, 50, 75, 100))) if len(known) else np.array([])
+    quarters = {}
+    for low, high in pairwise(edges):
+        inside = (seen >= low) & ((seen < high) | (high == edges[-1]) & (seen <= high))
+        if inside.any():
+            quarters[f"{low:.3g} to {high:.3g}"] = inside
+    return quarters
