@@ -133,4 +133,4 @@ def true_estimates(path: Path, without: tuple[int, ...] = ()) -> Estimates:
         for n in folder.numbers
     )
     markers, joint = CaptureEstimate("markers", views), CaptureEstimate("joint", views, depth)
-    return Estimates("joint", {"markers": markers, "joint": joint}, ())
+    return Estimates("joint", {"markers": markers, "joint": joint})
