@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.distance import dot, nearest_on_segments, nearest_on_triangle
-from workers.geometry.jit import compiled, compiled_for
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of, edge_keys, face_normals, has_rim, numbers_in, weld
 
 SLOPE = 0.02
@@ -169,26 +169,18 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
     for f in range(len(faces)):
         below, above = True, True
         for c in range(3):
-            rises, falls = neighbours_lie(vertices, faces[f, c], starts, members, normals[f])
-            above, below = above and rises, below and falls
+            corner = faces[f, c]
+            for m in range(starts[corner], starts[corner + 1]):
+                up = length2 = 0.0
+                for k in range(3):
+                    line = vertices[members[m], k] - vertices[corner, k]
+                    up += line * normals[f, k]
+                    length2 += line * line
+                slack = SLOPE * np.sqrt(length2)
+                below = below and up <= slack
+                above = above and up >= -slack
         side[f] = np.int64(below) - np.int64(above)
     return side
-
-
-@compiled
-def neighbours_lie(vertices: Array, corner: int, starts: Index, members: Index, normal: Array) -> tuple[bool, bool]:
-    """Whether all neighbours of a vertex lie above it along a normal [3], and whether all lie below, to within `SLOPE`."""
-    above, below = True, True
-    for m in range(starts[corner], starts[corner + 1]):
-        up = length2 = 0.0
-        for k in range(3):
-            line = vertices[members[m], k] - vertices[corner, k]
-            up += line * normal[k]
-            length2 += line * line
-        slack = SLOPE * np.sqrt(length2)
-        above = above and up >= -slack
-        below = below and up <= slack
-    return above, below
 
 
 @compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], i8[::1], b1")

@@ -12,7 +12,7 @@ from workers.geometry.distance import nearest_on_triangle
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import bounds_of
-from workers.physics.contact_surface import SLOPE, Index, Surface, bounds_in, find_near, neighbours_lie
+from workers.physics.contact_surface import SLOPE, Index, Surface, bounds_in, find_near
 
 DEEPEST_M = 3e-3
 """Overlap from which bodies are moved apart, metres: coarse parts may be smaller than a quarter of a metre's shape by half of
@@ -187,7 +187,16 @@ def corners_on_faces(
             beside2 += (nearest[k] - foot[k]) ** 2
         if beside2 > BORDER_M * BORDER_M:
             continue
-        over, under = neighbours_lie(vertices, n, starts, members, normal)
+        over, under = True, True
+        for m in range(starts[n], starts[n + 1]):
+            up = length2 = 0.0
+            for k in range(3):
+                along = vertices[members[m], k] - vertices[n, k]
+                up += normal[k] * along
+                length2 += along * along
+            slack = SLOPE * np.sqrt(length2)
+            over = over and up >= -slack
+            under = under and up <= slack
         # About the deepest face of a hollow everything rises, as about the underside of a body: there the corner tells
         upright, turned = over and (side[f] >= 0 or not under), under and side[f] <= 0
         gap = height if upright else -height
