@@ -252,9 +252,8 @@ def report(options: argparse.Namespace) -> int:
     began = time.monotonic()
     store = open_store(options.out)
     target = options.file or default_page(options.out)
-    beside = None if options.beside is None else open_store(options.beside)
     with explain_damage(store):
-        size, made = write_report(store, options.scenes, target, beside)
+        size, made = write_report(store, options.scenes, target)
     seconds = time.monotonic() - began
     print(
         f"{target}: {plural(made.figures.scenes, 'scene')}, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB"

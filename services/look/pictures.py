@@ -20,7 +20,7 @@ from schemas.dataset.layout import patch_index
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import MODALITIES, PixelKind
 from services.look.charts import Histogram
-from services.look.collect import Tables
+from services.look.collect import Tables, choose_spread
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, find_scene, read_image
 from services.read.stored_tables import patch_paths, view_paths
 from workers.store.store import Store
@@ -220,36 +220,15 @@ class Sample:
     depth: Mapping[str, Histogram]
 
 
-def choose_scenes(tables: Tables, by_category: Mapping[str, int], scenes: int) -> list[int]:
-    """About `scenes` scene ids, equally many of each category as far as there are, each category's evenly over its ids."""
-    each = _shares(by_category, scenes)
-    wanted = {
-        category: {int((i + 0.5) * by_category[category] / count) for i in range(count)}
-        for category, count in each.items()
-    }
-    seen = dict.fromkeys(by_category, 0)
-    chosen: dict[str, list[int]] = {category: [] for category in by_category}
+def choose_scenes(tables: Tables, scenes: int) -> list[int]:
+    """At most `scenes` scene ids, equally many of each category, evenly over its ids; at least one of each."""
+    by_category: dict[str, list[NDArray]] = {}
     for rows in tables.batches("scenes", ("scene_id", "category")):
-        ids = rows.column("scene_id").to_numpy()
-        names = np.asarray(rows.column("category").to_pylist())
+        ids, names = rows.column("scene_id").to_numpy(), np.asarray(rows.column("category").to_pylist())
         for category in np.unique(names).tolist():
-            of = ids[names == category]
-            first = seen.get(category, 0)
-            chosen[category] += [int(of[at - first]) for at in wanted[category] if first <= at < first + len(of)]
-            seen[category] = first + len(of)
-    return [scene_id for category in sorted(chosen) for scene_id in sorted(chosen[category])]
-
-
-def _shares(by_category: Mapping[str, int], scenes: int) -> dict[str, int]:
-    """How many of each category; at least one of each."""
-    shares = dict.fromkeys(by_category, 0)
-    while sum(shares.values()) < scenes or 0 in shares.values():
-        open_ones = [name for name in shares if shares[name] < by_category[name]]
-        if not open_ones:
-            break
-        least = min(open_ones, key=lambda name: shares[name])
-        shares[least] += 1
-    return shares
+            by_category.setdefault(category, []).append(ids[names == category])
+    each = max(1, scenes // max(len(by_category), 1))
+    return [int(i) for name in sorted(by_category) for i in choose_spread(np.concatenate(by_category[name]), each)]
 
 
 def show_scenes(store: Store, scene_ids: Iterable[int]) -> Sample:

@@ -12,14 +12,11 @@ from urllib.parse import quote
 import trimesh
 
 from schemas.errors import MachineError, OutputError, plural
-from schemas.job.job import Job
 from services.job.record import JobRecord, read_success, require_job
 from services.look.clouds import Space, pack_spaces, read_spaces
 from services.look.collect import Figures, collect, open_tables
 from services.look.pictures import Sample, choose_scenes, show_scenes
 from services.look.sections import (
-    Side,
-    beside_html,
     captures_html,
     charts_html,
     effects_html,
@@ -171,15 +168,15 @@ def read_report(store: Store, scenes: int) -> Report:
     record = require_job(store)
     tables = open_tables(store)
     figures = collect(tables)
-    sample = show_scenes(store, choose_scenes(tables, figures.by_category, scenes))
-    spaces = read_spaces(store, [one.scene_id for one in sample.scenes])
+    sample = show_scenes(store, choose_scenes(tables, scenes))
+    spaces = read_spaces(store, [scene.scene_id for scene in sample.scenes])
     return Report(record, (read_success(store) or {}).get("digest"), figures, sample, spaces)
 
 
-def page_of(report: Report, address: Address, other: Report | None = None) -> Page:
-    """The page of a report, with its pictures at these addresses; beside another dataset's, where there is one."""
+def page_of(report: Report, address: Address) -> Page:
+    """The page of a report, with its pictures at these addresses."""
     figures, sample, job = report.figures, report.sample, report.record.job
-    failed = sum(one.scenes for one in figures.failures)
+    failed = sum(failure.scenes for failure in figures.failures)
     sections = (
         Section("overview", "Overview", overview_html(figures, job, failed)),
         Section("pictures", "Pictures", sheets_html(sample.scenes, address)),
@@ -189,37 +186,23 @@ def page_of(report: Report, address: Address, other: Report | None = None) -> Pa
         Section("effects", "Effects", effects_html(figures)),
         Section("failures", "Failures", failures_html(figures.failures, figures.scenes + failed)),
         Section("captures", "Captures", captures_html(figures)),
-        Section("beside", "Side by side", beside_html(_side(report), _side(other), address) if other else ""),
     )
-    return Page(job.name, _subtitle(job, report.digest), sections, _footer(report))
+    what = "captures" if job.captures is not None else "scenes"
+    state = f"finished, digest {report.digest[:12]}" if report.digest else "not finished"
+    footer = (
+        f"Pictures are of {plural(len(sample.scenes), 'scene')}, chosen evenly from each category. "
+        f"Job {report.record.digest[:12]}. Made by verso report; this page fetches nothing."
+    )
+    return Page(job.name, f"{job.scenes:,} {what} asked, seed {job.seed}, {state}", sections, footer)
 
 
-def write_report(store: Store, scenes: int, target: Path, beside: Store | None = None) -> tuple[int, Report]:
+def write_report(store: Store, scenes: int, target: Path) -> tuple[int, Report]:
     """(bytes written, what the page was made of). Raises OutputError where the file cannot be written."""
     report = read_report(store, scenes)
-    other = None if beside is None else read_report(beside, scenes)
-    data = whole_page(page_of(report, lambda picture: picture.inline, other)).encode()
+    data = whole_page(page_of(report, lambda picture: picture.inline)).encode()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(data)
     except OSError as error:
         raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --out") from error
     return len(data), report
-
-
-def _side(report: Report) -> Side:
-    return report.record.job.name, report.figures, report.sample
-
-
-def _subtitle(job: Job, digest: str | None) -> str:
-    what = "captures" if job.captures is not None else "scenes"
-    state = f"finished, digest {digest[:12]}" if digest else "not finished"
-    return f"{job.scenes:,} {what} asked, seed {job.seed}, {state}"
-
-
-def _footer(report: Report) -> str:
-    shown = len(report.sample.scenes)
-    return (
-        f"Pictures are of {plural(shown, 'scene')}, chosen evenly from each category. Job {report.record.digest[:12]}. "
-        "Made by verso report; this page fetches nothing."
-    )

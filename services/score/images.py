@@ -107,7 +107,7 @@ def _flip(predicted: NDArray[np.uint8], true: NDArray[np.uint8]) -> float | None
     if importlib.util.find_spec("flip_evaluator") is None:
         return None
     with needs_making("FLIP"):
-        from services.study.colour import flip_between
+        from services.study.truths import flip_between
 
     return flip_between(true, predicted) if true.size else math.nan
 

@@ -4,13 +4,14 @@ The rays are cast from the scene's own cameras at its own poses: through pixels'
 the size of pixels, through places that do not depend on it. Views of all pairs count together.
 """
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from cachetools import LRUCache, cachedmethod
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from schemas.base import Array
@@ -18,19 +19,23 @@ from schemas.errors import SceneError
 from schemas.job.views import Images
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Camera, Pair, View
-from services.study.colour import (
+from services.study.measure import Answer, answer_for, context_for, laid_for, own_rest, warm_answer_for
+from services.study.model import OWN, Setting, resized
+from services.study.truths import (
     ColourTruth,
     Crop,
+    Patch,
+    Pixels,
+    Seen,
+    cast_patch,
+    cast_pixels,
     colour_truth_missing,
     converged_colour,
     crop_colour,
     crop_of,
     flip_error,
+    seen_by_other,
 )
-from services.study.knobs import size_value
-from services.study.measure import Answer, Meter, answer_for, context_for, laid_for, own_rest, warm_answer_for
-from services.study.model import OWN, Setting
-from services.study.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
 from workers.geometry.pixels import dequantise_depth
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import Scene, render_scene
@@ -40,54 +45,35 @@ KEPT = 12
 """Casts kept of a scene, some 0.3 MB each: the last ones used. Every setting uses the input camera's; the mirror camera moves
 whenever d_z changes."""
 
-Key = tuple[object, ...]
-
 
 class Truth:
-    """Casts of rays in one scene, with a cache of the last ones, which is kept from setting to setting while poses stay."""
+    """Casts of rays in one scene. `kept` has the last ones, which serve every setting that leaves its shapes and poses."""
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene_id, self.geometry = scene.plan.scene_id, _geometry(scene)
-        self.things = scene.posed.things
-        self._kept: LRUCache[Key, Any] = LRUCache(KEPT)
+    def __init__(self, scene: Scene, kept: LRUCache[tuple[object, ...], Any]) -> None:
+        self.scene_id, self.things, self._kept = scene.plan.scene_id, scene.posed.things, kept
+        arrays = [(thing.T_world_shape, thing.shape.vertices, thing.shape.faces) for thing in self.things]
+        regions = bytes(thing.region_id for thing in self.things)
+        self._geometry = self.scene_id, regions, *(hash(array.tobytes()) for some in arrays for array in some)
 
-    @cachedmethod(lambda self: self._kept, key=lambda self, camera: ("pixels", *_key(camera)))
+    def _cast(self, cast: Callable[[], Any], name: str, *cameras: Camera, pair: int = 0) -> Any:
+        views = [part for c in cameras for part in (*c.intrinsics.model_dump().values(), c.T_world_cam.tobytes())]
+        key = name, pair, *self._geometry, *views
+        if key not in self._kept:
+            self._kept[key] = cast()
+        return self._kept[key]
+
     def pixels(self, camera: Camera) -> Pixels:
         """The view at its pixels."""
-        return cast_pixels(self.things, camera)
+        return self._cast(lambda: cast_pixels(self.things, camera), "pixels", camera)
 
-    @cachedmethod(lambda self: self._kept, key=lambda self, camera, pair: ("patch", pair, *_frame(camera)))
     def patch(self, camera: Camera, pair: int) -> Patch:
-        """The objects in a pair's input view, the same for images of all sizes."""
-        return cast_patch(self.things, camera, self.scene_id, pair)
+        """The objects in a pair's input view."""
+        return self._cast(lambda: cast_patch(self.things, camera, self.scene_id, pair), "patch", camera, pair=pair)
 
-    @cachedmethod(lambda self: self._kept, key=lambda self, camera, other: ("both", *_key(camera), *_key(other)))
     def both(self, camera: Camera, other: Camera) -> NDArray[np.bool_]:
         """[N] bool: which pixels of `pixels(camera).box` show an object point that the other camera sees too."""
-        return seen_by_other(self.things, camera, self.pixels(camera).box, other)
-
-
-def truth_of(scene: Scene, kept: Truth | None = None) -> Truth:
-    """The truth of a scene: `kept`, of an earlier setting, where the geometry is the same, or a new one."""
-    return kept if kept is not None and kept.geometry == _geometry(scene) else Truth(scene)
-
-
-def _key(camera: Camera) -> Key:
-    return *camera.intrinsics.model_dump().values(), camera.T_world_cam.tobytes()
-
-
-def _frame(camera: Camera) -> Key:
-    """To 12 digits: a camera scaled to another size is the same one but for rounding."""
-    k = camera.intrinsics
-    shares = (k.fx / k.width, k.fy / k.height, k.cx / k.width, k.cy / k.height)
-    return *(round(share, 12) for share in shares), camera.T_world_cam.tobytes()
-
-
-def _geometry(scene: Scene) -> Key:
-    """What the casts depend on: the scene's shapes and their poses."""
-    things = scene.posed.things
-    arrays = [(thing.T_world_shape, thing.shape.vertices, thing.shape.faces) for thing in things]
-    return scene.plan.scene_id, *(thing.region_id for thing in things), *(a.tobytes() for some in arrays for a in some)
+        seen = self.pixels(camera).box
+        return self._cast(lambda: seen_by_other(self.things, camera, seen, other), "both", camera, other)
 
 
 PERCENTILE = 99.0
@@ -144,8 +130,8 @@ def _of_labels(views: Sequence[tuple[View, Pixels]], images: Images) -> dict[str
         differ += int(np.count_nonzero((mask != truth.box.region) & (by_ray | by_mask)) + outside)
         pixels += int(np.count_nonzero(by_ray))
         table = truth.spread.region == REGION_TABLE
-        for found, seen, chosen in ((objects_mm, truth.box, by_ray), (table_mm, truth.spread, table)):
-            found.append(_off_mm(seen.of(view.depth), seen.of(view.region), seen, chosen, images))
+        for off_mm, seen, chosen in ((objects_mm, truth.box, by_ray), (table_mm, truth.spread, table)):
+            off_mm.append(_off_mm(seen.of(view.depth), seen.of(view.region), seen, chosen, images))
     return {
         **_percentile("depth_mm", objects_mm, PERCENTILE),
         **_percentile("table_depth_mm", table_mm, PERCENTILE),
@@ -221,24 +207,31 @@ def measure_drawn(context: WorkerContext, settings: Sequence[Setting], scene_id:
 
     `s` is the time from rest to the encoded files, whose `bytes` are those of all files and of no rows.
     """
-    kept: list[Truth] = []
-    order = np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))
+    kept: LRUCache[tuple[object, ...], Any] = LRUCache(KEPT)
 
-    def measure(worker: WorkerContext, meter: Meter) -> Answer:
-        laid = laid_for(context, worker, scene_id)
-        with meter:
-            scene = render_scene(worker, laid, Stopwatch())
-            output = record_scene(worker, scene, Stopwatch())
-        truth = truth_of(scene, kept[-1] if kept else None)
-        kept[:] = [truth]
-        sizes = sum(len(file.data) for file in output.files)
-        return {"errors": measure_images(worker, scene, truth), "bytes": sizes}
+    def measure(worker: WorkerContext) -> Answer:
+        laid, began = laid_for(context, worker, scene_id), time.process_time()
+        scene = render_scene(worker, laid, Stopwatch())
+        files = record_scene(worker, scene, Stopwatch()).files
+        s = time.process_time() - began
+        return {
+            "s": s,
+            "errors": measure_images(worker, scene, Truth(scene, kept)),
+            "bytes": sum(len(file.data) for file in files),
+        }
 
-    with Meter() as rested, suppress(Exception):  # told by what is measured
+    began = time.monotonic()
+    with suppress(Exception):  # said by what is measured
         own_rest(context, scene_id)
-    workers = [(settings[k], context_for(context, settings[k])) for k in order]
-    answers = {one.name: warm_answer_for("draw", one, partial(measure, worker)) for one, worker in workers}
-    return {name: {**one, "took": one["took"] + rested.took / len(settings)} for name, one in answers.items()}
+    shared_s = (time.monotonic() - began) / len(settings)
+    workers = [(setting, context_for(context, setting)) for setting in settings]
+    answers = {setting.name: warm_answer_for("draw", setting, partial(measure, worker)) for setting, worker in workers}
+    return _with_shared(answers, shared_s)
+
+
+def _with_shared(answers: dict[str, Answer], shared_s: float) -> dict[str, Answer]:
+    """Answers that each took a share of what was made for all."""
+    return {name: {**answer, "took": answer["took"] + shared_s} for name, answer in answers.items()}
 
 
 def measure_colour(
@@ -249,19 +242,17 @@ def measure_colour(
     `flip` is against a path-traced image, where that tier is installed. `edge_flip`, of tier raster, is against the same
     tier's own light at 64 samples a pixel, because FLIP against other light tells little of edges.
     """
-    with Meter() as truths_made:
-        traced, smooth = colour_truths(context, scene_id)
+    began = time.monotonic()
+    traced, smooth = colour_truths(context, scene_id)
+    shared_s = (time.monotonic() - began) / len(settings)
 
-    def measure(setting: Setting, meter: Meter) -> Answer:
+    def measure(setting: Setting) -> Answer:
         worker, scene = _input_alone(context, setting, scene_id)
         truths = {"flip": traced, "edge_flip": smooth if worker.job.render.tier == "raster" else None}
         rgb = scene.pairs[0].input.rgb
-        found = {} if rgb is None else {name: flip_error(truth, rgb) for name, truth in truths.items() if truth}
-        return {"errors": found}
+        return {"errors": {name: flip_error(truth, rgb) for name, truth in truths.items() if truth and rgb is not None}}
 
-    answers = {setting.name: answer_for(partial(measure, setting)) for setting in settings}
-    shared_s = truths_made.took / len(settings)
-    return {name: {**one, "took": one["took"] + shared_s} for name, one in answers.items()}
+    return _with_shared({setting.name: answer_for(partial(measure, setting)) for setting in settings}, shared_s)
 
 
 @lru_cache(maxsize=2)
@@ -283,7 +274,7 @@ def _input_alone(context: WorkerContext, setting: Setting, scene_id: int) -> tup
 
 def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | None:
     """The raster tier's image with 64 samples a pixel: drawn 4 times as wide with 4 samples each, averaged by area."""
-    finest = {**size_value(context.job, FINE_WIDTH).changes, "render.tier": "raster", "render.samples": 4}
+    finest = {**resized(context.job, FINE_WIDTH), "render.tier": "raster", "render.samples": 4}
     with suppress(SceneError):
         rgb = _input_alone(context, Setting((("truth", "edges"),), finest), scene_id)[1].pairs[0].input.rgb
         return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))

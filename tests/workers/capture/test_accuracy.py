@@ -19,7 +19,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Mesh
 from tests.workers.capture.simulated import asset_of, made
 from workers.capture.folder import open_folder, read_truth
 from workers.capture.make_capture import process_capture
-from workers.capture.poses.markers import motion_between
+from workers.capture.poses.terms import motion_between
 from workers.capture.process import CaptureViews
 from workers.capture.reconstruct import ProcessorClock, estimate_poses, given_files
 from workers.capture.score import compare_poses, read_whole_truth, score_measured

@@ -27,23 +27,24 @@ from workers.capture.poses.joint import (
     INFLATION_OF_FEW,
     REACH_M,
     VIEW_FLOOR_M,
-    Problem,
+    BoardTerm,
+    ObjectTerm,
     gather,
     inflation,
     match_patches,
-    minimise,
     patch_sigma,
     placed,
     row_inflation,
 )
-from workers.capture.poses.markers import logarithm, motion_between, moved
 from workers.capture.poses.observation import Patches, no_patches
 from workers.capture.poses.terms import (
     NAMES,
-    BoardTerm,
-    ObjectTerm,
+    Problem,
     Shared,
-    identified,
+    correct_depth,
+    minimise,
+    motion_between,
+    moved,
     prior_sigma,
 )
 from workers.geometry.frames import translation, uniform_rotation
@@ -69,6 +70,7 @@ TERMS = {
         RAYS,
         np.array([912.37, 912.25]),
         np.array([0.2, 0.5, 0.9, 0.3]),
+        np.ones(len(FLAT), bool),
         seen=(PIXELS, LENS),
     ),
     "board": BoardTerm(VIEW, PATCHES, np.full(12, 0.1), np.full(12, 2.0)),
@@ -92,9 +94,7 @@ def test_derivatives_of_each_term_equal_finite_differences(name):
             ahead, back = POSES.copy(), POSES.copy()
             ahead[number], back[number] = moved(POSES[number], step), moved(POSES[number], -step)
             change = term.rows(ahead, SHARED).residual - term.rows(back, SHARED).residual
-            own = np.where(rows.first == number, rows.by_first[:, axis], 0)
-            if rows.second is not None:
-                own += np.where(rows.second == number, rows.by_second[:, axis], 0)
+            own = np.where(rows.view == number, rows.by_view[:, :, axis], 0).sum(axis=1)
             assert own == pytest.approx(change / 2e-6, rel=1e-4, abs=2e-2)
 
 
@@ -124,7 +124,7 @@ def test_shared_parameters_are_what_was_added_and_what_others_are_told():
     for axis, step in enumerate(1e-6 * np.eye(SIZE)):
         change = SHARED.moved(step).corrected(PATCHES) - SHARED.moved(-step).corrected(PATCHES)
         assert exact[:, :, axis] == pytest.approx(change / 2e-6, abs=1e-7)
-    depth = SHARED.correction(("offset_m",))
+    depth = correct_depth(SHARED, np.ones(SIZE), np.ones(SIZE))
     p = PATCHES.ray_z * depth.scale + depth.offset_m * PATCHES.ray
     assert SHARED.corrected(PATCHES) == pytest.approx(p @ depth.T_cam_depth[:3, :3].T + depth.T_cam_depth[:3, 3])
     assert SHARED.deviation() == pytest.approx(STEP) and not Shared().deviation().any()
@@ -135,8 +135,8 @@ def test_priors_hold_what_is_believed_and_tell_what_is_identified():
     assert by_print[NAMES.index("print_scale")] == 0 and by_depth[NAMES.index("print_scale")] > 0.1
     assert by_depth[NAMES.index("scale")] == 0.001  # the specification of the camera
     assert not prior_sigma(Estimation(), False)[:9].any()
-    assert identified(np.where(np.arange(SIZE) == 2, 0.1, 0.9) * by_print, by_print) == ("shift_x_m",)
-    assert identified(by_print, by_print) == ()
+    sigma = np.where(np.arange(SIZE) == 2, 0.1, 0.9) * by_print
+    assert correct_depth(Shared(), sigma, by_print).identified == ("shift_x_m",)
 
 
 SLOPES = np.array([1.0, -1.0, 1.0, -1.0])[:, None]
@@ -148,9 +148,7 @@ SLOPES = np.array([1.0, -1.0, 1.0, -1.0])[:, None]
 
 def corner_problem(truth, rng, corner_px=0.2, prior=None, fixed=None):
     seen = [observe(T, rng, corner_px=corner_px).corners for T in truth]
-    view = np.repeat(np.arange(len(seen)), [len(c.board) for c in seen])
-    board, rays = (np.concatenate([getattr(c, name) for c in seen]) for name in ("board", "rays"))
-    term = CornerTerm(view, board, rays, np.array([KINECT.fx, KINECT.fy]), np.full(4, max(corner_px, 0.1)))
+    term = CornerTerm.of(seen, PINHOLE, np.full(4, max(corner_px, 0.1)))
     free = np.zeros(len(truth), bool) if fixed is None else np.array(fixed)
     return Problem([term], np.zeros(SIZE) if prior is None else prior, free)
 
@@ -184,8 +182,7 @@ def test_the_covariance_is_the_scatter_of_the_solution():
     truth = hand_held(rng, 1)
     for _ in range(60):
         found = minimise(corner_problem(truth, rng), np.stack(truth), Shared(), 20)
-        T = np.linalg.inv(truth[0]) @ found.poses[0]
-        off.append([*T[:3, 3], *logarithm(T[:3, :3])])
+        off.append(motion_between(truth[0], found.poses[0]))
     scatter = np.sqrt(np.mean(np.square(off), axis=0))
     assert scatter == pytest.approx(np.sqrt(np.diag(found.covariance()[:6, :6])), rel=0.3)
 
@@ -290,7 +287,7 @@ def test_the_sigma_of_a_patch_is_at_1_m_and_no_view_is_better_than_its_floor():
     assert patch_sigma(rng.normal(0, 0.002, 5000) * growth, growth) == pytest.approx(0.002, rel=0.05)
     assert patch_sigma(np.zeros(9), np.ones(9)) == FLOOR_M == patch_sigma(np.zeros(0), np.zeros(0))
     sigma = np.full(101, 0.001)
-    factor = row_inflation(1.0, sigma, np.array([0] * 100 + [1]))
+    factor = row_inflation(1.0, sigma, np.array([0] * 100 + [1])[:, None])
     assert 1 / np.sqrt((1 / (sigma**2 * factor))[:100].sum()) == pytest.approx(VIEW_FLOOR_M)
     assert factor[100] == 1.0  # few patches keep their weight
 

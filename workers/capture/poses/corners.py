@@ -1,4 +1,4 @@
-"""Corners in the joint problem: their rows, the noise of each mode of a marker, and what a rolling shutter does to them."""
+"""Corners of all views: their rows, the noise of each mode of a marker, and what corners say of the shutter and the camera."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,18 +12,26 @@ from scipy.stats import f as variance_ratio
 from schemas.base import Array, frozen_array
 from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
-from workers.capture.poses.markers import MATERIAL, corner_sigma, cross_matrix, derivative_of_projection
+from workers.capture.poses.observation import Corners
 from workers.capture.poses.terms import (
     CAMERA,
+    GROW_M,
+    GROW_PX,
     GROWTH_M,
     GROWTH_PX,
     MAD,
     POSE,
     PRINT_SCALE,
     SHARED,
+    SIGNIFICANT,
+    Problem,
     Rows,
     Shared,
+    Solution,
+    cross_matrix,
     median_of_chi_square,
+    minimise,
+    motion_between,
     pose_halves,
     robust,
 )
@@ -31,6 +39,12 @@ from workers.geometry.lens import rays_of_pixels
 
 MODES = (2, 1, 5)
 """How many of the eight coordinates of a marker's corners are its place, the growth of its sides, and the rest: its shape."""
+FLOOR_PX = 0.02
+"""No corner is taken to be better than this."""
+PRIOR_RESIDUALS = 2
+"""The expected sigma of a corner counts as much as so many measured residuals."""
+MATERIAL = 5e-4
+"""What moves a pose by more than this share of its distance is told: a calibration is no better."""
 LEVEL = 1e-3
 """Level of the F tests by which markers ask for another camera than camera.json's: one capture in a thousand is wronged."""
 SWEPT = 0.005
@@ -41,32 +55,28 @@ EXPLAINED = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Rolling:
-    """By how much poses would move, motion [V, 6], if rows were read in turn; covariance [V, 6, 6] of the poses then."""
+class Doubt:
+    """What the poses may need: motion [V, 6] with its covariance [V, 6, 6], and why in words; empty where it is too little."""
 
     motion: Array
     covariance: Array
+    note: str
 
-    @property
-    def note(self) -> str:
-        """What the user is told."""
-        mm = 1000 * float(np.median(np.linalg.norm(self.motion[:, :3], axis=1)))
-        return (
-            f"the corners lie as if the camera moved while the rows of an image were read, which moves the poses by {mm:.1f} mm: "
-            "hold it still for each photograph, or use a global shutter"
-        )
+
+def corner_sigma(variance: float, free: float, spec: Estimation) -> float:
+    """Standard deviation, pixels, by the variance of residuals, `free` of them left by what was fitted, and by the expected."""
+    mixed = (free * variance + PRIOR_RESIDUALS * spec.corner_px**2) / (free + PRIOR_RESIDUALS)
+    return max(FLOOR_PX, float(np.sqrt(mixed)))
 
 
 @dataclass(frozen=True, eq=False)
 class CornerTerm:
     """Corners of all views, those of a marker together: view [K] index, board [K, 3] nominal metres, rays [K, 2].
 
-    sigma_px [4]: of a marker's place, growth and shape, as `MODES` has them, and of a corner that is no marker's. What a camera
-    does to edges changes the size of markers, and slopes of refined edges their shape, more than either moves them: weighed
-    alike, both would move the camera.
-
-    square [K]: which are of a marker; the others, of a chessboard, have no side that grows; None: all are. With `seen`
-    (their pixels [K, 2], centres at +0.5, and the camera of the rays) its intrinsics can be estimated as well.
+    square [K]: which are of a marker; the others, of a chessboard, have no side that grows. sigma_px [4]: of a marker's place,
+    growth and shape, as `MODES` has them, and of a corner that is no marker's. What a camera does to edges changes the size of
+    markers, and slopes of refined edges their shape, more than either moves them: weighed alike, both would move the camera.
+    With `seen` (their pixels [K, 2], centres at +0.5, and the camera of the rays) its intrinsics can be estimated as well.
     """
 
     view: NDArray[np.int64]
@@ -74,61 +84,63 @@ class CornerTerm:
     rays: Array
     focal: Array
     sigma_px: Array
-    square: NDArray[np.bool_] | None = None
+    square: NDArray[np.bool_]
     seen: tuple[Array, CaptureCamera] | None = None
 
-    @cached_property
-    def own(self) -> NDArray[np.bool_]:
-        """[K]: which corners are of a marker."""
-        return np.ones(len(self.board), np.bool_) if self.square is None else self.square
+    @staticmethod
+    def of(corners: Sequence[Corners], camera: CaptureCamera, sigma_px: Array) -> "CornerTerm":
+        """The corners of views in order, with the camera held."""
+        view = np.repeat(np.arange(len(corners)), [len(c.board) for c in corners])
+        board, rays, ids = (
+            np.concatenate([getattr(c, name) for c in corners]) for name in ("board", "rays", "markers")
+        )
+        focal = np.array([camera.intrinsics.fx, camera.intrinsics.fy])
+        return CornerTerm(view, board, rays, focal, sigma_px, ids >= 0)
 
     @cached_property
     def grown(self) -> Array:
         """[K, 2]: how corners move, pixels, where each side of their marker looks longer by a pixel."""
-        return outward_motion(self.focal * self.rays, self.own)
+        return outward_motion(self.focal * self.rays, self.square)
 
     def rows(self, poses: Array, shared: Shared) -> Rows:
         """Two rows a corner: each mode of a marker over its sigma, as one symmetric matrix, so that a row stays a corner's."""
         R, t = poses[self.view, :3, :3], poses[self.view, :3, 3]
-        outwards = outward_motion(self.board, self.own)
+        outwards = outward_motion(self.board, self.square)
         p = np.einsum("kji,kj->ki", R, shared.print_scale * self.board + shared.growth_m * outwards - t)
         z = np.maximum(p[:, 2], 1e-3)
-        x, y = p[:, 0] / z, p[:, 1] / z
+        at = p[:, :2] / z[:, None]
         rays, by_camera = self._rays(shared)
-        off = np.stack([x, y], axis=1) - rays
         focal = self.focal * (1.0 + np.array(shared.camera[:2]))  # else a longer one would make noise smaller
-        by_point = derivative_of_projection(x, y, z, focal)
+        by_point = np.concatenate([np.broadcast_to(np.eye(2), (len(p), 2, 2)), -at[..., None]], axis=2)
+        by_point = by_point * (focal / z[:, None])[..., None]
         values = np.zeros((len(p), 2, 1 + POSE + SHARED))
         residual, by_pose, by_shared = values[..., 0], values[..., 1 : 1 + POSE], values[..., 1 + POSE :]
-        residual[:] = focal * off + shared.growth_px * self.grown
-        by_pose[:] = np.concatenate([-by_point, by_point @ cross_matrix(p)], axis=2)
-        by_shared[:, :, PRINT_SCALE] = np.einsum("kij,kj->ki", by_point, np.einsum("kji,kj->ki", R, self.board))
-        by_shared[:, :, GROWTH_M] = np.einsum("kij,kj->ki", by_point, np.einsum("kji,kj->ki", R, outwards))
+        residual[:] = focal * (at - rays) + shared.growth_px * self.grown
+        by_pose[:] = np.concatenate([-by_point, by_point @ cross_matrix(p)], axis=2)  # p changes by -dt - dr x p
+        by_shared[:, :, PRINT_SCALE] = np.einsum("kij,klj,kl->ki", by_point, R, self.board)
+        by_shared[:, :, GROWTH_M] = np.einsum("kij,klj,kl->ki", by_point, R, outwards)
         by_shared[:, :, GROWTH_PX] = self.grown
         by_shared[:, :, CAMERA] = -focal[:, None] * by_camera
-        by_shared[:, :, CAMERA][:, [0, 1], [0, 1]] += self.focal * off
-        white = self._over_sigma(values)
+        by_shared[:, :, CAMERA][:, [0, 1], [0, 1]] += self.focal * (at - rays)
+        white = values / self.sigma_px[3]
+        place, growth, shape = (part / sigma for part, sigma in zip(self.modes(values), self.sigma_px, strict=False))
+        white[self.square] = (place + growth + shape).reshape(-1, *values.shape[1:])
         weight, cost = robust((white[..., 0] ** 2).sum(axis=1))
         flat = white.reshape(-1, white.shape[2])
+        by_view = flat[:, None, 1 : 1 + POSE]
         return Rows(
-            flat[:, 0], np.repeat(self.view, 2), flat[:, 1 : 1 + POSE], flat[:, 1 + POSE :], np.repeat(weight, 2), cost
-        )  # fmt: skip
+            flat[:, 0], np.repeat(self.view, 2)[:, None], by_view, flat[:, 1 + POSE :], np.repeat(weight, 2), cost
+        )
 
     def modes(self, values: Array) -> tuple[Array, Array, Array]:
         """(place, growth, shape), each [M, 4, 2, D]: orthogonal parts of values [K, 2, D] of the corners of M markers."""
-        quads = values[self.own].reshape(-1, 4, 2, values.shape[2])
-        growth = self.grown[self.own].reshape(-1, 4, 2)
+        quads = values[self.square].reshape(-1, 4, 2, values.shape[2])
+        growth = self.grown[self.square].reshape(-1, 4, 2)
         growth = growth - growth.mean(axis=1, keepdims=True)
         growth /= np.linalg.norm(growth, axis=(1, 2), keepdims=True)
         place = np.broadcast_to(quads.mean(axis=1, keepdims=True), quads.shape)
         grown = np.einsum("mij,mijd->md", growth, quads)[:, None, None] * growth[..., None]
         return place, grown, quads - place - grown
-
-    def _over_sigma(self, values: Array) -> Array:
-        over: Array = values / self.sigma_px[3]
-        place, growth, shape = (part / sigma for part, sigma in zip(self.modes(values), self.sigma_px, strict=False))
-        over[self.own] = (place + growth + shape).reshape(-1, *values.shape[1:])
-        return over
 
     def measured(self, poses: Array, shared: Shared, spec: Estimation) -> "CornerTerm":
         """The term with sigma_px as its residuals have it.
@@ -137,10 +149,10 @@ class CornerTerm:
         poses leave (restricted maximum likelihood; the median resists what hides markers).
         """
         rows, sigma_px = self.rows(poses, shared), self.sigma_px.copy()
-        by_pose = rows.by_first * np.sqrt(rows.weight)[:, None]
-        taken = np.einsum("nj,njk->nk", by_pose, pose_halves(rows, len(poses))[rows.first])
+        by_pose = rows.by_view[:, 0] * np.sqrt(rows.weight)[:, None]
+        taken = np.einsum("nj,njk->nk", by_pose, pose_halves(rows, len(poses))[rows.view[:, 0]])
         values = np.concatenate([rows.residual[:, None], taken], axis=1).reshape(-1, 2, 1 + POSE)
-        parts = [*self.modes(values), values[~self.own][:, None]]
+        parts = [*self.modes(values), values[~self.square][:, None]]
         for mode, (part, degrees) in enumerate(zip(parts, (*MODES, 2), strict=True)):
             squares = (part**2).sum(axis=(1, 2))
             total = degrees * len(squares)
@@ -154,38 +166,10 @@ class CornerTerm:
         """[V]: variance of the corners of each view over what their sigma says, at least 1: a view may be blurred."""
         residual, ratio = np.abs(self.rows(poses, shared).residual), np.ones(len(poses))
         for number in np.unique(self.view):
-            own = residual[np.repeat(self.view == number, 2)]
-            if len(own) > POSE:
-                ratio[number] = (MAD * float(np.median(own))) ** 2 * len(own) / (len(own) - POSE)
+            of_view = residual[np.repeat(self.view == number, 2)]
+            if len(of_view) > POSE:
+                ratio[number] = (MAD * float(np.median(of_view))) ** 2 * len(of_view) / (len(of_view) - POSE)
         return np.maximum(ratio, 1.0)
-
-    def rolling(self, poses: Array, shared: Shared, height: int) -> "Rolling | None":
-        """What a rolling shutter does to each pose; None where corners do not ask for it, or it moves the poses by too little.
-
-        Each view may have moved evenly from its first row to its last of `height`, which one step of Gauss and Newton finds
-        beside its pose. All corners count alike: what rows do to markers is noise to their modes. An F test over all views.
-        """
-        rows = dataclasses.replace(self, sigma_px=np.full(4, self.sigma_px[0])).rows(poses, shared)
-        share, prior = np.repeat(self.focal[1] * self.rays[:, 1] / height, 2), np.repeat([0.0, SWEPT**-2], POSE)
-        motion, covariance, gain, left = np.zeros((len(poses), POSE)), np.zeros((len(poses), POSE, POSE)), 0.0, 0.0
-        for number in range(len(poses)):
-            own = rows.first == number
-            root = np.sqrt(rows.weight[own])
-            both = root[:, None] * np.concatenate([rows.by_first[own], share[own, None] * rows.by_first[own]], axis=1)
-            residual, inverse = (
-                root * rows.residual[own],
-                np.linalg.pinv(both.T @ both + np.diag(prior), hermitian=True),
-            )
-            step = -inverse @ (both.T @ residual)
-            motion[number], covariance[number] = step[:POSE], inverse[:POSE, :POSE]
-            gain, left = gain - float(step @ (both.T @ residual)), left + float(residual @ residual)
-        degrees = POSE * len(poses), len(rows.residual) - 2 * POSE * len(poses)
-        shift = np.linalg.norm(motion[:, :3], axis=1) / np.linalg.norm(poses[:, :3, 3], axis=1)
-        if min(degrees) <= 0 or float(np.median(shift)) < MATERIAL:
-            return None
-        variance = (left - gain) / degrees[1]
-        sure = gain > EXPLAINED * left and variance_ratio.sf(gain / (degrees[0] * variance), *degrees) < LEVEL
-        return Rolling(motion, variance * covariance) if sure else None
 
     def _rays(self, shared: Shared) -> tuple[Array, Array]:
         """([K, 2] rays, [K, 2, 5] their derivatives by the numbers of the camera; 0 where those are not estimated)."""
@@ -207,6 +191,75 @@ DIFFERENCE = 1e-5
 """Step of the numbers of a camera by which rays are differentiated: rays are exact to 1e-11."""
 
 
+def outward_motion(corners: Array, square: NDArray[np.bool_]) -> Array:
+    """[K, D]: how corners [K, D] of quads, of which each is in a plane, move where each side of a quad gets longer by 1.
+
+    Each edge moves outwards by a half, along its normal; a corner stays where its two edges meet. square [K]: as in CornerTerm.
+    """
+    quads = corners[square].reshape(-1, 4, corners.shape[1])
+    along = np.roll(quads, -1, axis=1) - quads
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    before = np.roll(along, 1, axis=1)
+    # n1 d = n2 d = 1/2 with normals across the unit directions a and b: d = (a - b) / (2 |a x b|), outwards for either sense.
+    sine = np.sqrt(1.0 - (before * along).sum(axis=2, keepdims=True) ** 2)
+    motion = np.zeros_like(corners)
+    motion[square] = ((before - along) / (2.0 * sine)).reshape(-1, corners.shape[1])
+    return motion
+
+
+def find_rolling(term: CornerTerm, solution: Solution, height: int) -> Doubt | None:
+    """What a rolling shutter does to each pose; None where corners do not ask for it, or it moves the poses by too little.
+
+    Each view may have moved evenly from its first row to its last of `height`, which one step of Gauss and Newton finds
+    beside its pose. All corners count alike: what rows do to markers is noise to their modes. An F test over all views.
+    """
+    poses = solution.poses
+    rows = dataclasses.replace(term, sigma_px=np.full(4, term.sigma_px[0])).rows(poses, solution.shared)
+    share, prior = np.repeat(term.focal[1] * term.rays[:, 1] / height, 2), np.diag(np.repeat([0.0, SWEPT**-2], POSE))
+    motion, covariance, gain, left = np.zeros((len(poses), POSE)), np.zeros((len(poses), POSE, POSE)), 0.0, 0.0
+    for number in range(len(poses)):
+        J, residual, _ = rows.of_view(number)
+        both = np.concatenate([J, share[rows.view[:, 0] == number, None] * J], axis=1)
+        inverse = np.linalg.pinv(both.T @ both + prior, hermitian=True)
+        step = -inverse @ (both.T @ residual)
+        motion[number], covariance[number] = step[:POSE], inverse[:POSE, :POSE]
+        gain, left = gain - float(step @ (both.T @ residual)), left + float(residual @ residual)
+    degrees = POSE * len(poses), len(rows.residual) - 2 * POSE * len(poses)
+    shift_m = np.linalg.norm(motion[:, :3], axis=1)
+    if min(degrees) <= 0 or float(np.median(shift_m / np.linalg.norm(poses[:, :3, 3], axis=1))) < MATERIAL:
+        return None
+    variance = (left - gain) / degrees[1]
+    if gain <= EXPLAINED * left or variance_ratio.sf(gain / (degrees[0] * variance), *degrees) >= LEVEL:
+        return None
+    note = (
+        "the corners lie as if the camera moved while the rows of an image were read, which moves the poses by "
+        f"{1000 * float(np.median(shift_m)):.1f} mm: hold it still for each photograph, or use a global shutter"
+    )
+    return Doubt(motion, variance * covariance, note)
+
+
+# ---------------------------------------------------------------------------------------------- the camera
+
+FREE = np.array([0.1, 0.1, 0.1, 0.1, 1.0])
+"""Sigma of fx, fy, cx, cy (shares of the focal length) and k1 beforehand: wide, so that only what is not seen stays put."""
+ALIKE_PX = 0.01
+"""By so much markers may be displaced alike in all views, by what is printed beside them: no camera is blamed for it."""
+WEAK = 1e-3
+"""Of what one view tells of the camera, directions with less than this share of the strongest are left aside."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFit(Doubt):
+    """The camera by the markers of all views; significant: they ask for another than camera.json's.
+
+    is_known: the poses are nearer to the truth with this camera, by its own uncertainty.
+    """
+
+    camera: CaptureCamera
+    significant: bool
+    is_known: bool
+
+
 def corrected_camera(camera: CaptureCamera, numbers: Sequence[float] | Array) -> CaptureCamera:
     """The camera after the corrections (fx, fy, cx, cy, k1) of `Shared`."""
     k, (fx, fy, cx, cy, k1) = camera.intrinsics, (float(number) for number in numbers)
@@ -215,18 +268,82 @@ def corrected_camera(camera: CaptureCamera, numbers: Sequence[float] | Array) ->
     return dataclasses.replace(camera, intrinsics=k.model_copy(update=update), lens=lens)
 
 
-def outward_motion(corners: Array, square: NDArray[np.bool_] | None = None) -> Array:
-    """[K, D]: how corners [K, D] of quads, of which each is in a plane, move where each side of a quad gets longer by 1.
+def fit_camera(
+    held: CornerTerm, seen: tuple[Array, CaptureCamera], fixed: NDArray[np.bool_], begun: Solution, spec: Estimation
+) -> CameraFit | None:
+    """The camera by the corners of all views, begun at their poses; None where there are fewer corners than unknowns.
 
-    Each edge moves outwards by a half, along its normal; a corner stays where its two edges meet. square [K]: as in CornerTerm.
+    An F test of the robust cost with and without another camera. What corners of one view have in common (blur, a bent board)
+    looks like another camera: where the views' own gradients scatter by more than independent corners make them, that is the
+    noise, with as many degrees of freedom as views and numbers have.
     """
-    own = np.ones(len(corners), np.bool_) if square is None else square
-    quads = corners[own].reshape(-1, 4, corners.shape[1])
-    along = np.roll(quads, -1, axis=1) - quads
-    along /= np.linalg.norm(along, axis=2, keepdims=True)
-    before = np.roll(along, 1, axis=1)
-    # n1 d = n2 d = 1/2 with normals across the unit directions a and b: d = (a - b) / (2 |a x b|), outwards for either sense.
-    sine = np.sqrt(1.0 - (before * along).sum(axis=2, keepdims=True) ** 2)
-    moved = np.zeros_like(corners)
-    moved[own] = ((before - along) / (2.0 * sine)).reshape(-1, corners.shape[1])
-    return moved
+    size, count = len(FREE), len(begun.poses)
+    loose = np.zeros(count, bool)  # a pose that was given by hand is no measure of the camera
+    prior = np.concatenate([np.zeros(GROWTH_M), [GROW_M, GROW_PX], FREE])
+    corners, most = dataclasses.replace(held, seen=seen), spec.max_iterations
+    free = minimise(Problem([corners], prior, loose), begun.poses, begun.shared, most)
+    # A wrong camera makes corners look noisy: what is an outlier is known once it is right.
+    corners = corners.measured(free.poses, free.shared, spec)
+    free = minimise(Problem([corners], prior, loose), free.poses, free.shared, most)
+    without, no_camera = dataclasses.replace(corners, seen=None), np.arange(SHARED) < CAMERA.start
+    usual = minimise(Problem([without], prior * no_camera, loose), begun.poses, begun.shared, most)
+    rows = corners.rows(free.poses, free.shared)
+    degrees = len(rows.residual) - POSE * count - size - 2
+    if degrees < size or count < 2:
+        return None
+    variance = rows.cost / degrees
+    covariance = variance * free.covariance()
+    alike = 0.25 * len(rows.residual) * (ALIKE_PX / corners.sigma_px[0]) ** 2  # two of a marker's eight are its place
+    noise = size * variance * max(1.0, _scatter(rows, count, variance)) + alike
+    ratio = (without.rows(usual.poses, usual.shared).cost - rows.cost) / noise
+    significant = bool(variance_ratio.sf(ratio, size, size * (count - 1)) < LEVEL)
+    motion = np.stack([motion_between(a, b) for a, b in zip(begun.poses, free.poses, strict=True)])
+    motion[fixed] = 0.0
+    of_camera, by_camera = covariance[-size:, -size:], covariance[:-SHARED, -size:].reshape(count, POSE, size)
+    of_poses = np.einsum("vij,jk,vlk->vil", by_camera, np.linalg.inv(of_camera), by_camera)
+    shift_m, unsure_m = np.linalg.norm(motion[:, :3], axis=1), np.sqrt(np.trace(of_poses[:, :3, :3], axis1=1, axis2=2))
+    numbers, camera = np.array(free.shared.camera), corrected_camera(seen[1], free.shared.camera)
+    note = ""
+    if significant and float(np.max(shift_m / np.linalg.norm(begun.poses[:, :3, 3], axis=1))) >= MATERIAL:
+        sure = np.abs(numbers) > SIGNIFICANT * np.sqrt(np.diag(of_camera))
+        note = _camera_note(compare_cameras(camera, seen[1], sure), float(np.median(shift_m)))
+    is_known = significant and bool(np.median(shift_m) > np.median(unsure_m))
+    return CameraFit(motion, of_poses, note, camera, significant, is_known)
+
+
+def _scatter(rows: Rows, views: int, variance: float) -> float:
+    """Mean, over the views, of what their gradients by the camera come to over what independent corners make them."""
+    ratios = []
+    for number in range(views):
+        J, residual, by = rows.of_view(number)
+        if len(J) <= POSE:
+            continue
+        by = by[:, CAMERA] - J @ np.linalg.pinv(J.T @ J, hermitian=True) @ (
+            J.T @ by[:, CAMERA]
+        )  # what no pose takes up
+        strength, directions = np.linalg.eigh(by.T @ by)
+        kept = strength > WEAK * strength[-1]
+        along = directions[:, kept].T @ (by.T @ residual)
+        ratios.append(float((along**2 / strength[kept]).mean()) / variance)
+    return float(np.mean(ratios)) if ratios else 1.0
+
+
+def _camera_note(numbers: str, shift_m: float) -> str:
+    if not numbers:
+        return (
+            "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is "
+            "wrong: calibrate the camera at this size of image, or take views from more sides"
+        )
+    return (
+        f"camera.json does not fit: the markers say {numbers}, which moves the poses by {1000 * shift_m:.1f} mm. Calibrate the "
+        "camera at this size of image, or use --calibrate (estimation.calibrate), which takes what the markers say"
+    )
+
+
+def compare_cameras(camera: CaptureCamera, given: CaptureCamera, chosen: NDArray[np.bool_] | None = None) -> str:
+    """Numbers of two cameras in words, as camera.json has them with pixel_centre 0: all five, or those chosen."""
+    k, of = camera.intrinsics, given.intrinsics
+    pairs = [(k.fx, of.fx), (k.fy, of.fy), (k.cx_opencv, of.cx_opencv), (k.cy_opencv, of.cy_opencv)]
+    words = [f"{name} = {a:.1f} ({b:.1f} given)" for name, (a, b) in zip(("fx", "fy", "cx", "cy"), pairs, strict=True)]
+    words.append(f"k1 = {camera.lens[0]:.4f} ({given.lens[0]:.4f} given)")
+    return ", ".join(word for n, word in enumerate(words) if chosen is None or chosen[n])

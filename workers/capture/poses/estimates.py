@@ -1,34 +1,16 @@
 """The three estimates of a whole capture: by markers, by the article's method, and by all views in one problem."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
-from schemas.job.captures import Board, Estimation
-from workers.capture.poses.camera_fit import CameraFit, camera_note, fit_camera
-from workers.capture.poses.joint import Joint, Views, gather, measure_corners, solve_jointly
-from workers.capture.poses.markers import (
-    AMBIGUOUS,
-    MIN_CORNERS,
-    MOST_REPROJECTION_PX,
-    SETTLED,
-    Evidence,
-    Fit,
-    Judged,
-    MarkerPose,
-    cross_matrix,
-    is_ambiguous,
-    judge,
-    median_reprojection,
-    motion_between,
-)
+from workers.capture.poses.corners import Doubt, find_rolling, fit_camera
+from workers.capture.poses.joint import BoardTerm, Joint, Views, gather, measure_corners, solve_jointly
+from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
 from workers.capture.poses.terms import (
     NAMES,
@@ -36,62 +18,57 @@ from workers.capture.poses.terms import (
     PRINT_SCALE,
     SHARED,
     SIGNIFICANT,
-    BoardTerm,
-    ObjectTerm,
     Shared,
-    identified,
+    correct_depth,
+    cross_matrix,
+    motion_between,
 )
 from workers.geometry.frames import invert, pose, transform
 
 ARTICLE_SCALE_M = 0.02
 """Distance from which on a corner's loss grows linearly and no longer with the square: depth at an edge may be the floor's."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    T_board_cam: Pose
-    covariance: Array
-    iterations: int
-    converged: bool
+ARTICLE_SETTLED = 1e-8
+"""A step of fewer metres and radians ends a fit."""
 
 
 def estimate_article(evidence: Evidence) -> CaptureEstimate:
     """Each view by itself, begun at its pose from markers."""
     views: list[ViewEstimate] = []
     most, converged = 0, True
-    for observation, found in zip(evidence.observations, evidence.markers, strict=True):
-        judgement = Judged(None, faults=(found.reason,))
-        if observation.manual_T_board_cam is not None:
-            judgement = Judged(observation.manual_T_board_cam, remarks=(observation.given_by,))
-        elif found.fit is not None:
-            fitted = fit_article(observation.corners, found.fit.T_board_cam, evidence.spec.max_iterations)
-            lifted = int((observation.corners.depth_m > 0).sum())
-            judgement = Judged(None, faults=(f"{lifted} corners have depth, and {MIN_CORNERS} are needed",))
-            if fitted is not None:
-                judgement = Judged(fitted.T_board_cam, fitted.covariance, by_corners=False)
-                most, converged = max(most, fitted.iterations), converged and fitted.converged
-        views.append(judge(observation, judgement, evidence, DepthCorrection()))
+    for seen, view in zip(evidence.observations, evidence.markers, strict=True):
+        judgement, count = Judged(None, faults=(view.reason,)), int((seen.corners.depth_m > 0).sum())
+        if seen.manual_T_board_cam is not None:
+            judgement = Judged(seen.manual_T_board_cam, remarks=(seen.given_by,))
+        elif view.fit is not None and count < MIN_CORNERS:
+            judgement = Judged(None, faults=(f"{count} corners have depth, and {MIN_CORNERS} are needed",))
+        elif view.fit is not None:
+            T, covariance, steps = fit_article(seen.corners, view.fit.T_board_cam, evidence.spec.max_iterations)
+            judgement = Judged(T, covariance, by_corners=False)
+            most, converged = max(most, steps), converged and steps < evidence.spec.max_iterations
+        views.append(judge(seen, judgement, evidence, DepthCorrection()))
     return CaptureEstimate("article", tuple(views), iterations=most, converged=converged)
 
 
-def fit_article(corners: Corners, start: Pose, max_iterations: int = 100) -> _Fitted | None:
-    """The pose of least robust distance between lifted corners and their places on the board; None without enough depth.
+def fit_article(corners: Corners, start: Pose, max_iterations: int = 100) -> tuple[Pose, Array, int]:
+    """(the pose of least robust distance between lifted corners and their places on the board, its covariance, iterations).
 
     The loss of a corner is 2 (sqrt(1 + (d / scale)^2) - 1), d its distance. Each step is the closed solution of weighted
     least squares (Umeyama 1991) with the weights that the loss has at the step before, which never makes it larger.
+    The covariance [6, 6] is by the spread of the distances; a bias that all corners share does not show in it.
     """
     lifted = corners.depth_m > 0
-    if lifted.sum() < MIN_CORNERS:
-        return None
     z, board = corners.depth_m[lifted], corners.board[lifted]
     points = np.column_stack([corners.rays[lifted] * z[:, None], z])
-    T, iterations, converged = start, 0, False
-    while iterations < max_iterations and not converged:
+    T, iterations, settled = start, 0, False
+    while iterations < max_iterations and not settled:
         squares = ((transform(T, points) - board) ** 2).sum(axis=1) / ARTICLE_SCALE_M**2
         before, T = T, _align(points, board, 1.0 / np.sqrt(1.0 + squares))
         iterations += 1
-        converged = float(np.abs(motion_between(before, T)).max()) < SETTLED
-    return _Fitted(T, _covariance(T, points, board), iterations, converged)
+        settled = float(np.abs(motion_between(before, T)).max()) < ARTICLE_SETTLED
+    difference, R = transform(T, points) - board, np.broadcast_to(T[:3, :3], (len(points), 3, 3))
+    jacobian = np.concatenate([R, -R @ cross_matrix(points)], axis=2).reshape(-1, POSE)
+    variance = float((difference**2).sum()) / max(1, difference.size - POSE)
+    return T, np.asarray(variance * np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), np.float64), iterations
 
 
 def _align(points: Array, goals: Array, weight: Array) -> Pose:
@@ -103,95 +80,23 @@ def _align(points: Array, goals: Array, weight: Array) -> Pose:
     return pose(R, goal - R @ middle)
 
 
-def _covariance(T: Pose, points: Array, board: Array) -> Array:
-    """[6, 6] by the spread of the distances themselves; a bias that all corners share does not show in it."""
-    difference = points @ T[:3, :3].T + T[:3, 3] - board
-    jacobian = np.concatenate(
-        [np.broadcast_to(T[:3, :3], (len(points), 3, 3)), -T[:3, :3] @ cross_matrix(points)], axis=2
-    )
-    free = max(1, difference.size - 6)
-    information = np.einsum("kij,kil->jl", jacobian, jacobian)
-    variance = float((difference**2).sum()) / free
-    return np.asarray(variance * np.linalg.pinv(information, hermitian=True), np.float64)
-
-
 def estimate_markers(evidence: Evidence) -> CaptureEstimate:
     """Each view by itself; the sigma of a corner, which tells how certain a pose is, is measured over all of them."""
-    views = [
-        judge(observation, judged(found, evidence.corner_px), evidence, DepthCorrection())
-        for observation, found in zip(evidence.observations, evidence.markers, strict=True)
-    ]
-    return CaptureEstimate("markers", tuple(views), notes=(f"sigma of a corner: {evidence.corner_px:.3f} px",))
+    views = tuple(_by_markers(n, evidence, DepthCorrection()) for n in range(len(evidence.observations)))
+    return CaptureEstimate("markers", views, notes=(f"sigma of a corner: {evidence.corner_px:.3f} px",))
 
 
-def judged(found: MarkerPose, corner_px: float) -> Judged:
+def _by_markers(index: int, evidence: Evidence, depth: DepthCorrection) -> ViewEstimate:
     """The pose from markers with its covariance, and whether it is ambiguous."""
-    if found.fit is None:
-        return Judged(None, faults=(found.reason,))
-    faults = []
-    if is_ambiguous(found, corner_px):
-        faults.append("ambiguous: a pose of another tilt fits the markers as well (planar target)")
-    covariance = np.asarray(corner_px**2 * np.linalg.pinv(found.fit.information, hermitian=True), np.float64)
-    return Judged(found.fit.T_board_cam, covariance, tuple(faults))
+    view, judgement = evidence.markers[index], Judged(None, faults=(evidence.markers[index].reason,))
+    if view.fit is not None:
+        told = "ambiguous: a pose of another tilt fits the markers as well (planar target)"
+        faults = (told,) if view.is_ambiguous(evidence.corner_px) else ()
+        judgement = Judged(view.fit.T_board_cam, view.fit.covariance(evidence.corner_px), faults)
+    return judge(evidence.observations[index], judgement, evidence, depth)
 
 
-SCALES_DIFFER = 0.01
-"""Print and depth disagree: smaller differences may be errors of depth that change with distance, within specification."""
-
-
-def scale_note(joint: Joint, board: Board, spec: Estimation) -> str:
-    """Whether print and depth disagree about the scale, which no capture can decide; empty where they agree."""
-    shared = joint.solution.shared
-    index = PRINT_SCALE if spec.trust == "depth" else NAMES.index("scale")
-    # The scale of depth turns a measured length into a true one; the print's does so for a length of board.json.
-    excess = (shared.print_scale if spec.trust == "depth" else 1.0 / shared.scale) - 1.0
-    sigma = math.sqrt(max(0.0, float(joint.covariance[index - SHARED, index - SHARED])))
-    if joint.prior[index] == 0 or abs(excess) < max(SCALES_DIFFER, SIGNIFICANT * sigma):
-        return ""
-    larger = "larger" if excess > 0 else "smaller"
-    start = (
-        "print and depth disagree about the scale: "
-        f"by depth the print is {100 * abs(excess):.1f} % {larger} than board.json says"
-    )
-    if board.measured_ruler_m is not None:
-        return f"{start}, although its ruler was measured; the ruler was believed" if spec.trust == "print" else start
-    believed = "the print" if spec.trust == "print" else "depth"
-    return (
-        f"{start}. Which is right cannot be identified from the capture alone; {believed} was believed. "
-        f"Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as measured_ruler_m"
-    )
-
-
-def _less_certain(view: ViewEstimate, motion: Array, covariance: Array) -> ViewEstimate:
-    """The view with a motion [6] that it may need, and the covariance [6, 6] of that, in its own, whether it is used or not."""
-    if view.covariance is None:
-        return view
-    return dataclasses.replace(view, covariance=view.covariance + np.outer(motion, motion) + covariance)
-
-
-def noise_notes(joint: Joint, views: Views) -> list[str]:
-    """The sigmas that the terms were weighed with."""
-    notes = [f"sigma of a corner: {views.sigma_px[0]:.3f} px"]
-    if joint.board is not None:
-        growth = joint.board.patches.ray_z[:, 2] ** 2
-        notes.append(f"depth of the board: {_weights(joint.board, joint.board.view, growth)}")
-    if joint.surface is not None:
-        first, second = joint.surface.pairs.T
-        z = joint.surface.patches.ray_z[:, 2]
-        notes.append(
-            f"depth of the object: {_weights(joint.surface, joint.surface.view[first], np.hypot(z[first] ** 2, z[second] ** 2))}"
-        )
-    if joint.board is None and joint.surface is None:
-        notes.append("no depth on the board or the object: the joint estimate has corners alone")
-    return notes
-
-
-def _weights(term: BoardTerm | ObjectTerm, view: NDArray[np.int64], growth: Array) -> str:
-    """The sigma of a patch, and of all that the patches of one view tell together."""
-    together = np.bincount(view, 1.0 / (term.sigma_m**2 * term.inflation))
-    patch, whole = np.median(term.sigma_m / growth), np.median(1.0 / np.sqrt(together[together > 0]))
-    return f"sigma of a patch {1000 * patch:.2f} mm at 1 m, of all patches of a view together {1000 * whole:.2f} mm"
-
+# ---------------------------------------------------------------------------------------------- where the object stood
 
 WITHIN_RAD = 0.008
 """A point is compared with the patch of another view whose middle is at most so far from its direction: within the patch."""
@@ -283,107 +188,74 @@ def _compare(
     return agree, through
 
 
+# ---------------------------------------------------------------------------------------------- all views in one problem
+
 OFF_BOARD_MM = 10.0
 """A view whose depth lies farther off the board than this, after the correction, is flagged."""
 MIN_PATCHES = 4
 """So many patches of the board tell its tilt."""
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """Where a view begins: index among all views, pose, covariance by its markers, whether a rival pose remains possible."""
-
-    index: int
-    T_board_cam: Pose
-    covariance: Array
-    ambiguous: bool = False
-    fixed: bool = False
+SCALES_DIFFER = 0.01
+"""Print and depth disagree: smaller differences may be errors of depth that change with distance, within specification."""
 
 
 def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     """All views in one problem; a view that its markers do not fit stays as `markers` has it, and is flagged."""
-    starts = [s for n in range(len(evidence.observations)) if (s := _start(n, evidence)) is not None]
-    if not starts:
-        views = [_outside(n, evidence, Shared()) for n in range(len(evidence.observations))]
-        return CaptureEstimate("joint", tuple(views), notes=("no view has markers that fit the board",))
-    problem = measure_corners(_problem(starts, evidence), evidence.spec)
+    problem = _pose_problem(evidence)
+    if problem is None:
+        views = tuple(_by_markers(n, evidence, DepthCorrection()) for n in range(len(evidence.observations)))
+        return CaptureEstimate("joint", views, notes=("no view has markers that fit the board",))
+    problem = measure_corners(problem, evidence.spec)
     joint = solve_jointly(problem, evidence.spec)
-    fitted = fit_camera(problem, joint.solution, evidence.spec)
+    pixels = np.concatenate([o.corners.pixels for o in problem.observations])
+    camera = fit_camera(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
+    doubt: Doubt | None = camera if camera is not None and camera.note else None
+    doubt = doubt or find_rolling(problem.corner_term(), joint.solution, problem.camera.intrinsics.height)
+    everyone = list(range(len(problem.index)))
     # Poses of another camera see the object elsewhere although it rests.
-    doubtful = fitted is not None and fitted.significant and camera_note(fitted, evidence.camera, joint.solution.poses)
-    groups = [] if doubtful or problem.rolling(joint.solution) else _groups(problem, joint, list(range(len(starts))))
-    if len(groups) < 2:
-        return _result(starts, problem, joint, fitted, evidence)
-    elsewhere = {number for group in groups[1:] for number in group}
-    still = tuple(
-        dataclasses.replace(o, object_patches=no_patches()) if n in elsewhere else o
-        for n, o in enumerate(problem.observations)
-    )
-    problem = dataclasses.replace(problem, observations=still)
-    joint = solve_jointly(problem, evidence.spec)
-    numbers = [[problem.observations[n].number for n in group] for group in groups]
-    settled = len(_groups(problem, joint, groups[0])) == 1
-    return _mark_moved(_result(starts, problem, joint, fitted, evidence), numbers, settled)
+    groups = [everyone] if doubt else _groups(problem, joint, everyone)
+    if len(groups) > 1:
+        elsewhere = {number for group in groups[1:] for number in group}
+        still = tuple(
+            dataclasses.replace(o, object_patches=no_patches()) if n in elsewhere else o
+            for n, o in enumerate(problem.observations)
+        )
+        problem = dataclasses.replace(problem, observations=still)
+        joint = solve_jointly(problem, evidence.spec)
+    if doubt is None and camera is not None and (camera.significant or evidence.spec.calibrate):
+        doubt = camera
+    estimate = _result(problem, joint, doubt, evidence)
+    if len(groups) > 1:
+        numbers = [[problem.observations[n].number for n in group] for group in groups]
+        estimate = _mark_moved(estimate, numbers, len(_groups(problem, joint, groups[0])) == 1)
+    return dataclasses.replace(estimate, camera=camera.camera if camera is not None and camera.is_known else None)
 
 
-def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
-    """The views among these by where the object stands; poses that were given by hand are nobody's to doubt."""
-    if problem.fixed.any():
-        return [among]
-    term, sigma_m = joint.surface, 0.0
-    if term is not None:
-        z = term.patches.ray_z[term.pairs, 2]
-        sigma_m = float(np.median(term.sigma_m / np.hypot(z[:, 0] ** 2, z[:, 1] ** 2)))
-    # An object that moved pulls the poses after it: those by the board alone do not know of it.
-    solution, seen = joint.by_board, [problem.observations[n] for n in among]
-    own = solution.of_views()
-    lever = np.array([np.linalg.norm(T[:3, 3]) ** 2 for T in solution.poses])
-    unsure_m = np.sqrt(np.trace(own[:, :3, :3], axis1=1, axis2=2) + lever * np.trace(own[:, 3:, 3:], axis1=1, axis2=2))
-    groups = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
-    return [[among[n] for n in group] for group in groups]
-
-
-def _problem(starts: list[Start], evidence: Evidence) -> Views:
-    return Views(
-        tuple(evidence.observations[start.index] for start in starts),
-        np.stack([start.T_board_cam for start in starts]),
-        np.stack([start.covariance for start in starts]),
-        np.array([start.fixed for start in starts]),
-        evidence.camera,
-        np.full(4, evidence.corner_px),
-    )
-
-
-def _start(index: int, evidence: Evidence) -> Start | None:
-    """None for a view without a pose, or whose corners its pose does not explain."""
-    observation, found = evidence.observations[index], evidence.markers[index]
-    if observation.manual_T_board_cam is not None:
-        return Start(index, observation.manual_T_board_cam, np.zeros((POSE, POSE)), fixed=True)
-    if found.fit is None:
+def _pose_problem(evidence: Evidence) -> Views | None:
+    """The views with a pose that explains their corners, or that was given; None where there are none."""
+    chosen = []
+    for n, (seen, view) in enumerate(zip(evidence.observations, evidence.markers, strict=True)):
+        if seen.manual_T_board_cam is not None:
+            chosen.append((n, seen, seen.manual_T_board_cam, np.zeros((POSE, POSE)), True, False))
+        elif view.fit is not None and fits_board(seen, view.fit.T_board_cam, evidence.camera):
+            fit, is_open = view.fit, False
+            if view.rival is not None and view.is_ambiguous(evidence.corner_px):
+                scores = [
+                    option.cost / evidence.corner_px**2 + _tilt_misfit(seen, option.T_board_cam)
+                    for option in (fit, view.rival)
+                ]
+                fit, is_open = view.rival if scores[1] < scores[0] else fit, abs(scores[0] - scores[1]) < AMBIGUOUS
+            chosen.append((n, seen, fit.T_board_cam, fit.covariance(evidence.corner_px), False, is_open))
+    if not chosen:
         return None
-    off = median_reprojection(observation, found.fit.T_board_cam, evidence.camera, 1.0)
-    if off is None or off > MOST_REPROJECTION_PX:
-        return None
-    fit, ambiguous = _told_apart(observation, found, evidence)
-    covariance = evidence.corner_px**2 * np.linalg.pinv(fit.information, hermitian=True)
-    return Start(index, fit.T_board_cam, np.asarray(covariance, np.float64), ambiguous)
+    index, views, poses, covariance, fixed, ambiguous = zip(*chosen, strict=True)
+    sigma_px = np.full(4, evidence.corner_px)
+    pose_arrays = np.stack(poses), np.stack(covariance), np.array(fixed)
+    return Views(index, views, *pose_arrays, ambiguous, evidence.camera, sigma_px)
 
 
-def _told_apart(observation: Observation, found: MarkerPose, evidence: Evidence) -> tuple[Fit, bool]:
-    """(the fit that corners and the tilt of the board in depth together prefer, whether they leave it open)."""
-    fit, rival = found.fit, found.rival
-    assert fit is not None
-    if rival is None or not is_ambiguous(found, evidence.corner_px):
-        return fit, False
-    scores = [
-        one.cost / evidence.corner_px**2 + _tilt_misfit(observation, one.T_board_cam, evidence) for one in (fit, rival)
-    ]
-    return (rival if scores[1] < scores[0] else fit), abs(scores[0] - scores[1]) < AMBIGUOUS
-
-
-def _tilt_misfit(observation: Observation, T: Pose, evidence: Evidence) -> float:
+def _tilt_misfit(seen: Observation, T: Pose) -> float:
     """Misfit, in sigma squared, of the board's depth against the plane of the pose, its height left open."""
-    patches = observation.board_patches
+    patches = seen.board_patches
     if len(patches) < MIN_PATCHES:
         return 0.0
     height = transform(T, patches.ray_z)[:, 2]
@@ -391,79 +263,114 @@ def _tilt_misfit(observation: Observation, T: Pose, evidence: Evidence) -> float
     return float((np.minimum(np.abs(height - np.median(height)) / sigma, 5.0) ** 2).sum())
 
 
-def _outside(index: int, evidence: Evidence, shared: Shared) -> ViewEstimate:
-    """A view that is no part of the problem."""
-    observation, found = evidence.observations[index], evidence.markers[index]
-    return judge(observation, judged(found, evidence.corner_px), evidence, shared.correction(()))
+def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
+    """The views among these by where the object stands; poses that were given by hand are nobody's to doubt."""
+    if problem.fixed.any():
+        return [among]
+    term = joint.surface
+    sigma_m = 0.0 if term is None else float(np.median(term.sigma_m / term.growth))
+    # An object that moved pulls the poses after it: those by the board alone do not know of it.
+    solution, seen = joint.by_board, [problem.observations[n] for n in among]
+    covariance = solution.of_views()
+    place, turn = (np.trace(covariance[:, block, block], axis1=1, axis2=2) for block in (slice(3), slice(3, 6)))
+    unsure_m = np.sqrt(place + (solution.poses[:, :3, 3] ** 2).sum(axis=1) * turn)
+    groups = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
+    return [[among[n] for n in group] for group in groups]
 
 
-def _result(
-    starts: list[Start], problem: Views, joint: Joint, fitted: CameraFit | None, evidence: Evidence
-) -> CaptureEstimate:
+def _result(problem: Views, joint: Joint, doubt: Doubt | None, evidence: Evidence) -> CaptureEstimate:
+    """`doubt`: what the poses may need, which makes all but given ones less certain."""
     solution = joint.solution
-    misfit = fitted is not None and fitted.significant
-    told = camera_note(fitted, evidence.camera, solution.poses) if fitted is not None and misfit else ""
-    rolled = None if told else problem.rolling(solution)
-    asked = rolled or (fitted if misfit or evidence.spec.calibrate else None)
-    shared, sigma = solution.shared, np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
-    correction = shared.correction(identified(sigma, joint.prior))
-    wider, views = problem.corner_term().misfit(solution.poses, shared), {}
-    for place, start in enumerate(starts):
-        view = _joint_view(place, start, (problem, joint, evidence), float(wider[place]), correction)
-        if asked is not None and not start.fixed:
-            view = _less_certain(view, asked.motion[place], asked.covariance[place])
-        views[start.index] = view
-    for index in set(range(len(evidence.observations))) - set(views):
-        views[index] = _outside(index, evidence, shared)
+    sigma = np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
+    correction = correct_depth(solution.shared, sigma, joint.prior)
+    views = {
+        n: _by_markers(n, evidence, correction) for n in set(range(len(evidence.observations))) - set(problem.index)
+    }
+    for place, wider in enumerate(problem.corner_term().misfit(solution.poses, solution.shared)):
+        view = _joint_view(place, (problem, joint, evidence), float(wider), correction)
+        if doubt is not None and not problem.fixed[place] and view.covariance is not None:
+            motion = doubt.motion[place]
+            covariance = view.covariance + np.outer(motion, motion) + doubt.covariance[place]
+            view = dataclasses.replace(view, covariance=covariance)
+        views[problem.index[place]] = view
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
-    told = rolled.note if rolled is not None else told
-    notes = [told or scale_note(joint, evidence.board, evidence.spec), *noise_notes(joint, problem)]
-    return CaptureEstimate(
-        "joint",
-        tuple(views[index] for index in sorted(views)),
-        correction,
-        shared.print_scale,
-        solution.iterations,
-        solution.converged,
-        tuple(note for note in notes if note),
-        fitted.camera if fitted is not None and fitted.is_known() else None,
-    )
+    cause = doubt.note if doubt is not None and doubt.note else scale_note(joint, sigma, evidence)
+    notes = tuple(note for note in (cause, *noise_notes(joint, problem)) if note)
+    ordered = tuple(views[index] for index in sorted(views))
+    scale, steps = solution.shared.print_scale, solution.iterations
+    return CaptureEstimate("joint", ordered, correction, scale, steps, solution.converged, notes)
 
 
 def _joint_view(
-    place: int, start: Start, solved: tuple[Views, Joint, Evidence], wider: float, correction: DepthCorrection
+    place: int, solved: tuple[Views, Joint, Evidence], wider: float, correction: DepthCorrection
 ) -> ViewEstimate:
     """The view at a place of the problem, judged; its covariance is at least `wider` times that of independent corners."""
     problem, joint, evidence = solved
     block = slice(POSE * place, POSE * (place + 1))
     widening = problem.widening(place, max(evidence.corner_px, evidence.spec.corner_px))
-    observation = evidence.observations[start.index]
+    seen = evidence.observations[problem.index[place]]
     judgement = Judged(
         joint.solution.poses[place],
         joint.covariance[block, block] * max(wider, widening),
-        ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
-        (observation.given_by,) if start.fixed else (),
+        ("ambiguous: a pose of another tilt fits markers and depth as well",) * problem.ambiguous[place],
+        (seen.given_by,) * bool(problem.fixed[place]),
         by_corners=False,
     )
-    view = judge(observation, judgement, evidence, correction, joint.solution.shared.print_scale)
+    view = judge(seen, judgement, evidence, correction, joint.solution.shared.print_scale)
     if view.depth_mm is None or view.depth_mm <= OFF_BOARD_MM:
         return view
-    reason = f"depth lies {view.depth_mm:.1f} mm off the board, after the correction"
+    return _flagged(view, f"depth lies {view.depth_mm:.1f} mm off the board, after the correction")
+
+
+def _flagged(view: ViewEstimate, reason: str) -> ViewEstimate:
     return dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
 
 
 def _mark_moved(estimate: CaptureEstimate, groups: list[list[int]], settled: bool) -> CaptureEstimate:
     """The views of all groups but the largest are flagged, and all of them where no group is worth the name."""
     places = "; ".join(f"views {', '.join(map(str, group))}" for group in groups)
-    told = f"the object moved on the board; it stands still within each of: {places}"
+    note = f"the object moved on the board; it stands still within each of: {places}. "
     few = len(groups[0]) < FEWEST_VIEWS or not settled
-    told += ". No group is large enough to be used" if few else ". The first of these is used"
-    flagged = {number for group in (groups if few else groups[1:]) for number in group}
-    reason = "the object stands elsewhere on the board than in most views" if not few else told
-    views = [
-        dataclasses.replace(view, status="flagged", reasons=(*view.reasons, reason))
-        if view.status != "refused" and view.number in flagged
-        else view
+    note += "No group is large enough to be used" if few else "The first of these is used"
+    flagged = {number for group in groups[0 if few else 1 :] for number in group}
+    reason = note if few else "the object stands elsewhere on the board than in most views"
+    views = tuple(
+        _flagged(view, reason) if view.status != "refused" and view.number in flagged else view
         for view in estimate.views
-    ]
-    return dataclasses.replace(estimate, views=tuple(views), notes=(told, *estimate.notes))
+    )
+    return dataclasses.replace(estimate, views=views, notes=(note, *estimate.notes))
+
+
+def scale_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
+    """Whether print and depth disagree about the scale, which no capture can decide; empty where they agree."""
+    shared, board, by_print = joint.solution.shared, evidence.board, evidence.spec.trust == "print"
+    index = NAMES.index("scale") if by_print else PRINT_SCALE
+    # The scale of depth turns a measured length into a true one; the print's does so for a length of board.json.
+    excess = (1.0 / shared.scale if by_print else shared.print_scale) - 1.0
+    if joint.prior[index] == 0 or abs(excess) < max(SCALES_DIFFER, SIGNIFICANT * sigma[index]):
+        return ""
+    start = (
+        "print and depth disagree about the scale: by depth the print is "
+        f"{100 * abs(excess):.1f} % {'larger' if excess > 0 else 'smaller'} than board.json says"
+    )
+    if board.measured_ruler_m is not None:
+        return f"{start}, although its ruler was measured; the ruler was believed" if by_print else start
+    return (
+        f"{start}. Which is right cannot be identified from the capture alone; {'the print' if by_print else 'depth'} was "
+        f"believed. Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as "
+        "measured_ruler_m"
+    )
+
+
+def noise_notes(joint: Joint, views: Views) -> list[str]:
+    """The sigmas that the terms were weighed with: of a corner, of a patch, and of all that a view's patches tell together."""
+    notes = [f"sigma of a corner: {views.sigma_px[0]:.3f} px"]
+    for name, term in (("board", joint.board), ("object", joint.surface)):
+        if term is None:
+            continue
+        view = term.view if isinstance(term, BoardTerm) else term.view[term.pairs[:, 0]]
+        together = np.bincount(view, 1.0 / (term.sigma_m**2 * term.inflation))
+        patch, whole = np.median(term.sigma_m / term.growth), np.median(1.0 / np.sqrt(together[together > 0]))
+        of_patch = f"sigma of a patch {1000 * patch:.2f} mm at 1 m"
+        notes.append(f"depth of the {name}: {of_patch}, of all patches of a view together {1000 * whole:.2f} mm")
+    return notes if notes[1:] else [*notes, "no depth on the board or the object: the joint estimate has corners alone"]

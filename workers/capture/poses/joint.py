@@ -6,37 +6,108 @@ independent patches.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cholesky
 from scipy.spatial import cKDTree
 
 from schemas.base import Array
 from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
-from workers.capture.poses.corners import CornerTerm, Rolling
-from workers.capture.poses.markers import focal_lengths, moved
+from workers.capture.poses.corners import CornerTerm
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Observation, Patches
 from workers.capture.poses.terms import (
+    DEPTH_SCALE,
     GROW_M,
     GROW_PX,
     GROWTH_M,
     GROWTH_PX,
     MAD,
-    POSE,
     SHARED,
-    BoardTerm,
-    ObjectTerm,
+    Problem,
+    Rows,
     Shared,
+    Solution,
+    Term,
     median_of_chi_square,
-    normal_equations,
+    minimise,
     pose_halves,
     prior_sigma,
+    robust,
 )
-from workers.geometry.frames import add_up
+
+# ---------------------------------------------------------------------------------------------- depth
+
+
+@dataclass(frozen=True, eq=False)
+class BoardTerm:
+    """Depth of the board: patches of all views lie on its plane. view, sigma_m, inflation of their variance: each [P]."""
+
+    view: NDArray[np.int64]
+    patches: Patches
+    sigma_m: Array
+    inflation: Array
+
+    @property
+    def growth(self) -> Array:
+        """[P]: sigma of each row over that at 1 m: the distance squared."""
+        return np.asarray(self.patches.ray_z[:, 2] ** 2)
+
+    def rows(self, poses: Array, shared: Shared) -> Rows:
+        """One row a patch: its height over the board."""
+        p, sigma_m = shared.corrected(self.patches), self.sigma_m * shared.scale
+        up = poses[self.view, 2, :3]
+        residual = ((p * up).sum(axis=1) + poses[self.view, 2, 3]) / sigma_m
+        by_point = up / sigma_m[:, None]
+        by_shared = np.einsum("pi,pij->pj", by_point, shared.derivative(self.patches))
+        by_shared[:, DEPTH_SCALE] -= residual / shared.scale
+        weight, cost = robust(residual**2, 1.0 / self.inflation)
+        return Rows(residual, self.view[:, None], by_motion(by_point, p)[:, None], by_shared, weight, cost)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTerm:
+    """Depth of the object: patches of two views lie on one surface. view [P].
+
+    pairs [N, 2] of patches, the lower first; normal [N, 3]: unit, their mean, board axes; sigma_m, inflation [N].
+    """
+
+    view: NDArray[np.int64]
+    patches: Patches
+    pairs: NDArray[np.int64]
+    normal: Array
+    sigma_m: Array
+    inflation: Array
+
+    @property
+    def growth(self) -> Array:
+        """[N]: sigma of each row over that of a patch at 1 m."""
+        return np.asarray(np.linalg.norm(self.patches.ray_z[self.pairs, 2] ** 2, axis=1))
+
+    def rows(self, poses: Array, shared: Shared) -> Rows:
+        """One row a pair: the distance between the two along their common normal."""
+        p, by = shared.corrected(self.patches)[self.pairs], shared.derivative(self.patches)[self.pairs]
+        view = self.view[self.pairs]
+        R, t = poses[view, :3, :3], poses[view, :3, 3]
+        placed = np.einsum("nkij,nkj->nki", R, p) + t
+        sigma_m = self.sigma_m * shared.scale
+        residual = ((placed[:, 0] - placed[:, 1]) * self.normal).sum(axis=1) / sigma_m
+        along = np.einsum("nkji,nj->nki", R, self.normal / sigma_m[:, None]) * np.array([[1.0], [-1.0]])
+        by_shared = np.einsum("nki,nkij->nj", along, by)
+        by_shared[:, DEPTH_SCALE] -= residual / shared.scale
+        weight, cost = robust(residual**2, 1.0 / self.inflation)
+        return Rows(residual, view, by_motion(along, p), by_shared, weight, cost)
+
+
+Depth = TypeVar("Depth", BoardTerm, ObjectTerm)
+
+
+def by_motion(along: Array, points: Array) -> Array:
+    """[..., 6]: derivative, by a small motion of the camera, of the coordinate of its points [..., 3] along [..., 3]."""
+    return np.concatenate([along, np.cross(points, along)], axis=-1)
+
 
 REACH_M = 0.012
 """Patches of one surface lie at most so far apart: about their own width."""
@@ -47,14 +118,6 @@ PARTNERS = 3
 """Of the nearest patches of other views, so many are paired with each."""
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
-    """pairs [N, 2]: indices of patches, of two views, the lower first; normal [N, 3]: unit, their mean, board axes."""
-
-    pairs: NDArray[np.int64]
-    normal: Array
-
-
 def placed(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shared) -> tuple[Array, Array]:
     """(points [P, 3], normals [P, 3]) of patches in the board frame; the normal of depth that is stretched is kept."""
     R, t = poses[view, :3, :3], poses[view, :3, 3]
@@ -62,33 +125,34 @@ def placed(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shar
     return points, np.einsum("pij,pj->pi", R, patches.normal @ shared.T_cam_depth[:3, :3].T)
 
 
-def match_patches(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shared) -> Matches:
-    """The pairs at the present poses, each once, in order of index."""
+def match_patches(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shared) -> ObjectTerm:
+    """The pairs at the present poses, each once, in order of index; as noisy as patches at 1 m are, times their growth."""
+    none = np.zeros(0)
     if len(patches) < 2:
-        return Matches(np.zeros((0, 2), np.int64), np.zeros((0, 3)))
+        return ObjectTerm(view, patches, np.zeros((0, 2), np.int64), np.zeros((0, 3)), none, none)
     points, normals = placed(patches, view, poses, shared)
     count = min(NEIGHBOURS + 1, len(points))
     distance, neighbour = cKDTree(points).query(points, k=count, distance_upper_bound=REACH_M)
-    found = np.isfinite(distance)
-    neighbour = np.where(found, neighbour, 0)
-    alike = np.einsum("pi,pki->pk", normals, normals[neighbour]) > MIN_COSINE
-    normals = _smoothed(normals, neighbour, found & alike)
-    alike = np.einsum("pi,pki->pk", normals, normals[neighbour]) > MIN_COSINE
-    good = found & alike & (view[neighbour] != view[:, None])
+    near = np.isfinite(distance)
+    neighbour = np.where(near, neighbour, 0)
+
+    def are_alike() -> NDArray[np.bool_]:
+        return near & (np.einsum("pi,pki->pk", normals, normals[neighbour]) > MIN_COSINE)
+
+    # The surface bends less over a patch than its normal's noise: the mean of the normals around it is taken.
+    total = (normals[neighbour] * are_alike()[..., None]).sum(axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    normals = np.where(length > 0.5, total / np.maximum(length, 1e-9), normals)
+    good = are_alike() & (view[neighbour] != view[:, None])
     good &= np.cumsum(good, axis=1) <= PARTNERS
     first, column = np.nonzero(good)
-    pairs = np.sort(np.stack([first, neighbour[first, column]], axis=1), axis=1).astype(np.int64)
-    pairs = np.unique(pairs, axis=0)
-    normal = normals[pairs[:, 0]] + normals[pairs[:, 1]]
-    return Matches(pairs, normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    pairs = np.unique(np.sort(np.stack([first, neighbour[first, column]], axis=1), axis=1), axis=0).astype(np.int64)
+    normal = normals[pairs].sum(axis=1)
+    term = ObjectTerm(view, patches, pairs, normal / np.linalg.norm(normal, axis=1, keepdims=True), none, none)
+    return dataclasses.replace(term, sigma_m=term.growth, inflation=np.ones(len(pairs)))
 
 
-def _smoothed(normals: Array, neighbour: NDArray[np.intp], chosen: NDArray[np.bool_]) -> Array:
-    """[P, 3]: the mean of the normals around each patch: the surface bends less over a patch than its noise."""
-    total = (normals[neighbour] * chosen[..., None]).sum(axis=1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0.5, total / np.maximum(length, 1e-9), normals)
-
+# ---------------------------------------------------------------------------------------------- noise
 
 FLOOR_M = 2e-4
 """No patch is taken to be better than this at 1 m: stored depth has a step of 1 mm, and its errors are not all seen."""
@@ -121,8 +185,7 @@ def inflation(residual: Array, by_view: Array, view: NDArray[np.int64], pose_cov
         rank = int(kept.sum())
         if len(r) < 2 * rank or not rank:
             continue
-        weighted = 1.0 / (1.0 + (r / 3.0) ** 2)
-        along = directions[:, kept].T @ (J.T @ (weighted * r))
+        along = directions[:, kept].T @ (J.T @ (r * robust(r**2)[0]))
         misfit = float((along**2 / strength[kept]).sum())
         known = float(np.trace(J.T @ J @ pose_covariance[number]))
         ratios.append((misfit - known) / (rank * median_of_chi_square(rank)))
@@ -131,150 +194,56 @@ def inflation(residual: Array, by_view: Array, view: NDArray[np.int64], pose_cov
     return max(1.0, float(np.median(ratios))) ** 2
 
 
-def row_inflation(factor: float, sigma_m: Array, *views: NDArray[np.int64]) -> Array:
-    """[N]: inflation of each row of sigma_m [N], at least `factor`, so that no view's rows come to less than VIEW_FLOOR_M."""
-    count = np.max([np.bincount(view)[view] for view in views], axis=0)
+def row_inflation(factor: float, sigma_m: Array, view: NDArray[np.int64]) -> Array:
+    """[N]: inflation of each row of sigma_m [N], at least `factor`, so that no view's rows come to less than VIEW_FLOOR_M.
+
+    view [N, k]: the views of each row.
+    """
+    count = np.max([np.bincount(column)[column] for column in view.T], axis=0)
     return np.maximum(factor, count * (VIEW_FLOOR_M / sigma_m) ** 2)
 
 
-SETTLED = 1e-7
-"""A step of fewer metres and radians ends the iteration: a tenth of a micrometre."""
-
-
-Term = CornerTerm | BoardTerm | ObjectTerm
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """The terms; prior [S] sigma of the shared parameters, 0 for those that are fixed; fixed [V] poses that do not move."""
-
-    terms: Sequence[Term]
-    prior: Array
-    fixed: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """poses [V, 4, 4], the shared parameters, and the covariance [D, D], D = 6 V + S, zero where nothing moves."""
-
-    poses: Array
-    shared: Shared
-    matrix: Array
-    iterations: int
-    converged: bool
-
-    def of_views(self) -> Array:
-        """[V, 6, 6]: the covariance of each pose."""
-        count = len(self.poses)
-        blocks = self.covariance()[:-SHARED, :-SHARED].reshape(count, POSE, count, POSE)
-        return blocks[range(count), :, range(count)]
-
-    def covariance(self) -> Array:
-        """[D, D]: the inverse of the normal equations at the solution."""
-        free = np.diag(self.matrix) > 0
-        found = np.zeros_like(self.matrix)
-        upper = cholesky(_regular(self.matrix[np.ix_(free, free)]))
-        half = np.linalg.inv(upper)
-        found[np.ix_(free, free)] = half @ half.T
-        return found
-
-
-def minimise(problem: Problem, poses: Array, shared: Shared, most: int) -> Solution:
-    """The poses and shared parameters of least robust cost near a start, in at most `most` steps."""
-    damping, converged, iterations = 1e-6, False, 0
-    matrix, gradient, cost = _linearise(problem, poses, shared)
-    while iterations < most and not converged:
-        iterations += 1
-        step = _step(matrix, gradient, damping)
-        new_poses = np.stack(
-            [moved(T, motion) for T, motion in zip(poses, step[:-SHARED].reshape(-1, POSE), strict=True)]
-        )
-        new_shared = shared.moved(step[-SHARED:])
-        new_matrix, new_gradient, new_cost = _linearise(problem, new_poses, new_shared)
-        small = float(np.abs(step).max()) < SETTLED
-        if new_cost <= cost:
-            poses, shared, matrix, gradient, cost = new_poses, new_shared, new_matrix, new_gradient, new_cost
-            damping *= 0.1
-            converged = small
-        else:
-            damping = max(damping, 1e-6) * 10
-            converged = small or damping > 1e6
-    return Solution(poses, shared, matrix, iterations, converged)
-
-
-def _step(matrix: Array, gradient: Array, damping: float) -> Array:
-    free = np.diag(matrix) > 0
-    part = matrix[np.ix_(free, free)]
-    step = np.zeros(len(gradient))
-    step[free] = cho_solve(cho_factor(_regular(part + damping * np.diag(np.diag(part)))), -gradient[free])
-    return step
-
-
-def _regular(matrix: Array) -> Array:
-    """The matrix with so little on its diagonal that directions without any information (10 m or rad) can be factored."""
-    return matrix + 1e-2 * np.eye(len(matrix))
-
-
-def _linearise(problem: Problem, poses: Array, shared: Shared) -> tuple[Array, Array, float]:
-    """(matrix, gradient, cost); rows and columns of what is fixed are zero."""
-    rows = [term.rows(poses, shared) for term in problem.terms]
-    matrix, gradient = normal_equations(rows, len(poses))
-    free = problem.prior > 0
-    sigma = np.where(free, problem.prior, 1.0)
-    deviation = shared.deviation()
-    first = len(gradient) - SHARED
-    matrix[range(first, len(gradient)), range(first, len(gradient))] += 1.0 / sigma**2
-    gradient[first:] += deviation / sigma**2
-    held = np.concatenate([np.repeat(problem.fixed, POSE), ~free])
-    matrix[held], matrix[:, held], gradient[held] = 0.0, 0.0, 0.0
-    return matrix, gradient, add_up(r.cost for r in rows) + float(((deviation / sigma)[free] ** 2).sum())
-
+# ---------------------------------------------------------------------------------------------- all views
 
 ROUNDS = 4
 """How often the object's patches are paired anew."""
+NOISE_ROUNDS = 3
+"""How often poses and the noise of corners are found one by the other: the second round changes sigma by a few percent."""
 SURE_MARKERS = 12
 """Views of at least so many markers tell how noisy depth is, where there are a few of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The views of the problem in order, with their depth in one piece: poses [V, 4, 4] to begin with, covariance [V, 6, 6].
+    """The views of the problem in order: poses [V, 4, 4] to begin with, covariance [V, 6, 6] by their markers.
 
-    fixed [V]: a pose that was given by hand does not move.
+    index [V]: among all views of the capture; fixed [V]: a pose that was given by hand does not move; ambiguous [V]: a rival
+    pose remains possible.
     """
 
+    index: tuple[int, ...]
     observations: tuple[Observation, ...]
     poses: Array
     covariance: Array
     fixed: NDArray[np.bool_]
+    ambiguous: tuple[bool, ...]
     camera: CaptureCamera
     sigma_px: Array
 
     def corner_term(self) -> CornerTerm:
         """All corners, with the camera held."""
-        corners = [o.corners for o in self.observations]
-        view = np.repeat(np.arange(len(corners)), [len(c.board) for c in corners])
-        board, rays = np.concatenate([c.board for c in corners]), np.concatenate([c.rays for c in corners])
-        square = np.concatenate([c.markers for c in corners]) >= 0
-        return CornerTerm(view, board, rays, focal_lengths(self.camera), self.sigma_px, square)
-
-    def rolling(self, found: Solution) -> Rolling | None:
-        """What a rolling shutter does to the poses, where the corners ask for one."""
-        return self.corner_term().rolling(found.poses, found.shared, self.camera.intrinsics.height)
+        return CornerTerm.of([o.corners for o in self.observations], self.camera, self.sigma_px)
 
     def widening(self, place: int, single_px: float) -> float:
         """Factor of a view's covariance: whole markers are less noisy than corners (single_px); one marker has but its four."""
         single = (single_px / self.sigma_px[0]) ** 2
         return float(1.0 + max(0.0, single - 1.0) / max(1, self.observations[place].markers) ** 2)
 
-    def sure(self) -> NDArray[np.bool_]:
-        """[V]: views by which the noise of depth is measured."""
+    def sure(self, view: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """[N]: rows of views [N, k] by which the noise of depth is measured: those of many markers, or else all."""
         many = np.array([o.markers >= SURE_MARKERS for o in self.observations])
-        return many if many.sum() >= 4 else np.ones(len(many), bool)
-
-
-NOISE_ROUNDS = 3
-"""How often poses and the noise of corners are found one by the other: the second round changes sigma by a few percent."""
+        chosen = np.all((many if many.sum() >= 4 else np.ones_like(many))[view], axis=1)
+        return chosen if chosen.any() else np.ones_like(chosen)
 
 
 def measure_corners(views: Views, spec: Estimation) -> Views:
@@ -284,20 +253,19 @@ def measure_corners(views: Views, spec: Estimation) -> Views:
     """
     corners, prior, poses, shared = views.corner_term(), np.zeros(SHARED), views.poses, Shared()
     prior[[GROWTH_M, GROWTH_PX]] = GROW_M, GROW_PX
-    free = np.zeros_like(views.fixed)
     for _ in range(NOISE_ROUNDS):
-        found = minimise(Problem([corners], prior, free), poses, shared, spec.max_iterations)
-        poses, shared = found.poses, found.shared
+        solution = minimise(Problem([corners], prior, np.zeros_like(views.fixed)), poses, shared, spec.max_iterations)
+        poses, shared = solution.poses, solution.shared
         corners = corners.measured(poses, shared, spec)
     halves = pose_halves(corners.rows(poses, shared), len(poses))
-    covariance = halves @ halves.transpose(0, 2, 1)
     poses = np.where(views.fixed[:, None, None], views.poses, poses)
+    covariance = halves @ halves.transpose(0, 2, 1)
     return dataclasses.replace(views, poses=poses, covariance=covariance, sigma_px=corners.sigma_px)
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """The solution, that without the object, the noise of depth that it was weighed with (sigma at 1 m), and the pairs."""
+    """The solution with its covariance [D, D], that without the object, the prior [S], and the terms of depth as weighed."""
 
     solution: Solution
     by_board: Solution
@@ -312,33 +280,30 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
     on_board, board_view = gather([o.board_patches for o in views.observations])
     on_object, object_view = gather([o.object_patches for o in views.observations])
     prior = prior_sigma(spec, bool(len(on_board)) or bool(len(on_object)))
-    corners, held = views.corner_term(), np.ones(len(views.poses), bool)
-    shared, board = Shared(), None
+    terms: list[Term] = [views.corner_term()]
+    shared, board, surface = Shared(), None, None
     if len(on_board):
-        board = BoardTerm(board_view, on_board, DEPTH_SIGMA_M * on_board.ray_z[:, 2] ** 2, np.ones(len(on_board)))
-        start = Problem([corners, board] if spec.trust == "depth" else [board], prior, held)
+        term = BoardTerm(board_view, on_board, DEPTH_SIGMA_M * on_board.ray_z[:, 2] ** 2, np.ones(len(on_board)))
+        start = Problem([term], prior, np.ones_like(views.fixed))
         if spec.trust == "depth":  # a print of another size moves the cameras: they must be free
-            start = dataclasses.replace(start, fixed=views.fixed)
+            start = Problem([*terms, term], prior, views.fixed)
         first = minimise(start, views.poses, shared, 30)
-        shared = first.shared
-        board = _measured_board(board, views, first)
-    terms: list[Term] = [corners, *([board] if board else [])]
-    solution = minimise(Problem(terms, prior, views.fixed), views.poses, shared, spec.max_iterations)
-    by_board, surface, iterations, alike = solution, None, solution.iterations, 1.0
+        shared, board = first.shared, _measured_board(term, views, first)
+        terms.append(board)
+    by_board = solution = minimise(Problem(terms, prior, views.fixed), views.poses, shared, spec.max_iterations)
+    iterations, alike = solution.iterations, 1.0
     for _ in range(ROUNDS if len(on_object) else 0):
-        if iterations >= spec.max_iterations:
+        pairs = match_patches(on_object, object_view, solution.poses, solution.shared)
+        if iterations >= spec.max_iterations or not len(pairs.pairs):
             break
-        matches = match_patches(on_object, object_view, solution.poses, solution.shared)
-        measured = _measured_object(on_object, object_view, matches, views, solution)
-        if measured is None:
-            break
+        surface, factor = _measured_object(pairs, views, solution)
         # Poses that have followed the object's depth no longer show how far it had pulled them: the first rounds tell.
-        alike, surface = max(alike, measured[1]), measured[0]
-        first, second = object_view[matches.pairs].T
-        surface = dataclasses.replace(surface, inflation=row_inflation(alike, surface.sigma_m, first, second))
+        alike = max(alike, factor)
+        surface = dataclasses.replace(
+            surface, inflation=row_inflation(alike, surface.sigma_m, object_view[pairs.pairs])
+        )
         problem = Problem([*terms, surface], prior, views.fixed)
-        before = solution
-        solution = minimise(problem, before.poses, before.shared, spec.max_iterations - iterations)
+        solution = minimise(problem, solution.poses, solution.shared, spec.max_iterations - iterations)
         iterations += solution.iterations
     solution = dataclasses.replace(solution, iterations=iterations)
     return Joint(solution, by_board, solution.covariance(), prior, board, surface)
@@ -347,52 +312,35 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
 def gather(patches: list[Patches]) -> tuple[Patches, NDArray[np.int64]]:
     """(the patches of all views in one piece, [P] index of the view of each)."""
     view = np.repeat(np.arange(len(patches)), [len(p) for p in patches])
-    parts = zip(*[(p.ray_z, p.ray, p.normal, p.pixels, p.sigma_m) for p in patches], strict=True)
-    return Patches(*[np.concatenate(part) for part in parts]), view
+    names = [field.name for field in dataclasses.fields(Patches)]
+    return Patches(*[np.concatenate([getattr(p, name) for p in patches]) for name in names]), view
 
 
-def _measured_board(term: BoardTerm, views: Views, found: Solution) -> BoardTerm:
+def _with_sigma(term: Depth, views: Views, solution: Solution) -> tuple[Depth, Rows, NDArray[np.bool_]]:
+    """The term with the sigma of its patches by its own residuals, its rows, and which of them the noise is measured by."""
+    growth = term.growth
+    rows = dataclasses.replace(term, sigma_m=growth).rows(solution.poses, solution.shared)
+    chosen = views.sure(rows.view)
+    sigma = patch_sigma(rows.residual[chosen] * growth[chosen], growth[chosen])
+    term = dataclasses.replace(term, sigma_m=sigma * growth)
+    return term, term.rows(solution.poses, solution.shared), chosen
+
+
+def _measured_board(term: BoardTerm, views: Views, solution: Solution) -> BoardTerm:
     """The term with the sigma of its patches and their inflation as this capture's own residuals have them."""
-    growth = term.patches.ray_z[:, 2] ** 2
-    rows = dataclasses.replace(term, sigma_m=growth).rows(found.poses, found.shared)
-    chosen = views.sure()[term.view]
-    chosen = chosen if chosen.any() else np.ones_like(chosen)
-    sigma_m = patch_sigma(rows.residual[chosen] * growth[chosen], growth[chosen]) * growth
-    rows = dataclasses.replace(term, sigma_m=sigma_m).rows(found.poses, found.shared)
-    # Three numbers are what a plane tells: its height (z of the camera in the board frame) and its tilts.
-    up = found.poses[term.view, 2, :3]
-    by_plane = np.concatenate([np.full((len(up), 1), 1.0) / sigma_m[:, None], rows.by_first[:, 3:]], axis=1)
-    by_plane = np.where(np.isfinite(by_plane), by_plane, 0.0)
-    covariance = _plane_covariance(views, found.poses)
+    term, rows, chosen = _with_sigma(term, views, solution)
+    # What a plane tells: its height, along its normal, and the turn of the camera.
+    up = solution.poses[:, 2, :3]
+    by_plane = np.concatenate([1.0 / term.sigma_m[:, None], rows.by_view[:, 0, 3:]], axis=1)
+    take = np.zeros((len(up), 4, 6))
+    take[:, 0, :3], take[:, 1:, 3:] = up, np.eye(3)
+    covariance = take @ views.covariance @ take.transpose(0, 2, 1)
     factor = inflation(rows.residual[chosen], by_plane[chosen], term.view[chosen], covariance)
-    return dataclasses.replace(term, sigma_m=sigma_m, inflation=row_inflation(factor, sigma_m, term.view))
+    return dataclasses.replace(term, inflation=row_inflation(factor, term.sigma_m, rows.view))
 
 
-def _plane_covariance(views: Views, poses: Array) -> Array:
-    """[V, 4, 4]: of (height over the board along its normal, turn of the camera)."""
-    take = np.zeros((len(poses), 4, POSE))
-    take[:, 0, :3] = poses[:, 2, :3]
-    take[:, 1:, 3:] = np.eye(3)
-    return np.einsum("vij,vjk,vlk->vil", take, views.covariance, take)
-
-
-def _measured_object(
-    patches: Patches, view: NDArray[np.int64], matches: Matches, views: Views, found: Solution
-) -> tuple[ObjectTerm, float] | None:
-    """(the term of the pairs with their sigma by their own residuals, inflation); None where there are none."""
-    if not len(matches.pairs):
-        return None
-    a, b = matches.pairs.T
-    growth = np.hypot(patches.ray_z[a, 2] ** 2, patches.ray_z[b, 2] ** 2)
-    term = ObjectTerm(view, patches, matches.pairs, matches.normal, growth, np.ones(len(growth)))
-    residual = term.rows(found.poses, found.shared).residual
-    chosen = views.sure()[view[a]] & views.sure()[view[b]]
-    chosen = chosen if chosen.any() else np.ones_like(chosen)
-    sigma_m = patch_sigma(residual[chosen] * growth[chosen], growth[chosen]) * growth
-    rows = dataclasses.replace(term, sigma_m=sigma_m).rows(found.poses, found.shared)
-    # Each pair tells of both of its views.
-    assert rows.second is not None and rows.by_second is not None
-    both = np.concatenate([rows.first[chosen], rows.second[chosen]])
-    by = np.concatenate([rows.by_first[chosen], rows.by_second[chosen]])
-    factor = inflation(np.tile(rows.residual[chosen], 2), by, both, found.of_views())
-    return dataclasses.replace(term, sigma_m=sigma_m), factor
+def _measured_object(term: ObjectTerm, views: Views, solution: Solution) -> tuple[ObjectTerm, float]:
+    """(the pairs with their sigma by their own residuals, inflation by both views of each)."""
+    term, rows, chosen = _with_sigma(term, views, solution)
+    view, by = rows.view[chosen].T.ravel(), rows.by_view[chosen].swapaxes(0, 1).reshape(-1, 6)
+    return term, inflation(np.tile(rows.residual[chosen], 2), by, view, solution.of_views())

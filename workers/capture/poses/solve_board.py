@@ -11,7 +11,6 @@ from itertools import combinations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -23,8 +22,9 @@ from workers.capture.board_kinds import board_of_markers
 from workers.capture.detect import find_markers, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
-from workers.capture.poses.markers import cross_matrix
-from workers.geometry.frames import invert, pose, transform
+from workers.capture.poses.markers import opencv_poses
+from workers.capture.poses.terms import cross_matrix
+from workers.geometry.frames import invert, transform
 from workers.geometry.lens import rays_of_pixels
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
@@ -111,20 +111,12 @@ def _see(folder: CaptureFolder, dictionary: "cv2.aruco.Dictionary", border_bits:
     return seen
 
 
-def _poses_of(square: Array, rays: Array) -> list[Pose]:
-    """Both poses T_cam_tag of a square by its picture, the likelier first."""
-    _, turns, shifts, _ = cv2.solvePnPGeneric(square, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
-    return [_pose(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
-
-
-def _pose(turn: NDArray, shift: NDArray) -> Pose:
-    """Of OpenCV's rotation vector and shift."""
-    return pose(np.asarray(cv2.Rodrigues(turn)[0], np.float64), np.asarray(shift, np.float64).ravel())
-
-
 def _join(seen: Seen, square: Array) -> tuple[dict[int, Pose], dict[int, Pose]]:
     """(T_board_tag by tag, that of the first being the board's; T_cam_board by view), by the best joined pairs."""
-    single = {view: {n: _poses_of(square, rays) for n, rays in tags.items()} for view, tags in seen.items()}
+    single = {
+        view: {n: opencv_poses(square, rays, cv2.SOLVEPNP_IPPE_SQUARE) for n, rays in tags.items()}
+        for view, tags in seen.items()
+    }
     pairs: dict[tuple[int, int], list[list[Pose]]] = {}
     for both in single.values():
         for a, b in combinations(sorted(both), 2):
@@ -169,9 +161,8 @@ def _views_of(seen: Seen, places: Mapping[int, Pose], square: Array) -> dict[int
             continue
         points = np.concatenate([transform(places[n], square) for n in known])
         rays = np.concatenate([tags[n] for n in known])
-        done, turn, shift = cv2.solvePnP(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-        if done:
-            found[view] = _pose(turn, shift)
+        for T in opencv_poses(points, rays, cv2.SOLVEPNP_SQPNP)[:1]:
+            found[view] = T
     return found
 
 
@@ -184,7 +175,7 @@ def _adjust(
     at_view = np.array([list(views).index(view) for view, _ in pairs])
     at_tag = np.array([list(tags).index(n) for _, n in pairs])
     rays = np.array([seen[view][n] for view, n in pairs])
-    outward = outward_motion(rays.reshape(-1, 2)).reshape(rays.shape)
+    outward = outward_motion(rays.reshape(-1, 2), np.ones(rays.size // 2, bool)).reshape(rays.shape)
     begun = np.array([*views.values(), *(tags[n] for n in free)])
 
     def at(x: Array) -> tuple[Array, Array]:

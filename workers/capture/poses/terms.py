@@ -1,45 +1,48 @@
-"""The terms of the joint problem: the parameters that all views share, and rows of residuals over sigma with derivatives.
+"""Least squares over all views: small motions, the parameters that all views share, rows of residuals, and the least cost.
 
-Each term is fixed data: corners, the board's depth or the object's. Its rows depend on the poses [V, 4, 4] (T_board_cam) and on
-the shared parameters. The sigma of depth grows with its scale: otherwise a smaller scale, which makes noise smaller, would
-always fit better.
+A pose is changed from the right, in camera axes: T_board_cam <- T_board_cam exp(motion), motion = (metres, radians).
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.capture import DepthCorrection
 from schemas.job.captures import Estimation
-from workers.capture.poses.markers import (
-    cross_matrix,
-    exponential,
-    logarithm,
-)
 from workers.capture.poses.observation import Patches
-from workers.geometry.frames import pose
+from workers.geometry.frames import add_up, invert, pose
+
+
+def cross_matrix(vectors: Array) -> Array:
+    """[..., 3, 3] float64: the matrices v x of vectors [..., 3]."""
+    return np.cross(np.eye(3), np.asarray(vectors, np.float64)[..., None, :])
+
+
+def moved(T: Array, motion: Array) -> Array:
+    """[..., 4, 4] float64: poses T after small motions [..., 6] in their own axes, kept orthonormal."""
+    R, after = T[..., :3, :3], T.copy()
+    U, _, V = np.linalg.svd(R @ Rotation.from_rotvec(motion[..., 3:]).as_matrix())
+    after[..., :3, :3] = U @ V
+    after[..., :3, 3] += (R @ motion[..., :3, None])[..., 0]
+    return after
+
+
+def motion_between(T: Pose, other: Pose) -> Array:
+    """[6]: the small motion (metres, then radians) in the axes of T that takes T to the other."""
+    step = invert(T) @ other
+    return np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()])
+
 
 NAMES = (
-    "offset_m",
-    "scale",
-    "shift_x_m",
-    "shift_y_m",
-    "shift_z_m",
-    "turn_x_rad",
-    "turn_y_rad",
-    "turn_z_rad",
-    "print_scale",
-    "growth_m",
-    "growth_px",
-    "fx",
-    "fy",
-    "cx",
-    "cy",
-    "k1",
+    *("offset_m", "scale", "shift_x_m", "shift_y_m", "shift_z_m", "turn_x_rad", "turn_y_rad", "turn_z_rad"),
+    *("print_scale", "growth_m", "growth_px"),
+    *("fx", "fy", "cx", "cy", "k1"),
 )
 """The shared parameters in the order in which they stand in every array of S = 16 numbers.
 
@@ -50,6 +53,7 @@ DEPTH_SCALE = NAMES.index("scale")
 PRINT_SCALE = NAMES.index("print_scale")
 GROWTH_M, GROWTH_PX = NAMES.index("growth_m"), NAMES.index("growth_px")
 CAMERA = slice(NAMES.index("fx"), NAMES.index("k1") + 1)
+POSE, SHARED = 6, len(NAMES)
 
 OFFSET_M = 0.011
 SCALE = 0.001
@@ -93,7 +97,7 @@ class Shared:
         """[P, 3, S]: of `corrected` by the parameters; those of registration are a shift and a turn of what is corrected."""
         R = self.T_cam_depth[:3, :3]
         turned = (self.scale * patches.ray_z + self.offset_m * patches.ray) @ R.T
-        by = np.zeros((len(patches), 3, len(NAMES)))
+        by = np.zeros((len(patches), 3, SHARED))
         by[:, :, 0] = patches.ray @ R.T
         by[:, :, 1] = patches.ray_z @ R.T
         by[:, :, 2:5] = np.eye(3)
@@ -102,108 +106,83 @@ class Shared:
 
     def moved(self, step: Array) -> "Shared":
         """The parameters after a step [S]."""
-        R = exponential(step[5:8]) @ self.T_cam_depth[:3, :3]
-        U, _, V = np.linalg.svd(R)
+        U, _, V = np.linalg.svd(Rotation.from_rotvec(step[5:8]).as_matrix() @ self.T_cam_depth[:3, :3])
         T = frozen_array(pose(U @ V, self.T_cam_depth[:3, 3] + step[2:5]))
         plain = np.array([self.offset_m, self.scale, self.print_scale, self.growth_m, self.growth_px, *self.camera])
-        offset_m, scale, print_scale, growth_m, growth_px, *camera = (
-            plain + step[[0, 1, *range(8, len(step))]]
-        ).tolist()
+        plain = plain + step[[0, 1, *range(8, SHARED)]]
+        offset_m, scale, print_scale, growth_m, growth_px, *camera = plain.tolist()
         return Shared(offset_m, scale, T, print_scale, growth_m, growth_px, tuple(camera))
 
     def deviation(self) -> Array:
         """[S]: how far each parameter is from its expected value."""
-        turn = logarithm(self.T_cam_depth[:3, :3])
+        turn = Rotation.from_matrix(self.T_cam_depth[:3, :3]).as_rotvec()
         parts = [self.offset_m, self.scale - 1, *self.T_cam_depth[:3, 3], *turn, self.print_scale - 1]
         return np.array([*parts, self.growth_m, self.growth_px, *self.camera], dtype=np.float64)
-
-    def correction(self, identified: tuple[str, ...]) -> DepthCorrection:
-        """What the other stages are told."""
-        return DepthCorrection(self.offset_m, self.scale, self.T_cam_depth, identified)
 
 
 def prior_sigma(spec: Estimation, has_depth: bool) -> Array:
     """[S]: how far each parameter may be from its expected value, one sigma; 0 for those that are not estimated."""
-    trusts_print = spec.trust == "print"
-    scale, print_ = (SCALE_BY_PRINT, 0.0) if trusts_print else (SCALE, PRINT)
+    scale, print_ = (SCALE_BY_PRINT, 0.0) if spec.trust == "print" else (SCALE, PRINT)
     of_depth = np.array([OFFSET_M, scale, *[SHIFT_M] * 3, *[TURN_RAD] * 3, print_]) * has_depth
     return np.concatenate([of_depth, [GROW_M, GROW_PX], np.zeros(CAMERA.stop - CAMERA.start)])
 
 
-def identified(sigma: Array, prior: Array) -> tuple[str, ...]:
-    """Names of the parameters that the capture determines, by their sigma [9] after and before."""
-    return tuple(name for name, after, before in zip(NAMES, sigma, prior, strict=True) if after < IDENTIFIED * before)
-
-
-POSE = 6
-SHARED = len(NAMES)
+def correct_depth(shared: Shared, sigma: Array, prior: Array) -> DepthCorrection:
+    """What the other stages need, with the parameters that the capture determines, by their sigma [S] after and before."""
+    identified = tuple(n for n, after, before in zip(NAMES, sigma, prior, strict=True) if after < IDENTIFIED * before)
+    return DepthCorrection(shared.offset_m, shared.scale, shared.T_cam_depth, identified)
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """N residuals in standard deviations, each of one view or, with `second`, of two.
+    """N residuals in standard deviations, each of k views: one, or the two of a pair.
 
-    first, second [N]: index of the view; by_first, by_second [N, 6] derivatives by small motions; by_shared [N, S]; weight [N]:
-    robust weight over the inflation of the term's variance; cost: robust, of all rows.
+    view [N, k] indices; by_view [N, k, 6] derivatives by small motions of those views; by_shared [N, S]; weight [N]: robust
+    weight over the inflation of the term's variance; cost: robust, of all rows.
     """
 
     residual: Array
-    first: NDArray[np.int64]
-    by_first: Array
+    view: NDArray[np.int64]
+    by_view: Array
     by_shared: Array
     weight: Array
     cost: float
-    second: NDArray[np.int64] | None = None
-    by_second: Array | None = None
+
+    def of_view(self, number: int) -> tuple[Array, Array, Array]:
+        """(J [n, 6], residual [n], by_shared [n, S]) of the rows of one view alone, times the roots of their weights."""
+        chosen = (self.view[:, 0] == number) & (self.view[:, -1] == number)
+        root = np.sqrt(self.weight[chosen])
+        return (
+            root[:, None] * self.by_view[chosen, 0],
+            root * self.residual[chosen],
+            root[:, None] * self.by_shared[chosen],
+        )
+
+
+class Term(Protocol):
+    """Fixed data of one kind, whose rows depend on the poses [V, 4, 4] (T_board_cam) and on the shared parameters.
+
+    The sigma of depth grows with its scale: otherwise a smaller scale, which makes noise smaller, would always fit better.
+    """
+
+    def rows(self, poses: Array, shared: Shared) -> Rows:
+        """The residuals of all views."""
 
 
 def normal_equations(terms: Sequence[Rows], views: int) -> tuple[Array, Array]:
     """(J^T W J [D, D], J^T W r [D]), D = 6 V + S, the shared parameters last."""
     size = POSE * views + SHARED
-    blocks = np.zeros((views, POSE, views, POSE))
-    mixed = np.zeros((views, POSE, SHARED))
-    shared, gradient = np.zeros((SHARED, SHARED)), np.zeros((views, POSE))
-    shared_gradient = np.zeros(SHARED)
+    whole = np.zeros((size + 1, size + 1))  # the residual is one column more
     for rows in terms:
-        weighted = rows.by_shared * rows.weight[:, None]
-        shared += weighted.T @ rows.by_shared
-        shared_gradient += weighted.T @ rows.residual
-        _add(rows, rows.first, rows.by_first, blocks, mixed, gradient)
-        if rows.second is not None and rows.by_second is not None:
-            _add(rows, rows.second, rows.by_second, blocks, mixed, gradient)
-            _add_pairs(rows, rows.second, rows.by_second, blocks)
-    matrix = np.zeros((size, size))
-    poses = POSE * views
-    matrix[:poses, :poses] = blocks.reshape(poses, poses)
-    matrix[:poses, poses:] = mixed.reshape(poses, SHARED)
-    matrix[poses:, :poses] = matrix[:poses, poses:].T
-    matrix[poses:, poses:] = shared
-    return matrix, np.concatenate([gradient.ravel(), shared_gradient])
-
-
-def _add(rows: Rows, view: NDArray[np.int64], by_view: Array, blocks: Array, mixed: Array, gradient: Array) -> None:
-    """Adds what one side of the rows says of its own view."""
-    order = np.argsort(view, kind="stable")
-    starts = np.flatnonzero(np.diff(view[order], prepend=-1))
-    for start, stop in zip(starts, [*starts[1:], len(order)], strict=True):
-        index = order[start:stop]
-        number, J = view[index[0]], by_view[index]
-        weighted = J * rows.weight[index, None]
-        blocks[number, :, number] += weighted.T @ J
-        mixed[number] += weighted.T @ rows.by_shared[index]
-        gradient[number] += weighted.T @ rows.residual[index]
-
-
-def _add_pairs(rows: Rows, second: NDArray[np.int64], by_second: Array, blocks: Array) -> None:
-    """Adds what rows of two views say of both."""
-    key = rows.first * len(blocks) + second
-    order = np.argsort(key, kind="stable")
-    outer = (rows.by_first[order] * rows.weight[order, None])[:, :, None] * by_second[order][:, None]
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    sums = np.add.reduceat(outer, starts, axis=0)
-    for a, b, block in zip(rows.first[order[starts]], second[order[starts]], sums, strict=True):
-        blocks[a, :, b] += block
-        blocks[b, :, a] += block.T
+        by_view = rows.by_view.reshape(len(rows.residual), -1)
+        columns = np.column_stack([by_view, rows.by_shared, rows.residual])
+        key = rows.view[:, 0] * views + rows.view[:, -1]
+        order = np.argsort(key, kind="stable")
+        for index in np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(order) else ():
+            places = [POSE * n + np.arange(POSE) for n in rows.view[index[0]]] + [np.arange(size - SHARED, size + 1)]
+            place, J = np.concatenate(places), columns[index]
+            whole[np.ix_(place, place)] += J.T @ (J * rows.weight[index, None])
+    return whole[:-1, :-1], whole[:-1, -1]
 
 
 MAD = 1.4826
@@ -212,16 +191,9 @@ ROBUST = 3.0
 """Cauchy's loss: a residual of three sigma has half the weight of a small one."""
 
 
-def pose_halves(rows: Rows, views: int) -> Array:
-    """[V, 6, 6]: H with H H^T the covariance of each view's pose by its rows alone, with all that is shared held."""
-    halves = np.zeros((views, POSE, POSE))
-    for number in range(views):
-        own = rows.first == number
-        J, weight = rows.by_first[own], rows.weight[own][:, None]
-        strength, directions = np.linalg.eigh(J.T @ (weight * J))
-        kept = strength > 1e-9 * max(float(strength[-1]), 1e-12)
-        halves[number] = directions / np.sqrt(np.where(kept, strength, np.inf))
-    return halves
+def robust(squares: Array, times: Array | float = 1.0) -> tuple[Array, float]:
+    """(weights, cost) of Cauchy's loss for squared residuals in sigma, each `times` a constant weight."""
+    return times / (1.0 + squares / ROBUST**2), float((times * ROBUST**2 * np.log1p(squares / ROBUST**2)).sum())
 
 
 def median_of_chi_square(degrees: int) -> float:
@@ -229,60 +201,88 @@ def median_of_chi_square(degrees: int) -> float:
     return (1 - 2 / (9 * degrees)) ** 3
 
 
-@dataclass(frozen=True, eq=False)
-class BoardTerm:
-    """Depth of the board: patches of all views lie on its plane. view, sigma_m, inflation of their variance: each [P]."""
+def pose_halves(rows: Rows, views: int) -> Array:
+    """[V, 6, 6]: H with H H^T the covariance of each view's pose by its rows alone, with all that is shared held."""
+    halves = np.zeros((views, POSE, POSE))
+    for number in range(views):
+        J = rows.of_view(number)[0]
+        strength, directions = np.linalg.eigh(J.T @ J)
+        kept = strength > 1e-9 * max(float(strength[-1]), 1e-12)
+        halves[number] = directions / np.sqrt(np.where(kept, strength, np.inf))
+    return halves
 
-    view: NDArray[np.int64]
-    patches: Patches
-    sigma_m: Array
-    inflation: Array
 
-    def rows(self, poses: Array, shared: Shared) -> Rows:
-        """One row a patch: its height over the board."""
-        p, sigma_m = shared.corrected(self.patches), self.sigma_m * shared.scale
-        up = poses[self.view, 2, :3]
-        residual = ((p * up).sum(axis=1) + poses[self.view, 2, 3]) / sigma_m
-        by_point = up / sigma_m[:, None]
-        by_shared = np.einsum("pi,pij->pj", by_point, shared.derivative(self.patches))
-        by_shared[:, DEPTH_SCALE] -= residual / shared.scale
-        weight, cost = robust(residual**2, 1.0 / self.inflation)
-        return Rows(residual, self.view, by_motion(by_point, p), by_shared, weight, cost)
+SETTLED = 1e-7
+"""A step of fewer metres and radians ends the iteration: a tenth of a micrometre."""
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectTerm:
-    """Depth of the object: patches of two views lie on one surface. pairs [N, 2] of patches, normal [N, 3] board axes."""
+class Problem:
+    """The terms; prior [S] sigma of the shared parameters, 0 for those that are fixed; fixed [V] poses that do not move."""
 
-    view: NDArray[np.int64]
-    patches: Patches
-    pairs: NDArray[np.int64]
-    normal: Array
-    sigma_m: Array
-    inflation: Array
+    terms: Sequence[Term]
+    prior: Array
+    fixed: NDArray[np.bool_]
 
-    def rows(self, poses: Array, shared: Shared) -> Rows:
-        """One row a pair: the distance between the two along their common normal."""
-        p, by = shared.corrected(self.patches), shared.derivative(self.patches)
-        R = poses[self.view, :3, :3]
-        placed = np.einsum("pij,pj->pi", R, p) + poses[self.view, :3, 3]
-        a, b = self.pairs.T
-        sigma_m = self.sigma_m * shared.scale
-        residual = ((placed[a] - placed[b]) * self.normal).sum(axis=1) / sigma_m
-        unit = self.normal / sigma_m[:, None]
-        along_a, along_b = (np.einsum("nji,nj->ni", R[index], unit) for index in (a, b))
-        by_shared = np.einsum("ni,nij->nj", along_a, by[a]) - np.einsum("ni,nij->nj", along_b, by[b])
-        by_shared[:, DEPTH_SCALE] -= residual / shared.scale
-        weight, cost = robust(residual**2, 1.0 / self.inflation)
-        by_a, by_b = by_motion(along_a, p[a]), -by_motion(along_b, p[b])
-        return Rows(residual, self.view[a], by_a, by_shared, weight, cost, self.view[b], by_b)
+    def linearise(self, poses: Array, shared: Shared) -> tuple[Array, Array, float]:
+        """(matrix [D, D], gradient [D], cost); rows and columns of what is fixed are zero."""
+        rows = [term.rows(poses, shared) for term in self.terms]
+        matrix, gradient = normal_equations(rows, len(poses))
+        free = self.prior > 0
+        sigma, deviation = np.where(free, self.prior, 1.0), shared.deviation()
+        last = np.arange(len(gradient) - SHARED, len(gradient))
+        matrix[last, last] += 1.0 / sigma**2
+        gradient[last] += deviation / sigma**2
+        held = np.concatenate([np.repeat(self.fixed, POSE), ~free])
+        matrix[held], matrix[:, held], gradient[held] = 0.0, 0.0, 0.0
+        return matrix, gradient, add_up(r.cost for r in rows) + float(((deviation / sigma)[free] ** 2).sum())
 
 
-def by_motion(along: Array, points: Array) -> Array:
-    """[N, 6]: derivative, by a small motion of the camera, of the coordinate of its points [N, 3] along [N, 3]."""
-    return np.concatenate([along, np.cross(points, along)], axis=1)
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """poses [V, 4, 4], the shared parameters, and the matrix [D, D], D = 6 V + S, zero where nothing moves."""
+
+    poses: Array
+    shared: Shared
+    matrix: Array
+    iterations: int
+    converged: bool
+
+    def covariance(self) -> Array:
+        """[D, D]: the inverse of the normal equations at the solution."""
+        free = np.ix_(*[np.diag(self.matrix) > 0] * 2)
+        covariance = np.zeros_like(self.matrix)
+        covariance[free] = np.linalg.inv(_regular(self.matrix[free]))
+        return covariance
+
+    def of_views(self) -> Array:
+        """[V, 6, 6]: the covariance of each pose."""
+        count = len(self.poses)
+        blocks = self.covariance()[:-SHARED, :-SHARED].reshape(count, POSE, count, POSE)
+        return blocks[range(count), :, range(count)]
 
 
-def robust(squares: Array, times: Array | float = 1.0) -> tuple[Array, float]:
-    """(weights, cost) of Cauchy's loss for squared residuals in sigma, each `times` a constant weight."""
-    return times / (1.0 + squares / ROBUST**2), float((times * ROBUST**2 * np.log1p(squares / ROBUST**2)).sum())
+def minimise(problem: Problem, poses: Array, shared: Shared, most: int) -> Solution:
+    """The poses and shared parameters of least robust cost near a start, in at most `most` steps (Levenberg-Marquardt)."""
+    damping, converged, iterations = 1e-6, False, 0
+    matrix, gradient, cost = problem.linearise(poses, shared)
+    while iterations < most and not converged:
+        iterations += 1
+        free, step = np.diag(matrix) > 0, np.zeros(len(gradient))
+        part = matrix[np.ix_(free, free)]
+        step[free] = np.linalg.solve(_regular(part + damping * np.diag(np.diag(part))), -gradient[free])
+        new = moved(poses, step[:-SHARED].reshape(-1, POSE)), shared.moved(step[-SHARED:])
+        linear = problem.linearise(*new)
+        converged = float(np.abs(step).max()) < SETTLED
+        if linear[2] <= cost:
+            (poses, shared), (matrix, gradient, cost) = new, linear
+            damping *= 0.1
+        else:
+            damping = max(damping, 1e-6) * 10
+            converged = converged or damping > 1e6
+    return Solution(poses, shared, matrix, iterations, converged)
+
+
+def _regular(matrix: Array) -> Array:
+    """The matrix with so little on its diagonal that directions without any information (10 m or rad) can be inverted."""
+    return matrix + 1e-2 * np.eye(len(matrix))
