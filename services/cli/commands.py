@@ -255,11 +255,9 @@ def report(options: argparse.Namespace) -> int:
     with explain_damage(store):
         size, made = write_report(store, options.scenes, target)
     seconds = time.monotonic() - began
-    print(
-        f"{target}: {plural(made.figures.scenes, 'scene')}, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB"
-    )
+    print(f"{target}: {plural(made.figures.scenes, 'scene')}, pictures of {len(made.scenes)}, {size / 1e6:.1f} MB")
     answer = {"file": str(target), "bytes": size, "seconds": round(seconds, 2), "scenes": made.figures.scenes}
-    return finish(options, True, **answer, shown=[scene.scene_id for scene in made.sample.scenes])
+    return finish(options, True, **answer, shown=[scene.scene_id for scene in made.scenes])
 
 
 def serve(options: argparse.Namespace) -> int:

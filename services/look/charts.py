@@ -20,7 +20,6 @@ class Histogram:
     low: float
     high: float
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(FINE, np.int64))
-    total: float = 0.0
     least: float = np.inf
     most: float = -np.inf
 
@@ -32,20 +31,13 @@ class Histogram:
             return self
         step = np.clip((array - self.low) / (self.high - self.low) * FINE, 0, FINE - 1).astype(np.int64)
         counts = self.counts + np.bincount(step, minlength=FINE)
-        total = self.total + float(array.sum())
-        return Histogram(
-            self.low, self.high, counts, total, min(self.least, float(array.min())), max(self.most, float(array.max()))
-        )
+        ends = min(self.least, float(array.min())), max(self.most, float(array.max()))
+        return Histogram(self.low, self.high, counts, *ends)
 
     @property
     def count(self) -> int:
         """Number of values."""
         return int(self.counts.sum())
-
-    @property
-    def mean(self) -> float:
-        """The mean of all values; NaN of none."""
-        return self.total / self.count if self.count else float("nan")
 
     def percentile(self, share: float) -> float:
         """The value below which this share (0 to 1) lies, exact to a step; NaN of none."""
@@ -98,7 +90,7 @@ def chart_html(chart: Chart) -> str:
     Values that are all equal, or nearly all, are a sentence and no bar. Empty without values.
     """
     series = {name: histogram for name, histogram in chart.series.items() if histogram.count}
-    lines = [(name, _summary(chart, one)) for name, one in series.items()]
+    lines = [(name, _summary(chart, histogram)) for name, histogram in series.items()]
     words = "".join(_legend(at, *line) for at, line in enumerate(lines)) + (
         _legend(0, "", chart.note) if chart.note else ""
     )

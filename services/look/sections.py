@@ -124,9 +124,9 @@ def effects_html(figures: Figures) -> str:
         f'<details><summary>{plural(len(never), "effect")} that ran in no scene, and why</summary><dl class="why">{never_rows}'
         "</dl></details>"
     )
-    ran = _table(("effect", "scenes", "time", "each"), rows, "Effects that ran") if rows else ""
+    ran = table_html(("effect", "scenes", "time", "each"), rows, "Effects that ran") if rows else ""
     note = '<p class="note">An effect without a time is counted with its stage.</p>'
-    by_stage = _table(("stage", "share", "time", "each"), stages, "Time by stage")
+    by_stage = table_html(("stage", "share", "time", "each"), stages, "Time by stage")
     return f"{ran}{note}{left_out if never else ''}{by_stage}"
 
 
@@ -164,17 +164,18 @@ def captures_html(figures: Figures) -> str:
         "Corner error: median over the views after estimation. Pose, cloud (median) and completeness are held against the"
         " truth, which photographs do not have. Measured: share of the mirror views that is measured and not filled."
     )
-    return f'{_table(head, rows, "Quality")}<p class="note">{note}</p>'
+    return f'{table_html(head, rows, "Quality")}<p class="note">{note}</p>'
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str) -> str:
+def table_html(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str = "") -> str:
     """A table of HTML cells; the first is the row's name."""
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
     body = "".join(
         f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
         for first, *cells in rows
     )
-    return f"<table><caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f"<table>{title}<thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _bar(share: float) -> str:

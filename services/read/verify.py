@@ -28,7 +28,7 @@ from schemas.dataset.layout import (
 )
 from schemas.dataset.shard import Fingerprint
 from schemas.errors import CommitConflict, CorruptError, MachineError
-from schemas.job.identity import job_digest
+from schemas.job.job import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
 from services.merge.reading import RangeRows

@@ -24,8 +24,7 @@ import numpy as np
 from schemas.base import Array
 from schemas.capture import CaptureScore, SynthesizedView
 from schemas.errors import SceneError
-from schemas.job.identity import settings_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, settings_digest
 from schemas.scene.scene import ObjectStart, Settled
 from schemas.scene.view import Camera
 from services.study.model import OWN, Setting, apply
@@ -50,8 +49,7 @@ class Unit:
     """One scene to measure with these settings on top of a base setting.
 
     `job`: the job as JSON, beside the folder that its paths are of; `scratch`: a folder that all processes share; `part`: one of
-    services/study/table.py; `number`: the scene's place among the measured ones; `limit_s`: seconds of processor that one
-    setting may take.
+    services/study/table.py; `limit_s`: seconds of processor that one setting may take.
     """
 
     job: str
@@ -59,7 +57,6 @@ class Unit:
     scratch: str
     part: str
     scene_id: int
-    number: int
     settings: tuple[Setting, ...]
     base: Setting = OWN
     limit_s: float = math.inf
@@ -71,13 +68,13 @@ def answer_unit(unit: Unit) -> bytes:
 
     context = _based(unit.job, unit.folder, json.dumps(dict(unit.base.changes)))
     LIMIT["s"], RESTS["folder"] = unit.limit_s, Path(unit.scratch)
-    measure: Callable[..., dict[str, Answer]] = {
-        "rest": measure_rest,
-        "draw": measure_drawn,
-        "colour": measure_colour,
-        "capture": measure_capture,
-    }[unit.part]
-    return json.dumps(measure(context, shuffled(unit.settings, unit.scene_id), unit.scene_id, unit.number)).encode()
+    measures = {"rest": measure_rest, "draw": measure_drawn, "colour": measure_colour, "capture": measure_capture}
+    began = time.monotonic()
+    answers = measures[unit.part](context, shuffled(unit.settings, unit.scene_id), unit.scene_id)
+    shared_s = (time.monotonic() - began - sum(answer["took"] for answer in answers.values())) / len(answers)
+    for answer in answers.values():
+        answer["took"] += shared_s  # what was made for all
+    return json.dumps(answers).encode()
 
 
 @cache
@@ -176,32 +173,29 @@ def shuffled(settings: Sequence[Setting], scene_id: int) -> list[Setting]:
 
 # ---------------------------------------------------------------------------------------------- how a scene comes to rest
 
-POSED = 48
-"""Scenes of which poses are kept, the first ones."""
-
 _seen: set[int] = set()
 """Scenes whose shapes this process has built."""
 
 
-def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
-    """How the scene comes to rest, by the settings' names. `number`: its place among the measured scenes.
+def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, Answer]:
+    """How the scene comes to rest, by the settings' names.
 
-    `s` is the time to rest, without the plan. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm and rolled_deg
-    (sideways travel of the centre of mass, and turn, since the object was released; the largest of several objects). Beside
-    them `lost`, `planned` and `redrawn` objects, `corners`, mm, of each object's box in the world, and `planned_s`, the time
-    of the plan. The job itself also has `plan_s`, what a scene takes besides rest with new shapes: a process's first rest of
-    a scene makes them, and is the job's answer only where it is too slow to be done again.
+    `s` is the time to rest, and `planned_s` that of the plan before it. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm
+    and rolled_deg (sideways travel of the centre of mass, and turn, since the object was released; the largest of several
+    objects). Beside them `lost` and `planned` objects, and `corners`, mm, of each object's box in the world. The job
+    itself also has `plan_s`, what a scene takes besides rest with new shapes: a process's first rest of a scene makes them, and
+    is the job's answer only where it is too slow to be done again.
     """
     answers: dict[str, Answer] = {}
     cold: Answer = {}
     if scene_id not in _seen and not _rest_file(context, scene_id).exists():
-        cold = answer_for(partial(_rest, context, scene_id, number, OWN))
-        if cold["took"] >= QUICK_S["rest"] and OWN in settings:
-            answers[OWN.name] = cold
+        cold = answer_for(partial(_rest, context, scene_id, OWN))
+        if cold["took"] >= QUICK_S["rest"]:
+            answers = {setting.name: cold for setting in settings if not setting.changes}
     _seen.add(scene_id)
     for setting in settings:
         if setting.name not in answers:
-            measure = partial(_rest, context_for(context, setting), scene_id, number, setting)
+            measure = partial(_rest, context_for(context, setting), scene_id, setting)
             answers[setting.name] = warm_answer_for("rest", setting, measure)
     own = answers.get(OWN.name, {})
     if "s" in own and "s" in cold:
@@ -209,16 +203,14 @@ def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: 
     return answers
 
 
-def _rest(worker: WorkerContext, scene_id: int, number: int, setting: Setting) -> Answer:
-    planning, watch, began = ProcessorClock(), ProcessorClock(), time.monotonic()
+def _rest(worker: WorkerContext, scene_id: int, setting: Setting) -> Answer:
+    planning, watch = ProcessorClock(), ProcessorClock()
     plan, _ = plan_with_effects(worker, scene_id, planning)
-    planned, before = len(plan.objects), sum(start.redraws for start in plan.objects)
+    planned = len(plan.objects)
     try:
-        rest = lay_scene(worker, scene_id, watch).rest
+        rest = _settle(worker, scene_id, watch, is_kept=not setting.changes)
     except SceneError as error:
-        return {"failed": error.reason, "lost": planned, "planned": planned, "redrawn": 0}
-    if setting == OWN:
-        _keep_rest(worker, scene_id, rest, time.monotonic() - began)
+        return {"failed": error.reason, "lost": planned, "planned": planned}
     moves = list(zip(rest.starts, rest.settled, strict=True))
     return {
         "s": sum(s for stage, s in watch.seconds.items() if stage not in planning.seconds),
@@ -226,8 +218,7 @@ def _rest(worker: WorkerContext, scene_id: int, number: int, setting: Setting) -
         "errors": _errors_of(rest),
         "lost": planned - len(rest.settled),
         "planned": planned,
-        "redrawn": max(0, sum(start.redraws for start in rest.starts) - before),
-        **({"corners": [_corners_mm(*move).tolist() for move in moves]} if number < POSED else {}),
+        "corners": [_corners_mm(*move).tolist() for move in moves],
     }
 
 
@@ -265,18 +256,18 @@ def own_rest(context: WorkerContext, scene_id: int) -> Rest:
     """How the job's own scene rests, kept for what is drawn of it. Raises SceneError."""
     if (file := _rest_file(context, scene_id)).exists():
         return pickle.loads(file.read_bytes())
-    began = time.monotonic()
-    rest = lay_scene(context, scene_id, Stopwatch()).rest
-    _keep_rest(context, scene_id, rest, time.monotonic() - began)
-    return rest
+    return _settle(context, scene_id, Stopwatch(), is_kept=True)
 
 
-def _keep_rest(context: WorkerContext, scene_id: int, rest: Rest, took: float) -> None:
-    if took >= QUICK_S["rest"] and RESTS["folder"].is_dir():
-        file = _rest_file(context, scene_id)
+def _settle(context: WorkerContext, scene_id: int, watch: Stopwatch, is_kept: bool) -> Rest:
+    """How a scene rests; what is slow is kept for other processes."""
+    began, file = time.monotonic(), _rest_file(context, scene_id)
+    rest = lay_scene(context, scene_id, watch).rest
+    if is_kept and time.monotonic() - began >= QUICK_S["rest"] and RESTS["folder"].is_dir():
         fresh = file.with_suffix(f".{os.getpid()}")
         fresh.write_bytes(pickle.dumps(rest))
         fresh.replace(file)
+    return rest
 
 
 def _rest_file(context: WorkerContext, scene_id: int) -> Path:
@@ -309,21 +300,17 @@ HELD_OUT = 3
 """Views that are made of the others, for their depth and their time."""
 
 
-def measure_capture(
-    context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int
-) -> dict[str, Answer]:
+def measure_capture(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, Answer]:
     """Time, bytes and errors by setting of a simulated capture, which is kept in the shared folder for all settings.
 
     Time is that of detection, estimates, cloud, mesh and as many synthesised views as there are photographs. A process works
     untimed first: that compiles its loops.
     """
     if not _seen:
+        _seen.add(scene_id)
         answer_for(partial(_process, context, context, scene_id))
-    _seen.add(scene_id)
-    measures = {
-        setting.name: partial(_process, context, context_for(context, setting), scene_id) for setting in settings
-    }
-    return {name: answer_for(measure) for name, measure in measures.items()}
+    workers = {setting.name: context_for(context, setting) for setting in settings}
+    return {name: answer_for(partial(_process, context, worker, scene_id)) for name, worker in workers.items()}
 
 
 def _simulated(context: WorkerContext, scale: float, scene_id: int) -> CaptureFolder:

@@ -13,10 +13,10 @@ from typing import Any, Literal
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
+from schemas.base import set_key
 from schemas.errors import InputError, did_you_mean, number
 from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job, kind_of
-from schemas.job.keys import set_key
 from services.job.job_file import describe_fault
 
 Changes = Mapping[str, Any]
@@ -111,10 +111,9 @@ class Proof:
     promised: Mapping[str, Figure]
 
     @property
-    def missed(self) -> tuple[str, ...]:
-        """The errors whose measured figure is above its target, or is not there."""
-        known = self.measured
-        return tuple(name for name, most in self.targets.items() if name not in known or not known[name].value <= most)
+    def missed(self) -> list[str]:
+        """The errors whose measured figure is above its target."""
+        return [name for name, most in self.targets.items() if not self.measured[name].value <= most]
 
     @property
     def holds(self) -> bool:
@@ -127,9 +126,8 @@ class Study:
     """The content of a page: the machine, the command, and the table.
 
     `scenes` is the most that a setting was measured in; `job_scenes` is the size of the whole job; `seconds` were spent of a
-    budget of `budget_s`; `answer` is the answer in words and `chosen` the name of the setting in it, empty where nothing is
-    recommended; `doubts` are what is not decided, and how long that would take; `notes` hold for the whole study, such as
-    what was not measured, and why.
+    budget of `budget_s`; `chosen` is the name of the setting in the answer, empty where nothing is recommended; `doubts` are
+    what is not decided; `notes` hold for the whole study, such as what was not measured, and why.
     """
 
     job: str
@@ -150,6 +148,7 @@ class Study:
 
 # ---------------------------------------------------------------------------------------------- errors
 
+_SHAPES = "the stored shapes"
 _RAYS = "a ray caster in float64 at the same pixel centres"
 _FRONT = "65,536 rays about the objects, and their vertices"
 _PATCH = "rays at random in the objects' patch"
@@ -159,7 +158,7 @@ _REFERENCE = "finer steps than any that is measured"
 
 @dataclass(frozen=True)
 class ErrorKind:
-    """One error: its unit, its name in a few words, its definition, what it is held against, and what it is an error of.
+    """One error: its unit, name in a few words, definition, what it is held against, its group, and the usual target.
 
     A scene has one figure of it, and a setting the 95th percentile of its scenes' figures, or where it is `pooled` one
     figure over all its scenes. Less is better.
@@ -171,6 +170,7 @@ class ErrorKind:
     title: str
     truth: str
     group: Literal["physics", "labels", "mirror", "colour", "capture"]
+    target: float | None = None
     pooled: bool = False
 
     @property
@@ -185,53 +185,33 @@ class ErrorKind:
 
 
 # fmt: off
-ERRORS = {kind.name: kind for kind in (
-    ErrorKind("penetration_mm", "mm", "penetration",
-              "how deep an object stands in what it rests on", "the stored shapes", "physics"),
-    ErrorKind("gap_mm", "mm", "gap", "how high an object hovers", "the stored shapes", "physics"),
-    ErrorKind("unbalanced_share", "", "weight out of balance",
-              "share of a weight that contacts leave out of balance", "the stored shapes", "physics"),
-    ErrorKind("pose_mm", "mm", "pose", "pose off, where two finer settings agree", _REFERENCE, "physics"),
-    ErrorKind("outcome_mm", "mm", "where things end, on the whole",
-              "how far things slide and roll: two distributions apart", _REFERENCE, "physics", True),
-    ErrorKind("outcome_deg", "deg", "how they lie, on the whole",
-              "how far things turn: two distributions apart", _REFERENCE, "physics", True),
-    ErrorKind("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", True),
-    ErrorKind("lost_share", "", "objects that are lost", "objects of the plan that no scene has", "counted", "physics", True),
-    ErrorKind("redrawn_share", "", "objects dropped again",
-              "objects that left the table and were drawn again, an object", "counted", "physics", True),
-    ErrorKind("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("table_depth_mm", "mm", "depth of the table",
-              "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("mask_share", "", "the object's mask pixels",
-              "object pixels that are wrong in the mask", _RAYS, "labels"),
-    ErrorKind("between_mm", "mm", "depth between pixels",
-              "depth between pixels, read at the nearest", _PATCH, "labels"),
-    ErrorKind("outline_share", "", "regions between pixels",
-              "rays at random whose region the nearest pixel has wrong", _PATCH, "labels"),
-    ErrorKind("mirror_mm", "mm", "mirror camera", "mirror camera off, as d_z is", _FRONT, "mirror"),
-    ErrorKind("agreement_mm", "mm", "agreement of the views",
-              "input depth carried into the mirror view, off", "the mirror view", "mirror"),
-    ErrorKind("unfilled_share", "", "projected pixels left empty",
-              "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
-    ErrorKind("hidden_share", "", "projected pixels that show through",
-              "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
-    ErrorKind("camera_mm", "mm", "camera position",
-              "camera position off, median of a capture's views", _TRUTH, "capture"),
-    ErrorKind("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture"),
-    ErrorKind("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture"),
-    ErrorKind("cloud_p95_mm", "mm", "merged cloud, 95 %",
-              "points of the merged cloud off, 95 % of them", _TRUTH, "capture"),
-    ErrorKind("missing_share", "", "surface that is missing",
-              "visible surface without a point within 3 mm", _TRUTH, "capture"),
-    ErrorKind("view_depth_mm", "mm", "depth of synthesised views",
-              "depth of synthesised views off, median", _TRUTH, "capture"),
-    ErrorKind("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
-    ErrorKind("edge_flip", "", "edges, FLIP",
-              "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
+ERRORS = {row[0]: ErrorKind(*row) for row in (
+    ("pose_mm", "mm", "pose", "pose off, where two finer settings agree", _REFERENCE, "physics", 0.1),
+    ("outcome_mm", "mm", "where things end, on the whole", "slides and rolls: two distributions apart",
+     _REFERENCE, "physics", None, True),
+    ("penetration_mm", "mm", "penetration", "how deep an object stands in what it rests on", _SHAPES, "physics", 0.1),
+    ("gap_mm", "mm", "gap", "how high an object hovers", _SHAPES, "physics", 0.1),
+    ("unbalanced_share", "", "weight out of balance", "share of a weight that contacts leave", _SHAPES, "physics", 0.01),
+    ("outcome_deg", "deg", "how they lie, on the whole", "turns: two distributions apart", _REFERENCE, "physics", None, True),
+    ("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", None, True),
+    ("lost_share", "", "objects that are lost", "planned objects that no scene has", "counted", "physics", None, True),
+    ("between_mm", "mm", "depth between pixels", "depth between pixels, read at the nearest", _PATCH, "labels"),
+    ("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels", 0.1),
+    ("mask_share", "", "the object's mask pixels", "object pixels that are wrong in the mask", _RAYS, "labels", 0.001),
+    ("mirror_mm", "mm", "mirror camera", "mirror camera off, as d_z is", _FRONT, "mirror"),
+    ("unfilled_share", "", "projected pixels left empty", "of object pixels that both views see", _RAYS, "mirror"),
+    ("hidden_share", "", "projected pixels that show through", "what the mirror camera cannot see", _RAYS, "mirror"),
+    ("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
+    ("edge_flip", "", "edges, FLIP", "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
+    ("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture", 1.0),
+    ("missing_share", "", "surface that is missing", "visible surface without a point within 3 mm", _TRUTH, "capture", 0.05),
+    ("view_depth_mm", "mm", "depth of synthesised views", "depth of synthesised views off, median", _TRUTH, "capture", 1.5),
+    ("camera_mm", "mm", "camera position", "camera position off, median of a capture's views", _TRUTH, "capture", 0.5),
+    ("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture", 0.05),
+    ("cloud_p95_mm", "mm", "merged cloud, 95 %", "points of the merged cloud off, 95 % of them", _TRUTH, "capture", 3.0),
 )}
 # fmt: on
-"""By name."""
+"""By name, of each group first those that a picture shows rather."""
 
 # ---------------------------------------------------------------------------------------------- in words
 

@@ -15,11 +15,9 @@ from services.study.choose import AS_CHEAP, default_targets
 from services.study.model import OWN, REFERENCES, Figure, Row, Setting, Targets, joined
 from services.study.table import PARTS, Part, Table, part_of
 
-LEAST = 8
-"""Nothing is out, no part is decided and no combination is made before so many scenes."""
-
-FEWEST_RACING = 4
-"""So many settings are in every round; where even these do not fit, in as many scenes as fit."""
+LEAST, FEWEST_RACING = 8, 4
+"""Nothing is out, no part is decided and no combination is made before so many scenes; and so many settings are in every round,
+where even these do not fit in as many scenes as fit."""
 
 REFERENCE_SHARE = 0.3
 """References, which errors of all are held against, are in a round while each takes no more than this share of the others."""
@@ -76,10 +74,8 @@ def undecided(table: Table, part: Part, targets: Targets) -> list[Setting]:
     ]
 
 
-def next_round(
-    table: Table, part: Part, targets: Targets, scenes: range, allowed_s: float
-) -> tuple[list[Wanted], bool]:
-    """What is missing in these scenes of the settings in this round, scene by scene; and whether all of that fits."""
+def next_round(table: Table, part: Part, targets: Targets, scenes: range, allowed_s: float) -> list[Wanted]:
+    """What is missing in these scenes of the settings in this round, scene by scene, as far as it fits."""
     racing = [some.setting for some in standings(table, part, targets)]
     while seconds(table, wanted := missing(table, part, racing, scenes)) > allowed_s and len(racing) > FEWEST_RACING:
         racing = racing[: max(FEWEST_RACING, len(racing) // 2)]
@@ -88,8 +84,7 @@ def next_round(
     wanted += [item for some in references if seconds(table, some) <= most_s for item in some]
     wanted.sort(key=lambda item: item.scene_id)
     costs = itertools.accumulate(table.cost_s(part, item.setting) for item in wanted)
-    fitting = sum(cost <= (1.0 + REFERENCE_SHARE * len(REFERENCES)) * allowed_s for cost in costs)
-    return wanted[:fitting], fitting == len(wanted)
+    return wanted[: sum(cost <= (1.0 + REFERENCE_SHARE * len(REFERENCES)) * allowed_s for cost in costs)]
 
 
 def missing(table: Table, part: Part, settings: Iterable[Setting], scenes: range) -> list[Wanted]:
@@ -107,37 +102,27 @@ def seconds(table: Table, wanted: Sequence[Wanted]) -> float:
 SAVES = 0.98
 """A value saves time at this share of the job's own."""
 
-MOST_OF_A_KIND = 3
-"""The most knobs that are paired among those that save time."""
-
 
 def promising(rows: Sequence[Row], targets: Targets | None) -> list[Setting]:
     """Settings of two and more knobs to measure next. `rows`: the job's own first, then one value of one knob each.
 
-    Of the values that make no error worse which the job or a target holds: for each knob the cheapest that saves time, two by
-    two and all at once; and the cheapest for each target that the job misses, all at once, and with those that save time.
+    Of the values that make no error worse which a target or the job holds: for each knob the cheapest that saves time; for each
+    target that the job misses the cheapest that mends it; and both.
     """
     own = rows[0].errors
     limits = targets or {name: most for some in default_targets(rows) for name, most in some.items()}
+    held = {name: max(most, own[name].high) for name, most in limits.items() if name in own}
     singles = [
-        row
-        for row in sorted(rows[1:], key=lambda row: (row.ratio, row.setting.name))
-        if row.setting.kind == "single"
-        and all(
-            row.errors[name].value <= max(most, own[name].high)
-            for name, most in limits.items()
-            if name in row.errors and name in own
-        )
+        row for row in sorted(rows[1:], key=lambda row: (row.ratio, row.setting.name)) if row.setting.kind == "single"
     ]
-    saving = _first_of_knobs(row for row in singles if row.ratio < SAVES)
-    missed = [name for name, most in limits.items() if name in own and own[name].value > most]
-    mending = [
-        row
-        for name in missed
-        for row in [row for row in singles if name in row.errors and row.errors[name].value <= limits[name]][:1]
+    kept = [
+        row for row in singles if all(row.errors[name].value <= held[name] for name in held.keys() & row.errors.keys())
     ]
-    pairs = itertools.combinations(saving[:MOST_OF_A_KIND], 2)
-    together = [*pairs, saving, _first_of_knobs(mending), _first_of_knobs([*mending, *saving])]
+    saving = _first_of_knobs(row for row in kept if row.ratio < SAVES)
+    mending: list[Row] = []
+    for name in (name for name in held if own[name].value > limits[name]):
+        mending += [row for row in kept if name in row.errors and row.errors[name].value <= limits[name]][:1]
+    together = [saving, _first_of_knobs(mending), _first_of_knobs([*mending, *saving])]
     # In the order of the table, whatever the ranks, so that names do not depend on noise.
     settings = [joined([row.setting for row in rows if row in some]) for some in together if len(some) > 1]
     return list({setting.name: setting for setting in settings}.values())

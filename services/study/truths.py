@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import InputError
 from schemas.job.views import Render
-from schemas.scene.scene import Placed, ScenePlan
+from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
@@ -244,19 +244,14 @@ class Crop(NamedTuple):
     bottom: int
 
 
-class ColourTruth(NamedTuple):
-    """rgb [bottom - top, right - left, 3] uint8 sRGB: the crop of the input view, path-traced."""
-
-    crop: Crop
-    rgb: NDArray[np.uint8]
+Rgb = NDArray[np.uint8]
+"""[H, W, 3] sRGB."""
 
 
 def colour_truth_missing() -> str | None:
     """Why this machine has no truth of colour, with the remedy; None where it has."""
     if importlib.util.find_spec("mitsuba") is None:
-        return (
-            "errors of colour need the path-traced tier, which is not installed: `./verso extra pathtraced` installs it"
-        )
+        return "errors of colour need the path-traced tier: `./verso extra pathtraced` installs it"
     try:
         require_tier(Render(tier="pathtraced"))
     except InputError as error:
@@ -264,36 +259,27 @@ def colour_truth_missing() -> str | None:
     return None
 
 
-def converged_colour(context: WorkerContext, scene: Scene, paths: int) -> ColourTruth | None:
-    """The objects' crop of the first pair's input view by that many paths a pixel; None where no object is visible.
+def converged_colour(context: WorkerContext, scene: Scene, crop: Crop, paths: int) -> Rgb:
+    """The crop of the first pair's input view by that many paths a pixel.
 
     It depends on neither tier nor samples, seed of paths, bounces, sensor or size of the scene's own images: it has the look
     that the raster and path-traced tiers share, and a seed of its own.
     """
-    crop = crop_of(scene)
-    if crop is None:
-        return None
-    camera = scene.pairs[0].input.camera
-    things, plan = _in_studio(context, scene)
+    # As the path-traced tier draws it: the flat tier has another floor and other lights.
+    chance = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
+    floor, appearance = draw_appearance(chance, "pathtraced")
+    plan = replace(scene.plan, floor=floor, appearance=appearance)
+    things = [
+        Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
+        for thing in scene.posed.things
+    ]
     render = Render(tier="pathtraced", path_samples=paths, path_bounces=BOUNCES)
     effects = plan_effects(Facts(context.job.model_copy(update={"render": render}), plan, False))
+    camera = crop_camera(scene.pairs[0].input.camera, crop)
     rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id])
-    drawn = draw_view(
-        context.renderer, things, plan.appearance, crop_camera(camera, crop), render, lambda: rng, effects
-    )
+    drawn = draw_view(context.renderer, things, appearance, camera, render, lambda: rng, effects)
     assert drawn.rgb is not None
-    return ColourTruth(crop, drawn.rgb)
-
-
-def crop_of(scene: Scene) -> Crop | None:
-    """The compared crop of the first pair's input view; None where no object is visible."""
-    box = cast_patch(scene.posed.things, scene.pairs[0].input.camera).box
-    return None if box is None else crop_about(box)
-
-
-def flip_error(truth: ColourTruth, rgb: NDArray[np.uint8]) -> float:
-    """FLIP of a stored input view [H, W, 3] uint8 of any size, with the sensor's effects, in the truth's crop."""
-    return flip_between(truth.rgb, crop_colour(rgb, truth.crop))
+    return drawn.rgb
 
 
 def crop_about(box: Box) -> Crop:
@@ -325,14 +311,3 @@ def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:
     smaller = rgb.shape[0] < HEIGHT or rgb.shape[1] < WIDTH
     method = cv2.INTER_LINEAR if smaller else cv2.INTER_AREA
     return np.asarray(cv2.resize(rgb, (WIDTH, HEIGHT), interpolation=method), np.uint8)[here]
-
-
-def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], ScenePlan]:
-    """The scene's things and plan as the path-traced tier draws them; the flat tier has another floor and other lights."""
-    rng = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
-    floor, appearance = draw_appearance(rng, "pathtraced")
-    things = tuple(
-        Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
-        for thing in scene.posed.things
-    )
-    return things, replace(scene.plan, floor=floor, appearance=appearance)

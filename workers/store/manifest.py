@@ -180,13 +180,13 @@ def with_shape_files(assets: pa.Table, files: Mapping[str, FileEntry]) -> pa.Tab
 
 def files_of_assets(assets: pa.Table) -> list[FileEntry]:
     """The files that rows of a range's `assets` list: GLBs, and samples. Raises KeyError without `SHAPE_FILE_COLUMNS`."""
-    sizes, digests = (assets.column(field.name).to_pylist() for field in SHAPE_FILE_COLUMNS)
-    entries = []
     names = [name for name in ("category", "instance_id", "samples") if name in assets.column_names]
-    for row, size, sha256 in zip(assets.select(names).to_pylist(), sizes, digests, strict=True):
-        if sha256 is not None:
+    size, sha256 = (field.name for field in SHAPE_FILE_COLUMNS)
+    entries = []
+    for row in assets.select([*names, size, sha256]).to_pylist():
+        if row[sha256] is not None:
             path = asset_path(row["category"], row["instance_id"])
-            entries.append(FileEntry(path=path, bytes=size, sha256=sha256))
+            entries.append(FileEntry(path=path, bytes=row[size], sha256=row[sha256]))
         if (samples := row.get("samples")) is not None:
             entries.append(FileEntry(**{name: samples[name] for name in FileEntry.model_fields}))
     return entries

@@ -13,10 +13,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from schemas.base import set_key
 from schemas.errors import JobError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
-from schemas.job.keys import set_key
 from services.cli.main import main
 from services.job.job_file import NEEDS, describe_idle, load_job, pack_job, validate_job
 from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
@@ -158,8 +158,8 @@ def test_what_is_no_job_file_is_told_and_not_read_for_ever(tmp_path):
 CHANGES = (
     ("nonsense", ["write it as path.to.key=value"]),
     ("=3", ["write it as path.to.key=value"]),
-    ("name.deeper=3", ["'name' is 'a' and has no keys"]),
-    ("name.deeper.more=3", ["'a' has no key 'deeper'"]),
+    ("name.deeper=3", ["'name' is 'a' and has no key 'deeper'"]),
+    ("name.deeper.more=3", ["'name' is 'a' and has no key 'deeper'"]),
     ("assets.objects.7.weight=1", ["'7' must be a position from 0 to 0"]),
     ("assets.objects.first.weight=1", ["'first' must be a position from 0 to 0"]),
     ("assets.objects." + "9" * 300 + "=1", ["assets.objects"]),
@@ -177,7 +177,7 @@ CHANGES = (
 
 
 def test_changes_reach_every_depth_and_one_that_cannot_be_made_is_told_in_a_line(tmp_path):
-    assert "there is nothing at 'cameras'" in fault(write(tmp_path, "name: a\ncameras:"), "cameras.more=3")
+    assert "'cameras' is None and has no key 'more'" in fault(write(tmp_path, "name: a\ncameras:"), "cameras.more=3")
     path = write(tmp_path, "name: a\nassets: {objects: [{source: procedural}]}")
     for change, words in CHANGES:
         message = fault(path, change)

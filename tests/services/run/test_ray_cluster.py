@@ -30,7 +30,6 @@ from services.run.machine import (
 )
 from services.run.ray_cluster import (
     LOOK_EVERY_S,
-    NOT_INHERITED,
     PREFETCH,
     Slots,
     cluster_slots,
@@ -118,7 +117,7 @@ def test_each_run_has_a_token_of_its_own_that_nobody_guesses_and_the_rest_is_the
     first, second = private_environment(), private_environment()
     tokens = {one.pop("RAY_AUTH_TOKEN") for one in (first, second)}
     assert len(tokens) == 2 and all(len(bytes.fromhex(token)) >= 32 for token in tokens)
-    assert first == second and first["RAY_AUTH_MODE"] == "token" and not set(NOT_INHERITED) & set(first)
+    assert first == second and first["RAY_AUTH_MODE"] == "token" and first["RAY_REDIS_ADDRESS"] is None
 
 
 def test_slots_follow_the_cores_of_the_cluster_which_is_asked_now_and_then(monkeypatch):

@@ -35,7 +35,7 @@ SMALL = [
 
 def unit_of(job: Job, part: str, scene_id: int, scratch: Path) -> Unit:
     where = job.model_dump_json(), str(Path(TABLETOP).parent), str(scratch)
-    return Unit(*where, part, scene_id, scene_id, (Setting(),))
+    return Unit(*where, part, scene_id, (Setting(),))
 
 
 def units_of(folder: Path) -> list[str]:
@@ -120,7 +120,7 @@ def test_bad_input_is_told_by_its_value_and_remedy_before_anything_is_measured(t
         (["--target", "depth=0.1"], ["depth", "depth_mm"]),
         (["--target", "depth_mm=near"], ["near"]),
         (["--target", "depth_mm=-1"], ["-1"]),
-        (["--target", "kept_share=2"], ["lost_share", "-1"]),
+        (["--target", "kept_share=2"], ["kept_share=2", "from 0 up"]),
         (["--target", "cloud_mm=1"], ["cloud_mm", "no captures"]),
         (["--target", "pose_mm=1", "--set", "start.pose=tumbled"], ["pose_mm", "outcome_mm"]),
         (["--budget", "quick"], ["quick", "15m"]),
@@ -186,7 +186,7 @@ def test_a_setting_has_its_time_its_bytes_and_its_errors_or_a_reason(tmp_path, m
     monkeypatch.setitem(RESTS, "folder", tmp_path)
     job = job_of(SMALL_CAPTURE)
     context = open_worker(job, open_catalogue(job.assets, Path(), tuple(job.categories)))
-    answers = measure_capture(context, (OWN, COARSE, MERGED, HOPELESS), 0, 0)
+    answers = measure_capture(context, (OWN, COARSE, MERGED, HOPELESS), 0)
     assert all(answers[each.name]["s"] > 0 for each in (OWN, COARSE)) and "failed" in answers[HOPELESS.name]
     assert answers[MERGED.name]["s"] < 0.9 * answers[OWN.name]["s"]  # every photograph has a view from the other side
     assert answers[COARSE.name]["bytes"] < answers[OWN.name]["bytes"] / 3

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from services.study.model import OWN, REFERENCES, Figure, Setting
-from services.study.rounds import LEAST, Wanted, missing, next_round, standings, undecided
-from services.study.study import in_turn
+from services.study.rounds import LEAST, Wanted, next_round, standings, undecided
 from services.study.table import (
     LEAST_OUTCOMES,
     Table,
@@ -119,13 +118,12 @@ def rest(s: float, slid: float = 1.0, corner: float = 0.0, **more: object) -> di
         "corners": [[[corner, 0, 0]]],
         "lost": 0,
         "planned": 2,
-        "redrawn": 1,
         **more,
     }
 
 
 def lost(s: float, reason: str = "left_table") -> dict:
-    return {"s": s, "took": s, "failed": reason, "lost": 2, "planned": 2, "redrawn": 0}
+    return {"s": s, "took": s, "failed": reason, "lost": 2, "planned": 2}
 
 
 def test_rest_is_held_against_the_references_of_the_same_scenes():
@@ -145,7 +143,6 @@ def test_rest_is_held_against_the_references_of_the_same_scenes():
         1,
     )  # of the scene in which the references agree
     assert figures["failed_share"].value == 1 / len(own) and figures["lost_share"].value == 1 / len(own)
-    assert figures["redrawn_share"].value == (len(own) - 1) / (2 * len(own))
     assert figures_of("rest", {}, [fine, finest]) == {}
 
 
@@ -217,7 +214,7 @@ LOOSE = {"depth_mm": 0.2}
 
 
 def round_of(table: Table, scenes: int, allowed_s: float = 1e9) -> list[Wanted]:
-    return next_round(table, "draw", LOOSE, range(scenes), allowed_s)[0]
+    return next_round(table, "draw", LOOSE, range(scenes), allowed_s)
 
 
 def test_every_round_asks_for_the_same_scenes_of_all_that_can_still_win():
@@ -259,31 +256,23 @@ def test_a_round_that_does_not_fit_keeps_the_promising_half_and_never_takes_more
             answers[unit_name("draw", n, one)] = {"s": s, "took": 1.0, "bytes": 1, "errors": drawn}
     table = Table(parts, answers)
 
-    def names(allowed_s: float) -> tuple[set[str], bool, int]:
-        wanted, whole = next_round(table, "draw", LOOSE, range(6), allowed_s)
+    def names(allowed_s: float) -> tuple[set[str], int]:
+        wanted = next_round(table, "draw", LOOSE, range(6), allowed_s)
         assert len(wanted) <= 1.6 * allowed_s
-        return {one.setting.name for one in wanted}, whole, len({one.scene_id for one in wanted})
+        return {one.setting.name for one in wanted}, len({one.scene_id for one in wanted})
 
-    assert names(36.0) == ({OWN.name, *(one.name for one in some)}, True, 4)
-    assert names(35.0) == ({OWN.name, *(one.name for one in some[:3])}, True, 4)
-    assert names(5.0) == ({OWN.name, *(one.name for one in some[:3])}, False, 2)
-    assert names(0.0) == (set(), False, 0)
+    assert names(36.0) == ({OWN.name, *(one.name for one in some)}, 4)
+    assert names(35.0) == ({OWN.name, *(one.name for one in some[:3])}, 4)
+    assert names(5.0) == ({OWN.name, *(one.name for one in some[:3])}, 2)
+    assert names(0.0) == (set(), 0)
 
 
 def test_references_are_measured_as_far_as_they_take_little():
     values = [Setting(((knob, str(n)),), {f"physics.{knob}": n}) for knob in ("a", "b") for n in (1, 2)]
     parts = split_settings((OWN, *values), captured=False)
-    pilot = missing(Table(parts, {}), "rest", in_turn(parts.measured["rest"]), range(1))
     references = [reference.name for reference in REFERENCES]
-    assert [item.setting.name for item in pilot] == ["the job", "a=1", "b=1", "a=2", "b=2", *references]
     for took, is_in in ((1.0, True), (4.0, False)):
         answers = {unit_name("rest", n, setting): rest(1.0) for n in range(2) for setting in (OWN, *values)}
         answers |= {unit_name("rest", n, setting): rest(took) for n in range(2) for setting in REFERENCES}
-        wanted, _ = next_round(Table(parts, answers), "rest", {}, range(8), 1e9)
+        wanted = next_round(Table(parts, answers), "rest", {}, range(8), 1e9)
         assert (set(references) <= {item.setting.name for item in wanted}) == is_in
-
-
-def test_the_least_of_a_cost_is_known_before_anything_was_measured():
-    table = Table(PARTS, {})
-    assert table.cost_s("rest", OWN) == 1.0 and table.cost_s("rest", REFERENCES[0]) > 4.0
-    assert len(missing(table, "draw", [OWN], range(64))) == 64
