@@ -11,7 +11,7 @@ from schemas.environment import cache_folder
 from schemas.errors import MachineError, MeshError
 from schemas.job.assets import Assets, LibrarySource
 from schemas.job.job import Job
-from services.run.progress import ProgressLine
+from services.run.progress import show_counts
 from workers.assets.catalogue import Catalogue
 from workers.pool import Answers, Ended, run_pool
 
@@ -56,10 +56,8 @@ def find_parts(job: Job, catalogue: Catalogue, folder: Path | None = USUAL_FOLDE
         return
     if job.objects_per_scene.high == 1 and job.physics.collision != "parts":
         return
-    if all(library is None for library in catalogue.objects):
-        return
     cuts = list(_shapes(job, catalogue))
-    if len(cuts) > MOST_CUT:
+    if not cuts or len(cuts) > MOST_CUT:
         return
     deep = sorted(f"{cut.row.path}: {message}" for cut, _, message in cut_shapes(cuts, folder) if message)
     if deep:
@@ -86,19 +84,18 @@ def cut_shapes(cuts: Iterable[Cut], folder: Path | None = USUAL_FOLDER) -> Itera
 
     A shape is cut once for ever. Raises MachineError where a process is killed.
     """
-    asked = list(cuts)
-    line, kept = ProgressLine(len(asked), "meshes cut into convex parts", "mesh"), Answers(folder and folder / "cut")
-    for done, (cut, answer) in enumerate(run_pool(cut_shape, asked, key=lambda cut: cut.key, kept=kept), 1):
-        line.show(done)
-        if not isinstance(answer, Ended):
-            yield cut, *json.loads(answer)
-        elif answer.how == "killed":
-            raise MachineError(
-                f"a process that cuts {cut.row.path} into convex parts was killed: start again, what is cut stays"
-            )
-        else:
-            yield cut, 0, f"cannot be cut: it {answer.detail}; set `use` of its row in library.parquet to false"
-    line.close()
+    asked, kept = list(cuts), Answers(folder and folder / "cut")
+    with show_counts("meshes", "mesh") as watch:
+        for done, (cut, answer) in enumerate(run_pool(cut_shape, asked, key=lambda cut: cut.key, kept=kept), 1):
+            watch("cut into convex parts", done, len(asked))
+            if not isinstance(answer, Ended):
+                yield cut, *json.loads(answer)
+            elif answer.how == "killed":
+                raise MachineError(
+                    f"a process that cuts {cut.row.path} into convex parts was killed: start again, what is cut stays"
+                )
+            else:
+                yield cut, 0, f"cannot be cut: it {answer.detail}; set `use` of its row in library.parquet to false"
 
 
 def cut_shape(cut: Cut) -> bytes:

@@ -45,11 +45,10 @@ class ProgressLine:
 
     def __init__(self, asked: int, what: str, unit: str = "scene") -> None:
         self._asked, self._what, self._unit = asked, what, unit
-        self._bar = (
-            tqdm(total=asked, unit=unit, desc=what, file=sys.stderr, ncols=_columns(), nrows=USUAL_ROWS)
-            if sys.stderr.isatty()
-            else None
-        )
+        self._bar = None
+        if sys.stderr.isatty():
+            columns = os.get_terminal_size(sys.stderr.fileno()).columns or USUAL_COLUMNS
+            self._bar = tqdm(total=asked, unit=unit, desc=what, file=sys.stderr, ncols=columns, nrows=USUAL_ROWS)
         self._begun, self._next_s = time.monotonic(), FIRST_LINES_S[0]
 
     def expect(self, asked: int) -> None:
@@ -92,13 +91,6 @@ def show_counts(of: str, unit: str = "file") -> Iterator[Callable[[str, int, int
     finally:
         for line in lines.values():
             line.close()
-
-
-def _columns() -> int:
-    try:
-        return os.get_terminal_size(sys.stderr.fileno()).columns or USUAL_COLUMNS
-    except OSError:
-        return USUAL_COLUMNS
 
 
 def _describe(done: int, asked: int, unit: str, failed: int | None, passed_s: float) -> str:

@@ -105,8 +105,11 @@ def alive_nodes() -> list[dict[str, Any]]:
     return [node for node in ray.nodes() if node["Alive"]]
 
 
-def private_environment() -> dict[str, str]:
-    """The variables that every process of one private Ray starts with; each call makes a new token."""
+def private_environment() -> dict[str, str | None]:
+    """The variables that every process of one private Ray starts with, None for those of the user's that it must not see.
+
+    Each call makes a new token.
+    """
     return {
         # Who does not show the token is refused. The mode is said outright: left open, Ray takes a token from the home
         # folder, or leaves one there; and another variable could have it ask Kubernetes who the caller is.
@@ -120,11 +123,9 @@ def private_environment() -> dict[str, str]:
         # A GCS of this machine that is gone does not come back, as a cluster's may: its clients end after this time, which
         # is 60 s otherwise. So do the agents of a Ray whose other processes were killed.
         "RAY_gcs_rpc_server_reconnect_timeout_s": "15",
+        "RAY_REDIS_ADDRESS": None,  # would tie it to another one
     }
 
-
-NOT_INHERITED = ("RAY_REDIS_ADDRESS",)
-"""Variables of the user's that would tie a private Ray to another one."""
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Images never cross Ray, so its shared memory can be small."""
@@ -191,7 +192,7 @@ def kept_private() -> Iterator[None]:
     """
     environ = os.environ  # noqa: TID251 - Ray and its processes read these settings nowhere else
     mine = private_environment()
-    before = {name: environ.get(name) for name in (*mine, *NOT_INHERITED)}
+    before = {name: environ.get(name) for name in mine}
     replacements: list[tuple[Any, str, Any]] = [
         (ray_constants, "ENABLE_RAY_CLUSTER", False),  # read from the environment when Ray was imported
         (Node, "start_api_server", _note_that_there_is_no_dashboard),
@@ -203,7 +204,7 @@ def kept_private() -> Iterator[None]:
     with contextlib.ExitStack() as undo:
         undo.callback(_read_authentication_again)
         undo.callback(_set_variables, environ, before)
-        _set_variables(environ, {**dict.fromkeys(NOT_INHERITED), **mine})
+        _set_variables(environ, mine)
         for module, name, value in replacements:
             undo.callback(setattr, module, name, getattr(module, name))
             setattr(module, name, value)

@@ -48,8 +48,8 @@ def needed(place: Path, layout: str) -> tuple[int, int]:
     """The most blocks and files that a run has at once, at least those that it has in the end."""
     with small_disk(place, 16384, 100000):
         make_dataset(LocalStore(place / "out"), layout)
-        found = os.statvfs(place)
-        return found.f_blocks - found.f_bfree, found.f_files - found.f_ffree
+        disk = os.statvfs(place)
+        return disk.f_blocks - disk.f_bfree, disk.f_files - disk.f_ffree
 
 
 def told_by_a_run(out: Path, layout: str) -> list[str]:
@@ -75,13 +75,13 @@ def test_a_run_that_meets_a_full_disk_says_so_in_a_line_and_ends_once_there_is_r
     expected = contents(tmp_path / "once")
     blocks, files = needed(tmp_path / "whole", layout)
     points = POINTS[request.config.getoption("--scope")]
-    told = 0
+    refused = 0
     for point in range(points):
         place = tmp_path / "disk"
         share = point / points
         room = (2 + int(blocks * share), 100000) if lack == "bytes" else (16384, 2 + int(files * share))
         with small_disk(place, *room):
-            told += len(told_by_a_run(place / "out", layout))
+            refused += len(told_by_a_run(place / "out", layout))
             if (place / "out").exists():
                 assert not broken_promises(place / "out")
             widen(place)
@@ -89,6 +89,6 @@ def test_a_run_that_meets_a_full_disk_says_so_in_a_line_and_ends_once_there_is_r
             assert contents(place / "out") == expected
             assert not leftovers(place / "out")
         shutil.rmtree(place)
-    print(f"{layout}, {lack}: {told} of {points} points met a full disk")
-    record_figure(f"full disks, {lack}, {layout}", "passed", told)
-    assert told > points * 0.7
+    print(f"{layout}, {lack}: {refused} of {points} points met a full disk")
+    record_figure(f"full disks, {lack}, {layout}", "passed", refused)
+    assert refused > points * 0.7

@@ -40,8 +40,8 @@ def disturbed(tmp_path: Path, disturb, **settings) -> EndedRun:
 def line_of(run: EndedRun) -> str:
     """What it told beside its progress, all of it in one line of ours."""
     assert run.code == 1, run.told
-    told = [line.replace("\x1b[K", "") for line in run.told.splitlines()]
-    lines = [line for line in told if not line.startswith(f"{JOB['name']}: ") and line.strip("\x1b[0m ")]
+    said = [line.replace("\x1b[K", "") for line in run.told.splitlines()]
+    lines = [line for line in said if not line.startswith(f"{JOB['name']}: ") and line.strip("\x1b[0m ")]
     assert len(lines) == 1, run.told
     assert run.left == []
     return lines[0].strip("\x1b[0m ")

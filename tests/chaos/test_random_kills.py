@@ -59,13 +59,13 @@ def running(job: Path, out: Path) -> Iterator[Run]:
     """A run on two workers; what is left of it in the end is killed."""
     mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
     command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--workers", "2"]
-    with open(out.with_suffix(".txt"), "ab") as told:
+    with open(out.with_suffix(".txt"), "ab") as said:
         process = subprocess.Popen(
             command,
             cwd=ROOT,
             env={**os.environ, **dict([mark.split("=")])},
             stdout=subprocess.DEVNULL,
-            stderr=told,
+            stderr=said,
             start_new_session=True,
         )
     try:
@@ -78,8 +78,8 @@ def running(job: Path, out: Path) -> Iterator[Run]:
 
 def decided(out: Path) -> dict[str, tuple[int, int]]:
     """Inode and time of each commit record: another value means that it was written again."""
-    found = {path.name: path.stat() for path in out.glob("manifest/_commits/*.json")}
-    return {name: (stat.st_ino, stat.st_mtime_ns) for name, stat in found.items()}
+    stats = {path.name: path.stat() for path in out.glob("manifest/_commits/*.json")}
+    return {name: (stat.st_ino, stat.st_mtime_ns) for name, stat in stats.items()}
 
 
 def finish_once(job: Path, out: Path) -> tuple[str, float]:

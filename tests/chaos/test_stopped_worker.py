@@ -45,8 +45,8 @@ def test_a_worker_stopped_in_a_scene_is_told_ended_and_blamed_for_time(cluster, 
     assert merged.scenes == {"made": 7, "intrinsic": 0, "environmental": 1}
     (row,) = query(LocalStore(tmp_path), "select * from failures").to_pylist()
     assert (row["scene_id"], row["kind"], row["reason"], row["attempts"]) == (5, "environmental", "time", 1)
-    told = [line for line in capfd.readouterr().err.splitlines() if "no progress" in line]
-    for pid, line in zip(stopped, told, strict=True):
+    lines = [line for line in capfd.readouterr().err.splitlines() if "no progress" in line]
+    for pid, line in zip(stopped, lines, strict=True):
         assert line.startswith("verso: range from 4, scene 5: no progress for ")
         assert f"by process {pid} on {socket.gethostname()}, which was stopped by a signal" in line
     assert make(tmp_path, retry_failed=True).scenes == {"made": 8, "intrinsic": 0, "environmental": 0}

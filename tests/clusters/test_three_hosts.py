@@ -86,8 +86,8 @@ class Cluster:
         begun = time.monotonic()
         done = self.ray("up")
         assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-        while (found := self.nodes()) < nodes:
-            assert time.monotonic() < begun + 200, f"{found} nodes of {nodes}: {done.stdout[-2000:]}"
+        while (count := self.nodes()) < nodes:
+            assert time.monotonic() < begun + 200, f"{count} nodes of {nodes}: {done.stdout[-2000:]}"
             time.sleep(1.0)
         return time.monotonic() - begun
 

@@ -71,7 +71,7 @@ def test_a_job_that_would_write_to_one_hosts_private_disk_is_refused_before_the_
     with another_node(cluster, tmp_path, *own_disk):
         done = cluster.verso("run", str(job), "--out", str(disk / "out"), "--address", cluster.address)
     assert done.returncode == 2, done.stderr
-    (told,) = (line for line in done.stderr.splitlines() if line.startswith("verso: "))
-    assert "does not share the output folder" in told and "there is no such folder" in told
-    assert "NFS" in told and "s3://" in told and "nothing was made" in told
+    (line,) = (each for each in done.stderr.splitlines() if each.startswith("verso: "))
+    assert "does not share the output folder" in line and "there is no such folder" in line
+    assert "NFS" in line and "s3://" in line and "nothing was made" in line
     assert not list((disk / "out").glob("manifest/_commits/*")) and not list((disk / "out").glob("_staging/*/*"))

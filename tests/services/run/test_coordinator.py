@@ -263,8 +263,8 @@ def store(request, tmp_path) -> Store:
 def first_stall(take_stalls, within_s: float) -> tuple[AttemptName | None, Sight, float]:
     begun = time.monotonic()
     while time.monotonic() - begun < within_s:
-        if found := take_stalls():
-            return *found[0], time.monotonic() - begun
+        if stalls := take_stalls():
+            return *stalls[0], time.monotonic() - begun
         time.sleep(0.01)
     raise TimeoutError
 
@@ -275,13 +275,13 @@ def test_a_worker_that_stays_in_a_scene_is_found_and_one_that_goes_on_is_not(sto
     begin_attempt(store, Span(start=12, stop=16), TERMS, "others").begin_scene(12)
     stuck.begin_scene(5)
     with watch(store, "label", 2 * LIMIT_S) as take_stalls:
-        found = []
+        stalls = []
         for number in range(40):
             lively.begin_scene(8 + number % 4)
             time.sleep(0.03)
-            found += take_stalls()
-    assert {(attempt.start, sight.scene_id) for attempt, sight in found} == {(4, 5)}
-    attempt, sight = found[0]
+            stalls += take_stalls()
+    assert {(attempt.start, sight.scene_id) for attempt, sight in stalls} == {(4, 5)}
+    attempt, sight = stalls[0]
     assert (attempt.name, attempt.pid) == (stuck.name, os.getpid())
     assert sight.idle_s > SCENE_FACTOR * 2 * LIMIT_S
 

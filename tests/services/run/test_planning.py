@@ -1,6 +1,5 @@
 """What of a dataset is still to be made, without ever an overlap; in which shards; and what it had once and has lost."""
 
-import itertools
 import tracemalloc
 
 import pytest
@@ -72,21 +71,6 @@ def test_planners_with_old_views_and_other_ends_never_overlap_and_cover_all_in_t
             log.append((start, stop))
     scenes = [scene for start, stop in log for scene in range(start, stop)]
     assert sorted(scenes) == list(range(first, end))
-
-
-@given(st.data())
-def test_the_lazy_plan_is_that_of_a_list_over_every_cell(data):
-    first, size = data.draw(st.integers(0, 5), "first"), data.draw(st.integers(1, 6), "range size")
-    stop = first + data.draw(st.integers(1, 40), "scenes")
-    committed, missing = [], []
-    for line in range(first, stop, size):
-        cuts = st.lists(st.integers(line + 1, min(line + size, stop)), unique=True, max_size=3)
-        inner = [line, *sorted(data.draw(cuts, f"cuts {line}"))]
-        committed += itertools.pairwise(inner)
-        if inner[-1] < min(line + size, stop):
-            missing.append((inner[-1], min(line + size, stop)))
-    shuffled = data.draw(st.permutations(committed), "order")
-    assert list(plan_ranges(first, stop, size, shuffled)) == missing
 
 
 def summary(start, retry=0, failed=(), scenes=(), stop=None):

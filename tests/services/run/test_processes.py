@@ -30,8 +30,8 @@ children = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIP
 stopped = subprocess.Popen(["sleep", "600"])
 stopped.send_signal(19)
 children[1].wait()
-found = sorted(process.pid for process in descendants(os.getpid()))
-print(json.dumps([found, [process.pid for process in end_all(lambda: descendants(os.getpid()))]]))
+family = sorted(process.pid for process in descendants(os.getpid()))
+print(json.dumps([family, [process.pid for process in end_all(lambda: descendants(os.getpid()))]]))
 """
 
 
@@ -46,9 +46,9 @@ def sleeper():
 def test_orphans_in_other_sessions_stopped_and_stubborn_ones_are_ended_and_nobody_else(sleeper):
     begun = time.monotonic()
     done = subprocess.run([sys.executable, "-c", FAMILY], cwd=ROOT, capture_output=True, text=True, check=True)
-    found, left = json.loads(done.stdout)
-    assert (len(found), left) == (3, [])
-    assert [pid for pid in found if read_process(pid) is not None] == []
+    family, left = json.loads(done.stdout)
+    assert (len(family), left) == (3, [])
+    assert [pid for pid in family if read_process(pid) is not None] == []
     assert sleeper.poll() is None
     assert time.monotonic() - begun < 15
 

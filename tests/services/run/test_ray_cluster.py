@@ -30,7 +30,6 @@ from services.run.machine import (
 )
 from services.run.ray_cluster import (
     LOOK_EVERY_S,
-    NOT_INHERITED,
     PREFETCH,
     Slots,
     cluster_slots,
@@ -118,7 +117,7 @@ def test_each_run_has_a_token_of_its_own_that_nobody_guesses_and_the_rest_is_the
     first, second = private_environment(), private_environment()
     tokens = {one.pop("RAY_AUTH_TOKEN") for one in (first, second)}
     assert len(tokens) == 2 and all(len(bytes.fromhex(token)) >= 32 for token in tokens)
-    assert first == second and first["RAY_AUTH_MODE"] == "token" and not set(NOT_INHERITED) & set(first)
+    assert first == second and first["RAY_AUTH_MODE"] == "token" and first["RAY_REDIS_ADDRESS"] is None
 
 
 def test_slots_follow_the_cores_of_the_cluster_which_is_asked_now_and_then(monkeypatch):
@@ -202,18 +201,14 @@ def test_what_only_looks_like_one_or_is_another_users_stays(short):
 
 
 def test_a_name_that_is_too_long_for_sockets_leads_to_another_folder_or_is_told(short, monkeypatch):
-    longest, other = short / ("x" * (MAX_BASE_BYTES - len(str(short)) - 1)), short / "other"
-    for place in (longest, other):
-        place.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(longest))
-    with private_folder() as folder:
-        assert folder.is_relative_to(longest)
-        assert len(str(folder) + "/" + "s" * (SESSION_BYTES - 1)) == SOCKET_BYTES
-    long = f"/tmp/{'ü' * MAX_BASE_BYTES}"
-    monkeypatch.setattr(tempfile, "tempdir", long)
-    monkeypatch.setattr(module, "OTHERS", (short / "missing", other))
-    with private_folder() as folder:
-        assert folder.is_relative_to(other)
+    longest, long = short / ("x" * (MAX_BASE_BYTES - len(str(short)) - 1)), f"/tmp/{'ü' * MAX_BASE_BYTES}"
+    longest.mkdir()
+    for wanted, others in ((str(longest), ()), (long, (short / "missing", longest))):
+        monkeypatch.setattr(tempfile, "tempdir", wanted)
+        monkeypatch.setattr(module, "OTHERS", others)
+        with private_folder() as folder:
+            assert folder.is_relative_to(longest)
+            assert len(str(folder) + "/" + "s" * (SESSION_BYTES - 1)) == SOCKET_BYTES
     monkeypatch.setattr(module, "OTHERS", (short / "missing",))
     sizes = f"{len(os.fsencode(long))} bytes, at most {MAX_BASE_BYTES} fit"
     with (
@@ -330,5 +325,5 @@ def test_what_is_sent_would_be_seen(network):
     with network.watch() as frames:
         before = len(frames)
         subprocess.run(network.command([sys.executable, "-c", ask]), check=True)
-    told = set(frames[before:])
-    assert {"UDP to 10.211.0.1:53", "TCP to 169.254.169.254:80"} <= told, told
+    sent = set(frames[before:])
+    assert {"UDP to 10.211.0.1:53", "TCP to 169.254.169.254:80"} <= sent, sent

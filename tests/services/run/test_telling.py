@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import urllib.error
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -80,22 +81,22 @@ def test_another_jobs_folder_somebodys_files_and_a_place_that_cannot_be_written_
 def test_a_tier_that_cannot_draw_here_is_refused_with_the_remedy_before_anything_is_made(tmp_path, monkeypatch, capsys):
     job, out = tmp_path / "job.yaml", tmp_path / "out"
 
-    def told(render: dict, *more: str) -> str:
+    def refusal(render: dict, *more: str) -> str:
         job.write_text(json.dumps({"name": "t", "scenes": 1, "render": {"tier": "pathtraced", **render}}))
         assert main(["run", str(job), "--out", str(out), *more]) == 2
         assert not out.exists()
         return capsys.readouterr().err
 
     for key, value in (("path_samples", 0), ("path_samples", "many"), ("path_bounces", 65)):
-        assert f"render.{key}: {value!r}" in told({key: value}, "--dry-run")
+        assert f"render.{key}: {value!r}" in refusal({key: value}, "--dry-run")
     if importlib.util.find_spec("mitsuba"):
         with monkeypatch.context() as patch:
             patch.setattr("workers.render.tiers.SYSTEM_LIBRARY", "libnone-of-this-name.so.1")
-            assert "apt-get install -y libatomic1" in told({})
+            assert "apt-get install -y libatomic1" in refusal({})
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "mitsuba" else find(name, *a))
     for more in ([], ["--dry-run"]):
-        said = told({}, *more)
+        said = refusal({}, *more)
         assert "Mitsuba is not installed" in said and "./verso extra pathtraced" in said
 
 
@@ -153,29 +154,22 @@ def test_what_is_counted_is_served_while_it_lasts(place):
     meter = Meter("mugs")
     with serve(meter, place):
         assert scrape(place)["verso_phase", "planning"] == 1.0
-        meter.show(
-            {
-                **Tally(100, 40, since=1.8e9, ranges=4, in_flight=7).counts(2),
-                "failed": {"intrinsic: left_table": 3},
-                "lost": {"memory": 1},
-                "seconds": {"settle": 1.5, 'a "stage"\n': 2.0},
-            }
-        )
-        found = scrape(place)
-    assert found["verso_scenes_failed_total", "intrinsic: left_table"] == 3
-    assert found["verso_workers_lost_total", "memory"] == 1
-    assert found["verso_stage_seconds_total", "settle"] == 1.5
-    assert found["verso_stage_seconds_total", 'a "stage"\n'] == 2.0
-    assert (found["verso_phase", "making"], found["verso_phase", "planning"]) == (1.0, 0.0)
-    for name, value in (
-        ("scenes_asked", 100),
-        ("scenes_made_total", 40),
-        ("commits_total", 4),
-        ("ranges_in_flight", 7),
-        ("slots", 2),
-        ("making_since_timestamp_seconds", 1.8e9),
-    ):
-        assert found[f"verso_{name}",] == value
+        tally = Tally(100, 40, Counter({"intrinsic: left_table": 3}), since=1.8e9, ranges=4, in_flight=7)
+        tally.seconds = {"settle": 1.5, 'a "stage"\n': 2.0}
+        meter.show({**tally.counts(2), "lost": {"memory": 1}})
+        values = scrape(place)
+    labelled = {
+        ("scenes_failed_total", "intrinsic: left_table"): 3,
+        ("workers_lost_total", "memory"): 1,
+        ("stage_seconds_total", "settle"): 1.5,
+        ("stage_seconds_total", 'a "stage"\n'): 2.0,
+        ("phase", "making"): 1.0,
+        ("phase", "planning"): 0.0,
+    }
+    plain = {"scenes_asked": 100, "scenes_made_total": 40, "commits_total": 4, "ranges_in_flight": 7, "slots": 2}
+    plain["making_since_timestamp_seconds"] = 1.8e9
+    for (name, *label), value in (labelled | {(name,): value for name, value in plain.items()}).items():
+        assert values[f"verso_{name}", *label] == value
     with pytest.raises(urllib.error.URLError):
         scrape(place)
     with serve(Meter("mugs"), None), pytest.raises(urllib.error.URLError):
