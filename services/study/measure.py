@@ -32,7 +32,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.make_capture import require_captures, simulate_one
 from workers.capture.process import CaptureViews
-from workers.capture.reconstruct import ProcessorClock, estimate_surface, given_files
+from workers.capture.reconstruct import estimate_surface, given_files, processor_clock
 from workers.capture.score import read_whole_truth, score_capture
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import motion_between, transform
@@ -191,7 +191,7 @@ def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: 
 
 
 def _rest(worker: WorkerContext, scene_id: int, setting: Setting) -> Answer:
-    planning, watch = ProcessorClock(), ProcessorClock()
+    planning, watch = processor_clock(), processor_clock()
     plan, _ = plan_with_effects(worker, scene_id, planning)
     planned = len(plan.objects)
     try:
@@ -322,17 +322,17 @@ class TimedViews(CaptureViews):
 
 
 def _process(context: WorkerContext, worker: WorkerContext, scene_id: int) -> Answer:
-    watch, captures = ProcessorClock(), require_captures(worker.job)
+    watch, captures = processor_clock(), require_captures(worker.job)
     whole = _simulated(context, captures.simulate.image_scale, scene_id)
     chosen = spread_evenly(len(whole.numbers), captures.simulate.views)
     folder = replace(whole, numbers=tuple(whole.numbers[place] for place in chosen))
     with watch.stage("read"):
         given = given_files(folder, captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
-    views = TimedViews(given, estimates.estimate, captures, merged.body)
     truth, surface = read_whole_truth(folder), merged.surface
     assert truth is not None  # a simulated capture has it
-    score = score_capture(estimates.estimate, surface, views, truth, HELD_OUT).summary
+    views = TimedViews(given, captures, estimates.estimate, surface, merged.body)
+    score = score_capture(views, truth, HELD_OUT).summary
     mirrors_s = fmean(views.seconds) * len(estimates.estimate.used) if views.seconds else 0.0
     figures = {name: getattr(score, figure) for name, figure in ERRORS_OF_SCORE.items()}
     figures["missing_share"] = None if score.completeness is None else 1.0 - score.completeness
