@@ -245,11 +245,9 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str,
         low, high = max(figure.low, figure.value / REACH), min(figure.most, figure.value * REACH)
         axes.vlines(row.ms, shown(error, low), shown(error, high), color=mark["color"], lw=0.8, alpha=0.5)
         axes.plot(*place[row.setting.name], ls="", **mark)
-        if row.setting.kind in ("own", "preset") or (row in best and row.setting.kind == "single"):
-            text = row.setting.parts[0][1][:26] if row.setting.parts else "the job"
-            at = (-6.0, -12.0) if row.setting.kind == "own" else (6.0, 3.0)
-            side = "right" if row.setting.kind == "own" else "left"
-            axes.annotate(text, place[row.setting.name], at, textcoords="offset points", ha=side, zorder=6)
+        if row.setting.kind == "preset" or (row in best and row.setting.kind == "single"):
+            text = row.setting.parts[0][1][:26]
+            axes.annotate(text, place[row.setting.name], (6.0, 3.0), textcoords="offset points", zorder=6)
     if best:
         corners = pts_to_poststep(*zip(*(place[row.setting.name] for row in best), strict=True))
         axes.plot(*corners, color="#222222", lw=1.3, zorder=2, label="front: none is cheaper and better")

@@ -1,14 +1,14 @@
 """Studies of accuracy against time: rows that were made up, and the studies that are kept in docs/tradeoff."""
 
-import json
 from functools import cache
 from pathlib import Path
+
+from pydantic import TypeAdapter
 
 from schemas.job.job import JobKind
 from services.study.model import Figure, Proof, Row, Setting, Study
 
 EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"
-
 
 PROOF = Proof("step=60", 80, {"depth_mm": 0.1}, {"depth_mm": Figure(0.09, 0.08, 0.1, 0.08, 0.1, 80)}, {})
 """A recommendation that held, of an error that the setting did not measure itself."""
@@ -35,22 +35,7 @@ def study(*rows: Row, job_scenes: int = 64, notes: tuple[str, ...] = ()) -> Stud
 
 def read_study(folder: Path) -> Study:
     """What `write_study` was given; a tuple among the values of changes or machine comes back as a list."""
-    tree = json.loads((folder / "study.json").read_text(encoding="utf-8"))
-    assert tree.pop("verso_study") == 2
-    tuples = {name: tuple(tree[name]) for name in ("notes", "doubts")}
-    proofs = tuple(map(_proof, tree["proofs"]))
-    return Study(**(tree | tuples | {"rows": tuple(map(_row, tree["rows"])), "proofs": proofs}))
-
-
-def _proof(tree: dict) -> Proof:
-    figures = {side: {name: Figure(**one) for name, one in tree[side].items()} for side in ("measured", "promised")}
-    return Proof(**(tree | figures))
-
-
-def _row(tree: dict) -> Row:
-    setting = Setting(tuple((knob, label) for knob, label in tree["setting"]["parts"]), tree["setting"]["changes"])
-    errors = {name: Figure(**figure) for name, figure in tree["errors"].items()}
-    return Row(**(tree | {"setting": setting, "errors": errors, "notes": tuple(tree["notes"])}))
+    return TypeAdapter(Study).validate_json((folder / "study.json").read_bytes())
 
 
 @cache

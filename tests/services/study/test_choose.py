@@ -15,7 +15,6 @@ from services.study.choose import (
     describe_answer,
     error_of,
     front,
-    listed,
     parse_targets,
     recommend,
 )
@@ -148,15 +147,12 @@ def test_bad_targets_are_told_with_the_remedy():
     for text, message in {
         "": "write it as penetration_mm=0.1,depth_mm=0.5",
         "depth_mm": "write it as penetration_mm=0.1,depth_mm=0.5",
-        "=1": "write it as",
         "depth_mm=0.1,": "write it as",
         "depth_mm=a bit": "depth_mm=a bit: must be a number",
         "depth_mm=-0.1": "must be a number from 0 up",
         "depth_mm=nan": "must be a number",
-        "depth_mm=inf": "must be a number",
         "depth_mm=0.1,depth_mm=0.2": "is given twice, as 0.1 and as 0.2",
         "dept_mm=0.1": "did you mean 'depth_mm'",
-        "speed=1": "Known: pose_mm, ",
     }.items():
         with pytest.raises(InputError) as caught:
             parse_targets(text)
@@ -208,4 +204,3 @@ def test_amounts_are_written_as_a_person_reads_them():
         assert {value: write(value) for value in cases} == cases
     assert amount("penetration_mm", 0.1) == "0.1 mm" and amount("mask_share", 0.001) == "0.1 %"
     assert amount("flip", 0.12) == "0.12" and amount("outcome_deg", 0.01) == "0.01 deg"
-    assert [listed(words) for words in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == ["", "a", "a and b", "a, b and c"]

@@ -15,7 +15,6 @@ from schemas.scene.shape import Appearance
 from schemas.scene.view import Camera, Intrinsics, Pair, View
 from services.job.job_file import validate_job
 from services.study.images import Truth, measure_images
-from services.study.truths import cast_patch
 from tests.effects.scenes import SMALL, context_of, merged
 from tests.kit.shapes import box, shape_of
 from workers.geometry.camera import look_at
@@ -115,9 +114,8 @@ def test_depth_that_one_pixel_in_fifty_has_wrong_counts_and_one_in_two_hundred_o
     for every, off, expected in ((50, 0.1, 100.0), (200, 0.1, 0.0), (2, -TOP_Z, 0.0)):
         wrong = depth_m.copy()
         wrong[rows[::every], columns[::every]] += off
-        assert measure(table_and(block()), pair_of(view(wrong, region)))["depth_mm"] == pytest.approx(
-            expected, abs=1e-3
-        )
+        errors = measure(table_and(block()), pair_of(view(wrong, region)))
+        assert errors["depth_mm"] == pytest.approx(expected, abs=1e-3)
 
 
 def test_mask_pixels_that_differ_count_per_pixel_of_the_object(seen):
@@ -237,16 +235,6 @@ def test_truth_is_kept_while_the_poses_are_the_same_and_no_longer(seen):
     assert not any(pixels(other) is first for other in others) and pixels(things, scene_id=6) is not first
 
 
-def test_the_patch_is_the_box_about_what_is_seen_of_the_object():
-    """And not about its foot, which the top hides, nor about what another thing hides."""
-    half = np.array([0.1, 0.075]) * F / TOP_Z
-    patch = cast_patch(table_and(block()), camera_above())
-    expected = np.array([80 - half[0], 60 - half[1], 80 + half[0], 60 + half[1]])
-    assert np.array(patch.box) * (WIDTH, HEIGHT, WIDTH, HEIGHT) == pytest.approx(expected, abs=0.3)
-    things = table_and(block(), roof=box(0.4, 0.4, 0.01, (0.2, 0.0, 0.205)))  # its near edge is at the axis
-    assert cast_patch(things, camera_above()).box[2] * WIDTH == pytest.approx(80.0, abs=0.3)
-
-
 def test_a_made_scene_has_the_errors_that_its_units_and_pixels_leave():
     """99 of 100 of errors that rounding spreads evenly are within 99 % of half a unit. Pixels twice as wide, and nothing
     else changed, have twice the error between them."""
@@ -268,7 +256,6 @@ def test_a_made_scene_has_the_errors_that_its_units_and_pixels_leave():
     depth_m, region, _ = cast_view(scene.posed.things, camera)
     pixels = truth.pixels(camera)
     for rays in (pixels.box, pixels.spread):
-        assert np.array_equal(rays.region, rays.of(region)) and rays.depth_m == pytest.approx(
-            rays.of(depth_m), abs=1e-9
-        )
+        assert np.array_equal(rays.region, rays.of(region))
+        assert rays.depth_m == pytest.approx(rays.of(depth_m), abs=1e-9)
     assert np.count_nonzero(pixels.box.region >= 3) == np.count_nonzero(region >= 3) > 50

@@ -1,7 +1,6 @@
 """How one scene comes to rest with each setting and what it costs, and what breaks a measure is counted."""
 
-import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from schemas.errors import SettleError
 from schemas.job.job import Job
 from services.study import measure
-from services.study.measure import QUICK_S, answer_for, measure_rest, own_rest, warm_answer_for
+from services.study.measure import QUICK_S, answer_for, measure_rest, own_rest
 from services.study.model import REFERENCES, Setting
 from services.study.table import pose_error
 from workers.assets.catalogue import open_catalogue
@@ -70,37 +69,21 @@ def test_a_scene_that_cannot_be_drawn_is_a_failed_answer_with_its_reason():
 
 
 def test_what_breaks_a_measure_is_a_counted_answer(monkeypatch):
-    def flat() -> dict:
-        raise ValueError("initial simplex is flat")
-
-    def lost() -> dict:
-        raise SettleError("left_table", "it is gone")
-
-    def endless() -> dict:
-        while True:
+    def broken(error: Exception | None) -> dict:
+        while error is None:
             pass
+        raise error
 
     monkeypatch.setitem(measure.LIMIT, "s", 0.05)
-    scenes = answer_for(endless)
+    scenes = answer_for(partial(broken, None))
     assert scenes["failed"] == "time_out" and 0.03 < scenes["took"] < 20.0
     monkeypatch.setitem(measure.LIMIT, "s", float("inf"))
     tiny = answer_for(lambda: {"errors": {"penetration_mm": 4e-8, "gap_mm": 0.0123456789}})["errors"]
     assert tiny == {"penetration_mm": 0.0, "gap_mm": 0.012346}
-    assert answer_for(flat)["failed"] == "broken" and "initial simplex is flat" in answer_for(flat)["broken"]
-    assert answer_for(lost)["failed"] == "left_table" and "broken" not in answer_for(lost)
-
-
-def test_a_process_measures_its_first_answer_of_a_setting_again_unless_that_takes_long(monkeypatch):
-    calls: list[str] = []
-
-    def first_compiles() -> dict[str, int]:
-        calls.append("")
-        time.sleep(0.2 if len(calls) == 1 else 0.0)
-        return {"call": len(calls)}
-
-    assert [warm_answer_for("draw", COARSE, first_compiles)["call"] for _ in range(2)] == [2, 3]
-    monkeypatch.setitem(QUICK_S, "draw", 0.0)
-    assert warm_answer_for("draw", BOX, first_compiles)["call"] == 4
+    flat, lost = ValueError("initial simplex is flat"), SettleError("left_table", "it is gone")
+    flat, lost = (answer_for(partial(broken, error)) for error in (flat, lost))
+    assert flat["failed"] == "broken" and "initial simplex is flat" in flat["broken"]
+    assert lost["failed"] == "left_table" and "broken" not in lost
 
 
 @pytest.mark.minute

@@ -52,13 +52,12 @@ def test_the_page_answers_first_and_needs_no_network_no_script_and_no_file(tmp_p
     assert reader.texts["p"][0] == stored().answer
     assert reader.texts["h1"] == ["What accuracy costs in time: tabletop"]
     (picture,) = reader.links
-    assert (
-        base64.b64decode(picture.removeprefix("data:image/png;base64,")) == (tmp_path / "new/tradeoff.png").read_bytes()
-    )
+    data = base64.b64decode(picture.removeprefix("data:image/png;base64,"))
+    assert data == (tmp_path / "new" / "tradeoff.png").read_bytes()
     assert "script" not in reader.texts and "link" not in reader.texts
     assert not re.search(r"https?:|url\(|@import", page)
-    doubt = "Not decided: whether step=30 (4 scenes)."
-    assert Reader(page_of(study(row()), b"")).texts["p"][:2] == ["Use step=60.", doubt]
+    words = Reader(page_of(study(row()), b"")).texts["p"]
+    assert words[:2] == ["Use step=60.", "Not decided: whether step=30 (4 scenes)."]
 
 
 def test_what_comes_from_outside_is_escaped():
@@ -81,15 +80,9 @@ def test_every_setting_is_in_tables_of_even_rows():
 
 
 def test_a_row_says_what_the_job_costs_and_what_differs_by_more_than_colour():
-    rows = [
-        row(depth_mm=0.1),
-        row("a=1", 0.5, depth_mm=0.2),
-        row("a=2", 2.0, depth_mm=0.05),
-        row("a=3", 3.0, depth_mm=0.1),
-    ]
-    cells = {
-        cells[0]: cells for cells in Reader(page_of(study(*rows, job_scenes=100_000), b"")).rows if len(cells) == 6
-    }
+    rows = [row(name, ratio, depth_mm=d) for name, ratio, d in (("", 1, 0.1), ("a=1", 0.5, 0.2), ("a=2", 2, 0.05))]
+    made = study(*rows, row("a=3", 3.0, depth_mm=0.1), job_scenes=100_000)
+    cells = {cells[0]: cells for cells in Reader(page_of(made, b"")).rows if len(cells) == 6}
     marks = {"a=1": "▲ 0.2", "a=2": "▼ 0.05", "a=3": "0.1"}
     assert all(cells[name][-1].startswith(mark) for name, mark in marks.items())
     assert cells["a=2"][1:5] == ["2 times1.96 – 2.04", "236 ms", "6.6 h", "24 GB"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.study.model import OWN, REFERENCES, Figure, Setting
-from services.study.rounds import LEAST, Wanted, next_round, standings, undecided
+from services.study.rounds import LEAST, next_round, standings, undecided
 from services.study.table import (
     LEAST_OUTCOMES,
     Table,
@@ -111,10 +111,8 @@ def test_rest_is_held_against_the_references_of_the_same_scenes():
     figures = figures_of("rest", own, [fine, finest])
     assert figures["outcome_mm"].value == pytest.approx(2.0) and figures["outcome_mm"].scenes == LEAST_OUTCOMES
     assert figures["outcome_deg"].value == 0.0
-    assert (figures["pose_mm"].value, figures["pose_mm"].scenes) == (
-        2.0,
-        1,
-    )  # of the scene in which the references agree
+    pose = figures["pose_mm"]  # of the scene in which the references agree
+    assert (pose.value, pose.scenes) == (2.0, 1)
     assert figures["failed_share"].value == 1 / len(own) and figures["lost_share"].value == 1 / len(own)
     assert figures_of("rest", {}, [fine, finest]) == {}
 
@@ -148,13 +146,11 @@ def test_times_of_parts_add_up_and_a_preset_is_put_together_of_parts_that_were_m
 def test_percentiles_of_fewer_scenes_are_as_many_times_the_jobs_as_in_the_same_scenes():
     """The job's error is 1 mm in two scenes and 3 mm in two more, in which only it was measured; the setting's is half."""
 
-    def drawn(depth_mm: float) -> dict:
-        errors = {"depth_mm": depth_mm, "mirror_mm": 1e-9 * depth_mm, "mask_share": min(1.0, depth_mm / 3.0)}
-        return {"s": 1.0, "took": 1.0, "errors": errors}
-
-    answers = {unit_name("draw", n, OWN): drawn(1.0 if n < 2 else 3.0) for n in range(4)}
-    answers |= {unit_name("draw", n, UNITS): drawn(0.5) for n in range(2)}
-    answers |= {unit_name("draw", n, FLAT): drawn(2.0) for n in range(2)}
+    answers = {}
+    for n in range(4):
+        for some, depth_mm in ((OWN, 1.0 if n < 2 else 3.0), *([(UNITS, 0.5), (FLAT, 2.0)] if n < 2 else ())):
+            errors = {"depth_mm": depth_mm, "mirror_mm": 1e-9 * depth_mm, "mask_share": min(1.0, depth_mm / 3.0)}
+            answers[unit_name("draw", n, some)] = {"s": 1.0, "took": 1.0, "errors": errors}
     table = Table(PARTS, answers)
     flat = table.figures("draw", FLAT)["mask_share"]  # twice the job's, which is 1 in two more
     assert (flat.value, flat.high, flat.most) == (1.0, 1.0, 1.0)
@@ -182,18 +178,13 @@ def test_a_scene_that_fails_counts_and_a_setting_without_a_time_has_no_row():
 LOOSE = {"depth_mm": 0.2}
 
 
-def round_of(table: Table, scenes: int, allowed_s: float = 1e9) -> list[Wanted]:
-    return next_round(table, "draw", LOOSE, range(scenes), allowed_s)
-
-
 def test_every_round_asks_for_the_same_scenes_of_all_that_can_still_win():
-    table = Table(PARTS, journal(2))
-    assert sorted((one.scene_id, one.setting.name) for one in round_of(table, 4)) == sorted(
-        (n, one.name) for n in (2, 3) for one in (OWN, FLAT, UNITS)
-    )
-    assert round_of(table, 2) == []
-    late = round_of(Table(PARTS, journal(LEAST)), 64)
-    assert {one.setting.name for one in late} == {OWN.name, FLAT.name} and len(late) == 2 * (64 - LEAST)
+    early, late = (Table(PARTS, journal(scenes)) for scenes in (2, LEAST))
+    wanted = [(item.scene_id, item.setting.name) for item in next_round(early, "draw", LOOSE, range(4), 1e9)]
+    assert sorted(wanted) == sorted((n, some.name) for n in (2, 3) for some in (OWN, FLAT, UNITS))
+    assert next_round(early, "draw", LOOSE, range(2), 1e9) == []
+    wanted = next_round(late, "draw", LOOSE, range(64), 1e9)
+    assert {item.setting.name for item in wanted} == {OWN.name, FLAT.name} and len(wanted) == 2 * (64 - LEAST)
 
 
 def left(answers: dict) -> set[str]:
