@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 import urllib.parse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,14 +55,14 @@ def submit(options: argparse.Namespace) -> int:
 
 def jobs(options: argparse.Namespace) -> int:
     """`verso jobs`."""
-    from services.queue.listing import as_tree, format_rows, list_jobs
+    from services.queue.listing import format_rows, list_jobs
 
     queue = open_queue(_place(options))
     listed = list_jobs(queue)
     print("\n".join(format_rows(listed)) if listed else f"{queue.name} has no jobs")
     if any(job.state in ("queued", "waiting", "running", "cancelling") for job in listed):
         _say(_describe_supervisor(queue))
-    return finish(options, True, queue=queue.name, jobs=[as_tree(job) for job in listed])
+    return finish(options, True, queue=queue.name, jobs=[asdict(job) for job in listed])
 
 
 def logs(options: argparse.Namespace) -> int:
@@ -89,11 +90,9 @@ def logs(options: argparse.Namespace) -> int:
 def cancel(options: argparse.Namespace) -> int:
     """`verso cancel`."""
     queue = open_queue(_place(options))
-    view = queue.append(options.id, "cancel")
-    if view is None:
-        view = queue.read(options.id)
-        if view.state not in ("cancelling", "cancelled"):
-            raise RunError(f"job {options.id} is {view.state}: there is nothing to cancel")
+    view = queue.append(options.id, "cancel") or queue.read(options.id)
+    if view.state not in ("cancelling", "cancelled"):
+        raise RunError(f"job {options.id} is {view.state}: there is nothing to cancel")
     if view.state == "cancelling":
         _say(f"job {options.id} runs: its supervisor stops it; what is committed in {view.request.out} is kept")
         _say(_describe_supervisor(queue))
@@ -161,9 +160,8 @@ def _cluster_drivers(options: argparse.Namespace) -> "Drivers":
     try:
         drivers.states()
     except MachineError as error:
-        if options.address is not None:
-            raise
-        raise MachineError(f"{error}; or give the queue a Ray of its own on this machine: --address own") from error
+        own = "; or give the queue a Ray of its own on this machine: --address own" if options.address is None else ""
+        raise MachineError(f"{error}{own}") from error
     return drivers
 
 

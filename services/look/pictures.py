@@ -21,8 +21,15 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import MODALITIES, PixelKind
 from services.look.charts import Histogram
 from services.look.collect import Tables, choose_spread
-from services.read.dataset_reader import ReadFile, StoredRange, file_reader, find_scene, read_image
-from services.read.stored_tables import patch_paths, view_paths
+from services.read.dataset_reader import (
+    ReadFile,
+    StoredRange,
+    file_reader,
+    find_scene,
+    patch_paths,
+    read_image,
+    view_paths,
+)
 from workers.store.store import Store
 
 MOST_WIDTH = 480
@@ -99,7 +106,7 @@ def picture_of_depth(depth_m: NDArray, span_m: tuple[float, float], words: str, 
     share = np.clip((depth_m - low) / max(high - low, 1e-6), 0.0, 1.0)
     rgb = viridis()[(255 * (1.0 - share)).astype(np.uint8)]
     image = Image.fromarray(np.where(depth_m[..., None] > 0, rgb, np.uint8(0)))
-    return _png(image, words) if sharp else _jpeg(image, words)
+    return (_png if sharp else _jpeg)(image, words)
 
 
 def depth_span(depth_m: NDArray, regions: NDArray | None = None) -> tuple[float, float]:
@@ -212,34 +219,29 @@ class ShownScene:
     d_z_m: float | None
 
 
-@dataclass(frozen=True)
-class Sample:
-    """The scenes that a page shows, in order of category, and the depth of their object pixels by role."""
-
-    scenes: tuple[ShownScene, ...]
-    depth: Mapping[str, Histogram]
-
-
 def choose_scenes(tables: Tables, scenes: int) -> list[int]:
     """At most `scenes` scene ids, equally many of each category, evenly over its ids; at least one of each."""
-    by_category: dict[str, list[NDArray]] = {}
+    by_category: dict[str, list[int]] = {}
     for rows in tables.batches("scenes", ("scene_id", "category")):
         ids, names = rows.column("scene_id").to_numpy(), np.asarray(rows.column("category").to_pylist())
         for category in np.unique(names).tolist():
-            by_category.setdefault(category, []).append(ids[names == category])
+            by_category.setdefault(category, []).extend(ids[names == category].tolist())
     each = max(1, scenes // max(len(by_category), 1))
-    return [int(i) for name in sorted(by_category) for i in choose_spread(np.concatenate(by_category[name]), each)]
+    return [scene_id for name in sorted(by_category) for scene_id in choose_spread(by_category[name], each)]
 
 
-def show_scenes(store: Store, scene_ids: Iterable[int]) -> Sample:
-    """The pictures of these scenes. Raises CorruptError where an image is missing or damaged."""
+def show_scenes(store: Store, scene_ids: Iterable[int]) -> tuple[list[ShownScene], Mapping[str, Histogram]]:
+    """The pictures of these scenes, and the depth of their object pixels by role, metres.
+
+    Raises CorruptError where an image is missing or damaged.
+    """
     shown, depth = [], {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
     for scene_id in scene_ids:
         stored = find_scene(store, scene_id)
         row = stored.scene(scene_id)
         if row is not None:
             shown.append(show_scene(file_reader(store.read, stored), stored, row, depth))
-    return Sample(tuple(shown), depth)
+    return shown, depth
 
 
 def show_scene(

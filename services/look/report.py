@@ -1,7 +1,7 @@
 """`verso report`: a dataset as one HTML page that needs nothing beside it; and the pages of the server."""
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
@@ -13,9 +13,10 @@ import trimesh
 
 from schemas.errors import MachineError, OutputError, plural
 from services.job.record import JobRecord, read_success, require_job
+from services.look.charts import Histogram
 from services.look.clouds import Space, pack_spaces, read_spaces
 from services.look.collect import Figures, collect, open_tables
-from services.look.pictures import Sample, choose_scenes, show_scenes
+from services.look.pictures import ShownScene, choose_scenes, show_scenes
 from services.look.sections import (
     captures_html,
     charts_html,
@@ -127,8 +128,8 @@ class View:
 
     def state(self) -> dict[str, object]:
         """What the page asks for every few seconds."""
-        shown = {"name": self.name, "title": self.title, "live": self.live}
-        return {**shown, "version": self.version, "shape": self.shape}
+        names = ("name", "title", "live", "version", "shape")
+        return {name: getattr(self, name) for name in names}
 
     def fragments(self) -> dict[str, object]:
         """The sections by id."""
@@ -144,10 +145,6 @@ def live_page(view: View) -> str:
     return fill_page(page, policy="", style=style, icon="/icon.svg", scripts=scripts, data=data)
 
 
-SCENES = 24
-"""Scenes whose pictures are shown, unless told otherwise."""
-
-
 @dataclass(frozen=True)
 class Report:
     """What a page is made of."""
@@ -156,7 +153,9 @@ class Report:
     digest: str | None
     """Of the finished dataset."""
     figures: Figures
-    sample: Sample
+    scenes: list[ShownScene]
+    depth: Mapping[str, Histogram]
+    """Of the object pixels in these scenes, by role, metres."""
     spaces: tuple[Space, ...]
 
 
@@ -167,22 +166,21 @@ def read_report(store: Store, scenes: int) -> Report:
     """
     record = require_job(store)
     tables = open_tables(store)
-    figures = collect(tables)
-    sample = show_scenes(store, choose_scenes(tables, scenes))
-    spaces = read_spaces(store, [scene.scene_id for scene in sample.scenes])
-    return Report(record, (read_success(store) or {}).get("digest"), figures, sample, spaces)
+    shown, depth = show_scenes(store, choose_scenes(tables, scenes))
+    spaces = read_spaces(store, [scene.scene_id for scene in shown])
+    return Report(record, (read_success(store) or {}).get("digest"), collect(tables), shown, depth, spaces)
 
 
 def page_of(report: Report, address: Address) -> Page:
     """The page of a report, with its pictures at these addresses."""
-    figures, sample, job = report.figures, report.sample, report.record.job
+    figures, scenes, job = report.figures, report.scenes, report.record.job
     failed = sum(failure.scenes for failure in figures.failures)
     sections = (
         Section("overview", "Overview", overview_html(figures, job, failed)),
-        Section("pictures", "Pictures", sheets_html(sample.scenes, address)),
-        Section("compare", "Compare", compare_html(sample.scenes)),
+        Section("pictures", "Pictures", sheets_html(scenes, address)),
+        Section("compare", "Compare", compare_html(scenes)),
         Section("space", "In space", space_html(report.spaces, pack_spaces(report.spaces))),
-        Section("figures", "Figures", charts_html(figures, sample.depth)),
+        Section("figures", "Figures", charts_html(figures, report.depth)),
         Section("effects", "Effects", effects_html(figures)),
         Section("failures", "Failures", failures_html(figures.failures, figures.scenes + failed)),
         Section("captures", "Captures", captures_html(figures)),
@@ -190,7 +188,7 @@ def page_of(report: Report, address: Address) -> Page:
     what = "captures" if job.captures is not None else "scenes"
     state = f"finished, digest {report.digest[:12]}" if report.digest else "not finished"
     footer = (
-        f"Pictures are of {plural(len(sample.scenes), 'scene')}, chosen evenly from each category. "
+        f"Pictures are of {plural(len(scenes), 'scene')}, chosen evenly from each category. "
         f"Job {report.record.digest[:12]}. Made by verso report; this page fetches nothing."
     )
     return Page(job.name, f"{job.scenes:,} {what} asked, seed {job.seed}, {state}", sections, footer)

@@ -6,7 +6,7 @@ from html import escape
 
 from schemas.errors import describe_seconds, milliseconds, number, plural, size
 from schemas.job.job import Job
-from services.look.charts import Chart, Histogram, amount, chart_html, length_of_decade
+from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.clouds import Space
 from services.look.collect import Cost, Failure, Figures
 from services.look.pictures import SHOWN_ROLES
@@ -57,8 +57,10 @@ def overview_html(figures: Figures, job: Job, failed: int) -> str:
         for name, value, more in tiles
     )
     most = max(figures.by_category.values(), default=1)
+    frame = 'class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true"'
     rows = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td class="wide">{_bar(count / most)}</td><td>{count:,}</td></tr>'
+        f'<tr><th scope="row">{escape(name)}</th><td class="wide"><svg {frame}><rect class="bar" '
+        f'width="{100 * count / most:.1f}" height="8"/></svg></td><td>{count:,}</td></tr>'
         for name, count in figures.by_category.items()
     )
     table = f'<table class="bars"><caption>Scenes by category</caption><tbody>{rows}</tbody></table>' if rows else ""
@@ -87,15 +89,6 @@ def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
             lambda share: amount(100.0 * share, "%"),
         ),
         Chart("Inclination", figures.inclination, "Angle of the optical axis below the horizontal.", degrees),
-        Chart(
-            "Resting gap",
-            {"": figures.gap},
-            "Largest height at which an object of the scene hovers; logarithmic.",
-            length_of_decade,
-            f"0 in {figures.no_gap:,} of {plural(figures.no_gap + figures.gap.count, 'scene')}"
-            if figures.no_gap
-            else "",
-        ),
     )
     return f'<div class="charts">{"".join(map(chart_html, shown))}</div>'
 
@@ -124,9 +117,9 @@ def effects_html(figures: Figures) -> str:
         f'<details><summary>{plural(len(never), "effect")} that ran in no scene, and why</summary><dl class="why">{never_rows}'
         "</dl></details>"
     )
-    ran = _table(("effect", "scenes", "time", "each"), rows, "Effects that ran") if rows else ""
+    ran = table_html(("effect", "scenes", "time", "each"), rows, "Effects that ran") if rows else ""
     note = '<p class="note">An effect without a time is counted with its stage.</p>'
-    by_stage = _table(("stage", "share", "time", "each"), stages, "Time by stage")
+    by_stage = table_html(("stage", "share", "time", "each"), stages, "Time by stage")
     return f"{ran}{note}{left_out if never else ''}{by_stage}"
 
 
@@ -164,24 +157,18 @@ def captures_html(figures: Figures) -> str:
         "Corner error: median over the views after estimation. Pose, cloud (median) and completeness are held against the"
         " truth, which photographs do not have. Measured: share of the mirror views that is measured and not filled."
     )
-    return f'{_table(head, rows, "Quality")}<p class="note">{note}</p>'
+    return f'{table_html(head, rows, "Quality")}<p class="note">{note}</p>'
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str) -> str:
+def table_html(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str = "") -> str:
     """A table of HTML cells; the first is the row's name."""
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
     body = "".join(
         f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
         for first, *cells in rows
     )
-    return f"<table><caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _bar(share: float) -> str:
-    return (
-        '<svg class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
-        f'<rect class="bar" width="{100 * share:.1f}" height="8"/></svg>'
-    )
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f"<table>{title}<thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _why(cost: Cost) -> str:

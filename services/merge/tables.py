@@ -30,6 +30,7 @@ from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
+from schemas.job.job import Job
 from schemas.scene.view import ROLES
 from services.job.record import JobRecord
 from workers.store.canonical import TableDigest
@@ -258,9 +259,6 @@ def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: "MergeRe
     sources = "\n".join(f"- {line}" for line in describe_sources(catalogue))
     captured = job.captures is not None
     counts = ", ".join(f"{merged.scenes[outcome]} {outcome}" for outcome in ("made", "intrinsic", "environmental"))
-    regions = (
-        "neither board nor object, 2 board, 3 object" if captured else "nothing, 1 floor, 2 table, 3 and up objects"
-    )
     return f"""# {job.name}
 
 View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the
@@ -289,7 +287,13 @@ other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
 
 Every shape, with its licence and its split by instance, is a row of the `assets` table.
 
-## Reading it
+{_describe_reading(job)}"""
+
+
+def _describe_reading(job: Job) -> str:
+    objects = "nothing, 1 floor, 2 table, 3 and up objects"
+    regions = objects if job.captures is None else "neither board nor object, 2 board, 3 object"
+    return f"""## Reading it
 
 `pyarrow.dataset.dataset("manifest/views", partitioning="hive")` has a row for each camera and the names and checksums of
 its images, `manifest/objects` one for each thing that it may see; `bodies` in `manifest/scenes` says where each object lies.

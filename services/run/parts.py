@@ -89,7 +89,7 @@ def cut_shapes(cuts: Iterable[Cut], folder: Path | None = USUAL_FOLDER) -> Itera
     asked = list(cuts)
     line, kept = ProgressLine(len(asked), "meshes cut into convex parts", "mesh"), Answers(folder and folder / "cut")
     for done, (cut, answer) in enumerate(run_pool(cut_shape, asked, key=lambda cut: cut.key, kept=kept), 1):
-        line.show(done, name=cut.row.path)
+        line.show(done)
         if not isinstance(answer, Ended):
             yield cut, *json.loads(answer)
         elif answer.how == "killed":

@@ -1,38 +1,20 @@
 """The cheapest setting that meets the targets, the front of settings that are worth their time, and the answer in words. Pure."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from decimal import ROUND_CEILING, Context
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 from schemas.errors import InputError, RunError, describe_seconds, did_you_mean, milliseconds, plural, size
 from schemas.job.job import Job
-from services.study.model import ERRORS, Figure, Proof, Row, Setting, Targets, amount, short, times, unit
-from services.study.table import PARTS, Part, Table
+from services.study.model import ERRORS, Figure, Proof, Row, Targets, amount, short, times
 
 AS_CHEAP = 1.05
 """Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %."""
 
-FEWEST_SCENES = 4
-"""Fewer scenes recommend nothing, and compare nothing: a setting that is better in one or two is so by chance."""
+FEWEST_SCENES, MORE_FAILED = 4, 0.01
+"""Fewer scenes recommend nothing, as what is better in one or two is so by chance; and the share of scenes that a setting may
+fail more than the job, because one that fails more is cheap as it leaves work out."""
 
-MORE_FAILED = 0.01
-"""A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
-
-DEFAULT_TARGETS: Targets = {
-    "penetration_mm": 0.1,
-    "gap_mm": 0.1,
-    "unbalanced_share": 0.01,
-    "pose_mm": 0.1,
-    "depth_mm": 0.1,
-    "mask_share": 0.001,
-    "camera_mm": 0.5,
-    "camera_deg": 0.05,
-    "cloud_mm": 1.0,
-    "cloud_p95_mm": 3.0,
-    "missing_share": 0.05,
-    "view_depth_mm": 1.5,
-}
+DEFAULT_TARGETS: Targets = {kind.name: kind.target for kind in ERRORS.values() if kind.target is not None}
 """The targets without a wish of the user: the accuracy that a dataset's labels promise."""
 
 
@@ -50,17 +32,11 @@ def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
 
     A setting measures only the errors that its knobs can move.
     """
-    if name == "failed_share" and name not in row.errors:
-        value = row.failed_share
-        return Figure(value, value, value, value, value, 0)
     return row.errors.get(name) or own_row(rows).errors.get(name)
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
-    """The Pareto front of time and an error, from the cheapest setting to the best, of those measured in a few scenes at least.
-
-    Of settings equal in both, the first by name is kept.
-    """
+    """The Pareto front of time and an error, the cheapest setting first, of those measured in a few scenes; of ties by name."""
     kept: list[Row] = []
     known = [row for row in rows if tells(row, error)]
     for row in sorted(known, key=lambda row: (row.ratio, row.errors[error].value, row.setting.name)):
@@ -72,9 +48,6 @@ def front(rows: Sequence[Row], error: str) -> list[Row]:
 def tells(row: Row, error: str) -> bool:
     """Whether a setting measured an error in enough scenes to say that it is better or worse than another."""
     return error in row.errors and row.errors[error].scenes >= FEWEST_SCENES
-
-
-# ---------------------------------------------------------------------------------------------- the choice
 
 
 def recommend(rows: Sequence[Row], targets: Targets | None) -> Row:
@@ -109,7 +82,7 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
     limits = {**(bounds or {}), **targets}
     able = [row for row in candidates(rows, targets) if excess(row, limits, rows, "value") == 0.0]
     if not able:
-        raise TargetError(describe_miss(rows, targets, default=bounds is not None))
+        raise TargetError(describe_miss(rows, targets))
     if bounds is not None:
         return cheapest(able, rows)
     if few := [short(name) for name in targets if name in own.errors and not tells(own, name)]:
@@ -123,26 +96,16 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
 
 
 def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
-    """The settings that may be chosen.
-
-    The job itself, and those that were measured in a few scenes at least and do not fail `MORE_FAILED` more scenes, unless
-    failed scenes are a target themselves.
-    """
-    most = math.inf if "failed_share" in targets else own_row(rows).failed_share + MORE_FAILED
-    scenes = {
-        row.setting.name: min((figure.scenes for figure in row.errors.values()), default=FEWEST_SCENES) for row in rows
-    }
-    return [
-        row
-        for row in rows
-        if row.failed_share <= most and (not row.setting.parts or scenes[row.setting.name] >= FEWEST_SCENES)
-    ]
+    """The job itself, and settings that were measured in a few scenes and do not fail `MORE_FAILED` more, or their target."""
+    most = targets.get("failed_share", own_row(rows).failed_share + MORE_FAILED)
+    kept = [row for row in rows if row.failed_share <= most]
+    return [row for row in kept if not row.setting.parts or all(tells(row, name) for name in row.errors)]
 
 
 def excess(row: Row, targets: Targets, rows: Sequence[Row], end: str) -> float:
     """How many times its target the value or the bound (`most`) of a setting's worst error is; 0 where all are met.
 
-    Infinite where one was never measured. A bound is held against what is negligible at least, a value against a millionth.
+    Infinite where one was never measured. A bound is held against what is negligible at least.
     """
     above = [0.0]
     for name, target in targets.items():
@@ -173,49 +136,35 @@ def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
     return min((row for row in some if row.ratio <= least_ratio * AS_CHEAP), key=order)
 
 
-def describe_miss(rows: Sequence[Row], targets: Targets, default: bool) -> str:
-    """The nearest setting, whose greatest excess is the least, by how much it misses the targets, and which it would meet.
-
-    For `default` targets, which nobody asked for, with the option that sets others.
-    """
+def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
+    """The nearest setting, whose greatest excess is the least, and by how much it misses the targets."""
     near = candidates(rows, targets)
     nearest = min(near, key=lambda row: (excess(row, targets, rows, "value"), row.ratio, row.setting.name))
-    missed, loosened = list[str](), dict[str, str]()
+    missed = []
     for name, target in targets.items():
         figure = error_of(nearest, name, rows)
-        if figure is None:
-            missed.append(f"{name}, which was not measured with it")
-        elif figure.value > target:
-            missed.append(f"{name}, {amount(name, figure.value)} instead of {amount(name, target)}")
-            above = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(figure.value))  # so that it is met
-            loosened[name] = f"{above:f}"
-    asked = {name: f"{target:g}" for name, target in targets.items()}
+        if figure is None or figure.value > target:
+            value = "unknown" if figure is None else amount(name, figure.value)
+            missed.append(f"{name}, which is {value} instead of {amount(name, target)}")
     words = listed(missed) or "none of them, and is worse than the job in another error"
-    miss = f"The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses {words}"
-    if default:
-        return f"no setting meets the default targets. {miss}. Set others with --target {_as_option(asked | loosened)}"
-    remedy = f". Loosen to at least {_as_option(loosened)}" if loosened else ""
-    return f"no setting meets {_as_option(asked)}. {miss}{remedy}"
+    return (
+        f"no setting meets {','.join(f'{name}={most:g}' for name, most in targets.items())}. The nearest is "
+        f"{nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses {words}. Set others with --target"
+    )
 
 
-def _as_option(targets: Mapping[str, str]) -> str:
-    return ",".join(f"{name}={most}" for name, most in targets.items())
-
-
-# ---------------------------------------------------------------------------------------------- the answer in words
-
-
-def describe_answer(rows: Sequence[Row], targets: Targets | None, proofs: Sequence[Proof], scenes: int) -> str:
-    """Which of these rows to use for the targets, what it costs, for all of the job's scenes too, and what is not sure.
+def describe_answer(
+    rows: Sequence[Row], targets: Targets | None, proofs: Sequence[Proof], scenes: int
+) -> tuple[str, str]:
+    """Which of these rows to use for the targets, what it costs, and what is not sure; and its name, empty where it is none.
 
     Without targets they are `DEFAULT_TARGETS` as far as the study measured them, and no other error may grow beyond the
     job's own interval, so that a user without a wish keeps the same images.
     """
     if proofs and not proofs[-1].holds:
         names = ", ".join(sorted({proof.setting for proof in proofs}))
-        return (
-            f"Nothing is recommended: {names} did not keep the targets on fresh scenes. A longer --budget tells more."
-        )
+        words = f"{names} did not keep the targets on fresh scenes. A longer --budget tells more."
+        return f"Nothing is recommended: {words}", ""
     asked = default_targets(rows)[0] if targets is None else targets
     limits = listed([f"{amount(name, most)} of {short(name)}" for name, most in asked.items()])
     wish = f"at most {limits}" if asked else "any error at all"
@@ -223,32 +172,26 @@ def describe_answer(rows: Sequence[Row], targets: Targets | None, proofs: Sequen
     try:
         chosen = recommend(rows, targets)
     except TargetError as error:
-        return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {error}."
+        return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {error}.", ""
     own = own_row(rows)
     use = "use the job as it is" if chosen is own else f"use {chosen.setting.name}"
     saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
-    loss = f", and gives up {listed(losses)}" if (losses := worse_than(chosen, own)) else ""
-    whole = (
-        f"{plural(scenes, 'scene')}: {describe_seconds(chosen.ms * scenes / 1e3)}, {size(chosen.kilobytes * scenes)}"
-    )
-    cost = f"{milliseconds(chosen.ms)} of processor a scene ({whole})"
+    losses = [
+        f"{short(name)} ({amount(name, figure.value)} instead of {amount(name, own.errors[name].value)})"
+        for name, figure in chosen.errors.items()
+        if name in own.errors and figure.low > own.errors[name].high and figure.value > ERRORS[name].negligible
+    ]
+    loss = f", and gives up {listed(losses)}" if losses else ""
+    whole = f"{describe_seconds(chosen.ms * scenes / 1e3)}, {size(chosen.kilobytes * scenes)}"
+    cost = f"{milliseconds(chosen.ms)} of processor a scene ({plural(scenes, 'scene')}: {whole})"
     unproved = " It is not proved: the budget left no time for fresh scenes." if asked and not proofs else ""
-    return f"For {wish}, {use}, which costs {cost}{saved}{loss}.{_doubt(chosen, targets or {}, rows)}{unproved}"
+    doubt = _doubt(chosen, targets or {}, rows)
+    return f"For {wish}, {use}, which costs {cost}{saved}{loss}.{doubt}{unproved}", chosen.setting.name
 
 
 def listed(words: Sequence[str]) -> str:
     """Words in one phrase: "a", "a and b" or "a, b and c"."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-
-
-def worse_than(row: Row, own: Row) -> list[str]:
-    """The losses of a setting against the job, in words: errors whose interval lies above the job's."""
-    pairs = [(name, row.errors[name], ours) for name, ours in own.errors.items() if name in row.errors]
-    return [
-        f"{short(name)} ({amount(name, theirs.value)} instead of {amount(name, ours.value)})"
-        for name, theirs, ours in pairs
-        if theirs.low > ours.high and theirs.value > ERRORS[name].negligible
-    ]
 
 
 def _doubt(row: Row, targets: Targets, rows: Sequence[Row]) -> str:
@@ -262,27 +205,8 @@ def _doubt(row: Row, targets: Targets, rows: Sequence[Row]) -> str:
     return f" It is not sure to 95 %: scenes that were not measured may have {listed(unsure)}." if unsure else ""
 
 
-SURE_SCENES = 59
-"""Scenes that make a 95th percentile sure whatever its distribution (1 - 0.95^59 > 0.95)."""
-
-
-def describe_doubt(table: Table, part: Part, rivals: Sequence[Setting], processes: int) -> str:
-    """Which settings of a part are not decided with 95 % confidence, and how long that would take."""
-    most, scenes = min(SURE_SCENES, PARTS[part].scenes), {s.name: len(table.answers(part, s)) for s in rivals}
-    more_s = sum(max(0, most - scenes[s.name]) * table.cost_s(part, s) for s in rivals) / processes
-    after = f"about {describe_seconds(more_s)} more would tell" if more_s else "they lie too near to a target to tell"
-    names = ", ".join(f"{name} ({plural(count, 'scene')})" for name, count in scenes.items())
-    return f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %: {names}; {after}"
-
-
-# ---------------------------------------------------------------------------------------------- what a user types
-
-KEPT = "kept_share"
-"""How a user may ask for a share of objects that are kept: `lost_share` is 1 minus it."""
-
-
 def parse_targets(text: str) -> dict[str, float]:
-    """From "penetration_mm=0.1,depth_mm=0.5". Raises InputError with the remedy."""
+    """From "penetration_mm=0.1,depth_mm=0.5"; `kept_share` is 1 minus `lost_share`. Raises InputError with the remedy."""
     targets: dict[str, float] = {}
     for part in text.split(","):
         name, _, value = (piece.strip() for piece in part.partition("="))
@@ -292,41 +216,32 @@ def parse_targets(text: str) -> dict[str, float]:
             most = float(value)
         except ValueError:
             most = math.nan
-        if name == KEPT:
+        if name == "kept_share":
             name, most = "lost_share", round(1.0 - most, 12)
-            value = f"{most:g}"
         if name not in ERRORS:
             raise InputError(
                 f"--target {name}: there is no such error; {did_you_mean(name, ERRORS)}Known: {', '.join(ERRORS)}"
             )
         if name in targets:
-            raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {value}")
+            raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {most:g}")
         if not 0.0 <= most < math.inf:
-            example = ", a share such as 0.001 for 0.1 %" if unit(name) == "%" else ""
-            raise InputError(f"--target {name}={value}: must be a number from 0 up{example}")
+            raise InputError(f"--target {part.strip()}: must be a number from 0 up, such as 0.001 for 0.1 %")
         targets[name] = most
     return targets
 
 
-class Unmeasured(NamedTuple):
-    """Jobs in which an error, or the errors of some groups, cannot be measured, and why."""
-
-    is_so: Callable[[Job], bool]
-    names: str
-    why: str
-
-
-_UNMEASURED = (
-    Unmeasured(lambda job: job.captures is None, "capture", "the job has no captures"),
-    Unmeasured(lambda job: job.captures is not None, "physics labels mirror colour", "the job is one of captures"),
-    Unmeasured(lambda job: not job.cameras.mirror.enabled, "mirror", "cameras.mirror.enabled is false"),
-    Unmeasured(lambda job: not job.render.rgb, "colour", "render.rgb is false"),
-    Unmeasured(
+_UNMEASURED: tuple[tuple[Callable[[Job], bool], str, str], ...] = (
+    (lambda job: job.captures is None, "capture", "the job has no captures"),
+    (lambda job: job.captures is not None, "physics labels mirror colour", "the job is one of captures"),
+    (lambda job: not job.cameras.mirror.enabled, "mirror", "cameras.mirror.enabled is false"),
+    (lambda job: not job.render.rgb, "colour", "render.rgb is false"),
+    (
         lambda job: job.start.pose == "tumbled" or job.objects_per_scene.high > 1,
         "pose_mm",
         "where things end is random when they tumble or meet, so no pose is the true one; ask for outcome_mm",
     ),
 )
+"""Jobs in which an error, or the errors of some groups, cannot be measured, and why."""
 
 
 def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
@@ -335,8 +250,8 @@ def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
     `missing` says why this machine has no truth of colour.
     """
     for name in targets:
-        for row in _UNMEASURED:
-            if row.is_so(job) and {name, ERRORS[name].group} & set(row.names.split()):
-                raise InputError(f"--target {name}: it cannot be measured here: {row.why}")
+        for is_so, names, why in _UNMEASURED:
+            if is_so(job) and {name, ERRORS[name].group} & set(names.split()):
+                raise InputError(f"--target {name}: it cannot be measured here: {why}")
         if name == "flip" and missing is not None:
             raise InputError(f"--target flip: {missing}")

@@ -7,7 +7,6 @@ import sys
 import time
 from contextlib import closing
 from importlib.util import find_spec
-from pathlib import Path
 
 import yaml
 
@@ -18,7 +17,7 @@ from services.job.job_file import load_job, read_tree
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.study.choose import parse_targets, recommend, refuse_unmeasured
-from services.study.model import Row, Study, Targets, apply, choose_knobs, job_tree_with, knobs_of, settings_of
+from services.study.model import Study, Targets, apply, choose_knobs, job_tree_with, knobs_of, settings_of
 from services.study.study import Journal, Plan, run_study
 from services.study.truths import colour_truth_missing
 from workers.assets.catalogue import open_catalogue
@@ -62,13 +61,9 @@ def main(options: argparse.Namespace) -> int:
     with closing(ProgressLine(round(plan.budget_s), "tradeoff", unit="second")) as progress:
         study = run_study(plan, journal, progress, began, notes=notes, **about)
     write_study(study, options.out)
-    for word, lines in (
-        ("note", study.notes),
-        ("not decided", study.doubts),
-        ("proof", map(describe_proof, study.proofs)),
-    ):
-        for line in lines:
-            print(f"{word:12} {line}")
+    said = {"note": study.notes, "not decided": study.doubts, "proof": map(describe_proof, study.proofs)}
+    for line in (f"{word:12} {line}" for word, lines in said.items() for line in lines):
+        print(line)
     print(study.answer)
     return finish(study, options, targets)
 
@@ -80,12 +75,14 @@ def finish(study: Study, options: argparse.Namespace, targets: Targets | None) -
         raise RunError("nothing is recommended: no setting kept the targets on fresh scenes; the page has each")
     chosen = next(row for row in study.rows if row.setting.name == study.chosen)
     if options.target:
-        write_job(options.job, options.changes, chosen, options.out / "job.yaml", options.target)
-        print(f"{options.out / 'job.yaml'}: the job with {chosen.setting.name}")
+        tree = job_tree_with(chosen.setting.changes, read_tree(options.job, options.changes))
+        head = f"# {options.job.name} with {study.chosen}: the cheapest measured setting with {options.target}.\n"
+        path = options.out / "job.yaml"
+        path.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+        print(f"{path}: the job with {study.chosen}, without its comments")
     if options.json:
-        summary = {"chosen": chosen.setting.name, "changes": dict(chosen.setting.changes), "settings": len(study.rows)}
-        summary |= {"ok": True, "out": str(options.out), "ms": chosen.ms, "ratio": chosen.ratio}
-        print(json.dumps(summary))
+        summary = {"chosen": study.chosen, "changes": dict(chosen.setting.changes), "settings": len(study.rows)}
+        print(json.dumps({**summary, "ok": True, "out": str(options.out), "ms": chosen.ms, "ratio": chosen.ratio}))
     return 0
 
 
@@ -105,10 +102,3 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Targets | None) 
     settings, refused = settings_of(job, knobs)
     processes = options.workers or usable_cores()
     return Plan(job, options.job.parent, tuple(settings), targets, options.budget, processes), [*refused, *left_out]
-
-
-def write_job(source: Path, changes: list[str], row: Row, path: Path, target: str) -> None:
-    """Write the user's job file with the chosen keys; its comments are lost."""
-    tree = job_tree_with(row.setting.changes, read_tree(source, changes))
-    head = f"# {source.name} with {row.setting.name}: the cheapest measured setting with {target}.\n"
-    path.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")

@@ -13,10 +13,10 @@ from typing import Any, Literal
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
+from schemas.base import set_key
 from schemas.errors import InputError, did_you_mean, number
 from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job, kind_of
-from schemas.job.keys import set_key
 from services.job.job_file import describe_fault
 
 Changes = Mapping[str, Any]
@@ -111,10 +111,9 @@ class Proof:
     promised: Mapping[str, Figure]
 
     @property
-    def missed(self) -> tuple[str, ...]:
-        """The errors whose measured figure is above its target, or is not there."""
-        known = self.measured
-        return tuple(name for name, most in self.targets.items() if name not in known or not known[name].value <= most)
+    def missed(self) -> list[str]:
+        """The errors whose measured figure is above its target."""
+        return [name for name, most in self.targets.items() if not self.measured[name].value <= most]
 
     @property
     def holds(self) -> bool:
@@ -127,9 +126,8 @@ class Study:
     """The content of a page: the machine, the command, and the table.
 
     `scenes` is the most that a setting was measured in; `job_scenes` is the size of the whole job; `seconds` were spent of a
-    budget of `budget_s`; `answer` is the answer in words and `chosen` the name of the setting in it, empty where nothing is
-    recommended; `doubts` are what is not decided, and how long that would take; `notes` hold for the whole study, such as
-    what was not measured, and why.
+    budget of `budget_s`; `chosen` is the name of the setting in the answer, empty where nothing is recommended; `doubts` are
+    what is not decided; `notes` hold for the whole study, such as what was not measured, and why.
     """
 
     job: str
@@ -137,7 +135,6 @@ class Study:
     machine: Mapping[str, Any]
     scenes: int
     rows: tuple[Row, ...]
-    preset: str
     job_scenes: int
     notes: tuple[str, ...]
     budget_s: float
@@ -148,8 +145,7 @@ class Study:
     proofs: tuple[Proof, ...]
 
 
-# ---------------------------------------------------------------------------------------------- errors
-
+_SHAPES = "the stored shapes"
 _RAYS = "a ray caster in float64 at the same pixel centres"
 _FRONT = "65,536 rays about the objects, and their vertices"
 _PATCH = "rays at random in the objects' patch"
@@ -159,7 +155,7 @@ _REFERENCE = "finer steps than any that is measured"
 
 @dataclass(frozen=True)
 class ErrorKind:
-    """One error: its unit, its name in a few words, its definition, what it is held against, and what it is an error of.
+    """One error: its unit, name in a few words, definition, what it is held against, its group, and the usual target.
 
     A scene has one figure of it, and a setting the 95th percentile of its scenes' figures, or where it is `pooled` one
     figure over all its scenes. Less is better.
@@ -171,6 +167,7 @@ class ErrorKind:
     title: str
     truth: str
     group: Literal["physics", "labels", "mirror", "colour", "capture"]
+    target: float | None = None
     pooled: bool = False
 
     @property
@@ -180,60 +177,38 @@ class ErrorKind:
 
     @property
     def most(self) -> float:
-        """What it can be at most: shares at most 1."""
+        """Shares are at most 1."""
         return float("inf") if self.unit else 1.0
 
 
 # fmt: off
-ERRORS = {kind.name: kind for kind in (
-    ErrorKind("penetration_mm", "mm", "penetration",
-              "how deep an object stands in what it rests on", "the stored shapes", "physics"),
-    ErrorKind("gap_mm", "mm", "gap", "how high an object hovers", "the stored shapes", "physics"),
-    ErrorKind("unbalanced_share", "", "weight out of balance",
-              "share of a weight that contacts leave out of balance", "the stored shapes", "physics"),
-    ErrorKind("pose_mm", "mm", "pose", "pose off, where two finer settings agree", _REFERENCE, "physics"),
-    ErrorKind("outcome_mm", "mm", "where things end, on the whole",
-              "how far things slide and roll: two distributions apart", _REFERENCE, "physics", True),
-    ErrorKind("outcome_deg", "deg", "how they lie, on the whole",
-              "how far things turn: two distributions apart", _REFERENCE, "physics", True),
-    ErrorKind("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", True),
-    ErrorKind("lost_share", "", "objects that are lost", "objects of the plan that no scene has", "counted", "physics", True),
-    ErrorKind("redrawn_share", "", "objects dropped again",
-              "objects that left the table and were drawn again, an object", "counted", "physics", True),
-    ErrorKind("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("table_depth_mm", "mm", "depth of the table",
-              "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("mask_share", "", "the object's mask pixels",
-              "object pixels that are wrong in the mask", _RAYS, "labels"),
-    ErrorKind("between_mm", "mm", "depth between pixels",
-              "depth between pixels, read at the nearest", _PATCH, "labels"),
-    ErrorKind("outline_share", "", "regions between pixels",
-              "rays at random whose region the nearest pixel has wrong", _PATCH, "labels"),
-    ErrorKind("mirror_mm", "mm", "mirror camera", "mirror camera off, as d_z is", _FRONT, "mirror"),
-    ErrorKind("agreement_mm", "mm", "agreement of the views",
-              "input depth carried into the mirror view, off", "the mirror view", "mirror"),
-    ErrorKind("unfilled_share", "", "projected pixels left empty",
-              "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
-    ErrorKind("hidden_share", "", "projected pixels that show through",
-              "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
-    ErrorKind("camera_mm", "mm", "camera position",
-              "camera position off, median of a capture's views", _TRUTH, "capture"),
-    ErrorKind("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture"),
-    ErrorKind("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture"),
-    ErrorKind("cloud_p95_mm", "mm", "merged cloud, 95 %",
-              "points of the merged cloud off, 95 % of them", _TRUTH, "capture"),
-    ErrorKind("missing_share", "", "surface that is missing",
-              "visible surface without a point within 3 mm", _TRUTH, "capture"),
-    ErrorKind("view_depth_mm", "mm", "depth of synthesised views",
-              "depth of synthesised views off, median", _TRUTH, "capture"),
-    ErrorKind("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
-    ErrorKind("edge_flip", "", "edges, FLIP",
-              "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
+ERRORS = {row[0]: ErrorKind(*row) for row in (
+    ("pose_mm", "mm", "pose", "pose off, where two finer settings agree", _REFERENCE, "physics", 0.1),
+    ("outcome_mm", "mm", "where things end, on the whole", "slides and rolls: two distributions apart",
+     _REFERENCE, "physics", None, True),
+    ("penetration_mm", "mm", "penetration", "how deep an object stands in what it rests on", _SHAPES, "physics", 0.1),
+    ("gap_mm", "mm", "gap", "how high an object hovers", _SHAPES, "physics", 0.1),
+    ("unbalanced_share", "", "weight out of balance", "share of a weight that contacts leave", _SHAPES, "physics", 0.01),
+    ("outcome_deg", "deg", "how they lie, on the whole", "turns: two distributions apart", _REFERENCE, "physics", None, True),
+    ("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", None, True),
+    ("lost_share", "", "objects that are lost", "planned objects that no scene has", "counted", "physics", None, True),
+    ("between_mm", "mm", "depth between pixels", "depth between pixels, read at the nearest", _PATCH, "labels"),
+    ("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels", 0.1),
+    ("mask_share", "", "the object's mask pixels", "object pixels that are wrong in the mask", _RAYS, "labels", 0.001),
+    ("mirror_mm", "mm", "mirror camera", "mirror camera off, as d_z is", _FRONT, "mirror"),
+    ("unfilled_share", "", "projected pixels left empty", "of object pixels that both views see", _RAYS, "mirror"),
+    ("hidden_share", "", "projected pixels that show through", "what the mirror camera cannot see", _RAYS, "mirror"),
+    ("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
+    ("edge_flip", "", "edges, FLIP", "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
+    ("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture", 1.0),
+    ("missing_share", "", "surface that is missing", "visible surface without a point within 3 mm", _TRUTH, "capture", 0.05),
+    ("view_depth_mm", "mm", "depth of synthesised views", "depth of synthesised views off, median", _TRUTH, "capture", 1.5),
+    ("camera_mm", "mm", "camera position", "camera position off, median of a capture's views", _TRUTH, "capture", 0.5),
+    ("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture", 0.05),
+    ("cloud_p95_mm", "mm", "merged cloud, 95 %", "points of the merged cloud off, 95 % of them", _TRUTH, "capture", 3.0),
 )}
 # fmt: on
-"""By name."""
-
-# ---------------------------------------------------------------------------------------------- in words
+"""By name, of each group first those that a picture shows rather."""
 
 
 def short(name: str) -> str:
@@ -261,17 +236,15 @@ def times(ratio: float) -> str:
     return f"{number(round(ratio, 2) if 0.9 <= ratio < 1.1 else float(f'{ratio:.2g}'))} times"
 
 
-# ---------------------------------------------------------------------------------------------- knobs
-
 Knobs = Mapping[str, Mapping[str, Changes]]
 """By name, the values of a knob by their labels, from coarse to fine where they have an order."""
 
-_FINE = {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400}
-_FINEST = {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400}
-
-REFERENCES: tuple[Setting, ...] = (
-    Setting((("reference", "fine"),), {f"physics.{key}": value for key, value in _FINE.items()}),
-    Setting((("reference", "finest"),), {f"physics.{key}": value for key, value in _FINEST.items()}),
+REFERENCES = tuple(
+    Setting(
+        (("reference", name),),
+        {"physics.step_hz": hz, "physics.max_step_travel_mm": travel_mm, "physics.solver_iterations": 400},
+    )
+    for name, hz, travel_mm in (("fine", 3840, 0.03), ("finest", 7680, 0.015))
 )
 """Settings of physics finer than every measured value. The first gives the distribution of outcomes; a pose has a truth where
 both agree."""
@@ -290,13 +263,19 @@ def knobs_of(job: Job) -> Knobs:
             "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
             "image_scale": _values("captures.simulate.image_scale", (0.25, 0.5, 1.0)),
         }
+    rasters = (("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4))
+    paths = (1, 4, 16) if find_spec("mitsuba") else ()
+    tiers = {
+        **{label: {"render.tier": tier, "render.samples": samples} for label, tier, samples in rasters},
+        **{f"path-{n}": {"render.tier": "pathtraced", "render.path_samples": n} for n in paths},
+    }
     splat, removal = "images.projection.splat", "images.projection.hidden_point_removal"
     return {
         "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
         "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
         "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
         "rest": _values("physics.rest.speed_mm_s", (30.0, 10.0, 3.0, 1.0, 0.3)),
-        "collision": _collisions(job),
+        "collision": _values("physics.collision", ("box", "hull", "planned", "parts")),
         "concavity": _values("physics.concavity", (0.2, 0.1, 0.05, 0.02)),
         "exact_rest": {"off": {"physics.exact_rest": False}, "on": {"physics.exact_rest": True}},
         "size": {str(width): resized(job, width) for width in (160, 320, 640, 1280)},
@@ -310,24 +289,12 @@ def knobs_of(job: Job) -> Knobs:
             for size, removed in itertools.product((1, 3, 5), (False, True))
         },
         "png_level": _values("images.png_level", (0, 1, 2, 6, 9)),
-        "colour": _tiers(),
+        "colour": tiers,
     }
 
 
 def _values(key: str, values: Iterable[float | str]) -> dict[str, Changes]:
     return {value if isinstance(value, str) else f"{value:g}": {key: value} for value in values}
-
-
-def _collisions(job: Job) -> dict[str, Changes]:
-    """From coarse to fine; parts of meshes from outside at several tolerances (parts of built-in shapes have none).
-
-    The mesh itself is no value, because Bullet moves convex shapes alone.
-    """
-    key, depth = "physics.collision", "physics.concavity"
-    if all(source.source == "procedural" for source in job.assets.objects):
-        return _values(key, ("box", "hull", "planned", "parts"))
-    parts = {f"parts to {d:g}": {key: "parts", depth: d} for d in (0.1, 0.05, 0.02)}
-    return {**_values(key, ("box", "hull", "planned")), **parts}
 
 
 def resized(job: Job, width: int) -> Changes:
@@ -336,15 +303,6 @@ def resized(job: Job, width: int) -> Changes:
     scaled = {name: value * width / sensor.width for name, value in sensor}
     values = scaled | {"width": width, "height": max(1, round(scaled["height"]))}
     return {f"cameras.sensor.{name}": value for name, value in values.items()}
-
-
-def _tiers() -> dict[str, Changes]:
-    rasters = (("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4))
-    paths = (1, 4, 16) if find_spec("mitsuba") else ()
-    return {
-        **{label: {"render.tier": tier, "render.samples": samples} for label, tier, samples in rasters},
-        **{f"path-{n}": {"render.tier": "pathtraced", "render.path_samples": n} for n in paths},
-    }
 
 
 def choose_knobs(knobs: Knobs, names: Sequence[str] | None) -> Knobs:

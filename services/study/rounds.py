@@ -15,11 +15,9 @@ from services.study.choose import AS_CHEAP, default_targets
 from services.study.model import OWN, REFERENCES, Figure, Row, Setting, Targets, joined
 from services.study.table import PARTS, Part, Table, part_of
 
-LEAST = 8
-"""Nothing is out, no part is decided and no combination is made before so many scenes."""
-
-FEWEST_RACING = 4
-"""So many settings are in every round; where even these do not fit, in as many scenes as fit."""
+LEAST, FEWEST_RACING = 8, 4
+"""Nothing is out, no part is decided and no combination is made before so many scenes; and so many settings are in every round,
+where even these do not fit in as many scenes as fit."""
 
 REFERENCE_SHARE = 0.3
 """References, which errors of all are held against, are in a round while each takes no more than this share of the others."""
@@ -40,26 +38,21 @@ class Standing(NamedTuple):
     verdict: str
     is_missing: bool
     ratio: Figure | None
-    scenes: int
 
 
 def standings(table: Table, part: Part, targets: Targets) -> list[Standing]:
     """The settings that can still win: the job itself, then those that meet the targets so far, the cheapest first."""
-    own = table.figures(part, OWN)
-    asked = {name: most for name, most in targets.items() if part_of(name) == part and name in own}
-
-    def standing(setting: Setting) -> Standing:
+    asked = {name: most for name, most in targets.items() if part_of(name) == part and name in table.figures(part, OWN)}
+    every = []
+    for setting in (setting for setting in table.split.measured[part] if setting not in REFERENCES):
         figures = table.figures(part, setting)
-        verdicts = {figures[name].verdict(most) if name in figures else "open" for name, most in asked.items()}
-        verdict = next((name for name in ("misses", "open") if name in verdicts), "meets")
+        verdicts = [figures[name].verdict(most) if name in figures else "open" for name, most in asked.items()]
+        verdict = "misses" if "misses" in verdicts else "open" if "open" in verdicts else "meets"
         is_missing = any(figures[name].value > most for name, most in asked.items() if name in figures)
-        scenes = len(table.answers(part, setting))
-        return Standing(setting, verdict, is_missing, table.ratio(part, setting), scenes)
-
-    every = [standing(setting) for setting in table.split.measured[part] if setting not in REFERENCES]
-    judged = [some for some in every if some.scenes >= min(LEAST, PARTS[part].scenes)]
-    best = min((some.ratio.high for some in judged if some.ratio and some.verdict == "meets"), default=math.inf)
-    out = [some for some in judged if some.verdict == "misses" or (some.ratio and some.ratio.low > best * AS_CHEAP)]
+        every.append(Standing(setting, verdict, is_missing, table.ratio(part, setting)))
+    known = [some for some in every if len(table.answers(part, some.setting)) >= min(LEAST, PARTS[part].scenes)]
+    best = min((some.ratio.high for some in known if some.ratio and some.verdict == "meets"), default=math.inf)
+    out = [some for some in known if some.verdict == "misses" or (some.ratio and some.ratio.low > best * AS_CHEAP)]
     left = [some for some in every if some not in out or some.setting == OWN]
     return sorted(left, key=lambda s: (s.setting != OWN, s.is_missing, s.ratio.value if s.ratio else 1.0))
 
@@ -76,10 +69,8 @@ def undecided(table: Table, part: Part, targets: Targets) -> list[Setting]:
     ]
 
 
-def next_round(
-    table: Table, part: Part, targets: Targets, scenes: range, allowed_s: float
-) -> tuple[list[Wanted], bool]:
-    """What is missing in these scenes of the settings in this round, scene by scene; and whether all of that fits."""
+def next_round(table: Table, part: Part, targets: Targets, scenes: range, allowed_s: float) -> list[Wanted]:
+    """What is missing in these scenes of the settings in this round, scene by scene, as far as it fits."""
     racing = [some.setting for some in standings(table, part, targets)]
     while seconds(table, wanted := missing(table, part, racing, scenes)) > allowed_s and len(racing) > FEWEST_RACING:
         racing = racing[: max(FEWEST_RACING, len(racing) // 2)]
@@ -88,8 +79,7 @@ def next_round(
     wanted += [item for some in references if seconds(table, some) <= most_s for item in some]
     wanted.sort(key=lambda item: item.scene_id)
     costs = itertools.accumulate(table.cost_s(part, item.setting) for item in wanted)
-    fitting = sum(cost <= (1.0 + REFERENCE_SHARE * len(REFERENCES)) * allowed_s for cost in costs)
-    return wanted[:fitting], fitting == len(wanted)
+    return wanted[: sum(cost <= (1.0 + REFERENCE_SHARE * len(REFERENCES)) * allowed_s for cost in costs)]
 
 
 def missing(table: Table, part: Part, settings: Iterable[Setting], scenes: range) -> list[Wanted]:
@@ -102,50 +92,28 @@ def seconds(table: Table, wanted: Sequence[Wanted]) -> float:
     return sum(table.cost_s(item.part, item.setting) for item in wanted)
 
 
-# ---------------------------------------------------------------------------------------------- combinations
-
-SAVES = 0.98
-"""A value saves time at this share of the job's own."""
-
-MOST_OF_A_KIND = 3
-"""The most knobs that are paired among those that save time."""
-
-
 def promising(rows: Sequence[Row], targets: Targets | None) -> list[Setting]:
     """Settings of two and more knobs to measure next. `rows`: the job's own first, then one value of one knob each.
 
-    Of the values that make no error worse which the job or a target holds: for each knob the cheapest that saves time, two by
-    two and all at once; and the cheapest for each target that the job misses, all at once, and with those that save time.
+    Of the values that make no error worse which a target or the job holds: for each knob the cheapest that saves time; for each
+    target that the job misses the cheapest that mends it; and both.
     """
     own = rows[0].errors
     limits = targets or {name: most for some in default_targets(rows) for name, most in some.items()}
+    held = {name: max(most, own[name].high) for name, most in limits.items() if name in own}
     singles = [
-        row
-        for row in sorted(rows[1:], key=lambda row: (row.ratio, row.setting.name))
-        if row.setting.kind == "single"
-        and all(
-            row.errors[name].value <= max(most, own[name].high)
-            for name, most in limits.items()
-            if name in row.errors and name in own
-        )
+        row for row in sorted(rows[1:], key=lambda row: (row.ratio, row.setting.name)) if row.setting.kind == "single"
     ]
-    saving = _first_of_knobs(row for row in singles if row.ratio < SAVES)
-    missed = [name for name, most in limits.items() if name in own and own[name].value > most]
-    mending = [
-        row
-        for name in missed
-        for row in [row for row in singles if name in row.errors and row.errors[name].value <= limits[name]][:1]
+    kept = [
+        row for row in singles if all(row.errors[name].value <= held[name] for name in held.keys() & row.errors.keys())
     ]
-    pairs = itertools.combinations(saving[:MOST_OF_A_KIND], 2)
-    together = [*pairs, saving, _first_of_knobs(mending), _first_of_knobs([*mending, *saving])]
-    # In the order of the table, whatever the ranks, so that names do not depend on noise.
-    settings = [joined([row.setting for row in rows if row in some]) for some in together if len(some) > 1]
+    saving = [row for row in kept if row.ratio < 0.98]
+    mending: list[Row] = []
+    for name in (name for name in held if own[name].value > limits[name]):
+        mending += [row for row in kept if name in row.errors and row.errors[name].value <= limits[name]][:1]
+    settings = []
+    for some in (saving, mending, [*mending, *saving]):
+        first = {row.setting.knob: row for row in reversed(some)}.values()  # of each knob
+        if len(first) > 1:  # in the order of the table, whatever the ranks, so that names do not depend on noise
+            settings.append(joined([row.setting for row in rows if row in first]))
     return list({setting.name: setting for setting in settings}.values())
-
-
-def _first_of_knobs(rows: Iterable[Row]) -> list[Row]:
-    """The first value of each knob, in the order of the rows."""
-    first: dict[str, Row] = {}
-    for row in rows:
-        first.setdefault(row.setting.knob, row)
-    return list(first.values())

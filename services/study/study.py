@@ -7,7 +7,6 @@ import math
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,9 @@ from services.run.progress import ProgressLine
 from services.study import choose
 from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, recommend
 from services.study.measure import Unit, answer_unit
-from services.study.model import OWN, REFERENCES, Figure, Proof, Row, Setting, Study, Targets, joined
+from services.study.model import OWN, Proof, Row, Setting, Study, Targets, joined
 from services.study.rounds import LEAST, Wanted, missing, next_round, promising, seconds, undecided
-from services.study.table import PARTS, UNTIMED, Part, Table, changes_of, figures_of, part_of, split_settings, unit_name
+from services.study.table import AT_REST, PARTS, Part, Table, figures_of, part_of, split_settings, unit_name
 from workers.pool import Answers, Ended, Pool
 
 
@@ -36,12 +35,8 @@ class Plan:
     processes: int
 
 
-# ---------------------------------------------------------------------------------------------- what was measured before
-
-JOURNAL_FILE = "answers"
-
-HEADER, SPENT = "study", "spent"
-"""Keys of a journal beside those of answers: what was studied, and seconds of the budget."""
+JOURNAL_FILE, HEADER, SPENT = "answers", "study", "spent"
+"""The file of a journal, and its keys beside those of answers: what was studied, and seconds of the budget."""
 
 
 class Journal(dict[str, Any]):
@@ -70,23 +65,15 @@ class Journal(dict[str, Any]):
         self._kept.put(key, json.dumps(answer).encode())
 
 
-# ---------------------------------------------------------------------------------------------- measuring within a budget
-
-FIRST_SHARE, PILOT_SHARE = 0.5, 0.3
-"""By these shares of the budget the job's own first scenes must be there, and the pilot ends. The first scenes have more time
-than the pilot, because processes start before them, in seconds that no later start saves."""
-
-LEAST_PROOF_SHARE, MOST_PROOF_SHARE = 0.13, 0.33
-"""Within these shares of the budget lies the time that is kept for a proof: that of its fewest scenes."""
+FIRST_SHARE, PILOT_SHARE, RACE_SHARE = 0.5, 0.3, 0.75
+"""By these shares of the budget the job's own first scenes must be there, the first round ends, and the last, so that a proof
+still fits. The first scenes have more time than the first round, because processes start before them."""
 
 LATE_SHARE = 0.03
 """What is under way then may take this share more, because a process that is ended takes seconds to come back."""
 
-PAGE_S = 6.0
-"""Seconds of the budget that are kept for the table, the picture and the page."""
-
-UNIT_SHARE = 0.01
-"""A unit of several settings takes about this share of the budget at most."""
+PAGE_S, UNIT_SHARE = 6.0, 0.01
+"""Seconds of the budget that are kept for the page, and the share that a unit of several settings takes at most, about."""
 
 SLOW, LEAST_LIMIT_S = 3.0, 40.0
 """A scene that takes this many times the longest of the job's own, and so many seconds of processor at least, is a time out."""
@@ -107,7 +94,7 @@ class Measurement:
     def __post_init__(self) -> None:
         """Splits the plan's settings."""
         self.targets = self.plan.targets or DEFAULT_TARGETS
-        self.split = split_settings(self.plan.settings, self.plan.job.captures is not None)
+        self.add(())
 
     @property
     def spent_s(self) -> float:
@@ -129,45 +116,28 @@ class Measurement:
         self.plan = replace(self.plan, settings=(*self.plan.settings, *new))
         self.split = split_settings(self.plan.settings, self.plan.job.captures is not None)
 
-    def run(self, wanted: Sequence[Wanted], share: float) -> None:
-        """Measures, in order, until a share of the budget is spent: settings of one part and scene side by side in units."""
+    def run(self, wanted: Sequence[Wanted], share: float, base: Setting = OWN) -> None:
+        """Measures, in order, until a share of the budget is spent, and keeps the answers; what a process died of is `broken`.
+
+        Settings of one part and scene, on top of the base setting, are measured side by side in units.
+        """
         table, units = self.table(), list[Unit]()
+        where = self.plan.job.model_dump_json(), str(self.plan.job_folder), self.scratch
         for (part, scene), items in itertools.groupby(wanted, key=lambda item: (item.part, item.scene_id)):
             some = list(items)
             size = max(1, int(UNIT_SHARE * self.plan.budget_s * len(some) / max(seconds(table, some), 1e-3)))
             took = [answer["took"] for answer in table.answers(part, OWN).values()]
-            limit_s = max(LEAST_LIMIT_S, SLOW * max(took)) if took else math.inf
+            limit_s = max(LEAST_LIMIT_S, SLOW * max(took)) if took and base == OWN else math.inf
             for n in range(0, len(some), size):
-                settings = [item.setting for item in some[n : n + size]]
-                units.append(self.unit(part, scene, settings, limit_s=limit_s))
-        self.keep(units, share, share + LATE_SHARE)
-
-    def unit(self, part: Part, scene_id: int, settings: Sequence[Setting], **more: Any) -> Unit:
-        """One scene to measure, with what a process must know."""
-        number = scene_id - self.plan.job.first_scene
-        where = self.plan.job.model_dump_json(), str(self.plan.job_folder), self.scratch
-        return Unit(*where, part, scene_id, number, tuple(settings), **more)
-
-    def keep(self, units: Sequence[Unit], share: float, late_share: float, prefix: str = "") -> None:
-        """Measures these until a share of the budget is spent, and keeps the answers; what a process died of is `broken`."""
-        last, end = (time.monotonic() + self.left_s(some) for some in (share, late_share))
+                settings = tuple(item.setting for item in some[n : n + size])
+                units.append(Unit(*where, part, scene, settings, base, limit_s))
+        last, end = (time.monotonic() + self.left_s(some) for some in (share, min(1.0, share + LATE_SHARE)))
         for unit, answer in self.pool.run(units, last, end):
-            if isinstance(answer, Ended):
-                broken = {"failed": "broken", "broken": f"its process died: {answer.detail}", "s": None, "took": 0.0}
-                by_name = {setting.name: broken for setting in unit.settings}
-            else:
-                by_name = json.loads(answer)
+            by_name = {} if isinstance(answer, Ended) else json.loads(answer)
             for setting in unit.settings:
-                self.journal.add(prefix + unit_name(unit.part, unit.scene_id, setting), by_name[setting.name])
+                died = {"failed": "broken", "broken": f"its process died: {getattr(answer, 'detail', '')}", "took": 0.0}
+                self.journal.add(unit_name(unit.part, unit.scene_id, setting), by_name.get(setting.name, died))
             self.progress.show(round(self.spent_s))
-
-    def race_share(self) -> float:
-        """The share of the budget at which rounds end, so that the fewest scenes of a proof still fit."""
-        table = self.table()
-        own = [table.answers(part, OWN).values() for part in self.split.timed]
-        scene_s = sum(max((answer["took"] for answer in answers), default=0.0) for answers in own)
-        share = math.ceil(FEWEST_SCENES / self.plan.processes) * scene_s / max(1.0, self.plan.budget_s - PAGE_S)
-        return 1.0 - min(MOST_PROOF_SHARE, max(LEAST_PROOF_SHARE, LATE_SHARE + share))
 
 
 def run_study(plan: Plan, journal: Journal, progress: ProgressLine, began: float, **about: Any) -> Study:
@@ -182,41 +152,39 @@ def run_study(plan: Plan, journal: Journal, progress: ProgressLine, began: float
     ):
         bench = Measurement(plan, journal, pool, scratch, progress, began, float(journal.get(SPENT, 0.0)))
         try:
-            run_pilot(bench)
+            run_first(bench)
             run_rounds(bench)
             rows, able, proofs = choose_and_prove(bench)
         finally:
             journal.add(SPENT, bench.spent_s)
-    table, notes = bench.table(), list(about.pop("notes", ()))
+    table, notes, doubts = bench.table(), list(about.pop("notes")), list[str]()
     if late := [setting.name for setting in plan.settings if table.row(setting) is None]:
         notes.append(f"not reached within the budget: {', '.join(late)}")
-    doubts = []
     for part in bench.split.measured:
         if rivals := undecided(table, part, bench.targets):
-            doubts.append(choose.describe_doubt(table, part, rivals, plan.processes))
-    study = Study(
+            names = [f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rivals]
+            doubts.append(
+                f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %: {', '.join(names)}"
+            )
+    answer, chosen = choose.describe_answer(able, plan.targets, proofs, plan.job.scenes)
+    return Study(
         job=plan.job.name,
         scenes=max(len(table.answers(part, OWN)) for part in bench.split.measured),
         rows=tuple(rows),
-        preset=plan.job.preset,
         job_scenes=plan.job.scenes,
         notes=tuple(notes),
         budget_s=plan.budget_s,
         seconds=bench.spent_s,
-        answer=choose.describe_answer(able, plan.targets, proofs, plan.job.scenes),
-        chosen="",
+        answer=answer,
+        chosen=chosen,
         doubts=tuple(doubts),
         proofs=tuple(proofs),
         **about,
     )
-    with suppress(TargetError):
-        if not proofs or proofs[-1].holds:
-            return replace(study, chosen=recommend(able, plan.targets).setting.name)
-    return study
 
 
-def run_pilot(bench: Measurement) -> None:
-    """One scene of the job itself, a few more, then one of every setting, for costs. Raises RunError."""
+def run_first(bench: Measurement) -> None:
+    """One scene of the job itself, and a few more. Raises RunError where there is none."""
     timed, first_scene = bench.split.timed, bench.plan.job.first_scene
 
     def run_own(parts: Sequence[Part], scenes: int) -> None:
@@ -241,46 +209,31 @@ def run_pilot(bench: Measurement) -> None:
             "a study needs scenes; `verso run` with --scenes 4 tells more of each"
         )
     run_own(timed[1:], FEWEST_SCENES)
-    table, scene = bench.table(), range(first_scene, first_scene + 1)
-    every = [item for part, some in bench.split.measured.items() for item in missing(table, part, in_turn(some), scene)]
-    bench.run(every, PILOT_SHARE)
 
 
-def in_turn(settings: Iterable[Setting]) -> list[Setting]:
-    """The knobs in turn, the first value of each, then the second, so that a pilot that is cut off knows something of all."""
-    turns: dict[str, int] = {}
-    places: dict[str, tuple[bool, int]] = {}
-    for setting in settings:
-        turns[setting.knob] = turns.get(setting.knob, 0) + 1
-        places[setting.name] = setting in REFERENCES, turns[setting.knob]
-    return sorted(settings, key=lambda setting: places[setting.name])
+LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+"""Scenes of the rounds, of which the first is a pilot that tells costs."""
 
 
 def run_rounds(bench: Measurement) -> None:
     """Rounds of twice as many scenes, until every part is decided or the budget's share is spent.
 
-    A round takes half of the time that is left at most, and each part its share of that.
+    A round takes half of the time that is left at most, and each part its share of that. What did not fit is asked again.
     """
-    levels, share, first = dict.fromkeys(bench.split.measured, 2), bench.race_share(), bench.plan.job.first_scene
-    combined = False
-    while levels and bench.left_s(share) > 0.0:
-        table, allowed_s = bench.table(), bench.left_s(share) * bench.plan.processes / 2
-        weights, wanted = sum(PARTS[part].share for part in levels), list[Wanted]()
-        for part, level in list(levels.items()):
-            most = PARTS[part].scenes
-            scenes, part_s = range(first, first + min(level, most)), allowed_s * PARTS[part].share / weights
-            some, whole = next_round(table, part, bench.targets, scenes, part_s)
-            wanted += some
-            decided = level >= most or (level > LEAST and not undecided(table, part, bench.targets))
-            if decided if whole else not some:
-                del levels[part]
-            elif whole:  # otherwise what is left of this level waits for what other parts leave of the budget
-                levels[part] = 2 * level
+    first = bench.plan.job.first_scene
+    for level in LEVELS:
+        table, share = bench.table(), PILOT_SHARE if level == 1 else RACE_SHARE
+        parts = [part for part in bench.split.measured if level <= PARTS[part].scenes]
+        parts = [part for part in parts if level <= LEAST or undecided(table, part, bench.targets)]
+        weights, wanted = sum(PARTS[part].share for part in parts), list[Wanted]()
+        for part in parts:
+            part_s = bench.left_s(share) * bench.plan.processes / 2 * PARTS[part].share / weights
+            allowed_s = math.inf if level == 1 else part_s
+            wanted += next_round(table, part, bench.targets, range(first, first + level), allowed_s)
         # Scene by scene, so that what the end of the budget cuts off leaves the same scenes of all.
         bench.run(sorted(wanted, key=lambda item: item.scene_id), share)
-        if not combined and max(levels.values(), default=LEAST) >= LEAST:
+        if level == LEAST:
             bench.add(combinations(bench))
-            combined = True
 
 
 def combinations(bench: Measurement) -> list[Setting]:
@@ -292,26 +245,20 @@ def combinations(bench: Measurement) -> list[Setting]:
     return together
 
 
-# ---------------------------------------------------------------------------------------------- the choice and its proof
-
-FRESH_SCENE = 1_000_000
-"""How far from the job's first scene those begin that prove a recommendation: no study measures them before."""
-
-PROVED = 200
-"""The most scenes of a proof; the fewest are `FEWEST_SCENES`."""
+FRESH_SCENE, PROVED = 1_000_000, 200
+"""How far from the job's first scene those begin that prove a recommendation, which no study measures before, and the most."""
 
 
 def crossed_rows(bench: Measurement, rows: Sequence[Row]) -> list[Row]:
-    """Of every setting that changes rest alone with every one that changes what is drawn alone."""
-    table, of = bench.table(), bench.split.of
-    alone: dict[Part, list[Setting]] = {"rest": [], "draw": []}
-    for setting in (row.setting for row in rows if row.setting.kind != "preset"):
-        changed = [part for part, some in of[setting.name].items() if some != OWN and part != UNTIMED]
-        if len(changed) == 1 and changed[0] in alone:
-            alone[changed[0]].append(setting)
-    pairs = itertools.product(alone["rest"], alone["draw"])
-    crossed = [table.row(joined(pair), {**of[pair[1].name], "rest": of[pair[0].name]["rest"]}) for pair in pairs]
-    return [row for row in crossed if row is not None and row not in rows]
+    """Of every setting that changes rest alone with every one that changes what is drawn alone; their parts were measured."""
+    known = [row.setting for row in rows if row.setting.kind in ("single", "several")]
+    resting, drawn = (
+        [some for some in known if all(key.startswith(AT_REST) == is_rest for key in some.changes)]
+        for is_rest in (True, False)
+    )
+    crossed = [joined(pair) for pair in itertools.product(resting, drawn)]
+    table = Table(split_settings((*bench.plan.settings, *crossed), bench.plan.job.captures is not None), bench.journal)
+    return [row for setting in crossed if (row := table.row(setting))]
 
 
 def choose_and_prove(bench: Measurement) -> tuple[list[Row], list[Row], list[Proof]]:
@@ -330,24 +277,11 @@ def choose_and_prove(bench: Measurement) -> tuple[list[Row], list[Row], list[Pro
         if chosen.setting.name in {proof.setting for proof in proofs} or not (proof := prove(bench, chosen, targets)):
             break
         proofs.append(proof)
-        able = without(every, proofs)
+        failed = {proof.setting for proof in proofs if not proof.holds}
+        able = [row for row in every if row.setting == OWN or row.setting.name not in failed]
         if proof.holds or bench.left_s() <= 0.0:
             break
     return rows, able, proofs
-
-
-def without(rows: Sequence[Row], proofs: Sequence[Proof]) -> list[Row]:
-    """The rows without those that share what failed a proof: the changes of the part whose error was missed.
-
-    The job's own stays, because all others are held against it.
-    """
-    changes = {row.setting.name: row.setting.changes for row in rows}
-    failed = [(part, changes_of(changes[some.setting], part)) for some in proofs for part in map(part_of, some.missed)]
-    return [
-        row
-        for row in rows
-        if row.setting == OWN or all(changes_of(row.setting.changes, part) != bad for part, bad in failed)
-    ]
 
 
 def prove(bench: Measurement, chosen: Row, targets: Targets) -> Proof | None:
@@ -359,25 +293,17 @@ def prove(bench: Measurement, chosen: Row, targets: Targets) -> Proof | None:
     if not parts:
         return None
     digest = hashlib.sha256(repr(sorted(chosen.setting.changes.items())).encode()).hexdigest()[:8]
-    first = bench.plan.job.first_scene + FRESH_SCENE
+    fresh, first = Setting((("proof", digest),)), bench.plan.job.first_scene + FRESH_SCENE
+    scenes = {part: range(first, first + min(PROVED, PARTS[part].scenes)) for part in parts}
+    wanted = [item for part in parts for item in missing(bench.table(), part, [fresh], scenes[part])]
     # A scene is drawn after its rest was measured, so that no process settles what another is settling.
-    at_once = bench.plan.processes
-    batches = [range(n, min(n + at_once, PROVED)) for n in range(0, PROVED, at_once)]
-    fresh = [(part, n) for batch in batches for part in parts for n in batch if n < PARTS[part].scenes]
-    keys = {(part, n): f"proof-{digest}/{unit_name(part, first + n, OWN)}" for part, n in fresh}
-    units = [
-        bench.unit(part, first + n, [OWN], base=chosen.setting)
-        for part, n in fresh
-        if keys[part, n] not in bench.journal
-    ]
-    bench.keep(units, 1.0, 1.0, f"proof-{digest}/")
-    measured, counts = dict[str, Figure](), list[int]()
-    for part in parts:
-        answers = {n: bench.journal[key] for (at, n), key in keys.items() if at == part and key in bench.journal}
-        measured |= figures_of(part, answers)
-        counts.append(len(answers))
-    if min(counts) < FEWEST_SCENES:
+    wanted.sort(key=lambda item: ((item.scene_id - first) // bench.plan.processes, parts.index(item.part)))
+    bench.run(wanted, 1.0, base=chosen.setting)
+    answers = {part: bench.table().answers(part, fresh) for part in parts}
+    count = min(map(len, answers.values()))
+    if count < FEWEST_SCENES:
         return None
-    asked = {name: target for name, target in targets.items() if name in measured}
+    figures = {name: figure for part in parts for name, figure in figures_of(part, answers[part]).items()}
+    asked = {name: target for name, target in targets.items() if name in figures}
     promised = {name: chosen.errors[name] for name in asked if name in chosen.errors}
-    return Proof(chosen.setting.name, min(counts), asked, {name: measured[name] for name in asked}, promised)
+    return Proof(chosen.setting.name, count, asked, {name: figures[name] for name in asked}, promised)

@@ -8,7 +8,7 @@ row is put together of its parts, so that no combination across parts needs a me
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from statistics import fmean, median
 from typing import Any
@@ -19,19 +19,16 @@ from scipy.stats import beta, binom, nct, norm
 
 from schemas.base import Array
 from schemas.errors import plural
-from services.study.model import ERRORS, OWN, REFERENCES, Changes, Figure, Row, Setting
+from services.study.model import ERRORS, OWN, REFERENCES, Figure, Row, Setting
 
 Answer = Mapping[str, Any]
-"""What one scene says of one setting: `s` seconds of processor (None where the machine slept), `took` seconds by the clock,
-`errors`, `failed` with a reason, and by part `bytes`, `plan_s`, `corners`, `lost`, `planned` and `redrawn`."""
+"""What one scene says of one setting: `s` seconds of processor, `took` seconds by the clock,
+`errors`, `failed` with a reason, and by part `bytes`, `plan_s`, `corners`, `lost` and `planned`."""
 
 Answers = Mapping[int, Answer]
 """By scene."""
 
-# ---------------------------------------------------------------------------------------------- parts of a scene
-
 Part = str
-"""rest, draw, colour or capture."""
 
 AT_REST = ("physics.", "start.", "assets.")
 """Keys that change how objects rest; every other one changes what is drawn."""
@@ -39,10 +36,7 @@ AT_REST = ("physics.", "start.", "assets.")
 
 @dataclass(frozen=True)
 class PartKind:
-    """A part of a scene in words, the groups of its errors, the keys that change it, and what it gets of a study.
-
-    scenes: the most scenes. share: of the time of a round, relative to the other parts.
-    """
+    """A part of a scene in words, the groups of its errors, the keys that change it, its most scenes, and its share of time."""
 
     words: str
     groups: tuple[str, ...]
@@ -67,11 +61,6 @@ def part_of(error: str) -> Part:
     return next(part for part, kind in PARTS.items() if ERRORS[error].group in kind.groups)
 
 
-def changes_of(changes: Changes, part: Part) -> dict[str, Any]:
-    """Those of a setting's changes that change a part."""
-    return {key: value for key, value in changes.items() if PARTS[part].is_changed_by(key)}
-
-
 @dataclass(frozen=True)
 class Split:
     """What is measured: by part the settings, the job itself first, and of each setting of the table its settings by part."""
@@ -93,7 +82,7 @@ def split_settings(settings: Iterable[Setting], captured: bool) -> Split:
     for setting in settings:
         of[setting.name] = {}
         for part in parts:
-            changes = changes_of(setting.changes, part)
+            changes = {key: value for key, value in setting.changes.items() if PARTS[part].is_changed_by(key)}
             key = part, repr(sorted(changes.items()))
             of[setting.name][part] = known.setdefault(key, Setting(setting.parts, changes))
     measured = {part: tuple(setting for (at, _), setting in known.items() if at == part) for part in parts}
@@ -102,18 +91,14 @@ def split_settings(settings: Iterable[Setting], captured: bool) -> Split:
     return Split(measured, of)
 
 
-# ---------------------------------------------------------------------------------------------- over scenes
-
 PERCENTILE = 95.0
 """The percentile of the scenes' figures that is a setting's error."""
 
-RESAMPLES = 200
-"""Bootstrap samples of the scenes for an interval."""
-
-INTERVAL = (2.5, 97.5)
-
 SURE = 0.95
 """Confidence of a bound, one-sided."""
+
+RESAMPLES, INTERVAL = 200, (2.5, 97.5)
+"""Bootstrap samples of the scenes for an interval, and its percentiles of them."""
 
 
 def figure_over_scenes(values: Sequence[float], negligible: float = 0.0, most: float = math.inf) -> Figure:
@@ -122,11 +107,15 @@ def figure_over_scenes(values: Sequence[float], negligible: float = 0.0, most: f
     In its bound values up to `negligible` count as that, and it is at most `most`, as shares are at most 1.
     """
     scenes = np.asarray(values, float)
-    samples = np.percentile(scenes[_resampled(len(scenes))], PERCENTILE, axis=1)
-    value = float(np.percentile(scenes, PERCENTILE))
     least, greatest = bounds_of_percentile(scenes, negligible)
-    low, high = np.percentile(samples, INTERVAL).tolist()
-    return Figure(value, low, high, least, max(value, min(most, greatest)), len(scenes))
+    percentiles = np.percentile(scenes[_resampled(len(scenes))], PERCENTILE, axis=1)
+    return _figure(percentiles, len(scenes), min(most, greatest), least)
+
+
+def _figure(samples: Array, scenes: int, most: float | None = None, least: float | None = None) -> Figure:
+    """A figure from its value and those of the bootstrap's samples, which are its bounds where there are no better ones."""
+    value, (low, high) = float(samples[0]), np.percentile(samples[1:], INTERVAL).tolist()
+    return Figure(value, low, high, low if least is None else least, max(value, high if most is None else most), scenes)
 
 
 def bounds_of_percentile(values: Array, negligible: float = 0.0) -> tuple[float, float]:
@@ -165,12 +154,12 @@ def share(parts: Sequence[float], wholes: Sequence[float], counted: bool = False
     Of `counted` things the bound is never below the exact one of as many that are alike (Clopper and Pearson 1934), so that
     none of six says little.
     """
-    part, whole = np.asarray(parts, float), np.asarray(wholes, float)
-    rows, count, out_of = _resampled(len(part)), part.sum(), whole.sum()
-    low, high = np.percentile(part[rows].sum(axis=1) / whole[rows].sum(axis=1), INTERVAL).tolist()
-    exact = float(beta.ppf(SURE, count + 1, out_of - count)) if counted and count < out_of else float(counted)
-    value = float(count / out_of)
-    return Figure(value, low, high, low, max(value, exact, high), len(part))
+    rows, part, whole = _resampled(len(parts)), np.asarray(parts, float), np.asarray(wholes, float)
+    count, rest = part.sum(), whole.sum() - part.sum()
+    figure = _figure(part[rows].sum(axis=1) / whole[rows].sum(axis=1), len(part))
+    if not counted:
+        return figure
+    return replace(figure, most=max(figure.most, float(beta.ppf(SURE, count + 1, rest)) if rest else 1.0))
 
 
 def apart(values: Sequence[float], truth: Sequence[float]) -> Figure:
@@ -179,21 +168,16 @@ def apart(values: Sequence[float], truth: Sequence[float]) -> Figure:
     For as many samples of either it is the mean gap of the sorted ones (Ramdas, Garcia and Cuturi 2017), in their unit. The
     end of a tumbling object is random, so that only distributions can be compared. The interval is a paired bootstrap's.
     """
-    both = np.asarray([values, truth], float)
-    rows = np.vstack([np.arange(len(values)), _resampled(len(values))])
-    distances = np.abs(np.diff(np.sort(both[:, rows], axis=-1), axis=0)).mean(axis=-1)[0]
-    low, high = np.percentile(distances[1:], INTERVAL).tolist()
-    value = float(distances[0])
-    return Figure(value, low, high, low, max(value, high), len(values))
+    both = np.sort(np.asarray([values, truth], float)[:, _resampled(len(values))], axis=-1)
+    return _figure(np.abs(both[0] - both[1]).mean(axis=-1), len(values))
 
 
 @cache
 def _resampled(count: int) -> NDArray[np.int64]:
-    """[RESAMPLES, count] places of scenes, the same ones for every figure of as many scenes, so that settings are paired."""
-    return np.random.default_rng(0).integers(0, count, (RESAMPLES, count), dtype=np.int64)
+    """[1 + RESAMPLES, count] places of scenes: all, then samples, the same for every figure, so that settings are paired."""
+    samples = np.random.default_rng(0).integers(0, count, (RESAMPLES, count), dtype=np.int64)
+    return np.vstack([np.arange(count), samples])
 
-
-# ---------------------------------------------------------------------------------------------- errors of one setting
 
 AGREE_MM = 0.05
 """Two references agree where their poses are nearer than this; only then is there a true pose."""
@@ -213,10 +197,9 @@ def figures_of(part: Part, answers: Answers, references: Sequence[Answers] = ())
     if part == "rest" and answers:
         failed = ["failed" in answer for answer in answers.values()]
         figures["failed_share"] = share(failed, [1.0] * len(failed), counted=True)
-    if counted := [answer for answer in answers.values() if "lost" in answer]:
-        planned = [answer["planned"] for answer in counted]
-        for name, key in (("lost_share", "lost"), ("redrawn_share", "redrawn")):
-            figures[name] = share([answer[key] for answer in counted], planned, counted=True)
+    if planned := {n: answer["planned"] for n, answer in answers.items() if "planned" in answer}:
+        lost = [answers[n]["lost"] for n in planned]
+        figures["lost_share"] = share(lost, list(planned.values()), counted=True)
     if references:
         truth = {n: answer["errors"] for n, answer in references[0].items() if n in known and "errors" in answer}
         for name, key in (("outcome_mm", "slid_mm"), ("outcome_deg", "rolled_deg")):
@@ -231,9 +214,9 @@ def figures_of(part: Part, answers: Answers, references: Sequence[Answers] = ())
 
 
 def pose_error(answer: Answer, references: Sequence[Answer]) -> float | None:
-    """The largest distance of an object's place to that of the first reference, mm; None where the references disagree.
+    """The largest distance of a corner of an object's own box to where the first reference has it, mm.
 
-    Places are those of the corners of the object's own box, which no point of the object moves farther than.
+    No point of the object moves farther. None where the references disagree.
     """
     if any("corners" not in other for other in (answer, *references)):
         return None
@@ -243,12 +226,6 @@ def pose_error(answer: Answer, references: Sequence[Answer]) -> float | None:
 def _apart_mm(answer: Answer, other: Answer) -> float:
     mine, theirs = np.array(answer["corners"]), np.array(other["corners"])
     return float(np.linalg.norm(mine - theirs, axis=-1).max()) if mine.shape == theirs.shape else SCENE_MM
-
-
-# ---------------------------------------------------------------------------------------------- the table
-
-REFERENCE_TIMES = 8.0
-"""A guess at how many times the job's own time a reference takes, before one was measured."""
 
 
 def unit_name(part: Part, scene_id: int, setting: Setting) -> str:
@@ -285,8 +262,7 @@ class Table:
     def cost_s(self, part: Part, setting: Setting) -> float:
         """Seconds by the clock of one scene: the mean so far, or the usual one of the part's settings."""
         usual = median([s for (at, _), s in self._took.items() if at == part] or [1.0])
-        guess = (REFERENCE_TIMES if setting in REFERENCES else 1.0) * usual
-        return self._took.get((part, setting.name), guess)
+        return self._took.get((part, setting.name), usual)
 
     def figures(self, part: Part, setting: Setting) -> dict[str, Figure]:
         """The errors of a part's setting.
@@ -324,9 +300,9 @@ class Table:
         value, low, high = (1.0 + weight * (ratio - 1.0) for ratio in (figure.value, figure.low, figure.high))
         return Figure(value, low, high, low, high, figure.scenes)
 
-    def row(self, setting: Setting, of: Mapping[Part, Setting] | None = None) -> Row | None:
-        """A setting's row, put together of these settings of its parts; None where one of them has no time yet."""
-        mine = of or self.split.of[setting.name]
+    def row(self, setting: Setting) -> Row | None:
+        """A setting's row, put together of its parts; None where one of them has no time yet."""
+        mine = self.split.of[setting.name]
         changed = {part: changes for part, changes in mine.items() if changes != OWN}
         ratios = [self.ratio(part, changes) for part, changes in changed.items() if part != UNTIMED]
         known = [ratio for ratio in ratios if ratio is not None]
@@ -341,29 +317,9 @@ class Table:
         drawn = [self.answers(part, mine[part]).values() for part in ("draw", "capture") if part in mine]
         sizes = [answer["bytes"] for answers in drawn for answer in answers if "bytes" in answer]
         kilobytes = fmean(sizes) / 1e3 if sizes else 0.0
-        failed = self._failed_share(mine)
-        notes = self._notes(mine)
+        every = [self.answers(part, some).values() for part, some in mine.items()]
+        failed = max(sum("failed" in answer for answer in answers) / max(1, len(answers)) for answers in every)
+        failures = [answer for answers in every for answer in answers if "failed" in answer]
+        reasons = Counter(answer.get("broken", answer["failed"]) for answer in failures)
+        notes = tuple(f"{reason}: {plural(count, 'scene')}" for reason, count in sorted(reasons.items()))
         return Row(setting, self.own_ms * ratio, ratio, ratio - less, ratio + more, kilobytes, errors, failed, notes)
-
-    def _notes(self, mine: Mapping[Part, Setting]) -> tuple[str, ...]:
-        """The reasons of scenes that fail, with their counts; and where it was measured in fewer scenes than the job."""
-        answers = [answer for part, setting in mine.items() for answer in self.answers(part, setting).values()]
-        reasons = [answer.get("broken", answer["failed"]) for answer in answers if "failed" in answer]
-        notes = [f"{reason}: {plural(count, 'scene')}" for reason, count in sorted(Counter(reasons).items())]
-        counts = [(len(self.answers(part, setting)), len(self.answers(part, OWN))) for part, setting in mine.items()]
-        if fewer := [count for count, own in counts if count < own]:
-            notes.append(
-                f"measured in {min(fewer)} scenes and the job in more: percentiles are the job's, times the ratio in the same"
-            )
-        return tuple(notes)
-
-    def _failed_share(self, mine: Mapping[Part, Setting]) -> float:
-        """The share of scenes that fail, of rest or of a capture, and of those that are drawn more than the job's own."""
-
-        def failed(part: Part, setting: Setting) -> float:
-            answers = self.answers(part, setting).values()
-            return sum("failed" in answer for answer in answers) / len(answers) if answers else 0.0
-
-        first = next(iter(mine))
-        more = failed("draw", mine["draw"]) - failed("draw", OWN) if "draw" in mine else 0.0
-        return min(1.0, failed(first, mine[first]) + max(0.0, more))

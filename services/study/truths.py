@@ -10,7 +10,6 @@ import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import InputError
 from schemas.job.views import Render
-from schemas.scene.scene import Placed, ScenePlan
+from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
@@ -34,31 +33,23 @@ from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Scene
 
-# ---------------------------------------------------------------------------------------------- rays
-
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""
-
-Index = NDArray[np.int64]
 
 SAME_M = 1e-4
 """A ray to a point meets it where z is this near: half of a stored unit, and a hundred times the error of Embree's float32
 rays at a grazing surface."""
 
-SPREAD_PIXELS = 19_200
-"""The most pixels, about, that are cast evenly over the image: a sixteenth of 640 x 480."""
-
-SPREAD_SEED = 0x5B4EAD
+SPREAD_PIXELS, SPREAD_SEED = 19_200, 0x5B4EAD
+"""Pixels at random that are cast all over the image, as many as a sixteenth of 640 x 480, and their random stream. A grid would
+fall in step with the pattern of pixels that a projection fills."""
 
 DENSE = 256
 """Rays along each side of the box about the objects: 16 in a pixel and more while that box has at most 4,096 of a 640 x 480
 image's pixels, as the objects of the built-in jobs have."""
 
-BETWEEN = 4096
-"""Rays at random in the objects' patch. A median of as many is off by 2 % of the spread."""
-
-BETWEEN_SEED = 0x0B5E55ED
-"""The random stream of those rays, which no job's seed reaches."""
+BETWEEN, BETWEEN_SEED = 4096, 0x0B5E55ED
+"""Rays at random in the objects' patch, and their random stream. A median of as many is off by 2 % of the spread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +59,8 @@ class Seen:
     rows [N], columns [N] int64; depth_m [N] float64, z along the optical axis, 0 without a hit; region [N] uint8.
     """
 
-    rows: Index
-    columns: Index
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
     depth_m: Array
     region: NDArray[np.uint8]
 
@@ -151,22 +142,10 @@ def cast_pixels(things: Sequence[Placed], camera: Camera) -> Pixels:
     eye = Eye(things, camera)
     left, top, right, bottom = eye.box() or (0.0, 0.0, 0.0, 0.0)
     rows, columns = np.mgrid[math.floor(top) : math.ceil(bottom), math.floor(left) : math.ceil(right)]
-    places = (rows.ravel(), columns.ravel()), _spread(eye.k.width, eye.k.height)
+    random = np.random.default_rng([SPREAD_SEED, eye.k.width, eye.k.height])
+    spread = np.divmod(random.permutation(eye.k.height * eye.k.width)[:SPREAD_PIXELS], eye.k.width)
+    places = (rows.ravel(), columns.ravel()), spread
     return Pixels(*(Seen(v, u, *eye.cast(u.astype(float) + 0.5, v.astype(float) + 0.5)) for v, u in places))
-
-
-@cache
-def _spread(width: int, height: int) -> tuple[Index, Index]:
-    """(rows, columns) of about `SPREAD_PIXELS` pixels: one at random in each square of pixels, the same in every image.
-
-    A grid would fall in step with the pattern of pixels that a projection fills.
-    """
-    step = max(1, round(math.sqrt(width * height / SPREAD_PIXELS)))
-    rows, columns = (corner.ravel() for corner in np.mgrid[0:height:step, 0:width:step])
-    within = np.random.default_rng([SPREAD_SEED, width, height]).integers(step, size=(2, len(rows)))
-    rows, columns = rows + within[0], columns + within[1]
-    there = (rows < height) & (columns < width)
-    return rows[there], columns[there]
 
 
 def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
@@ -206,9 +185,6 @@ def seen_by_other(things: Sequence[Placed], camera: Camera, seen: Seen, other: C
     return both
 
 
-# ---------------------------------------------------------------------------------------------- colour
-
-
 def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
     """The mean of FLIP's map, from 0 for equal images to 1. Both are [H, W, 3] uint8 sRGB of one size. Raises ValueError."""
     import flip_evaluator  # of the extra `study`
@@ -224,15 +200,11 @@ def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
 WIDTH, HEIGHT = 640, 480
 """The size of the image that colours are compared at, whatever the size of the image under test. Only a crop is traced."""
 
-MARGIN_SHARE = 0.25
-MARGIN_PX = 4
+MARGIN_SHARE, MARGIN_PX = 0.25, 4
 """Margin about the objects that is compared too, because their contact shadows fall there."""
 
-BOUNCES = 16
-"""Bounces of the truth's paths, whatever the job's: glass before glass takes eight."""
-
-TRUTH_SEED = 0xC0107
-"""The random stream of the truth's paths, which no job's seed reaches."""
+BOUNCES, TRUTH_SEED = 16, 0xC0107
+"""Bounces of the truth's paths, whatever the job's, as glass before glass takes eight; and their random stream."""
 
 
 class Crop(NamedTuple):
@@ -244,19 +216,14 @@ class Crop(NamedTuple):
     bottom: int
 
 
-class ColourTruth(NamedTuple):
-    """rgb [bottom - top, right - left, 3] uint8 sRGB: the crop of the input view, path-traced."""
-
-    crop: Crop
-    rgb: NDArray[np.uint8]
+Rgb = NDArray[np.uint8]
+"""[H, W, 3] sRGB."""
 
 
 def colour_truth_missing() -> str | None:
     """Why this machine has no truth of colour, with the remedy; None where it has."""
     if importlib.util.find_spec("mitsuba") is None:
-        return (
-            "errors of colour need the path-traced tier, which is not installed: `./verso extra pathtraced` installs it"
-        )
+        return "errors of colour need the path-traced tier: `./verso extra pathtraced` installs it"
     try:
         require_tier(Render(tier="pathtraced"))
     except InputError as error:
@@ -264,36 +231,27 @@ def colour_truth_missing() -> str | None:
     return None
 
 
-def converged_colour(context: WorkerContext, scene: Scene, paths: int) -> ColourTruth | None:
-    """The objects' crop of the first pair's input view by that many paths a pixel; None where no object is visible.
+def converged_colour(context: WorkerContext, scene: Scene, crop: Crop, paths: int) -> Rgb:
+    """The crop of the first pair's input view by that many paths a pixel.
 
     It depends on neither tier nor samples, seed of paths, bounces, sensor or size of the scene's own images: it has the look
     that the raster and path-traced tiers share, and a seed of its own.
     """
-    crop = crop_of(scene)
-    if crop is None:
-        return None
-    camera = scene.pairs[0].input.camera
-    things, plan = _in_studio(context, scene)
+    # As the path-traced tier draws it: the flat tier has another floor and other lights.
+    chance = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
+    floor, appearance = draw_appearance(chance, "pathtraced")
+    plan = replace(scene.plan, floor=floor, appearance=appearance)
+    things = [
+        Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
+        for thing in scene.posed.things
+    ]
     render = Render(tier="pathtraced", path_samples=paths, path_bounces=BOUNCES)
     effects = plan_effects(Facts(context.job.model_copy(update={"render": render}), plan, False))
+    camera = crop_camera(scene.pairs[0].input.camera, crop)
     rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id])
-    drawn = draw_view(
-        context.renderer, things, plan.appearance, crop_camera(camera, crop), render, lambda: rng, effects
-    )
+    drawn = draw_view(context.renderer, things, appearance, camera, render, lambda: rng, effects)
     assert drawn.rgb is not None
-    return ColourTruth(crop, drawn.rgb)
-
-
-def crop_of(scene: Scene) -> Crop | None:
-    """The compared crop of the first pair's input view; None where no object is visible."""
-    box = cast_patch(scene.posed.things, scene.pairs[0].input.camera).box
-    return None if box is None else crop_about(box)
-
-
-def flip_error(truth: ColourTruth, rgb: NDArray[np.uint8]) -> float:
-    """FLIP of a stored input view [H, W, 3] uint8 of any size, with the sensor's effects, in the truth's crop."""
-    return flip_between(truth.rgb, crop_colour(rgb, truth.crop))
+    return drawn.rgb
 
 
 def crop_about(box: Box) -> Crop:
@@ -325,14 +283,3 @@ def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:
     smaller = rgb.shape[0] < HEIGHT or rgb.shape[1] < WIDTH
     method = cv2.INTER_LINEAR if smaller else cv2.INTER_AREA
     return np.asarray(cv2.resize(rgb, (WIDTH, HEIGHT), interpolation=method), np.uint8)[here]
-
-
-def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], ScenePlan]:
-    """The scene's things and plan as the path-traced tier draws them; the flat tier has another floor and other lights."""
-    rng = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
-    floor, appearance = draw_appearance(rng, "pathtraced")
-    things = tuple(
-        Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
-        for thing in scene.posed.things
-    )
-    return things, replace(scene.plan, floor=floor, appearance=appearance)

@@ -233,12 +233,8 @@ class Attempt:
         )
 
     def _own_files(self, record: CommitRecord) -> list[FileEntry]:
-        """What `committed_files` would read from the tables: every file that this attempt wrote, sorted by path.
-
-        Raises ValueError naming one that is not the range's own.
-        """
-        by_path = self._terms.layout == "files"
-        listed = [entry for path, entry in self._files.items() if by_path or is_shape(path)]
+        """Every file that this attempt wrote, as `committed_files` has them. Raises ValueError naming one of another range."""
+        listed = [entry for path, entry in self._files.items() if self._terms.layout == "files" or is_shape(path)]
         if (foreign := foreign_path(listed, self.span, self._terms.pairs_per_scene)) is not None:
             raise ValueError(f"{foreign!r} is not a file of the range from scene {self.span.start}")
         return sorted({*record.files, *listed}, key=attrgetter("path"))

@@ -64,11 +64,8 @@ class LocalStore(Store):
             raise cannot_be_written(self.name, error) from error
         retry_if_swept(lambda: probe_folder(self.root))
 
-    def put_if_absent(self, key: str, data: bytes) -> bool:
-        """Links a finished temporary file to `key`: the one step that refuses a second writer."""
-        return self._link(key, data, TEMPORARY)
-
-    def _link(self, key: str, data: bytes, folder: str) -> bool:
+    def put_if_absent(self, key: str, data: bytes, folder: str = TEMPORARY) -> bool:
+        """Links a finished file in `folder` to `key`: the one step that refuses a second writer."""
         return not os.path.exists(self._at(key)) and self._place(os.link, key, data, folder)
 
     def put(self, key: str, data: bytes, durable: bool = True) -> None:
@@ -135,11 +132,15 @@ class LocalStore(Store):
 
     def children(self, prefix: str) -> list[str]:
         """Folders directly below `prefix`."""
-        return [entry.name for entry in self._scan(prefix) if entry.is_dir(follow_symlinks=False)]
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(prefix)) as entries:
+            return sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
+        return []
 
     def names(self, prefix: str) -> list[str]:
         """Everything directly below `prefix`."""
-        return [entry.name for entry in self._scan(prefix)]
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            return sorted(os.listdir(self.path(prefix)))
+        return []
 
     def remove(self, key: str) -> None:
         """Removes a file."""
@@ -220,12 +221,6 @@ class LocalStore(Store):
                 os.makedirs(self._at(TEMPORARY), exist_ok=True)
             return retry_if_swept(place_once)
 
-    def _scan(self, prefix: str) -> list[os.DirEntry[str]]:
-        """What is directly below a folder, by name; nothing where there is no folder."""
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            return sorted(os.scandir(self.path(prefix)), key=lambda entry: entry.name)
-        return []
-
     def _explained(self, key: str) -> contextlib.AbstractContextManager[None]:
         return explain_disk_errors(f"{key} in {self.name} could not be written")
 
@@ -275,7 +270,7 @@ class LocalStage(Stage):
 
     def put_if_absent(self, key: str, data: bytes) -> bool:
         """Links a finished file of the folder to `key`."""
-        return self._store._link(key, data, self._staging)
+        return self._store.put_if_absent(key, data, self._staging)
 
     def close(self) -> None:
         """Closes the folder."""

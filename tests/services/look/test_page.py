@@ -81,7 +81,7 @@ def test_a_bucket_with_tars_gives_the_same_report(tmp_path):
     local, _ = make_dataset(tmp_path, name="other", scenes=2, categories=["can"], output={"layout": "tar"})
 
     def pictures_of(report):
-        return [(one.scene_id, [picture.name for picture in one.pictures.values()]) for one in report.sample.scenes]
+        return [(one.scene_id, [picture.name for picture in one.pictures.values()]) for one in report.scenes]
 
     for remove in ((), (SUCCESS_FILE,)):
         for name in remove:

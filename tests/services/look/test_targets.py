@@ -31,7 +31,7 @@ def decoded(picture) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def shown_targets(targets):
-    return show_scenes(targets, [0]).scenes[0]
+    return show_scenes(targets, [0])[0][0]
 
 
 def test_sixteen_bits_are_shown_as_colours_and_a_silhouette_as_an_outline_over_what_hides_it():

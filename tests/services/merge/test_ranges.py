@@ -1,18 +1,15 @@
 """Ranges on their way into a merge: their rows, the files that they name, and what they share."""
 
 import contextlib
-import json
 
 import pyarrow as pa
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from obstore.store import MemoryStore
 
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
-from schemas.errors import CommitConflict, CorruptError, MachineError
+from schemas.errors import CorruptError
 from services.merge import reading
 from services.merge.reading import SharedRows, check_published, merge_folder, read_ranges, stored_sizes
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
@@ -30,7 +27,8 @@ def test_ranges_come_in_order_with_every_row_and_a_table_that_is_altered_or_miss
     ranges = list(read_ranges(store, FIRST, STOP))
     assert [read.records[0].span.start for read in ranges] == [*range(FIRST, STOP, 4)]
     for table in set(TABLES) - {"timings", "assets"}:
-        assert [row for read in ranges for row in read.rows[table].to_pylist()] == plain_rows(table)
+        tables = [read.rows[table] for read in ranges if table in read.rows]
+        assert [row for rows in tables for row in rows.to_pylist()] == plain_rows(table)
     path = tmp_path / range_table_path(FIRST + 4, "views")
     path.write_bytes(path.read_bytes()[::-1])
     for words in ("does not", "is committed"):
@@ -92,23 +90,6 @@ def test_a_published_file_that_is_missing_or_cut_is_told_by_name(place, tmp_path
 
 # ------------------------------------------------------------------------------------------- what ranges share
 
-NAMES = st.text(st.characters(blacklist_categories=["Cs"]), max_size=4)
-SHAPE = "assets/mug/a.glb"
-
-
-@pytest.fixture
-def shared(tmp_path):
-    with contextlib.closing(SharedRows(tmp_path)) as rows:
-        yield rows
-
-
-@given(st.dictionaries(NAMES, NAMES, max_size=60))
-def test_files_come_back_sorted_by_the_bytes_of_their_paths(tmp_path_factory, files):
-    with contextlib.closing(SharedRows(tmp_path_factory.mktemp("shared"))) as shared:
-        shared.add_files(files.items())
-        expected = sorted(files.items(), key=lambda pair: pair[0].encode())
-        assert list(shared.files(mixed=False)) == list(shared.files(mixed=False)) == expected
-
 
 def test_more_files_than_fit_in_the_cache_come_back_sorted_and_are_not_sorted_when_read(tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "CACHE_KIB", 64)
@@ -122,42 +103,13 @@ def test_more_files_than_fit_in_the_cache_come_back_sorted_and_are_not_sorted_wh
         assert not any("TEMP B-TREE" in plan for plan in plans)
 
 
-def test_images_are_counted_and_named_once_and_a_shape_has_one_digest(shared):
-    output = made_scene(3)
-    shared.add_images(pa.Table.from_pylist(output.rows["views"], schema=SCHEMAS["views"]))
-    images = sorted(file.path for file in output.files if not file.path.startswith("assets/"))
-    assert shared.images == len(images)
-    shared.add_files([(SHAPE, "bb"), (SHAPE, "bb")])
-    assert [path for path, _ in shared.files(mixed=False)] == [SHAPE, *images]
-    shared.add_files([(SHAPE, "aa")])
-    with pytest.raises(CommitConflict, match="two digests by one stack: aa, bb"):
-        list(shared.files(mixed=False))
-    assert (SHAPE, "aa") in list(shared.files(mixed=True))
-    for path, again in (("mug/RGB99998.png", "aa"), ("mug/RGB99999.png", "bb")):
-        shared.add_files([(path, "aa"), (path, again)])
-        with pytest.raises(CorruptError, match=r"mug/RGB99998\.png belongs to two views"):
-            list(shared.files(mixed=True))
-
-
-def test_an_asset_comes_back_once_as_it_was_and_must_be_the_same_in_every_range(shared):
-    def rows_of(*splits: str) -> pa.Table:
-        row = made_scene(0).rows["assets"][0]
-        return pa.Table.from_pylist([{**row, "split": split} for split in splits], schema=SCHEMAS["assets"])
-
-    shared.add_assets(rows_of("train", "train"))
-    assert pa.concat_tables(shared.assets(mixed=False)).equals(rows_of("train"))
-    shared.add_assets(rows_of("test"))
-    with pytest.raises(CommitConflict, match="is described differently by two ranges"):
-        list(shared.assets(mixed=False))
-    (mixed,) = pa.concat_tables(shared.assets(mixed=True)).to_pylist()
-    assert json.dumps(mixed) == min(json.dumps(row) for row in rows_of("train", "test").to_pylist())
-
-
-def test_a_full_disk_is_explained(tmp_path):
-    def fill():
-        with merge_folder(LocalStore(tmp_path)) as folder, contextlib.closing(SharedRows(folder)) as shared:
-            shared._db.execute("PRAGMA max_page_count = 4")
-            shared.add_files((f"{i:05d}", f"{i:064d}") for i in range(1000))
-
-    with pytest.raises(MachineError, match=r"could not write its files: .* full; free some space"):
-        fill()
+def test_images_are_counted_and_named_once(tmp_path):
+    with contextlib.closing(SharedRows(tmp_path)) as shared:
+        output = made_scene(3)
+        shared.add_images(pa.Table.from_pylist(output.rows["views"], schema=SCHEMAS["views"]))
+        images = sorted(file.path for file in output.files if not file.path.startswith("assets/"))
+        assert shared.images == len(images) and [path for path, _ in shared.files(mixed=False)] == images
+        for path, again in (("mug/RGB99998.png", "aa"), ("mug/RGB99999.png", "bb")):
+            shared.add_files([(path, "aa"), (path, again)])
+            with pytest.raises(CorruptError, match=r"mug/RGB99998\.png belongs to two views"):
+                list(shared.files(mixed=True))

@@ -31,7 +31,7 @@ from workers.capture.folder import CaptureFolder, open_folder, read_truth
 from workers.capture.process import ProcessedFolder, process_folder
 from workers.capture.simulate.simulate import photograph, simulate_capture
 from workers.capture.simulate.studio import build_studio, place_object, plan_path
-from workers.geometry.lens import opencv_lens
+from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
 

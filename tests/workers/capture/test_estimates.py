@@ -35,7 +35,7 @@ from workers.capture.poses.markers import Evidence, fit_markers
 from workers.capture.poses.observation import Setup, no_patches
 from workers.capture.poses.terms import moved
 from workers.geometry.frames import transform
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 # ---------------------------------------------------------------------------------------------- markers
 

@@ -48,7 +48,7 @@ from workers.capture.poses.terms import (
     prior_sigma,
 )
 from workers.geometry.frames import translation, uniform_rotation
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 RNG = np.random.default_rng(0)
 STEP = np.array([0.01, -0.02, 0.01, 0.02, -0.01, 0.03, -0.02, 0.01, 0.005, 2e-4, 0.1, 0.01, 0.02, -0.01, 0.01, 0.02])

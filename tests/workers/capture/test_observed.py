@@ -52,7 +52,7 @@ from workers.capture.poses.observation import (
 from workers.capture.poses.terms import cross_matrix, motion_between, moved
 from workers.geometry.camera import look_at
 from workers.geometry.frames import invert, pose, transform, translation
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 SPEC = Estimation()
 FOCAL = np.array([KINECT.fx, KINECT.fy])

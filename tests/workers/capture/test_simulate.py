@@ -43,7 +43,7 @@ from workers.capture.simulate.studio import (
 )
 from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import invert, transform
-from workers.geometry.lens import opencv_lens, opencv_matrix
+from workers.geometry.pixels import opencv_lens, opencv_matrix
 from workers.geometry.raycast import cast_view
 from workers.scene.chance import SceneChance
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture

@@ -41,7 +41,7 @@ from workers.capture.surface.synthesize import (
 from workers.capture.surface.tsdf import fit_depth
 from workers.geometry.camera import look_at
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
-from workers.geometry.lens import opencv_matrix
+from workers.geometry.pixels import opencv_matrix
 from workers.geometry.raycast import cast_view
 
 # ---------------------------------------------------------------------------------------------- without the lens

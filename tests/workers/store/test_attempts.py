@@ -41,9 +41,9 @@ def test_a_winner_publishes_every_file_with_its_digest_and_rows_and_leaves_no_st
     named = {entry.path: (entry.bytes, entry.sha256) for entry in committed_files(store, result.record)}
     tables = {range_table_path(0, table): table for table in TABLES}
     assert named.keys() == {*made, *tables}
-    for path, told in named.items():
+    for path, entry in named.items():
         data = (tmp_path / path).read_bytes()
-        assert told == (len(data), hashlib.sha256(data).hexdigest()) and made.get(path, data) == data
+        assert entry == (len(data), hashlib.sha256(data).hexdigest()) and made.get(path, data) == data
         if path in tables:
             assert decode_table(tables[path], data, path).num_rows == result.record.tables[tables[path]]
     assert [(mark.scene_id, mark.outcome) for mark in result.record.scenes] == [(i, "made") for i in range(4)]
@@ -149,8 +149,8 @@ def test_a_loser_that_made_other_bytes_says_where_and_names_both_fingerprints(st
     def conflict(make, start=0, stop=4):
         return attempt_at(store, start, stop, terms(fingerprint="stack-b"), make).commit().conflict
 
-    told = conflict(lambda i: made_scene(i, salt="!" if i == 2 else ""))
-    assert "at scene 2:" in told and "stack-a" in told and "stack-b" in told and whole.attempt in told
+    message = conflict(lambda i: made_scene(i, salt="!" if i == 2 else ""))
+    assert "at scene 2:" in message and "stack-a" in message and "stack-b" in message and whole.attempt in message
     assert "assets/" in conflict(lambda i: with_shapes(made_scene(i), lambda data: data + b"!"))
     assert "scene 1:" in conflict(lambda i: made_scene(i, salt="!" * i), stop=2)
     assert conflict(made_scene, stop=2) is conflict(killed) is None
@@ -185,9 +185,9 @@ def test_a_scene_is_blamed_from_its_beginning_until_the_commit(store):
 
 
 def test_a_worker_that_dies_while_it_commits_blames_no_scene_and_is_not_told_so_twice(store, monkeypatch):
-    attempt, told = attempt_at(store, 0, 4), attempt_at(store, 0, 4)
+    attempt, noted = attempt_at(store, 0, 4), attempt_at(store, 0, 4)
     assert blamed_scene(store, 0, attempt.name) == 3
-    told.end_scenes()
+    noted.end_scenes()
 
     class Died(BaseException):
         pass
@@ -199,11 +199,11 @@ def test_a_worker_that_dies_while_it_commits_blames_no_scene_and_is_not_told_so_
         patch.setattr(LocalStage, "flush", dies)
         with pytest.raises(Died):
             attempt.commit()
-    assert attempts_at(store, 0) == sorted((attempt.name, told.name))
-    assert blamed_scene(store, 0, attempt.name) is blamed_scene(store, 0, told.name) is None
+    assert attempts_at(store, 0) == sorted((attempt.name, noted.name))
+    assert blamed_scene(store, 0, attempt.name) is blamed_scene(store, 0, noted.name) is None
     write, written = LocalStage.write, []
     monkeypatch.setattr(LocalStage, "write", lambda stage, path, data: (written.append(path), write(stage, path, data)))
-    assert told.commit().won
+    assert noted.commit().won
     assert written and "_current" not in written
 
 

@@ -63,13 +63,13 @@ def test_a_file_system_that_is_not_safe_is_refused_by_name_and_a_full_one_is_tol
 
     replaces = lambda source, target: target.write_bytes(source.read_bytes())  # noqa: E731
     kind = file_system_of(tmp_path)
-    for link, told in (
+    for link, message in (
         (replaces, rf"type {kind} that fails at refusing a second hard link.*local disk"),
         (unsupported, rf"type {kind} that fails at a hard link \(Operation not permitted\)"),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(os, "link", link)
-            with pytest.raises(OutputError, match=told):
+            with pytest.raises(OutputError, match=message):
                 LocalStore(tmp_path / "out").prepare()
     store = LocalStore(tmp_path / "out")
     store.prepare()

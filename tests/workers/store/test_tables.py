@@ -101,9 +101,7 @@ def test_a_torn_file_or_another_table_is_told_by_name():
 def test_the_digest_of_a_scene_knows_no_order_or_type_and_tells_the_last_bit_of_any_number():
     base = made_scene(3).rows
     digest = scene_digest(base)
-    turned = {
-        table: [dict(reversed(row.items())) for row in reversed(found)] for table, found in reversed(base.items())
-    }
+    turned = {table: [dict(reversed(row.items())) for row in reversed(seen)] for table, seen in reversed(base.items())}
     turned["scenes"][0]["penetration_mm"] = np.float64(turned["scenes"][0]["penetration_mm"])
     turned["scenes"][0]["redraws"] = np.int64(turned["scenes"][0]["redraws"])
     assert scene_digest(turned) == digest

@@ -125,7 +125,7 @@ def test_there_is_one_tar_for_each_range_and_category_the_same_whoever_makes_it(
 
 def test_a_tar_alone_is_enough_to_train_from_and_its_members_have_no_time_or_owner(store, tmp_path):
     attempt_at(store, 0, 8, TAR).commit()
-    found = 0
+    seen = 0
     for path in tmp_path.glob("*/*.tar"):
         members = members_of(path)
         attributes = {(m.mtime, m.uid, m.gid, m.uname, m.gname, m.mode, m.type) for m, _ in members}
@@ -144,15 +144,15 @@ def test_a_tar_alone_is_enough_to_train_from_and_its_members_have_no_time_or_own
             assert json.loads(sample["json"]) == json.loads(
                 encode_label(pose_labels(stored)[path.parent.name, int(key)])
             )
-            found += 1
-    assert found == 2 * 7  # scene 5 fails
+            seen += 1
+    assert seen == 2 * 7  # scene 5 fails
 
 
 def test_labels_that_differ_from_the_tables_are_told_by_pose_and_key(store, tmp_path):
     attempt_at(store, 0, 4, TAR).commit()
     rows, path = rows_of(*range(4)), tmp_path / CATEGORY / "0000000000.tar"
     off = "differs from the tables at"
-    for change, told in (
+    for change, message in (
         (lambda data: data, None),
         (lambda data: data.replace(b'"fx":525.0', b'"fx":525.5'), f"{off} views.aligned.fx, views.input.fx"),
         (lambda data: data.replace(b'"fx":525.0', b'"fx":525'), f"{off} views.aligned.fx"),
@@ -169,8 +169,8 @@ def test_labels_that_differ_from_the_tables_are_told_by_pose_and_key(store, tmp_
         members = [(h, change(data) if h.name == "00000.json" else data) for h, data in members_of(path)]
         forged = archive_of(*((header, data) for header, data in members if data is not None))
         faults = check_labels(CATEGORY, forged, "here.tar", rows)
-        assert [pose_id for pose_id, _ in faults] == ([] if told is None else [0])
-        assert all(fault.startswith("here.tar: 00000.json ") and told in fault for _, fault in faults), told
+        assert [pose_id for pose_id, _ in faults] == ([] if message is None else [0])
+        assert all(fault.startswith("here.tar: 00000.json ") and message in fault for _, fault in faults), message
     faults = check_labels(CATEGORY, path.read_bytes(), "here.tar", rows_of(1, 2, 3))
     assert faults[0] == (0, "here.tar: 00000.json is of a pose that the tables do not have")
 
@@ -179,10 +179,10 @@ def test_a_torn_or_foreign_tar_is_told_by_name(store, tmp_path):
     attempt_at(store, 0, 4, TAR).commit()
     link = tarfile.TarInfo("00000.RGB.png")
     link.type, link.linkname = tarfile.SYMTYPE, "00001.RGB.png"
-    for data, told in (
+    for data, message in (
         ((tmp_path / CATEGORY / "0000000000.tar").read_bytes()[:700], ""),
         (archive_of((tarfile.TarInfo("../../etc/passwd"), b"")), ""),
         (archive_of((link, b"")), ".*00000.RGB.png is no file"),
     ):
-        with pytest.raises(CorruptError, match=rf"here.tar is not a whole archive{told}"):
+        with pytest.raises(CorruptError, match=rf"here.tar is not a whole archive{message}"):
             list(read_tar("mug", data, "here.tar"))

@@ -50,7 +50,7 @@ from workers.capture.simulate.studio import (
 from workers.geometry.colour import SRGB_STEPS, encode_codes, encode_srgb
 from workers.geometry.frames import pose, rotation_about
 from workers.geometry.jit import compiled
-from workers.geometry.lens import opencv_lens
+from workers.geometry.pixels import opencv_lens
 from workers.geometry.zbuffer import register_depth
 from workers.render.pathtraced import draw_view
 from workers.render.raster.gbuffer import shared_renderer

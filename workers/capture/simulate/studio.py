@@ -27,7 +27,7 @@ from workers.assets.appearance import draw_appearance
 from workers.capture.board import TOUCHING_M, board_geometry, marker_cells, marker_corners
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
-from workers.geometry.lens import undistort
+from workers.geometry.pixels import undistort
 from workers.scene.chance import SceneChance, Stream
 
 
