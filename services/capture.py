@@ -160,7 +160,8 @@ def simulate(options: argparse.Namespace) -> int:
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise OutputError(f"{path} is there already: name a new or an empty folder")
     from workers.assets.catalogue import open_catalogue
-    from workers.capture.simulate.simulate import load_object, simulate_capture
+    from workers.capture.make_capture import load_object
+    from workers.capture.simulate.simulate import simulate_capture
     from workers.render.tiers import require_tier
     from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
     from workers.scene.plan import SceneChance
@@ -353,13 +354,11 @@ def _against_truth(result: "CaptureViews") -> tuple["SurfaceErrors", dict[str, A
             f"view {number} made of the others: depth {errors.depth_median_mm:.2f} mm (95 %: {errors.depth_p95_mm:.2f}), "
             f"colour {errors.color_error:.1f} of 255, covers {errors.covered:.1%}, {errors.measured_share:.1%} measured"
         )
-    depth = score_measured(result, truth)
-    print(
-        f"depth    of {depth.measured_of_visible:.1%} of what was visible in any view; {depth.completeness_of_measured:.1%} of "
-        "that has a point within 3 mm"
-    )
+    measured, complete = score_measured(result, truth)
+    print(f"depth    of {measured:.1%} of what was visible in any view; {complete:.1%} of that has a point within 3 mm")
     answer = {
-        **dataclasses.asdict(depth),
+        "measured_of_visible": measured,
+        "completeness_of_measured": complete,
         "aligned_by": None,
         "pose_mm": one.pose_mm,
         "pose_deg": one.pose_deg,

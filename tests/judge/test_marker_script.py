@@ -15,9 +15,10 @@ from tests.judge import marker_script
 from tests.workers.capture.drawn import KINECT, errors, hand_held, photograph
 from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import CaptureFile, open_folder, write_description, write_view
+from workers.capture.make_capture import load_object
 from workers.capture.process import process_folder
 from workers.capture.score import compare_poses, read_whole_truth
-from workers.capture.simulate.simulate import load_object, simulate_capture
+from workers.capture.simulate.simulate import simulate_capture
 from workers.scene.chance import SceneChance
 from workers.scene.effects import CAPTURE_EFFECTS
 

@@ -17,6 +17,7 @@ from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, SceneOutput
 from schemas.scene.shape import Asset, Material, Part, Shape
 from workers.assets.builtin.make import shape_digest
+from workers.assets.catalogue import Catalogue, load_asset
 from workers.assets.mass import mass_properties
 from workers.capture.folder import CaptureFolder, open_folder, read_receipt, read_truth
 from workers.capture.process import CaptureViews
@@ -32,12 +33,13 @@ from workers.capture.rows import (
     with_targets,
 )
 from workers.capture.score import read_whole_truth, score_capture
-from workers.capture.simulate.simulate import load_object, simulate_capture
+from workers.capture.simulate.simulate import simulate_capture
 from workers.door.meshes.mesh import is_solid
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import translation
 from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.plan import choose_assets
 from workers.store.file_system import temporary_folder
 
 BOARD = "board"
@@ -177,6 +179,12 @@ def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Ite
             instance_id = simulate_one(context, scene_id, path)
             effects, skipped = read_receipt(path)
         yield Origin(path, instance_id, None, effects, skipped)
+
+
+def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
+    """The object of a capture, chosen as the first object of a scene is. Raises MeshError where its mesh is refused."""
+    (ref, *_), _ = choose_assets(job, catalogue, chance)
+    return load_asset(catalogue, ref)
 
 
 def simulate_one(context: WorkerContext, scene_id: int, path: Path) -> str:

@@ -69,24 +69,16 @@ from workers.scene.context import Stopwatch
 from workers.scene.pairs import front_distance, place_mirror_camera
 from workers.store.images import encode_mask, encode_png
 
-_VIEWS = SCHEMAS["views"]
-_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv")
+_CAMERA = ("T_world_cam", "width", "height", "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv")
+_RESIDUALS = ("reprojection_before_px", "reprojection_px", "depth_before_mm", "depth_mm", "sigma_mm", "sigma_deg")
 
 SCHEMA = pa.schema(
     [
-        pa.field("number", pa.int64(), False),
-        pa.field("estimate", pa.string(), False),
-        pa.field("chosen", pa.bool_(), False),
-        pa.field("status", pa.string(), False),
-        pa.field("reasons", pa.list_(pa.string()), False),
-        _VIEWS.field("T_world_cam").with_nullable(True),
-        *(_VIEWS.field(name) for name in _CAMERA),
-        pa.field("markers", pa.int64(), False),
-        *(
-            (name, pa.float64())
-            for name in ("reprojection_before_px", "reprojection_px", "depth_before_mm", "depth_mm")
-        ),
-        *((name, pa.float64()) for name in ("sigma_mm", "sigma_deg")),
+        *(("number", pa.int64()), ("estimate", pa.string()), ("chosen", pa.bool_()), ("status", pa.string())),
+        ("reasons", pa.list_(pa.string())),
+        *((name, SCHEMAS["views"].field(name).type) for name in _CAMERA),
+        ("markers", pa.int64()),
+        *((name, pa.float64()) for name in _RESIDUALS),
     ]
 )
 """Camera columns are those of the table `views` of a dataset, the board frame being the world; `before` is by markers alone.
@@ -122,25 +114,14 @@ def pose_table(estimates: Estimates, camera: CaptureCamera) -> bytes:
 
 def _pose_row(view: ViewEstimate, before: ViewEstimate | None, camera: CaptureCamera) -> Row:
     pose = np.eye(4) if view.T_board_cam is None else view.T_board_cam
-    sigma_mm, sigma_deg = _sigmas(view)
-    return {
-        **camera_columns(Camera(camera.intrinsics, pose)),
-        **({"T_world_cam": None} if view.T_board_cam is None else {}),
-        **residual_columns(view, before),
-        "status": view.status,
-        "reasons": list(view.reasons),
-        "depth_before_mm": None if before is None else before.depth_mm,
-        "sigma_mm": sigma_mm,
-        "sigma_deg": sigma_deg,
-    }
-
-
-def _sigmas(view: ViewEstimate) -> tuple[float | None, float | None]:
-    if view.covariance is None:
-        return None, None
-    blocks = view.covariance[:3, :3], view.covariance[3:, 3:]
-    place, turn = (float(np.sqrt(max(np.linalg.eigvalsh(block).max(), 0.0))) for block in blocks)
-    return 1e3 * place, float(np.degrees(turn))
+    row = {**camera_columns(Camera(camera.intrinsics, pose)), **residual_columns(view, before)}
+    row |= {"status": view.status, "reasons": view.reasons, "depth_before_mm": before.depth_mm if before else None}
+    if view.T_board_cam is None:
+        row["T_world_cam"] = None
+    if view.covariance is not None:
+        place, turn = (np.linalg.eigvalsh(view.covariance[part, part]).max() for part in (np.s_[:3], np.s_[3:]))
+        row |= {"sigma_mm": 1e3 * max(place, 0.0) ** 0.5, "sigma_deg": float(np.degrees(max(turn, 0.0) ** 0.5))}
+    return row
 
 
 def read_poses(path: Path) -> tuple[ViewEstimate, ...]:
@@ -189,7 +170,7 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
         given = given_files(open_folder(path), captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
     with watch.stage("masks"):
-        files = {**_pose_files(given, estimates), **_mask_files(given, estimates.estimate, merged.body)}
+        files = _view_files(given, estimates, merged.body)
     surface = merged.surface
     with watch.stage("encode"):
         files[CLOUD_FILE] = cloud_ply(surface)
@@ -202,22 +183,15 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     return ProcessedFolder(estimates, merged, seconds, tuple(sorted([*stayed, *masks])))
 
 
-def _pose_files(given: Given, estimates: Estimates) -> dict[str, bytes]:
-    """board_ and correction_ files of every view with a pose."""
-    files = {}
+def _view_files(given: Given, estimates: Estimates, body: Mesh) -> dict[str, bytes]:
+    """board_ and correction_ files of every view with a pose; mask_ files, as the lens draws them, where the user has none."""
+    camera, files = given.folder.camera, {}
     for number, (board, correction) in corrections_of(given, estimates).items():
         files[f"board_{number:05d}.txt"] = pose_text(board).encode()
         files[f"correction_{number:05d}.txt"] = pose_text(correction).encode()
-    return files
-
-
-def _mask_files(given: Given, estimate: CaptureEstimate, body: Mesh) -> dict[str, bytes]:
-    """mask_ files of every view with a pose and without a mask of the user's, as the lens draws them."""
-    camera, files = given.folder.camera, {}
-    for view in estimate.views:
-        if view.T_board_cam is not None and not given.has_mask(view.number):
-            mask = silhouette(body, Camera(camera.intrinsics, view.T_board_cam))
-            files[f"mask_{view.number:05d}.png"] = encode_mask(distort_mask(mask, camera))
+        if not given.has_mask(number):
+            mask = silhouette(body, Camera(camera.intrinsics, correction @ board))
+            files[f"mask_{number:05d}.png"] = encode_mask(distort_mask(mask, camera))
     return files
 
 

@@ -248,22 +248,25 @@ def _with_given_pose(seen: Observation, markers: MarkerPose, given: Given) -> Ob
     return replace(seen, manual_T_board_cam=T, given_by=f"the pose of {name} is kept as it was given")
 
 
-def _other_markers(folder: CaptureFolder) -> str:
-    return other_dictionaries(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
-
-
 def _no_markers(folder: CaptureFolder) -> str:
     what = f"{folder.path}: no marker of {folder.board.dictionary} was found in any of {len(folder.numbers)} views"
-    seen = _other_markers(folder)
-    return f"{what}; {seen}: correct board.json" if seen else f"{what}: check that they are sharp, and not over-exposed"
+    others = _other_markers(folder)
+    return (
+        f"{what}; {others}: correct board.json"
+        if others
+        else f"{what}: check that they are sharp, and not over-exposed"
+    )
 
 
 def _no_pose(estimate: CaptureEstimate, folder: CaptureFolder) -> str:
     first = next((f"view {view.number}: {'; '.join(view.reasons)}" for view in estimate.views if view.reasons), "")
     few = max(view.markers for view in estimate.views) < FEW_MARKERS
-    seen = _other_markers(folder) if few else ""
-    what = f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}; {first}"
-    return f"{what}; {seen}" if seen else what
+    words = [f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}", first]
+    return "; ".join(part for part in (*words, _other_markers(folder) if few else "") if part)
+
+
+def _other_markers(folder: CaptureFolder) -> str:
+    return other_dictionaries(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
 
 
 def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tuple[Estimates, Merged]:

@@ -95,15 +95,10 @@ def read_surface(path: Path) -> Reconstruction:
     """The surface of cloud.ply and mesh.ply. Raises CaptureError where one is not there or another's."""
     cloud, mesh = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"], _read_ply(path / MESH_FILE, _VERTEX)
     vertices = mesh["vertex"]
-    return Reconstruction(
-        _columns(cloud, _PLACE).astype(np.float64),
-        _columns(cloud, _NORMAL).astype(np.float64),
-        _columns(cloud, _COLOR),
-        cloud["views"].astype(np.int32),
-        _columns(vertices, _PLACE).astype(np.float64),
-        mesh["face"]["vertex_indices"].astype(np.int32),
-        _columns(vertices, _COLOR),
-    )
+    places, normals = (_columns(cloud, names).astype(np.float64) for names in (_PLACE, _NORMAL))
+    cloud_columns = places, normals, _columns(cloud, _COLOR), cloud["views"].astype(np.int32)
+    corners, faces = _columns(vertices, _PLACE).astype(np.float64), mesh["face"]["vertex_indices"].astype(np.int32)
+    return Reconstruction(*cloud_columns, corners, faces, _columns(vertices, _COLOR))
 
 
 def _columns(rows: Element, names: Sequence[str]) -> NDArray:

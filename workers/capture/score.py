@@ -74,17 +74,6 @@ class SurfaceErrors:
 
 
 @dataclass(frozen=True)
-class MeasuredSurface:
-    """What depth there was to merge: share of the visible samples that at least one view has depth of, and their completeness.
-
-    A surface that is seen at a grazing angle alone, or between two edges, is visible and has no depth.
-    """
-
-    measured_of_visible: float
-    completeness_of_measured: float
-
-
-@dataclass(frozen=True)
 class ViewErrors:
     """A synthesised view against the true one, on pixels of the object that both have.
 
@@ -139,11 +128,6 @@ def measured_points(points: Array, normals: Array, view: PosedView) -> NDArray[n
     z = view.depth_m[np.floor(v).astype(np.int64), np.floor(u).astype(np.int64)]
     measured[facing] = (z > 0.0) & (np.abs(z - seen[:, 2]) * cosine[facing] < MEASURED_M)
     return measured
-
-
-def true_view(mesh: Mesh, camera: Camera) -> Array:
-    """[H, W] float64: exact depth of the mesh alone, by the ray caster, 0 where it is not seen."""
-    return cast_view([placed(mesh)], camera)[0]
 
 
 def compare_view(view: SynthesizedView, depth_m: Array, rgb: NDArray[np.uint8]) -> ViewErrors:
@@ -272,15 +256,9 @@ def score_capture(views: CaptureViews, truth: Truth, held_out: int = HELD_OUT) -
     left_out = score_held_out(views, truth, known, held_out)
     depth_mm = {n: errors.depth_median_mm for n, errors in left_out.items()}
     by_view = {n: ViewScore(mm, deg, depth_mm.get(n)) for n, mm, deg in zip(known, poses.mm, poses.deg, strict=True)}
-    summary = CaptureScore(
-        pose_mm=poses.median_mm,
-        pose_deg=poses.median_deg,
-        cloud_median_mm=surface.cloud_median_mm,
-        cloud_p95_mm=surface.cloud_p95_mm,
-        completeness=surface.completeness,
-        depth_median_mm=float(np.median(list(depth_mm.values()))) if depth_mm else None,
-        views=by_view,
-    )
+    depth = float(np.median(list(depth_mm.values()))) if depth_mm else None
+    cloud = surface.cloud_median_mm, surface.cloud_p95_mm, surface.completeness
+    summary = CaptureScore(poses.median_mm, poses.median_deg, *cloud, depth, by_view)
     return Score(summary, poses, surface, left_out)
 
 
@@ -302,8 +280,11 @@ def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]
     )
 
 
-def score_measured(views: CaptureViews, truth: Truth) -> MeasuredSurface:
-    """How much of what was visible had depth in any used view, and how much of that has a point within 3 mm."""
+def score_measured(views: CaptureViews, truth: Truth) -> tuple[float, float]:
+    """What depth there was to merge: (share of the visible samples that a used view has depth of, completeness of those).
+
+    A surface that is seen at a grazing angle alone, or between two edges, is visible and has no depth.
+    """
     samples, normals = sample_surface(truth.surface)
     numbers = sorted(set(views.cameras) & set(truth.T_board_cam))
     k = views.folder.camera.intrinsics
@@ -313,8 +294,8 @@ def score_measured(views: CaptureViews, truth: Truth) -> MeasuredSurface:
         measured |= measured_points(samples, normals, views.posed(number))
     distance, _ = cKDTree(views.surface.points).query(samples)
     both = visible & measured
-    share = float((distance[both] <= COMPLETE_M).mean()) if both.any() else 0.0
-    return MeasuredSurface(float(both.sum() / max(int(visible.sum()), 1)), share)
+    complete = float((distance[both] <= COMPLETE_M).mean()) if both.any() else 0.0
+    return float(both.sum() / max(int(visible.sum()), 1)), complete
 
 
 def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most: int) -> dict[int, ViewErrors]:
@@ -322,7 +303,7 @@ def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most
     errors: dict[int, ViewErrors] = {}
     for number in (known[place] for place in spread_evenly(len(known), most)):
         camera = Camera(views.folder.camera.intrinsics, truth.T_board_cam[number])
-        depth_m = true_view(truth.surface, camera)
+        depth_m = cast_view([placed(truth.surface)], camera)[0]  # of the object alone
         with suppress(CaptureError, ViewError):  # the view sees nothing of the object, or nothing beside it does
             made = views.synthesize(camera, without=number)
             errors[number] = compare_view(made, depth_m, views.posed(number).rgb)

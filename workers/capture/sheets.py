@@ -2,8 +2,8 @@
 
 import io
 import math
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ def draw_print(board: Board, layout: PrintLayout, px_per_m: float) -> NDArray[np
         down, row = _cover(np.array([corner[1] - top, corner[1] - bottom]) * px_per_m, light.shape[0])
         part = light[row : row + len(down), column : column + len(across)]
         np.minimum(part, 1.0 - down @ across.T, out=part)
-    picture = _pixels(light)
+    picture = np.rint(255.0 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
     arrow = (layout.arrow - corner) * [px_per_m, -px_per_m] - 0.5  # OpenCV has pixel centres at whole numbers
     cv2.fillConvexPoly(picture, np.rint(arrow * 256).astype(np.int32), 0, cv2.LINE_AA, 8)
     for words in layout.words:
@@ -66,10 +66,6 @@ def _light_of_markers(board: Board, size_m: tuple[float, float], px_per_m: float
         down, row = _cover((0.5 * size_m[1] - top + edges) * px_per_m, height)
         light[row : row + len(down), column : column + len(across)] -= down @ cells.astype(np.float64) @ across.T
     return light
-
-
-def _pixels(light: Array) -> NDArray[np.uint8]:
-    return np.rint(255.0 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
 
 
 def _cover(edges: Array, count: int) -> tuple[Array, int]:
@@ -105,8 +101,7 @@ OVERLAP_M = 0.005
 """By which the print goes on beyond a seam, for paper that is not cut exactly."""
 
 
-@dataclass(frozen=True)
-class Tile:
+class Tile(NamedTuple):
     """The part of the sheet that one page shows: board frame, metres; column and row from the upper left, from 0."""
 
     left: float
@@ -123,7 +118,6 @@ def board_pdf(board: Board) -> bytes:
     stream, canvas = _canvas(board, (layout.width_m, layout.height_m))
     canvas.translate(0.5 * layout.width_m * POINTS_PER_M, 0.5 * layout.height_m * POINTS_PER_M)
     _draw(canvas, layout)
-    canvas.showPage()
     canvas.save()
     return stream.getvalue()
 
@@ -139,14 +133,23 @@ def tiled_pdf(board: Board) -> bytes:
     page, tiles = tile_sheet(board, layout)
     stream, canvas = _canvas(board, page)
     for number, tile in enumerate(tiles, start=1):
-        left, bottom = _place(tile, page)
+        width, height = tile.right - tile.left, tile.top - tile.bottom
+        left, bottom = 0.5 * (page[0] - width), 0.5 * (page[1] - height)  # in the middle of the page
         canvas.saveState()
         canvas.translate((left - tile.left) * POINTS_PER_M, (bottom - tile.bottom) * POINTS_PER_M)
-        _clip(canvas, tile)
+        path = canvas.beginPath()  # what lies beyond the tile and its overlap is left out
+        corner, size = (tile.left, tile.bottom), (width, height)
+        path.rect(
+            *((x - OVERLAP_M) * POINTS_PER_M for x in corner), *((x + 2 * OVERLAP_M) * POINTS_PER_M for x in size)
+        )
+        canvas.clipPath(path, stroke=0, fill=0)
         _draw(canvas, layout)
         canvas.restoreState()
-        _cut_marks(canvas, tile, (left, bottom))
-        _number(canvas, number, tiles, page)
+        _cut_marks(canvas, (left, left + width), (bottom, bottom + height))
+        place = f"row {tile.row + 1} of {tiles[-1].row + 1} from the top, column {tile.column + 1} of {tiles[-1].column + 1}"
+        words = f"page {number} of {len(tiles)}: {place} from the left; cut along the marks, glue edge to edge"
+        canvas.setFont("Helvetica", 6)
+        canvas.drawCentredString(0.5 * page[0] * POINTS_PER_M, 0.006 * POINTS_PER_M, words)
         canvas.showPage()
     canvas.save()
     return stream.getvalue()
@@ -208,39 +211,13 @@ def _draw(canvas: Canvas, layout: PrintLayout) -> None:
         canvas.restoreState()
 
 
-def _place(tile: Tile, page: tuple[float, float]) -> tuple[float, float]:
-    """Lower left corner of a tile on its page, metres: in the middle."""
-    return 0.5 * (page[0] - (tile.right - tile.left)), 0.5 * (page[1] - (tile.top - tile.bottom))
-
-
-def _clip(canvas: Canvas, tile: Tile) -> None:
-    """Leaves out what lies beyond the tile and its overlap."""
-    left, bottom = tile.left - OVERLAP_M, tile.bottom - OVERLAP_M
-    width, height = tile.right - tile.left + 2 * OVERLAP_M, tile.top - tile.bottom + 2 * OVERLAP_M
-    path = canvas.beginPath()
-    path.rect(*(x * POINTS_PER_M for x in (left, bottom, width, height)))
-    canvas.clipPath(path, stroke=0, fill=0)
-
-
-def _cut_marks(canvas: Canvas, tile: Tile, at: tuple[float, float]) -> None:
-    """Thin grey lines outside the tile's corners, along which the page is cut."""
-    width, height = tile.right - tile.left, tile.top - tile.bottom
+def _cut_marks(canvas: Canvas, across: tuple[float, float], up: tuple[float, float]) -> None:
+    """Thin grey lines outside the corners of a tile between these edges, along which the page is cut."""
     canvas.saveState()
     canvas.setStrokeGray(0.4)
     canvas.setLineWidth(0.2)
-    for x, outwards in ((at[0], -1), (at[0] + width, 1)):
-        for y in (at[1], at[1] + height):
-            canvas.line(*(p * POINTS_PER_M for p in (x, y, x + outwards * 0.8 * EDGE_M, y)))
-    for y, outwards in ((at[1], -1), (at[1] + height, 1)):
-        for x in (at[0], at[0] + width):
-            canvas.line(*(p * POINTS_PER_M for p in (x, y, x, y + outwards * 0.8 * EDGE_M)))
+    for x, right in zip(across, (-0.8 * EDGE_M, 0.8 * EDGE_M), strict=True):
+        for y, upwards in zip(up, (-0.8 * EDGE_M, 0.8 * EDGE_M), strict=True):
+            canvas.line(*(p * POINTS_PER_M for p in (x, y, x + right, y)))
+            canvas.line(*(p * POINTS_PER_M for p in (x, y, x, y + upwards)))
     canvas.restoreState()
-
-
-def _number(canvas: Canvas, number: int, tiles: list[Tile], page: tuple[float, float]) -> None:
-    tile = tiles[number - 1]
-    columns, rows = tiles[-1].column + 1, tiles[-1].row + 1
-    place = f"row {tile.row + 1} of {rows} from the top, column {tile.column + 1} of {columns} from the left"
-    canvas.setFont("Helvetica", 6)
-    words = f"page {number} of {len(tiles)}: {place}; cut along the marks, glue edge to edge"
-    canvas.drawCentredString(0.5 * page[0] * POINTS_PER_M, 0.006 * POINTS_PER_M, words)

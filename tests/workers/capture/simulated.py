@@ -29,8 +29,8 @@ from workers.capture.board import marker_corners
 from workers.capture.detect import refine_corners
 from workers.capture.folder import CaptureFolder, open_folder, read_truth
 from workers.capture.process import ProcessedFolder, process_folder
-from workers.capture.simulate.photograph import build_studio, photograph, place_object
-from workers.capture.simulate.simulate import plan_path, simulate_capture
+from workers.capture.simulate.simulate import photograph, simulate_capture
+from workers.capture.simulate.studio import build_studio, place_object, plan_path
 from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture

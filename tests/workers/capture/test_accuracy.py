@@ -23,8 +23,8 @@ from workers.capture.poses.terms import motion_between
 from workers.capture.process import CaptureViews
 from workers.capture.reconstruct import estimate_poses, given_files, processor_clock
 from workers.capture.score import compare_poses, read_whole_truth, score_measured
-from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth, place_object
-from workers.capture.simulate.simulate import simulate_capture
+from workers.capture.simulate.simulate import DEPTH_UNITS_PER_M, measure_depth, simulate_capture
+from workers.capture.simulate.studio import build_studio, place_object
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
 from workers.store.images import encode_png
@@ -87,7 +87,7 @@ def assess(path: Path, record, what: str) -> tuple[dict, list]:
     assert score is not None and truth is not None
     mesh = Mesh(done.surface.vertices, done.surface.faces)
     views = CaptureViews(given_files(folder), Captures(), done.estimates.estimate, done.surface, mesh)
-    unmeasured = 1.0 - score_measured(views, truth).measured_of_visible
+    unmeasured = 1.0 - score_measured(views, truth)[0]
     figures = {
         "joint_mm": (poses["joint"][0], 0.5),
         "joint_deg": (poses["joint"][1], 0.05),

@@ -23,7 +23,7 @@ from workers.capture.board import (
 from workers.capture.board_kinds import KINDS, BoardSizes, read_board_file
 from workers.capture.detect import detect_markers
 from workers.capture.sheets import A4_M, EDGE_M, OVERLAP_M, board_pdf, board_png, tile_sheet, tiled_pdf
-from workers.capture.simulate.photograph import THICKNESS_M, board_body
+from workers.capture.simulate.studio import THICKNESS_M, board_body
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import transform
 

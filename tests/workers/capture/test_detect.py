@@ -26,9 +26,8 @@ from workers.capture.folder import CaptureFile, read_board, write_description, w
 from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
-from workers.capture.simulate.camera import HAND_DEG_S, HAND_M_S
-from workers.capture.simulate.photograph import build_studio, mark_object, place_object, take_light
-from workers.capture.simulate.simulate import plan_path
+from workers.capture.simulate.simulate import HAND_DEG_S, HAND_M_S, mark_object, take_light
+from workers.capture.simulate.studio import build_studio, place_object, plan_path
 from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import pose, rotation_about, transform
 from workers.scene.chance import SceneChance, Stream

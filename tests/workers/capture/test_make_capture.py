@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.capture import DepthCorrection, PosedImages, Reconstruction
+from schemas.capture import PosedImages, Reconstruction
 from schemas.dataset.commit import FileEntry
 from schemas.errors import AssetSourceError, CaptureError, ViewError
 from schemas.job.assets import Assets
 from schemas.job.captures import Board, Captures, Estimation
 from schemas.job.job import Job
 from schemas.scene.scene import SceneOutput
-from schemas.scene.view import Camera, Intrinsics, Pair, View
+from schemas.scene.view import Camera, Intrinsics
 from tests.captures import captures_job, exact_capture, rolled_pose, use_exact_captures, write_folder
 from tests.workers.capture.simulated import box, copy_of
 from workers.assets.catalogue import open_catalogue, split_of
@@ -26,7 +26,6 @@ from workers.capture.folder import open_folder, read_truth, write_pose
 from workers.capture.make_capture import (
     board_asset,
     image_effects,
-    is_corrected,
     make_pairs,
     place_capture,
     process_capture,
@@ -36,20 +35,17 @@ from workers.capture.make_capture import (
 from workers.capture.results import open_sources
 from workers.capture.rows import (
     CapturedObject,
-    CapturedPair,
     LeftOut,
     Origin,
     capture_regions,
     make_capture_pair,
     record_capture,
-    with_targets,
 )
-from workers.geometry.camera import look_at, unproject
+from workers.geometry.camera import look_at
 from workers.geometry.frames import invert, translation
 from workers.geometry.projection import Bounds, Seen, compare_covisible
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
-from workers.scene.rows import object_rows
 from workers.store.images import decode_png
 from workers.store.manifest import check_files, table_of_rows
 
@@ -150,54 +146,6 @@ def test_the_board_has_one_place_in_both_views_and_no_region_is_where_nothing_wa
     assert not mirror.region[mirror.depth == 0].any() and (mirror.region == 3).any()
 
 
-def test_targets_are_of_the_merged_mesh_and_say_what_share_of_the_object_it_has():
-    job = captures_job(cameras={"mirror": {"T_z_m": 0.6}}, targets={"views": ["normals", "coordinates", "layers"]})
-    across = DONE.surface.vertices[DONE.surface.faces][..., 1].mean(axis=1)
-    holed = dataclasses.replace(DONE.surface, faces=DONE.surface.faces[across < np.median(across)])
-    for surface_of, least, most in ((DONE.surface, 0.999, 1.0), (holed, 0.2, 0.95)):
-        placed = place_capture(job, 2, dataclasses.replace(DONE, surface=surface_of), "mug", "capture")
-        made = make_capture_pair(job, placed, DONE.images(1), 1, DONE.synthesize, shared_renderer().count_pixels)
-        pair = with_targets(job, placed, made, Stopwatch()).pair
-        for view in (pair.input, pair.mirror):
-            (row,) = (one for one in object_rows(2, view, job, placed.things) if one["region_id"] == 3)
-            share, there = row["targets_share"], view.further["coordinates"].any(axis=2)
-            assert (
-                least <= share <= most and share == there[view.region == 3].mean() and not there[view.region != 3].any()
-            )
-            rows, columns = np.nonzero(there & (view.depth > 0))
-            seen = unproject(
-                rows, columns, view.depth[rows, columns] / job.images.depth_units_per_m, view.camera.intrinsics
-            )
-            T = np.linalg.inv(placed.T_world_obj) @ view.camera.T_world_cam
-            told = view.further["coordinates"][rows, columns] / 65535 * row["coordinates_scale_m"]
-            off = np.linalg.norm(told + row["coordinates_offset_m"] - (seen @ T[:3, :3].T + T[:3, 3]), axis=1)
-            # Behind a hole the next wall is seen, which the photograph does not show.
-            assert np.quantile(off, 0.9 if surface_of is DONE.surface else 0.1) < 0.0003
-            normals = view.further["normals"][rows, columns] / 65535 * 2 - 1
-            assert ((normals * seen).sum(axis=1) < 0).all()
-
-
-def test_every_pixel_of_the_board_has_a_normal_and_one_beyond_the_mesh_has_none():
-    """From above: the board's edges lie on pixel centres, the mesh's a fortieth of a pixel within the mask's last centres."""
-    job = captures_job(targets={"views": ["normals"]})
-    side = 2 * (0.07 - 0.00025) * 0.9
-    body = trimesh.creation.box((side, side, 0.1))
-    vertices = np.asarray(body.vertices) + np.array([0.0, 0.0, 0.05])
-    mesh = dataclasses.replace(
-        DONE.surface, vertices=vertices, faces=body.faces, vertex_colors=vertices.astype(np.uint8)
-    )
-    above = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
-    camera = Camera(Intrinsics(width=121, height=101, fx=100.0, fy=100.0, cx=60.5, cy=50.5), above)
-    mask = np.zeros((101, 121), bool)
-    mask[43:58, 53:68] = True
-    view = View("input", 0, 0, camera, None, mask.astype(np.uint16), capture_regions(camera, DONE.board, mask), ())
-    placed = place_capture(job, 0, dataclasses.replace(DONE, surface=mesh), "box", "capture")
-    made = with_targets(job, placed, CapturedPair(1, Pair(0.9, view), None), Stopwatch()).pair.input
-    there = made.further["normals"].any(axis=2)
-    assert np.count_nonzero(view.region == 2) == 61 * 41 - 15 * 15 and there[view.region == 2].all()
-    assert np.count_nonzero(there & mask) == 13 * 13 and there[44:57, 54:67].all()
-
-
 def test_pose_ids_follow_from_capture_and_place_and_labels_name_board_and_object():
     pair = pair_of(DONE.images(2), at=3)
     told = [(view.role, view.pose_id, view.parent_id) for view in pair.views]
@@ -219,16 +167,6 @@ def test_a_view_without_depth_of_the_object_has_no_pair_and_what_is_switched_off
 
     one = make_capture_pair(job, alone, seen, 0, refuse, shared_renderer().count_pixels)
     assert (len(one.pair.views), one.mirror) == (1, None)
-
-
-def test_switches_of_the_job_are_the_effects_of_a_captures_images():
-    both = {"splat": 3, "hidden_point_removal": True}
-    for projection, ran in (
-        ({}, ("mirror", "projection")),
-        ({"enabled": False}, ("mirror",)),
-        (both, ("mirror", "projection", "splat", "hidden_point_removal")),
-    ):
-        assert image_effects(captures_job(images={"projection": projection})).ran == ran
 
 
 # ---------------------------------------------------------------------------------------------- rows
@@ -393,13 +331,3 @@ def test_without_truth_there_is_no_score_and_a_manual_correction_is_its_views_po
     expected = translation(0.001, 0.0, 0.0) @ truth.T_board_cam[2]
     np.testing.assert_allclose(done.estimates.estimate.views[2].T_board_cam, expected, atol=1e-9)
     assert done.score is None and any("manual" in note for note in done.estimates.estimate.notes)
-
-
-def test_depth_counts_as_corrected_where_the_estimate_changes_it():
-    for depth, corrected in (
-        (DepthCorrection(), False),
-        (DepthCorrection(offset_m=0.001), True),
-        (DepthCorrection(scale=1.01), True),
-        (DepthCorrection(T_cam_depth=translation(0.0, 0.01, 0.0)), True),
-    ):
-        assert is_corrected(depth) is corrected

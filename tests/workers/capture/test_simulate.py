@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from shapely import Polygon
 
 from schemas.base import Range
 from schemas.errors import CaptureError
 from schemas.job.assets import CATEGORIES
-from schemas.job.captures import Board, KinectDepthNoise, RegistrationError, Simulate
+from schemas.job.captures import Board, Simulate
 from schemas.job.job import Job
 from schemas.job.views import Distortion
 from schemas.scene.scene import Placed
@@ -24,39 +23,30 @@ from tests.workers.capture.simulated import Made, asset_of, corner_errors, made,
 from workers.assets.catalogue import open_catalogue
 from workers.capture.board import marker_corners
 from workers.capture.folder import open_folder, read_pose, read_truth, read_view
-from workers.capture.simulate.camera import (
-    AT_REST,
+from workers.capture.make_capture import load_object
+from workers.capture.simulate.simulate import (
     AXIAL_M,
     AXIAL_PER_M,
-    HEIGHT_M,
     OFFSET_M,
     OFFSET_SHARE,
-    SAMPLES,
-    add_bent_light,
-    add_light,
-    cover_markers,
-    develop,
-    draw_motion,
-    kinect_noise,
-    make_samples,
-    pinhole_lookup,
-    pose_at,
-)
-from workers.capture.simulate.photograph import COLOR, assumed_device, make_rig, place_object, true_board
-from workers.capture.simulate.simulate import (
     VIEWS,
-    load_object,
-    plan_path,
-    planned_settings,
+    develop,
     simulate_capture,
 )
-from workers.geometry.colour import SRGB_STEPS, decode_codes, decode_srgb, encode_codes, encode_srgb
-from workers.geometry.frames import angle_between, invert, pose, transform, uniform_rotation
+from workers.capture.simulate.studio import (
+    COLOR,
+    make_rig,
+    pinhole_lookup,
+    place_object,
+    plan_path,
+    true_board,
+)
+from workers.geometry.colour import encode_codes, encode_srgb
+from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import opencv_lens, opencv_matrix
 from workers.geometry.raycast import cast_view
 from workers.scene.chance import SceneChance
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
-from workers.scene.sensor import sense_depth
 
 SMALL = {"views": 2, "image_scale": 0.25}
 ON = {
@@ -92,11 +82,6 @@ def test_what_is_asked_for_runs_and_everything_else_says_why_not():
         assert [effect for effect in CAPTURE_EFFECTS if plan.runs(effect)] == [name] and name not in plan.skipped
     for tier, has, lacks in (("raster", "shadows", "glass"), ("pathtraced", "glass", "shadows")):
         assert plan_capture(Simulate(tier=tier)).runs(has) and not plan_capture(Simulate(tier=tier)).runs(lacks)
-    simulate = Simulate(**{name: value for name, (value, _) in ON.items()})
-    for name in CAPTURE_EFFECTS:  # an effect that is withdrawn is off in the settings
-        planned = planned_settings(simulate, plan_capture(simulate).without(name))
-        assert [effect for effect in CAPTURE_EFFECTS if getattr(planned, effect) is None] == [name]
-    assert planned_settings(simulate, plan_capture(simulate)) == simulate
 
 
 def test_a_camera_stores_light_by_its_curve_and_sharpens_and_compresses_what_it_stores():
@@ -149,27 +134,6 @@ def test_paths_go_around_the_object_at_several_heights_within_their_intervals():
         assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 0.7  # no jump across the object
 
 
-def test_the_roll_has_its_standard_deviation():
-    T = np.concatenate([path_of(seed, views=24) for seed in range(150)])
-    rolls = np.degrees(np.arctan2(T[:, 2, 0], -T[:, 2, 1]))
-    assert np.std(rolls) == pytest.approx(12.0, rel=0.1) and abs(np.mean(rolls)) < 1.0
-
-
-def test_way_and_turn_of_an_exposure_are_speed_times_time_in_any_direction_about_its_middle():
-    T, ways = pose(uniform_rotation(np.random.default_rng(3)), np.array([1.0, 2.0, 3.0])), []
-    for seed in range(2000):
-        motion = draw_motion(0.04, np.random.default_rng(seed))
-        ways.append(motion.way / 0.006)
-        if seed < 10:
-            first, last = pose_at(T, motion, -0.5), pose_at(T, motion, 0.5)
-            assert np.linalg.norm(last[:3, 3] - first[:3, 3]) == pytest.approx(0.15 * 0.04)
-            assert angle_between(first[:3, :3], last[:3, :3]) == pytest.approx(math.radians(8.0 * 0.04))
-            assert np.array_equal(pose_at(T, motion, 0.0), T) and np.array_equal(pose_at(T, AT_REST, 0.3), T)
-    assert np.abs(np.mean(ways, axis=0)).max() < 0.05 and np.allclose(
-        np.cov(np.transpose(ways)), np.eye(3) / 3, atol=0.03
-    )
-
-
 # ---------------------------------------------------------------------------------------------- device, board and object
 
 
@@ -185,15 +149,6 @@ def test_the_device_is_the_articles_and_the_published_one():
     quarter = make_rig(0.25).color
     assert (quarter.width, quarter.height) == (480, 270)
     assert (270 - quarter.cy) / quarter.fy == pytest.approx((1080 - COLOR.cy) / COLOR.fy)
-    assert assumed_device(device, None) is device
-    point = np.array([[0.1, -0.2, 0.8]])
-    true = transform(T, point)
-    shifted = assumed_device(device, RegistrationError(shift_m=[0.01, -0.002, 0.003]))
-    assert np.allclose(transform(shifted.T_color_depth, point) - true, [0.01, -0.002, 0.003])
-    turned = assumed_device(device, RegistrationError(shift_m=[0.0, 0.0, 0.0], turn_deg=1.0))
-    off = transform(turned.T_color_depth, point) - true
-    assert np.linalg.norm(off) == pytest.approx(math.radians(1.0) * np.hypot(true[0, 0], true[0, 2]), rel=1e-3)
-    assert off[0, 1] == 0.0  # about the image's vertical
 
 
 def test_objects_stand_exactly_on_the_print_and_a_print_scale_overrules_the_ruler():
@@ -206,61 +161,7 @@ def test_objects_stand_exactly_on_the_print_and_a_print_scale_overrules_the_rule
     assert np.allclose(marker_corners(true_board(board, Simulate(print_scale=1.02))), 1.02 * marker_corners(Board()))
 
 
-def test_each_slip_hides_a_part_of_its_marker_and_looks_up():
-    markers = [Polygon(corners[:, :2]) for corners in marker_corners(Board())]
-    for share in (0.1, 0.5, 1.0):
-        for seed in range(5):
-            part = cover_markers(share, Board(), np.random.default_rng(seed)).parts[0]
-            slips = [Polygon(slip[:, :2]) for slip in part.vertices.reshape(-1, 4, 3)]
-            assert (part.vertices[:, 2] == HEIGHT_M).all() and len(slips) == round(35 * share)
-            covered = np.array([[s.intersection(m).area / m.area for m in markers] for s in slips])
-            assert ((covered.max(axis=1) > 0.03) & (covered.max(axis=1) < 0.75)).all()
-            assert len(set(covered.argmax(axis=1))) >= 0.9 * len(slips)
-            a, b, c = (part.vertices[part.faces[:, n]] for n in range(3))
-            up = np.cross(b - a, c - a)[:, 2]
-            assert (up > 0.0).all() and 0.5 * up.sum() == pytest.approx(sum(s.area for s in slips))
-    assert cover_markers(0.0, Board(), np.random.default_rng(1)) is None
-
-
-def measured(spec, z):
-    """Errors [H, W] of depth on a plane that the camera faces, and those of the image's middle."""
-    camera = Camera(make_rig(0.5).depth.intrinsics, np.eye(4))
-    exact = np.full((camera.intrinsics.height, camera.intrinsics.width), z)
-    region, rng = np.ones(exact.shape, np.uint8), np.random.default_rng(1)
-    error = sense_depth(exact, region, camera, kinect_noise(spec), rng) - z
-    row, column = (side // 2 for side in error.shape)
-    return error, error[row - 30 : row + 30, column - 30 : column + 30]
-
-
-def test_sigma_and_bias_of_depth_are_the_stated_functions_far_inside_what_the_maker_guarantees():
-    for z, sigma_mm, bias_mm in ((0.6, 0.98, 2.1), (1.0, 1.3, 2.5), (2.0, 2.8, 3.5)):
-        _, middle = measured(KinectDepthNoise(), z)
-        assert 1000.0 * middle.std() == pytest.approx(sigma_mm, rel=0.05)
-        assert 1000.0 * middle.mean() == pytest.approx(bias_mm, abs=0.1)
-    _, middle = measured(KinectDepthNoise(), 3.5)
-    assert middle.std() < 0.017 and middle.mean() < 0.011 + 0.0035
-    (all_once, once), (_, twice), (_, none) = (measured(KinectDepthNoise(times=n), 0.8) for n in (1.0, 2.0, 0.0))
-    assert twice.std() == pytest.approx(2.0 * once.std(), rel=1e-6) and none.std() == pytest.approx(0.0, abs=1e-12)
-    assert twice.mean() == pytest.approx(once.mean(), abs=2e-4)
-    assert np.allclose(measured(KinectDepthNoise(bias_m=0.01), 0.8)[0] - all_once, 0.01, atol=1e-12)
-    noise = kinect_noise(KinectDepthNoise(times=100.0))
-    assert noise.flying_share == noise.edge_dropout == 1.0
-
-
 # ---------------------------------------------------------------------------------------------- samples and lens
-
-
-def test_samples_are_spread_over_columns_rows_and_moments_and_light_is_averaged_before_it_is_encoded():
-    samples = np.array([(s.right_px, s.down_px, s.moment) for s in make_samples()])
-    for values in samples.T:
-        assert np.allclose(np.sort(values), (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5)
-    assert np.abs(samples.mean(axis=0)).max() < 1e-15 and (samples[SAMPLES // 2] == 0.0).all()
-    assert np.allclose(samples, -samples[::-1])  # odd moments vanish: a straight edge is not displaced
-    assert np.allclose(np.corrcoef(samples.T), np.eye(3), atol=1e-12)
-    total = np.zeros((1, 1, 3))
-    for n in range(SAMPLES):
-        add_light(total, np.full((1, 1, 3), 255 if n < 3 else 40, np.uint8), SRGB_STEPS / SAMPLES)
-    assert total == pytest.approx((3.0 + 6.0 * decode_srgb(np.array(40 / 255.0))) / 9.0, rel=1e-12)
 
 
 def test_opencv_projects_each_looked_up_ray_to_its_stored_pixel():
@@ -279,18 +180,6 @@ def test_opencv_projects_each_looked_up_ray_to_its_stored_pixel():
     assert opencv_lens(None).tolist() == [0.0] * 8
 
 
-def test_a_ramp_is_read_at_the_samples_place():
-    """Bilinear interpolation is exact on a ramp: light is a plane in the image, sampled with the lookup's own slope."""
-    rows, columns = np.mgrid[0:6, 0:7].astype(np.float64)
-    u, v = 2.3 + 1.1 * columns + 0.05 * rows, 2.6 + 0.9 * rows - 0.02 * columns
-    ramp = np.repeat((np.arange(16)[None, :] * 3 + np.arange(16)[:, None] * 5)[..., None], 3, axis=2).astype(np.uint8)
-    total, (right, down, drawn_right, drawn_down) = np.zeros((6, 7, 3)), (0.3, -0.2, -0.4, 0.1)
-    add_bent_light(total, ramp, np.arange(256.0), (u, v), (right, down, drawn_right, drawn_down))
-    at_u, at_v = u + 1.1 * right + 0.05 * down, v + 0.9 * down - 0.02 * right
-    expected = 3.0 * (at_u - drawn_right - 0.5) + 5.0 * (at_v - drawn_down - 0.5)
-    assert np.allclose(total, expected[..., None], atol=1e-9)
-
-
 # ---------------------------------------------------------------------------------------------- photographs
 
 NEAR = {"views": 1, "image_scale": 0.5, "distance_m": [0.4, 0.45]}
@@ -306,35 +195,6 @@ def test_corners_lie_where_opencv_projects_them(settings):
     errors, outwards = corner_errors(*take_one(**NEAR, **settings), printed)
     assert len(errors) >= 60 and np.median(np.abs(errors)) < 0.05
     assert np.abs(errors.mean(axis=0)).max() < 0.03 and abs(np.median(outwards)) < 0.03
-
-
-def test_motion_blurs_edges_a_lens_leaves_no_black_corner_and_slips_hide_markers():
-    plain, blurred, bent, hidden = (
-        take_one(**NEAR, **more)[0].rgb
-        for more in (
-            *({}, {"motion_blur": 0.1}),
-            *({"distortion": {"k1": -0.12, "k2": 0.05}}, {"hidden_markers": 0.6}),
-        )
-    )
-    sharp, soft = (
-        np.abs(np.diff(decode_codes(one).mean(axis=2), axis=1)).max(axis=1).mean() for one in (plain, blurred)
-    )
-    assert soft < 0.8 * sharp
-    assert all(bent[row, column].max() > 0 for row in (0, -1) for column in (0, -1))
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
-    before, after = (len(detector.detectMarkers(one[..., ::-1].copy())[1]) for one in (plain, hidden))
-    assert before >= 15 and after < 0.75 * before
-
-
-def test_exposure_multiplies_linear_light_and_noise_has_the_variance_of_its_electrons():
-    asked = ({}, {"exposure": {"stops": [-1.0, -1.0]}}, {"rgb_noise": {"full_well_e": 1000.0, "read_noise_e": 5.0}})
-    light, dark, noisy = (decode_codes(read_view(made(**SMALL, **one).folder, 0).rgb) for one in asked)
-    bright = light > 0.2
-    assert np.median(dark[bright] / light[bright]) == pytest.approx(0.5, rel=0.01)
-    for low, high in ((0.1, 0.15), (0.2, 0.3)):
-        chosen = (light > low) & (light < high)
-        expected = light[chosen].mean() / 1000.0 + (5.0 / 1000.0) ** 2
-        assert np.var((noisy - light)[chosen]) == pytest.approx(expected, rel=0.1)
 
 
 @pytest.mark.slow

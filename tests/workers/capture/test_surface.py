@@ -8,7 +8,6 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from schemas.base import frozen_array
-from schemas.capture import Reconstruction
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Estimation, Fusion
 from schemas.scene.shape import Mesh
@@ -16,31 +15,29 @@ from schemas.scene.view import Camera, Intrinsics
 from tests.conftest import SHARED_DATA
 from tests.workers.capture.analytic_capture import BOARD, HIGH, RADIUS, SPHERE, Thing, capture, cast, kinect
 from workers.capture.folder import open_folder
-from workers.capture.reconstruct import Merged, estimate_poses, given_files, reconstruct
+from workers.capture.reconstruct import estimate_poses, given_files, reconstruct
 from workers.capture.score import read_mesh_file, score_surface
 from workers.capture.surface.fusion import (
     UNSEEN,
     Sight,
     color_points,
+    cut_below,
     exposure_gains,
     fuse_views,
-    measure_support,
-    observe,
+    large_parts,
+    vertex_normals,
 )
-from workers.capture.surface.object_mask import CELL_M, Ground, down_to_board, find_object, silhouette
+from workers.capture.surface.object_mask import CELL_M, down_to_board, find_object, silhouette
 from workers.capture.surface.posed_view import PosedView
 from workers.capture.surface.tsdf import (
     BACK_VOXELS,
     FRONT_VOXELS,
     Volume,
-    cut_below,
     empty_volume,
     extract_surface,
     fit_depth,
     fit_surfaces,
     integrate,
-    large_parts,
-    vertex_normals,
 )
 from workers.geometry.camera import look_at
 from workers.geometry.distance import distance_to_mesh
@@ -170,21 +167,6 @@ def sight(position, error_m=0.0):
     depth, _, rgb = cast(NOTHING, camera)
     depth = np.where(depth > 0, depth + error_m, 0).astype(np.float32)
     return Sight(PosedView(0, camera, camera, rgb, depth), fit_surfaces(depth, SMALL), camera)
-
-
-def test_the_offset_is_the_way_along_the_normal_to_the_surface_that_a_view_sees():
-    for position in ((0.02, 0.0, 0.6), (0.5, 0.2, 0.4)):
-        for height_m in (-0.003, 0.0, 0.004):
-            offset_m, weight, _, past = observe(points(height_m), UP, sight(position), WITHIN_M)
-            assert (weight > 0).all() and np.abs(offset_m + height_m).max() < 5e-5 and not past.any()
-    one = sight((0.3, 0.0, 0.5))
-    for where, normals in ((points(0.008), UP), (points(), -UP), (points(), np.tile([-1.0, 0, 0], (len(GRID), 1)))):
-        assert not observe(where, normals, one, WITHIN_M)[1].any()
-    near, far = sight((0, 0.001, 0.4), error_m=-0.001), sight((0, 0.001, 0.8), error_m=0.0005)
-    found = measure_support(points(), UP, [near, far], WITHIN_M)
-    assert (found.views == 2).all()
-    w = (0.8005 / 0.399) ** 4  # the errors lie along the vertical nearly
-    assert np.median(found.mean_m) == pytest.approx((0.001 * w - 0.0005) / (w + 1), abs=1e-4)
 
 
 def test_exposures_are_made_alike():
@@ -333,18 +315,6 @@ def test_a_thin_floor_is_in_the_cloud_and_a_hole_shows_the_board(record_figure):
     ring = capture(Thing(sphere=None, boxes=CUP.boxes[:4]), count=12, sigma_m=0.002)
     hole = fuse(ring).points
     assert not (np.abs(hole[:, :2]) < 0.035).all(axis=1).any() and not find_object(ring, BOARD, Fusion()).floor.any()
-
-
-@pytest.mark.parametrize("hidden_m", [0.001, 0.002, 0.003])
-def test_the_hidden_share_is_that_of_the_walls_below_the_clearance(hidden_m):
-    """Of a box of 90 x 60 x 4 mm without its underside, 300 mm around."""
-    box = trimesh.creation.box((0.09, 0.06, 0.004)).apply_translation((0.0, 0.0, 0.002))
-    cut = cut_below(Mesh(np.array(box.vertices), np.array(box.faces, np.int32)), (0.0, 0.0, 0.0), hidden_m)
-    ground = Ground((0.0, 0.0, 0.0), hidden_m)
-    nothing = np.empty((0, 3))
-    surface = Reconstruction(nothing, nothing, nothing, nothing, cut.vertices, cut.faces, nothing)
-    merged = Merged(ground, surface, down_to_board(cut, ground), ())
-    assert merged.hidden_share == pytest.approx(300 * 1e3 * hidden_m / (5400 + 1200), rel=1e-6)
 
 
 @pytest.mark.shared_data

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.capture import CaptureCamera, CapturedView, DepthCorrection, Reconstruction, SynthesizedView
+from schemas.capture import CaptureCamera, CapturedView, DepthCorrection, Reconstruction
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
 from schemas.scene.shape import Mesh
@@ -16,12 +16,9 @@ from schemas.scene.view import Camera, Intrinsics
 from tests.workers.capture.analytic_capture import Thing, capture, cast, kinect, poses
 from workers.capture.score import (
     align_mesh,
-    compare_poses,
-    compare_view,
     measured_points,
     sample_surface,
     score_surface,
-    true_view,
 )
 from workers.capture.surface.posed_view import (
     UNSEEN,
@@ -29,14 +26,13 @@ from workers.capture.surface.posed_view import (
     correct_depth,
     distort_mask,
     facing_cosine,
+    placed,
     pose_view,
     visible_points,
 )
 from workers.capture.surface.synthesize import (
-    Layer,
     choose_sources,
     fill_holes,
-    merge_layers,
     move_depth,
     prepare_source,
     synthesize_view,
@@ -46,6 +42,7 @@ from workers.capture.surface.tsdf import fit_depth
 from workers.geometry.camera import look_at
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.pixels import opencv_matrix
+from workers.geometry.raycast import cast_view
 
 # ---------------------------------------------------------------------------------------------- without the lens
 
@@ -217,17 +214,6 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
     assert choose_sources(dict(enumerate(axes)), down, Synthesis()) == [2, 1, 3, 4, 0]
 
 
-def test_the_nearest_surface_is_averaged_and_what_one_from_behind_hides_is_empty():
-    def layer(depth_m, weight, code):
-        full = [np.full((3, 4), value, np.float32) for value in (depth_m, weight)]
-        return Layer(*full, np.full((3, 4, 3), code, np.uint8), np.ones((3, 4), bool))
-
-    rgb, depth, _ = merge_layers([layer(1.000, 1.0, 10), layer(1.002, 3.0, 50), layer(1.2, 9.0, 250)])
-    assert np.allclose(depth, 1.0015) and (rgb == 40).all()
-    assert not merge_layers([layer(1.0, 1.0, 10), layer(0.8, 0.0, 0)])[1].any()
-    assert np.allclose(merge_layers([layer(1.0, 1.0, 10), layer(1.1, 0.0, 0)])[1], 1.0)
-
-
 def halves():
     """(rgb, depth, mask) of a near surface at the left and a farther one at the right."""
     depth = np.full((60, 80), 1.0)
@@ -258,15 +244,6 @@ MESH = Mesh(np.array(BOX.vertices), np.array(BOX.faces, np.int32))
 ABOVE = Camera(K, frozen_array(look_at(np.array([0.4, 0.1, 0.4]), np.zeros(3))))
 
 
-def test_pose_errors_are_distances_and_angles():
-    turned = pose(rotation_about(np.array([0.0, 1.0, 0.0]), np.radians(0.3)), np.zeros(3))
-    errors = compare_poses([translation(0.003, 0.004, 0), turned, np.eye(4)], [np.eye(4)] * 3)
-    assert errors.mm == pytest.approx([5.0, 0.0, 0.0])
-    assert errors.median_mm == 0.0 and max(errors.deg) == pytest.approx(0.3)
-    with pytest.raises(CaptureError, match="no view has a pose"):
-        compare_poses([], [])
-
-
 def test_samples_are_even_over_the_area_and_surface_errors_are_the_distances_that_were_made():
     samples, normals = sample_surface(MESH, 20_000)
     top = normals[:, 2] > 0.5
@@ -282,26 +259,8 @@ def test_samples_are_even_over_the_area_and_surface_errors_are_the_distances_tha
     assert errors.visible_share == pytest.approx(seen, abs=0.01) and 0.3 < seen < 0.7
 
 
-def test_view_errors_count_what_is_off_missing_and_too_much():
-    depth = true_view(MESH, ABOVE)
-    mask = depth > 0
-    assert depth[mask].min() > 0.4 and mask.sum() > 3000
-    rows, columns = np.nonzero(mask)
-    shown, extra = mask.copy(), np.zeros_like(mask)
-    shown[rows[: len(rows) // 4], columns[: len(rows) // 4]] = False
-    extra[:10, :30] = True
-    rgb = np.full((*mask.shape, 3), 100, np.uint8)
-    view = SynthesizedView(rgb, np.where(shown | extra, depth + 0.001, 0), shown | extra, shown, 0.9, (1, 2))
-    errors = compare_view(view, depth, rgb + 7)
-    assert errors.depth_median_mm == pytest.approx(1.0) and errors.color_error == pytest.approx(7.0)
-    assert errors.covered == pytest.approx(0.75, abs=0.001)
-    assert errors.beyond == pytest.approx(300 / (300 + shown.sum()))
-    with pytest.raises(CaptureError, match="nothing of the object"):
-        compare_view(SynthesizedView(rgb, depth, extra, shown, 0.9, ()), depth, rgb)
-
-
 def test_points_are_measured_where_a_pixel_has_their_depth():
-    depth = true_view(MESH, ABOVE).astype(np.float32)
+    depth = cast_view([placed(MESH)], ABOVE)[0].astype(np.float32)
     points, normals = sample_surface(MESH, 4000)
     rgb = np.zeros((*depth.shape, 3), np.uint8)
     towards = ((ABOVE.position - points) * normals).sum(axis=1) > 0.02

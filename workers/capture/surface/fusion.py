@@ -5,7 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from schemas.base import Array
@@ -20,20 +23,17 @@ from workers.capture.surface.tsdf import (
     FRONT_VOXELS,
     MOST_EDGE_DEG,
     SurfaceDepth,
-    cut_below,
     empty_volume,
     extract_surface,
     fit_surfaces,
     integrate,
-    keep_vertices,
-    large_parts,
     sample_inverse,
-    vertex_normals,
 )
 from workers.geometry.camera import project_bounds
 from workers.geometry.colour import SRGB_STEPS, encode_codes
 from workers.geometry.frames import UP, invert, transform
 from workers.geometry.jit import compiled
+from workers.geometry.mesh import face_areas, piece_of
 
 UNSEEN = 128
 """The code of each channel where no view sees anything."""
@@ -324,3 +324,42 @@ def _clean(mesh: Mesh, region: ObjectRegion) -> Mesh:
     mesh = Mesh(cut.vertices - UP * region.lift_m(cut.vertices)[:, None], cut.faces)
     # The cut lies on the clearance itself, and its points must not fall below it by rounding.
     return large_parts(keep_vertices(mesh, region.holds(mesh.vertices + 1e-6 * UP)), LEAST_PART)
+
+
+def keep_vertices(mesh: Mesh, keep: NDArray[np.bool_]) -> Mesh:
+    """The faces whose three vertices are kept, with the vertices that they use."""
+    return piece_of(mesh, mesh.faces[keep[mesh.faces].all(axis=1)])
+
+
+def cut_below(mesh: Mesh, plane: tuple[float, float, float], height_m: float) -> Mesh:
+    """What is above the plane z = a x + b y + c + height_m; faces across it are cut along it."""
+    a, b, c = plane
+    normal = np.array([-a, -b, 1.0])
+    normal /= np.linalg.norm(normal)
+    if not len(mesh.faces):
+        return mesh
+    vertices, faces, _ = trimesh.intersections.slice_faces_plane(
+        mesh.vertices, mesh.faces, normal, np.array([0.0, 0.0, c + height_m])
+    )
+    return Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32).reshape(-1, 3))
+
+
+def large_parts(mesh: Mesh, least_share: float) -> Mesh:
+    """The connected parts that have at least a share of the area of the largest one."""
+    ends, count = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices)
+    graph = sparse.coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(count, count))
+    part = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    area = np.bincount(part, weights=face_areas(mesh.vertices, mesh.faces))
+    return piece_of(mesh, mesh.faces[area[part] >= least_share * area.max(initial=0.0)])
+
+
+def vertex_normals(mesh: Mesh) -> Array:
+    """[V, 3] unit normals, the mean of the faces' weighted by their area; up where a vertex has no face."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    across, normals = np.cross(b - a, c - a), np.zeros((len(mesh.vertices), 3))
+    for axis in range(3):
+        for corner in range(3):
+            normals[:, axis] += np.bincount(mesh.faces[:, corner], weights=across[:, axis], minlength=len(normals))
+    length = np.linalg.norm(normals, axis=1)
+    normals[length == 0.0] = [0.0, 0.0, 1.0]
+    return normals / np.where(length == 0.0, 1.0, length)[:, None]

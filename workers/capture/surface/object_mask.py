@@ -122,8 +122,8 @@ class ObjectRegion(Ground):
         thing = (z > 0.0) & (on_floor | high)
         board = (z > 0.0) & ~thing & (along < 0.0) & (above > 0.0)
         size = np.sqrt(up[0] * up[0] + up[1] * up[1] + up[2] * up[2])
-        planes = (np.where(board, -along / divisor, 0.0).astype(np.float32) for divisor in (above, size))
-        return np.where(thing, depth_m, np.float32(0.0)), *planes
+        inverse, facing = (np.where(board, -along / divisor, 0.0).astype(np.float32) for divisor in (above, size))
+        return np.where(thing, depth_m, np.float32(0.0)), inverse, facing
 
     def _cells(self, places: tuple[Array, Array], cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """[...] bool: places (x, y), each [...], above the cells that are named."""
@@ -139,7 +139,7 @@ def _cells_at(places: tuple[Array, Array], corner: Array) -> tuple[NDArray[np.in
 
 def _pixel_rays(k: Intrinsics, shape: tuple[int, ...], stride: int = 1) -> tuple[Array, Array]:
     """(x [1, w], y [h, 1]) at z = 1 of every `stride`-th pixel of an image [H, W]."""
-    rows, columns = (np.arange(stride // 2, side, stride) + 0.5 for side in shape)
+    rows, columns = (np.arange(stride // 2, side, stride, dtype=np.float64) + 0.5 for side in shape)
     return ((columns - k.cx) / k.fx)[None, :], ((rows - k.cy) / k.fy)[:, None]
 
 
@@ -177,18 +177,20 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
             f"nothing on the board stands more than {clearance * 1e3:.1f} mm above it (highest: {highest * 1e3:.1f} mm): lower "
             f"fusion.board_clearance_m ({spec.board_clearance_m * 1e3:g} mm) if the object is flat",
         )
-    notes = {
-        f"{others} other thing{'s' * (others > 1)} on the board left out": others > 0,
-        f"the board's surface is uneven by {spread * 1e3:.2f} mm, so the clearance is {clearance * 1e3:.1f} mm": clearance
-        > spec.board_clearance_m,
-        f"what stands within {STAND_M * 1e3:g} mm of markers out of the board's plane is no part of the object": stands.any(),
-    }
+    notes = [f"{others} other thing{'s' * (others > 1)} on the board left out"] if others else []
+    if clearance > spec.board_clearance_m:
+        notes.append(
+            f"the board's surface is uneven by {spread * 1e3:.2f} mm, so the clearance is {clearance * 1e3:.1f} mm"
+        )
+    if stands.any():
+        notes.append(
+            f"what stands within {STAND_M * 1e3:g} mm of markers out of the board's plane is no part of the object"
+        )
     floor_m = min(max(FLOOR_M, 4.0 * spread), clearance)
     floor = _floor(footprint, known & (above > floor_m) & ~stands, known & (above <= floor_m))
     cells = _grow(footprint) | floor
     low, high = _box(cells, -half, plane[2], _top_m(tall_bins, footprint))
-    told = tuple(note for note, holds in notes.items() if holds)
-    return ObjectRegion(plane, clearance, low, high, spread, cells, -half, floor, floor_m, told)
+    return ObjectRegion(plane, clearance, low, high, spread, cells, -half, floor, floor_m, tuple(notes))
 
 
 def _heights(views: Sequence[PosedView], half: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +16,7 @@ from workers.door.recordings.pictures import pinhole_maps, remap
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
-from workers.geometry.pixels import opencv_matrix
+from workers.geometry.pixels import pixel_rays
 from workers.geometry.projection import in_frame
 from workers.geometry.raycast import first_hit
 
@@ -65,13 +64,9 @@ def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.b
     """[H, W] bool: a pinhole's mask as the lens draws it, so that it fits the stored images."""
     if not camera.has_lens:
         return mask
-    k = camera.intrinsics
-    matrix = opencv_matrix(k)
-    rows, columns = np.mgrid[0 : k.height, 0 : k.width].astype(np.float64)
-    stored = np.stack([columns.ravel(), rows.ravel()], axis=1).reshape(-1, 1, 2)
-    straight = cv2.undistortPoints(stored, matrix, camera.lens, P=matrix).reshape(k.height, k.width, 2)
-    maps = [straight[..., axis].astype(np.float32) for axis in range(2)]
-    return remap(mask.view(np.uint8), maps, between=False).view(np.bool_)
+    k, rays = camera.intrinsics, pixel_rays(camera.intrinsics, camera.lens)
+    straight = (rays * [k.fx, k.fy] + [k.cx_opencv, k.cy_opencv]).astype(np.float32)
+    return remap(mask.view(np.uint8), [straight[..., 0], straight[..., 1]], between=False).view(np.bool_)
 
 
 CLEAR_M = 1e-5
@@ -140,22 +135,17 @@ def visible_points(
     visible = np.zeros(len(points), np.bool_)
     if not len(points) or not len(cameras):
         return visible
-    positions = np.array([camera.position for camera in cameras])
+    positions, lifted = np.array([camera.position for camera in cameras]), points + clear_m * normals
     cosine = np.stack([facing_cosine(points, normals, camera) for camera in cameras])
     order = np.argsort(-cosine, axis=0, kind="stable")
-    first = 0
     # The ray caster builds its tree at each call: few calls, the cameras that face a point most first.
-    for stop in (1, 4, len(cameras)):
-        point = np.repeat(np.flatnonzero(~visible), max(min(stop, len(cameras)) - first, 0))
+    for ranks in (order[:1], order[1:4], order[4:]):
+        point, camera = np.tile(np.flatnonzero(~visible), len(ranks)), ranks[:, ~visible].ravel()
+        asked = cosine[camera, point] > least_cos
+        point, camera = point[asked], camera[asked]
         if len(point):
-            place = np.tile(np.arange(first, min(stop, len(cameras))), int((~visible).sum()))
-            camera_of = order[place, point]
-            asked = cosine[camera_of, point] > least_cos
-            point, camera_of = point[asked], camera_of[asked]
-            origins = points[point] + clear_m * normals[point]
-            hits = first_hit([placed(mesh)], origins, positions[camera_of] - origins)
+            hits = first_hit([placed(mesh)], lifted[point], positions[camera] - lifted[point])
             visible[point[hits.distance > 1.0]] = True
-        first = stop
     return visible
 
 

@@ -118,27 +118,19 @@ def _carry(inverse: NDArray[np.float32], source: Camera, target: Camera) -> tupl
     return pixels, depth
 
 
-@compiled
 def _join(inverse: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.int32]:
     """[T, 3]: two triangles for each square of four pixels, of the three that lie on one surface, by number.
 
     The first begins with the lowest number and is wound as the image's axes are, the second with the highest and otherwise.
     """
-    height, width = inverse.shape
-    triangles, count = np.empty((2 * inverse.size, 3), np.int32), 0
-    of_all = inverse.ravel()
-    for row in range(height - 1):
-        for column in range(width - 1):
-            n = row * width + column
-            for first in (n, n + width + 1):
-                least, most, good = np.inf, 0.0, True
-                for pixel in (first, n + 1, n + width):
-                    good = good and z[pixel] > 0.0
-                    least, most = min(least, of_all[pixel]), max(most, of_all[pixel])
-                if good and not least < (1.0 - SAME_SURFACE) * most:
-                    triangles[count, 0], triangles[count, 1], triangles[count, 2] = first, n + 1, n + width
-                    count += 1
-    return triangles[:count]
+    number = np.arange(inverse.size, dtype=np.int32).reshape(inverse.shape)
+    upper, right, lower, last = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    pairs = [np.stack([first, right, lower], axis=-1) for first in (upper, last)]
+    triangles = np.stack(pairs, axis=2).reshape(-1, 3)
+    corners = inverse.ravel()[triangles]
+    joined = (z[triangles] > 0.0).all(axis=1)
+    joined &= corners.min(axis=1) >= np.float64(1.0 - SAME_SURFACE) * corners.max(axis=1)
+    return triangles[joined]
 
 
 @compiled
@@ -197,8 +189,8 @@ def fill_holes(rgb: NDArray[np.uint8], depth_m: Array, mask: NDArray[np.bool_], 
         framed[1][at] = (depths[:, rim] * shares).sum(axis=0) / count
         framed[2][at] = (inside[:, rim] * shares).sum(axis=0) / count > 0.5
         holes = holes[~rim]
-    rgb, depth_m, mask = (image[1:-1, 1:-1] for image in framed)
-    return rgb, depth_m, mask
+    colour, depth, filled = (image[1:-1, 1:-1] for image in framed)
+    return np.asarray(colour, np.uint8), np.asarray(depth, np.float64), np.asarray(filled, np.bool_)
 
 
 def _small_holes(known: NDArray[np.bool_], size_px: int) -> NDArray[np.bool_]:

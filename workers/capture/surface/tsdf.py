@@ -12,10 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
-from scipy.sparse.csgraph import connected_components
+from scipy import ndimage
 from skimage.measure import marching_cubes
 
 from schemas.base import Array
@@ -24,7 +22,6 @@ from schemas.scene.view import Camera, Intrinsics
 from workers.capture.surface.posed_view import pixel_of
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
-from workers.geometry.mesh import face_areas, piece_of
 
 REACHES = (2, 1)
 """Samples to each side: 5 x 5, and 3 x 3 where those do not lie on a plane, as at a rim."""
@@ -375,42 +372,3 @@ def extract_surface(volume: Volume) -> Mesh:
     except (RuntimeError, ValueError):  # no surface in the cells that were seen
         return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
     return Mesh(volume.origin + volume.voxel_m * vertices.astype(np.float64), faces.astype(np.int32))
-
-
-def keep_vertices(mesh: Mesh, keep: NDArray[np.bool_]) -> Mesh:
-    """The faces whose three vertices are kept, with the vertices that they use."""
-    return piece_of(mesh, mesh.faces[keep[mesh.faces].all(axis=1)])
-
-
-def cut_below(mesh: Mesh, plane: tuple[float, float, float], height_m: float) -> Mesh:
-    """What is above the plane z = a x + b y + c + height_m; faces across it are cut along it."""
-    a, b, c = plane
-    normal = np.array([-a, -b, 1.0])
-    normal /= np.linalg.norm(normal)
-    if not len(mesh.faces):
-        return mesh
-    vertices, faces, _ = trimesh.intersections.slice_faces_plane(
-        mesh.vertices, mesh.faces, normal, np.array([0.0, 0.0, c + height_m])
-    )
-    return Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32).reshape(-1, 3))
-
-
-def large_parts(mesh: Mesh, least_share: float) -> Mesh:
-    """The connected parts that have at least a share of the area of the largest one."""
-    ends, count = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices)
-    graph = sparse.coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(count, count))
-    part = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
-    area = np.bincount(part, weights=face_areas(mesh.vertices, mesh.faces))
-    return piece_of(mesh, mesh.faces[area[part] >= least_share * area.max(initial=0.0)])
-
-
-def vertex_normals(mesh: Mesh) -> Array:
-    """[V, 3] unit normals, the mean of the faces' weighted by their area; up where a vertex has no face."""
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
-    across, normals = np.cross(b - a, c - a), np.zeros((len(mesh.vertices), 3))
-    for axis in range(3):
-        for corner in range(3):
-            normals[:, axis] += np.bincount(mesh.faces[:, corner], weights=across[:, axis], minlength=len(normals))
-    length = np.linalg.norm(normals, axis=1)
-    normals[length == 0.0] = [0.0, 0.0, 1.0]
-    return normals / np.where(length == 0.0, 1.0, length)[:, None]

@@ -1,18 +1,19 @@
-"""One photograph of a virtual capture: object and board as geometry, the Azure Kinect's two cameras, its images as stored."""
+"""What a virtual capture photographs, by what and from where: the object on its board, the Azure Kinect, the camera's path."""
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose, frozen_array
-from schemas.capture import CapturedView, DepthCamera
+from schemas.capture import DepthCamera
+from schemas.errors import CaptureError
 from schemas.job.captures import Board, RegistrationError, Simulate
-from schemas.job.views import Render
+from schemas.job.views import Distortion
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import (
-    REGION_FIRST_OBJECT,
     REGION_FLOOR,
     REGION_TABLE,
     Appearance,
@@ -21,34 +22,13 @@ from schemas.scene.shape import (
     Part,
     Shape,
 )
-from schemas.scene.view import Camera, Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.assets.appearance import draw_appearance
 from workers.capture.board import TOUCHING_M, board_geometry, marker_cells, marker_corners
-from workers.capture.simulate.camera import (
-    AT_REST,
-    CENTRE,
-    STEP_M,
-    Band,
-    Sample,
-    add_bent_light,
-    add_light,
-    bands_of,
-    cover_markers,
-    develop,
-    draw_motion,
-    kinect_noise,
-    make_samples,
-    pinhole_lookup,
-    pose_at,
-)
-from workers.geometry.colour import SRGB_STEPS
+from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
-from workers.geometry.pixels import opencv_lens
-from workers.geometry.zbuffer import register_depth
-from workers.render.pathtraced import draw_view
-from workers.render.raster.gbuffer import shared_renderer
+from workers.geometry.pixels import undistort
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.sensor import add_noise, expose, sense_depth
 
 
 def place_object(asset: Asset, rng: np.random.Generator) -> Pose:
@@ -79,18 +59,23 @@ def board_body(board: Board) -> Shape:
     """
     if board.markers:
         return _layout_body(board)
-    across, up, ink = _cells(board)
-    vertices, top = _grid(across, up)
-    quads, black = top.reshape(-1, 4), ink.ravel()
+    across, up, black = _cells(board)
+    vertices, quads = _grid(across, up)
     sides, low = _sides(vertices, len(across), len(up))
-    paper = np.concatenate([quads[~black], sides])
-    all_vertices = frozen_array(np.concatenate([vertices, low]))
+    paper, ink = np.concatenate([quads[~black], sides]), quads[black]
+    whole = np.concatenate([vertices, low])
+    return _printed(whole, paper, whole, ink, closed=True)
+
+
+def _printed(
+    paper: Array, paper_quads: NDArray[np.int32], ink: Array, ink_quads: NDArray[np.int32], closed: bool
+) -> Shape:
     return Shape(
         (
-            Part("paper", all_vertices, _triangles(paper), Material(PAPER, roughness=1.0)),
-            Part("ink", all_vertices, _triangles(quads[black]), Material(INK, roughness=1.0)),
+            Part("paper", frozen_array(paper), _triangles(paper_quads), Material(PAPER, roughness=1.0)),
+            Part("ink", frozen_array(ink), _triangles(ink_quads), Material(INK, roughness=1.0)),
         ),
-        closed=True,
+        closed=closed,
     )
 
 
@@ -120,12 +105,7 @@ def _layout_body(board: Board) -> Shape:
     quads = np.concatenate(ink)[:, ::-1]  # counter-clockwise as seen from the front
     solid = np.concatenate(boxes)
     numbers = [np.arange(4 * len(some), dtype=np.int32).reshape(-1, 4) for some in (solid, quads)]
-    return Shape(
-        (
-            Part("paper", frozen_array(solid.reshape(-1, 3)), _triangles(numbers[0]), Material(PAPER, roughness=1.0)),
-            Part("ink", frozen_array(quads.reshape(-1, 3)), _triangles(numbers[1]), Material(INK, roughness=1.0)),
-        )
-    )
+    return _printed(solid.reshape(-1, 3), numbers[0], quads.reshape(-1, 3), numbers[1], closed=False)
 
 
 def _on_quad(corners: Array, places: Array) -> Array:
@@ -149,19 +129,18 @@ def _cells(board: Board) -> tuple[Array, Array, NDArray[np.bool_]]:
     side = bits.shape[1]
     corners = marker_corners(board)[..., :2].reshape(board.rows, board.columns, 4, 2)
     edges = np.arange(side + 1) / side
-    left, right = corners[0, :, 0, 0], corners[0, :, 1, 0]
-    top, bottom = corners[:, 0, 0, 1], corners[:, 0, 3, 1]
+    x, y = (
+        first[:, None] * (1.0 - edges) + last[:, None] * edges
+        for first, last in ((corners[0, :, 0, 0], corners[0, :, 1, 0]), (corners[:, 0, 0, 1], corners[:, 0, 3, 1]))
+    )
     half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
-    x = (left[:, None] * (1.0 - edges) + right[:, None] * edges).ravel()
-    y = (top[:, None] * (1.0 - edges) + bottom[:, None] * edges).ravel()
-    across, up = np.unique([-half[0], *x, half[0]]), np.unique([-half[1], *y, half[1]])
-    ink = np.zeros((len(up) - 1, len(across) - 1), np.bool_)
-    for row in range(board.rows):
-        for column in range(board.columns):
-            i = int(np.searchsorted(up, y[row * (side + 1) + side]))
-            j = int(np.searchsorted(across, x[column * (side + 1)]))
-            ink[i : i + side, j : j + side] = bits[row * board.columns + column][::-1]
-    return across, up, ink
+    across, up = (np.unique([-end, *lines.ravel(), end]) for end, lines in zip(half, (x, y), strict=True))
+    black = np.zeros((len(up) - 1, len(across) - 1), np.bool_)
+    for number, cells in enumerate(bits):
+        row, column = divmod(number, board.columns)
+        i, j = np.searchsorted(up, y[row, -1]), np.searchsorted(across, x[column, 0])
+        black[i : i + side, j : j + side] = cells[::-1]
+    return across, up, black
 
 
 def _grid(across: Array, up: Array) -> tuple[Array, NDArray[np.int32]]:
@@ -191,6 +170,39 @@ def _triangles(quads: NDArray[np.int32]) -> NDArray[np.int32]:
     return frozen_array(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), np.int32)
 
 
+HEIGHT_M = 0.0003
+"""Of a slip above the print: paper that does not lie quite flat."""
+
+SIDE = (0.4, 0.8)
+"""Shortest and longest side of a slip, in sides of a marker."""
+
+YELLOW = (0.93, 0.86, 0.45, 1.0)
+"""sRGB."""
+
+
+def cover_markers(share: float, board: Board, rng: np.random.Generator) -> Shape | None:
+    """Level slips in the board frame, metres, one over a part of each chosen marker; None where none is chosen."""
+    corners = marker_corners(board)
+    corners = corners[np.abs(corners[..., 2]).max(axis=1) == 0.0]  # those that lie on the board
+    chosen = np.sort(rng.permutation(len(corners))[: round(share * len(corners))])
+    if not len(chosen):
+        return None
+    slips = np.stack([_slip(corners[m], rng) for m in chosen])
+    vertices = np.dstack([slips, np.full((*slips.shape[:2], 1), HEIGHT_M)]).reshape(-1, 3)
+    faces = _triangles(np.arange(len(vertices), dtype=np.int32).reshape(-1, 4))
+    return Shape((Part("slips", frozen_array(vertices), faces, Material(YELLOW, roughness=1.0)),))
+
+
+def _slip(corners: Array, rng: np.random.Generator) -> Array:
+    """[4, 2]: a turned rectangle whose middle lies on a marker; counter-clockwise from above."""
+    side = float(np.linalg.norm(corners[1] - corners[0]))
+    middle = corners.mean(axis=0)[:2] + side * rng.uniform(-0.5, 0.5, 2)
+    half = 0.5 * side * rng.uniform(*SIDE, 2)
+    turn = rng.uniform(0.0, math.pi)
+    u, v = np.array([math.cos(turn), math.sin(turn)]), np.array([-math.sin(turn), math.cos(turn)])
+    return np.stack([middle + a * half[0] * u + b * half[1] * v for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+
+
 COLOR = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.44 + 0.5, cy=548.29 + 0.5)
 """The article's camera. Its principal point (961.44, 548.29) counts from the first pixel's centre."""
 
@@ -206,8 +218,7 @@ DEPTH_TILT_DEG = 6.0
 """The depth camera looks down from the colour camera's axis by so much (Microsoft's specification)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Rig:
+class Rig(NamedTuple):
     """Both cameras of one device: pinholes with pixel centres at +0.5."""
 
     color: Intrinsics
@@ -243,16 +254,30 @@ def assumed_device(device: DepthCamera, error: RegistrationError | None) -> Dept
     return replace(device, T_color_depth=frozen_array(T_error @ device.T_color_depth))
 
 
-DEPTH_UNITS_PER_M = 1000.0
+MARGIN_PX = 2
+"""Width of the wider picture beyond what the lens sees, for samples beside a pixel's centre."""
 
-LABELS = EffectPlan(("floor", "table"), {})
-"""What is drawn of depth and regions, without colour."""
+WIDEST = 2.0
+"""A pinhole picture that must be more than so many times as wide or high belongs to no lens of this camera."""
 
-LABELS_FINER = 3
-"""Regions that a lens bends are drawn so many times as fine."""
 
-TRACED_SAMPLES_MOVING = 4
-"""Paths through each pixel of the nine pictures of a moving camera, which together have 36."""
+def pinhole_lookup(lens: Distortion, k: Intrinsics) -> tuple[Intrinsics, Array, Array]:
+    """(a pinhole camera that sees all that the lens does, u [H, W] and v [H, W] in its image of each stored pixel's centre).
+
+    Raises CaptureError where the lens folds over within the image, or needs a picture more than `WIDEST` times as large.
+    """
+    rows, columns = np.mgrid[0 : k.height, 0 : k.width]
+    u, v = undistort(columns + 0.5, rows + 0.5, lens, k)
+    if not (np.isfinite(u).all() and np.isfinite(v).all()):
+        raise CaptureError("lens", f"the lens {lens} folds over within the image: make its coefficients smaller")
+    left, top = math.floor(u.min()) - MARGIN_PX, math.floor(v.min()) - MARGIN_PX
+    right, bottom = math.ceil(u.max()) + MARGIN_PX, math.ceil(v.max()) + MARGIN_PX
+    if right - left > WIDEST * k.width or bottom - top > WIDEST * k.height:
+        size = f"{right - left} x {bottom - top}"
+        raise CaptureError("lens", f"the lens {lens} needs a pinhole picture of {size}: make its coefficients smaller")
+    update = {"width": right - left, "height": bottom - top, "cx": k.cx - left, "cy": k.cy - top}
+    return k.model_copy(update=update), u - left, v - top
+
 
 FINER = 3.0
 """The floor's pattern is so many times as fine as in a scene: a table top is looked at from nearby."""
@@ -299,109 +324,69 @@ def build_studio(simulate: Simulate, board: Board, thing: Placed, effects: Effec
     return Studio(simulate, effects, tuple(things), appearance, rig, T_world_board, chance, drawn, lookup)
 
 
-def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[CapturedView, NDArray[np.bool_]]:
-    """One view as it is stored, and the object's true pixels [H, W] bool."""
-    T_world_cam = studio.T_world_board @ T_board_cam
-    rgb = develop(sense_light(studio, number, take_light(studio, number, T_world_cam)), studio.simulate)
-    depth_m = measure_depth(studio, number, T_world_cam)
-    depth = np.rint(np.clip(depth_m * DEPTH_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
-    return CapturedView(number, rgb, depth, None), mark_object(studio, T_world_cam)
+VIEWS_PER_TURN = 14
+"""A turn around the object at one height has about as many views, and a path has at most `MOST_TURNS`."""
+
+MOST_TURNS = 3
+
+ROLL_DEG = 12.0
+"""Standard deviation of the roll of the hand-held camera."""
+
+AIM_M = 0.02
+"""Standard deviation of the point that the camera looks at about the object's middle."""
+
+JITTER = 0.25
+"""Share of an irregular step from view to view in what otherwise changes smoothly."""
 
 
-def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
-    """[H, W, 3]: linear light of one exposure; T_world_cam is the pose at its middle, and of its middle row."""
-    k, simulate = studio.rig.color, studio.simulate
-    blur, rolling = (
-        AT_REST if time_s is None else draw_motion(time_s, studio.chance.stream(Stream.MOTION, number))
-        for time_s in (simulate.motion_blur, simulate.rolling_shutter)
-    )
-    samples, render = plan_pictures(studio)
-    total, light_of = np.zeros((k.height, k.width, 3)), SRGB_STEPS / len(samples)
-    rng = studio.chance.stream(Stream.PATHS, number)
-    for place, sample in enumerate(samples):
-        whole, drawn_at = (Band(0, k.height, 0.0),), point_drawn(sample, studio)
-        for band in whole if rolling is AT_REST else bands_of(k.height, place, len(samples)):
-            T = pose_at(pose_at(T_world_cam, rolling, band.moment), blur, sample.moment)
-            rgb, rows = draw_picture(studio, drawn_at, band, T, render, rng), slice(band.first, band.stop)
-            if studio.lookup is None:
-                add_light(total[rows], rgb, light_of)
-            else:
-                (u, v), offsets = studio.lookup, (sample.right_px, sample.down_px, drawn_at.right_px, drawn_at.down_px)
-                add_bent_light(total[rows], rgb, light_of, (u[rows], v[rows]), offsets)
-    return total
+def plan_path(simulate: Simulate, target: Array, rng: np.random.Generator) -> Array:
+    """[V, 4, 4] float64: poses in the frame of `target` [3], whose z points up, optical frame.
 
-
-def draw_picture(
-    studio: Studio, drawn_at: Sample, band: Band, T_world_cam: Pose, render: Render, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """[h, w, 3]: a pinhole's rows of the band alone, or all of the wider picture that a lens bends."""
-    k = studio.drawn_color
-    # The camera whose pixel centres lie at the sample's point of each pixel.
-    update = {"cx": k.cx - drawn_at.right_px, "cy": k.cy - drawn_at.down_px}
-    if studio.lookup is None:
-        update |= {"cy": update["cy"] - band.first, "height": band.stop - band.first}
-    camera = Camera(k.model_copy(update=update), T_world_cam)
-    drawn = draw_view(shared_renderer(), studio.things, studio.appearance, camera, render, lambda: rng, studio.effects)
-    assert drawn.rgb is not None
-    return drawn.rgb
-
-
-def mark_object(studio: Studio, T_world_cam: Pose) -> NDArray[np.bool_]:
-    """[H, W] bool: pixels of the stored image whose centres see the object; through a lens to a sixth of a pixel."""
-    if studio.lookup is None:
-        return draw_labels(studio, Camera(studio.drawn_color, T_world_cam))[1]
-    _, mask = draw_labels(studio, Camera(scale_intrinsics(studio.drawn_color, LABELS_FINER), T_world_cam))
-    columns, rows = (np.floor(LABELS_FINER * place).astype(np.int64) for place in studio.lookup)
-    return mask[rows, columns]
-
-
-def draw_labels(studio: Studio, camera: Camera) -> tuple[Array, NDArray[np.bool_]]:
-    """(depth [H, W] float64, metres, 0 where nothing is; the object's pixels [H, W] bool), both of pixel centres."""
-    drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS)
-    return drawn.depth_m.astype(np.float64), drawn.region == REGION_FIRST_OBJECT
-
-
-def plan_pictures(studio: Studio) -> tuple[tuple[Sample, ...], Render]:
-    """The samples of a photograph, and how each picture is drawn."""
-    render = Render(tier=studio.simulate.tier)
-    if render.tier != "pathtraced":
-        return make_samples(), render
-    if studio.simulate.motion_blur is None and studio.simulate.rolling_shutter is None:
-        return (CENTRE,), render
-    return make_samples(), render.model_copy(update={"path_samples": TRACED_SAMPLES_MOVING})
-
-
-def point_drawn(sample: Sample, studio: Studio) -> Sample:
-    """The point of a pixel that a picture has at its pixel centres.
-
-    Through a lens it is the opposite one, so that the nine pictures are read at nine places between their pixels, and all of
-    the image is equally sharp. A traced picture is antialiased already, with its mean at the centre.
+    The camera goes around the target up to three times, higher each time, looks at it and rolls. Its distance and its
+    inclination stay within the intervals of `simulate`; the roll is normal.
     """
-    if studio.simulate.tier == "pathtraced":
-        return replace(CENTRE, moment=sample.moment)
-    bent = studio.lookup is not None
-    return replace(sample, right_px=-sample.right_px, down_px=-sample.down_px) if bent else sample
+    views = simulate.views
+    turns = min(max(round(views / VIEWS_PER_TURN), 1), MOST_TURNS)
+    time = (np.arange(views) + 0.5) / views
+    yaw0, way = rng.uniform(-math.pi, math.pi), rng.choice([-1.0, 1.0])
+    step = 2.0 * math.pi * turns / views
+    yaw = yaw0 + way * (2.0 * math.pi * turns * time + JITTER * step * rng.uniform(-1.0, 1.0, views))
+    level = (_climb(time, turns) + 0.5 * _sway(time, rng)) / turns
+    inclination = _within(simulate.inclination_rad, level)
+    distance = _within(simulate.distance_m, 0.5 + 0.5 * _sway(time, rng))
+    roll = np.radians(ROLL_DEG) * _normal_sway(time, rng)
+    aim = target + AIM_M * rng.standard_normal((views, 3))
+    rolls = [pose(rotation_about(UP, float(angle)), np.zeros(3)) for angle in roll]  # about the optical axis, z
+    return np.stack([orbit_pose(aim[n], inclination[n], yaw[n], distance[n]) @ rolls[n] for n in range(views)])
 
 
-def sense_light(studio: Studio, number: int, light: Array) -> Array:
-    """[H, W, 3]: what the colour sensor makes of linear light: exposure, then noise."""
-    simulate, sensed = studio.simulate, light
-    if simulate.exposure is not None:
-        sensed = expose(sensed, simulate.exposure, studio.chance.sensor_stream("exposure", number))
-    if simulate.rgb_noise is not None:
-        sensed = add_noise(sensed, simulate.rgb_noise, studio.chance.sensor_stream("rgb_noise", number))
-    return sensed
+def _within(interval: tuple[float, float], share: Array) -> Array:
+    """Values at shares of an interval; shares are clipped to [0, 1]."""
+    low, high = interval
+    return low + (high - low) * np.clip(share, 0.0, 1.0)
 
 
-def measure_depth(studio: Studio, number: int, T_world_cam: Pose) -> Array:
-    """[H, W] float64, metres: measured from the depth camera's place, and registered to the colour camera as stored."""
-    simulate, device = studio.simulate, studio.rig.depth
-    camera = Camera(device.intrinsics, T_world_cam @ device.T_color_depth)
-    drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS)
-    depth_m: Array = drawn.depth_m.astype(np.float64)
-    if simulate.depth_noise is not None:
-        rng = studio.chance.sensor_stream("depth_noise", number)
-        depth_m = sense_depth(depth_m, drawn.region, camera, kinect_noise(simulate.depth_noise), rng)
-        depth_m = STEP_M * np.rint(depth_m / STEP_M)
-    assumed = assumed_device(device, simulate.registration_error)
-    return register_depth(depth_m, assumed, studio.rig.color, opencv_lens(simulate.distortion))
+def _climb(time: Array, turns: int) -> Array:
+    """0.5 on the first turn, 1.5 on the second, ..., rising smoothly in the last third of each but the last."""
+    at = time * turns
+    turn = np.minimum(np.floor(at), turns - 1)
+    late = np.clip(3.0 * (at - turn) - 2.0, 0.0, 1.0)
+    rise = late * late * (3.0 - 2.0 * late)
+    return turn + 0.5 + np.where(turn < turns - 1, rise, 0.0)
+
+
+def _sway(time: Array, rng: np.random.Generator) -> Array:
+    """Within [-1, 1]: a smooth swaying and a little irregular jitter."""
+    cycles, phase = rng.uniform(1.0, 5.0, 3), rng.uniform(0.0, 2.0 * math.pi, 3)
+    smooth = np.sin(2.0 * math.pi * cycles * time[:, None] + phase).mean(axis=1)
+    return (1.0 - JITTER) * smooth + JITTER * rng.uniform(-1.0, 1.0, len(time))
+
+
+def _normal_sway(time: Array, rng: np.random.Generator) -> Array:
+    """Standard normal at each moment; neighbours are alike, because a hand turns back slowly."""
+    keep = 0.7
+    drawn = rng.standard_normal(len(time))
+    value = np.empty(len(time))
+    for n in range(len(time)):
+        value[n] = drawn[n] if n == 0 else keep * value[n - 1] + math.sqrt(1.0 - keep * keep) * drawn[n]
+    return value
