@@ -90,7 +90,12 @@ class _Export:
         counts = {name: self._counts[name] for name in ("scenes", "pairs", "pairs_left_out")}
         left_out = dict(sorted(self._left_out.items()))
         manifest = {**self._folder.plan, "ranges": len(self._codes), **counts, "left_out": left_out}
-        manifest |= self._writer.describe()
+        described = self._writer.describe()
+        if reserved := sorted(described.keys() & manifest.keys()):
+            raise ValueError(
+                f"the writer of {self._writer.request.format} describes {', '.join(reserved)}: export.json has that"
+            )
+        manifest |= described
         self._writer.close()
         self._folder.finish(manifest)
         return ExportResult(manifest, self._counts["pairs"] - before)

@@ -96,6 +96,14 @@ def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, nam
         shutil.rmtree(target)
 
 
+@pytest.mark.parametrize("key", ["pairs", "left_out", "format", "ranges"])
+def test_a_writer_that_describes_what_every_manifest_has_is_refused(key, files, tmp_path, monkeypatch):
+    monkeypatch.setattr(FORMATS["gltf"].load(), "describe", lambda _: {key: 1})
+    with pytest.raises(ValueError, match=f"the writer of gltf describes {key}: "):
+        export_to(files, tmp_path / "out", "gltf", first_scene=0, last_scene=0)
+    assert not (tmp_path / "out/export.json").exists()
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, request, tmp_path):
     files, tars = map(request.getfixturevalue, OF.get(name, ("files", "tars")))
