@@ -211,16 +211,15 @@ class Events:
     def __init__(self, store: Store, folder: str) -> None:
         self._store = store
         self._folder = folder
-        self._known: list[bytes] = []
-        """Events that were read: they never change."""
+        self._known: dict[int, bytes] = {}
+        """Events that were read, by number: they never change."""
 
     def read(self) -> list[bytes]:
         """All events from the first. Raises CorruptError where one is missing, or the folder holds what is none."""
         names = self._store.names(self._folder)
         if names != [event_path("", number)[1:] for number in range(len(names))]:
             raise CorruptError(f"{self._store.name}/{self._folder} lacks an event, or holds what is none")
-        self._known += [self._store.read(f"{self._folder}/{name}") for name in names[len(self._known) :]]
-        return self._known[: len(names)]
+        return [self._read(number) for number in range(len(names))]
 
     def append(self, decide: Callable[[Sequence[bytes]], bytes | None]) -> list[bytes] | None:
         """Adds the event that `decide` makes of all events before it, and returns all; None where it makes none.
@@ -238,6 +237,11 @@ class Events:
                 return [*before, event]
             time.sleep(pause_s)
             pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
+
+    def _read(self, number: int) -> bytes:
+        if number not in self._known:
+            self._known[number] = self._store.read(event_path(self._folder, number))
+        return self._known[number]
 
 
 def event_path(folder: str, number: int) -> str:
