@@ -30,7 +30,6 @@ from workers.capture.import_recording import (
     Imported,
     Losses,
     choose_frames,
-    count_losses,
     describe_losses,
     import_recording,
     measure_frame,
@@ -145,16 +144,7 @@ def test_each_frame_gets_the_depth_less_than_half_a_period_away():
     assert pair_frames(TEN, depth[:0], PERIOD) == {} and pair_frames(TEN[:0], depth, PERIOD) == {}
 
 
-def test_losses_are_counted_from_what_the_file_says_and_told_in_numbers():
-    end = float(TEN[-1])
-    assert (
-        count_losses(TEN, 10, 0, PERIOD, end)
-        == count_losses(TEN, 10, 0, PERIOD, end + 0.4 * PERIOD)
-        == Losses(0, 0, 0, 0)
-    )
-    assert count_losses(TEN[:6], 6, 0, PERIOD, end) == Losses(0, 0, 0, 4)
-    assert count_losses(TEN[:6], 5, 0, PERIOD, None) == Losses(0, 1, 0, None)
-    assert count_losses(np.delete(TEN, [2, 5]), 8, 1, PERIOD, end) == Losses(1, 0, 1, 0)
+def test_losses_are_told_in_numbers():
     assert describe_losses(Losses(0, 0, 0, 0)) == []
     told = "; ".join(describe_losses(Losses(3, 4, 5, 6)))
     assert all(word in told for word in ("about 6 frames", "3 frames are missing", "5 frames are damaged", "4 colour"))
