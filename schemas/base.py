@@ -1,7 +1,10 @@
-"""The base of every configuration model, and the value types that they share."""
+"""The base of every configuration model, the value types that they share, and dotted keys of a tree of values."""
 
+import copy
 import unicodedata
-from typing import Annotated, NamedTuple
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,3 +74,32 @@ def frozen_array(values: object, dtype: type = np.float64) -> NDArray:
     array: NDArray = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array
+
+
+def with_defaults(tree: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a tree with values by dotted key where it has none; a path through a value without keys is left out."""
+    filled = copy.deepcopy(dict(tree))
+    for path, value in defaults.items():
+        with suppress(ValueError):
+            set_key(filled, path, value, keep=True)
+    return filled
+
+
+def set_key(tree: dict[str, Any], path: str, value: object, keep: bool = False) -> None:
+    """Set one key, such as `assets.objects.0.weight`, in place; missing branches are made, positions in a list count from 0.
+
+    With `keep`, a value that is there already stays. Raises ValueError where the path leads through a value that has no keys.
+    """
+    branch: Any = tree
+    keys = path.split(".")
+    for depth, key in enumerate(keys, 1):
+        if isinstance(branch, list) and not (key.isdigit() and int(key) < len(branch)):
+            raise ValueError(f"'{key}' must be a position from 0 to {len(branch) - 1}")
+        if not isinstance(branch, list | dict):
+            raise ValueError(f"'{'.'.join(keys[: depth - 1])}' is {branch!r} and has no key '{key}'")
+        place: Any = int(key) if isinstance(branch, list) else key
+        if depth == len(keys):
+            break
+        branch = branch[place] if isinstance(branch, list) else branch.setdefault(place, {})
+    if not (keep and isinstance(branch, dict) and place in branch):
+        branch[place] = value

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
+from schemas.base import set_key
 from schemas.capture import CaptureEstimate
 from schemas.errors import CaptureError, InputError, OutputError, plural
 from schemas.job.captures import Board, Captures
 from schemas.job.job import Job
-from schemas.job.keys import set_key
 from schemas.job.views import Render
 from services.job.job_file import change_key, validate_job
 

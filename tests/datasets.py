@@ -11,8 +11,8 @@ from schemas.dataset.shard import ShardOrder
 from schemas.job.job import Job
 from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job
-from services.merge.dataset_card import write_card
 from services.merge.merge import merge
+from services.merge.tables import write_card
 from services.read.verify import verify
 from services.run.range_planner import plan_spans
 from workers.capture.results import open_sources

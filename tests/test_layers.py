@@ -104,7 +104,7 @@ STARTS = (
         ("import services.dataset.one_scene", {"ray"}),
         (f"{NO_EXTRA}; import services.bench.command, services.study.command", {"ray"}),
     ),
-    (("import services.study.plots", {"matplotlib.pyplot"}),),
+    (("import services.study.page", {"matplotlib.pyplot"}),),
 )
 """By process: what starts one after the other, and what is not loaded then."""
 

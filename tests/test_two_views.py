@@ -23,8 +23,7 @@ import trimesh
 
 from schemas.base import Counts
 from schemas.errors import SceneError
-from schemas.job.identity import settings_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, settings_digest
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import Pair
 from services.job.job_file import load_job

@@ -7,6 +7,18 @@ from schemas.base import Frozen
 from schemas.dataset.commit import CommitSummary, CommitTerms, Span
 from schemas.job.job import Job
 
+_SAME_WHEELS = "install the same wheel and requirements.lock, or the same image, on both"
+_REMEDIES = {
+    "code": _SAME_WHEELS,
+    "libraries": _SAME_WHEELS,
+    "python": "use the same Python on both, or the same image",
+    "binaries": "install the wheels of requirements.lock, none built here (pip --only-binary :all:), or the same image",
+    "renderer": "install the same Mesa (libgl1-mesa-dri), or the same GPU and driver, on both",
+    "simd": "use processors of one kind, and set NPY_DISABLE_CPU_FEATURES alike (deploy/Dockerfile has the value)",
+    "maths": "use machines of one kind with the same C library, or the same image, and unset GLIBC_TUNABLES",
+}
+"""By field of a fingerprint, the most telling first."""
+
 
 class Fingerprint(Frozen):
     """A stack; two with the same digest make the same bytes.
@@ -34,23 +46,8 @@ class Fingerprint(Frozen):
 
     def remedies(self, other: "Fingerprint") -> str:
         """What makes the two the same, by what differs: a clause without a full stop."""
-        if self.code != other.code or self.libraries != other.libraries:
-            return "install the same wheel and requirements.lock, or the same image, on both"
-        if self.python != other.python:
-            return "use the same Python on both, or the same image"
-        if self.binaries != other.binaries:
-            return (
-                "install the wheels of requirements.lock, none built here (pip --only-binary :all:), or the same image"
-            )
-        if self.renderer != other.renderer:
-            return "install the same Mesa (libgl1-mesa-dri), or the same GPU and driver, on both"
-        if self.simd != other.simd:
-            return (
-                "use processors of one kind, and set NPY_DISABLE_CPU_FEATURES alike (deploy/Dockerfile has the value)"
-            )
-        if self.maths != other.maths:
-            return "use machines of one kind with the same C library, or the same image, and unset GLIBC_TUNABLES"
-        return "their processors or C libraries differ: use machines of one kind, or the same image"
+        differing = (remedy for name, remedy in _REMEDIES.items() if getattr(self, name) != getattr(other, name))
+        return next(differing, "their processors or C libraries differ: use machines of one kind, or the same image")
 
     def differences(self, other: "Fingerprint") -> list[str]:
         """One line for each difference, `name: mine, theirs`."""

@@ -20,8 +20,8 @@ from schemas.base import (
     Range,
     Share,
     Text,
+    with_defaults,
 )
-from schemas.job.keys import with_defaults
 from schemas.job.views import Distortion, Exposure, RgbNoise
 
 Estimate = Literal["markers", "article", "joint"]

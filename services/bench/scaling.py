@@ -20,10 +20,10 @@ from schemas.job.job import Job
 from services.bench.figures import Lap, by_clock, by_processor, slope_ratio, spread_of
 from services.bench.measure import WARM_UP, Part, run_part
 from services.run.coordinator import Coordinator, Limits
-from services.run.joining import Pattern, terms_of_driver
-from services.run.metrics import Tally
+from services.run.progress import Tally
 from services.run.range_planner import deal_shards, plan_ranges
 from services.run.ray_cluster import PREFETCH, Slots, private_ray
+from services.run.worker_entry import Pattern, terms_of_driver
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.pool import Ended, Pool
 from workers.store.local import LocalStore

@@ -57,14 +57,16 @@ def run(options: argparse.Namespace) -> int:
     named |= {"run.workers": options.workers, "run.shard_size": options.shard_size}
     changes = [f"{key}={value}" for key, value in named.items() if value is not None]
     job = load_job(options.job, [*changes, *options.changes])
-    from services.run.run_job import RunRequest, run_job  # takes seconds: a job file that is wrong is told before
+    from services.run.run_job import (  # takes seconds: a job file that is wrong is told before
+        RunRequest,
+        describe_plan,
+        run_job,
+    )
 
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
     request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed, options.metrics)
     if options.dry_run:
-        from services.run.dry_run import describe_plan
-
         print("\n".join(describe_plan(request)))
         return 0
     result = run_job(request)
@@ -250,15 +252,12 @@ def report(options: argparse.Namespace) -> int:
     began = time.monotonic()
     store = open_store(options.out)
     target = options.file or default_page(options.out)
-    beside = None if options.beside is None else open_store(options.beside)
     with explain_damage(store):
-        size, made = write_report(store, options.scenes, target, beside)
+        size, made = write_report(store, options.scenes, target)
     seconds = time.monotonic() - began
-    print(
-        f"{target}: {plural(made.figures.scenes, 'scene')}, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB"
-    )
+    print(f"{target}: {plural(made.figures.scenes, 'scene')}, pictures of {len(made.scenes)}, {size / 1e6:.1f} MB")
     answer = {"file": str(target), "bytes": size, "seconds": round(seconds, 2), "scenes": made.figures.scenes}
-    return finish(options, True, **answer, shown=[scene.scene_id for scene in made.sample.scenes])
+    return finish(options, True, **answer, shown=[scene.scene_id for scene in made.scenes])
 
 
 def serve(options: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 import urllib.parse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,14 +55,14 @@ def submit(options: argparse.Namespace) -> int:
 
 def jobs(options: argparse.Namespace) -> int:
     """`verso jobs`."""
-    from services.queue.listing import as_tree, format_rows, list_jobs
+    from services.queue.listing import format_rows, list_jobs
 
     queue = open_queue(_place(options))
     listed = list_jobs(queue)
     print("\n".join(format_rows(listed)) if listed else f"{queue.name} has no jobs")
     if any(job.state in ("queued", "waiting", "running", "cancelling") for job in listed):
         _say(_describe_supervisor(queue))
-    return finish(options, True, queue=queue.name, jobs=[as_tree(job) for job in listed])
+    return finish(options, True, queue=queue.name, jobs=[asdict(job) for job in listed])
 
 
 def logs(options: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 
 import shtab
 
-from services.cli.arguments import Command, Option, read_job, read_path, read_place
+from services.cli.arguments import Command, read_job, read_path, read_place
 from services.cli.main import build_parser
 from services.cli.rows import COMMANDS
 
@@ -68,17 +68,6 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
             yield from _describe(command.commands, f"{words} ")
             continue
         yield from (f"\n##{'#' * bool(above)} {words}\n", what, "", f"    ./verso {words} {command.example}".rstrip())
-        if options := [
-            f"`{written}`" for option in (*command.options, *command.one_of) if (written := _written(option))
-        ]:
-            yield from ("", f"Options: {', '.join(options)}.")
-
-
-def _written(option: Option) -> str:
-    """How an option is written, with the name of its value; empty for an argument, which the example shows."""
-    (name,), settings = option
-    value = settings.get("metavar") or "|".join(settings.get("choices", ()))
-    return f"{name} {value}".rstrip() if name.startswith("-") else ""
 
 
 if __name__ == "__main__":

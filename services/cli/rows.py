@@ -110,12 +110,6 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
         OUT,
         path("--out", "FILE.html", "the page to write (default: OUT-report.html, beside the dataset)", dest="file"),
         PICTURES,
-        option(
-            "--beside",
-            "OUT",
-            "another dataset to show at the side of this one: captures beside scenes, say",
-            read.read_place,
-        ),
     ),
     "serve": command(
         "the same page live while a job runs; read-only",

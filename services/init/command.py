@@ -17,14 +17,16 @@ from pydantic import ValidationError
 
 from schemas.errors import AssetSourceError, InputError, MachineError, MeshError, OutputError, plain_line
 from schemas.job.assets import TABLE, Assets, LibrarySource, MeshLimits, is_usable
+from schemas.job.physics import Physics
 from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_table, plural
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import MOST_KEYS, validate_job
+from services.run.parts import Cut, cut_shapes
 from services.run.progress import show_counts
 from workers.assets.catalogue import Watch
 from workers.assets.library.categories import BY_FILE, BY_FOLDER, BY_PARENT
 from workers.assets.library.copies import COPY, PART
-from workers.assets.library.making import Making, locked, make_library
+from workers.assets.library.making import Making, locked, remake_library
 from workers.assets.library.shapes import load_shape, make_shapes, with_shape
 from workers.assets.library.table import TABLE_FILE, Library, Row, write_table, write_whole
 from workers.render.raster.gbuffer import shared_renderer
@@ -81,10 +83,14 @@ def main(options: argparse.Namespace) -> int:
     out: Path = options.out or Path(f"{dataset_name(folder)}_library")
     making = read_making(options)
     _check_target(out)
+    with locked(out, wait=False):
+        return _init(options, folder, out, making)
+
+
+def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) -> int:
+    """Makes the library and all that lies beside it, and tells of it."""
     with show_counts("meshes") as watch:
-        library = make_library(folder, out, making, watch, edited=True)
-        with locked(out, wait=False):
-            library = fill_library(library, watch)
+        library = fill_library(remake_library(folder, out, making, watch), watch)
     used = [row for row in library.rows if row.use and row.category]
     left_out = sorted(
         (row for row in library.rows if row not in used), key=lambda row: (row.reason in (PART, COPY), row.path)
@@ -150,18 +156,28 @@ def _check_target(out: Path) -> None:
 def fill_library(library: Library, watch: Watch) -> Library:
     """The library with its shapes made, all or of a large one those of the sheet, and its table written again."""
     used = [row for row in library.rows if row.use and row.category]
-    rows = used if len(used) <= MOST_MADE else used[:MOST]
+    asked = used if len(used) <= MOST_MADE else used[:MOST]
     made = dict[str, Row]()
-    for done, (row, shape) in enumerate(make_shapes(library, rows, must_keep=True), 1):
-        watch("made", done, len(rows))
+    for done, (row, shape) in enumerate(make_shapes(library, asked, must_keep=True), 1):
+        watch("made", done, len(asked))
         if isinstance(shape, MeshError) and shape.kind == "environmental":
             raise AssetSourceError(shape.detail)
         made[row.path] = with_shape(library, row, shape)
-    numbers = {path: k for k, path in enumerate([row.path for row in used if made.get(row.path, row).use][:MOST], 1)}
-    rows = [replace(made.get(row.path, row), picture=numbers.get(row.path)) for row in library.rows]
-    library = replace(library, rows=tuple(rows))
+    shown = [row for row in (made.get(row.path, row) for row in used) if row.use][:MOST]
+    counts = _count_parts(library, [row for row in shown if row.category != TABLE])
+    numbers = {row.path: k for k, row in enumerate(shown, 1)}
+    filled = (made.get(row.path, row) for row in library.rows)
+    rows = tuple(replace(row, picture=numbers.get(row.path), parts=counts.get(row.path)) for row in filled)
+    library = replace(library, rows=rows)
     write_table(library)
     return library
+
+
+def _count_parts(library: Library, rows: Sequence[Row]) -> dict[str, int]:
+    """By path, how many convex parts a shape is dropped as in a pile. They are kept, so a job does not cut it again."""
+    alone, settings, assets = replace(library, rows=()), LibrarySource(source="library", folder=os.curdir), Assets()
+    cuts = [Cut(alone, row, settings, assets, row.instance_id, Physics().concavity) for row in rows]
+    return {cut.row.path: count for cut, count, _ in cut_shapes(cuts) if count}
 
 
 def _write_job(out: Path, folder: Path, used: Sequence[Row]) -> None:

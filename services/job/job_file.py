@@ -10,10 +10,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from schemas.base import set_key
 from schemas.dataset.layout import SWITCHES, is_stored
 from schemas.errors import JobError, did_you_mean, plain_line
 from schemas.job.job import Job
-from schemas.job.keys import set_key
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.packed import is_packed, pack, unpack
 from services.job.reference import allowed_keys

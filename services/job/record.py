@@ -10,8 +10,7 @@ import yaml
 
 from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING, SUCCESS_FILE, is_merged_path
 from schemas.errors import CorruptError, JobError, OutputError
-from schemas.job.identity import compare_jobs, job_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, compare_jobs, job_digest
 from services.job.job_file import parse_yaml, validate_job
 from workers.store.commit import is_sealed, seal
 from workers.store.store import Store

@@ -20,7 +20,6 @@ class Histogram:
     low: float
     high: float
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(FINE, np.int64))
-    total: float = 0.0
     least: float = np.inf
     most: float = -np.inf
 
@@ -32,20 +31,13 @@ class Histogram:
             return self
         step = np.clip((array - self.low) / (self.high - self.low) * FINE, 0, FINE - 1).astype(np.int64)
         counts = self.counts + np.bincount(step, minlength=FINE)
-        total = self.total + float(array.sum())
-        return Histogram(
-            self.low, self.high, counts, total, min(self.least, float(array.min())), max(self.most, float(array.max()))
-        )
+        ends = min(self.least, float(array.min())), max(self.most, float(array.max()))
+        return Histogram(self.low, self.high, counts, *ends)
 
     @property
     def count(self) -> int:
         """Number of values."""
         return int(self.counts.sum())
-
-    @property
-    def mean(self) -> float:
-        """The mean of all values; NaN of none."""
-        return self.total / self.count if self.count else float("nan")
 
     def percentile(self, share: float) -> float:
         """The value below which this share (0 to 1) lies, exact to a step; NaN of none."""
@@ -58,35 +50,17 @@ class Histogram:
         value = self.low + (min(at, FINE - 1) + 0.5) * (self.high - self.low) / FINE
         return float(np.clip(value, self.least, self.most))
 
-    def bars(self, window: "Window") -> NDArray[np.int64]:
-        """[n] counts of the bars of a window."""
-        stop = window.first + window.width * window.number
-        padded = np.pad(self.counts[window.first : stop], (0, max(0, stop - FINE)))
-        return padded.reshape(window.number, window.width).sum(axis=1)
 
-    def edge(self, window: "Window", bar: int) -> float:
-        """The value at the left edge of a bar; of bar `number`, the end of the last."""
-        return self.low + (window.first + bar * window.width) * (self.high - self.low) / FINE
-
-
-@dataclass(frozen=True)
-class Window:
-    """Equal bars over a part of the steps: the first step, steps in a bar, number of bars."""
-
-    first: int
-    width: int
-    number: int
-
-
-def window_of(histograms: Sequence[Histogram], bars: int) -> Window:
-    """About `bars` bars over the steps that any of these histograms, of one range, occupies."""
-    used = np.flatnonzero(np.sum([one.counts for one in histograms], axis=0))
-    if not used.size:
-        return Window(0, FINE // bars, bars)
-    low, high = int(used[0]), int(used[-1]) + 1
-    width = max(1, -(-(high - low) // bars))
+def bars_of(histograms: Sequence[Histogram], most_bars: int) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """([n + 1] edges, [n] counts of each histogram) of equal bars over the steps that these histograms, of one range, occupy."""
+    used = np.flatnonzero(np.sum([histogram.counts for histogram in histograms], axis=0))
+    low, high = (int(used[0]), int(used[-1]) + 1) if used.size else (0, FINE)
+    width = -(-(high - low) // most_bars)
     first = low // width * width
-    return Window(first, width, -(-(high - first) // width))
+    starts = np.arange(first, high, width)
+    step = (histograms[0].high - histograms[0].low) / FINE
+    edges = histograms[0].low + step * np.append(starts, starts[-1] + width)
+    return edges, [np.add.reduceat(histogram.counts[:high], starts) for histogram in histograms]
 
 
 BARS = 40
@@ -116,7 +90,7 @@ def chart_html(chart: Chart) -> str:
     Values that are all equal, or nearly all, are a sentence and no bar. Empty without values.
     """
     series = {name: histogram for name, histogram in chart.series.items() if histogram.count}
-    lines = [(name, _summary(chart, one)) for name, one in series.items()]
+    lines = [(name, _summary(chart, histogram)) for name, histogram in series.items()]
     words = "".join(_legend(at, *line) for at, line in enumerate(lines)) + (
         _legend(0, "", chart.note) if chart.note else ""
     )
@@ -130,36 +104,35 @@ def chart_html(chart: Chart) -> str:
 
 def _drawing(chart: Chart, series: Mapping[str, Histogram], lines: Sequence[tuple[str, str]]) -> str:
     """The bars, and the ends and the middle of their axis."""
-    window = window_of(list(series.values()), BARS)
-    most = max(int(one.bars(window).max()) for one in series.values())
-    first = next(iter(series.values()))
-    ends = [first.edge(window, 0), first.edge(window, window.number)]
-    ticks = [ends[0], sum(ends) / 2, ends[1]]
-    told = "; ".join(f"{name}: {line}" if name else line for name, line in lines)
-    drawn = "".join(_draw(chart, one, window, most, at) for at, one in enumerate(series.values()))
+    edges, counts = bars_of(list(series.values()), BARS)
+    most = int(np.max(counts))
+    words = "; ".join(f"{name}: {line}" if name else line for name, line in lines)
+    drawn = _bars(chart, edges, counts[0], most) + "".join(_line(others, most) for others in counts[1:])
+    ticks = (edges[0], (edges[0] + edges[-1]) / 2, edges[-1])
     return (
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none" role="img" '
-        f'aria-label="{escape(f"{chart.title}. {told}")}">{drawn}</svg>\n'
+        f'aria-label="{escape(f"{chart.title}. {words}")}">{drawn}</svg>\n'
         f'<div class="ticks">{"".join(f"<span>{escape(chart.tell(tick))}</span>" for tick in ticks)}</div>\n'
     )
 
 
-def _draw(chart: Chart, one: Histogram, window: Window, most: int, at: int) -> str:
-    """Filled bars for the first series, a line of steps for the others; `most` is the count of the highest bar."""
-    counts = one.bars(window).tolist()
-    step, unit = WIDTH / len(counts), (HEIGHT - 4) / max(most, 1)
-    tops = [HEIGHT - count * unit for count in counts]
-    if at:
-        path = f"M0 {HEIGHT}" + "".join(f"V{top:.1f}H{(i + 1) * step:.1f}" for i, top in enumerate(tops))
-        return f'<path class="line" vector-effect="non-scaling-stroke" d="{path}V{HEIGHT}"/>'
+def _bars(chart: Chart, edges: NDArray[np.float64], counts: NDArray[np.int64], most: int) -> str:
+    """Filled bars; `most` is the count of the highest bar."""
+    step, unit = WIDTH / len(counts), (HEIGHT - 4) / most
     bars = []
-    for i, (top, count) in enumerate(zip(tops, counts, strict=True)):
-        if not count:
-            continue
-        span = f"{chart.tell(one.edge(window, i))} to {chart.tell(one.edge(window, i + 1))}: {count:,}"
-        place = f'x="{i * step + step * 0.06:.2f}" y="{top:.1f}" width="{step * 0.88:.2f}" height="{HEIGHT - top:.1f}"'
+    for i in np.flatnonzero(counts).tolist():
+        span = f"{chart.tell(edges[i])} to {chart.tell(edges[i + 1])}: {counts[i]:,}"
+        height = counts[i] * unit
+        place = f'x="{(i + 0.06) * step:.2f}" y="{HEIGHT - height:.1f}" width="{step * 0.88:.2f}" height="{height:.1f}"'
         bars.append(f'<rect class="bar" {place}><title>{escape(span)}</title></rect>')
     return "".join(bars)
+
+
+def _line(counts: NDArray[np.int64], most: int) -> str:
+    """A line of steps."""
+    step, tops = WIDTH / len(counts), HEIGHT - counts * (HEIGHT - 4) / most
+    path = f"M0 {HEIGHT}" + "".join(f"V{top:.1f}H{(i + 1) * step:.1f}" for i, top in enumerate(tops))
+    return f'<path class="line" vector-effect="non-scaling-stroke" d="{path}V{HEIGHT}"/>'
 
 
 def _summary(chart: Chart, one: Histogram) -> str:

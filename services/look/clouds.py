@@ -2,24 +2,22 @@
 
 import base64
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array, Pose
+from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_world_poses
-from schemas.dataset.layout import samples_path
-from schemas.errors import CorruptError, VersoError
+from schemas.errors import VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from services.look.collect import choose_spread
-from services.look.pictures import OBJECT_REGIONS, PLAIN, SHOWN_ROLES, PairImages, metres_of, read_pair
-from services.read.dataset_reader import decode_samples, file_reader, find_scene
-from services.read.scene_geometry import posed_scene, region_names
+from services.look.pictures import PLAIN, SHOWN_ROLES, PairImages, metres_of, read_pair
+from services.read.dataset_reader import file_reader, find_scene
+from services.read.scene_geometry import posed_scene
 from workers.geometry.camera import unproject
-from workers.geometry.frames import transform
 from workers.store.store import Store
 
 MOST_POINTS = 90_000
@@ -27,9 +25,6 @@ MOST_POINTS = 90_000
 
 MOST_SPACES, FEWER_POINTS = 8, 24_000
 """Scenes that may be chosen in the 3-D view, and the points of a cloud where there are several."""
-
-FLOOR_SHARE = 0.15
-"""Largest share of the points that the floor has, where there are too many."""
 
 REACH_M = 1.4
 """Points of the floor beyond this horizontal distance from the objects are left out."""
@@ -43,30 +38,19 @@ MOST_FACES = 120_000
 GRID_STEPS = 160
 """Cells of that grid along the longest side of the mesh."""
 
-MOST_SAMPLES = 4_000
-"""Samples of one kind, of all objects of a scene: they travel with every page."""
-
-INSIDE, OUTSIDE = OBJECT_REGIONS[1], OBJECT_REGIONS[0]
-"""Colours of samples of the volume."""
-
-DOT_SHARE = 1 / 150
-"""Size of a sample of the volume, of the diagonal of all of them."""
-
 
 @dataclass(frozen=True)
 class Cloud:
-    """The points of one view, or samples of the objects' shapes."""
+    """The points of one view."""
 
     role: str
-    """The view's, or `surface`, `inside`, `outside`."""
     points: Array
     """[N, 3] metres, world."""
     colors: NDArray[np.uint8]
     """[N, 3] sRGB."""
     size_m: float
     """Distance between neighbouring points of an object that faces the camera."""
-    T_world_cam: Array | None = None
-    """Of a view's cloud."""
+    T_world_cam: Array
 
 
 @dataclass(frozen=True)
@@ -91,7 +75,7 @@ class Space:
     clouds: tuple[Cloud, ...]
     bodies: tuple[Body, ...]
     missing: str
-    """Sentences that say why there is no mesh, or no samples; empty where nothing is missing."""
+    """A sentence that says why there is no mesh; empty where there is one."""
 
 
 def read_spaces(store: Store, scene_ids: Sequence[int]) -> tuple[Space, ...]:
@@ -116,58 +100,7 @@ def read_space(store: Store, scene_id: int, most_points: int = MOST_POINTS) -> S
     if not clouds:
         return None
     bodies, missing = _read_bodies(store, scene_id)
-    try:
-        clouds += read_samples(store, scene)
-    except CorruptError as error:
-        missing += f" There are no samples: {error}."
     return Space(scene_id, scene["category"], target, clouds, bodies, missing)
-
-
-def read_samples(store: Store, scene: Row, most: int = MOST_SAMPLES) -> tuple[Cloud, ...]:
-    """The stored samples of a scene's objects where these lie, at most `most` of each kind; none without the target.
-
-    Raises CorruptError where a file is damaged.
-    """
-    poses = read_world_poses(scene)
-    clouds: dict[str, Cloud] = {}
-    objects = {region: name for region, name in region_names(scene).items() if region >= REGION_FIRST_OBJECT}
-    for region, name in objects.items():
-        arrays = _read_arrays(store, samples_path(*name))
-        for new in _samples_of(arrays, poses[region], max(most // len(objects), 1)):
-            old = clouds.get(new.role)
-            clouds[new.role] = new if old is None else _joined(old, new)
-    return tuple(clouds.values())
-
-
-def _joined(one: Cloud, other: Cloud) -> Cloud:
-    points, colors = (one.points, other.points), (one.colors, other.colors)
-    return replace(one, points=np.concatenate(points), colors=np.concatenate(colors))
-
-
-def _samples_of(arrays: Mapping[str, NDArray], T_world_obj: Pose, most: int) -> Iterator[Cloud]:
-    """The clouds of one object; samples of the volume are told apart by the sign of their distance."""
-    if "surface_points" in arrays:
-        points = arrays["surface_points"]
-        kept = _evenly(np.arange(len(points)), most)
-        size_m = _diagonal(points) / float(np.sqrt(len(kept)))
-        yield Cloud("surface", transform(T_world_obj, points[kept]), arrays["surface_colors"][kept], size_m)
-    if "volume_points" in arrays:
-        points, inside = arrays["volume_points"], arrays["volume_distance"] < 0.0
-        for role, of, color in (("inside", inside, INSIDE), ("outside", ~inside, OUTSIDE)):
-            kept = _evenly(np.flatnonzero(of), most)
-            colors = np.full((len(kept), 3), color, np.uint8)
-            yield Cloud(role, transform(T_world_obj, points[kept]), colors, DOT_SHARE * _diagonal(points))
-
-
-def _diagonal(points: NDArray) -> float:
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
-
-
-def _read_arrays(store: Store, path: str) -> Mapping[str, NDArray]:
-    try:
-        return decode_samples(store.read(path), path)
-    except FileNotFoundError:
-        return {}
 
 
 def cloud_of(role: str, images: PairImages, view: Row, target: Array, most_points: int) -> Cloud:
@@ -181,8 +114,9 @@ def cloud_of(role: str, images: PairImages, view: Row, target: Array, most_point
     points = unproject(rows, columns, z, camera.intrinsics) @ T[:3, :3].T + T[:3, 3]
     region = regions[rows, columns]
     near = np.hypot(*(points[:, :2] - target[:2]).T) < REACH_M
-    groups = (near & (region >= REGION_FIRST_OBJECT), near & (region == REGION_TABLE), near & (region == REGION_FLOOR))
-    kept = _thin([np.flatnonzero(group) for group in groups], most_points)
+    kept = np.zeros(0, np.int64)
+    for group in (region >= REGION_FIRST_OBJECT, region == REGION_TABLE, region == REGION_FLOOR):
+        kept = np.append(kept, _evenly(np.flatnonzero(near & group), most_points - len(kept)))
     rgb = images.get((role, "rgb"))
     colors = np.full((len(kept), 3), 150, np.uint8) if rgb is None else rgb[rows[kept], columns[kept]]
     ours = z[region >= REGION_FIRST_OBJECT]
@@ -190,18 +124,8 @@ def cloud_of(role: str, images: PairImages, view: Row, target: Array, most_point
     return Cloud(role, points[kept], colors, size_m, T)
 
 
-def _thin(groups: Sequence[NDArray[np.int64]], most: int) -> NDArray[np.int64]:
-    """At most `most` indices: of the first groups as many as there are, and then of the last, the floor, its share."""
-    floor = _evenly(groups[-1], max(int(FLOOR_SHARE * most), most - sum(map(len, groups[:-1]))))
-    room, chosen = most - len(floor), [floor]
-    for group in groups[:-1]:
-        chosen.append(_evenly(group, room))
-        room -= len(chosen[-1])
-    return np.sort(np.concatenate(chosen))
-
-
 def _evenly(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    return indices[:: -(-len(indices) // most)] if 0 < most < len(indices) else indices[: max(most, 0)]
+    return indices[:: -(-len(indices) // most)] if 0 < most < len(indices) else indices[:most]
 
 
 def _read_bodies(store: Store, scene_id: int) -> tuple[tuple[Body, ...], str]:
@@ -237,19 +161,18 @@ def coarsen(body: Body) -> Body:
 
 
 def pack_spaces(spaces: Sequence[Space]) -> str:
-    """JSON for the page: a list of what `pack_space` makes."""
-    return f"[{','.join(map(pack_space, spaces))}]"
-
-
-def pack_space(space: Space) -> str:
     """JSON for the page; arrays are base64 of little-endian numbers, points relative to the target."""
+    return json.dumps([_packed(space) for space in spaces], separators=(",", ":"))
+
+
+def _packed(space: Space) -> dict[str, Any]:
     clouds = [
         {
             "role": cloud.role,
             "points": _base64(np.clip(np.round((cloud.points - space.target) / QUANTUM_M), -32767, 32767), "<i2"),
             "colors": _base64(cloud.colors, "u1"),
             "size": round(cloud.size_m, 6),
-            "camera": None if cloud.T_world_cam is None else [round(float(x), 6) for x in cloud.T_world_cam.ravel()],
+            "camera": [round(float(x), 6) for x in cloud.T_world_cam.ravel()],
         }
         for cloud in space.clouds
     ]
@@ -261,14 +184,13 @@ def pack_space(space: Space) -> str:
         }
         for body in space.bodies
     ]
-    packed: Mapping[str, Any] = {
+    return {
         "scene": space.scene_id,
         "quantum": QUANTUM_M,
         "target": [round(float(x), 6) for x in space.target],
         "clouds": clouds,
         "bodies": bodies,
     }
-    return json.dumps(packed, separators=(",", ":"))
 
 
 def _base64(values: NDArray, kind: str) -> str:

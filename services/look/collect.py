@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
@@ -11,42 +11,32 @@ from operator import itemgetter
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import MANIFEST
-from schemas.dataset.tables import SCHEMAS
 from services.job.record import read_success
 from services.look.charts import Histogram
-from services.read.stored_tables import category_of
+from services.read.stored_tables import StoredTables
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import range_rows, read_range
+from workers.store.manifest import join_rows
 from workers.store.store import Store
 
 MOST_RANGES = 256
 """Largest number of ranges that are read of a dataset that is not merged; more are sampled evenly."""
 
-BATCH_ROWS = 65_536
-
-_INNER = {"files": "files.list.element.bytes"}
-"""Columns of which a part is enough; names and digests of files are most of the bytes of `views`."""
+BATCH_ROWS = 16_384
 
 
 @dataclass(frozen=True)
 class Tables:
-    """The rows of a dataset: its merged files, or those of committed ranges."""
+    """The rows of a dataset: its merged tables, or those of committed ranges."""
 
     store: Store
-    merged: tuple[str, ...]
-    """Merged files; none while the dataset is being made."""
+    merged: bool
     ranges: tuple[tuple[int, tuple[int, ...]], ...]
     """(first scene, retries) of the ranges that are read where it is not merged."""
-    all_ranges: int
-
-    @property
-    def sampled(self) -> bool:
-        """Whether rows of some ranges only are read."""
-        return not self.merged and len(self.ranges) < self.all_ranges
+    sampled: bool
+    """Whether rows of some ranges only are read."""
 
     def batches(self, table: str, columns: Sequence[str]) -> Iterator[pa.Table]:
         """The rows in order of files, with these columns; those that old files lack are null.
@@ -54,38 +44,24 @@ class Tables:
         Raises CorruptError where a range's file does not match its commit, pyarrow's errors where a merged one is damaged.
         """
         if self.merged:
-            prefix = f"{MANIFEST}/{table}/"
-            parts = (part for key in self.merged if key.startswith(prefix) for part in self._merged(key, columns))
-        else:
-            parts = (range_rows(self.store, records, table) for records in self._records)
-        for part in parts:
-            if part.num_rows:
-                yield _with_columns(part, table, columns)
+            rows = StoredTables(self.store).dataset(table)
+            for batch in rows.to_batches(columns=list(columns), batch_size=BATCH_ROWS):
+                yield pa.table(batch)
+        for records in self._records:
+            yield join_rows(table, [range_rows(self.store, records, table)]).select(list(columns))
 
     @cached_property
     def _records(self) -> list[list[CommitRecord]]:
         return [read_range(self.store, start, retries) for start, retries in self.ranges]
 
-    def _merged(self, key: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        with self.store.open(key) as stored_file:
-            file = pq.ParquetFile(stored_file, page_checksum_verification=True)
-            stored = set(file.schema_arrow.names)
-            wanted = [_INNER.get(name, name) for name in columns if name in stored]
-            for batch in file.iter_batches(BATCH_ROWS, columns=wanted):
-                rows = pa.table(batch)
-                if "category" in columns and "category" not in stored:
-                    rows = rows.append_column("category", pa.repeat(pa.scalar(category_of(key)), rows.num_rows))
-                yield rows
-
 
 def open_tables(store: Store) -> Tables:
     """The tables of a dataset as it is now, which may have no rows yet."""
-    done = read_success(store)
-    if done is not None:
-        return Tables(store, tuple(sorted(done["files"])), (), 0)
+    if read_success(store) is not None:
+        return Tables(store, True, (), False)
     codes = map(split_code, list_codes(store))
     ranges = [(start, tuple(retry for _, retry in group)) for start, group in groupby(codes, key=itemgetter(0))]
-    return Tables(store, (), tuple(choose_spread(ranges, MOST_RANGES)), len(ranges))
+    return Tables(store, False, tuple(choose_spread(ranges, MOST_RANGES)), len(ranges) > MOST_RANGES)
 
 
 def choose_spread(items: Sequence, count: int) -> list:
@@ -93,14 +69,6 @@ def choose_spread(items: Sequence, count: int) -> list:
     if len(items) <= count:
         return list(items)
     return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]
-
-
-def _with_columns(rows: pa.Table, table: str, columns: Sequence[str]) -> pa.Table:
-    schema = SCHEMAS[table]
-    for name in columns:
-        if name not in rows.column_names:
-            rows = rows.append_column(name, pa.nulls(rows.num_rows, schema.field(name).type))
-    return rows.select(list(columns))
 
 
 @dataclass
@@ -113,11 +81,6 @@ class Cost:
     """How many of the runs have a time."""
     skips: Counter[str] = field(default_factory=Counter)
     """How often it was left out, by reason."""
-
-    def add(self, seconds: float, times: int) -> None:
-        """Takes times that were measured."""
-        self.seconds += seconds
-        self.timed += times
 
 
 @dataclass(frozen=True)
@@ -222,8 +185,8 @@ def _read_scenes(tables: Tables, figures: Figures) -> None:
             figures.effects.setdefault(name, Cost()).runs += runs
         skipped = _flat(rows, "skipped")
         both = pc.binary_join_element_wise(pc.struct_field(skipped, "effect"), pc.struct_field(skipped, "why"), "\0")
-        for told, times in _counts(both).items():
-            name, _, why = told.partition("\0")
+        for reason, times in _counts(both).items():
+            name, _, why = reason.partition("\0")
             figures.effects.setdefault(name, Cost()).skips[why] += times
         figures.captures += _captures(rows, MOST_CAPTURES - len(figures.captures))
 
@@ -250,67 +213,50 @@ def _read_views(tables: Tables, figures: Figures) -> None:
 def _read_timings(tables: Tables, figures: Figures) -> None:
     for rows in tables.batches("timings", ("stages", "effects", "total_s")):
         figures.seconds += float(_numbers(rows, "total_s").sum())
-        for stage, one in _sums(rows, "stages"):
-            cost = figures.stages.setdefault(stage, Cost())
-            cost.add(*one)
-            cost.runs = cost.timed
-        for effect, one in _sums(rows, "effects"):
-            if effect in figures.effects:
-                figures.effects[effect].add(*one)
-
-
-def _sums(rows: pa.Table, column: str) -> Iterator[tuple[str, tuple[float, int]]]:
-    """(name, (seconds, how many)) of the times in a list column."""
-    items = _flat(rows, column)
-    named = pa.table({"name": pc.struct_field(items, "name"), "seconds": pc.struct_field(items, "seconds")})
-    for one in named.group_by("name").aggregate([("seconds", "sum"), ("seconds", "count")]).to_pylist():
-        yield one["name"], (one["seconds_sum"], one["seconds_count"])
+        for column, costs in (("stages", figures.stages), ("effects", figures.effects)):
+            times = pa.table(pa.RecordBatch.from_struct_array(_flat(rows, column)))
+            for row in times.group_by("name").aggregate([("seconds", "sum"), ("seconds", "count")]).to_pylist():
+                if column == "stages" or row["name"] in costs:
+                    cost = costs.setdefault(row["name"], Cost())
+                    cost.seconds += row["seconds_sum"]
+                    cost.timed += row["seconds_count"]
 
 
 def _read_failures(tables: Tables) -> tuple[Failure, ...]:
     """Each way of failing, the most frequent first."""
-    counts: Counter[tuple[str, str, str]] = Counter()
-    examples: dict[tuple[str, str, str], list[int]] = {}
-    details: dict[tuple[str, str, str], str] = {}
+    failures: dict[tuple[str, str, str], Failure] = {}
     for rows in tables.batches("failures", ("scene_id", "reason", "kind", "stage", "detail")):
         for row in rows.to_pylist():
             key = (row["reason"], row["kind"], row["stage"])
-            counts[key] += 1
-            details.setdefault(key, row["detail"])
-            if len(found := examples.setdefault(key, [])) < MOST_EXAMPLES:
-                found.append(row["scene_id"])
-    return tuple(Failure(*key, count, tuple(examples[key]), details[key]) for key, count in counts.most_common())
+            failure = failures.setdefault(key, Failure(*key, 0, (), row["detail"]))
+            examples = (*failure.examples, row["scene_id"])[:MOST_EXAMPLES]
+            failures[key] = replace(failure, scenes=failure.scenes + 1, examples=examples)
+    return tuple(sorted(failures.values(), key=lambda failure: -failure.scenes))
 
 
 def _count_instances(tables: Tables) -> int:
     """Number of different objects; what they stand on is not counted."""
     seen: set[str] = set()
-    unique = 0
     for rows in tables.batches("assets", ("instance_id", "category")):
         objects = rows.filter(pc.invert(pc.is_in(rows.column("category"), value_set=pa.array(GROUNDS))))
-        if tables.merged:  # each stands there once
-            unique += objects.num_rows
-        else:
-            seen.update(objects.column("instance_id").to_pylist())
-    return unique + len(seen)
+        seen.update(objects.column("instance_id").to_pylist())
+    return len(seen)
 
 
 def _captures(rows: pa.Table, most: int) -> Iterator[CaptureQuality]:
     """The rows that are captures, at most so many."""
-    column = rows.column("capture")
-    if column.null_count == len(column):
-        return
-    for row in rows.select(["scene_id", "category", "capture"]).slice(0, max(most, 0)).to_pylist():
-        if (one := row["capture"]) is not None:
-            plain = ("reprojection_px", "measured_share", "pose_mm", "cloud_median_mm", "completeness")
-            yield CaptureQuality(
-                row["scene_id"], one["name"], row["category"], one["views"], len(one["left_out"]), one["estimate"],
-                **{name: one[name] for name in plain},
-            )  # fmt: skip
+    captured = rows.filter(pc.field("capture").is_valid())
+    for row in captured.select(["scene_id", "category", "capture"]).slice(0, max(most, 0)).to_pylist():
+        capture = row["capture"]
+        figures = ("reprojection_px", "measured_share", "pose_mm", "cloud_median_mm", "completeness")
+        yield CaptureQuality(
+            row["scene_id"], capture["name"], row["category"], capture["views"], len(capture["left_out"]),
+            capture["estimate"], **{name: capture[name] for name in figures},
+        )  # fmt: skip
 
 
 def _counts(values: pa.Array | pa.ChunkedArray) -> Counter[str]:
-    return Counter({one["values"]: one["counts"] for one in pc.value_counts(values).to_pylist()})
+    return Counter({count["values"]: count["counts"] for count in pc.value_counts(values).to_pylist()})
 
 
 def _flat(rows: pa.Table, column: str) -> pa.Array:

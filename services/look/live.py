@@ -2,8 +2,9 @@
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Literal
 
@@ -33,6 +34,9 @@ LOOKS = 64
 """Ranges at the end of the dataset among which the latest are looked for."""
 
 
+NOTHING = Status(0, 0, {}, 0, None, None, (), None)
+
+
 @dataclass(frozen=True)
 class Progress:
     """What a person who waits wants to know."""
@@ -40,22 +44,14 @@ class Progress:
     phase: Phase
     name: str = ""
     """Of the job."""
-    asked: int = 0
-    made: int = 0
-    failed: Mapping[str, int] = field(default_factory=dict)
-    """By `kind: reason`."""
-    scenes_per_s: float | None = None
-    """Of the latest commits; None where nothing runs."""
-    left_s: float | None = None
-    running: tuple[int, ...] = ()
-    """Scenes in progress."""
-    told: tuple[str, ...] = ()
-    """What is wrong with the folder, a sentence each."""
+    status: Status = NOTHING
+    damage: str = ""
+    """Why the folder cannot be read."""
 
     @property
     def done(self) -> int:
         """Scenes made or failed."""
-        return self.made + sum(self.failed.values())
+        return self.status.made + sum(self.status.failed.values())
 
 
 def read_progress(store: Store) -> Progress:
@@ -69,43 +65,29 @@ def read_progress(store: Store) -> Progress:
             try:
                 status = read_status(store, job.first_scene, job.stop_scene)
             except OutputError:  # the job is written, and nothing is begun
-                return Progress("empty", job.name, job.scenes)
+                return Progress("empty", job.name, replace(NOTHING, asked=job.scenes))
             lives = status.holder is not None and shows_life(store, status.holder)
     except VersoError as error:
-        return Progress("unreadable", told=(str(error),))
-    return progress_of(job.name, status, lives)
-
-
-def progress_of(name: str, status: Status, lives: bool) -> Progress:
-    """The progress in a status; `lives`: whether a run shows life."""
+        return Progress("unreadable", damage=str(error))
+    if lives:
+        return Progress("making", job.name, status)
     begun = status.made or status.failed or status.lost
-    ended: Phase = "finished" if status.digest and not status.missing else "stopped" if begun else "empty"
-    phase: Phase = "making" if lives else ended
-    rate = status.scenes_per_s if lives else None
     return Progress(
-        phase,
-        name,
-        status.asked,
-        status.made,
-        status.failed,
-        rate,
-        status.missing / rate if rate else None,
-        tuple(one.scene_id for one in status.running if lives and one.scene_id is not None),
-        status.lost,
+        "finished" if status.digest and not status.missing else "stopped" if begun else "empty", job.name, status
     )
 
 
 def latest_scenes(store: Store, count: int = LATEST) -> list[ShownScene]:
     """The scenes of the newest commits, the newest first; those that cannot be read just now are left out."""
     codes = [split_code(code) for code in list_codes(store)[-LOOKS:]]
-    found = {start: store.stat(commit_path(start, retry)) for start, retry in codes}
-    written = {start: entry.modified_s if entry else 0.0 for start, entry in found.items()}
+    entries = {start: store.stat(commit_path(start, retry)) for start, retry in codes}
+    written = {start: entry.modified_s if entry else 0.0 for start, entry in entries.items()}
     shown: list[ShownScene] = []
     for start in sorted(written, key=lambda start: (-written[start], -start)):
         if len(shown) >= count:
             break
         try:
-            stored = read_stored(store, read_range(store, start, [retry for one, retry in codes if one == start]))
+            stored = read_stored(store, read_range(store, start, [retry for first, retry in codes if first == start]))
             read, depth = file_reader(store.read, stored), {role: Histogram(*DEPTH_M) for role in ("input", "mirror")}
             for row in stored.rows["scenes"][: -(count - len(shown)) - 1 : -1]:
                 shown.append(show_scene(read, stored, row, depth, PLAIN))
@@ -125,50 +107,37 @@ STATES: dict[Phase, str] = {
 
 def live_html(progress: Progress, latest: Sequence[ShownScene], address: Address) -> str:
     """The contents of the live section."""
-    return _state(progress) + _troubles(progress) + _latest(progress, latest, address)
+    failed = [f"{count:,} failed, {reason.replace('_', ' ')}" for reason, count in progress.status.failed.items()]
+    wrong = [*([progress.damage] if progress.damage else ()), *progress.status.lost, *failed]
+    troubles = f'<ul class="troubles">{"".join(f"<li>{escape(line)}</li>" for line in wrong)}</ul>' if wrong else ""
+    pictures = "".join(strip_html(scene, address) for scene in latest)
+    return _state(progress) + troubles + (f'<div class="latest">{pictures}</div>' if pictures else "")
 
 
 def title_of(progress: Progress) -> str:
     """The title of the window: the share that is done, and the job."""
-    share = f"{progress.done / progress.asked:.0%} · " if progress.asked and progress.phase == "making" else ""
+    share = f"{progress.done / max(progress.status.asked, 1):.0%} · " if progress.phase == "making" else ""
     return f"{share}{progress.name or 'Verso'}"
 
 
 def _state(progress: Progress) -> str:
-    state = f'<span class="state {progress.phase}">{STATES[progress.phase]}</span>'
+    state, status = f'<span class="state {progress.phase}">{STATES[progress.phase]}</span>', progress.status
+    asked = plural(status.asked, "scene")
     if progress.phase == "empty":
-        job = (
-            f"The job {progress.name} asks for {plural(progress.asked, 'scene')}."
-            if progress.name
-            else "There is no job yet."
-        )
+        job = f"The job {progress.name} asks for {asked}." if progress.name else "There is no job yet."
         return f'<p class="lead">{state}</p><p class="empty">{escape(job)} This page follows the folder.</p>'
     if progress.phase == "unreadable":
         return f'<p class="lead">{state}</p>'
-    facts = [f"{progress.done:,} of {plural(progress.asked, 'scene')}"]
-    if progress.scenes_per_s is not None:
-        facts.append(f"{number(float(f'{progress.scenes_per_s:.2g}'))} a second")
-    if progress.left_s:
-        facts.append(f"{describe_seconds(progress.left_s)} left")
-    facts.append(f"{sum(progress.failed.values()):,} failed")
-    if progress.running:
-        facts.append(
-            f"now at {', '.join(map(str, progress.running[:4]))}{' and more' if len(progress.running) > 4 else ''}"
-        )
-    bar = f'<progress max="{max(progress.asked, 1)}" value="{progress.done}" aria-label="Scenes done"></progress>'
+    facts = [f"{progress.done:,} of {asked}", f"{sum(status.failed.values()):,} failed"]
+    if progress.phase == "making":
+        if status.scenes_per_s:
+            facts.append(f"{number(float(f'{status.scenes_per_s:.2g}'))} a second")
+            facts.append(f"{describe_seconds(status.missing / status.scenes_per_s)} left")
+        running = [str(run.scene_id) for run in status.running if run.scene_id is not None]
+        if running:
+            facts.append(f"now at {', '.join(running[:4])}{' and more' if len(running) > 4 else ''}")
+    bar = f'<progress max="{max(status.asked, 1)}" value="{progress.done}" aria-label="Scenes done"></progress>'
     return f'<p class="lead">{state} {escape(" · ".join(facts))}</p>{bar}'
-
-
-def _troubles(progress: Progress) -> str:
-    lines = [f"{count:,} failed, {told.replace('_', ' ')}" for told, count in progress.failed.items()]
-    items = "".join(f"<li>{escape(line)}</li>" for line in [*progress.told, *lines])
-    return f'<ul class="troubles">{items}</ul>' if items else ""
-
-
-def _latest(progress: Progress, latest: Sequence[ShownScene], address: Address) -> str:
-    if not latest or progress.phase == "unreadable":
-        return ""
-    return f'<div class="latest">{"".join(strip_html(scene, address) for scene in latest)}</div>'
 
 
 LOOK_S = 2.0
@@ -231,7 +200,10 @@ class Follower:
         """One look at the folder, without the report."""
         progress = read_progress(self._store)
         if progress.done != self._shown.done or progress.phase != self._shown.phase:
-            self._latest = self._read_latest() if progress.phase in ("making", "stopped", "finished") else []
+            self._latest = []
+            # Damage is told by the progress.
+            with suppress(VersoError), explain_damage(self._store):
+                self._latest = latest_scenes(self._store) if progress.done else []
         self._shown = progress
         self._publish()
 
@@ -263,13 +235,6 @@ class Follower:
     def _publish(self) -> None:
         live = live_html(self._shown, self._latest, self.shelf.put)
         self.view = View(self._shown.name or "Verso", title_of(self._shown), live, self._sections, self._version)
-
-    def _read_latest(self) -> list[ShownScene]:
-        try:
-            with explain_damage(self._store):
-                return latest_scenes(self._store)
-        except VersoError:  # told by the progress
-            return []
 
     def _read_sections(self) -> tuple[Section, ...] | None:
         """The sections of a report; None where a file is being moved or merged just now."""

@@ -20,7 +20,7 @@ from schemas.dataset.layout import patch_index
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import MODALITIES, PixelKind
 from services.look.charts import Histogram
-from services.look.collect import Tables
+from services.look.collect import Tables, choose_spread
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, find_scene, read_image
 from services.read.stored_tables import patch_paths, view_paths
 from workers.store.store import Store
@@ -99,7 +99,7 @@ def picture_of_depth(depth_m: NDArray, span_m: tuple[float, float], words: str, 
     share = np.clip((depth_m - low) / max(high - low, 1e-6), 0.0, 1.0)
     rgb = viridis()[(255 * (1.0 - share)).astype(np.uint8)]
     image = Image.fromarray(np.where(depth_m[..., None] > 0, rgb, np.uint8(0)))
-    return _png(image, words) if sharp else _jpeg(image, words)
+    return (_png if sharp else _jpeg)(image, words)
 
 
 def depth_span(depth_m: NDArray, regions: NDArray | None = None) -> tuple[float, float]:
@@ -212,55 +212,29 @@ class ShownScene:
     d_z_m: float | None
 
 
-@dataclass(frozen=True)
-class Sample:
-    """The scenes that a page shows, in order of category, and the depth of their object pixels by role."""
-
-    scenes: tuple[ShownScene, ...]
-    depth: Mapping[str, Histogram]
-
-
-def choose_scenes(tables: Tables, by_category: Mapping[str, int], scenes: int) -> list[int]:
-    """About `scenes` scene ids, equally many of each category as far as there are, each category's evenly over its ids."""
-    each = _shares(by_category, scenes)
-    wanted = {
-        category: {int((i + 0.5) * by_category[category] / count) for i in range(count)}
-        for category, count in each.items()
-    }
-    seen = dict.fromkeys(by_category, 0)
-    chosen: dict[str, list[int]] = {category: [] for category in by_category}
+def choose_scenes(tables: Tables, scenes: int) -> list[int]:
+    """At most `scenes` scene ids, equally many of each category, evenly over its ids; at least one of each."""
+    by_category: dict[str, list[int]] = {}
     for rows in tables.batches("scenes", ("scene_id", "category")):
-        ids = rows.column("scene_id").to_numpy()
-        names = np.asarray(rows.column("category").to_pylist())
+        ids, names = rows.column("scene_id").to_numpy(), np.asarray(rows.column("category").to_pylist())
         for category in np.unique(names).tolist():
-            of = ids[names == category]
-            first = seen.get(category, 0)
-            chosen[category] += [int(of[at - first]) for at in wanted[category] if first <= at < first + len(of)]
-            seen[category] = first + len(of)
-    return [scene_id for category in sorted(chosen) for scene_id in sorted(chosen[category])]
+            by_category.setdefault(category, []).extend(ids[names == category].tolist())
+    each = max(1, scenes // max(len(by_category), 1))
+    return [scene_id for name in sorted(by_category) for scene_id in choose_spread(by_category[name], each)]
 
 
-def _shares(by_category: Mapping[str, int], scenes: int) -> dict[str, int]:
-    """How many of each category; at least one of each."""
-    shares = dict.fromkeys(by_category, 0)
-    while sum(shares.values()) < scenes or 0 in shares.values():
-        open_ones = [name for name in shares if shares[name] < by_category[name]]
-        if not open_ones:
-            break
-        least = min(open_ones, key=lambda name: shares[name])
-        shares[least] += 1
-    return shares
+def show_scenes(store: Store, scene_ids: Iterable[int]) -> tuple[list[ShownScene], Mapping[str, Histogram]]:
+    """The pictures of these scenes, and the depth of their object pixels by role, metres.
 
-
-def show_scenes(store: Store, scene_ids: Iterable[int]) -> Sample:
-    """The pictures of these scenes. Raises CorruptError where an image is missing or damaged."""
+    Raises CorruptError where an image is missing or damaged.
+    """
     shown, depth = [], {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
     for scene_id in scene_ids:
         stored = find_scene(store, scene_id)
         row = stored.scene(scene_id)
         if row is not None:
             shown.append(show_scene(file_reader(store.read, stored), stored, row, depth))
-    return Sample(tuple(shown), depth)
+    return shown, depth
 
 
 def show_scene(

@@ -1,7 +1,7 @@
 """`verso report`: a dataset as one HTML page that needs nothing beside it; and the pages of the server."""
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
@@ -12,14 +12,12 @@ from urllib.parse import quote
 import trimesh
 
 from schemas.errors import MachineError, OutputError, plural
-from schemas.job.job import Job
 from services.job.record import JobRecord, read_success, require_job
+from services.look.charts import Histogram
 from services.look.clouds import Space, pack_spaces, read_spaces
 from services.look.collect import Figures, collect, open_tables
-from services.look.pictures import Sample, choose_scenes, show_scenes
+from services.look.pictures import ShownScene, choose_scenes, show_scenes
 from services.look.sections import (
-    Side,
-    beside_html,
     captures_html,
     charts_html,
     effects_html,
@@ -130,8 +128,8 @@ class View:
 
     def state(self) -> dict[str, object]:
         """What the page asks for every few seconds."""
-        shown = {"name": self.name, "title": self.title, "live": self.live}
-        return {**shown, "version": self.version, "shape": self.shape}
+        names = ("name", "title", "live", "version", "shape")
+        return {name: getattr(self, name) for name in names}
 
     def fragments(self) -> dict[str, object]:
         """The sections by id."""
@@ -147,10 +145,6 @@ def live_page(view: View) -> str:
     return fill_page(page, policy="", style=style, icon="/icon.svg", scripts=scripts, data=data)
 
 
-SCENES = 24
-"""Scenes whose pictures are shown, unless told otherwise."""
-
-
 @dataclass(frozen=True)
 class Report:
     """What a page is made of."""
@@ -159,7 +153,9 @@ class Report:
     digest: str | None
     """Of the finished dataset."""
     figures: Figures
-    sample: Sample
+    scenes: list[ShownScene]
+    depth: Mapping[str, Histogram]
+    """Of the object pixels in these scenes, by role, metres."""
     spaces: tuple[Space, ...]
 
 
@@ -170,56 +166,41 @@ def read_report(store: Store, scenes: int) -> Report:
     """
     record = require_job(store)
     tables = open_tables(store)
-    figures = collect(tables)
-    sample = show_scenes(store, choose_scenes(tables, figures.by_category, scenes))
-    spaces = read_spaces(store, [one.scene_id for one in sample.scenes])
-    return Report(record, (read_success(store) or {}).get("digest"), figures, sample, spaces)
+    shown, depth = show_scenes(store, choose_scenes(tables, scenes))
+    spaces = read_spaces(store, [scene.scene_id for scene in shown])
+    return Report(record, (read_success(store) or {}).get("digest"), collect(tables), shown, depth, spaces)
 
 
-def page_of(report: Report, address: Address, other: Report | None = None) -> Page:
-    """The page of a report, with its pictures at these addresses; beside another dataset's, where there is one."""
-    figures, sample, job = report.figures, report.sample, report.record.job
-    failed = sum(one.scenes for one in figures.failures)
+def page_of(report: Report, address: Address) -> Page:
+    """The page of a report, with its pictures at these addresses."""
+    figures, scenes, job = report.figures, report.scenes, report.record.job
+    failed = sum(failure.scenes for failure in figures.failures)
     sections = (
         Section("overview", "Overview", overview_html(figures, job, failed)),
-        Section("pictures", "Pictures", sheets_html(sample.scenes, address)),
-        Section("compare", "Compare", compare_html(sample.scenes)),
+        Section("pictures", "Pictures", sheets_html(scenes, address)),
+        Section("compare", "Compare", compare_html(scenes)),
         Section("space", "In space", space_html(report.spaces, pack_spaces(report.spaces))),
-        Section("figures", "Figures", charts_html(figures, sample.depth)),
+        Section("figures", "Figures", charts_html(figures, report.depth)),
         Section("effects", "Effects", effects_html(figures)),
         Section("failures", "Failures", failures_html(figures.failures, figures.scenes + failed)),
         Section("captures", "Captures", captures_html(figures)),
-        Section("beside", "Side by side", beside_html(_side(report), _side(other), address) if other else ""),
     )
-    return Page(job.name, _subtitle(job, report.digest), sections, _footer(report))
+    what = "captures" if job.captures is not None else "scenes"
+    state = f"finished, digest {report.digest[:12]}" if report.digest else "not finished"
+    footer = (
+        f"Pictures are of {plural(len(scenes), 'scene')}, chosen evenly from each category. "
+        f"Job {report.record.digest[:12]}. Made by verso report; this page fetches nothing."
+    )
+    return Page(job.name, f"{job.scenes:,} {what} asked, seed {job.seed}, {state}", sections, footer)
 
 
-def write_report(store: Store, scenes: int, target: Path, beside: Store | None = None) -> tuple[int, Report]:
+def write_report(store: Store, scenes: int, target: Path) -> tuple[int, Report]:
     """(bytes written, what the page was made of). Raises OutputError where the file cannot be written."""
     report = read_report(store, scenes)
-    other = None if beside is None else read_report(beside, scenes)
-    data = whole_page(page_of(report, lambda picture: picture.inline, other)).encode()
+    data = whole_page(page_of(report, lambda picture: picture.inline)).encode()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(data)
     except OSError as error:
         raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --out") from error
     return len(data), report
-
-
-def _side(report: Report) -> Side:
-    return report.record.job.name, report.figures, report.sample
-
-
-def _subtitle(job: Job, digest: str | None) -> str:
-    what = "captures" if job.captures is not None else "scenes"
-    state = f"finished, digest {digest[:12]}" if digest else "not finished"
-    return f"{job.scenes:,} {what} asked, seed {job.seed}, {state}"
-
-
-def _footer(report: Report) -> str:
-    shown = len(report.sample.scenes)
-    return (
-        f"Pictures are of {plural(shown, 'scene')}, chosen evenly from each category. Job {report.record.digest[:12]}. "
-        "Made by verso report; this page fetches nothing."
-    )

@@ -1,6 +1,6 @@
 """The sections of the page. Pure: figures and pictures to HTML."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
 
@@ -9,89 +9,27 @@ from schemas.job.job import Job
 from services.look.charts import Chart, Histogram, amount, chart_html, length_of_decade
 from services.look.clouds import Space
 from services.look.collect import Cost, Failure, Figures
-from services.look.pictures import Sample, ShownScene
-from services.look.sheets import Address, strip_html
-
-Side = tuple[str, Figures, Sample]
-"""Name, figures and shown scenes of one dataset."""
-
-
-def beside_html(ours: Side, theirs: Side, address: Address) -> str:
-    """A table of both datasets' figures, and a scene of each category that both have."""
-    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in ("", ours[0], theirs[0]))
-    rows = "".join(
-        f'<tr><th scope="row">{name}</th><td>{told(ours)}</td><td>{told(theirs)}</td></tr>'
-        for name, told in _ROWS.items()
-    )
-    caption = "<caption>Medians, where nothing else is said</caption>"
-    table = f"<table>{caption}<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
-    first, second = ({scene.category for scene in side[2].scenes} for side in (ours, theirs))
-    pairs = "".join(_pair(category, (ours, theirs), address) for category in sorted(first & second))
-    only = "".join(
-        f'<p class="note">Only in {escape(side[0])}: {escape(", ".join(sorted(own)))}.</p>'
-        for side, own in ((ours, first - second), (theirs, second - first))
-        if own
-    )
-    return f'{table}<div class="pairs">{pairs}</div>{only}'
-
-
-def _pair(category: str, sides: Sequence[Side], address: Address) -> str:
-    cells = [
-        f'<div class="latest"><p class="note">{escape(name)}</p>{strip_html(_first(sample.scenes, category), address)}</div>'
-        for name, _, sample in sides
-    ]
-    return f'<div class="pair">{"".join(cells)}</div>'
-
-
-def _first(scenes: Sequence[ShownScene], category: str) -> ShownScene:
-    return next(scene for scene in scenes if scene.category == category)
-
-
-def _median(histograms: Mapping[str, Histogram], role: str, unit: str, times: float = 1.0) -> str:
-    one = histograms.get(role)
-    return amount(times * one.percentile(0.5), unit) if one is not None and one.count else "–"
-
-
-_ROWS: dict[str, Callable[[Side], str]] = {
-    "scenes": lambda side: f"{side[1].scenes:,}",
-    "pairs of views": lambda side: f"{side[1].pairs:,}",
-    "time of a scene, mean": lambda side: milliseconds(1e3 * side[1].seconds / max(side[1].scenes, 1)),
-    "depth of the objects, input": lambda side: _median(side[2].depth, "input", "m"),
-    "depth of the objects, mirror": lambda side: _median(side[2].depth, "mirror", "m"),
-    "visibility, input": lambda side: _median(side[1].visibility, "input", "%", 100.0),
-    "visibility, mirror": lambda side: _median(side[1].visibility, "mirror", "%", 100.0),
-    "inclination, input": lambda side: _median(side[1].inclination, "input", "°"),
-}
-
-
-SAMPLES = {"surface": "surface samples", "inside": "volume inside", "outside": "volume outside"}
-"""Clouds of the shapes' samples, by role."""
+from services.look.pictures import SHOWN_ROLES
 
 
 def space_html(spaces: Sequence[Space], data: str) -> str:
     """The 3-D view with its controls; `data` is what its script reads. Empty where there is nothing to show."""
     if not spaces:
         return ""
-    clouds = {cloud.role: cloud for space in spaces for cloud in space.clouds}
-    views = [role for role, cloud in clouds.items() if cloud.T_world_cam is not None]
-    switches = [(f"{role} cloud", role, True) for role in views]
-    switches += [("mesh", "mesh", True)] if any(space.bodies for space in spaces) else []
-    switches += [("cameras", "cameras", True)]
-    # They hide what the page shows first.
-    switches += [(name, role, False) for role, name in SAMPLES.items() if role in clouds]
+    roles = {cloud.role for space in spaces for cloud in space.clouds}
+    switches = [(f"{role} cloud", role) for role in SHOWN_ROLES if role in roles]
+    switches += [("mesh", "mesh")] if any(space.bodies for space in spaces) else []
+    switches += [("cameras", "cameras")]
     boxes = "".join(
-        f'<label><input type="checkbox" data-part="{part}"{" checked" if on else ""}> {escape(name)}</label>'
-        for name, part, on in switches
+        f'<label><input type="checkbox" data-part="{part}" checked> {name}</label>' for name, part in switches
     )
     boxes += '<label><input type="checkbox" data-part="tint"> colour by camera</label>'
     options = "".join(
-        f'<option value="{at}" data-missing="{escape(one.missing)}">'
-        f"{escape(one.category)}, scene {one.scene_id}</option>"
-        for at, one in enumerate(spaces)
+        f'<option value="{at}" data-missing="{escape(space.missing)}">'
+        f"{escape(space.category)}, scene {space.scene_id}</option>"
+        for at, space in enumerate(spaces)
     )
     about = "The stored depth of both cameras as points, with the mesh as it was posed."
-    if clouds.keys() & SAMPLES.keys():
-        about += " Of an object, the input cloud is the partial cloud and surface samples are the complete one."
     keys = "Arrow keys turn, plus and minus zoom, 0 resets."
     return (
         f'<p class="sub">{about}<span id="space-missing">{escape(spaces[0].missing)}</span></p>'
@@ -124,7 +62,9 @@ def overview_html(figures: Figures, job: Job, failed: int) -> str:
         for name, count in figures.by_category.items()
     )
     table = f'<table class="bars"><caption>Scenes by category</caption><tbody>{rows}</tbody></table>' if rows else ""
-    return f'<dl class="tiles">{tiles_html}</dl>{table}{_sampled(figures)}'
+    sampled = "The dataset is not finished and large: the figures are of ranges chosen evenly from it."
+    note = f'<p class="note">{sampled}</p>' if figures.sampled else ""
+    return f'<dl class="tiles">{tiles_html}</dl>{table}{note}'
 
 
 def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
@@ -162,14 +102,15 @@ def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
 
 def effects_html(figures: Figures) -> str:
     """What ran, how often and for how long; what was left out and why; the time of each stage."""
-    ran = {name: cost for name, cost in figures.effects.items() if cost.runs}
-    plain = [name for name, cost in ran.items() if not cost.timed and not cost.skips]
     never = {name: cost for name, cost in figures.effects.items() if not cost.runs}
-    head = ("effect", "scenes", "time", "each")
     rows = [
-        (f"<code>{escape(name)}</code>{_why(cost)}", _share(cost.runs, figures.scenes), *_times(cost))
-        for name, cost in ran.items()
-        if name not in plain
+        (
+            f"<code>{escape(name)}</code>{_why(cost)}",
+            f"{cost.runs:,}<small>{cost.runs / max(figures.scenes, 1):.0%}</small>",
+            *_times(cost),
+        )
+        for name, cost in figures.effects.items()
+        if cost.runs
     ]
     stages = [
         (f"<code>{escape(name)}</code>", f"{cost.seconds / max(figures.seconds, 1e-9):.1%}", *_times(cost))
@@ -183,10 +124,10 @@ def effects_html(figures: Figures) -> str:
         f'<details><summary>{plural(len(never), "effect")} that ran in no scene, and why</summary><dl class="why">{never_rows}'
         "</dl></details>"
     )
-    return (
-        f"{_table(head, rows, 'Effects that ran') if rows else ''}{_plain(plain)}"
-        f"{left_out if never else ''}{_table(('stage', 'share', 'time', 'each'), stages, 'Time by stage')}"
-    )
+    ran = table_html(("effect", "scenes", "time", "each"), rows, "Effects that ran") if rows else ""
+    note = '<p class="note">An effect without a time is counted with its stage.</p>'
+    by_stage = table_html(("stage", "share", "time", "each"), stages, "Time by stage")
+    return f"{ran}{note}{left_out if never else ''}{by_stage}"
 
 
 def failures_html(failures: Iterable[Failure], scenes: int) -> str:
@@ -194,7 +135,7 @@ def failures_html(failures: Iterable[Failure], scenes: int) -> str:
     items = [
         f'<li><p><strong>{escape(one.reason.replace("_", " "))}</strong> <span class="count">{plural(one.scenes, "scene")}'
         f"</span></p><p>{escape(one.detail)}</p><p class=\"note\">Stage {escape(one.stage)}, {escape(one.kind)}; for example "
-        f"{escape(_listed(one.examples))}.</p></li>"
+        f"scene {', '.join(map(str, one.examples))}.</p></li>"
         for one in failures
     ]  # fmt: skip
     if not items:
@@ -223,17 +164,18 @@ def captures_html(figures: Figures) -> str:
         "Corner error: median over the views after estimation. Pose, cloud (median) and completeness are held against the"
         " truth, which photographs do not have. Measured: share of the mirror views that is measured and not filled."
     )
-    return f'{_table(head, rows, "Quality")}<p class="note">{note}</p>'
+    return f'{table_html(head, rows, "Quality")}<p class="note">{note}</p>'
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str) -> str:
+def table_html(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str = "") -> str:
     """A table of HTML cells; the first is the row's name."""
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
     body = "".join(
         f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
         for first, *cells in rows
     )
-    return f"<table><caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f"<table>{title}<thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _bar(share: float) -> str:
@@ -248,7 +190,7 @@ def _why(cost: Cost) -> str:
     if not cost.skips:
         return ""
     (why, times), *others = cost.skips.most_common()
-    more = f", {len(others)} more {'reason' if len(others) == 1 else 'reasons'}" if others else ""
+    more = f", {plural(len(others), 'more reason')}" if others else ""
     return f"<small>left out {times:,} ×: {escape(why)}{more}</small>"
 
 
@@ -259,27 +201,5 @@ def _times(cost: Cost) -> tuple[str, str]:
     return describe_seconds(cost.seconds), milliseconds(1e3 * cost.seconds / cost.timed)
 
 
-def _plain(names: Iterable[str]) -> str:
-    """Effects of which there is no more to tell than that they ran."""
-    listed = ", ".join(f"<code>{escape(name)}</code>" for name in names)
-    every = f" Ran in every scene, and counted with its stage: {listed}." if listed else ""
-    return f'<p class="note">An effect without a time is counted with its stage.{every}</p>'
-
-
-def _share(part: int, whole: int) -> str:
-    return f"{part:,}<small>{part / max(whole, 1):.0%}</small>"
-
-
 def _figure(value: float | None, unit: str, times: float = 1.0) -> str:
     return "–" if value is None else f"{number(value * times)} {unit}"
-
-
-def _listed(scenes: Iterable[int]) -> str:
-    numbers = [str(scene) for scene in scenes]
-    return f"scene{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}"
-
-
-def _sampled(figures: Figures) -> str:
-    if not figures.sampled:
-        return ""
-    return '<p class="note">The dataset is not finished and large: the figures are of ranges chosen evenly from it.</p>'

@@ -97,11 +97,9 @@ def is_loopback(host: str) -> bool:
 
 def is_address(name: str) -> bool:
     """Whether it is an IP address and no name."""
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(name))
+    return False
 
 
 def _name_of(host: str) -> str:
@@ -115,10 +113,9 @@ def _name_of(host: str) -> str:
 
 
 def _cookies(header: str, name: str) -> list[str]:
-    try:
-        cookie: SimpleCookie = SimpleCookie(header)
-    except CookieError:
-        return []
+    cookie: SimpleCookie = SimpleCookie()
+    with contextlib.suppress(CookieError):
+        cookie.load(header)
     return [cookie[name].value] if name in cookie else []
 
 
@@ -139,7 +136,7 @@ STATIC = {
 }
 """Files of the page, by their whole path: nothing is looked up on the disk by what a request names."""
 
-TOLD = {
+REMEDIES = {
     401: "this page needs its token: open the address that `verso serve` printed",
     403: "this server is not known by that name: open the address that `verso serve` printed",
     404: "there is nothing here: the page is at /",
@@ -171,10 +168,8 @@ def choose_place(host: str, port: int, token: str | None) -> Place:
     if token == "auto" or (token is None and not is_loopback(host)):
         token = secrets.token_urlsafe(24)
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
-        told = (
-            f"--token has {len(token)} characters: give at least {LEAST_TOKEN} plain ones, or `auto` for a random one"
-        )
-        raise InputError(told)
+        remedy = f"give at least {LEAST_TOKEN} plain ones, or `auto` for a random one"
+        raise InputError(f"--token has {len(token)} characters: {remedy}")
     return Place(host, port, token)
 
 
@@ -187,9 +182,9 @@ def serving(follower: Follower, place: Place) -> Iterator[Place]:
     try:
         server = _Server(follower, place)
     except (OSError, OverflowError, UnicodeError) as error:
-        told = getattr(error, "strerror", None) or str(error)
+        reason = getattr(error, "strerror", None) or str(error)
         remedy = "choose another --port, or a --host of this machine"
-        raise InputError(f"{place.host} port {place.port} cannot be opened: {told}; {remedy}") from error
+        raise InputError(f"{place.host} port {place.port} cannot be opened: {reason}; {remedy}") from error
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, name="http", daemon=True)
     thread.start()
     try:
@@ -204,12 +199,12 @@ def serving(follower: Follower, place: Place) -> Iterator[Place]:
 def ended_by_signal() -> Iterator[threading.Event]:
     """An event that Ctrl-C and SIGTERM set while the block runs, in place of what they would do. For the main thread."""
     ended = threading.Event()
-    before = {one: signal.signal(one, lambda *_: ended.set()) for one in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield ended
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class _Server(ThreadingHTTPServer):
@@ -291,16 +286,16 @@ class _Handler(BaseHTTPRequestHandler):
             headers = {name.lower(): value for name, value in self.headers.items()}
             verdict = judge(self.server.gate, self.command, self.path, headers)
         except ValueError:  # an address that is none
-            return self._send(404, "text/plain", TOLD[404].encode())
+            return self._send(404, "text/plain", REMEDIES[404].encode())
         if verdict.status == 303:
             cookie = f"{self.server.gate.cookie}={self.server.gate.token}; Path=/; HttpOnly; SameSite=Lax"
             return self._send(303, "text/plain", b"", {"Location": "/", "Set-Cookie": cookie})
-        found = self._find(verdict.path) if verdict.status == 200 else None
-        if found is None:
+        page = self._find(verdict.path) if verdict.status == 200 else None
+        if page is None:
             status = 404 if verdict.status == 200 else verdict.status
             more = {"Allow": "GET, HEAD"} if status == 405 else {}
-            return self._send(status, "text/plain", f"{status}: {TOLD[status]}\n".encode(), more)
-        kind, data = found
+            return self._send(status, "text/plain", f"{status}: {REMEDIES[status]}\n".encode(), more)
+        kind, data = page
         kept = "private, max-age=86400, immutable" if verdict.path.startswith("/picture/") else "no-store"
         return self._send(200, kind, data, {"Cache-Control": kept})
 

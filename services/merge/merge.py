@@ -1,22 +1,17 @@
 """Merging of committed ranges into the finished dataset: strict, in constant memory, repeatable after a kill.
 
 Two coordinators may merge at once: the lock is advice, and one that was paused wakes up late. Each merge ends in one
-consistent dataset or in a refusal, because
+consistent dataset or in a refusal, because commits are only ever added, two merges of the same commits write the same, and
+whoever lost the lock, or finds other commits than it began with, stops: asked before the merge, before it replaces the first
+file and before it writes `_SUCCESS`. Should it be paused between question and step, the step itself fails.
 
-- commits are only ever added: a merge is a function of its commits, and two merges of the same commits write the same;
-- whoever lost the lock, or finds other commits than it began with, stops: asked before the merge, before it replaces the
-  first file and before it writes `_SUCCESS`;
-- should it be paused between question and step, the step itself fails. On a disk every file, `_SUCCESS` too, gets its
-  name by a rename out of the merge's own folder, and loses it by one into that folder; the next merge takes this folder
-  away in one step before it reads a commit. In an object store every put is conditional on what was listed before the
-  question: what a later merge replaced is not replaced again. (A file that a later merge left as it was has the same
-  rows in every merge between, because the rows that come before a row only become more.) A file that the later merge
-does not have can still be put; the merge that put it is then refused at its next step, and empties it again.
-
-What is left in an object store: a merge that is paused just before a put, while another takes the lock, commits and
-merges, and that is then killed right after this put. It may leave a file too many, or, where the other is killed too, its
-`_SUCCESS` over files of the other. Sizes and names in `_SUCCESS` do not agree then, so the next run merges again. Files
-above `objects.CONDITIONAL_BYTES` are asked for and then put, not in one step.
+- On a disk every file gets its name by a rename out of the merge's own folder, and loses it by one into that folder, which
+  the next merge takes away in one step before it reads a commit.
+- In an object store every put is conditional on what was listed before the question. A file that the later merge does not
+  have can still be put; the merge that put it is then refused at its next step, and empties it again. Where it is killed
+  right after this put, a file too many may stay, or, where the other is killed too, its `_SUCCESS` over files of the other:
+  sizes and names in `_SUCCESS` do not agree then, so the next run merges again. Files above `objects.CONDITIONAL_BYTES` are
+  asked for and then put, not in one step.
 """
 
 import contextlib
@@ -24,29 +19,39 @@ import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.dataset.layout import CAM_POSES, CAMERAS, MANIFEST, OBJECTS, SUCCESS_FILE, is_shape
+from schemas.dataset.layout import (
+    CAM_POSES,
+    CAMERAS,
+    MANIFEST,
+    OBJECTS,
+    SUCCESS_FILE,
+    is_shape,
+)
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.errors import RunError, VersoError
 from services.job.record import read_success
-from services.merge.reading import Block, PublishedFiles, read_blocks
-from services.merge.shared import SharedRows, merge_folder
+from services.merge.reading import RangeRows, SharedRows, check_published, merge_folder, read_ranges, stored_sizes
 from services.merge.tables import MergedTable, PoseFiles
 from workers.store.attempt import sweep
 from workers.store.canonical import dataset_digest
 from workers.store.commit import commits_digest
 from workers.store.file_system import sha256_of
-from workers.store.manifest import PARQUET_OPTIONS
+from workers.store.manifest import PARQUET_OPTIONS, join_rows
 from workers.store.store import Entry, Store, map_ahead, stat_all
+
+RANGES_PER_BLOCK = 128
+ROWS_PER_BLOCK = 4_096
+"""A block ends with either of them, rows of all tables counted: small enough for memory, large enough to be fast."""
 
 
 class Merging:
-    """Takes every range in turn; keeps files below `folder`, which must be empty."""
+    """Takes every range in turn, and joins their rows in blocks; keeps files below `folder`, which must be empty."""
 
     def __init__(self, folder: Path) -> None:
         self._tables = {table: MergedTable(table, folder) for table in TABLES}
@@ -54,12 +59,22 @@ class Merging:
         self._shared = SharedRows(folder)
         self._fingerprints: set[str] = set()
         self._scenes = Counter({"made": 0, "intrinsic": 0, "environmental": 0})
+        self._block: list[Mapping[str, pa.Table]] = []
 
-    def add(self, block: Block) -> None:
-        """Takes the next ranges. Raises CorruptError where rows do not join."""
-        self._fingerprints.update(record.terms.fingerprint for record in chain.from_iterable(block.ranges))
-        self._shared.add_files((entry.path, entry.sha256) for _, entry in block.files if is_shape(entry.path))
-        rows = block.rows
+    def add(self, read: RangeRows) -> None:
+        """Takes the next range. Raises CorruptError where rows do not join."""
+        self._fingerprints.update(record.terms.fingerprint for record in read.records)
+        self._shared.add_files((entry.path, entry.sha256) for entry in read.files if is_shape(entry.path))
+        self._block.append(read.rows)
+        rows = sum(len(table) for tables in self._block for table in tables.values())
+        if len(self._block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:
+            self._end_block()
+
+    def _end_block(self) -> None:
+        block, self._block = self._block, []
+        if not block:
+            return
+        rows = {table: join_rows(table, [tables[table] for tables in block]).combine_chunks() for table in TABLES}
         self._shared.add_assets(rows["assets"])
         self._shared.add_images(rows["views"])
         self._poses.add(rows["views"], rows["objects"])
@@ -74,6 +89,7 @@ class Merging:
 
     def finish(self) -> tuple[dict, dict[str, Path]]:
         """The contents of `_SUCCESS`, and the finished files by key."""
+        self._end_block()
         mixed = len(self._fingerprints) > 1
         for rows in self._shared.assets(mixed):
             self._tables["assets"].add(rows)
@@ -110,95 +126,83 @@ def file_entry(path: Path) -> dict[str, object]:
         return {"bytes": path.stat().st_size, "sha256": sha256_of(file)}
 
 
-class Installation:
-    """Replaces an older merge by this one, file by file and `_SUCCESS` last; a context that undoes what it can on an error.
+def install(
+    store: Store, folder: Path, files: Mapping[str, Path], success: dict, require_unchanged: Callable[[], None]
+) -> None:
+    """Replaces an older merge by this one, file by file; `_SUCCESS` goes first and comes last, unless scenes are to be retried.
 
     `require_unchanged` raises RunError where another process works here. It is asked after what is there was listed, and
-    before anything is replaced.
+    before anything is replaced. Raises RunError too where another merge replaced a file meanwhile.
     """
-
-    def __init__(self, store: Store, folder: Path, require_unchanged: Callable[[], None]) -> None:
-        self._store = store
-        self._folder = folder
-        self._require_unchanged = require_unchanged
-        self._new: dict[str, Entry] = {}
-        """Objects that were put where there was nothing."""
-
-    def __enter__(self) -> "Installation":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Where a merge is refused, rows of its new files must not stay beside a newer merge that does not have them."""
-        if kind is None or not issubclass(kind, VersoError):
-            return
-        for key, mine in self._new.items():
+    new: dict[str, Entry] = {}
+    try:
+        success["files"] |= put_files(store, folder, files, new, require_unchanged)
+        local = folder / SUCCESS_FILE
+        local.write_bytes(encode_success(success))
+        before = store.stat(SUCCESS_FILE)
+        require_unchanged()
+        if not success["scenes"]["environmental"]:
+            store.replace(local, SUCCESS_FILE, before)
+    except VersoError:
+        # Rows of this merge's new files must not stay beside a newer merge that does not have them.
+        for key, mine in new.items():
             with contextlib.suppress(VersoError):
                 if key.endswith(".parquet"):
-                    self._store.replace(_empty_table(self._folder, key), key, mine)
-
-    def put_files(self, files: Mapping[str, Path]) -> dict[str, dict[str, object]]:
-        """Takes `_SUCCESS` away, then puts the files into their places; older ones that have no successor go.
-
-        An object store cannot delete on a condition. There an empty table takes the place of such a file; the entries of
-        these come back. Raises RunError where another merge replaced a file meanwhile.
-        """
-        store = self._store
-        before = stat_all(store, _FOLDERS, [*_SINGLE, SUCCESS_FILE])
-        self._require_unchanged()
-        if before.pop(SUCCESS_FILE, None) is not None:
-            if not store.withdraw(SUCCESS_FILE, self._folder):
-                store.remove(SUCCESS_FILE)
-            store.sync([SUCCESS_FILE])
-        stale = sorted(before.keys() - files.keys())
-        emptied = {}
-        for key in stale:
-            if not store.withdraw(key, self._folder):
-                emptied[key] = _empty_table(self._folder, key)
-        placed = {**emptied, **files}.items()
-        for _ in map_ahead(store, lambda item: self._put(*item, before.get(item[0])), placed, at_once=AT_ONCE):
-            pass
-        store.sync([*files, *stale])
-        return {key: file_entry(path) for key, path in emptied.items()}
-
-    def put_success(self, data: bytes) -> None:
-        """Writes `_SUCCESS`. Raises RunError where another merge wrote it, or took this merge's folder away."""
-        local = self._folder / SUCCESS_FILE
-        local.write_bytes(data)
-        before = self._store.stat(SUCCESS_FILE)
-        self._require_unchanged()
-        self._store.replace(local, SUCCESS_FILE, before)
-
-    def _put(self, key: str, local: Path, before: Entry | None) -> None:
-        now = self._store.replace(local, key, before)
-        if now is not None and before is None:
-            self._new[key] = now
+                    store.replace(_empty_table(folder, key), key, mine)
+        raise
 
 
-def sizes_agree(store: Store, files: Mapping[str, Mapping[str, object]]) -> bool:
-    """Whether these files are there with their sizes, and no others where merged files are."""
-    found = stat_all(store, _FOLDERS, _SINGLE)
-    return {key: entry.bytes for key, entry in found.items()} == {key: file["bytes"] for key, file in files.items()}
+def put_files(
+    store: Store, folder: Path, files: Mapping[str, Path], new: dict[str, Entry], require_unchanged: Callable[[], None]
+) -> dict[str, dict[str, object]]:
+    """Takes `_SUCCESS` away, then puts the files into their places; older ones that have no successor go.
+
+    An object store cannot delete on a condition. There an empty table takes the place of such a file; the entries of
+    these come back. `new` gets the objects that are put where there was nothing.
+    """
+    before = stat_all(store, _FOLDERS, [*_SINGLE, SUCCESS_FILE])
+    require_unchanged()
+    if before.pop(SUCCESS_FILE, None) is not None:
+        if not store.withdraw(SUCCESS_FILE, folder):
+            store.remove(SUCCESS_FILE)
+        store.sync([SUCCESS_FILE])
+    stale = sorted(before.keys() - files.keys())
+    emptied = {key: _empty_table(folder, key) for key in stale if not store.withdraw(key, folder)}
+    placed = {**emptied, **files}
+
+    def put(key: str) -> None:
+        entry = store.replace(placed[key], key, before.get(key))
+        if entry is not None and key not in before:
+            new[key] = entry
+
+    for _ in map_ahead(store, put, placed, at_once=AT_ONCE):
+        pass
+    store.sync([*files, *stale])
+    return {key: file_entry(path) for key, path in emptied.items()}
 
 
 def _empty_table(folder: Path, key: str) -> Path:
     """A file with the schema of the table that `key` belongs to."""
     table = key.split("/")[1]
-    schema = SCHEMAS[table]
     path = folder / f"empty-{table}.parquet"
-    pq.write_table(schema.remove(schema.get_field_index("category")).empty_table(), path, **PARQUET_OPTIONS)
+    pq.write_table(SCHEMAS[table].empty_table().drop_columns("category"), path, **PARQUET_OPTIONS)
     return path
 
 
 @dataclass(frozen=True)
 class MergeResult:
-    """The contents of the merged dataset; `complete` says whether `_SUCCESS` was written."""
+    """The contents of the merged dataset."""
 
     digest: str
-    complete: bool
     scenes: dict[str, int]
     """How many were made, and how many failed by kind."""
     rows: dict[str, int]
     """By table."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether `_SUCCESS` was written."""
+        return not self.scenes["environmental"]
 
 
 def merge(
@@ -214,33 +218,34 @@ def merge(
     another process works here, CorruptError naming a file that does not match its commit, CommitConflict where ranges
     made one shape differently, MachineError where a disk is full.
     """
-    commits = commits_digest(store)
-    asked = {"first_scene": first_scene, "stop_scene": stop_scene, "commits": commits}
-    if (done := _merged_already(store, asked)) is not None:
-        with merge_folder(store):
-            pass  # what a killed merge left goes
-        return _result(done)
+    asked = {"first_scene": first_scene, "stop_scene": stop_scene, "commits": commits_digest(store)}
+    done = _merged_already(store, asked)
+    if done is None:
+        require_lock()
+        sweep(store)
+    with merge_folder(store) as folder:  # what a killed merge left goes
+        success = done or _merge_anew(store, folder, asked, require_lock)
+    return MergeResult(success["digest"], success["scenes"], success["rows"])
+
+
+def _merge_anew(
+    store: Store, folder: Path, asked: Mapping[str, Any], require_lock: Callable[[], None]
+) -> dict[str, Any]:
+    """Merges what is `asked`; the contents of `_SUCCESS`."""
 
     def require_unchanged() -> None:
         require_lock()
-        if commits_digest(store) != commits:
+        if commits_digest(store) != asked["commits"]:
             raise RunError("ranges were committed while they were merged: another coordinator works here; start again")
 
-    require_lock()
-    sweep(store)
-    with merge_folder(store) as folder:
-        with contextlib.closing(Merging(folder)) as merging, contextlib.closing(PublishedFiles(store, folder)) as files:
-            for block in read_blocks(store, first_scene, stop_scene):
-                files.check(block)
-                merging.add(block)
-            success, merged = merging.finish()
-        with Installation(store, folder, require_unchanged) as installation:
-            success["files"] |= installation.put_files(merged)
-            if success["scenes"]["environmental"]:
-                require_unchanged()
-            else:
-                installation.put_success(encode_success(success | asked))
-    return _result(success)
+    with contextlib.closing(Merging(folder)) as merging, stored_sizes(store, folder) as size_of:
+        for read in read_ranges(store, asked["first_scene"], asked["stop_scene"]):
+            check_published(read, size_of)
+            merging.add(read)
+        success, files = merging.finish()
+    success |= asked
+    install(store, folder, files, success, require_unchanged)
+    return success
 
 
 def encode_success(success: Mapping[str, object]) -> bytes:
@@ -249,13 +254,9 @@ def encode_success(success: Mapping[str, object]) -> bytes:
 
 
 def _merged_already(store: Store, asked: Mapping[str, object]) -> dict | None:
-    """The contents of `_SUCCESS` where it is of these very commits and all its files are there."""
+    """The contents of `_SUCCESS` where it is of these very commits, and its files are there with their sizes, and no others."""
     done = read_success(store)
-    if done is None or any(done.get(key) != value for key, value in asked.items()):
+    if done is None or not asked.items() <= done.items():
         return None
-    return done if sizes_agree(store, done["files"]) else None
-
-
-def _result(success: Mapping[str, Any]) -> MergeResult:
-    complete = not success["scenes"]["environmental"]
-    return MergeResult(success["digest"], complete, success["scenes"], success["rows"])
+    sizes = {key: entry.bytes for key, entry in stat_all(store, _FOLDERS, _SINGLE).items()}
+    return done if sizes == {key: file["bytes"] for key, file in done["files"].items()} else None

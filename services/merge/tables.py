@@ -1,4 +1,4 @@
-"""The merged files: manifest tables by category, and the article's camPoses.csv, cameras.csv and objects.dat.
+"""The merged files: manifest tables by category, the article's camPoses.csv, cameras.csv and objects.dat, and DATASET.md.
 
 Tables are written in files of about 100,000 rows, the text files in blocks of lines (dataset.md section 1).
 """
@@ -6,58 +6,80 @@ Tables are written in files of about 100,000 rows, the text files in blocks of l
 import io
 import re
 from collections.abc import Sequence
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import IO
+from typing import TYPE_CHECKING
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from schemas.dataset.layout import CAM_POSES, CAMERAS, OBJECTS, merged_table_path
-from schemas.dataset.tables import SCHEMAS, SORT_KEYS
+from schemas.dataset.layout import (
+    ARTICLE,
+    CAM_POSES,
+    CAMERAS,
+    FINGERPRINT_FILE,
+    JOB_FILE,
+    OBJECTS,
+    README_FILE,
+    merged_table_path,
+    stored_roles,
+)
+from schemas.dataset.shard import Fingerprint
+from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError
+from schemas.job.assets import ProceduralSource
+from schemas.job.captures import Captures
+from schemas.job.job import Job
 from schemas.scene.view import ROLES
-from workers.store.canonical import TableDigest, text_bytes
-from workers.store.manifest import PARQUET_OPTIONS
+from services.job.record import JobRecord
+from workers.store.canonical import TableDigest
+from workers.store.commit import is_sealed, seal
+from workers.store.manifest import PARQUET_OPTIONS, row_keys
+from workers.store.store import Store
+
+if TYPE_CHECKING:
+    from services.merge.merge import MergeResult
+    from workers.assets.catalogue import Catalogue
 
 ROWS_PER_FILE = 100_000
 ROWS_PER_GROUP = 8_192
 """Rows of a Parquet row group; also how many rows of a table wait before they are split by category."""
-WAITING_BYTES = 24 << 20
-"""Memory for the rows of one table that wait, before they are split and behind that in all categories together."""
+WAITING_BYTES = 12 << 20
+"""Memory for the rows of one table that wait to be split, and as much behind that in all categories together."""
 
 
 class MergedTable:
     """Writes one table below `folder` as hive partitions, and digests its rows."""
 
     def __init__(self, table: str, folder: Path) -> None:
-        self.table = table
         self.digest = TableDigest(table)
+        self._table = table
         self._folder = folder
         self._parts: dict[str, _Parts] = {}
-        self._unsplit: list[pa.Table] = []
-        self._unsplit_bytes = 0
-        self._last_row: pa.Table | None = None
+        self._waiting: list[pa.Table] = []
+        self._last_key: list[tuple] = []
 
     def add(self, rows: pa.Table) -> None:
         """Takes the next rows, best some thousands, sorted by key. Raises CorruptError where a key does not rise."""
-        if not rows.num_rows:
-            return
-        rows = rows.combine_chunks()
-        self._check_order(rows)
+        keys = row_keys(self._table, rows)
+        for before, after in pairwise([*self._last_key, *keys]):
+            if before >= after:
+                raise CorruptError(
+                    f"{self._table}: the key {after} comes after {before}: the ranges do not join; "
+                    "`verso verify` lists what is damaged"
+                )
+        self._last_key = keys[-1:] or self._last_key
         self.digest.update(rows)
-        self._unsplit.append(rows)
-        self._unsplit_bytes += rows.nbytes
-        if self._unsplit_bytes >= WAITING_BYTES // 2 or sum(map(len, self._unsplit)) >= ROWS_PER_GROUP:
+        self._waiting += [rows] if keys else []
+        if _bytes_of(self._waiting) >= WAITING_BYTES or sum(map(len, self._waiting)) >= ROWS_PER_GROUP:
             self._split()
 
     def finish(self, categories: list[str]) -> dict[str, Path]:
         """The finished files by key. An empty table gets one empty file under the first of `categories`."""
         self._split()
-        if not self._parts:
-            self._parts_of(categories[0]).write(SCHEMAS[self.table].empty_table())
-        return {key: path for parts in self._parts.values() for key, path in parts.finish().items()}
+        parts = self._parts or {categories[0]: _Parts(self._table, categories[0], self._folder)}
+        return {key: path for part in parts.values() for key, path in part.finish().items()}
 
     @property
     def categories(self) -> set[str]:
@@ -67,115 +89,81 @@ class MergedTable:
 
     def _split(self) -> None:
         """Gives the rows to their categories; where those hold too much then, the largest write theirs."""
-        if not self._unsplit:
-            return
-        rows = pa.concat_tables(self._unsplit)
-        self._unsplit, self._unsplit_bytes = [], 0
+        rows = pa.concat_tables([SCHEMAS[self._table].empty_table(), *self._waiting])
+        self._waiting = []
         column = rows.column("category")
         for category in sorted(column.unique().to_pylist()):
-            self._parts_of(category).write(rows.filter(pc.equal(column, category)))
-        while sum(parts.waiting_bytes for parts in self._parts.values()) > WAITING_BYTES // 2:
-            max(self._parts.values(), key=lambda parts: parts.waiting_bytes).flush()
+            parts = self._parts.setdefault(category, _Parts(self._table, category, self._folder))
+            parts.waiting.append(rows.filter(pc.equal(column, category)).drop_columns("category"))
+            if sum(map(len, parts.waiting)) >= ROWS_PER_GROUP:
+                parts.flush()
+        while sum(_bytes_of(parts.waiting) for parts in self._parts.values()) > WAITING_BYTES:
+            max(self._parts.values(), key=lambda parts: _bytes_of(parts.waiting)).flush()
 
-    def _parts_of(self, category: str) -> "_Parts":
-        if category not in self._parts:
-            self._parts[category] = _Parts(self.table, category, self._folder)
-        return self._parts[category]
 
-    def _check_order(self, rows: pa.Table) -> None:
-        """Compares each row with the one before it, column by column of the key."""
-        keys = rows.select(SORT_KEYS[self.table])
-        if self._last_row is not None:
-            keys = pa.concat_tables([self._last_row, keys]).combine_chunks()
-        rises = pa.array(np.zeros(len(keys) - 1, bool))
-        for column in reversed(keys.columns):
-            before, after = column.slice(0, len(keys) - 1), column.slice(1)
-            rises = pc.or_(pc.less(before, after), pc.and_(pc.equal(before, after), rises))
-        if (at := pc.index(rises, False).as_py()) >= 0:
-            before, after = (tuple(keys.slice(at + i, 1).to_pylist()[0].values()) for i in (0, 1))
-            raise CorruptError(
-                f"{self.table}: the key ({', '.join(keys.column_names)}) = {after} comes after {before}: "
-                "the ranges do not join; `verso verify` lists what is damaged"
-            )
-        self._last_row = keys.take([len(keys) - 1])
+def _bytes_of(tables: Sequence[pa.Table]) -> int:
+    return sum(rows.nbytes for rows in tables)
 
 
 class _Parts:
-    """The files of one category of one table."""
+    """The files of one category of one table. As there may be hundreds, a file is open only while it is written."""
 
     def __init__(self, table: str, category: str, folder: Path) -> None:
-        self._table = table
-        self._category = category
+        self._path_of = lambda number: merged_table_path(table, category, number)
         self._folder = folder
-        schema = SCHEMAS[table]
-        self._schema = schema.remove(schema.get_field_index("category"))
-        self._waiting: list[pa.Table] = []
-        self.waiting_bytes = 0
+        self._empty = SCHEMAS[table].empty_table().drop_columns("category")
+        self.waiting: list[pa.Table] = []
+        """Rows without their category that are not yet written."""
+        self._files: dict[str, Path] = {}
         self._writer: pq.ParquetWriter | None = None
         self._sink = _Sink()
-        self._file_rows = 0
-        self._files: dict[str, Path] = {}
-
-    def write(self, rows: pa.Table) -> None:
-        """Takes the next rows."""
-        self._waiting.append(rows.drop_columns("category"))
-        self.waiting_bytes += self._waiting[-1].nbytes
-        if sum(map(len, self._waiting)) >= ROWS_PER_GROUP:
-            self.flush()
+        self._room = 0
+        """Rows that the open file still takes."""
 
     def finish(self) -> dict[str, Path]:
         """Ends the last file; the files by key."""
-        if self._waiting or not self._files:
+        if self.waiting or not self._files:
             self.flush()
         self._end_file()
         return self._files
 
     def flush(self) -> None:
-        """Writes the rows that wait."""
-        assert self._schema is not None
-        rows = pa.concat_tables([self._schema.empty_table(), *self._waiting])
-        self._waiting, self.waiting_bytes = [], 0
+        """Writes the rows that wait, or an empty file where there has been none."""
+        rows = pa.concat_tables([self._empty, *self.waiting])
+        self.waiting = []
         while rows.num_rows or not self._files:
-            piece = rows.slice(0, ROWS_PER_FILE - self._file_rows)
-            self._open().write_table(piece, row_group_size=ROWS_PER_GROUP)
+            if self._writer is None:
+                key = self._path_of(len(self._files))
+                self._files[key] = self._folder / key
+                self._files[key].parent.mkdir(parents=True, exist_ok=True)
+                self._writer, self._room = pq.ParquetWriter(self._sink, rows.schema, **PARQUET_OPTIONS), ROWS_PER_FILE
+            piece = rows.slice(0, self._room)
+            self._writer.write_table(piece, row_group_size=ROWS_PER_GROUP)
             self._store()
-            self._file_rows += piece.num_rows
+            self._room -= piece.num_rows
             rows = rows.slice(piece.num_rows)
-            if self._file_rows >= ROWS_PER_FILE:
+            if not self._room:
                 self._end_file()
-
-    def _open(self) -> pq.ParquetWriter:
-        if self._writer is None:
-            key = merged_table_path(self._table, self._category, len(self._files))
-            self._files[key] = self._folder / key
-            self._files[key].parent.mkdir(parents=True, exist_ok=True)
-            self._sink = _Sink()
-            self._writer = pq.ParquetWriter(pa.PythonFile(self._sink, mode="w"), self._schema, **PARQUET_OPTIONS)
-        return self._writer
 
     def _end_file(self) -> None:
         if self._writer is not None:
             self._writer.close()
             self._store()
-            self._writer, self._file_rows = None, 0
+            self._writer = None
 
     def _store(self) -> None:
-        """Appends what the writer wrote to the file on the disk, which is open only meanwhile."""
+        """Moves what the writer wrote since the last call to the file on the disk."""
         with open(list(self._files.values())[-1], "ab") as file:
-            self._sink.drain(file)
+            file.write(self._sink.getvalue())
+        self._sink.seek(0)
+        self._sink.truncate()
 
 
 class _Sink(io.BytesIO):
-    """Where a Parquet writer writes to: memory, so that it never fails and hundreds of files need not be open at once."""
+    """Memory that a Parquet writer writes to."""
 
     def close(self) -> None:
-        """Does nothing: what the writer wrote last is still to be drained."""
-
-    def drain(self, file: IO[bytes]) -> None:
-        """Moves the bytes since the last call to a file."""
-        file.write(self.getvalue())
-        self.seek(0)
-        self.truncate()
+        """Does nothing: what the writer wrote last is still to be stored."""
 
 
 _ELEMENTS = [f"T{row}{column}" for row in range(4) for column in range(4)]
@@ -184,8 +172,6 @@ _CAMERA_COLUMNS = [
     *("cx_opencv", "cy_opencv", "depth_units_per_m"),
 ]
 _UNSAFE = re.compile(r"[%\s\x00-\x1f\x7f]")
-PLAIN_FROM, PLAIN_BELOW = 1e-4, 1e10
-"""Sizes of doubles that Arrow writes as Python's repr does, but for `.0`; others have an exponent in one of them."""
 
 
 class PoseFiles:
@@ -208,16 +194,14 @@ class PoseFiles:
 
 def cam_pose_lines(views: pa.Table) -> bytes:
     """`id,parent_id,T00,...,T33` for the input and mirror cameras among rows sorted by pose id."""
-    rows = views.select(["pose_id", "parent_id", "T_world_cam"]).filter(_is_pose(views)).combine_chunks()
-    return _lines([rows.column("pose_id"), rows.column("parent_id"), _joined(rows.column("T_world_cam"), ",")], ",")
+    return _lines(_poses(views), ["pose_id", "parent_id", "T_world_cam"], ",")
 
 
 def camera_lines(views: pa.Table) -> bytes:
     """One line for each camera, by pose id and then in the order input, aligned, mirror, projected."""
-    rank = pc.index_in(views.column("role"), value_set=pa.array(ROLES))
-    order = np.lexsort((rank.to_numpy(), views.column("pose_id").to_numpy()))
-    rows = views.select([*_CAMERA_COLUMNS, "T_world_cam"]).take(order).combine_chunks()
-    return _lines([*(rows.column(name) for name in _CAMERA_COLUMNS), _joined(rows.column("T_world_cam"), ",")], ",")
+    poses, roles = (views.column(name).to_pylist() for name in ("pose_id", "role"))
+    order = sorted(range(len(views)), key=lambda row: (poses[row], ROLES.index(roles[row])))
+    return _lines(views.take(pa.array(order, pa.int64())), [*_CAMERA_COLUMNS, "T_world_cam"], ",")
 
 
 def object_lines(objects: pa.Table) -> bytes:
@@ -226,54 +210,137 @@ def object_lines(objects: pa.Table) -> bytes:
     White space and `%` in names are written as in a URL (`my%20mug`), so every line has 22 words.
     """
     columns = ["pose_id", "category", "instance_id", "region_id", "u", "v", "T_cam_obj"]
-    rows = objects.select(columns).filter(_is_pose(objects)).combine_chunks()
-    names = []
-    for name in ("category", "instance_id"):
-        coded = rows.column(name).dictionary_encode().combine_chunks()
-        words = pa.array([escaped(text) for text in coded.dictionary.to_pylist()], pa.string())
-        names.append(words.take(coded.indices))
-    numbers = [rows.column(name) for name in ("region_id", "u", "v")]
-    return _lines([rows.column("pose_id"), *names, *numbers, _joined(rows.column("T_cam_obj"), " ")], " ")
+    return _lines(_poses(objects), columns, " ")
 
 
 def escaped(name: str) -> str:
     """A name as one word; `urllib.parse.unquote` reverses it."""
-    return _UNSAFE.sub(lambda found: "".join(f"%{byte:02X}" for byte in found[0].encode()), name)
+    return _UNSAFE.sub(lambda unsafe: "".join(f"%{byte:02X}" for byte in unsafe[0].encode()), name)
 
 
-def shortest(numbers: pa.Array) -> pa.Array:
-    """Doubles as Python's repr writes them, the shortest digits that give them back."""
-    values = numbers.to_numpy(zero_copy_only=False)
-    sizes = np.abs(values)
-    plain = (sizes >= PLAIN_FROM) & (sizes < PLAIN_BELOW) | (sizes == 0)
-    texts = numbers.cast(pa.string())
-    texts = pc.if_else(pa.array(values == np.trunc(values)), pc.binary_join_element_wise(texts, ".0", ""), texts)
-    if plain.all():
-        return texts
-    return pc.replace_with_mask(texts, pa.array(~plain), pa.array(map(repr, values[~plain].tolist()), pa.string()))
+def _poses(rows: pa.Table) -> pa.Table:
+    """Rows of input and mirror cameras; aligned and projected cameras are in cameras.csv alone."""
+    return rows.filter(pc.is_in(rows.column("role"), value_set=pa.array(["input", "mirror"])))
 
 
-def _joined(matrices: pa.ChunkedArray, separator: str) -> pa.Array:
-    """[rows] strings: the sixteen numbers of each matrix."""
-    numbers = pa.concat_arrays([chunk.flatten() for chunk in matrices.chunks] or [pa.array([], pa.float64())])
-    ends = pa.array(np.arange(0, len(numbers) + 1, 16, dtype=np.int32))
-    return pc.binary_join(pa.ListArray.from_arrays(ends, shortest(numbers)), separator)
+def _lines(rows: pa.Table, columns: Sequence[str], separator: str) -> bytes:
+    """The rows as lines of UTF-8: a matrix is sixteen words, a double the shortest digits that give it back."""
+    words = [rows.column(name).to_pylist() for name in columns[:-1]]
+    lines = zip(*words, rows.column(columns[-1]).to_pylist(), strict=True)
+    return "".join(separator.join(map(_word, chain(line[:-1], line[-1]))) + "\n" for line in lines).encode()
 
 
-def _lines(columns: Sequence[pa.ChunkedArray | pa.Array], separator: str) -> bytes:
-    """The rows as lines of UTF-8."""
-    texts = [_text(column) for column in columns]
-    lines = pc.binary_join_element_wise(*texts[:-1], pc.binary_join_element_wise(texts[-1], "", "\n"), separator)
-    return b"".join(map(text_bytes, lines.chunks if isinstance(lines, pa.ChunkedArray) else [lines]))
+def _word(value: float | str) -> str:
+    return escaped(value) if isinstance(value, str) else repr(value)
 
 
-def _text(column: pa.ChunkedArray | pa.Array) -> pa.Array:
-    whole = pa.concat_arrays(column.chunks) if isinstance(column, pa.ChunkedArray) and column.chunks else column
-    if pa.types.is_floating(whole.type):
-        return shortest(whole)
-    return whole if pa.types.is_string(whole.type) else whole.cast(pa.string())
+SHAPES_OF_CAPTURES = """\
+- reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing
+- boards: a rectangle, CC0-1.0"""
+SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
+"""The ends of the card's last line."""
 
 
-def _is_pose(rows: pa.Table) -> pa.ChunkedArray:
-    """Which rows are of input and mirror cameras; aligned and projected cameras are in cameras.csv alone."""
-    return pc.is_in(rows.column("role"), value_set=pa.array(["input", "mirror"]))
+def is_card_sealed(data: bytes) -> bool:
+    """Whether the bytes of a card are those that a run wrote."""
+    return is_sealed(data, *SEAL)
+
+
+def write_card(store: Store, record: JobRecord, catalogue: "Catalogue", merged: "MergeResult") -> None:
+    """Writes DATASET.md."""
+    fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
+    store.put(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
+
+
+def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: "MergeResult", fingerprint: Fingerprint) -> str:
+    """The text of DATASET.md."""
+    job, objects = record.job, record.job.objects_per_scene
+    libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))
+    sources = "\n".join(f"- {line}" for line in describe_sources(catalogue))
+    captured = job.captures is not None
+    counts = ", ".join(f"{merged.scenes[outcome]} {outcome}" for outcome in ("made", "intrinsic", "environmental"))
+    return f"""# {job.name}
+
+View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the
+other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
+
+| | |
+|---|---|
+| scenes | {job.first_scene} to {job.stop_scene - 1}: {counts} |
+| pairs in each scene | {"at most " * captured}{job.pairs_per_scene} |
+| objects in each scene | {objects.low}{f" to {objects.high}" * (objects.low < objects.high)} |
+| views of each pair | {", ".join(stored_roles(job))}{"" if job.render.rgb else "; without RGB"} |
+| seed | {job.seed} |
+| dataset digest | `{merged.digest}` |
+| job digest | `{record.digest}` (the job is in `{JOB_FILE}`) |
+| stack's fingerprint | `{fingerprint.digest}` |
+| canary scene | `{fingerprint.canary}` |
+| renderer | {fingerprint.renderer} |
+
+| library | version |
+|---|---|
+{libraries}
+
+{_describe_captures(job.captures, catalogue) if job.captures is not None else ""}## Shapes
+
+{SHAPES_OF_CAPTURES if captured else sources}
+
+Every shape, with its licence and its split by instance, is a row of the `assets` table.
+
+{_describe_reading(job)}"""
+
+
+def _describe_reading(job: Job) -> str:
+    objects = "nothing, 1 floor, 2 table, 3 and up objects"
+    regions = objects if job.captures is None else "neither board nor object, 2 board, 3 object"
+    return f"""## Reading it
+
+`pyarrow.dataset.dataset("manifest/views", partitioning="hive")` has a row for each camera and the names and checksums of
+its images, `manifest/objects` one for each thing that it may see; `bodies` in `manifest/scenes` says where each object lies.
+Depth is 16-bit PNG, z along the optical axis, {job.images.depth_units_per_m:g} units a metre, 0 where there is none.
+Masks are 8-bit PNG: 0 {regions}. Poses are camera to world, optical frame (x right,
+y down, z forward), metres.
+"""
+
+
+def _describe_captures(captures: Captures, catalogue: "Catalogue") -> str:
+    """The section on where photographs come from and what was done to them."""
+    board = captures.printed_board
+    origin = f"{len(catalogue.captures)} folders of photographs with registered depth, each with the board in its board.json."
+    if not captures.folders:
+        shapes = "\n".join(f"- {line}" for line in describe_sources(catalogue) if not line.startswith("tables"))
+        origin = f"virtual, of {captures.simulate.views} views, {board.words}, and shapes from\n\n{shapes}"
+    return f"""## Captures
+
+Each scene is a capture of one object on a board of markers; its world is the board's frame. The captures are {origin}
+
+Poses are those of the estimate `{captures.estimation.estimate}`. Input images are the photographs without their lens, and
+their depth as it was measured; where the estimate determined an offset, a scale or a registration of the depth camera, depth
+is corrected by it, and drawn anew from the fitted surface where the depth camera's place is. Mirror images are made of the
+{captures.synthesis.views} nearest photographs, projected images of the input's.
+The column `capture` of `manifest/scenes` and `manifest/views` has residuals, what was corrected, the share that was measured,
+and, for virtual captures, errors against truth.
+
+"""
+
+
+MOST_LICENCES = 10
+"""Licences of a library that the card names, with how many shapes have them."""
+
+
+def describe_sources(catalogue: "Catalogue") -> list[str]:
+    """One line for each source of objects and of tables with its licence, and those of `Catalogue.describe_left_out`."""
+    lines = []
+    for what, sources, libraries in (
+        ("objects", catalogue.assets.objects, catalogue.objects),
+        ("tables", catalogue.assets.tables, catalogue.tables),
+    ):
+        for source, library in zip(sources, libraries, strict=True):
+            if isinstance(source, ProceduralSource):
+                origin = f"made from seed {source.seed}, licence CC0-1.0"
+            else:
+                assert library is not None
+                most = ", ".join(f"{name} ({count})" for name, count in library.licences.most_common(MOST_LICENCES))
+                origin = f"library {source.folder}, licences {most}"
+            lines.append(f"{what}, weight {source.weight:g}: {origin}")
+    return lines + catalogue.describe_left_out()

@@ -17,7 +17,7 @@ import subprocess
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -29,8 +29,8 @@ from schemas.errors import InputError, InUseError, MachineError, RunError, Verso
 from schemas.queue import JobRequest
 from services.queue.queue import Queue
 from services.queue.supervise import Driver, Drivers
-from services.run.machine import usable_cores
-from services.run.ray_cluster import address_here, living_folders, private_folder, ray_in
+from services.run.machine import living_folders, private_folder, usable_cores
+from services.run.ray_cluster import address_here, ray_in
 from services.run.supervisor import STOP_S
 
 ANSWER_S: Final = 30.0
@@ -119,19 +119,14 @@ class RayDrivers(Drivers):
         """Turns what the client raises into a MachineError with one line."""
         try:
             yield
-        except AuthenticationError as error:
-            raise MachineError(
-                f"--address {self._address}: the cluster asks for a token: set RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN "
-                "here too"
-            ) from error
-        except OSError as error:  # what `requests` raises are OSErrors, too
-            raise MachineError(
-                f"--address {self._address}: Ray's job API does not answer there ({type(error).__name__}): it is the address of "
-                "the dashboard, as `ray start --head` prints it"
-            ) from error
-        except (RuntimeError, ValueError) as error:
-            words = plain_line(" ".join(str(error).split()), 300)
-            raise MachineError(f"--address {self._address}: Ray's job API refuses: {words}") from error
+        except (AuthenticationError, OSError, RuntimeError, ValueError) as error:
+            words = f"Ray's job API refuses: {plain_line(' '.join(str(error).split()), 300)}"
+            if isinstance(error, AuthenticationError):
+                words = "the cluster asks for a token: set RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN here too"
+            elif isinstance(error, OSError):  # as what `requests` raises
+                remedy = "it is the address of the dashboard, as `ray start --head` prints it"
+                words = f"Ray's job API does not answer there ({type(error).__name__}): {remedy}"
+            raise MachineError(f"--address {self._address}: {words}") from error
 
 
 def _first_line(text: str | None) -> str:
@@ -167,20 +162,13 @@ def drive(queue: Queue, job: str, attempt: int, work: Callable[[JobRequest], End
         )
     try:
         ending = work(view.request)
-    except InUseError as error:
-        queue.append(job, "busy", attempt, note=_note(str(error)))
-        raise
     except VersoError as error:
-        queue.append(job, "ended", attempt, code=error.exit_code, note=_note(str(error)))
+        note = plain_line(" ".join(str(error).split()), MOST_NOTE)
+        end = {"kind": "busy"} if isinstance(error, InUseError) else {"kind": "ended", "code": error.exit_code}
+        queue.append(job, attempt=attempt, note=note, **end)
         raise
-    queue.append(
-        job, "ended", attempt, code=ending.code, note=_note(ending.note), scenes=ending.scenes, digest=ending.digest
-    )
+    queue.append(job, "ended", attempt, **asdict(ending))
     return ending.code
-
-
-def _note(text: str) -> str:
-    return plain_line(" ".join(text.split()), MOST_NOTE)
 
 
 EVERY_S: Final = 5.0
@@ -232,7 +220,10 @@ class OwnDrivers(Drivers):
 
     def states(self) -> dict[str, Driver]:
         """Of the drivers that this process started."""
-        return {submission: _state_of(process.poll()) for submission, process in self._known.items()}
+        return {
+            submission: Driver("running") if process.poll() is None else Driver("over", _end_of(process.returncode))
+            for submission, process in self._known.items()
+        }
 
     def hand_over(self, submission: str, words: Sequence[str]) -> None:
         """Starts the process. Raises MachineError where the program cannot be started."""
@@ -271,10 +262,8 @@ class OwnDrivers(Drivers):
         return True
 
 
-def _state_of(code: int | None) -> Driver:
-    if code is None:
-        return Driver("running")
-    return Driver("over", f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}")
+def _end_of(code: int) -> str:
+    return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
 
 
 def _read_log(folder: Path, submission: str) -> str | None:
@@ -289,9 +278,10 @@ class LogsHere(RayDrivers):
 
     def log(self, submission: str) -> str | None:
         """Of a driver of either kind."""
-        found = (_read_log(folder / FOLDER, submission) for folder in living_folders())
-        here = next((text for text in found if text is not None), None)
-        return super().log(submission) if here is None else here
+        for folder in living_folders():
+            if (text := _read_log(folder / FOLDER, submission)) is not None:
+                return text
+        return super().log(submission)
 
 
 @contextlib.contextmanager

@@ -60,16 +60,11 @@ def main(words: list[str]) -> int:
 
 def check_words(words: list[str]) -> None:
     """Raises InputError for words that no command has: the shell before this process may have made others of what was typed."""
-    if not words or words[0] in ("-h", "--help"):
+    is_asked = bool(words) and words[0] in ("--follow", "--stop")
+    if not words or (words[0].startswith("-") and not is_asked) or (is_asked and len(words) != 2):
         raise InputError(USAGE)
-    for word in words:
-        if not word.isprintable():
-            raise InputError(f"{word!r} has characters that are no part of a name or value")
-    if words[0] in ("--follow", "--stop"):
-        if len(words) != 2:
-            raise InputError(f"{words[0]} takes the id of one job")
-    elif words[0].startswith("-"):
-        raise InputError(f"the job comes first, and {words[0]!r} is none")
+    if wrong := [word for word in words if not word.isprintable()]:
+        raise InputError(f"{wrong[0]!r} has characters that are no part of a name or value")
     if any(word.split("=")[0] == "--address" for word in words):
         raise InputError("--address is this cluster's")
 

@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
 
 from schemas.errors import MachineError, VersoError, describe_seconds
 from schemas.queue import submission_id
@@ -84,27 +85,19 @@ def _scenes_done(out: str) -> int | None:
 def format_rows(rows: Sequence[JobRow]) -> list[str]:
     """A table, a line each, with what there is to say about a job below it."""
     cells = [COLUMNS, *(_cells(row) for row in rows)]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(COLUMNS) - 1)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = []
-    for number, line in enumerate(cells):
-        padded = [cell.ljust(width) for cell, width in zip(line, widths, strict=False)]
-        lines.append("  ".join([*padded, line[-1]]).rstrip())
-        if number and rows[number - 1].note:
-            lines.append(f"    {rows[number - 1].note}")
+    for line, note in zip(cells, ["", *(row.note for row in rows)], strict=True):
+        lines.append("  ".join(map(str.ljust, line, widths)).rstrip())
+        lines += [f"    {note}"] if note else []
     return lines
 
 
 def _cells(row: JobRow) -> tuple[str, ...]:
-    scenes = (
-        "" if row.scenes_asked is None else f"{'?' if row.scenes_done is None else row.scenes_done}/{row.scenes_asked}"
-    )
-    state = {"waiting": "waiting for its folder"}.get(row.state, row.state)
+    done = "?" if row.scenes_done is None else row.scenes_done
+    scenes = "" if row.scenes_asked is None else f"{done}/{row.scenes_asked}"
+    state = "waiting for its folder" if row.state == "waiting" else row.state
     return row.id, row.name, str(row.priority), state, str(row.attempts), scenes, describe_seconds(row.age_s), row.out
-
-
-def as_tree(row: JobRow) -> dict[str, Any]:
-    """A row for `--json`."""
-    return asdict(row)
 
 
 EVERY_S = 1.0
@@ -145,26 +138,17 @@ def follow_logs(
     queue: Queue, drivers: Drivers, job: str, say: Callable[[str], None], sleep: Callable[[float], None] = time.sleep
 ) -> Iterator[str]:
     """What a job's drivers write, from the first attempt on, until the job has ended; a header comes before each attempt."""
-    attempt, shown = 1, 0
-    said: set[str] = set()
-
-    def say_once(line: str) -> None:
-        if line not in said:
-            said.add(line)
-            say(line)
-
+    shown: dict[int, int] = {}
+    say_once = cache(say)
     while True:
         view = queue.read(job)
-        while attempt <= view.attempt:
+        for attempt in range(max(shown, default=1), view.attempt + 1):
             text = _read(queue, drivers, view, attempt, say_once)
-            if text and not shown:
+            if text and not shown.get(attempt):
                 yield header(attempt)
-            if len(text) > shown:
-                yield text[shown:]
-                shown = len(text)
-            if attempt == view.attempt:
-                break
-            attempt, shown = attempt + 1, 0
+            if len(text) > shown.setdefault(attempt, 0):
+                yield text[shown[attempt] :]
+                shown[attempt] = len(text)
         if view.ended:
             return
         sleep(EVERY_S)

@@ -9,8 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, TypeVar
 
-from pydantic import ValidationError
-
 from schemas.base import Frozen
 from schemas.dataset.layout import COMMITS, LOCK_FILE, MANIFEST, RANGES, STAGING
 from schemas.errors import CorruptError, InputError, OutputError, plain_line
@@ -284,10 +282,10 @@ def make_queue(url: str) -> Queue:
         raise InputError(
             f"--queue {url}: there is no folder {store.root.parent}: make it, or mount what should be there"
         )
-    found = set(store.names(""))
-    if MARK_FILE in found:  # somebody else has made it since
+    names = set(store.names(""))
+    if MARK_FILE in names:  # somebody else has made it since
         return open_queue(url)
-    if foreign := sorted(found - OWN):
+    if foreign := sorted(names - OWN):
         raise InputError(
             f"--queue {url} is no queue: it holds {plain_line(', '.join(foreign[:3]))} and no {MARK_FILE}; choose a new or "
             "an empty folder"
@@ -332,11 +330,5 @@ def _decode(model: type[Model], data: bytes, name: str) -> Model:
                 f"{name}: queue: {version} is newer than this program, which reads 1: install a newer Verso"
             )
         return model.model_validate(tree)
-    except ValidationError as error:
-        fault = error.errors()[0]
-        where = plain_line(".".join(map(str, fault["loc"])))
-        raise CorruptError(
-            f"{name} was not written by this program: {where}: {plain_line(fault['msg'], 200)}"
-        ) from error
-    except ValueError as error:
-        raise CorruptError(f"{name} is damaged: {plain_line(str(error), 200)}") from error
+    except ValueError as error:  # of JSON or of the model
+        raise CorruptError(f"{name} was not written by this program: {plain_line(str(error), 200)}") from error

@@ -6,7 +6,8 @@ What it does next is decided by pure functions, from the states of all jobs and 
 import contextlib
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
 from typing import Final, Literal, NamedTuple, Protocol
 
 from schemas.errors import CorruptError, InUseError, MachineError, RunError
@@ -66,14 +67,14 @@ def tend_drivers(views: Sequence[JobView], drivers: Mapping[str, Driver]) -> lis
     actions = []
     for view in views:
         job, attempt = view.request.id, view.attempt
-        found = drivers.get(submission_id(job, attempt))
-        runs = found is not None and found.state == "running"
+        driver = drivers.get(submission_id(job, attempt))
+        runs = driver is not None and driver.state == "running"
         if not view.held or (runs and view.state != "cancelling"):
             continue
         if view.state == "cancelling":
             actions.append(Action("stop" if runs else "note stop", job, attempt))
-        elif found is not None:
-            said = f" ({found.said})" if found.said else ""
+        elif driver is not None:
+            said = f" ({driver.said})" if driver.said else ""
             actions.append(Action("note death", job, attempt, f"its driver ended without telling how{said}"))
         elif view.began:
             actions.append(Action("note death", job, attempt, "Ray does not know its driver any more"))
@@ -93,11 +94,10 @@ def choose_starts(
     taken = {view.request.out for view in views if view.claims_folder}
     chosen: list[Action] = []
     for view in sorted((view for view in views if view.state in ("queued", "waiting")), key=turn):
-        own = view.claims_folder
-        if room <= len(chosen) or not is_due(view) or (view.request.out in taken and not own):
-            continue
-        taken.add(view.request.out)
-        chosen.append(Action("start", view.request.id, view.attempt + 1))
+        is_free = view.claims_folder or view.request.out not in taken
+        if len(chosen) < room and is_free and is_due(view):
+            taken.add(view.request.out)
+            chosen.append(Action("start", view.request.id, view.attempt + 1))
     return chosen
 
 
@@ -135,23 +135,6 @@ class Rules:
     command: Sequence[str]
 
 
-@dataclass
-class _Memory:
-    """What a supervisor remembers between two looks, all of which it can do without."""
-
-    settled: set[str] = field(default_factory=set)
-    """Ended jobs whose logs are kept, or gone."""
-    seen: dict[str, tuple[int, float]] = field(default_factory=dict)
-    """By job: how many events it had, and when that was seen first."""
-    kept: set[str] = field(default_factory=set)
-    """Drivers whose logs are in the queue, or could not be had."""
-    share: int | None = None
-    outage: str | None = None
-    """Why the last look failed."""
-    told: set[str] = field(default_factory=set)
-    """What was said and need not be said again."""
-
-
 class Supervisor:
     """Looks at a queue and at Ray's drivers again and again, and does what is to be done.
 
@@ -167,7 +150,16 @@ class Supervisor:
         self._rules = rules
         self._say = say
         self._clock = clock
-        self._memory = _Memory()
+        self._settled: set[str] = set()
+        """Ended jobs whose logs are kept, or gone."""
+        self._seen: dict[str, tuple[int, float]] = {}
+        """By job: how many events it had, and when that was seen first."""
+        self._kept: set[str] = set()
+        """Drivers whose logs are in the queue, or could not be had."""
+        self._share = 0
+        self._fails = False
+        """Whether the last look did."""
+        self._say_once = cache(say)
 
     def look(self, require_held: Callable[[], None] = lambda: None) -> None:
         """One round. Where storage or Ray does not answer, that is told, and waited for.
@@ -178,16 +170,16 @@ class Supervisor:
             require_held()
             self._look()
         except (MachineError, OSError) as error:
-            if self._memory.outage is None:
+            if not self._fails:
                 self._say(f"{error}; it is asked again and again")
-            self._memory.outage = str(error)
+            self._fails = True
         else:
-            if self._memory.outage is not None:
+            if self._fails:
                 self._say("all answer again")
-            self._memory.outage = None
+            self._fails = False
 
     def _look(self) -> None:
-        views, faults = self._queue.read_all(job for job in self._queue.ids() if job not in self._memory.settled)
+        views, faults = self._queue.read_all(job for job in self._queue.ids() if job not in self._settled)
         known = self._drivers.states()
         for job, fault in faults.items():
             self._say_once(f"job {job} is left alone: {fault}")
@@ -247,14 +239,14 @@ class Supervisor:
             job = view.request.id
             for attempt in range(1, view.attempt + 1):
                 submission = submission_id(job, attempt)
-                if states.get(submission) == "over" and submission not in self._memory.kept:
+                if states.get(submission) == "over" and submission not in self._kept:
                     self._keep_log(job, attempt)
             if view.ended and states.get(submission_id(job, view.attempt)) != "running":
-                self._memory.settled.add(job)
+                self._settled.add(job)
 
     def _keep_log(self, job: str, attempt: int) -> None:
         submission = submission_id(job, attempt)
-        self._memory.kept.add(submission)
+        self._kept.add(submission)
         try:
             if not self._queue.has_log(job, attempt):
                 self._queue.put_log(job, attempt, self._drivers.log(submission) or "")
@@ -263,23 +255,18 @@ class Supervisor:
 
     def _is_due(self, view: JobView) -> bool:
         """Whether a job's pause is over; it is counted from when its last event was seen, by this machine's clock."""
-        events, since = self._memory.seen.get(view.request.id, (-1, 0.0))
+        events, since = self._seen.get(view.request.id, (-1, 0.0))
         if events != view.events:
             since = self._clock()
-            self._memory.seen[view.request.id] = (view.events, since)
+            self._seen[view.request.id] = (view.events, since)
         return self._clock() - since >= pause_of(view)
 
     def _tell_share(self, ids: Sequence[str]) -> None:
         """Tells the drivers among how many the cluster is shared, where that has changed."""
         running = max(1, sum(view.held for view in self._queue.read_all(ids)[0]))
-        if running != self._memory.share:
+        if running != self._share:
             self._queue.put_share(running)
-            self._memory.share = running
-
-    def _say_once(self, line: str) -> None:
-        if line not in self._memory.told:
-            self._memory.told.add(line)
-            self._say(line)
+            self._share = running
 
 
 def supervise(

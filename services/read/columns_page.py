@@ -72,7 +72,7 @@ def _facts(column: Column) -> str:
 def write_page() -> str:
     """The text of docs/columns.md."""
     lines = [HEADER + "\n".join(f"- **{name}**: {text}" for name, text in FRAMES.items())]
-    first: dict[str, str] = {}
+    first: dict[tuple[str, str], str] = {}
     for table in TABLES:
         lines += [
             "",
@@ -81,11 +81,14 @@ def write_page() -> str:
             f"{TABLES[table]} Key: {', '.join(f'`{one}`' for one in SORT_KEYS[table])}.",
             "",
         ]
-        rows = {f"- `{column.path}` ({_facts(column)}): {column.meaning}": column.path for column in COLUMNS[table]}
-        again = {row: path for row, path in rows.items() if first.setdefault(row, table) != table}
-        lines += [row for row in rows if row not in again]
-        for other in dict.fromkeys(first[row] for row in again):
-            lines.append(f"- as in {other}: {', '.join(f'`{again[row]}`' for row in again if first[row] == other)}")
+        new, again = dict[str, list[str]](), dict[str, list[str]]()
+        for column in COLUMNS[table]:
+            meaning = f"({_facts(column)}): {column.meaning}"
+            other = first.setdefault((column.path, meaning), table)
+            place = new.setdefault(meaning, []) if other == table else again.setdefault(f"as in {other}:", [])
+            place.append(f"`{column.path}`")
+        lines += [f"- {', '.join(paths)} {meaning}" for meaning, paths in new.items()]
+        lines += [f"- {where} {', '.join(paths)}" for where, paths in again.items()]
     return "\n".join(lines) + "\n"
 
 

@@ -14,7 +14,7 @@ from schemas.dataset.layout import (
 from schemas.dataset.shard import Fingerprint
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SORT_KEYS
 from schemas.errors import CorruptError, MachineError
-from schemas.job.identity import job_digest
+from schemas.job.job import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, decode_samples, file_reader, find_scene

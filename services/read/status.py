@@ -77,7 +77,7 @@ def read_status(store: Store, first_scene: int, stop_scene: int) -> Status:
         digest=(read_success(store) or {}).get("digest"),
         running=running,
         holder=read_holder(store),
-        lost=tuple(find_lost(store, ledger)),
+        lost=tuple(find_lost(ledger)),
     )
 
 

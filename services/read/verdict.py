@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from schemas.dataset.layout import SUCCESS_FILE, commit_path
 from schemas.errors import CorruptError
-from services.merge.shared import open_scratch
+from services.merge.reading import open_scratch
 from workers.store.store import Store
 
 MOST_FAULTS = 1_000

@@ -25,15 +25,13 @@ from schemas.dataset.layout import (
     README_FILE,
     SUCCESS_FILE,
     commit_path,
-    pose_of_image,
 )
 from schemas.dataset.shard import Fingerprint
-from schemas.dataset.tables import TABLES
 from schemas.errors import CommitConflict, CorruptError, MachineError
-from schemas.job.identity import job_digest
+from schemas.job.job import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
-from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
+from services.merge.reading import RangeRows
 from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error
 from services.read.verify_files import (
     Known,
@@ -44,50 +42,11 @@ from services.read.verify_files import (
     read_stored_success,
     tell_strays,
 )
-from services.read.verify_range import RangeCheck, ReadRange, Spans, commit_groups, read_records
+from services.read.verify_range import RangeCheck, Spans, commit_groups, read_records
 from workers.store.commit import commits_digest
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
-from workers.store.manifest import join_rows
 from workers.store.store import Store
-
-
-class Remerge:
-    """Takes whole ranges in order, and joins their rows in blocks as the merge does."""
-
-    def __init__(self, folder: Path) -> None:
-        self._merging = Merging(folder)
-        self._waiting: list[ReadRange] = []
-        self._rows = 0
-
-    def add(self, one: ReadRange) -> None:
-        """Takes the next range, with its rows. Raises CorruptError where rows do not join."""
-        assert one.rows is not None
-        self._waiting.append(one)
-        self._rows += sum(map(len, one.rows.values()))
-        if len(self._waiting) >= RANGES_PER_BLOCK or self._rows >= ROWS_PER_BLOCK:
-            self._flush()
-
-    def finish(self) -> tuple[dict[str, Any], dict[str, Path]]:
-        """The contents of `_SUCCESS`, and the finished files by key. Raises CorruptError, CommitConflict."""
-        self._flush()
-        return self._merging.finish()
-
-    def close(self) -> None:
-        """Closes every file, finished or not."""
-        self._merging.close()
-
-    def _flush(self) -> None:
-        waiting, self._waiting, self._rows = self._waiting, [], 0
-        if not waiting:
-            return
-        files = [(one.records[0], entry) for one in waiting for entry in one.files if pose_of_image(entry.path) is None]
-        rows = {
-            table: join_rows(table, [one.rows[table] for one in waiting if one.rows]).combine_chunks()
-            for table in TABLES
-        }
-        self._merging.add(Block([one.records for one in waiting], files, rows))
-
 
 MOST_TOLD = 100
 """Different jobs or stacks that are remembered with a commit of theirs."""
@@ -225,7 +184,7 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
         (folder / "merged").mkdir()
-        with contextlib.closing(Remerge(folder / "merged")) as merging:
+        with contextlib.closing(Merging(folder / "merged")) as merging:
             check = RangeCheck(store, job.record, job.digest, index, verdict)
             found = _read_ranges(store, _spans(job, success, verdict), check, merging, progress)
             check_terms(job, found.terms, verdict)
@@ -250,7 +209,7 @@ def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
 
 
 def _read_ranges(
-    store: Store, spans: Spans, check: RangeCheck, merging: Remerge, progress: Callable[[Verdict], None]
+    store: Store, spans: Spans, check: RangeCheck, merging: Merging, progress: Callable[[Verdict], None]
 ) -> Ranges:
     """Reads every range in order, and merges it again."""
     found = Ranges(spans, Terms())
@@ -268,7 +227,7 @@ def _read_ranges(
             spans.unreadable.append((start, records[0].span.stop))
         elif found.mergeable and spans.fits:
             try:
-                merging.add(one)
+                merging.add(RangeRows(one.records, one.files, one.rows))
             except CorruptError as error:
                 found.mergeable = False
                 check.verdict.tell(str(error), COPY)
@@ -277,7 +236,7 @@ def _read_ranges(
     return found
 
 
-def _merge_again(merging: Remerge, found: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
+def _merge_again(merging: Merging, found: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
     """`_SUCCESS` and the merged files as the commits give them; None where not every range can be read."""
     if not (found.mergeable and found.spans.fits and found.spans.done):
         return None

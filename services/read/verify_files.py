@@ -29,8 +29,8 @@ from schemas.dataset.layout import (
     is_shape,
     pose_of_image,
 )
-from services.merge.dataset_card import is_card_sealed
 from services.merge.merge import encode_success, file_entry
+from services.merge.tables import is_card_sealed
 from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable
 from workers.store.file_system import sha256_of
 from workers.store.store import Store

@@ -10,25 +10,22 @@ import signal
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import ray
 from ray.exceptions import NodeDiedError, OutOfMemoryError, RayError, RayTaskError
-from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
-from services.run.joining import Pattern
 from services.run.machine import Process, send
-from services.run.metrics import Tally
-from services.run.progress import log_event, say
-from services.run.ray_cluster import Slots
+from services.run.progress import Tally, log_event, say
+from services.run.ray_cluster import LOOK_EVERY_S, Slots, alive_nodes, on_node
 from services.run.watchdog import AttemptName, Sight, end_worker_here, find_own_workers, scenes_in_progress, watch
-from services.run.worker_entry import enter_shard
+from services.run.worker_entry import Pattern, enter_shard
 from workers.store.attempt import TIMED_OUT, attempts_at, blamed_scene, host_part, retry_of_attempt, sweep_attempt
 from workers.store.commit import read_record
 from workers.store.ledger import read_summary
@@ -93,29 +90,6 @@ def count_under_way(shards: Iterable[tuple[Span, ...]], in_progress: Mapping[int
     return total
 
 
-LOOK_EVERY_S = 2.0
-"""How often the cluster is asked for its nodes."""
-
-
-class LostNodes:
-    """Tells each host once when its last node is gone; `alive` names the hosts that have a node now."""
-
-    def __init__(self, alive: Callable[[], Collection[str]], clock: Callable[[], float] = time.monotonic) -> None:
-        self._alive = alive
-        self._clock = clock
-        self._known: set[str] = set()
-        self._looked_s = float("-inf")
-
-    def take(self) -> set[str]:
-        """The hosts that had a node at the last look and have none now."""
-        if self._clock() - self._looked_s < LOOK_EVERY_S:
-            return set()
-        self._looked_s = self._clock()
-        now = set(self._alive())
-        lost, self._known = self._known - now, now
-        return lost
-
-
 def hosts_of(store: Store, label: str, spans: Iterable[Span]) -> set[str]:
     """The hosts whose workers have begun these ranges, by what they left: attempts with this label, and commits by them."""
     names = []
@@ -149,12 +123,12 @@ class Limits:
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
-def _shard_task(env_vars: dict[str, str], num_gpus: float) -> Any:
+def _shard_task(env_vars: Mapping[str, str], num_gpus: float) -> Any:
     """The task that makes a shard, as Ray's remote function; a new one asks for workers of its own."""
     # Ray would end a process after each task with a GPU, unless max_calls is given
     on_gpu: dict[str, Any] = {"num_gpus": num_gpus, "max_calls": 0} if num_gpus else {}
     task = ray.remote(num_cpus=1, max_retries=0, **on_gpu)(enter_shard)
-    return task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
+    return task.options(runtime_env={"env_vars": dict(env_vars)}) if env_vars else task
 
 
 class Coordinator:
@@ -165,7 +139,7 @@ class Coordinator:
         self._order = pattern.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
         self._terms = pattern.terms
         self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
-        self._env_vars = dict(pattern.env_vars)
+        self._env_vars = pattern.env_vars
         self._task = _shard_task(self._env_vars, limits.num_gpus)
         self._limits = limits
         self._tally = tally
@@ -176,7 +150,8 @@ class Coordinator:
         self._notes: set[str] = set()
         """What workers said of their devices."""
         self._deaths = Deaths(limits.attempts)
-        self._lost_nodes = LostNodes(lambda: {host for _, host in _alive_nodes()})
+        self._hosts: set[str] = set()
+        self._looked_s = float("-inf")
 
     def run(self, shards: Iterator[tuple[Span, ...]], progress: Callable[[Tally], None] = lambda tally: None) -> None:
         """Makes every range of every shard.
@@ -184,8 +159,8 @@ class Coordinator:
         Raises CommitConflict where two attempts made other bytes, RunError where a worker cannot be kept alive or too
         many scenes fail. On KeyboardInterrupt, committed ranges stay and running shards are ended.
         """
-        try:
-            with watch(self._store, self._order.label, self._order.job.run.scene_timeout_s) as take_stalls:
+        with watch(self._store, self._order.label, self._order.job.run.scene_timeout_s) as take_stalls:
+            try:
                 while self._fill_slots(shards):
                     ready, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
                     for ref in ready:
@@ -194,12 +169,14 @@ class Coordinator:
                         self._end_stalled(attempt, sight)
                     self._tally.in_flight = sum(len(spans) for spans in self._running.values())
                     self._tally.under_way = self._count_under_way()
-                    if self._env_vars and (lost := self._lost_nodes.take()):
+                    if self._env_vars and (lost := self._take_lost_hosts()):
                         self._give_up_on(lost)
                     progress(self._tally)
-        except BaseException:
-            self._cancel()
-            raise
+            finally:  # what still runs after an error is made again by the next run
+                for ref in self._running:
+                    ray.cancel(ref, force=True)
+                if self._running:
+                    ray.wait(list(self._running), num_returns=len(self._running), timeout=5.0)
 
     def _count_under_way(self) -> int:
         """Scenes made in shards that have not reported; 0 where a look costs much: on an object store, or of many shards."""
@@ -219,13 +196,6 @@ class Coordinator:
             self._running[self._task.remote(self._terms, pickle.dumps(order), self._catalogue)] = spans
         return bool(self._running)
 
-    def _cancel(self) -> None:
-        """Ends running shards; what is not committed is made again by the next run."""
-        for ref in self._running:
-            ray.cancel(ref, force=True)
-        if self._running:
-            ray.wait(list(self._running), num_returns=len(self._running), timeout=5.0)
-
     def _collect(self, ref: "ray.ObjectRef", spans: tuple[Span, ...]) -> None:
         try:
             report: ShardReport = ray.get(ref)
@@ -233,10 +203,10 @@ class Coordinator:
             if isinstance(error.cause, VersoError):
                 raise error.cause from error
             log_event("bug", logging.ERROR, range=spans[0].start, traceback=str(error))
-            said = next(iter(str(error.cause).splitlines()), "")
+            line = next(iter(str(error.cause).splitlines()), "")
             raise RunError(
                 f"a worker raised an error that is a bug, with the scenes from {spans[0].start}: "
-                f"{type(error.cause).__name__}: {said}; what is committed is kept, {self._store.name}/_logs has the traceback"
+                f"{type(error.cause).__name__}: {line}; what is committed is kept, {self._store.name}/_logs has the traceback"
             ) from error
         except RayError as error:
             return self._handle_death(spans, error, ref in self._stalled)
@@ -263,6 +233,14 @@ class Coordinator:
                 'run.max_failure_share allows: see `verso query OUT "select * from failures"`'
             )
 
+    def _take_lost_hosts(self) -> set[str]:
+        """The hosts that had a node at the last look, and have none now; none where that look was just now."""
+        if time.monotonic() - self._looked_s < LOOK_EVERY_S:
+            return set()
+        self._looked_s = time.monotonic()
+        before, self._hosts = self._hosts, set(_hosts_by_node().values())
+        return before - self._hosts
+
     def _give_up_on(self, hosts: set[str]) -> None:
         """Gives out again what workers on lost hosts had, and what no worker has begun: Ray may have sent it there."""
         log_event("nodes lost", logging.WARNING, hosts=sorted(hosts))
@@ -282,60 +260,53 @@ class Coordinator:
 
     def _end_stalled(self, attempt: AttemptName | None, sight: Sight) -> None:
         """Says that a worker shows no progress, and ends it: what follows is the same as after any other death."""
-        own = {process.pid: process for process in find_own_workers()}
+        workers = {process.pid: process for process in find_own_workers()}
         if attempt is None:
-            return self._end_stopped(sight.idle_s, list(own.values()))
+            return self._end_stopped(sight.idle_s, [worker for worker in workers.values() if worker.stopped])
         key = attempt.start, retry_of_attempt(attempt.name)
-        refs = (ref for ref, spans in self._running.items() if key in [(span.start, span.retry) for span in spans])
-        if (ref := next(refs, None)) is None:
+        refs = {ref for ref, spans in self._running.items() if key in [(span.start, span.retry) for span in spans]}
+        if not refs:
             return
-        self._stalled.add(ref)
+        self._stalled |= refs
         start, pid, host = attempt.start, attempt.pid, attempt.host
         log_event("worker stalled", logging.WARNING, range=start, scene=sight.scene_id, pid=pid, host=host)
         doing = "committing" if sight.scene_id is None else f"scene {sight.scene_id}"
-        stopped = ", which was stopped by a signal" if pid in own and own[pid].stopped else ""
+        stopped = ", which was stopped by a signal" if pid in workers and workers[pid].stopped else ""
         say(
             f"range from {start}, {doing}: no progress for {sight.idle_s:.0f} s by process {pid} on {host}{stopped}: "
             "it is ended, and the range is made again"
         )
-        if pid in own:
-            return send(own[pid], signal.SIGKILL)
-        for node, its_host in _alive_nodes():
-            if its_host == host:
-                _end_worker.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(pid)
+        if pid in workers:
+            return send(workers[pid], signal.SIGKILL)
+        for node, node_host in _hosts_by_node().items():
+            if node_host == host:
+                on_node(_end_worker, node).remote(pid)
 
-    def _end_stopped(self, idle_s: float, own: list[Process]) -> None:
+    def _end_stopped(self, idle_s: float, stopped: list[Process]) -> None:
         """Says that no worker has begun a range for a long time, and ends those that were stopped by a signal."""
-        stopped = [process for process in own if process.stopped]
-        named = ", ".join(str(process.pid) for process in stopped)
-        log_event("nothing begun", logging.WARNING, seconds=round(idle_s), stopped=named)
+        pids = ", ".join(str(process.pid) for process in stopped)
+        log_event("nothing begun", logging.WARNING, seconds=round(idle_s), stopped=pids)
         why = (
-            f"process {named} was stopped by a signal and is ended"
-            if stopped
-            else "Ray has started none: see `ray status`"
+            f"process {pids} was stopped by a signal and is ended" if pids else "Ray has started none: see `ray status`"
         )
         say(f"no worker has begun a range for {idle_s:.0f} s: {why}")
         for process in stopped:
             send(process, signal.SIGKILL)
 
     def _handle_death(self, spans: tuple[Span, ...], error: RayError, stalled: bool = False) -> None:
-        """Counts the ranges that a dead worker committed, then gives out the others again, one by one."""
-        left = list(spans)
+        """Counts the ranges that a dead worker committed, then gives out the others again, one by one.
+
+        Raises RunError where workers die before they begin a scene.
+        """
+        left = deque(spans)
         while left and self._store.size(commit_path(left[0].start, left[0].retry)) is not None:
-            summary = read_summary(self._store, left[0].start, left[0].retry)
+            span = left.popleft()
+            summary = read_summary(self._store, span.start, span.retry)
             self._tally.made += summary.made
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
             self._tally.add_commit(summary)
-            left.pop(0)
-        if left:
-            self._count_death(left, error, stalled)
-        self._again.extend((span,) for span in left)
-
-    def _count_death(self, left: Sequence[Span], error: RayError, stalled: bool) -> None:
-        """Counts a death against the scene in progress. Raises RunError where workers die before they begin a scene.
-
-        left: the ranges of its shard that are not committed.
-        """
+        if not left:
+            return
         span, scene, timed_out = self._find_evidence(left)
         reason: Reason = (
             "time" if timed_out or stalled else "memory" if isinstance(error, OutOfMemoryError) else "killed"
@@ -344,6 +315,7 @@ class Coordinator:
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
         self._tally.lost[reason] += 1
         self._deaths.count(span.start, scene, reason, message, isinstance(error, NodeDiedError))
+        self._again.extend((span,) for span in left)
 
     def _find_evidence(self, left: Sequence[Span]) -> tuple[Span, int | None, bool]:
         """The range and the scene in progress when a worker of this run was lost, and whether its time was up.
@@ -353,7 +325,7 @@ class Coordinator:
         paused. So its attempts are given up: each is fenced and its record looked for once more before its files go; one that
         has won meanwhile is published.
         """
-        found: tuple[Span, int | None, bool] = left[0], None, False
+        evidence: tuple[Span, int | None, bool] = left[0], None, False
         for span in left:
             for name in attempts_at(self._store, span.start):
                 if self._order.label not in name:
@@ -361,11 +333,11 @@ class Coordinator:
                 scene = blamed_scene(self._store, span.start, name)
                 timed_out = bool(self._store.size(f"{staging_path(span.start, name)}/{TIMED_OUT}"))
                 sweep_attempt(self._store, span.start, name, given_up=True)
-                if scene is not None and found[1] is None:
-                    found = span, scene, timed_out
-        return found
+                if scene is not None and evidence[1] is None:
+                    evidence = span, scene, timed_out
+        return evidence
 
 
-def _alive_nodes() -> list[tuple[str, str]]:
-    """(id, host, as attempts are named) of the cluster's nodes."""
-    return [(node["NodeID"], host_part(node["NodeManagerHostname"])) for node in ray.nodes() if node["Alive"]]
+def _hosts_by_node() -> dict[str, str]:
+    """The host, as attempts are named, of each of the cluster's nodes, by its id."""
+    return {node["NodeID"]: host_part(node["NodeManagerHostname"]) for node in alive_nodes()}

@@ -28,11 +28,6 @@ class Beat:
     period_s: float = 2.0
     patience: int = 5
 
-    @property
-    def silence_s(self) -> float:
-        """How long a holder may show no life."""
-        return self.patience * self.period_s
-
 
 DEFAULT_BEAT = Beat()
 
@@ -66,7 +61,7 @@ class Lock:
     def __init__(self, store: Store, mine: Holder, beat: Beat) -> None:
         self._store = store
         self._mine = mine
-        self._silence_s = beat.silence_s
+        self._silence_s = beat.patience * beat.period_s
         self._shown_at = _now_s()
         """When this process last showed life, by the clock that also counts while the machine sleeps."""
         self._beats = 0
@@ -84,17 +79,17 @@ class Lock:
         """Whether this process still has the lock. Asks the store, and shows life there. Raises MachineError."""
         with self._one_at_a_time:
             begun = _now_s()
-            if not self._lost and self._is_last() and self.show_life():
-                late = _now_s() - begun >= self._silence_s  # paused in between: another may have taken over meanwhile
+            if not self._lost and self._is_last():
+                self.show_life()
                 self._shown_at = begun
-                self._lost = late and not self._is_last()
+                if _now_s() - begun >= self._silence_s:  # paused in between: another may have taken over meanwhile
+                    self._is_last()
             return not self._lost
 
-    def show_life(self) -> bool:
-        """Writes the heartbeat's file anew; true."""
+    def show_life(self) -> None:
+        """Writes the heartbeat's file anew."""
         self._beats += 1
         self._store.put(LOCK_FILE, json.dumps(asdict(self._mine) | {"beat": self._beats}).encode(), durable=False)
-        return True
 
     def require_held(self) -> None:
         """Raises RunError naming the process that took over. To be called before anything that would replace its work."""
@@ -115,7 +110,7 @@ class Lock:
                 _clear(self._store)
 
     def _is_last(self) -> bool:
-        """Whether the last event is this process's.
+        """Whether the last event is this process's; otherwise the lock is lost.
 
         Where the events are gone, removed by hand, it takes the lock again, unless somebody had the time to take over, to
         work and to end.
@@ -139,8 +134,7 @@ def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[Lock]:
     mine = Holder(uuid.uuid4().hex, socket.gethostname(), os.getpid(), _machine(), _born(os.getpid()) or "")
     while not _take(store, mine, _find_gone(store, beat)):
         pass
-    lock = Lock(store, mine, beat)
-    ended = threading.Event()
+    lock, ended = Lock(store, mine, beat), threading.Event()
     heartbeat = threading.Thread(
         target=_show_life, args=(lock, beat.period_s, ended), name="lock heartbeat", daemon=True
     )
@@ -158,30 +152,33 @@ def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[Lock]:
 def read_holder(store: Store) -> Holder | None:
     """The holder of the lock, None where it is free; `UNREADABLE` where the store's events cannot be read."""
     try:
-        events = Events(store, LOCK_CLAIMS).read()
-        return Holder(**json.loads(events[-1])) if events else None
+        return _last_of(Events(store, LOCK_CLAIMS).read())
     except FileNotFoundError:  # given back while it was read
         return None
     except (CorruptError, ValueError, TypeError):
         return UNREADABLE
 
 
+def _last_of(events: Sequence[bytes]) -> Holder | None:
+    return Holder(**json.loads(events[-1])) if events else None
+
+
 def shows_life(store: Store, holder: Holder, beat: Beat = DEFAULT_BEAT) -> bool:
     """Whether a holder lives: by its process on this machine, elsewhere by a heartbeat that changes within the patience."""
     if is_here(holder):
         return _born(holder.pid) == holder.born
-
-    def read_beat() -> bytes | None:
-        with contextlib.suppress(FileNotFoundError):
-            return store.read(LOCK_FILE)
-        return None
-
-    before = read_beat()
+    before = _read_beat(store)
     for _ in range(beat.patience):
         time.sleep(beat.period_s)
-        if read_beat() != before or read_holder(store) != holder:
+        if _read_beat(store) != before or read_holder(store) != holder:
             return True
     return False
+
+
+def _read_beat(store: Store) -> bytes | None:
+    with contextlib.suppress(FileNotFoundError):
+        return store.read(LOCK_FILE)
+    return None
 
 
 def is_here(holder: Holder) -> bool:
@@ -199,13 +196,10 @@ def _show_life(lock: Lock, period_s: float, ended: threading.Event) -> None:
 
 def _find_gone(store: Store, beat: Beat) -> Holder | None:
     """The holder if it is dead or shows no life, None if the lock is free. Raises InUseError where it lives."""
-    first = read_holder(store)
-    if first is None:
-        return None
-    if not shows_life(store, first, beat):
-        return first
-    now = read_holder(store)
-    if now is None:
+    holder = read_holder(store)
+    if holder is None or not shows_life(store, holder, beat):
+        return holder
+    if (now := read_holder(store)) is None:
         return None
     by = f"process {now.pid} on {now.host}"
     raise InUseError(
@@ -220,13 +214,9 @@ def _take(store: Store, mine: Holder, gone: Holder | None) -> bool:
     if gone == UNREADABLE:
         _clear(store)
         gone = None
-
-    def decide(before: Sequence[bytes]) -> bytes | None:
-        last = Holder(**json.loads(before[-1])) if before else None
-        return json.dumps(asdict(mine)).encode() if last == gone else None
-
+    event = json.dumps(asdict(mine)).encode()
     try:
-        return Events(store, LOCK_CLAIMS).append(decide) is not None
+        return Events(store, LOCK_CLAIMS).append(lambda before: event if _last_of(before) == gone else None) is not None
     except (CorruptError, FileNotFoundError, ValueError, TypeError):  # given back, or damaged, at this moment
         return False
 
@@ -279,28 +269,15 @@ def explain_lost_folder(root: Path | None) -> Iterator[None]:
     try:
         yield
     except (VersoError, OSError) as error:
-        lost = _how_lost(folder, root)
-        deadline = time.monotonic() + REMOVAL_S
-        while lost is None and type(error) in LOOKS_LOST and time.monotonic() < deadline:
+        deadline = time.monotonic() + (REMOVAL_S if type(error) in LOOKS_LOST else 0.0)
+        while (
+            there := root.exists() and os.path.samestat(os.fstat(folder), os.stat(root))
+        ) and time.monotonic() < deadline:
             time.sleep(0.1)  # whoever removes it may not be done
-            lost = _how_lost(folder, root)
-        if lost:
-            raise MachineError(f"{root} was {lost} while the run worked in it: {_REMEDIES[lost]}") from error
-        raise
+        if there:
+            raise
+        raise MachineError(
+            f"{root} was removed or moved while the run worked in it: move it back, or start again to make it anew"
+        ) from error
     finally:
         os.close(folder)
-
-
-_REMEDIES = {
-    "removed": "what it held is gone, start again to make it anew",
-    "moved": "move it back and start again, what is committed is kept",
-}
-
-
-def _how_lost(folder: int, root: Path) -> str | None:
-    """What became of the folder that was opened; None where it is still what is found at `root`."""
-    opened = os.fstat(folder)
-    with contextlib.suppress(OSError):
-        if os.path.samestat(opened, os.stat(root)):
-            return None
-    return "moved" if opened.st_nlink else "removed"

@@ -1,15 +1,24 @@
-"""Processes and cores of this machine: who descends from whom, ending descendants, and a container's share of the cores. Edge."""
+"""This machine: processes found and ended, a container's share of the cores, and folders that go with their owner. Edge.
+
+The folders are those of private Rays: closed to other users, with names short enough for sockets.
+"""
 
 import contextlib
 import ctypes
+import fcntl
 import math
 import os
+import shutil
 import signal
+import stat
+import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from schemas.errors import MachineError
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
@@ -62,14 +71,20 @@ def descendants(pid: int) -> list[Process]:
     Parents first, and of one generation's the older first.
     """
     children: defaultdict[int, list[Process]] = defaultdict(list)
+    for process in _processes():
+        children[process.parent].append(process)
+    family, level = [], children[pid]
+    while level:
+        family += sorted(level, key=lambda process: int(process.born))
+        level = [child for process in level for child in children[process.pid]]
+    return [process for process in family if not process.ended]
+
+
+def _processes() -> Iterator[Process]:
+    """All processes of this machine."""
     for entry in os.listdir("/proc"):
         if entry.isdigit() and (process := read_process(int(entry))) is not None:
-            children[process.parent].append(process)
-    found, level = [], children[pid]
-    while level:
-        found += sorted(level, key=lambda process: int(process.born))
-        level = [child for process in level for child in children[process.pid]]
-    return [process for process in found if not process.ended]
+            yield process
 
 
 def send(process: Process, number: int) -> None:
@@ -80,32 +95,23 @@ def send(process: Process, number: int) -> None:
             signal.pidfd_send_signal(descriptor.fileno(), number)
 
 
-def marked(mark: str) -> list[Process]:
+def marked(mark: str) -> Iterator[Process]:
     """Processes whose environment, as they were started, has the line `mark`; without this one."""
-    found = []
-    for entry in os.listdir("/proc"):
+    for process in _processes():
         with contextlib.suppress(OSError):
-            if entry.isdigit() and mark.encode() in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
-                found.append(read_process(int(entry)))
-    return [process for process in found if process and not process.ended and process.pid != os.getpid()]
+            has_line = mark.encode() in Path(f"/proc/{process.pid}/environ").read_bytes().split(b"\0")
+            if has_line and not process.ended and process.pid != os.getpid():
+                yield process
 
 
-def end_descendants() -> list[Process]:
-    """Ends everything that descends from this process, as `end_all`.
-
-    For a child subreaper alone, whose descendants cannot leave it.
-    """
-    return end_all(lambda: descendants(os.getpid()))
-
-
-def end_all(find: Callable[[], list[Process]]) -> list[Process]:
+def end_all(find: Callable[[], Iterable[Process]]) -> list[Process]:
     """Ends what `find` finds, until it finds nothing more: SIGTERM, then SIGKILL. Returns what even that did not end."""
     for number, patience_s in ((signal.SIGTERM, GRACE_S), (signal.SIGKILL, KILL_S)):
-        deadline, told = time.monotonic() + patience_s, set[tuple[int, str]]()
-        while left := find():
+        deadline, sent = time.monotonic() + patience_s, set[tuple[int, str]]()
+        while left := list(find()):
             for process in left:
-                if (process.pid, process.born) not in told:
-                    told.add((process.pid, process.born))
+                if (process.pid, process.born) not in sent:
+                    sent.add((process.pid, process.born))
                     send(process, number)
             reap()
             if time.monotonic() > deadline:
@@ -121,8 +127,8 @@ def reap() -> dict[int, int]:
     """Wait statuses of the children that have ended, by process id."""
     statuses: dict[int, int] = {}
     with contextlib.suppress(ChildProcessError):
-        while (found := os.waitpid(-1, os.WNOHANG))[0]:
-            statuses[found[0]] = found[1]
+        while (child := os.waitpid(-1, os.WNOHANG))[0]:
+            statuses[child[0]] = child[1]
     return statuses
 
 
@@ -153,22 +159,15 @@ def usable_cores(proc: Path = Path("/proc/self/cgroup"), cgroups: Path = Path("/
     return math.ceil(quota) if quota < cores else cores
 
 
-def _control_groups(proc: Path, cgroups: Path) -> list[Path]:
+def _control_groups(proc: Path, cgroups: Path) -> Iterator[Path]:
     """The folders whose limits apply to this process: its own group and all above it, in either version's layout."""
-    try:
-        lines = proc.read_text().splitlines()
-    except OSError:
-        return []
-    folders: list[Path] = []
-    for line in lines:
+    for line in proc.read_text().splitlines() if proc.exists() else ():
         _, controllers, path = line.split(":", 2)
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        top = cgroups / "cpu" if controllers else cgroups
-        own = top / path.lstrip("/")
-        # Inside a container the path may be the host's, of which only the top is mounted here.
-        folders += [own, *(above for above in own.parents if above.is_relative_to(top))]
-    return folders
+        if not controllers or "cpu" in controllers.split(","):
+            top = cgroups / "cpu" if controllers else cgroups
+            group = top / path.lstrip("/")
+            # Inside a container the path may be the host's, of which only the top is mounted here.
+            yield from (folder for folder in (group, *group.parents) if folder.is_relative_to(top))
 
 
 def _quota(folder: Path) -> float:
@@ -181,3 +180,112 @@ def _quota(folder: Path) -> float:
     except OSError:
         return math.inf
     return math.inf if granted in ("max", "-1") else int(granted) / int(period)
+
+
+# ------------------------------------------------------------------------------------------------ private folders
+
+PREFIX = "vr-"
+
+OWNER = "owner"
+"""A file that the owner keeps locked. The kernel unlocks it when the process ends, however that happens."""
+
+INNER = "r"
+"""What Ray gets. It opens its own folder to every user (0777), so it gets one inside a folder that nobody else enters."""
+
+SOCKET_BYTES = 107
+"""The longest name of a Unix socket on Linux."""
+
+SESSION_BYTES = len("/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store")
+"""What Ray puts behind the name of its folder; 4194304 is the largest process id."""
+
+MAX_BASE_BYTES = SOCKET_BYTES - SESSION_BYTES - len(f"/{PREFIX}12345678/{INNER}")
+"""The longest temporary folder that has room for a private Ray's."""
+
+OTHERS = (Path("/tmp"), Path("/var/tmp"), Path("/dev/shm"))
+"""Where to go when the user's temporary folder has too long a name."""
+
+
+@contextlib.contextmanager
+def private_folder() -> Iterator[Path]:
+    """An empty folder that no other user can enter; removed when the block ends.
+
+    Folders of processes that are gone are removed first. Raises MachineError where no place has a name short enough.
+    """
+    places = _places()
+    for place in places:
+        remove_dead(place)
+    folder, owner = _make(places)
+    try:
+        yield folder / INNER
+    finally:
+        _remove(folder)
+        os.close(owner)
+
+
+def living_folders() -> list[Path]:
+    """This user's private folders on this machine, those of processes that are gone removed first."""
+    places = _places()
+    for place in places:
+        remove_dead(place)
+    return [folder / INNER for place in places for folder in _private_folders(place)]
+
+
+def remove_dead(place: Path) -> None:
+    """Removes this user's folders below `place` whose owner does not live."""
+    for folder in _private_folders(place):
+        # Locked by a process that lives, or not one of these folders, or removed by another process meanwhile.
+        with (
+            contextlib.suppress(OSError),
+            open(os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)) as owner,
+        ):
+            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _remove(folder)
+
+
+def _private_folders(place: Path) -> Iterator[Path]:
+    """This user's below `place`."""
+    for folder in place.glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError):
+            status = folder.lstat()
+            if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and (folder / OWNER).exists():
+                yield folder
+
+
+def _places() -> list[Path]:
+    """The user's temporary folder if its name is short enough, then the others. Raises MachineError if none exists."""
+    try:
+        wanted = Path(tempfile.gettempdir())
+    except FileNotFoundError as error:
+        raise MachineError(f"{error.strerror}: set TMPDIR to one that can be written") from error
+    places = [place for place in (wanted, *OTHERS) if len(os.fsencode(place)) <= MAX_BASE_BYTES]
+    return list(dict.fromkeys(places))
+
+
+def _make(places: Sequence[Path]) -> tuple[Path, int]:
+    """A folder in the first place that takes one, and the open file that shows that its owner lives."""
+    errors = []
+    for place in places:
+        try:
+            folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
+            (folder / INNER).mkdir()
+            # It gets its name when it is locked, so nobody ever finds it unlocked before
+            unnamed = folder / f"{OWNER}.new"
+            owner = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            unnamed.rename(folder / OWNER)
+            return folder, owner
+        except OSError as error:
+            errors.append(f"{place} ({error.strerror or error})")
+    wanted = tempfile.gettempdir()
+    tried = f"; cannot be written: {', '.join(errors)}" if errors else ""
+    raise MachineError(
+        f"no place for Ray's sockets: the name of {wanted} has {len(os.fsencode(wanted))} bytes, at most {MAX_BASE_BYTES} "
+        f"fit{tried}: set TMPDIR to a writable folder with a short name"
+    )
+
+
+def _remove(folder: Path) -> None:
+    """Removes a folder, the owner's file last: what a process that is just ending wrote meanwhile is found again."""
+    shutil.rmtree(folder / INNER, ignore_errors=True)
+    if not (folder / INNER).exists():
+        shutil.rmtree(folder, ignore_errors=True)

@@ -2,16 +2,21 @@
 
 import json
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from schemas.environment import cache_folder
 from schemas.errors import MachineError, MeshError
+from schemas.job.assets import Assets, LibrarySource
 from schemas.job.job import Job
 from services.run.progress import ProgressLine
-from workers.assets.catalogue import Catalogue, InstanceRef
+from workers.assets.catalogue import Catalogue
 from workers.pool import Answers, Ended, run_pool
+
+if TYPE_CHECKING:
+    from workers.assets.library.table import Library, Row
 
 MOST_TOLD = 3
 """Meshes that are named one by one."""
@@ -24,20 +29,28 @@ USUAL_FOLDER = cache_folder("parts")
 
 @dataclass(frozen=True)
 class Cut:
-    """A shape to be cut, by its key and path."""
+    """A shape to be cut, and the key of the answer. Its library has no rows, which may be many."""
 
-    catalogue: Catalogue
-    ref: InstanceRef
+    library: "Library"
+    row: "Row"
+    settings: LibrarySource
+    assets: Assets
+    instance_id: str
     concavity: float
-    key: str
-    path: str
+
+    @property
+    def key(self) -> str:
+        """Digest of what the parts follow from."""
+        from workers.physics.convex_parts import key_of, version_of_parts  # unused by built-in shapes
+
+        asked = json.dumps([self.instance_id, self.row.key, self.concavity])
+        return key_of("parts", version_of_parts(), asked)
 
 
 def find_parts(job: Job, catalogue: Catalogue, folder: Path | None = USUAL_FOLDER) -> None:
     """Cuts every shape that the job may drop onto another object, and keeps its parts in `folder`, where workers look for them.
 
-    A shape is looked at once for ever. Single objects are left out: over a flat table few ever need parts. Raises MachineError
-    where a process is killed.
+    Single objects are left out: over a flat table few ever need parts. Raises MachineError where a process is killed.
     """
     if job.captures is not None or job.physics.collision in ("box", "hull") or folder is None:
         return
@@ -45,56 +58,67 @@ def find_parts(job: Job, catalogue: Catalogue, folder: Path | None = USUAL_FOLDE
         return
     if all(library is None for library in catalogue.objects):
         return
-    kept = Answers(folder / "cut")
-    cuts = [cut for cut in _shapes(job, catalogue) if cut.key not in kept]
-    if not cuts or len(cuts) > MOST_CUT:
+    cuts = list(_shapes(job, catalogue))
+    if len(cuts) > MOST_CUT:
         return
-    line, deep = ProgressLine(len(cuts), "meshes cut into convex parts", "mesh"), list[str]()
-    for done, (cut, answer) in enumerate(run_pool(cut_shape, cuts, key=lambda cut: cut.key, kept=kept), 1):
-        line.show(done, name=cut.path)
-        if isinstance(answer, Ended):
-            raise MachineError(
-                f"a process that cuts {cut.path} into convex parts ended: {answer.detail}: start again, what is cut stays"
-            )
-        if message := answer.decode():
-            deep.append(f"{cut.path}: {message}")
-    line.close()
+    deep = sorted(f"{cut.row.path}: {message}" for cut, _, message in cut_shapes(cuts, folder) if message)
     if deep:
         more = f"; and {len(deep) - MOST_TOLD} more" if len(deep) > MOST_TOLD else ""
-        message = (
-            f"verso: convex parts fill deeper hollows than physics.concavity says: {'; '.join(deep[:MOST_TOLD])}{more}"
-        )
-        print(f"{message}. Objects rest on the true meshes all the same", file=sys.stderr)
+        print(f"verso: {'; '.join(deep[:MOST_TOLD])}{more}", file=sys.stderr)
 
 
 def _shapes(job: Job, catalogue: Catalogue) -> Iterator[Cut]:
     """Every shape of a library that the job may draw as an object."""
-    from workers.physics.convex_parts import key_of, version_of_parts  # what a job of built-in shapes has no use for
-
-    for number, library in enumerate(catalogue.objects):
-        for category in job.categories if library is not None else ():
-            assert library is not None
+    for number, (settings, library) in enumerate(zip(catalogue.assets.objects, catalogue.objects, strict=True)):
+        if library is None:
+            continue
+        assert isinstance(settings, LibrarySource)
+        alone = replace(library, rows=())
+        for category in job.categories:
             for index, row in enumerate(library.entries.get(category, ())):
                 if row.use:
-                    ref = catalogue.refer(number, category, index)
-                    asked = json.dumps([ref.instance_id, row.key, job.physics.concavity])
-                    key = key_of("parts", version_of_parts(), asked)
-                    yield Cut(catalogue, ref, job.physics.concavity, key, row.path)
+                    name = catalogue.refer(number, category, index).instance_id
+                    yield Cut(alone, row, settings, catalogue.assets, name, job.physics.concavity)
+
+
+def cut_shapes(cuts: Iterable[Cut], folder: Path | None = USUAL_FOLDER) -> Iterator[tuple[Cut, int, str]]:
+    """Each shape with its number of parts, 0 where it is refused, and what is to be told of it, empty for nothing.
+
+    A shape is cut once for ever. Raises MachineError where a process is killed.
+    """
+    asked = list(cuts)
+    line, kept = ProgressLine(len(asked), "meshes cut into convex parts", "mesh"), Answers(folder and folder / "cut")
+    for done, (cut, answer) in enumerate(run_pool(cut_shape, asked, key=lambda cut: cut.key, kept=kept), 1):
+        line.show(done)
+        if not isinstance(answer, Ended):
+            yield cut, *json.loads(answer)
+        elif answer.how == "killed":
+            raise MachineError(
+                f"a process that cuts {cut.row.path} into convex parts was killed: start again, what is cut stays"
+            )
+        else:
+            yield cut, 0, f"cannot be cut: it {answer.detail}; set `use` of its row in library.parquet to false"
+    line.close()
 
 
 def cut_shape(cut: Cut) -> bytes:
-    """In a process of the pool: finds the parts of a shape; what is to be told of them, empty where nothing is."""
+    """In a process of the pool: finds the parts of a shape; as JSON, how many, and what is to be told of them."""
+    from workers.assets.library.shapes import load_shape
     from workers.geometry.hull import hull_of
     from workers.geometry.mesh import fills_hull
     from workers.physics.convex_parts import decompose
 
     try:
-        asset = cut.catalogue.load(cut.ref)
+        asset = load_shape(cut.library, cut.row, cut.settings, cut.assets, cut.instance_id)
     except MeshError:
-        return b""  # refused, or changed meanwhile: its scenes say so
+        return json.dumps([0, ""]).encode()  # refused, or changed meanwhile: its scenes say so
     if asset.volume_m3 is not None and fills_hull(asset.volume_m3, hull_of(asset.shape).vertices):
-        return b""
+        return json.dumps([1, ""]).encode()
     parts, size_m = decompose(asset.shape.mesh, asset.sha256, cut.concavity), max(asset.extents_m)
     deep = parts.depth_m > cut.concavity * size_m  # twice what is asked for
-    message = f"{len(parts.clouds)} parts, {parts.depth_m * 1e3:.1f} mm of {size_m * 1e3:.0f} mm" if deep else ""
-    return message.encode()
+    count = len(parts.clouds)
+    message = (
+        f"{count} convex parts fill hollows of {parts.depth_m * 1e3:.1f} mm, deeper than physics.concavity = "
+        f"{cut.concavity:g} asks for; it rests on its true mesh all the same"
+    )
+    return json.dumps([count, message if deep else ""]).encode()

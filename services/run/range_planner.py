@@ -1,7 +1,6 @@
 """What of a dataset is still to be made, such that ranges never overlap; and which commits it had once and has no more."""
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -15,10 +14,6 @@ from schemas.dataset.commit import Ledger, Span
 from schemas.dataset.layout import commit_path
 from schemas.errors import OutputError
 from schemas.job.job import Job
-from services.job.record import read_success
-from workers.store.commit import commits_digest
-from workers.store.ledger import list_commits
-from workers.store.store import Store
 
 MAX_SHARD = 64
 """Scenes in a shard of a large job: seconds of work for each millisecond that Ray takes to hand it out."""
@@ -52,15 +47,11 @@ def plan_ranges(
 ) -> Iterator[tuple[int, int]]:
     """The missing ranges [start, stop), in order, one at a time. `committed`, [N, 2] in any order, may be out of date.
 
-    Grid lines lie at first_scene + k * range_size. No range crosses one. Within a cell, the only starts that are ever
-    planned are the cell's own line and the stop of a committed range. A range ends at the next line or at stop_scene,
-    whichever comes first.
-
-    Ranges cannot overlap, even if planners have old views and other values of stop_scene: a record is put only if
-    absent, so one start has one range for ever. In a cell, the first committed range can only begin at the line (no stop
-    existed before it), and each later one begins where one of them stops. So they form a single chain without overlap,
-    no range leaves its cell, and the chain ends at the cell's largest stop. An old view lacks the
-    end of a chain: it plans a start that is taken, and loses the put.
+    Grid lines lie at first_scene + k * range_size. In a cell between two, only the line and the stop of a committed range are
+    ever planned as a start; a range ends at the next line or at stop_scene. Ranges cannot overlap, even if planners have old
+    views and other values of stop_scene: a record is put only if absent, so one start has one range for ever, and the ranges
+    of a cell form one chain from its line. An old view lacks the end of a chain: it plans a start that is taken, and loses
+    the put.
 
     Raises OutputError where scenes outside [first_scene, stop_scene) are committed: fewer scenes than committed is
     refused; and where committed ranges do not lie on this grid.
@@ -110,34 +101,24 @@ def plan_retries(ledger: Ledger) -> list[Span]:
 
 
 def deal_shards(
-    spans: Iterable[Span], scenes: int, range_size: int, count_slots: Callable[[], int]
+    spans: Iterable[Span], scenes: int, range_size: int, count_slots: Callable[[], int], shard_size: int | None = None
 ) -> Iterator[tuple[Span, ...]]:
-    """Whole ranges in order, in shards that get smaller towards the end, so that all slots end at nearly the same time.
+    """Whole ranges in order, in shards of `shard_size` scenes or a little more. Made one at a time, on demand.
 
-    A shard has half of an even share of the scenes that are left, and at most 64. At most four ranges, so that slow scenes,
-    which have short ranges, have short shards too. `scenes` are those of all spans. Made one at a time, on demand.
+    Without a size, shards get smaller towards the end, so that all slots end at nearly the same time. A shard has half of an
+    even share of the scenes that are left, and at most 64. At most four ranges, so that slow scenes, which have short ranges,
+    have short shards too. `scenes` are those of all spans.
     """
     most, left, waiting = min(MAX_SHARD, MOST_RANGES * range_size), scenes, iter(spans)
-    while shard := _take(waiting, min(most, math.ceil(left / (2 * count_slots())))):
+    while True:
+        least = shard_size or max(1, min(most, math.ceil(left / (2 * count_slots()))))
+        shard: list[Span] = []
+        while sum(span.count for span in shard) < least and (span := next(waiting, None)) is not None:
+            shard.append(span)
+        if not shard:
+            return
         left -= sum(span.count for span in shard)
-        yield shard
-
-
-def group_shards(spans: Iterable[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:
-    """Whole ranges in order, grouped until they hold at least `shard_size` scenes. Made one at a time, on demand."""
-    waiting = iter(spans)
-    while shard := _take(waiting, shard_size):
-        yield shard
-
-
-def _take(spans: Iterator[Span], least: int) -> tuple[Span, ...]:
-    """The next ranges, until they hold at least so many scenes, and at least one; none where none is left."""
-    shard: list[Span] = []
-    for span in spans:
-        shard.append(span)
-        if sum(one.count for one in shard) >= least:
-            break
-    return tuple(shard)
+        yield tuple(shard)
 
 
 def _check_grid(first_scene: int, stop_scene: int, range_size: int, ranges: NDArray[np.int64]) -> None:
@@ -159,45 +140,15 @@ def _check_grid(first_scene: int, stop_scene: int, range_size: int, ranges: NDAr
         )
 
 
-REMEDY = "restore it from a copy, or run the job again to make its scenes anew"
 MOST_TOLD = 20
-DIGEST_UP_TO = 100_000
-"""Commits whose sizes are compared with `_SUCCESS` too, which takes a second; `verso verify` compares any number."""
 
 
-def find_lost(store: Store, ledger: Ledger | None = None) -> list[str]:
-    """What is lost, a line each with the remedy; empty where every commit that there was is there.
-
-    `ledger` is what `list_commits` returned, if it was called. Raises as `list_commits`.
-    """
-    ledger = ledger or list_commits(store)
+def find_lost(ledger: Ledger) -> list[str]:
+    """What is lost, a line each with the remedy; empty where every commit of the kept summary is there."""
+    remedy = "restore it from a copy, or run the job again to make its scenes anew"
     lines = [
-        f"{commit_path(start, retry)} is lost: it was committed, and is gone; {REMEDY}" for start, retry in ledger.lost
+        f"{commit_path(start, retry)} is lost: it was committed, and is gone; {remedy}" for start, retry in ledger.lost
     ]
     if len(lines) > MOST_TOLD:
-        lines[MOST_TOLD:] = [f"{len(lines) - MOST_TOLD} more commits are lost; {REMEDY}"]
-    return lines or _compare_with_success(store, ledger)
-
-
-def _compare_with_success(store: Store, ledger: Ledger) -> list[str]:
-    """What the finished dataset says it was made of, against the commits that are there."""
-    success = read_success(store) or {}
-    first, stop = success.get("first_scene"), success.get("stop_scene")
-    if not isinstance(first, int) or not isinstance(stop, int):
-        return []
-    if gap := _first_gap(ledger, first, stop):
-        return [f"the commits of scenes {gap[0]} to {gap[1] - 1} of the finished dataset are lost; {REMEDY}"]
-    failed = Counter(ledger.failures.column("kind").to_pylist())
-    counts = {"intrinsic": 0, "environmental": 0, **failed, "made": ledger.committed - failed.total()}
-    few = len(ledger.start) <= DIGEST_UP_TO
-    if success.get("scenes") != counts or (few and success.get("commits") != commits_digest(store)):
-        return ["the commits are not those that the finished dataset was merged from: run the job again to merge them"]
-    return []
-
-
-def _first_gap(ledger: Ledger, first: int, stop: int) -> tuple[int, int] | None:
-    """The first scenes of [first, stop) that no commit holds."""
-    starts, stops = ledger.ranges.T
-    ends = np.append(first, stops)
-    gaps = np.flatnonzero(np.append(starts, stop) > ends)
-    return (int(ends[gaps[0]]), min(int(np.append(starts, stop)[gaps[0]]), stop)) if len(gaps) else None
+        lines[MOST_TOLD:] = [f"{len(lines) - MOST_TOLD} more commits are lost; {remedy}"]
+    return lines

@@ -1,40 +1,47 @@
-"""The Ray that runs the work: a private one on this machine, or a running cluster; and how many shards it runs at once.
+"""The Ray that runs the work: a private one on this machine, or a running cluster; its slots, and what its nodes must have.
 
-A private Ray listens on loopback alone and answers who shows its token. Its folder is closed to other users, has a name that
-is short enough for sockets, and is removed once its owner is gone. On a cluster the slots change as nodes come and go.
+A private Ray listens on loopback alone, answers who shows its token, and leaves nothing. On a cluster the slots change as
+nodes come and go. Its nodes are asked what they have before the first scene: the question travels whole, so that a node
+without this project can answer, and it comes without the run's environment, so that a processor that cannot have it is told
+instead of crashed.
 """
 
 import contextlib
-import fcntl
 import math
 import os
 import secrets
 import shutil
 import socket
-import stat
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray import cloudpickle
 from ray._private import ray_constants, utils
 from ray._private.node import Node
 from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
 from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from schemas.dataset.layout import FINGERPRINT_FILE, LOCK_FILE
+from schemas.dataset.shard import ShardOrder
 from schemas.errors import MachineError
 from schemas.job.job import Run
-from services.run.machine import usable_cores
+from services.run import worker_entry
+from services.run.machine import private_folder, usable_cores
+from services.run.progress import say
 from services.run.supervisor import core_stderr, tell
+from services.run.worker_entry import Pattern, WorkerTerms, refusal_of
+from workers.store.store import Store
 
 PREFETCH = 2
 """Shards given to Ray for each slot: one that runs and one that waits, so that no slot is idle between two."""
 
 LOOK_EVERY_S = 2.0
-"""How often a cluster is asked for its cores."""
+"""How often a cluster is asked for its cores, or its nodes."""
 
 
 @dataclass(frozen=True)
@@ -50,52 +57,41 @@ class Slots:
         return self.look() if self.look else self
 
 
-def slots_of(cores: int, workers: int | None) -> Slots:
-    """The slots of a cluster with that many cores, at least one: `workers` where that is less.
+def slots_of(cores: int, workers: int | None, jobs: int = 1) -> Slots:
+    """The slots of a cluster with that many cores, at least one: `workers` where that is less; an even share of several jobs.
 
-    Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
+    Any free core would start a waiting shard, so none may wait where there are fewer workers than cores, or other jobs.
     """
     cores = max(1, cores)
-    return Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
+    running = math.ceil(min(workers or cores, cores) / max(1, jobs))
+    alone = jobs <= 1 and running == cores
+    return Slots(running, PREFETCH * running if alone else running)
 
 
-def cluster_slots(
-    count_cores: Callable[[], int], workers: int | None, clock: Callable[[], float] = time.monotonic
-) -> Slots:
+def cluster_slots(count_cores: Callable[[], int], workers: int | None, count_jobs: Callable[[], int]) -> Slots:
     """The slots of a cluster, at least one also while it has no node; `count_cores` is asked every few seconds."""
-    known, at_s = slots_of(count_cores(), workers), clock()
+    cores, at_s = count_cores(), time.monotonic()
 
     def look() -> Slots:
-        nonlocal known, at_s
-        if clock() - at_s >= LOOK_EVERY_S:
-            known, at_s = slots_of(count_cores(), workers), clock()
-        return known
+        nonlocal cores, at_s
+        if time.monotonic() - at_s >= LOOK_EVERY_S:
+            cores, at_s = count_cores(), time.monotonic()
+        return slots_of(cores, workers, count_jobs())
 
-    return replace(known, look=look)
-
-
-def share_slots(whole: Slots, jobs: Callable[[], int]) -> Slots:
-    """With other jobs an even share of all, rounded up, of which none waits in Ray: it would take another job's turn."""
-
-    def look() -> Slots:
-        now, sharing = whole.now(), jobs()
-        share = math.ceil(now.running / max(1, sharing))
-        return now if sharing <= 1 else Slots(share, share)
-
-    return replace(whole, look=look)
+    return replace(look(), look=look)
 
 
 RAY_PARTS = 10_000
 """Ray counts parts of a resource in so many steps. Rounded down, all parts of a GPU fit."""
 
 
-def share_gpus(nodes: Sequence[tuple[int, int]], running: int, run: Run) -> float:
-    """The part of a GPU that a shard asks for: by (cores, GPUs) of each node, shards that run at once, and the job.
+def share_gpus(resources: Iterable[Mapping[str, float]], running: int, run: Run) -> float:
+    """The part of a GPU that a shard asks for: by what each node has, shards that run at once, and the job.
 
     By default as few workers have a GPU together as leave no shard waiting: Ray fills one GPU before it takes the next.
     0 where no node has one, and where some have none and the job takes any device: those would stand idle.
     """
-    working = [(cores, gpus) for cores, gpus in nodes if cores > 0]
+    working = [(int(node["CPU"]), int(node.get("GPU", 0))) for node in resources if node.get("CPU")]
     with_gpu = [(cores, gpus) for cores, gpus in working if gpus > 0]
     if not with_gpu or (run.device == "any" and len(with_gpu) < len(working)):
         return 0.0
@@ -104,10 +100,9 @@ def share_gpus(nodes: Sequence[tuple[int, int]], running: int, run: Run) -> floa
     return RAY_PARTS // (run.workers_per_gpu or fewest) / RAY_PARTS
 
 
-def nodes_here() -> list[tuple[int, int]]:
-    """(cores, GPUs) of each node of the Ray that this process is connected to."""
-    found = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    return [(int(one.get("CPU", 0)), int(one.get("GPU", 0))) for one in found]
+def alive_nodes() -> list[dict[str, Any]]:
+    """The nodes of the Ray that this process is connected to, as Ray describes them."""
+    return [node for node in ray.nodes() if node["Alive"]]
 
 
 def private_environment() -> dict[str, str]:
@@ -131,109 +126,6 @@ def private_environment() -> dict[str, str]:
 NOT_INHERITED = ("RAY_REDIS_ADDRESS",)
 """Variables of the user's that would tie a private Ray to another one."""
 
-
-PREFIX = "vr-"
-
-OWNER = "owner"
-"""A file that the owner keeps locked. The kernel unlocks it when the process ends, however that happens."""
-
-INNER = "r"
-"""What Ray gets. It opens its own folder to every user (0777), so it gets one inside a folder that nobody else enters."""
-
-SOCKET_BYTES = 107
-"""The longest name of a Unix socket on Linux."""
-
-SESSION_BYTES = len("/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store")
-"""What Ray puts behind the name of its folder; 4194304 is the largest process id."""
-
-MAX_BASE_BYTES = SOCKET_BYTES - SESSION_BYTES - len(f"/{PREFIX}12345678/{INNER}")
-"""The longest temporary folder that has room for a private Ray's."""
-
-OTHERS = (Path("/tmp"), Path("/var/tmp"), Path("/dev/shm"))
-"""Where to go when the user's temporary folder has too long a name."""
-
-
-@contextlib.contextmanager
-def private_folder() -> Iterator[Path]:
-    """An empty folder that no other user can enter; removed when the block ends.
-
-    Folders of processes that are gone are removed first. Raises MachineError where no place has a name short enough.
-    """
-    places = _places()
-    for place in places:
-        remove_dead(place)
-    folder, owner = _make(places)
-    try:
-        yield folder / INNER
-    finally:
-        _remove(folder)
-        os.close(owner)
-
-
-def living_folders() -> list[Path]:
-    """This user's private folders on this machine, those of processes that are gone removed first."""
-    found = []
-    for place in _places():
-        remove_dead(place)
-        for folder in place.glob(f"{PREFIX}*"):
-            with contextlib.suppress(OSError):
-                if folder.lstat().st_uid == os.geteuid() and (folder / OWNER).exists():
-                    found.append(folder / INNER)
-    return found
-
-
-def remove_dead(place: Path) -> None:
-    """Removes this user's folders below `place` whose owner does not live."""
-    for folder in place.glob(f"{PREFIX}*"):
-        # Locked by a process that lives, or not one of these folders, or removed by another process meanwhile.
-        with contextlib.suppress(OSError):
-            status = folder.lstat()
-            if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid():
-                with open(os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)) as owner:
-                    fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    _remove(folder)
-
-
-def _places() -> list[Path]:
-    """The user's temporary folder if its name is short enough, then the others. Raises MachineError if none exists."""
-    try:
-        wanted = Path(tempfile.gettempdir())
-    except FileNotFoundError as error:
-        raise MachineError(f"{error.strerror}: set TMPDIR to one that can be written") from error
-    places = [place for place in (wanted, *OTHERS) if len(os.fsencode(place)) <= MAX_BASE_BYTES]
-    return list(dict.fromkeys(places))
-
-
-def _make(places: Sequence[Path]) -> tuple[Path, int]:
-    """A folder in the first place that takes one, and the open file that shows that its owner lives."""
-    errors = []
-    for place in places:
-        try:
-            folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
-            (folder / INNER).mkdir()
-            # It gets its name when it is locked, so nobody ever finds it unlocked before
-            unnamed = folder / f"{OWNER}.new"
-            owner = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            unnamed.rename(folder / OWNER)
-            return folder, owner
-        except OSError as error:
-            errors.append(f"{place} ({error.strerror or error})")
-    wanted = tempfile.gettempdir()
-    tried = f"; cannot be written: {', '.join(errors)}" if errors else ""
-    raise MachineError(
-        f"no place for Ray's sockets: the name of {wanted} has {len(os.fsencode(wanted))} bytes, at most {MAX_BASE_BYTES} "
-        f"fit{tried}: set TMPDIR to a writable folder with a short name"
-    )
-
-
-def _remove(folder: Path) -> None:
-    """Removes a folder, the owner's file last: what a process that is just ending wrote meanwhile is found again."""
-    shutil.rmtree(folder / INNER, ignore_errors=True)
-    if not (folder / INNER).exists():
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 OBJECT_STORE_BYTES = 128 * 2**20
 """Images never cross Ray, so its shared memory can be small."""
 
@@ -241,18 +133,18 @@ CONNECT_S = 10.0
 """Time for a cluster's head to accept a connection."""
 
 
-def open_ray(address: str | None, workers: int | None) -> contextlib.AbstractContextManager[Slots]:
-    """The cluster at `address`, or a private Ray, by default with a worker for each usable core."""
-    return private_ray(workers or usable_cores()) if address is None else cluster_ray(address, workers)
+def open_ray(
+    address: str | None, workers: int | None, sharing: Callable[[], int] | None = None
+) -> contextlib.AbstractContextManager[Slots]:
+    """The cluster at `address`, shared with so many jobs, or a private Ray, by default with a worker for each usable core."""
+    return private_ray(workers or usable_cores()) if address is None else cluster_ray(address, workers, sharing)
 
 
 @contextlib.contextmanager
 def private_ray(workers: int) -> Iterator[Slots]:
-    """A private Ray with `workers` slots, shut down when the block ends.
+    """A private Ray with `workers` slots, shut down when the block ends. Raises MachineError where Ray does not start.
 
-    Never joins another Ray on this machine and contacts no other host. Its processes listen on loopback and on sockets in
-    a folder that no other user can enter, and answer those that show its token, which no file and no log holds. Raises
-    MachineError where Ray does not start.
+    It never joins another Ray on this machine, contacts no other host, and has a token that no file and no log holds.
     """
     with private_folder() as folder, ray_in(folder, workers) as slots:
         yield slots
@@ -260,27 +152,29 @@ def private_ray(workers: int) -> Iterator[Slots]:
 
 @contextlib.contextmanager
 def ray_in(folder: Path, workers: int) -> Iterator[Slots]:
-    """A private Ray as above, in a private folder."""
-    with kept_private():
+    """The same, in a private folder."""
+    shared = Path("/dev/shm")
+    # A container often has 64 MiB of shared memory only. In a folder Ray warns of slow storage, which reports can bear.
+    roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
+    settings = {
+        "num_cpus": workers,
+        "include_dashboard": False,
+        "object_store_memory": OBJECT_STORE_BYTES,
+        "_temp_dir": str(folder),
+        "_plasma_directory": str(shared if roomy else folder),
+        "_node_ip_address": "127.0.0.1",
+        "_system_config": {"enable_metrics_collection": False},  # they would be served without asking for the token
+    }
+    with kept_private(), contextlib.ExitStack() as stack:
         tell(folder=str(folder.parent))  # the supervisor removes it where this process cannot
-        settings = {
-            "num_cpus": workers,
-            "include_dashboard": False,
-            "object_store_memory": OBJECT_STORE_BYTES,
-            "_temp_dir": str(folder),
-            "_plasma_directory": _object_store_folder(str(folder)),
-            "_node_ip_address": "127.0.0.1",
-            "_system_config": {"enable_metrics_collection": False},  # they would be served without asking for the token
-        }
-        with contextlib.ExitStack() as stack:
-            try:
-                stack.enter_context(connection("local", **settings))
-            except Exception as error:  # Ray raises plain ones, after half a minute where the machine is overloaded
-                said = next(iter(str(error).splitlines()), type(error).__name__)
-                raise MachineError(
-                    f"Ray did not start on this machine ({said}): see `verso doctor`, or start again when less is running here"
-                ) from error
-            yield Slots(workers, PREFETCH * workers)
+        try:
+            stack.enter_context(connection("local", **settings))
+        except Exception as error:  # Ray raises plain ones, after half a minute where the machine is overloaded
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise MachineError(
+                f"Ray did not start on this machine ({reason}): see `verso doctor`, or start again when less is running here"
+            ) from error
+        yield Slots(workers, PREFETCH * workers)
 
 
 @contextlib.contextmanager
@@ -318,7 +212,7 @@ def kept_private() -> Iterator[None]:
 
 
 def _note_that_there_is_no_dashboard(node: Node, **_: Any) -> None:
-    """What the dashboard's process does where it serves nothing; Ray's agent would ask for the address every second."""
+    """Ray's agent would ask for the address every second."""
     node._webui_url = ""
     address, namespace = ray_constants.DASHBOARD_ADDRESS, ray_constants.KV_NAMESPACE_DASHBOARD
     node.get_gcs_client().internal_kv_put(address.encode(), b"none", True, namespace)
@@ -344,19 +238,9 @@ def address_here() -> str:
     return str(ray.get_runtime_context().gcs_address)
 
 
-def _object_store_folder(temporary: str) -> str:
-    """Shared memory where there is enough of it, otherwise the temporary folder.
-
-    A container often has 64 MiB only. Ray then warns of slow storage, which does not matter for reports of a kilobyte.
-    """
-    shared = Path("/dev/shm")
-    roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
-    return str(shared) if roomy else temporary
-
-
 @contextlib.contextmanager
-def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
-    """A running cluster: as many slots as it has cores at the moment, or `workers` where that is less.
+def cluster_ray(address: str, workers: int | None, sharing: Callable[[], int] | None = None) -> Iterator[Slots]:
+    """A running cluster: as many slots as it has cores at the moment, or `workers` where that is less, shared by jobs.
 
     The user's own settings of authentication (RAY_AUTH_MODE, RAY_AUTH_TOKEN) count. Raises MachineError where no Ray
     answers at the address, or where it wants another token.
@@ -372,7 +256,7 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
             ) from error
         if _count_cores() < 1:
             raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-        yield cluster_slots(_count_cores, workers)
+        yield cluster_slots(_count_cores, workers, sharing or (lambda: 1))
 
 
 def _count_cores() -> int:
@@ -384,9 +268,8 @@ def connection(address: str, **settings: Any) -> Iterator[None]:
     """A connection to a Ray, shut down when the block ends.
 
     Ray's messages about dead workers go where its C++ core writes (to the user, or to a supervisor, which keeps them for
-    the logs), because standard output is for the command's answer, and what they mean is told by us. Ray puts the
-    current folder first on its workers' search path. It is the project's for that moment, because the packages have
-    generic names: a `services` folder in the user's working folder must not be found instead.
+    the logs): standard output is for the command's answer. Ray puts the current folder first on its workers' search path. It
+    is the project's for that moment: a `services` folder in the user's working folder must not be found instead.
     """
     with core_stderr() as stream, contextlib.redirect_stdout(stream):
         # While it starts, Ray asks Python to dump its stack to standard error where it crashes.
@@ -414,3 +297,79 @@ def _check_reachable(address: str) -> None:
             f"--address {address}: no Ray answers there ({error.strerror or error}); start one with `ray start --head`, or "
             "leave --address out to run on this machine"
         ) from error
+
+
+# ------------------------------------------------------------------------------------------------ who may work
+
+ANSWER_S = 60.0
+"""Time for a node's answer: it may have to start a process for it. One that is silent is asked again by its workers."""
+
+
+def on_node(task: Any, node: str) -> Any:
+    """A remote function that runs on the node with this id."""
+    return task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False))
+
+
+def join_cluster(store: Store, token: str, pattern: Pattern) -> Pattern:
+    """The pattern for workers on other hosts. Raises VersoError where a node of the cluster cannot work on the run.
+
+    `token` is what the lock's file in the output folder holds.
+    """
+    terms = pattern.terms
+    if store.root is not None:
+        terms = replace(terms, out=str(store.root), proof=str(store.root / LOCK_FILE), token=token)
+    check_nodes(terms)
+    return replace(pattern, order=with_own_stack(store, pattern.order), terms=terms, env_vars=dict(terms.environment))
+
+
+def with_own_stack(store: Store, order: ShardOrder) -> ShardOrder:
+    """The order of a strict job without commits, with this process's fingerprint, which every worker must then have.
+
+    Left as it is where the job has commits, or wants a GPU and this host draws in software: then the first worker decides.
+    """
+    if order.terms.fingerprint_mode != "strict" or order.terms.fingerprint:
+        return order
+    from workers.render.raster.context import is_software
+    from workers.render.raster.gbuffer import shared_renderer
+    from workers.shard.fingerprint import take_fingerprint  # loads GL
+
+    renderer = shared_renderer()
+    if order.job.run.device == "gpu" and is_software(renderer.name):
+        return order
+    mine = take_fingerprint(renderer, order.job.drawn.tier)
+    store.put(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
+    return order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": mine.digest})})
+
+
+def check_nodes(terms: WorkerTerms) -> None:
+    """Raises the refusal of the first node that cannot work on the run; nothing where the driver's node is the only one.
+
+    A node that does not answer is said and left out.
+    """
+    nodes = [node["NodeID"] for node in alive_nodes() if node["Resources"].get("CPU")]
+    if len(nodes) < 2:
+        return
+    deadline = time.monotonic() + ANSWER_S
+    for node, answer in [(node, _ask(node, terms)) for node in nodes]:
+        try:
+            sight = worker_entry.Sight(**ray.get(answer, timeout=max(0.1, deadline - time.monotonic())))
+        except RayError as error:
+            say(
+                f"node {node[:12]} does not say what it has ({type(error).__name__}): its workers are asked before they begin"
+            )
+            continue
+        if (refusal := refusal_of(terms, sight)) is not None:
+            raise refusal
+
+
+def _ask(node: str, terms: WorkerTerms) -> ray.ObjectRef:
+    """What the node will tell of itself."""
+
+    def look(proof: str, token: str) -> dict:
+        return asdict(worker_entry.see((), proof, token))
+
+    cloudpickle.register_pickle_by_value(worker_entry)
+    try:
+        return on_node(ray.remote(num_cpus=0, max_retries=0)(look), node).remote(terms.proof, terms.token)
+    finally:
+        cloudpickle.unregister_pickle_by_value(worker_entry)

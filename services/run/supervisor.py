@@ -9,13 +9,14 @@ three are gone, and then ends what carries the run's mark. Nothing heavy is load
 import contextlib
 import json
 import os
+import shutil
 import signal
 import sys
 import time
 import traceback
 import uuid
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Final
 
@@ -26,7 +27,6 @@ from services.run.machine import (
     descendants,
     die_with,
     end_all,
-    end_descendants,
     marked,
     reap,
     send,
@@ -53,32 +53,24 @@ class Facts:
 def judge(facts: Facts, status: int, stopped_by: int | None, kept: str) -> tuple[int, str | None]:
     """The exit code, and the line to print (None where the command printed its own).
 
-    `status` is the command's wait status, `stopped_by` the signal that the supervisor passed on to it, if any, and
-    `kept` what remains of its work.
+    `status` is the command's wait status, `stopped_by` the signal that was passed on to it, `kept` what remains of its work.
     """
     if facts.code is not None and facts.ended_by is None:
         return facts.code, None
-    if number := stopped_by or facts.ended_by or _stop_of(status):
-        how = "interrupted" if number == signal.SIGINT else f"stopped by {_name(number)}"
-    elif not os.WIFSIGNALED(status):
-        how = f"the run ended without a word (exit code {os.waitstatus_to_exitcode(status)}), as it does where Ray is lost"
-    elif os.WTERMSIG(status) == signal.SIGKILL:
+    ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else None
+    number = stopped_by or facts.ended_by or ended_by
+    name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+    if number == signal.SIGINT:
+        how = "interrupted"
+    elif number in STOPS:
+        how = f"stopped by {name}"
+    elif number == signal.SIGKILL:
         how = "the run was killed (SIGKILL), which Linux also does where memory runs out"
+    elif number is not None:
+        how = f"the run crashed ({name}) in Ray or in another library"
     else:
-        how = f"the run crashed ({_name(os.WTERMSIG(status))}) in Ray or in another library"
+        how = f"the run ended without a word (exit code {os.waitstatus_to_exitcode(status)}), as it does where Ray is lost"
     return 1, f"{how}; {kept}"
-
-
-def _stop_of(status: int) -> int | None:
-    """The signal of a process that ended by one that asks it to."""
-    return os.WTERMSIG(status) if os.WIFSIGNALED(status) and os.WTERMSIG(status) in STOPS else None
-
-
-def _name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 STOP_S = 30.0
@@ -103,17 +95,16 @@ def supervise(command: Callable[[], int], kept: str, quiet: bool = True, answers
     """The exit code of `command`, which runs in a child; returns there too, with the same code.
 
     A command that dies is told in one line on standard error, with `kept`: what remains of its work. `quiet` keeps what
-    C++ code writes to standard error out of the terminal. With `answers`, the command owes standard output a JSON object in
-    its last line, and one is printed for a command that dies. For a process without threads.
+    C++ code writes out of the terminal. With `answers`, a JSON object is printed for a command that dies. For a process without
+    threads.
     """
     words = os.memfd_create("last words") if quiet else None
-    watched = {number for number in (*STOPS, signal.SIGTSTP, signal.SIGCONT) if _is_wanted(number)}
+    all_watched = {*STOPS, signal.SIGTSTP, signal.SIGCONT}
+    watched = {number for number in all_watched if signal.getsignal(number) != signal.SIG_IGN}  # as `nohup` asks for
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, watched | {signal.SIGCHLD})
     last = os.pipe()
-    keeper = _Layer(
-        frozenset(watched), kept, words, answers, signal.SIGKILL, innermost=True, last=last, mark=_set_mark()
-    )
+    keeper = _Layer(frozenset(watched), kept, words, answers, signal.SIGKILL, True, last, _set_mark())
     front = replace(keeper, dies_with_parent=signal.SIGTERM, innermost=False)
     return front.tend(lambda: keeper.tend(lambda: _drive(command, words, mask)))
 
@@ -167,7 +158,7 @@ class _Layer:
         child = os.fork()
         if child == 0:
             os.close(ear)
-            _listeners[:] = [*_listeners, mouth] if _listeners else [self.last[1], mouth]
+            _listeners[:] = [*(_listeners or [self.last[1]]), mouth]
             os.setsid()
             die_with(me, self.dies_with_parent)
             return work()
@@ -175,22 +166,23 @@ class _Layer:
         if self.innermost:
             _start_last(self.last, self.mark)
         status, stopped_by = self._wait(child)
-        end_descendants()
+        end_all(lambda: descendants(os.getpid()))  # all of them: they cannot leave a child subreaper
         facts = _read(ear)
-        if facts.folder is not None:
-            _remove(facts.folder)
+        _remove(facts.folder)
         code, line = judge(facts, status, stopped_by, self.kept)
         where = _keep_last_words(self.words, facts.logs)
         if line is not None:
-            line += where if stopped_by is None else ""
-            with contextlib.suppress(OSError):  # a terminal that was closed
-                # A bar that its process could not end stands on the terminal's line
-                wipe = "\r\x1b[K" if sys.stderr.isatty() else ""
-                print(f"{wipe}verso: {line}", file=sys.stderr, flush=True)
-                if self.answers:
-                    print(json.dumps({"ok": False, "error": line, "kind": "Ended"}), flush=True)
+            self._say(line + where if stopped_by is None else line)
         tell(code=code, ended_by=None)
         return code
+
+    def _say(self, line: str) -> None:
+        """Tells the user, and the program that waits for an answer, how the command ended."""
+        with contextlib.suppress(OSError):  # a terminal that was closed
+            wipe = "\r\x1b[K" if sys.stderr.isatty() else ""  # a bar that its process could not end
+            print(f"{wipe}verso: {line}", file=sys.stderr, flush=True)
+            if self.answers:
+                print(json.dumps({"ok": False, "error": line, "kind": "Ended"}), flush=True)
 
     def _wait(self, child: int) -> tuple[int, int | None]:
         """The child's wait status, and the first signal that it was ended by, if any."""
@@ -204,20 +196,15 @@ class _Layer:
                 return statuses[child], stopped_by
             number = caught.si_signo if caught else None
             if number in STOPS:
-                again = stopped_by is not None
+                # Python's interrupt for the command, and its end at the second one; the signal itself for the keeper
+                for_command = signal.SIGINT if stopped_by is None else signal.SIGKILL
                 stopped_by = stopped_by or number
                 deadline = min(deadline, time.monotonic() + patience_s)
-                os.kill(child, self._passed_on(number, again))
+                os.kill(child, for_command if self.innermost else number)
             elif number in (signal.SIGTSTP, signal.SIGCONT):
                 self._suspend(child, number)
             if time.monotonic() > deadline:
                 os.kill(child, signal.SIGKILL)
-
-    def _passed_on(self, number: int, again: bool) -> int:
-        """What the child gets for a signal: Python's interrupt for the command, the signal itself for the keeper."""
-        if not self.innermost:
-            return number
-        return signal.SIGKILL if again else signal.SIGINT
 
     def _suspend(self, child: int, number: int) -> None:
         """Ctrl-Z, or going on after it, of the whole tree."""
@@ -243,41 +230,35 @@ def _start_last(pipe: tuple[int, int], mark: str) -> None:
         os.close(writer)
     facts = _read(pipe[0], to_its_end=True)
     end_all(lambda: marked(mark))
-    if facts.folder is not None:
-        _remove(facts.folder)
+    _remove(facts.folder)
     os._exit(0)
 
 
 def _drive(command: Callable[[], int], words: int | None, mask: Collection[int]) -> int:
     """Runs the command in this process, and tells its exit code once everything is said."""
-    if words is not None:
-        _split_stderr(words)
+    if (
+        words is not None
+    ):  # from now on Python's standard error is the user's as before, and what C++ writes to is `words`
+        users = os.dup(2)
+        sys.stderr = os.fdopen(users, "w", buffering=1, encoding=sys.stderr.encoding, errors=sys.stderr.errors)
+        os.dup2(words, 2)
+    code = 1
     try:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         code = command()
         sys.stdout.flush()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said
     except KeyboardInterrupt:
-        code = 1
         tell(ended_by=signal.SIGINT)
     except SystemExit:  # how Ray answers SIGTERM; the command line raises none of its own from here on
-        code = 1
         tell(ended_by=signal.SIGTERM)
     except Exception:
-        code = 1
         traceback.print_exc()
     tell(code=code)
     # gRPC's destructors hang where a Ray did not start; the default of SIGALRM is to end the process
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(EXIT_S)
     return code
-
-
-def _split_stderr(words: int) -> None:
-    """From now on, Python's standard error is the user's as before, and descriptor 2, which C++ writes to, is `words`."""
-    users = os.dup(2)
-    sys.stderr = os.fdopen(users, "w", buffering=1, encoding=sys.stderr.encoding, errors=sys.stderr.errors)
-    os.dup2(words, 2)
 
 
 def _keep_last_words(words: int | None, logs: str | None) -> str:
@@ -302,20 +283,13 @@ def _read(pipe: int, to_its_end: bool = False) -> Facts:
     with contextlib.suppress(BlockingIOError):
         while part := os.read(pipe, 2**16):
             data += part
-    known = {field.name for field in fields(Facts)}
     facts = Facts()
     for line in data.splitlines():
         with contextlib.suppress(ValueError):  # cut short by a kill
-            facts = replace(facts, **{name: value for name, value in json.loads(line).items() if name in known})
+            facts = replace(facts, **json.loads(line))
     return facts
 
 
-def _remove(folder: str) -> None:
-    import shutil  # only where something is left
-
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_wanted(number: signal.Signals) -> bool:
-    """Whether the user did not ask to ignore the signal, as `nohup` does."""
-    return signal.getsignal(number) != signal.SIG_IGN
+def _remove(folder: str | None) -> None:
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,7 +1,6 @@
-"""The watchdog: looks at what workers note about their scenes, and ends those that show no change. Edge.
+"""The watchdog: finds workers that show no change for longer than a scene may take, by what they note. Edge.
 
-It stands outside the workers, so it also sees one that was stopped, or that hangs while it writes or commits. Which attempts
-have stalled is decided by pure functions above it: no change for longer than a scene may take.
+It stands outside the workers, so it also sees one that was stopped, or that hangs while it writes or commits.
 """
 
 import contextlib
@@ -68,12 +67,13 @@ def find_stalls(seen: Mapping[AttemptName, Sight], scene_timeout_s: float) -> di
 
     Of several attempts at one range, the one that changed last is the one that counts: workers of others were lost.
     """
-    latest = {one.start: one for one in sorted(seen, key=lambda one: (seen[one].idle_s, one), reverse=True)}
+    by_age = sorted(seen.items(), key=lambda item: (item[1].idle_s, item[0]), reverse=True)
+    latest = {attempt.start: (attempt, sight) for attempt, sight in by_age}
     factors = {True: COMMIT_FACTOR, False: SCENE_FACTOR}
     return {
-        attempt: seen[attempt]
-        for attempt in latest.values()
-        if seen[attempt].idle_s > factors[seen[attempt].scene_id is None] * scene_timeout_s
+        attempt: sight
+        for attempt, sight in latest.values()
+        if sight.idle_s > factors[sight.scene_id is None] * scene_timeout_s
     }
 
 
@@ -82,10 +82,6 @@ LOOKS = 12
 
 MOST_LOOKS_AT_ONCE = 3
 """A pause between two looks counts as at most this many: in a longer one this process was suspended itself."""
-
-
-_WORKER_TITLE = b"ray::"
-
 
 Stall = tuple[AttemptName | None, Sight]
 """An attempt that shows no change, and what is the same for so long; None: in that time there was no attempt at all."""
@@ -99,7 +95,7 @@ def watch(store: Store, label: str, scene_timeout_s: float) -> Iterator[Callable
     """
     stalls: deque[Stall] = deque()
     over = threading.Event()
-    settings = (store, label, scene_timeout_s, stalls, over)
+    settings = store, label, scene_timeout_s, stalls, over
     threading.Thread(target=_watch, args=settings, name="watchdog", daemon=True).start()
     try:
         yield lambda: [stalls.popleft() for _ in range(len(stalls))]
@@ -128,26 +124,26 @@ def _watch(store: Store, label: str, scene_timeout_s: float, stalls: deque[Stall
 
 def scenes_in_progress(store: Store, label: str) -> dict[AttemptName, int | None]:
     """The scene in progress (None between scenes) of every attempt with this label that has not ended."""
-    own = (AttemptName(start, name) for start, name in staged_attempts(store) if label in name)
-    return {attempt: blamed_scene(store, attempt.start, attempt.name) for attempt in own}
+    staged = staged_attempts(store)
+    return {AttemptName(start, name): blamed_scene(store, start, name) for start, name in staged if label in name}
 
 
 def find_own_workers() -> list[Process]:
-    """Workers of this process's own Ray: descendants that Ray gave a title."""
-    return [process for process in descendants(os.getpid()) if _title(process.pid).startswith(_WORKER_TITLE)]
+    """Workers of this process's own Ray."""
+    return [process for process in descendants(os.getpid()) if _is_worker(process.pid)]
 
 
 def end_worker_here(pid: int) -> bool:
     """Kills a Ray worker of this machine; False where the id is none of a Ray worker. To be run on the worker's node."""
     process = read_process(pid)
-    if process is None or pid == os.getpid() or not _title(pid).startswith(_WORKER_TITLE):
+    if process is None or pid == os.getpid() or not _is_worker(pid):
         return False
     send(process, signal.SIGKILL)
     return True
 
 
-def _title(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""
+def _is_worker(pid: int) -> bool:
+    """Whether Ray gave the process a title."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::")
+    return False

@@ -11,8 +11,8 @@ import pickle
 import socket
 import time
 import uuid
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,8 +21,8 @@ from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_
 from schemas.errors import FingerprintError, MachineError, OutputError, VersoError
 
 if TYPE_CHECKING:
-    from schemas.dataset.shard import ShardReport
-
+    from schemas.dataset.shard import ShardOrder, ShardReport
+    from workers.assets.catalogue import Catalogue
 
 LOOK_S = 3.0
 """Time for a file that was just written to be seen through a network file system."""
@@ -65,11 +65,11 @@ def start_environment(names: Iterable[str], environ: Path = Path("/proc/self/env
 def look_at_folder(proof: str, token: str, patience_s: float = LOOK_S) -> str:
     """What is wrong with the folder of the file `proof`, which holds `token` for every node that sees it; or nothing."""
     folder, deadline = os.path.dirname(proof), time.monotonic() + patience_s
-    while (held := _token_in(proof)) != token:
+    while (there := _token_in(proof)) != token:
         if time.monotonic() > deadline:
             if not os.path.isdir(folder):
                 return "there is no such folder"
-            return "it is another folder" if held is None else "it holds the lock of another run"
+            return "it is another folder" if there is None else "it holds the lock of another run"
         time.sleep(0.1)
     scratch = os.path.join(folder, "_staging", "_tmp", f"node-{uuid.uuid4().hex}")
     try:
@@ -83,8 +83,7 @@ def look_at_folder(proof: str, token: str, patience_s: float = LOOK_S) -> str:
 
 def _token_in(proof: str) -> str | None:
     try:
-        held = json.loads(Path(proof).read_bytes())
-        return str(held["token"])
+        return str(json.loads(Path(proof).read_bytes())["token"])
     except (OSError, ValueError, KeyError, TypeError):  # a file that is just being replaced, too
         return None
 
@@ -102,10 +101,6 @@ def see(names: Iterable[str], proof: str, token: str) -> Sight:
     return Sight(socket.gethostname(), processor_flags(), start_environment(names), code, no_code, folder)
 
 
-VARIABLES = (*STACK_ENVIRONMENT, *ON_X86_64_V3)
-"""The variables that a worker must have as the driver has them."""
-
-
 @dataclass(frozen=True)
 class WorkerTerms:
     """What every worker of a run must have: the driver's environment, code and output folder."""
@@ -120,10 +115,26 @@ class WorkerTerms:
     token: str = ""
 
 
-def worker_environment(environ: Mapping[str, str]) -> dict[str, str]:
-    """The variables that a driver with this environment gives to the workers of a cluster."""
-    own = {name: value for name, value in FOR_SPEED.items() if environ.get(name) == value}
-    return own | {name: environ[name] for name in VARIABLES if name in environ}
+@dataclass(frozen=True)
+class Pattern:
+    """An order without ranges, the assets, and what its worker must have.
+
+    `env_vars` are set for the workers of a cluster; those of a private Ray inherit them.
+    """
+
+    order: "ShardOrder"
+    catalogue: "Catalogue"
+    terms: WorkerTerms
+    env_vars: Mapping[str, str] = field(default_factory=dict)
+
+
+def terms_of_driver(environ: Mapping[str, str] = os.environ) -> WorkerTerms:  # noqa: TID251 - workers are to have the same
+    """What workers must have: this process's code and, of its environment, the variables of the stack."""
+    from workers.source import code_digest
+
+    environment = {name: value for name, value in FOR_SPEED.items() if environ.get(name) == value}
+    environment |= {name: environ[name] for name in (*STACK_ENVIRONMENT, *ON_X86_64_V3) if name in environ}
+    return WorkerTerms(tuple(sorted(environment.items())), code_digest(), socket.gethostname())
 
 
 def refusal_of(terms: WorkerTerms, node: Sight, is_worker: bool = False) -> VersoError | None:
@@ -135,22 +146,16 @@ def refusal_of(terms: WorkerTerms, node: Sight, is_worker: bool = False) -> Vers
             f"the processor of {node.host} is below x86-64-v3 (no {', '.join(missing)}), and that of {driver} is not: they do "
             f"not make the same bytes. Take {node.host} out of the cluster, or use machines of one kind"
         )
-    found = {name: node.environment.get(name) for name, _ in terms.environment}
-    told = [
-        f"{name} is {'not set' if found[name] is None else repr(found[name])} there and {value!r} here"
-        for name, value in terms.environment
-        if found[name] != value
-    ]
-    if told and is_worker:
+    if is_worker and (differing := "; ".join(_differences(terms, node))):
         return FingerprintError(
             f"a worker on {node.host} has not the environment of the run on {terms.driver}, on which bytes depend: "
-            f"{'; '.join(told)}. Set it for `ray start` on {node.host} (deploy/Dockerfile has the list), and see that nothing "
+            f"{differing}. Set it for `ray start` on {node.host} (deploy/Dockerfile has the list), and see that nothing "
             "there changes it"
         )
     if node.code != terms.code:
-        have = f"has code {node.code[:12]}" if node.code else f"has no code of this project ({node.no_code})"
+        code = f"has code {node.code[:12]}" if node.code else f"has no code of this project ({node.no_code})"
         return FingerprintError(
-            f"{node.host} {have}, and {driver} has {terms.code[:12]}: install the same wheel or image on every node, then start "
+            f"{node.host} {code}, and {driver} has {terms.code[:12]}: install the same wheel or image on every node, then start "
             "Ray there again"
         )
     if node.folder:
@@ -160,6 +165,12 @@ def refusal_of(terms: WorkerTerms, node: Sight, is_worker: bool = False) -> Vers
             "output.layout=tar); nothing was made"
         )
     return None
+
+
+def _differences(terms: WorkerTerms, node: Sight) -> Iterator[str]:
+    for name, value in terms.environment:
+        if (there := node.environment.get(name)) != value:
+            yield f"{name} is {'not set' if there is None else repr(there)} there and {value!r} here"
 
 
 DRAIN = "VERSO_DRAIN"
@@ -182,9 +193,8 @@ def enter_shard(terms: WorkerTerms, order: bytes, catalogue: bytes) -> "ShardRep
 @cache
 def check_worker(terms: WorkerTerms) -> None:
     """Raises the refusal of this process; asked once in a process and run."""
-    names = [name for name, _ in terms.environment]
-    refusal = refusal_of(terms, see(names, terms.proof, terms.token), is_worker=True)
-    if refusal is not None:
+    sight = see([name for name, _ in terms.environment], terms.proof, terms.token)
+    if (refusal := refusal_of(terms, sight, is_worker=True)) is not None:
         raise refusal
 
 

@@ -1,25 +1,34 @@
-"""`verso score`: scores predictions of a dataset, or compares two scores. Writes items.parquet, summary.json, index.html."""
+"""Edge: `verso score` scores predictions of a dataset, or compares two scores. Writes items.parquet, summary.json, index.html.
+
+The page is one HTML file that needs nothing beside it: the answer first, then tables and distributions.
+"""
 
 import argparse
 import json
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+from urllib.parse import quote
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.errors import InputError, plural
-from services.dataset.dataset import Dataset
+from schemas.errors import InputError, number, plural
 from services.job.record import read_success, require_dataset
+from services.look.charts import Chart, Histogram, amount, chart_html
+from services.look.report import POLICY, Page, Section, fill_page, read_web
+from services.look.sections import table_html
 from services.read.verdict import explain_damage
 from services.score.items import Asked
-from services.score.page import answer_of, interval, page_of, told
 from services.score.predictions import find_predictions
 from services.score.run import ITEMS_FILE, describe_refused, score_dataset
-from services.score.summary import HEADLINES, compare, summarise
+from services.score.summary import HEADLINES, Figure, compare, summarise, values_of
 from workers.store.local import open_store
 
 SUMMARY_FILE, PAGE_FILE = "summary.json", "index.html"
@@ -53,7 +62,7 @@ def main(options: argparse.Namespace) -> int:
         summary = {**head, **asdict(asked), **summarise(table)}
         _write(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
         troubles = describe_refused(path)
-        _write(target / PAGE_FILE, page_of(summary, table, troubles, Dataset(store), given))
+        _write(target / PAGE_FILE, page_of(summary, table, troubles))
     for line in troubles:
         print(f"verso: {line}", file=sys.stderr)
     _print_metrics(summary["metrics"])
@@ -66,7 +75,9 @@ def main(options: argparse.Namespace) -> int:
 def _print_metrics(metrics: dict[str, Any]) -> None:
     for name, one in metrics.items():
         if name in HEADLINES and one["items"]:
-            print(f"{name:28}{told(name, one['value']):>12}  {interval(name, one):28}{plural(one['items'], 'item')}")
+            print(
+                f"{name:28}{in_words(name, one['value']):>12}  {interval(name, one):28}{plural(one['items'], 'item')}"
+            )
 
 
 def _compare(options: argparse.Namespace) -> int:
@@ -77,16 +88,16 @@ def _compare(options: argparse.Namespace) -> int:
     if one["align"] != other["align"]:
         how = f"with --align {one['align']} and {other['align']}"
         raise InputError(f"{options.compare[0]} and {options.compare[1]} were scored {how}: score both alike")
-    found = compare(a, b)
-    for name in [name for name in found if name in HEADLINES]:
-        row = found[name]
-        verdict = {"a": f"{options.compare[0]} is better", "b": f"{options.compare[1]} is better", None: "not decided"}[
-            row["better"]
-        ]
+    metrics = compare(a, b)
+    better = {"a": f"{options.compare[0]} is better", "b": f"{options.compare[1]} is better", None: "not decided"}
+    for name, row in metrics.items():
+        if name not in HEADLINES:
+            continue
+        verdict = better[row["better"]]
         print(
-            f"{name:28}{told(name, row['a']):>12}{told(name, row['b']):>12}  b - a: {interval(name, row):28}{verdict}"
+            f"{name:28}{in_words(name, row['a']):>12}{in_words(name, row['b']):>12}  b - a: {interval(name, row):28}{verdict}"
         )
-    return _finish(options, True, {"a": str(options.compare[0]), "b": str(options.compare[1]), "metrics": found})
+    return _finish(options, True, {"a": str(options.compare[0]), "b": str(options.compare[1]), "metrics": metrics})
 
 
 def _read_score(path: Path) -> tuple[pa.Table, dict[str, Any]]:
@@ -108,3 +119,126 @@ def _finish(options: argparse.Namespace, ok: bool, answer: dict[str, Any]) -> in
     if options.json:
         print(json.dumps({"ok": ok, **answer}))
     return 0 if ok else 1
+
+
+_SHOWN: Final = ("depth_mae_m", "rgb_psnr_db", "shape_chamfer_l1_m", "volume_iou", "pose_add_m")
+"""The metric of each kind that is told first."""
+
+_CHARTS: Final = (
+    ("Depth of the object", {"seen": "depth_mae_seen_m", "hidden": "depth_mae_hidden_m"}),
+    ("Depth within 2 mm", {"": "depth_within_2mm"}),
+    ("PSNR", {"": "rgb_psnr_db"}),
+    ("SSIM", {"": "rgb_ssim"}),
+    ("Chamfer distance", {"": "shape_chamfer_l1_m"}),
+    ("F-score at 2 mm", {"": "shape_fscore_2mm"}),
+    ("IoU", {"": "shape_iou"}),
+    ("IoU at the volume's points", {"": "volume_iou"}),
+    ("ADD", {"": "pose_add_m"}),
+    ("Rotation", {"": "pose_rotation_deg"}),
+)
+
+_UNITS: Final = {"_m": (1e3, "mm"), "_m2": (1e6, "mm²"), "_deg": (1.0, "°"), "_px": (1.0, "px"), "_db": (1.0, "dB")}
+
+_STYLE: Final = "table { display: block; overflow-x: auto; margin-bottom: 2rem; }"
+
+
+def in_words(name: str, value: float | int | None) -> str:
+    """A value of a metric in words: lengths in millimetres; a dash for none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    times, unit = _UNITS.get(name[name.rfind("_") :], (1.0, ""))
+    return amount(value * times, unit) if unit else number(value)
+
+
+def interval(name: str, figure: Figure) -> str:
+    """`low to high`; empty where there is none."""
+    return "" if figure["low"] is None else f"{in_words(name, figure['low'])} to {in_words(name, figure['high'])}"
+
+
+def words(name: str) -> str:
+    """The name of a metric for readers: `depth mae hidden`."""
+    return name.removesuffix("_m").removesuffix("_deg").removesuffix("_db").replace("_", " ")
+
+
+def answer_of(summary: Mapping[str, Any]) -> str:
+    """One line with the first metric of every kind, and the numbers of items."""
+    numbers = ", ".join(f"{summary[word]} {word}" for word in ("scored", "missing", "refused"))
+    lines = []
+    for name in (*_SHOWN, "depth_mae_hidden_m"):
+        if figure := summary["metrics"].get(name):
+            ends = interval(name, figure)
+            lines.append(f"{words(name)} {in_words(name, figure['value'])}{ends and f' ({ends})'}")
+    return ". ".join([*lines, f"{plural(summary['items'], 'item')}: {numbers}"]) + "."
+
+
+def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]) -> str:
+    """The whole page. `troubles`: a line for each refused or missing item that is named."""
+    items = "".join(f"<li>{escape(line)}</li>" for line in troubles)
+    answer = f'<p class="lead">{escape(answer_of(summary))}</p><ul class="troubles">{items}</ul>'
+    note = (
+        "Means over items, 95 % intervals by a bootstrap over scenes. Refused items count as worst, missing ones not. "
+        "Seen and hidden: the object's pixels whose surface the input view sees, and does not."
+    )
+    sections = [
+        Section("answer", "Answer", answer),
+        Section("metrics", "Metrics", f'{_metrics(summary["metrics"])}<p class="note">{note}</p>'),
+        Section("groups", "By group", "".join(_group(name, of) for name, of in summary["by"].items())),
+        Section("distributions", "Distributions", _charts(table)),
+    ]
+    page = Page(
+        f"Score of {Path(summary['predictions']).name}",
+        f"Against {summary['dataset']}; alignment: {summary['align']}",
+        sections,
+        "",
+    )
+    icon = f"data:image/svg+xml,{quote(read_web('icon.svg').strip())}"
+    style = f"<style>{read_web('page.css')}{_STYLE}</style>"
+    return fill_page(
+        page, policy=POLICY, style=style, icon=icon, scripts=f"<script>{read_web('page.js')}</script>", data=""
+    )
+
+
+def _metrics(metrics: Mapping[str, Figure]) -> str:
+    rows = [
+        (
+            f"{words(name)}<small><code>{name}</code></small>",
+            in_words(name, one["value"]),
+            interval(name, one) or "–",
+            str(one["items"]),
+        )
+        for name, one in metrics.items()
+        if one["items"]
+    ]
+    first, rest = rows[: sum(name in HEADLINES for name in metrics)], rows[sum(name in HEADLINES for name in metrics) :]
+    head = ("metric", "mean", "95 % interval", "items")
+    more = (
+        f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
+        if rest
+        else ""
+    )
+    return table_html(head, first) + more
+
+
+def _group(title: str, groups: Mapping[str, Mapping[str, Figure]]) -> str:
+    names = [name for name in HEADLINES if any(group.get(name, {}).get("items") for group in groups.values())][:6]
+    rows = [
+        (
+            escape(word),
+            *(f"{in_words(name, group[name]['value'])}<small>{interval(name, group[name])}</small>" for name in names),
+        )
+        for word, group in groups.items()
+    ]
+    return table_html((title.replace("_", " "), *map(words, names)), rows) if rows else ""
+
+
+def _charts(table: pa.Table) -> str:
+    figures = []
+    for title, columns in _CHARTS:
+        values = {word: values_of(table, name) for word, name in columns.items() if name in table.column_names}
+        known = np.concatenate([*(one[np.isfinite(one)] for one in values.values()), np.empty(0)])
+        if len(known):
+            top = float(known.max()) or 1.0
+            series = {word: Histogram(0.0, top).add(one) for word, one in values.items()}
+            name = next(iter(columns.values()))
+            figures.append(chart_html(Chart(title, series, f"Of an item; {words(name)}.", partial(in_words, name))))
+    return f'<div class="charts">{"".join(figures)}</div>' if figures else ""

@@ -29,10 +29,8 @@ SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the full size to a 16th (Wang, Simoncelli and Bovik 2003, section 3.2)."""
 
 
-def score_colour(
-    predicted: NDArray[np.uint8], true: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None, flip: bool = True
-) -> dict[str, float | None]:
-    """Likeness of sRGB images [H, W, 3] uint8 of one size; with a mask [H, W], of its pixels.
+def score_colour(predicted: NDArray[np.uint8], true: NDArray[np.uint8], flip: bool = True) -> dict[str, float | None]:
+    """Likeness of sRGB images [H, W, 3] uint8 of one size.
 
     psnr_db: 10 log10(255^2 / mean square difference of codes), dB; inf where all are equal.
     ssim: mean structural similarity, 1 where equal (Wang, Bovik, Sheikh and Simoncelli 2004, eq. 13 with C3 = C2 / 2): Gaussian
@@ -41,43 +39,37 @@ def score_colour(
     ms_ssim: the same at five scales (Wang, Simoncelli and Bovik 2003, eq. 7): product of the mean contrast and structure at
     each scale, and of luminance too at the last, to the powers `SCALES`; a scale is the means of 2 x 2 pixels of the one before,
     an odd last row or column left out; a negative mean counts as 0.
-    flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None with a mask, where
-    `flip` is false, and without flip-evaluator.
+    flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None where `flip` is false, and without
+    flip-evaluator.
 
     nan where there is nothing to compare: no pixels (all), no whole window (ssim), none at the fifth scale (ms_ssim: images below
-    176 pixels). A window counts by its middle pixel, at coarse scales by that pixel's share in the mask. Raises ValueError where
-    sizes differ.
+    176 pixels).
     """
-    for image in (predicted, true):
-        if image.shape != true.shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise ValueError(f"colours are [H, W, 3] uint8 of one size, not {image.shape} {image.dtype}")
-    weights = np.ones(true.shape[:2]) if mask is None else mask.astype(np.float64)
-    if weights.shape != true.shape[:2]:
-        raise ValueError(f"a mask of {weights.shape} pixels of an image of {true.shape[:2]}")
     a, b = predicted.astype(np.float64), true.astype(np.float64)
-    error, (ssim, ms_ssim) = _mean((a - b) ** 2, weights), _similarities(a, b, weights)
+    error = float(((a - b) ** 2).mean()) if a.size else math.nan
+    ssim, ms_ssim = _similarities(a, b)
     return {
         "psnr_db": math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error),
         "ssim": ssim,
         "ms_ssim": ms_ssim,
-        "flip": None if mask is not None or not flip else _flip(predicted, true),
+        "flip": _flip(predicted, true) if flip else None,
     }
 
 
-def _similarities(a: Array, b: Array, weights: Array) -> tuple[float, float]:
-    """(SSIM, MS-SSIM) of images [H, W, 3] at pixels with weights [H, W]."""
+def _similarities(a: Array, b: Array) -> tuple[float, float]:
+    """(SSIM, MS-SSIM) of images [H, W, 3]."""
     ssim, product = math.nan, 1.0
     for scale, exponent in enumerate(SCALES):
         if scale:
-            a, b, weights = _halve(a), _halve(b), _halve(weights)
+            a, b = _halve(a), _halve(b)
         if min(a.shape[:2]) <= 2 * RADIUS_PX:  # no whole window
             return ssim, math.nan
         inner = (slice(RADIUS_PX, -RADIUS_PX),) * 2
         luminance, contrast = (each[inner] for each in _similarity_maps(a, b))
-        whole, part = _mean(luminance * contrast, weights[inner]), _mean(contrast, weights[inner])
+        whole, part = float((luminance * contrast).mean()), float(contrast.mean())
         ssim = ssim if scale else whole
         value = part if scale < len(SCALES) - 1 else whole
-        product *= value if math.isnan(value) else max(value, 0.0) ** exponent
+        product *= max(value, 0.0) ** exponent
     return ssim, product
 
 
@@ -97,17 +89,11 @@ def _halve(image: Array) -> Array:
     return (even[0::2, 0::2] + even[0::2, 1::2] + even[1::2, 0::2] + even[1::2, 1::2]) / 4.0
 
 
-def _mean(values: Array, weights: Array) -> float:
-    """Mean of values [H, W, 3] over channels, and pixels with weights [H, W]; nan where all weigh nothing."""
-    total = float(weights.sum())
-    return float((values * weights[:, :, None]).sum()) / (3.0 * total) if total > 0.0 else math.nan
-
-
 def _flip(predicted: NDArray[np.uint8], true: NDArray[np.uint8]) -> float | None:
     if importlib.util.find_spec("flip_evaluator") is None:
         return None
     with needs_making("FLIP"):
-        from services.study.colour import flip_between
+        from services.study.truths import flip_between
 
     return flip_between(true, predicted) if true.size else math.nan
 
@@ -130,27 +116,18 @@ def score_depth(predicted_m: ArrayLike, true_m: ArrayLike, parts: Mapping[str, N
     within_1mm, within_2mm, within_5mm, within_10mm: share with |d - t| at most that (Knapitsch et al. 2017, of points).
     holes: share without prediction; these count as missed in delta and within. pixels: how many have truth.
 
-    A part without truth has nan, and 0 pixels; of one that is all holes mae_m, rmse_m and abs_rel are nan. Raises ValueError
-    where sizes differ.
+    A part without truth has nan, and 0 pixels; of one that is all holes mae_m, rmse_m and abs_rel are nan.
     """
     predicted, true = (np.ascontiguousarray(image, np.float64) for image in (predicted_m, true_m))
-    code = np.zeros(true.shape, np.uint16)
-    if any(image.shape != true.shape for image in (predicted, *parts.values())) or len(parts) > 16:
-        raise ValueError(
-            f"depth {predicted.shape} of {true.shape} in {len(parts)} parts: sizes differ, or more than 16"
-        )
-    for k, part in enumerate(parts.values()):
-        code |= part.astype(np.uint16) << k
-    known = (code > 0) & (true > 0.0) & (true < np.inf)
-    where, values = code[known], _metrics_of(predicted[known], true[known])
-    sums = np.stack([np.bincount(where, each, 1 << len(parts)) for each in values], axis=1)
+    known = (true > 0.0) & (true < np.inf)
+    values = _metrics_of(predicted[known], true[known])
     scores: dict[str, float] = {}
-    for k, name in enumerate(parts):
-        row = sums[np.arange(len(sums)) >> k & 1 == 1].sum(axis=0)
+    for name, part in parts.items():
+        row = values[:, part[known]].sum(axis=1)
         holes, pixels = row[-2:]
-        values = row / np.repeat([pixels - holes or np.nan, pixels or np.nan, 1.0], [3, len(row) - 4, 1])
-        values[1] = np.sqrt(values[1])
-        scores |= {f"{name}.{metric}": float(value) for metric, value in zip(METRICS, values, strict=True)}
+        row /= np.repeat([pixels - holes or np.nan, pixels or np.nan, 1.0], [3, len(row) - 4, 1])
+        row[1] = np.sqrt(row[1])
+        scores |= {f"{name}.{metric}": float(value) for metric, value in zip(METRICS, row, strict=True)}
     return scores
 
 

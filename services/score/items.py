@@ -29,8 +29,7 @@ from services.dataset.correspondence import carry
 from services.dataset.pair import Pair
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
-from services.score.points import INVERTED, box_of, check_distance, score_volume
-from services.score.pose import score_pose, symmetries_of
+from services.score.pose import INVERTED, box_of, check_distance, score_pose, score_volume, symmetries_of
 from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform

@@ -16,7 +16,7 @@ from trimesh.registration import procrustes
 from schemas.base import Array, Pose
 from schemas.scene.shape import Mesh
 from services.score.images import Alignment
-from services.score.points import box_of
+from services.score.pose import box_of
 from workers.assets.mass import unite_bodies
 from workers.assets.winding import winding_numbers
 from workers.door.meshes.mesh import is_solid, merge_points

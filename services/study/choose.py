@@ -1,17 +1,12 @@
-"""The cheapest setting that meets the targets, and the front of settings that are worth their time. Pure."""
+"""The cheapest setting that meets the targets, the front of settings that are worth their time, and the answer in words. Pure."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from decimal import ROUND_CEILING, Context
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
-from schemas.errors import InputError, RunError, did_you_mean
+from schemas.errors import InputError, RunError, describe_seconds, did_you_mean, milliseconds, plural, size
 from schemas.job.job import Job
-from services.study.knobs import OTHER_WORLD
-from services.study.model import ERRORS, NEGLIGIBLE, Figure, Row, amount, listed, short, times, unit
-
-Targets = Mapping[str, float]
-"""The greatest allowed value of each error, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""
+from services.study.model import ERRORS, Figure, Proof, Row, Setting, Targets, amount, short, times, unit
+from services.study.table import PARTS, Part, Table
 
 AS_CHEAP = 1.05
 """Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %."""
@@ -22,20 +17,7 @@ FEWEST_SCENES = 4
 MORE_FAILED = 0.01
 """A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
 
-DEFAULT_TARGETS: Targets = {
-    "penetration_mm": 0.1,
-    "gap_mm": 0.1,
-    "unbalanced_share": 0.01,
-    "pose_mm": 0.1,
-    "depth_mm": 0.1,
-    "mask_share": 0.001,
-    "camera_mm": 0.5,
-    "camera_deg": 0.05,
-    "cloud_mm": 1.0,
-    "cloud_p95_mm": 3.0,
-    "missing_share": 0.05,
-    "view_depth_mm": 1.5,
-}
+DEFAULT_TARGETS: Targets = {kind.name: kind.target for kind in ERRORS.values() if kind.target is not None}
 """The targets without a wish of the user: the accuracy that a dataset's labels promise."""
 
 
@@ -44,11 +26,8 @@ class TargetError(RunError):
 
 
 def own_row(rows: Sequence[Row]) -> Row:
-    """The row of the job as it is. Raises ValueError where there is none."""
-    for row in rows:
-        if not row.setting.parts:
-            return row
-    raise ValueError("a study has one row for the job as it is; here there is none")
+    """The row of the job as it is, which every table has."""
+    return next(row for row in rows if not row.setting.parts)
 
 
 def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
@@ -56,8 +35,9 @@ def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
 
     A setting measures only the errors that its knobs can move.
     """
-    if name not in row.errors and name == "failed_share":
-        return Figure(row.failed_share, row.failed_share, row.failed_share, row.failed_share, 0)
+    if name == "failed_share" and name not in row.errors:
+        value = row.failed_share
+        return Figure(value, value, value, value, value, 0)
     return row.errors.get(name) or own_row(rows).errors.get(name)
 
 
@@ -67,7 +47,7 @@ def front(rows: Sequence[Row], error: str) -> list[Row]:
     Of settings equal in both, the first by name is kept.
     """
     kept: list[Row] = []
-    known = [row for row in rows if tells(row, error) and not math.isnan(row.errors[error].value)]
+    known = [row for row in rows if tells(row, error)]
     for row in sorted(known, key=lambda row: (row.ratio, row.errors[error].value, row.setting.name)):
         if not kept or row.errors[error].value < kept[-1].errors[error].value:
             kept.append(row)
@@ -79,26 +59,18 @@ def tells(row: Row, error: str) -> bool:
     return error in row.errors and row.errors[error].scenes >= FEWEST_SCENES
 
 
-def as_cheap(row: Row, other: Row) -> bool:
-    """Whether the times of two settings overlap, so that their order is noise."""
-    return row.ratio_least <= other.ratio_most and other.ratio_least <= row.ratio_most
-
-
 # ---------------------------------------------------------------------------------------------- the choice
 
 
-def recommend(rows: Sequence[Row], targets: Targets | None = None) -> Row:
+def recommend(rows: Sequence[Row], targets: Targets | None) -> Row:
     """The setting to use for the targets, or for the default ones without a change for the worse. Raises TargetError."""
     if targets is not None:
         return choose(rows, targets)
     asked, bounds = default_targets(rows)
-    seeing = [row for row in rows if not set(dict(row.setting.parts)) & blind_knobs(rows)]
-    return choose(seeing, asked, bounds)
-
-
-def targets_of(rows: Sequence[Row], targets: Targets | None) -> Targets:
-    """The targets that were asked for, or the default ones that were measured."""
-    return default_targets(rows)[0] if targets is None else targets
+    single = [row for row in rows if row.setting.kind == "single"]
+    telling = {row.setting.knob for row in single if set(row.errors) - {"failed_share"}}
+    blind = {row.setting.knob for row in single} - telling  # knobs without any measured error: their loss is unknown
+    return choose([row for row in rows if not set(dict(row.setting.parts)) & blind], asked, bounds)
 
 
 def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
@@ -108,64 +80,62 @@ def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, fl
     return asked, {name: max(own[name].value, own[name].high) for name in own if name not in asked}
 
 
-def blind_knobs(rows: Sequence[Row]) -> set[str]:
-    """Knobs without any measured error, such as the tier without FLIP: their loss is unknown."""
-    single = [(row.setting.knob, row) for row in rows if len(row.setting.parts) == 1]
-    return {knob for knob, _ in single} - {knob for knob, row in single if set(row.errors) - {"failed_share"}}
-
-
 def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None) -> Row:
     """The cheapest setting all of whose errors meet the targets. Raises TargetError.
 
-    What a user asks for, without `bounds`, is met with bounds for scenes at large (`Figure.bound`). Where no setting does, by
+    What a user asks for, without `bounds`, is met with bounds for scenes at large (`Figure.most`). Where no setting does, by
     values (`value <= target`) of settings whose bounds are nearest to the targets; of fewer than `FEWEST_SCENES` scenes of
     the job itself by nothing. Default targets are met by values, and `bounds` are further targets that no message names.
     """
+    own = own_row(rows)
     if unknown := [name for name in targets if all(error_of(row, name, rows) is None for row in rows)]:
-        raise TargetError(_describe_unmeasured(rows, unknown[0]))
-    able = [row for row in candidates(rows, targets) if meets(row, {**(bounds or {}), **targets}, rows)]
+        known = ", ".join(sorted({error for row in rows for error in row.errors}))
+        raise TargetError(f"--target {unknown[0]}: this study did not measure it. It measured {known}")
+    limits = {**(bounds or {}), **targets}
+    able = [row for row in candidates(rows, targets) if excess(row, limits, rows, "value") == 0.0]
     if not able:
         raise TargetError(describe_miss(rows, targets, default=bounds is not None))
     if bounds is not None:
         return cheapest(able, rows)
-    own = own_row(rows)
-    if few := [name for name in targets if name in own.errors and not tells(own, name)]:
+    if few := [short(name) for name in targets if name in own.errors and not tells(own, name)]:
         raise TargetError(
-            f"of {listed([short(name) for name in few])} fewer than {FEWEST_SCENES} scenes of the job were measured, which "
-            "promise nothing of others: give a longer --budget"
+            f"of {listed(few)} fewer than {FEWEST_SCENES} scenes of the job were measured, which promise nothing of others: "
+            "give a longer --budget"
         )
-    excess = {row.setting.name: _excess(row, targets, rows) for row in able}
-    most = max(1.0, min(excess.values()) * AS_CHEAP)
-    return cheapest([row for row in able if excess[row.setting.name] <= most], rows)
+    above = {row.setting.name: excess(row, targets, rows, "most") for row in able}
+    most = max(1.0, min(above.values()) * AS_CHEAP)
+    return cheapest([row for row in able if above[row.setting.name] <= most], rows)
 
 
 def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
     """The settings that may be chosen.
 
-    The job itself, and those that were measured in a few scenes at least, make the same world (`OTHER_WORLD`) and do not
-    fail `MORE_FAILED` more scenes, unless failed scenes are a target themselves.
+    The job itself, and those that were measured in a few scenes at least and do not fail `MORE_FAILED` more scenes, unless
+    failed scenes are a target themselves.
     """
     most = math.inf if "failed_share" in targets else own_row(rows).failed_share + MORE_FAILED
-    same = [row for row in rows if not OTHER_WORLD & set(dict(row.setting.parts)) and row.failed_share <= most]
-    scenes = {row.setting.name: min((one.scenes for one in row.errors.values()), default=math.inf) for row in same}
-    return [row for row in same if not row.setting.parts or scenes[row.setting.name] >= FEWEST_SCENES]
-
-
-def meets(row: Row, targets: Targets, rows: Sequence[Row]) -> bool:
-    """Whether all errors are at most their targets; what was never measured is not."""
-    figures = {name: error_of(row, name, rows) for name in targets}
-    return all(figure is not None and figure.value <= targets[name] for name, figure in figures.items())
-
-
-def _excess(row: Row, targets: Targets, rows: Sequence[Row]) -> float:
-    """How many times its target the bound of a setting's worst error is; 1 where all are met. What is negligible is met."""
-    figures = {name: error_of(row, name, rows) for name in targets}
-    above = [
-        figure.bound / max(targets[name], NEGLIGIBLE[ERRORS[name].unit])
-        for name, figure in figures.items()
-        if figure is not None and figure.bound > targets[name]
+    scenes = {
+        row.setting.name: min((figure.scenes for figure in row.errors.values()), default=FEWEST_SCENES) for row in rows
+    }
+    return [
+        row
+        for row in rows
+        if row.failed_share <= most and (not row.setting.parts or scenes[row.setting.name] >= FEWEST_SCENES)
     ]
-    return max([1.0, *above])
+
+
+def excess(row: Row, targets: Targets, rows: Sequence[Row], end: str) -> float:
+    """How many times its target the value or the bound (`most`) of a setting's worst error is; 0 where all are met.
+
+    Infinite where one was never measured. A bound is held against what is negligible at least, a value against a millionth.
+    """
+    above = [0.0]
+    for name, target in targets.items():
+        figure = error_of(row, name, rows)
+        value = math.inf if figure is None else getattr(figure, end)
+        if value > target:
+            above.append(value / max(target, 1e-6 if end == "value" else ERRORS[name].negligible))
+    return max(above)
 
 
 def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
@@ -173,144 +143,143 @@ def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
 
     Errors are, to the bit, because scenes are a pure function of job and seed; times are not. So every cost up to `AS_CHEAP`
     times the least upper end of an interval counts as the least, and facts without noise decide among those: the job itself
-    first, because a change for 5 % is not worth making; then the least sum of errors relative to the job's own; then the
-    fewest changes; then the name.
+    first, because a change for 5 % is not worth making; then the least sum of errors relative to the job's own, where what
+    is negligible counts as the bound of that; then the fewest changes; then the name.
     """
+    own = own_row(rows).errors
 
     def order(row: Row) -> tuple[bool, float, int, str]:
-        parts = row.setting.parts
-        return bool(parts), round(relative_error(row, rows), 6), len(parts), row.setting.name
+        least = {name: ERRORS[name].negligible for name in own}
+        values = {name: (error_of(row, name, rows) or own[name]).value for name in own}
+        relative = sum(max(values[name], least[name]) / max(own[name].value, least[name]) for name in own)
+        return bool(row.setting.parts), round(relative, 6), len(row.setting.parts), row.setting.name
 
-    least = min(max(row.ratio, row.ratio_most) for row in some)
-    return min((row for row in some if row.ratio <= least * AS_CHEAP), key=order)
-
-
-def relative_error(row: Row, rows: Sequence[Row]) -> float:
-    """The sum of a setting's errors, each as a share of the job's own; what is negligible counts as the bound of that."""
-    shares = []
-    for name, figure in own_row(rows).errors.items():
-        least = NEGLIGIBLE[ERRORS[name].unit]
-        shares.append(max((error_of(row, name, rows) or figure).value, least) / max(figure.value, least))
-    return sum(shares)
+    least_ratio = min(max(row.ratio, row.ratio_most) for row in some)
+    return min((row for row in some if row.ratio <= least_ratio * AS_CHEAP), key=order)
 
 
-def next_better(rows: Sequence[Row], chosen: Row, targets: Targets) -> Row | None:
-    """The cheapest setting that is better: in one target its interval lies below, and in no other its value is above.
-
-    Intervals decide, so that the noise of a few scenes does not count as better.
-    """
-    better = []
-    for row in candidates(rows, targets):
-        both = [(error_of(row, name, rows), error_of(chosen, name, rows)) for name in targets]
-        pairs = [(theirs, ours) for theirs, ours in both if theirs and ours]
-        no_worse = all(theirs.value <= ours.high for theirs, ours in pairs)
-        if no_worse and any(theirs.high < ours.low for theirs, ours in pairs):
-            better.append(row)
-    return cheapest(better, rows) if better else None
-
-
-# ---------------------------------------------------------------------------------------------- no setting meets them
-
-
-def _describe_unmeasured(rows: Sequence[Row], name: str) -> str:
-    known = ", ".join(sorted({error for row in rows for error in row.errors}))
-    return f"--target {name}: this study did not measure it. It measured {known}"
-
-
-def describe_miss(rows: Sequence[Row], targets: Targets, default: bool = False) -> str:
-    """The nearest setting, by how much it misses the targets, and which targets it would meet.
-
-    For `default` targets, which nobody asked for, with the option that sets others.
-    """
-    nearest = nearest_row(rows, targets)
-    missed, loosened = list[str](), dict[str, str]()
-    for name, target in targets.items():
-        figure = error_of(nearest, name, rows)
-        if figure is None:
-            missed.append(f"{name}, which was not measured with it")
-        elif figure.value > target:
-            over = f"{amount(name, figure.value - target)} more than {amount(name, target)}"
-            ratio = f" ({times(figure.value / target)})" if target > 0 else ""
-            missed.append(f"{name}, {amount(name, figure.value)} is {over}{ratio}")
-            above = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(figure.value))  # so that it is met
-            loosened[name] = f"{above:f}"
-    asked = {name: f"{target:g}" for name, target in targets.items()}
+def describe_miss(rows: Sequence[Row], targets: Targets, default: bool) -> str:
+    """The nearest setting, whose greatest excess is the least, and by how much it misses the targets."""
+    near = candidates(rows, targets)
+    nearest = min(near, key=lambda row: (excess(row, targets, rows, "value"), row.ratio, row.setting.name))
+    figures = {name: error_of(nearest, name, rows) for name in targets}
+    missed = [
+        f"{name} of {amount(name, figure.value)} instead of {amount(name, targets[name])}"
+        if figure
+        else f"{name}, not measured with it"
+        for name, figure in figures.items()
+        if figure is None or figure.value > targets[name]
+    ]
     words = listed(missed) or "none of them, and is worse than the job in another error"
-    miss = f"The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses {words}"
-    if default:
-        return f"no setting meets the default targets. {miss}. Set others with --target {_as_option(asked | loosened)}"
-    remedy = f". Loosen to at least {_as_option(loosened)}" if loosened else ""
-    return f"no setting meets {_as_option(asked)}. {miss}{remedy}"
+    wish = "the default targets" if default else ",".join(f"{name}={most:g}" for name, most in targets.items())
+    return (
+        f"no setting meets {wish}. The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses "
+        f"{words}. Set others with --target"
+    )
 
 
-def _as_option(targets: Mapping[str, str]) -> str:
-    return ",".join(f"{name}={most}" for name, most in targets.items())
+# ---------------------------------------------------------------------------------------------- the answer in words
 
 
-def nearest_row(rows: Sequence[Row], targets: Targets) -> Row:
-    """The setting whose greatest excess over its targets is the least; then the cheapest, then by name."""
+def describe_answer(
+    rows: Sequence[Row], targets: Targets | None, proofs: Sequence[Proof], scenes: int
+) -> tuple[str, str]:
+    """Which of these rows to use for the targets, what it costs, and what is not sure; and its name, empty where it is none.
 
-    def excess(row: Row) -> tuple[float, float, str]:
-        """How many times its target the worst error is, a target of 0 counting as a millionth; time; and name."""
-        figures = {name: error_of(row, name, rows) for name in targets}
-        values = {name: math.inf if figure is None else figure.value for name, figure in figures.items()}
-        above = [value / max(targets[name], 1e-6) for name, value in values.items() if value > targets[name]]
-        return max([1.0, *above]), row.ratio, row.setting.name
+    Without targets they are `DEFAULT_TARGETS` as far as the study measured them, and no other error may grow beyond the
+    job's own interval, so that a user without a wish keeps the same images.
+    """
+    if proofs and not proofs[-1].holds:
+        names = ", ".join(sorted({proof.setting for proof in proofs}))
+        words = f"{names} did not keep the targets on fresh scenes. A longer --budget tells more."
+        return f"Nothing is recommended: {words}", ""
+    asked = default_targets(rows)[0] if targets is None else targets
+    limits = listed([f"{amount(name, most)} of {short(name)}" for name, most in asked.items()])
+    wish = f"at most {limits}" if asked else "any error at all"
+    wish += ", and nothing else worse than the job has it" if targets is None else ""
+    try:
+        chosen = recommend(rows, targets)
+    except TargetError as error:
+        return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {error}.", ""
+    own = own_row(rows)
+    use = "use the job as it is" if chosen is own else f"use {chosen.setting.name}"
+    saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
+    losses = [
+        f"{short(name)} ({amount(name, figure.value)} instead of {amount(name, own.errors[name].value)})"
+        for name, figure in chosen.errors.items()
+        if name in own.errors and figure.low > own.errors[name].high and figure.value > ERRORS[name].negligible
+    ]
+    loss = f", and gives up {listed(losses)}" if losses else ""
+    whole = f"{describe_seconds(chosen.ms * scenes / 1e3)}, {size(chosen.kilobytes * scenes)}"
+    cost = f"{milliseconds(chosen.ms)} of processor a scene ({plural(scenes, 'scene')}: {whole})"
+    unproved = " It is not proved: the budget left no time for fresh scenes." if asked and not proofs else ""
+    doubt = _doubt(chosen, targets or {}, rows)
+    return f"For {wish}, {use}, which costs {cost}{saved}{loss}.{doubt}{unproved}", chosen.setting.name
 
-    return min(candidates(rows, targets), key=excess)
+
+def listed(words: Sequence[str]) -> str:
+    """Words in one phrase: "a", "a and b" or "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _doubt(row: Row, targets: Targets, rows: Sequence[Row]) -> str:
+    """A sentence on the targets that other scenes may miss; empty where all are sure."""
+    figures = {name: error_of(row, name, rows) for name in targets}
+    unsure = [
+        f"{short(name)} up to {amount(name, figure.most) if math.isfinite(figure.most) else 'any'} (from {figure.scenes})"
+        for name, figure in figures.items()
+        if figure is not None and figure.most > targets[name]
+    ]
+    return f" It is not sure to 95 %: scenes that were not measured may have {listed(unsure)}." if unsure else ""
+
+
+def describe_doubt(table: Table, part: Part, rivals: Sequence[Setting]) -> str:
+    """Which settings of a part are not decided with 95 % confidence."""
+    names = ", ".join(f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rivals)
+    return f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %, a longer --budget tells more: {names}"
 
 
 # ---------------------------------------------------------------------------------------------- what a user types
 
-KEPT = "kept_share"
-"""How a user may ask for a share of objects that are kept: `lost_share` is 1 minus it."""
-
 
 def parse_targets(text: str) -> dict[str, float]:
-    """From "penetration_mm=0.1,depth_mm=0.5". Raises InputError with the remedy."""
+    """From "penetration_mm=0.1,depth_mm=0.5"; `kept_share` is 1 minus `lost_share`. Raises InputError with the remedy."""
     targets: dict[str, float] = {}
     for part in text.split(","):
-        name, equals, value = (piece.strip() for piece in part.partition("="))
-        if not equals or not name:
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        if not name or not value:
             raise InputError(f"--target {part.strip() or text!r}: write it as penetration_mm=0.1,depth_mm=0.5")
         try:
             most = float(value)
         except ValueError:
             most = math.nan
-        if name == KEPT:
+        if name == "kept_share":
             name, most = "lost_share", round(1.0 - most, 12)
-            value = f"{most:g}"
         if name not in ERRORS:
-            known = ", ".join(ERRORS)
-            raise InputError(f"--target {name}: there is no such error; {did_you_mean(name, ERRORS)}Known: {known}")
+            raise InputError(
+                f"--target {name}: there is no such error; {did_you_mean(name, ERRORS)}Known: {', '.join(ERRORS)}"
+            )
         if name in targets:
-            raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {value}")
+            raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {most:g}")
         if not 0.0 <= most < math.inf:
             example = ", a share such as 0.001 for 0.1 %" if unit(name) == "%" else ""
-            raise InputError(f"--target {name}={value}: must be a number from 0 up{example}")
+            raise InputError(f"--target {part.strip()}: must be a number from 0 up{example}")
         targets[name] = most
     return targets
 
 
-class Unmeasured(NamedTuple):
-    """Jobs in which an error, or the errors of some groups, cannot be measured, and why."""
-
-    is_so: Callable[[Job], bool]
-    names: str
-    why: str
-
-
-_UNMEASURED = (
-    Unmeasured(lambda job: job.captures is None, "capture", "the job has no captures"),
-    Unmeasured(lambda job: job.captures is not None, "physics labels mirror colour", "the job is one of captures"),
-    Unmeasured(lambda job: not job.cameras.mirror.enabled, "mirror", "cameras.mirror.enabled is false"),
-    Unmeasured(lambda job: not job.render.rgb, "colour", "render.rgb is false"),
-    Unmeasured(
+_UNMEASURED: tuple[tuple[Callable[[Job], bool], str, str], ...] = (
+    (lambda job: job.captures is None, "capture", "the job has no captures"),
+    (lambda job: job.captures is not None, "physics labels mirror colour", "the job is one of captures"),
+    (lambda job: not job.cameras.mirror.enabled, "mirror", "cameras.mirror.enabled is false"),
+    (lambda job: not job.render.rgb, "colour", "render.rgb is false"),
+    (
         lambda job: job.start.pose == "tumbled" or job.objects_per_scene.high > 1,
         "pose_mm",
         "where things end is random when they tumble or meet, so no pose is the true one; ask for outcome_mm",
     ),
 )
+"""Jobs in which an error, or the errors of some groups, cannot be measured, and why."""
 
 
 def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
@@ -319,8 +288,8 @@ def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
     `missing` says why this machine has no truth of colour.
     """
     for name in targets:
-        for row in _UNMEASURED:
-            if row.is_so(job) and {name, ERRORS[name].group} & set(row.names.split()):
-                raise InputError(f"--target {name}: it cannot be measured here: {row.why}")
+        for is_so, names, why in _UNMEASURED:
+            if is_so(job) and {name, ERRORS[name].group} & set(names.split()):
+                raise InputError(f"--target {name}: it cannot be measured here: {why}")
         if name == "flip" and missing is not None:
             raise InputError(f"--target flip: {missing}")

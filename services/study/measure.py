@@ -1,4 +1,4 @@
-"""Measures one scene with settings, each in turn: how it comes to rest, what is drawn of it, and the processor's time of both.
+"""What a study measures of one scene, or of one capture, with each setting: the processor's time, and how it comes to rest.
 
 It runs in the pool's processes (workers/pool.py), each of which keeps the context of its job. What no code foresaw in a setting
 is a counted answer, `broken`, and never the end of a study.
@@ -13,26 +13,31 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NoReturn
 
 import numpy as np
 
 from schemas.base import Array
+from schemas.capture import CaptureScore, SynthesizedView
 from schemas.errors import SceneError
-from schemas.job.identity import settings_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, settings_digest
 from schemas.scene.scene import ObjectStart, Settled
-from services.study.knobs import apply
-from services.study.model import OWN, Setting
+from schemas.scene.view import Camera
+from services.study.model import OWN, Setting, apply
 from workers.assets.catalogue import open_catalogue
+from workers.capture.folder import CaptureFolder, open_folder
+from workers.capture.make_capture import require_captures, simulate_one
+from workers.capture.process import CaptureViews
+from workers.capture.reconstruct import ProcessorClock, estimate_surface, given_files
+from workers.capture.score import read_whole_truth, score_capture
+from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import motion_between, transform
-from workers.physics.fall import FINEST
-from workers.physics.settle import Rest, recheck_scene
+from workers.physics.settle import Rest
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
-from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Laid, lay_scene, plan_with_effects
 from workers.shard.run_shard import describe, run_scene
 
@@ -44,8 +49,7 @@ class Unit:
     """One scene to measure with these settings on top of a base setting.
 
     `job`: the job as JSON, beside the folder that its paths are of; `scratch`: a folder that all processes share; `part`: one of
-    services/study/knobs.py; `number`: the scene's place among the measured ones; `limit_s`: seconds of processor
-    that one setting may take.
+    services/study/table.py; `limit_s`: seconds of processor that one setting may take.
     """
 
     job: str
@@ -53,30 +57,24 @@ class Unit:
     scratch: str
     part: str
     scene_id: int
-    number: int
     settings: tuple[Setting, ...]
     base: Setting = OWN
     limit_s: float = math.inf
 
 
 def answer_unit(unit: Unit) -> bytes:
-    """Answers by the settings' names, as JSON. The parts are imported here: captures load what scenes have no use for."""
+    """Answers by the settings' names, as JSON."""
+    from services.study.images import measure_colour, measure_drawn  # imports this file
+
     context = _based(unit.job, unit.folder, json.dumps(dict(unit.base.changes)))
     LIMIT["s"], RESTS["folder"] = unit.limit_s, Path(unit.scratch)
-    if unit.part == "capture":
-        from services.study.captures import measure_capture
-
-        measure: Callable[..., dict[str, Answer]] = partial(measure_capture, scratch=Path(unit.scratch))
-    else:
-        from services.study.images import measure_colour, measure_drawn
-
-        measure = {
-            "rest": measure_rest,
-            "again": measure_again,
-            "draw": measure_drawn,
-            "colour": measure_colour,
-        }[unit.part]
-    return json.dumps(measure(context, unit.settings, unit.scene_id, unit.number)).encode()
+    measures = {"rest": measure_rest, "draw": measure_drawn, "colour": measure_colour, "capture": measure_capture}
+    began = time.monotonic()
+    answers = measures[unit.part](context, shuffled(unit.settings, unit.scene_id), unit.scene_id)
+    shared_s = (time.monotonic() - began - sum(answer["took"] for answer in answers.values())) / len(answers)
+    for answer in answers.values():
+        answer["took"] += shared_s  # what was made for all
+    return json.dumps(answers).encode()
 
 
 @cache
@@ -108,32 +106,12 @@ Answer = dict[str, Any]
 DIGITS = 6
 """Decimals of an error that are kept: a nanometre, a millionth of a share. What is less is rounding."""
 
-SLEPT_S = 1.0
-"""Times of what the machine slept in for longer are thrown away."""
-
 QUICK_S = {"rest": 2.0, "draw": 20.0}
 """By part: a process's first answer of a setting that takes less is measured once more, because the first compiles code and
 shaders. What draws compiles for seconds on a busy machine; rest compiles before, and a second pile costs more than it tells."""
 
 LIMIT = {"s": math.inf}
 """The seconds of processor that one answer of this process may take."""
-
-
-class Meter:
-    """Within `with`, measures: `s` seconds of processor, None where the machine slept in between; `took` seconds by the clock."""
-
-    s: float | None = None
-    took: float
-
-    def __enter__(self) -> "Meter":
-        self._began = time.process_time(), time.monotonic(), time.clock_gettime(time.CLOCK_BOOTTIME)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        cpu, clock, wall = self._began
-        self.took = time.monotonic() - clock
-        slept = time.clock_gettime(time.CLOCK_BOOTTIME) - wall - self.took > SLEPT_S
-        self.s = None if slept else time.process_time() - cpu
 
 
 class TimeOut(SceneError):
@@ -146,35 +124,34 @@ def _out_of_time(*_: object) -> NoReturn:
     raise TimeOut("time_out", f"took more than {LIMIT['s']:.0f} s of processor")
 
 
-def answer_for(measure: Callable[[Meter], Answer]) -> Answer:
-    """What `measure` answers, with its times: it gets a meter for what counts as the setting's time, the clock runs for all.
+def answer_for(measure: Callable[[], Answer]) -> Answer:
+    """What `measure` answers, and the seconds by the clock that it `took`.
 
     A scene that cannot be made, or takes longer than the limit, is `failed` with its reason; anything else that it raises is
     also `broken`.
     """
-    meter = Meter()
-    with Meter() as whole:
-        try:
-            if LIMIT["s"] < math.inf:
-                signal.signal(signal.SIGPROF, _out_of_time)
-                signal.setitimer(signal.ITIMER_PROF, LIMIT["s"])
-            answer = measure(meter)
-            if "errors" in answer:
-                answer["errors"] = {name: round(value, DIGITS) for name, value in answer["errors"].items()}
-        except SceneError as error:
-            answer = {"failed": error.reason}
-        except Exception as error:  # one scene that breaks a measure must not end the study
-            answer = {"failed": "broken", "broken": describe(error)}
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0.0)
-    return {**answer, "s": meter.s, "took": whole.took}
+    began = time.monotonic()
+    try:
+        if LIMIT["s"] < math.inf:
+            signal.signal(signal.SIGPROF, _out_of_time)
+            signal.setitimer(signal.ITIMER_PROF, LIMIT["s"])
+        answer = measure()
+        if "errors" in answer:
+            answer["errors"] = {name: round(value, DIGITS) for name, value in answer["errors"].items()}
+    except SceneError as error:
+        answer = {"failed": error.reason}
+    except Exception as error:  # one scene that breaks a measure must not end the study
+        answer = {"failed": "broken", "broken": describe(error)}
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+    return {**answer, "took": time.monotonic() - began}
 
 
 _ran: set[tuple[str, str]] = set()
 """Parts and settings that this process has run."""
 
 
-def warm_answer_for(part: str, setting: Setting, measure: Callable[[Meter], Answer]) -> Answer:
+def warm_answer_for(part: str, setting: Setting, measure: Callable[[], Answer]) -> Answer:
     """`answer_for`, twice where it is this process's first of the setting and quick (`QUICK_S`)."""
     answer = answer_for(measure)
     if (part, setting.name) not in _ran:
@@ -196,66 +173,52 @@ def shuffled(settings: Sequence[Setting], scene_id: int) -> list[Setting]:
 
 # ---------------------------------------------------------------------------------------------- how a scene comes to rest
 
-POSED = 48
-"""Scenes of which poses are kept, the first ones."""
-
 _seen: set[int] = set()
 """Scenes whose shapes this process has built."""
 
 
-def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
-    """How the scene comes to rest, by the settings' names. `number`: its place among the measured scenes.
+def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, Answer]:
+    """How the scene comes to rest, by the settings' names.
 
-    `s` is the time to rest, without the plan. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm and rolled_deg
-    (sideways travel of the centre of mass, and turn, since the object was released; the largest of several objects). Beside
-    them `lost`, `planned` and `redrawn` objects, `corners`, mm, of each object's box in the world, and `planned_s`, the time
-    of a plan whose shapes are there. The job itself also has `plan_s`, that of its plan with new shapes: a process's first
-    rest of a scene makes them, and is the job's answer only where it is too slow to be done again.
+    `s` is the time to rest, and `planned_s` that of the plan before it. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm
+    and rolled_deg (sideways travel of the centre of mass, and turn, since the object was released; the largest of several
+    objects). Beside them `lost` and `planned` objects, and `corners`, mm, of each object's box in the world. The job
+    itself also has `plan_s`, what a scene takes besides rest with new shapes: a process's first rest of a scene makes them, and
+    is the job's answer only where it is too slow to be done again.
     """
     answers: dict[str, Answer] = {}
-    new_s = cold_s = None
-    if scene_id not in _seen:
-        _seen.add(scene_id)
-        with Meter() as planning, suppress(Exception):  # told by what is measured
-            plan_with_effects(context, scene_id, Stopwatch())
-        new_s = planning.s
-        if not _rest_file(context, scene_id).exists():
-            cold = answer_for(partial(_rest, context, scene_id, number, OWN))
-            if cold["took"] < QUICK_S["rest"]:
-                cold_s = cold["s"]
-            elif OWN in settings:
-                answers[OWN.name] = cold
-    for setting in shuffled([one for one in settings if one.name not in answers], scene_id):
-        measure = partial(_rest, context_for(context, setting), scene_id, number, setting)
-        answers[setting.name] = warm_answer_for("rest", setting, measure)
-    own = answers.get(OWN.name)
-    if own is not None and new_s is not None:
-        own["plan_s"] = new_s + max(0.0, (cold_s or 0.0) - (own.get("planned_s") or 0.0) - (own["s"] or 0.0))
+    cold: Answer = {}
+    if scene_id not in _seen and not _rest_file(context, scene_id).exists():
+        cold = answer_for(partial(_rest, context, scene_id, OWN))
+        if cold["took"] >= QUICK_S["rest"]:
+            answers = {setting.name: cold for setting in settings if not setting.changes}
+    _seen.add(scene_id)
+    for setting in settings:
+        if setting.name not in answers:
+            measure = partial(_rest, context_for(context, setting), scene_id, setting)
+            answers[setting.name] = warm_answer_for("rest", setting, measure)
+    own = answers.get(OWN.name, {})
+    if "s" in own and "s" in cold:
+        own["plan_s"] = cold["planned_s"] + max(0.0, cold["s"] - own["s"])
     return answers
 
 
-def _rest(worker: WorkerContext, scene_id: int, number: int, setting: Setting, meter: Meter) -> Answer:
-    with Meter() as planning:
-        plan, _ = plan_with_effects(worker, scene_id, Stopwatch())
-    planned, before = len(plan.objects), sum(start.redraws for start in plan.objects)
+def _rest(worker: WorkerContext, scene_id: int, setting: Setting) -> Answer:
+    planning, watch = ProcessorClock(), ProcessorClock()
+    plan, _ = plan_with_effects(worker, scene_id, planning)
+    planned = len(plan.objects)
     try:
-        with meter:
-            rest = lay_scene(worker, scene_id, Stopwatch()).rest
+        rest = _settle(worker, scene_id, watch, is_kept=not setting.changes)
     except SceneError as error:
-        return {"failed": error.reason, "lost": planned, "planned": planned, "redrawn": 0}
-    finally:
-        if meter.s is not None and planning.s is not None:
-            meter.s -= planning.s
-    if setting == OWN:
-        _keep_rest(worker, scene_id, rest, meter.took)
+        return {"failed": error.reason, "lost": planned, "planned": planned}
     moves = list(zip(rest.starts, rest.settled, strict=True))
     return {
-        "planned_s": planning.s,
+        "s": sum(s for stage, s in watch.seconds.items() if stage not in planning.seconds),
+        "planned_s": sum(planning.seconds.values()),
         "errors": _errors_of(rest),
         "lost": planned - len(rest.settled),
         "planned": planned,
-        "redrawn": max(0, sum(start.redraws for start in rest.starts) - before),
-        **({"corners": [_corners_mm(*move).tolist() for move in moves]} if number < POSED else {}),
+        "corners": [_corners_mm(*move).tolist() for move in moves],
     }
 
 
@@ -281,24 +244,6 @@ def _corners_mm(start: ObjectStart, end: Settled) -> Array:
     return np.round(1e3 * transform(end.T_world_obj, corners), DIGITS)
 
 
-RELEASED = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
-"""Settings of physics, in steps 16 times shorter, with which objects at rest are released again."""
-
-
-def measure_again(context: WorkerContext, settings: Sequence[Setting], scene_id: int, number: int) -> dict[str, Answer]:
-    """How far objects at rest move when they are let go again in the finest steps: moved_mm and turned_deg."""
-    return {one.name: answer_for(partial(_again, context_for(context, one), scene_id)) for one in settings}
-
-
-def _again(worker: WorkerContext, scene_id: int, meter: Meter) -> Answer:
-    laid = lay_scene(worker, scene_id, Stopwatch())
-    physics = worker.job.physics.model_copy(update=RELEASED)
-    effects = plan_effects(Facts(worker.job.model_copy(update={"physics": physics}), laid.plan, raycast_checked=False))
-    again = recheck_scene(laid.plan, laid.rest, physics, effects, FINEST).settled
-    moved, turned = ([getattr(one, name) or 0.0 for one in again] for name in ("recheck_move_mm", "recheck_turn_deg"))
-    return {"errors": {"moved_mm": max(moved), "turned_deg": max(turned)}}
-
-
 # ---------------------------------------------------------------------------------------------- the job's own rest
 
 RESTS = {"folder": Path(os.devnull)}
@@ -311,18 +256,18 @@ def own_rest(context: WorkerContext, scene_id: int) -> Rest:
     """How the job's own scene rests, kept for what is drawn of it. Raises SceneError."""
     if (file := _rest_file(context, scene_id)).exists():
         return pickle.loads(file.read_bytes())
-    with Meter() as meter:
-        rest = lay_scene(context, scene_id, Stopwatch()).rest
-    _keep_rest(context, scene_id, rest, meter.took)
-    return rest
+    return _settle(context, scene_id, Stopwatch(), is_kept=True)
 
 
-def _keep_rest(context: WorkerContext, scene_id: int, rest: Rest, took: float) -> None:
-    if took >= QUICK_S["rest"] and RESTS["folder"].is_dir():
-        file = _rest_file(context, scene_id)
+def _settle(context: WorkerContext, scene_id: int, watch: Stopwatch, is_kept: bool) -> Rest:
+    """How a scene rests; what is slow is kept for other processes."""
+    began, file = time.monotonic(), _rest_file(context, scene_id)
+    rest = lay_scene(context, scene_id, watch).rest
+    if is_kept and time.monotonic() - began >= QUICK_S["rest"] and RESTS["folder"].is_dir():
         fresh = file.with_suffix(f".{os.getpid()}")
         fresh.write_bytes(pickle.dumps(rest))
         fresh.replace(file)
+    return rest
 
 
 def _rest_file(context: WorkerContext, scene_id: int) -> Path:
@@ -335,3 +280,90 @@ def laid_for(context: WorkerContext, worker: WorkerContext, scene_id: int) -> La
     rest = own_rest(context, scene_id)
     plan, effects = plan_with_effects(worker, scene_id, Stopwatch())
     return Laid(replace(plan, objects=rest.starts), effects, rest)
+
+
+# ---------------------------------------------------------------------------------------------- a simulated capture
+
+POINT_BYTES, VERTEX_BYTES, FACE_BYTES = 3 * 4 + 3 * 4 + 3, 3 * 4 + 3, 3 * 4
+"""As a cloud and a mesh are written: float32 coordinates and normals, 8-bit colours, 32-bit indices."""
+
+ERRORS_OF_SCORE = {
+    "camera_mm": "pose_mm",
+    "camera_deg": "pose_deg",
+    "cloud_mm": "cloud_median_mm",
+    "cloud_p95_mm": "cloud_p95_mm",
+    "view_depth_mm": "depth_median_mm",
+}
+"""Names of the study's errors, and of the score's figures."""
+
+HELD_OUT = 3
+"""Views that are made of the others, for their depth and their time."""
+
+
+def measure_capture(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, Answer]:
+    """Time, bytes and errors by setting of a simulated capture, which is kept in the shared folder for all settings.
+
+    Time is that of detection, estimates, cloud, mesh and as many synthesised views as there are photographs. A process works
+    untimed first: that compiles its loops.
+    """
+    if not _seen:
+        _seen.add(scene_id)
+        answer_for(partial(_process, context, context, scene_id))
+    workers = {setting.name: context_for(context, setting) for setting in settings}
+    return {name: answer_for(partial(_process, context, worker, scene_id)) for name, worker in workers.items()}
+
+
+def _simulated(context: WorkerContext, scale: float, scene_id: int) -> CaptureFolder:
+    """The capture with the job's own number of views, and a scale of images; made once."""
+    place = RESTS["folder"] / f"capture-{scene_id}-{scale:g}"
+    if not place.exists():
+        made = place.with_name(f"{place.name}-{os.getpid()}")
+        simulate_one(context_for(context, Setting((), {"captures.simulate.image_scale": scale})), scene_id, made)
+        with suppress(OSError):  # another process was faster, with the same bytes
+            made.rename(place)
+    return open_folder(place)
+
+
+@dataclass(eq=False)
+class TimedViews(CaptureViews):
+    """Views that keep the seconds of processor that each synthesised one took."""
+
+    seconds: list[float] = field(default_factory=list)
+
+    def synthesize(self, camera: Camera, without: int | None = None) -> SynthesizedView:
+        """As `CaptureViews.synthesize`."""
+        began = time.process_time()
+        made = super().synthesize(camera, without)
+        self.seconds.append(time.process_time() - began)
+        return made
+
+
+def _process(context: WorkerContext, worker: WorkerContext, scene_id: int) -> Answer:
+    watch, captures = ProcessorClock(), require_captures(worker.job)
+    whole = _simulated(context, captures.simulate.image_scale, scene_id)
+    folder = fewer_views(whole, captures.simulate.views)
+    with watch.stage("read"):
+        given = given_files(folder, captures.estimation)
+    estimates, merged = estimate_surface(given, captures, watch)
+    views = TimedViews(given, estimates.estimate, captures, merged.body)
+    truth, surface = read_whole_truth(folder), merged.surface
+    score = None if truth is None else score_capture(estimates.estimate, surface, views, truth, HELD_OUT).summary
+    mirrors_s = fmean(views.seconds) * len(estimates.estimate.used) if views.seconds else 0.0
+    points, vertices, faces = map(len, (surface.points, surface.vertices, surface.faces))
+    return {
+        "s": sum(watch.seconds.values()) + mirrors_s,
+        "errors": errors_of(score or CaptureScore()),
+        "bytes": points * POINT_BYTES + vertices * VERTEX_BYTES + faces * FACE_BYTES,
+    }
+
+
+def fewer_views(folder: CaptureFolder, views: int) -> CaptureFolder:
+    """The same capture with some of its views only, evenly over the path."""
+    return replace(folder, numbers=tuple(folder.numbers[place] for place in spread_evenly(len(folder.numbers), views)))
+
+
+def errors_of(score: CaptureScore) -> dict[str, float]:
+    """The study's errors from a score; what was not measured is left out."""
+    figures = {name: getattr(score, figure) for name, figure in ERRORS_OF_SCORE.items()}
+    figures["missing_share"] = None if score.completeness is None else 1.0 - score.completeness
+    return {name: float(value) for name, value in figures.items() if value is not None}

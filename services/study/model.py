@@ -1,39 +1,29 @@
-"""The models of a study of accuracy against time, the errors that it measures, and how amounts are written. Pure.
+"""What a study turns and measures: its models, the errors with their truths, the knobs of a job, and how amounts are written.
 
 An error names the truth that it is held against, which is never the setting under test.
 """
 
-from collections.abc import Mapping
+import copy
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from importlib.util import find_spec
 from typing import Any, Literal
 
-from schemas.errors import number
-from schemas.job.job import Job
+from pydantic import ValidationError
+from pydantic_core import to_jsonable_python
 
-Group = Literal["physics", "labels", "mirror", "colour", "capture"]
-"""The part of a scene that an error belongs to: how objects come to rest; depth and masks; the mirror pose and the
-projection into its view; RGB; or a capture as a whole."""
+from schemas.base import set_key
+from schemas.errors import InputError, did_you_mean, number
+from schemas.job.captures import ESTIMATES
+from schemas.job.job import PRESETS, Job, kind_of
+from services.job.job_file import describe_fault
 
 Changes = Mapping[str, Any]
 """Values by dotted key of the job, such as {"physics.step_hz": 240}."""
 
-
-@dataclass(frozen=True)
-class Value:
-    """One value of a knob: its label in tables and plots, the keys of the job that it sets, and a package that it needs."""
-
-    label: str
-    changes: Changes
-    package: str | None = None
-
-
-@dataclass(frozen=True)
-class Knob:
-    """One property that is turned; its values go from coarse to fine where they have an order."""
-
-    name: str
-    values: tuple[Value, ...]
+Targets = Mapping[str, float]
+"""The greatest allowed value of each error, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -58,48 +48,36 @@ class Setting:
         """The job itself, a preset, one knob turned, or several."""
         if not self.parts:
             return "own"
-        return "preset" if self.parts[0][0] == "preset" else "single" if len(self.parts) == 1 else "several"
+        return "preset" if self.knob == "preset" else "single" if len(self.parts) == 1 else "several"
 
 
 OWN = Setting()
 """The job as it is."""
 
 
-Verdict = Literal["meets", "misses", "open"]
-
-
 @dataclass(frozen=True)
 class Figure:
     """An error of a setting: its value, its 95 % interval by bootstrap over these scenes, and their number.
 
-    The bootstrap knows no scene worse than the worst of its own, so that its upper end tells settings of the same scenes
-    apart, and says little of other scenes: `least` and `most` are the bounds for those (services/study/table.py), None where
-    there are no better ones. `less`: whether it is surely less than the job's own in most scenes, None where nothing tells.
+    The bootstrap knows no scene worse than the worst of its own, so that its ends tell settings of the same scenes apart, and
+    say little of other scenes. `least` and `most` bound the error of as many scenes as one likes, each with 95 % confidence.
     """
 
     value: float
     low: float
     high: float
-    median: float
+    least: float
+    most: float
     scenes: int
-    most: float | None = None
-    less: bool | None = None
-    least: float | None = None
 
-    @property
-    def bound(self) -> float:
-        """What the error of as many scenes as one likes is at most, with 95 % confidence."""
-        return max(self.value, self.high if self.most is None else self.most)
-
-    def verdict(self, target: float) -> Verdict:
+    def verdict(self, target: float) -> Literal["meets", "misses", "open"]:
         """Whether the error of as many scenes as one likes is surely (95 %) at most a target, or surely above it."""
-        least = self.low if self.least is None else self.least
-        return "meets" if self.bound <= target else "misses" if least > target else "open"
+        return "meets" if self.most <= target else "misses" if self.least > target else "open"
 
     def scaled(self, times: float, most: float) -> "Figure":
         """Times a factor, and at most `most`."""
-        ends = {name: getattr(self, name) for name in ("value", "low", "high", "median", "most", "least")}
-        return replace(self, **{name: min(most, end * times) for name, end in ends.items() if end is not None})
+        ends = {name: getattr(self, name) for name in ("value", "low", "high", "least", "most")}
+        return replace(self, **{name: min(most, end * times) for name, end in ends.items()})
 
 
 @dataclass(frozen=True)
@@ -128,15 +106,14 @@ class Proof:
 
     setting: str
     scenes: int
-    targets: Mapping[str, float]
+    targets: Targets
     measured: Mapping[str, Figure]
     promised: Mapping[str, Figure]
 
     @property
-    def missed(self) -> tuple[str, ...]:
-        """The errors whose measured figure is above its target, or is not there."""
-        known = self.measured
-        return tuple(name for name, most in self.targets.items() if name not in known or not known[name].value <= most)
+    def missed(self) -> list[str]:
+        """The errors whose measured figure is above its target."""
+        return [name for name, most in self.targets.items() if not self.measured[name].value <= most]
 
     @property
     def holds(self) -> bool:
@@ -146,12 +123,11 @@ class Proof:
 
 @dataclass(frozen=True)
 class Study:
-    """The content of a report: the machine, the command, and the table.
+    """The content of a page: the machine, the command, and the table.
 
-    `scenes` is the most that a setting was measured in; `job_scenes` is the size of the whole job, 0 where its cost is not
-    told; `seconds` were spent of a budget of `budget_s`; `answer` is the answer in words and `chosen` the name of the
-    setting in it, empty where nothing is recommended; `doubts` are what is not decided, and how long that would take;
-    `notes` hold for the whole study, such as what was not measured, and why.
+    `scenes` is the most that a setting was measured in; `job_scenes` is the size of the whole job; `seconds` were spent of a
+    budget of `budget_s`; `chosen` is the name of the setting in the answer, empty where nothing is recommended; `doubts` are
+    what is not decided; `notes` hold for the whole study, such as what was not measured, and why.
     """
 
     job: str
@@ -159,46 +135,30 @@ class Study:
     machine: Mapping[str, Any]
     scenes: int
     rows: tuple[Row, ...]
-    preset: str = "balanced"
-    job_scenes: int = 0
-    notes: tuple[str, ...] = ()
-    budget_s: float = 0.0
-    seconds: float = 0.0
-    answer: str = ""
-    chosen: str = ""
-    doubts: tuple[str, ...] = ()
-    proofs: tuple[Proof, ...] = ()
-
-    @property
-    def sample(self) -> str:
-        """What was measured, in words."""
-        return f"up to {self.scenes} scenes with each of {len(self.rows)} settings"
+    preset: str
+    job_scenes: int
+    notes: tuple[str, ...]
+    budget_s: float
+    seconds: float
+    answer: str
+    chosen: str
+    doubts: tuple[str, ...]
+    proofs: tuple[Proof, ...]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The job that is measured, its settings, the presets, the targets, the seconds to spend, and processes."""
+# ---------------------------------------------------------------------------------------------- errors
 
-    job: Job
-    job_folder: Path
-    settings: tuple[Setting, ...]
-    presets: tuple[Setting, ...]
-    targets: Mapping[str, float] | None
-    budget_s: float = 900.0
-    processes: int = 2
-
-
+_SHAPES = "the stored shapes"
 _RAYS = "a ray caster in float64 at the same pixel centres"
 _FRONT = "65,536 rays about the objects, and their vertices"
 _PATCH = "rays at random in the objects' patch"
-_FINEST = "the finest steps, 1 s"
 _TRUTH = "the truth of the simulation"
 _REFERENCE = "finer steps than any that is measured"
 
 
 @dataclass(frozen=True)
 class ErrorKind:
-    """One error: its unit, its name in a few words, its definition, what it is held against, and its part of a scene.
+    """One error: its unit, name in a few words, definition, what it is held against, its group, and the usual target.
 
     A scene has one figure of it, and a setting the 95th percentile of its scenes' figures, or where it is `pooled` one
     figure over all its scenes. Less is better.
@@ -209,65 +169,49 @@ class ErrorKind:
     short: str
     title: str
     truth: str
-    group: Group
+    group: Literal["physics", "labels", "mirror", "colour", "capture"]
+    target: float | None = None
     pooled: bool = False
+
+    @property
+    def negligible(self) -> float:
+        """What is as good as none, however it compares."""
+        return 0.02 if self.unit else 0.001
+
+    @property
+    def most(self) -> float:
+        """What it can be at most: shares at most 1."""
+        return float("inf") if self.unit else 1.0
 
 
 # fmt: off
-ERRORS = {kind.name: kind for kind in (
-    ErrorKind("penetration_mm", "mm", "penetration",
-              "how deep an object stands in what it rests on", "the stored shapes", "physics"),
-    ErrorKind("gap_mm", "mm", "gap", "how high an object hovers", "the stored shapes", "physics"),
-    ErrorKind("unbalanced_share", "", "weight out of balance",
-              "share of a weight that contacts leave out of balance", "the stored shapes", "physics"),
-    ErrorKind("moved_mm", "mm", "motion when let go again",
-              "how far an object moves when it is let go again", _FINEST, "physics"),
-    ErrorKind("turned_deg", "deg", "turn when let go again",
-              "how far it turns when it is let go again", _FINEST, "physics"),
-    ErrorKind("pose_mm", "mm", "pose", "pose off, where two finer settings agree", _REFERENCE, "physics"),
-    ErrorKind("outcome_mm", "mm", "where things end, on the whole",
-              "how far things slide and roll: two distributions apart", _REFERENCE, "physics", True),
-    ErrorKind("outcome_deg", "deg", "how they lie, on the whole",
-              "how far things turn: two distributions apart", _REFERENCE, "physics", True),
-    ErrorKind("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", True),
-    ErrorKind("lost_share", "", "objects that are lost", "objects of the plan that no scene has", "counted", "physics", True),
-    ErrorKind("redrawn_share", "", "objects dropped again",
-              "objects that left the table and were drawn again, an object", "counted", "physics", True),
-    ErrorKind("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("table_depth_mm", "mm", "depth of the table",
-              "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("mask_share", "", "the object's mask pixels",
-              "object pixels that are wrong in the mask", _RAYS, "labels"),
-    ErrorKind("between_mm", "mm", "depth between pixels",
-              "depth between pixels, read at the nearest", _PATCH, "labels"),
-    ErrorKind("outline_share", "", "regions between pixels",
-              "rays at random whose region the nearest pixel has wrong", _PATCH, "labels"),
-    ErrorKind("mirror_mm", "mm", "mirror camera", "mirror camera off, as d_z is", _FRONT, "mirror"),
-    ErrorKind("agreement_mm", "mm", "agreement of the views",
-              "input depth carried into the mirror view, off", "the mirror view", "mirror"),
-    ErrorKind("unfilled_share", "", "projected pixels left empty",
-              "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
-    ErrorKind("hidden_share", "", "projected pixels that show through",
-              "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
-    ErrorKind("camera_mm", "mm", "camera position",
-              "camera position off, median of a capture's views", _TRUTH, "capture"),
-    ErrorKind("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture"),
-    ErrorKind("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture"),
-    ErrorKind("cloud_p95_mm", "mm", "merged cloud, 95 %",
-              "points of the merged cloud off, 95 % of them", _TRUTH, "capture"),
-    ErrorKind("missing_share", "", "surface that is missing",
-              "visible surface without a point within 3 mm", _TRUTH, "capture"),
-    ErrorKind("view_depth_mm", "mm", "depth of synthesised views",
-              "depth of synthesised views off, median", _TRUTH, "capture"),
-    ErrorKind("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
-    ErrorKind("edge_flip", "", "edges, FLIP",
-              "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
+ERRORS = {row[0]: ErrorKind(*row) for row in (
+    ("pose_mm", "mm", "pose", "pose off, where two finer settings agree", _REFERENCE, "physics", 0.1),
+    ("outcome_mm", "mm", "where things end, on the whole", "slides and rolls: two distributions apart",
+     _REFERENCE, "physics", None, True),
+    ("penetration_mm", "mm", "penetration", "how deep an object stands in what it rests on", _SHAPES, "physics", 0.1),
+    ("gap_mm", "mm", "gap", "how high an object hovers", _SHAPES, "physics", 0.1),
+    ("unbalanced_share", "", "weight out of balance", "share of a weight that contacts leave", _SHAPES, "physics", 0.01),
+    ("outcome_deg", "deg", "how they lie, on the whole", "turns: two distributions apart", _REFERENCE, "physics", None, True),
+    ("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", None, True),
+    ("lost_share", "", "objects that are lost", "planned objects that no scene has", "counted", "physics", None, True),
+    ("between_mm", "mm", "depth between pixels", "depth between pixels, read at the nearest", _PATCH, "labels"),
+    ("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels", 0.1),
+    ("mask_share", "", "the object's mask pixels", "object pixels that are wrong in the mask", _RAYS, "labels", 0.001),
+    ("mirror_mm", "mm", "mirror camera", "mirror camera off, as d_z is", _FRONT, "mirror"),
+    ("unfilled_share", "", "projected pixels left empty", "of object pixels that both views see", _RAYS, "mirror"),
+    ("hidden_share", "", "projected pixels that show through", "what the mirror camera cannot see", _RAYS, "mirror"),
+    ("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
+    ("edge_flip", "", "edges, FLIP", "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
+    ("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture", 1.0),
+    ("missing_share", "", "surface that is missing", "visible surface without a point within 3 mm", _TRUTH, "capture", 0.05),
+    ("view_depth_mm", "mm", "depth of synthesised views", "depth of synthesised views off, median", _TRUTH, "capture", 1.5),
+    ("camera_mm", "mm", "camera position", "camera position off, median of a capture's views", _TRUTH, "capture", 0.5),
+    ("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture", 0.05),
+    ("cloud_p95_mm", "mm", "merged cloud, 95 %", "points of the merged cloud off, 95 % of them", _TRUTH, "capture", 3.0),
 )}
 # fmt: on
-"""By name."""
-
-NEGLIGIBLE: Mapping[str, float] = {"mm": 0.02, "deg": 0.02, "": 0.001}
-"""By unit: errors below this are as good as none, however they compare."""
+"""By name, of each group first those that a picture shows rather."""
 
 # ---------------------------------------------------------------------------------------------- in words
 
@@ -292,22 +236,140 @@ def amount(name: str, value: float) -> str:
     return f"{number(shown(name, value))} {unit(name)}".strip()
 
 
-def as_often(ratio: float) -> str:
-    """A ratio of times in two digits: "1" within the noise of 5 %, "0.62", "1.6", "47"."""
-    return "1" if abs(ratio - 1.0) < 0.05 else number(float(f"{ratio:.2g}"))
-
-
-def cost(ratio: float) -> str:
-    """A ratio of times as a cost: "2 × the time", or "no more time" within the noise."""
-    often = as_often(ratio)
-    return "no more time" if often == "1" else f"{often} × the time"
-
-
 def times(ratio: float) -> str:
-    """A ratio of times with its word, and a third digit near 1: "1.07 times"."""
-    return f"{number(round(ratio, 2)) if 0.9 <= ratio < 1.1 else as_often(ratio)} times"
+    """A ratio of times in two digits, three near 1: "1.07 times"."""
+    return f"{number(round(ratio, 2) if 0.9 <= ratio < 1.1 else float(f'{ratio:.2g}'))} times"
 
 
-def listed(words: list[str]) -> str:
-    """Words in one phrase: "a", "a and b" or "a, b and c"."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+# ---------------------------------------------------------------------------------------------- knobs
+
+Knobs = Mapping[str, Mapping[str, Changes]]
+"""By name, the values of a knob by their labels, from coarse to fine where they have an order."""
+
+_FINE = {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400}
+_FINEST = {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400}
+
+REFERENCES: tuple[Setting, ...] = (
+    Setting((("reference", "fine"),), {f"physics.{key}": value for key, value in _FINE.items()}),
+    Setting((("reference", "finest"),), {f"physics.{key}": value for key, value in _FINEST.items()}),
+)
+"""Settings of physics finer than every measured value. The first gives the distribution of outcomes; a pose has a truth where
+both agree."""
+
+
+def knobs_of(job: Job) -> Knobs:
+    """Every knob, with the values that mean something for this job."""
+    if (captures := job.captures) is not None:
+        views = [n for n in (4, 6, 10, 20, 40) if n < captures.simulate.views]
+        return {
+            "views": _values("captures.simulate.views", views),
+            # `markers` and `article` estimate each view by itself, `joint` all together.
+            "estimate": _values("captures.estimation.estimate", ESTIMATES),
+            "iterations": _values("captures.estimation.max_iterations", (1, 2, 5, 20)),
+            "voxel": _values("captures.fusion.voxel_m", (0.006, 0.004, 0.002, 0.0015)),
+            "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
+            "image_scale": _values("captures.simulate.image_scale", (0.25, 0.5, 1.0)),
+        }
+    splat, removal = "images.projection.splat", "images.projection.hidden_point_removal"
+    return {
+        "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
+        "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
+        "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
+        "rest": _values("physics.rest.speed_mm_s", (30.0, 10.0, 3.0, 1.0, 0.3)),
+        "collision": _collisions(job),
+        "concavity": _values("physics.concavity", (0.2, 0.1, 0.05, 0.02)),
+        "exact_rest": {"off": {"physics.exact_rest": False}, "on": {"physics.exact_rest": True}},
+        "size": {str(width): resized(job, width) for width in (160, 320, 640, 1280)},
+        "units": _values(
+            "images.depth_units_per_m",
+            [n for n in (1000, 2000, 5000, 8000) if n * job.images.depth_range_m.high <= 65_535],
+        ),
+        "pivot_depth": _values("cameras.mirror.percentile", (50.0, 10.0, 5.0, 2.0, 0.5, 0.0)),
+        "splat": {
+            f"{size}{' without backs' if removed else ''}": {splat: size, removal: removed}
+            for size, removed in itertools.product((1, 3, 5), (False, True))
+        },
+        "png_level": _values("images.png_level", (0, 1, 2, 6, 9)),
+        "colour": _tiers(),
+    }
+
+
+def _values(key: str, values: Iterable[float | str]) -> dict[str, Changes]:
+    return {value if isinstance(value, str) else f"{value:g}": {key: value} for value in values}
+
+
+def _collisions(job: Job) -> dict[str, Changes]:
+    """From coarse to fine; parts of meshes from outside at several tolerances (parts of built-in shapes have none).
+
+    The mesh itself is no value, because Bullet moves convex shapes alone.
+    """
+    key, depth = "physics.collision", "physics.concavity"
+    if all(source.source == "procedural" for source in job.assets.objects):
+        return _values(key, ("box", "hull", "planned", "parts"))
+    parts = {f"parts to {d:g}": {key: "parts", depth: d} for d in (0.1, 0.05, 0.02)}
+    return {**_values(key, ("box", "hull", "planned")), **parts}
+
+
+def resized(job: Job, width: int) -> Changes:
+    """The job's camera with another number of pixels and the same field of view."""
+    sensor = job.cameras.sensor
+    scaled = {name: value * width / sensor.width for name, value in sensor}
+    values = scaled | {"width": width, "height": max(1, round(scaled["height"]))}
+    return {f"cameras.sensor.{name}": value for name, value in values.items()}
+
+
+def _tiers() -> dict[str, Changes]:
+    rasters = (("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4))
+    paths = (1, 4, 16) if find_spec("mitsuba") else ()
+    return {
+        **{label: {"render.tier": tier, "render.samples": samples} for label, tier, samples in rasters},
+        **{f"path-{n}": {"render.tier": "pathtraced", "render.path_samples": n} for n in paths},
+    }
+
+
+def choose_knobs(knobs: Knobs, names: Sequence[str] | None) -> Knobs:
+    """The knobs with these names, or all for None. Raises InputError for an unknown name."""
+    for name in names or ():
+        if name not in knobs:
+            hint = did_you_mean(name, knobs)
+            raise InputError(f"--knobs {name}: there is no such knob; {hint}known: {', '.join(knobs)}")
+    return knobs if names is None else {name: knobs[name] for name in names}
+
+
+def settings_of(job: Job, knobs: Knobs) -> tuple[list[Setting], list[str]]:
+    """The job itself, each value of each knob that it does not have itself, and the presets; and what is left out, and why."""
+    settings, left_out = [OWN], []
+    for knob, values in knobs.items():
+        for label, changes in values.items():
+            setting = Setting(((knob, label),), changes)
+            try:
+                if apply(job, changes) != job:
+                    settings.append(setting)
+            except InputError as error:
+                left_out.append(f"{setting.name}: {error}")
+    for name, keys in PRESETS[kind_of(job.model_dump(mode="json"))].items():
+        if others := {key: value for key, value in keys.items() if apply(job, {key: value}) != job}:
+            settings.append(Setting((("preset", name),), others))
+    return settings, left_out
+
+
+def joined(settings: Sequence[Setting]) -> Setting:
+    """Several settings at once, of different knobs."""
+    parts = tuple(part for setting in settings for part in setting.parts)
+    return Setting(parts, {key: value for setting in settings for key, value in setting.changes.items()})
+
+
+def apply(job: Job, changes: Changes) -> Job:
+    """The job with these changes. Raises InputError where the job may not have them."""
+    try:
+        return Job.model_validate(job_tree_with(changes, job.model_dump(mode="json")))
+    except ValidationError as error:
+        raise InputError("; ".join(describe_fault(fault) for fault in error.errors())) from error
+
+
+def job_tree_with(changes: Changes, tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys and values of a job file, a copy of `tree`, with these changes made: {"physics": {"step_hz": 240}}."""
+    made: dict[str, Any] = copy.deepcopy(dict(tree))
+    for path, value in changes.items():
+        set_key(made, path, to_jsonable_python(value))
+    return made

@@ -1,96 +1,72 @@
-"""The files of a study: Parquet tables, the whole study as JSON, and one HTML page that needs nothing beside it."""
+"""The files of a study: the table as Parquet, all of it as JSON, a picture, and one HTML page that needs nothing beside it."""
 
 import base64
+import io
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from html import escape
+from itertools import cycle, zip_longest
 from pathlib import Path
 from string import Template
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.cbook import pts_to_poststep
+from matplotlib.figure import Figure as Picture
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from schemas.errors import describe_seconds, milliseconds, number, size
-from services.study.choose import as_cheap, front, own_row, tells
+from services.study.choose import front, own_row, tells
 from services.study.model import ERRORS, Proof, Row, Study, amount, short, shown, times, unit
 
-STUDY_FILE = "study.json"
-WIDE_FILE = "tradeoff.parquet"
-LONG_FILE = "errors.parquet"
-
-STUDY_VERSION = 1
+STUDY_VERSION = 2
 """The version of the JSON file's format."""
 
-_SETTING = [("setting", pa.string()), ("knob", pa.string()), ("value", pa.string())]
 _COST = ("ms", "ratio", "ratio_least", "ratio_most", "kilobytes", "failed_share")
 
-LONG_SCHEMA = pa.schema(
-    [
-        *_SETTING,
-        ("error", pa.string()),
-        ("unit", pa.string()),
-        ("group", pa.string()),
-        *((name, pa.float64()) for name in ("ms", "ratio", "amount", "low", "high", "median")),
-        ("scenes", pa.int64()),
-    ]
-)
+
+def table_of(rows: Sequence[Row]) -> pa.Table:
+    """A row for each setting: knobs and values of a combination joined by commas, its cost, and each error with its interval.
+
+    Only errors that were measured have columns; they are null in settings that did not measure them.
+    """
+    measured = [name for name in ERRORS if any(name in row.errors for row in rows)]
+    ends = {"": "value", "_low": "low", "_high": "most"}
+    lines = []
+    for row in rows:
+        knob, value = (", ".join(part[place] for part in row.setting.parts) for place in (0, 1))
+        words = {"setting": row.setting.name, "knob": knob, "value": value, "notes": "; ".join(row.notes)}
+        figures = {
+            f"{name}{end}": getattr(row.errors.get(name), key, None) for name in measured for end, key in ends.items()
+        }
+        costs = {name: getattr(row, name) for name in _COST}
+        lines.append({**words, "changes": json.dumps(dict(row.setting.changes)), **figures, **costs})
+    return pa.Table.from_pylist(lines)
 
 
-def wide_schema() -> pa.Schema:
-    """The schema of `tradeoff.parquet`: one row for each setting; an error and its interval are null where not measured."""
-    names = sorted(ERRORS, key=lambda name: name in _COST)  # those with a column among the costs last
-    figures = [f"{name}{end}" for name in names for end in ("", "_low", "_high") if f"{name}{end}" not in _COST]
-    numbers = [(name, pa.float64()) for name in (*_COST, *figures)]
-    return pa.schema([*_SETTING, ("changes", pa.string()), *numbers, ("notes", pa.list_(pa.string()))])
-
-
-def write_tables(study: Study, folder: Path) -> list[Path]:
-    """Write `tradeoff.parquet`, `errors.parquet` and `study.json`, each whole or not at all; returns their paths."""
+def write_study(study: Study, folder: Path) -> None:
+    """Write `tradeoff.parquet`, `study.json`, `tradeoff.png` and `index.html`, each whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    wide = pa.Table.from_pylist([_wide(row) for row in study.rows], wide_schema())
-    long = pa.Table.from_pylist([line for row in study.rows for line in _long(row)], LONG_SCHEMA)
+    table, picture = io.BytesIO(), draw_tradeoff(study)
+    pq.write_table(table_of(study.rows), table)
     text = json.dumps({"verso_study": STUDY_VERSION, **asdict(study)}, indent=1) + "\n"
-    return [
-        _replace(folder / WIDE_FILE, lambda file: pq.write_table(wide, file)),
-        _replace(folder / LONG_FILE, lambda file: pq.write_table(long, file)),
-        _replace(folder / STUDY_FILE, lambda file: file.write_text(text, encoding="utf-8")),
-    ]
+    for name, data in {
+        "tradeoff.parquet": table.getvalue(),
+        "study.json": text.encode(),
+        "tradeoff.png": picture,
+        "index.html": page_of(study, picture).encode(),
+    }.items():
+        partial = folder / f".{name}.{os.getpid()}"
+        partial.write_bytes(data)
+        os.replace(partial, folder / name)
 
 
-def _names(row: Row) -> dict[str, str]:
-    """A setting's name, knobs and values; those of a combination are joined by commas."""
-    knobs, values = (", ".join(part[place] for part in row.setting.parts) for place in (0, 1))
-    return {"setting": row.setting.name, "knob": knobs, "value": values}
-
-
-def _wide(row: Row) -> dict[str, Any]:
-    line: dict[str, Any] = {**_names(row), "changes": json.dumps(dict(row.setting.changes)), "notes": list(row.notes)}
-    for name, figure in row.errors.items():
-        line |= {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.bound}
-    return line | {name: getattr(row, name) for name in _COST}
-
-
-def _long(row: Row) -> list[dict[str, Any]]:
-    setting = {**_names(row), "ms": row.ms, "ratio": row.ratio}
-    return [
-        {**asdict(figure), **setting, "high": figure.bound, "amount": figure.value, "error": name}
-        | {"unit": ERRORS[name].unit, "group": ERRORS[name].group}
-        for name, figure in row.errors.items()
-    ]
-
-
-def _replace(file: Path, write: Callable[[Path], Any]) -> Path:
-    """Write under another name in the same folder, then rename, so that no reader sees half a file."""
-    partial = file.with_name(f".{file.name}.{os.getpid()}")
-    write(partial)
-    os.replace(partial, file)
-    return file
-
-
-TEMPLATE = Path(__file__).with_name("page.html")
+# ---------------------------------------------------------------------------------------------- the page
 
 GROUPS = {
     "physics": "How objects rest",
@@ -101,42 +77,33 @@ GROUPS = {
 }
 
 
-def write_page(study: Study, plots: Sequence[Path], file: Path) -> None:
-    """Write the page with the pictures in it: the first of `plots` on top, then one a knob."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(page_of(study, plots), encoding="utf-8")
-
-
-def page_of(study: Study, plots: Sequence[Path]) -> str:
-    """The whole page."""
+def page_of(study: Study, picture: bytes) -> str:
+    """The whole page, with the picture in it."""
+    data = base64.b64encode(picture).decode("ascii")
+    notes = [f"{row.setting.name}: {note}" for row in study.rows for note in row.notes]
     tables = {name: table for group, name in GROUPS.items() if (table := _group_table(study, group))}
-    knobs = [_picture(plot, f"Errors over time along the knob {plot.stem.removeprefix('knob_')}") for plot in plots[1:]]
-    summary = '<details open class="knobs"><summary>Each knob by itself</summary>'
-    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
+    return Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8")).substitute(
         job=escape(study.job),
         answer=escape(study.answer),
-        proof=_proofs(study),
+        proof="".join(f"<p>Proved: {escape(describe_proof(proof))}.</p>" for proof in study.proofs),
         doubts="".join(f'<p class="doubt">Not decided: {escape(line)}.</p>' for line in study.doubts),
-        tradeoff="".join(_picture(plot, "Errors over processor time, a point for each setting") for plot in plots[:1]),
+        tradeoff=f'<img class="plot" alt="Errors over processor time" src="data:image/png;base64,{data}">',
         groups="\n".join(f"<h2>{name}</h2>{table}" for name, table in tables.items()),
         errors=_errors(study),
-        notes="".join(f"<li>{escape(line)}</li>" for line in _notes(study) or ["Nothing was left out."]),
+        notes="".join(f"<li>{escape(line)}</li>" for line in (*study.notes, *notes)),
         machine=_machine(study),
-        knobs=f"{summary}\n{''.join(knobs)}</details>" if knobs else "",
     )
 
 
-def _picture(plot: Path, what: str) -> str:
-    data = base64.b64encode(plot.read_bytes()).decode("ascii")
-    return f'<img class="plot" alt="{escape(what)}" src="data:image/png;base64,{data}">\n'
-
-
-def _table(body: str | Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
-    """A table of words, or of lines in HTML, with its head, of which there may be none."""
-    kind = "" if isinstance(body, str) else ' class="words"'
-    lines = body if isinstance(body, str) else "".join(f"<tr>{_cells('td', row)}</tr>\n" for row in body)
+def _table(lines: str, head: Sequence[str] = (), kind: str = "words") -> str:
+    """A table of lines in HTML, with its head, of which there may be none."""
     heads = f"<thead><tr>{_cells('th', head)}</tr></thead>" if head else ""
-    return f'<div class="scroll"><table{kind}>{heads}\n<tbody>{lines}</tbody></table></div>'
+    return f'<div class="scroll"><table class="{kind}">{heads}\n<tbody>{lines}</tbody></table></div>'
+
+
+def _lines(rows: Iterable[Sequence[str]]) -> str:
+    """Lines of words."""
+    return "".join(f"<tr>{_cells('td', row)}</tr>\n" for row in rows)
 
 
 def _cells(kind: str, words: Iterable[str]) -> str:
@@ -145,25 +112,14 @@ def _cells(kind: str, words: Iterable[str]) -> str:
 
 def describe_proof(proof: Proof) -> str:
     """One line: what was promised and measured, and whether it holds."""
-    words = [
-        f"{short(name)} {amount(name, proof.measured[name].value)}"
-        + (f", promised {amount(name, proof.promised[name].value)}" if name in proof.promised else "")
-        + f" (at most {amount(name, most)})"
-        for name, most in proof.targets.items()
-    ]
+    words = []
+    for name, most in proof.targets.items():
+        promised = f", promised {amount(name, proof.promised[name].value)}" if name in proof.promised else ""
+        words.append(
+            f"{short(name)} {amount(name, proof.measured[name].value)}{promised} (at most {amount(name, most)})"
+        )
     end = "holds" if proof.holds else "does not hold: withdrawn"
     return f"{proof.setting} on {proof.scenes} fresh scenes: {'; '.join(words)}: {end}"
-
-
-def _proofs(study: Study) -> str:
-    rows = [
-        (proof.setting, str(proof.scenes), short(name), amount(name, most),
-         amount(name, proof.promised[name].value) if name in proof.promised else "as the job",
-         amount(name, proof.measured[name].value), "yes" if proof.measured[name].value <= most else "no: withdrawn")
-        for proof in study.proofs for name, most in proof.targets.items()
-    ]  # fmt: skip
-    head = ("setting", "fresh scenes", "error", "at most", "promised", "measured", "holds")
-    return f"<h2>Promised, and measured on fresh scenes</h2>{_table(rows, head)}" if rows else ""
 
 
 def _errors(study: Study) -> str:
@@ -173,88 +129,58 @@ def _errors(study: Study) -> str:
          "all scenes together" if kind.pooled else "95th percentile", "yes" if kind.name in measured else "no")
         for kind in ERRORS.values()
     ]  # fmt: skip
-    return _table(rows, ("target", "in short", "what it says", "unit", "held against", "over scenes", "measured"))
-
-
-def _notes(study: Study) -> list[str]:
-    """The study's notes, then its settings' notes, each once with the names of its settings."""
-    about: dict[str, list[str]] = {}
-    for row in study.rows:
-        for note in row.notes:
-            about.setdefault(note, []).append(row.setting.name)
-    return [*study.notes, *(f"{note} ({', '.join(names)})" for note, names in about.items())]
+    head = ("target", "in short", "what it says", "unit", "held against", "over scenes", "measured")
+    return _table(_lines(rows), head)
 
 
 def _machine(study: Study) -> str:
     own = own_row(study.rows)
-    rows = [
-        ("command", study.command),
-        ("scenes", study.sample),
-        ("time spent", f"{describe_seconds(study.seconds)} of a budget of {describe_seconds(study.budget_s)}"),
-        ("preset of the job", study.preset),
-        ("a scene as the job is", f"{milliseconds(own.ms)} of processor, {size(own.kilobytes)}"),
-    ]
-    if study.job_scenes:
-        seconds, kilobytes = own.ms * study.job_scenes / 1e3, own.kilobytes * study.job_scenes
-        cost = f"{describe_seconds(seconds)} on one core ({number(seconds / 3600)} core-hours), {size(kilobytes)}"
-        rows.append((f"the job's {study.job_scenes:,} scenes", cost))
-    return _table(rows + [(name.replace("_", " "), _words(value)) for name, value in study.machine.items()])
+    hours = number(own.ms * study.job_scenes / 3.6e6)
+    rows = {
+        "command": study.command,
+        "scenes": sample(study),
+        "time spent": f"{describe_seconds(study.seconds)} of a budget of {describe_seconds(study.budget_s)}",
+        "preset of the job": study.preset,
+        f"the job's {study.job_scenes:,} scenes": f"{hours} core-hours, {size(own.kilobytes * study.job_scenes)}",
+        **{name: value if isinstance(value, str) else json.dumps(value) for name, value in study.machine.items()},
+    }
+    return _table(_lines(rows.items()))
 
 
-def _words(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_words(inner)}" for name, inner in value.items())
-    if isinstance(value, list | tuple):
-        return ", ".join(map(_words, value))
-    return number(value) if isinstance(value, float) else str(value)
-
-
-# ---------------------------------------------------------------------------------------------- a part of a scene
+def sample(study: Study) -> str:
+    """What was measured, in words."""
+    return f"up to {study.scenes} scenes with each of {len(study.rows)} settings"
 
 
 def _group_table(study: Study, group: str) -> str:
-    """The settings that measured an error of this part, by knob; empty where none did."""
+    """The settings that measured an error of this part: the job, presets, each knob, combinations; empty where none did."""
     measured = {name for row in study.rows for name in row.errors}
     names = [kind.name for kind in ERRORS.values() if kind.group == group and kind.name in measured]
-    if not names:
-        return ""
-    whole = [f"{study.job_scenes:,} scenes, one core", "on disk"] if study.job_scenes else ["on disk, a scene"]
-    errors = [f"{short(name)}{f', {unit(name)}' if unit(name) else ''}" for name in names]
-    head = ["setting", "time", "a scene", *whole, *errors]
+    errors = [", ".join(filter(None, [short(name), unit(name)])) for name in names]
+    head = ["setting", "time", "a scene", f"{study.job_scenes:,} scenes, one core", "on disk", *errors]
     best = {name: front(study.rows, name) for name in names}
-    body = ""
-    for section, rows in _sections(study.rows, names).items():
-        title = f'<tr><th class="knob" colspan="{len(head)}">{escape(section)}</th></tr>\n' if section else ""
-        body += title + "".join(_line(study, row, best) for row in rows)
-    return _table(body, head)
-
-
-def _sections(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[Row]]:
-    """The job, presets, each knob in the order of the table, combinations last; those that measured one of the errors."""
-    titles = {"preset": "presets", "several": "several at once"}
-    sections: dict[str, list[Row]] = {"": [], "presets": []}
-    for row in sorted(rows, key=lambda row: row.setting.kind == "several"):
-        if set(row.errors) & set(names):
-            sections.setdefault(titles.get(row.setting.kind, row.setting.knob), []).append(row)
-    return {name: found for name, found in sections.items() if found}
+    order = {"own": 0, "preset": 1, "single": 2, "several": 3}
+    rows = [row for row in study.rows if set(row.errors) & set(names)]
+    lines = [_line(study, row, best) for row in sorted(rows, key=lambda row: order[row.setting.kind])]
+    return _table("".join(lines), head, "") if lines else ""
 
 
 def _line(study: Study, row: Row, best: Mapping[str, Sequence[Row]]) -> str:
     own = own_row(study.rows)
-    same = "≈ " if row is not own and as_cheap(row, own) else ""
+    same = "≈ " if row is not own and row.ratio_least <= 1.0 <= row.ratio_most else ""
     spread = f"<small>{number(row.ratio_least)} – {number(row.ratio_most)}</small>" if row is not own else ""
-    called = row.setting.parts[0][1] if len(row.setting.parts) == 1 else row.setting.name
-    cells = [escape(called), f"{same}{times(row.ratio)}{spread}", milliseconds(row.ms)]
-    if study.job_scenes:
-        seconds = row.ms * study.job_scenes / 1e3
-        cells.append(f"{describe_seconds(seconds)}<small>{number(seconds / 3600)} core-hours</small>")
-    cells.append(size(row.kilobytes * (study.job_scenes or 1)))
-    figures = "".join(_figure(name, row, own, rows) for name, rows in best.items())
-    kind = ' class="own"' if row is own else ""
-    return f"<tr{kind}>{''.join(f'<td>{cell}</td>' for cell in cells)}{figures}</tr>\n"
+    cells = [
+        escape(row.setting.name),
+        f"{same}{times(row.ratio)}{spread}",
+        milliseconds(row.ms),
+        describe_seconds(row.ms * study.job_scenes / 1e3),
+        size(row.kilobytes * study.job_scenes),
+    ]
+    figures = "".join(_figure(name, row, own, row in rows) for name, rows in best.items())
+    return f'<tr class="{row.setting.kind}">{"".join(f"<td>{cell}</td>" for cell in cells)}{figures}</tr>\n'
 
 
-def _figure(name: str, row: Row, own: Row, best: Sequence[Row]) -> str:
+def _figure(name: str, row: Row, own: Row, is_best: bool) -> str:
     """One error, marked where it is on the front and where it differs from the job's by more than both intervals.
 
     Fewer scenes than tell anything are pale.
@@ -262,13 +188,109 @@ def _figure(name: str, row: Row, own: Row, best: Sequence[Row]) -> str:
     figure = row.errors.get(name)
     if figure is None:
         return "<td>·</td>"
-    mine, side, mark = own.errors.get(name, figure), "", ""
-    if not tells(row, name):
-        side = "few"
-    elif figure.high < mine.low:
-        side, mark = "better", "▼ "
-    elif figure.low > mine.high:
-        side, mark = "worse", "▲ "
-    classes = " ".join(filter(None, [side, "front" if row in best else ""]))
-    value, low, high = (number(shown(name, one)) for one in (figure.value, figure.low, figure.bound))
-    return f'<td class="{classes}">{mark}{value}<small>{low} – {high}</small></td>'
+    mine = own.errors.get(name, figure)
+    marks = {"worse": "▲ "} if figure.low > mine.high else {"better": "▼ "} if figure.high < mine.low else {"": ""}
+    ((side, mark),) = marks.items() if tells(row, name) else (("few", ""),)
+    value, low, high = (number(shown(name, end)) for end in (figure.value, figure.low, figure.most))
+    return f'<td class="{side}{" front" * is_best}">{mark}{value}<small>{low} – {high}</small></td>'
+
+
+# ---------------------------------------------------------------------------------------------- the picture
+
+PANELS = 4
+"""The most panels of a picture."""
+
+MOVED = 0.05
+"""What is no more than this share of the job's own error is negligible too."""
+
+REACH = 4.0
+"""An interval is cut where it reaches beyond this many times its middle, which would otherwise fill the axis."""
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#6F6800")
+"""Okabe and Ito's palette for colour-blind readers, the yellow darker so that it is seen on white."""
+
+MARKS: Mapping[str, dict[str, Any]] = {
+    "own": {"label": "the job as it is", "color": "black", "marker": "*", "ms": 16.0, "mec": "white", "zorder": 5},
+    "preset": {"label": "preset", "color": "black", "marker": "s", "ms": 10.0, "mfc": "none", "mew": 1.5, "zorder": 4},
+    "several": {"label": "several knobs at once", "color": "#777777", "marker": "d", "ms": 6.5, "mfc": "white"},
+    "single": {"ms": 6.5, "mec": "white", "mew": 0.6, "zorder": 4},
+}
+"""Markers by the kind of setting; of one knob it has the knob's colour and form."""
+
+
+@style.context(["default", {"font.family": "DejaVu Sans", "font.size": 9.5, "axes.edgecolor": "#888888"}])
+def draw_tradeoff(study: Study) -> bytes:
+    """A PNG with panels of errors that a knob moves over processor time, both logarithmic: the first of each group first."""
+    every = {name: moving_rows(study.rows, name) for name in ERRORS}
+    moving = {name: rows for name, rows in every.items() if any(row.setting.kind == "single" for row in rows)}
+    by_group = [[name for name in moving if ERRORS[name].group == group] for group in GROUPS]
+    panels = [name for rank in zip_longest(*by_group) for name in rank if name is not None][:PANELS]
+    lines = max(1, -(-len(panels) // 2))
+    picture = Picture((12.0, lines * 4.6 + 1.0), dpi=150, layout="constrained")
+    title = f"{study.job[:40]}: a scene takes {milliseconds(own_row(study.rows).ms)}; {sample(study)}"
+    picture.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    knobs = dict.fromkeys(row.setting.knob for row in study.rows if row.setting.kind == "single")
+    looks = {knob: look for knob, *look in zip(knobs, cycle(COLORS), cycle("o^svPX"), strict=False)}
+    legend: dict[str, Any] = {}
+    for place, name in enumerate(panels, start=1):
+        axes = picture.add_subplot(lines, 2, place)
+        axes.set_title(GROUPS[ERRORS[name].group], loc="left", fontsize=11)
+        _draw_panel(axes, moving[name], name, looks)
+        handles, labels = axes.get_legend_handles_labels()
+        legend |= dict(zip(labels, handles, strict=True))
+    if legend:
+        picture.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=5, frameon=False)
+    data = io.BytesIO()
+    # Neither a date nor the library's name, so that the same study gives the same bytes.
+    picture.savefig(data, format="png", metadata={"Software": None})
+    return data.getvalue()
+
+
+def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
+    """The job, presets, knobs of which a value moves the error by more than what is negligible, and combinations with these."""
+    measured = [row for row in rows if error in row.errors]
+    own = own_row(rows).errors.get(error)
+    value, least = (own.value, max(ERRORS[error].negligible, MOVED * own.value)) if own else (0.0, -1.0)
+    single = [row for row in measured if row.setting.kind == "single"]
+    moving = {row.setting.knob for row in single if abs(row.errors[error].value - value) > least}
+    return [row for row in measured if row.setting.kind in ("own", "preset") or set(dict(row.setting.parts)) & moving]
+
+
+def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str, Sequence[str]]) -> None:
+    """Points by knob with their intervals and, beside those of the front and the presets, their values; and the front."""
+    best = front(rows, error)
+    place = {row.setting.name: (row.ms, shown(error, row.errors[error].value)) for row in rows}
+    for row in rows:
+        mark, figure = dict(MARKS[row.setting.kind]), row.errors[error]
+        if row.setting.kind == "single":
+            color, marker = looks[row.setting.knob]
+            mark |= {"color": color, "marker": marker, "label": row.setting.knob}
+        if not tells(row, error):
+            mark |= {"alpha": 0.4}  # fewer than `FEWEST_SCENES` scenes
+        low, high = max(figure.low, figure.value / REACH), min(figure.most, figure.value * REACH)
+        axes.vlines(row.ms, shown(error, low), shown(error, high), color=mark["color"], lw=0.8, alpha=0.5)
+        axes.plot(*place[row.setting.name], ls="", **mark)
+        if row.setting.kind in ("own", "preset") or (row in best and row.setting.kind == "single"):
+            text = row.setting.parts[0][1][:26] if row.setting.parts else "the job"
+            at = (-6.0, -12.0) if row.setting.kind == "own" else (6.0, 3.0)
+            side = "right" if row.setting.kind == "own" else "left"
+            axes.annotate(text, place[row.setting.name], at, textcoords="offset points", ha=side, zorder=6)
+    if best:
+        corners = pts_to_poststep(*zip(*(place[row.setting.name] for row in best), strict=True))
+        axes.plot(*corners, color="#222222", lw=1.3, zorder=2, label="front: none is cheaper and better")
+    values = [value for _, value in place.values()]
+    axes.set_xscale("log")
+    if min(values) > 0.0:
+        axes.set_yscale("log")
+    else:  # linear from 0 to the least value above 0
+        axes.set_yscale("symlog", linthresh=min((value for value in values if value > 0.0), default=1.0))
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() == "log":
+            low, high = axis.get_view_interval()
+            subs = (1.0, 2.0, 5.0) if high > 4.0 * low else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+            axis.set_major_locator(LogLocator(subs=subs, numticks=8))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.set(xlabel="ms of processor a scene", ylabel=", ".join(filter(None, [short(error), unit(error)])))
+    axes.grid(color="#e8e8e8")
+    axes.spines[["top", "right"]].set_visible(False)

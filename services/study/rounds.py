@@ -7,36 +7,20 @@ it may, the less promising half of its settings is left behind, and once more, u
 """
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
-from statistics import median
+import math
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from services.study.choose import AS_CHEAP
-from services.study.knobs import REFERENCES, Part, joined, part_of
-from services.study.model import ERRORS, NEGLIGIBLE, OWN, Row, Setting, Verdict
-from services.study.table import Table
+from services.study.choose import AS_CHEAP, default_targets
+from services.study.model import OWN, REFERENCES, Figure, Row, Setting, Targets, joined
+from services.study.table import PARTS, Part, Table, part_of
 
-Targets = Mapping[str, float]
-
-MOST: Mapping[Part, int] = {"rest": 512, "again": 64, "draw": 64, "colour": 8, "capture": 32}
-"""The most scenes of each part."""
-
-SHARES: Mapping[Part, float] = {"rest": 3.0, "again": 1.0, "draw": 2.0, "colour": 1.0, "capture": 1.0}
-"""How the time of a round is shared among the parts that are not decided."""
-
-LEAST = 8
-"""Nothing is out before it was measured in so many scenes."""
-
-FEWEST_RACING = 4
-"""So many settings are in every round; where even these do not fit, in as many scenes as fit."""
+LEAST, FEWEST_RACING = 8, 4
+"""Nothing is out, no part is decided and no combination is made before so many scenes; and so many settings are in every round,
+where even these do not fit in as many scenes as fit."""
 
 REFERENCE_SHARE = 0.3
 """References, which errors of all are held against, are in a round while each takes no more than this share of the others."""
-
-DEAR, DEAR_SCENES = 6.0, 4
-"""Settings that take this many times the usual one's seconds are measured in so many scenes and no more."""
-
-OUT_MISSES, OUT_COSTS = "misses a target", "costs more than one that meets the targets"
 
 
 class Wanted(NamedTuple):
@@ -47,118 +31,101 @@ class Wanted(NamedTuple):
     setting: Setting
 
 
-def next_round(
-    table: Table, part: Part, targets: Targets, scenes: range, allowed_s: float
-) -> tuple[list[Wanted], bool]:
-    """What is missing in these scenes of the settings in this round, scene by scene; and whether all of that fits."""
-    racing = by_promise(table, part, targets, len(scenes))
-    while seconds(table, wanted := missing(table, part, racing, scenes)) > allowed_s and len(racing) > FEWEST_RACING:
-        racing = racing[: max(FEWEST_RACING, len(racing) // 2)]
-    most_s = REFERENCE_SHARE * seconds(table, wanted)
-    references = [missing(table, part, [one], scenes) for one in REFERENCES if one in table.parts.measured[part]]
-    wanted += [one for some in references if seconds(table, some) <= most_s for one in some]
-    wanted.sort(key=lambda one: one.scene_id)
-    costs = itertools.accumulate(table.cost_s(part, one.setting) for one in wanted)
-    fitting = sum(cost <= (1.0 + REFERENCE_SHARE * len(REFERENCES)) * allowed_s for cost in costs)
-    return wanted[:fitting], fitting == len(wanted)
+class Standing(NamedTuple):
+    """A setting of a part: its verdict on the part's targets, whether its values miss one, and its ratio of time, if any."""
+
+    setting: Setting
+    verdict: str
+    is_missing: bool
+    ratio: Figure | None
+    scenes: int
 
 
-def missing(table: Table, part: Part, settings: Iterable[Setting], scenes: range) -> list[Wanted]:
-    """What has no answer of these settings in these scenes."""
-    return [Wanted(part, n, one) for n in scenes for one in settings if n not in table.answers(part, one)]
-
-
-def seconds(table: Table, wanted: Sequence[Wanted]) -> float:
-    """What these take by the clock, about, one after the other."""
-    return sum(table.cost_s(one.part, one.setting) for one in wanted)
-
-
-def by_promise(table: Table, part: Part, targets: Targets, scenes: int) -> list[Setting]:
+def standings(table: Table, part: Part, targets: Targets) -> list[Standing]:
     """The settings that can still win: the job itself, then those that meet the targets so far, the cheapest first."""
-    settings = [one for one in table.parts.measured[part] if one not in REFERENCES]
-    usual_s, out = median(table.cost_s(part, one) for one in settings), why_out(table, part, targets)
+    own = table.figures(part, OWN)
+    asked = {name: most for name, most in targets.items() if part_of(name) == part and name in own}
 
-    def promise(setting: Setting) -> tuple[bool, bool, float]:
-        figures, ratio = table.figures(part, setting), table.ratio(part, setting)
-        missed = any(name in figures and figures[name].value > most for name, most in targets.items())
-        return setting != OWN, missed, ratio.value if ratio else 1.0
+    def standing(setting: Setting) -> Standing:
+        figures = table.figures(part, setting)
+        verdicts = {figures[name].verdict(most) if name in figures else "open" for name, most in asked.items()}
+        verdict = next((name for name in ("misses", "open") if name in verdicts), "meets")
+        is_missing = any(figures[name].value > most for name, most in asked.items() if name in figures)
+        scenes = len(table.answers(part, setting))
+        return Standing(setting, verdict, is_missing, table.ratio(part, setting), scenes)
 
-    def is_dear(setting: Setting) -> bool:
-        return setting != OWN and table.cost_s(part, setting) > DEAR * usual_s
-
-    racing = [one for one in settings if one.name not in out and (scenes <= DEAR_SCENES or not is_dear(one))]
-    return sorted(racing, key=promise)
-
-
-def verdict(table: Table, part: Part, setting: Setting, targets: Targets) -> Verdict:
-    """Whether a setting surely meets those targets whose errors the part measures, or surely misses one."""
-    figures, known = table.figures(part, setting), table.figures(part, OWN)
-    asked = {name: most for name, most in targets.items() if part_of(name) == part and name in known}
-    verdicts = {figures[name].verdict(most) if name in figures else "open" for name, most in asked.items()}
-    return "misses" if "misses" in verdicts else "open" if "open" in verdicts else "meets"
-
-
-def why_out(table: Table, part: Part, targets: Targets) -> dict[str, str]:
-    """By name the settings of a part that cannot win any more, and why; never the job itself."""
-    judged = [one for one in table.parts.measured[part] if table.scenes(part, one) >= min(LEAST, MOST[part])]
-    verdicts = {one.name: verdict(table, part, one, targets) for one in judged}
-    ratios = {one.name: ratio for one in judged if (ratio := table.ratio(part, one))}
-    best = min((ratio.high for name, ratio in ratios.items() if verdicts[name] == "meets"), default=float("inf"))
-    out = {name: OUT_COSTS for name, ratio in ratios.items() if ratio.low > best * AS_CHEAP}
-    out |= {name: OUT_MISSES for name, found in verdicts.items() if found == "misses"}
-    return {name: why for name, why in out.items() if name not in {one.name for one in (OWN, *REFERENCES)}}
+    every = [standing(setting) for setting in table.split.measured[part] if setting not in REFERENCES]
+    judged = [some for some in every if some.scenes >= min(LEAST, PARTS[part].scenes)]
+    best = min((some.ratio.high for some in judged if some.ratio and some.verdict == "meets"), default=math.inf)
+    out = [some for some in judged if some.verdict == "misses" or (some.ratio and some.ratio.low > best * AS_CHEAP)]
+    left = [some for some in every if some not in out or some.setting == OWN]
+    return sorted(left, key=lambda s: (s.setting != OWN, s.is_missing, s.ratio.value if s.ratio else 1.0))
 
 
 def undecided(table: Table, part: Part, targets: Targets) -> list[Setting]:
     """Settings that may turn out cheaper than the cheapest that surely meets the targets."""
-    out = why_out(table, part, targets)
-    alive = [one for one in table.parts.measured[part] if one.name not in out and one not in REFERENCES]
-    verdicts = {one.name: verdict(table, part, one, targets) for one in alive}
-    ratios = {one.name: ratio for one in alive if (ratio := table.ratio(part, one))}
-    best = min((ratio.value for name, ratio in ratios.items() if verdicts[name] == "meets"), default=float("inf"))
+    left = standings(table, part, targets)
+    best = min((some.ratio.value for some in left if some.ratio and some.verdict == "meets"), default=math.inf)
     return [
-        one
-        for one in alive
-        if verdicts[one.name] == "open"
-        and (ratios[one.name].low * AS_CHEAP < best if one.name in ratios else one.kind != "several")
+        some.setting
+        for some in left
+        if some.verdict == "open"
+        and (some.ratio.low * AS_CHEAP < best if some.ratio else some.setting.kind != "several")
     ]
+
+
+def next_round(table: Table, part: Part, targets: Targets, scenes: range, allowed_s: float) -> list[Wanted]:
+    """What is missing in these scenes of the settings in this round, scene by scene, as far as it fits."""
+    racing = [some.setting for some in standings(table, part, targets)]
+    while seconds(table, wanted := missing(table, part, racing, scenes)) > allowed_s and len(racing) > FEWEST_RACING:
+        racing = racing[: max(FEWEST_RACING, len(racing) // 2)]
+    most_s = REFERENCE_SHARE * seconds(table, wanted)
+    references = [missing(table, part, [some], scenes) for some in REFERENCES if some in table.split.measured[part]]
+    wanted += [item for some in references if seconds(table, some) <= most_s for item in some]
+    wanted.sort(key=lambda item: item.scene_id)
+    costs = itertools.accumulate(table.cost_s(part, item.setting) for item in wanted)
+    return wanted[: sum(cost <= (1.0 + REFERENCE_SHARE * len(REFERENCES)) * allowed_s for cost in costs)]
+
+
+def missing(table: Table, part: Part, settings: Iterable[Setting], scenes: range) -> list[Wanted]:
+    """What has no answer of these settings in these scenes."""
+    return [Wanted(part, n, setting) for n in scenes for setting in settings if n not in table.answers(part, setting)]
+
+
+def seconds(table: Table, wanted: Sequence[Wanted]) -> float:
+    """What these take by the clock, about, one after the other."""
+    return sum(table.cost_s(item.part, item.setting) for item in wanted)
 
 
 # ---------------------------------------------------------------------------------------------- combinations
 
-SAVES, WORSE, BETTER = 0.98, 1.5, 0.67
-"""A value saves time at this share of the job's own, keeps an error that grows to this share, and shrinks one below this."""
-
-DEAREST = 5.0
-"""A value that takes at least this many times the job's time is measured by itself only."""
-
-MOST_OF_A_KIND = 3
-"""The most knobs that are paired among those that save time, and among those that are more exact."""
+SAVES = 0.98
+"""A value saves time at this share of the job's own."""
 
 
-def promising(rows: Sequence[Row], targets: Targets) -> tuple[Setting, ...]:
-    """Settings of two and more knobs to measure next.
+def promising(rows: Sequence[Row], targets: Targets | None) -> list[Setting]:
+    """Settings of two and more knobs to measure next. `rows`: the job's own first, then one value of one knob each.
 
-    `rows`: the job's own first, then one value of one knob each. For each knob the cheapest value that keeps every error, and
-    the most exact value that shrinks one; of either kind the best knobs, two by two and all at once; and at once the cheapest
-    value of every knob that meets the targets.
+    Of the values that make no error worse which a target or the job holds: for each knob the cheapest that saves time; for each
+    target that the job misses the cheapest that mends it; and both.
     """
-    singles = [row for row in rows[1:] if len(row.setting.parts) == 1 and row.ratio < DEAREST]
-    shares = {row.setting.name: _least_share(row, rows[0]) for row in singles}
-    known = [(share, row) for row in singles if (share := shares[row.setting.name]) is not None]
-    cheap = sorted((row for row in singles if row.ratio < SAVES), key=lambda row: (row.ratio, row.setting.name))
-    saving = _first_of_knobs(row for row in cheap if shares[row.setting.name] is not None)
-    exact = _first_of_knobs(
-        row for share, row in sorted(known, key=lambda pair: (pair[0], pair[1].setting.name)) if share < BETTER
-    )
-    meeting = _first_of_knobs(
-        row for row in cheap if all(row.errors[name].value <= targets[name] for name in set(targets) & set(row.errors))
-    )
-    pairs = [pair for kind in (saving, exact) for pair in itertools.combinations(kind[:MOST_OF_A_KIND], 2)]
-    together = [some for some in (*pairs, saving, exact, meeting) if len(some) > 1]
+    own = rows[0].errors
+    limits = targets or {name: most for some in default_targets(rows) for name, most in some.items()}
+    held = {name: max(most, own[name].high) for name, most in limits.items() if name in own}
+    singles = [
+        row for row in sorted(rows[1:], key=lambda row: (row.ratio, row.setting.name)) if row.setting.kind == "single"
+    ]
+    kept = [
+        row for row in singles if all(row.errors[name].value <= held[name] for name in held.keys() & row.errors.keys())
+    ]
+    saving = _first_of_knobs(row for row in kept if row.ratio < SAVES)
+    mending: list[Row] = []
+    for name in (name for name in held if own[name].value > limits[name]):
+        mending += [row for row in kept if name in row.errors and row.errors[name].value <= limits[name]][:1]
+    together = [saving, _first_of_knobs(mending), _first_of_knobs([*mending, *saving])]
     # In the order of the table, whatever the ranks, so that names do not depend on noise.
-    settings = [joined([row.setting for row in singles if row in some]) for some in together]
-    return tuple({setting.name: setting for setting in settings}.values())
+    settings = [joined([row.setting for row in rows if row in some]) for some in together if len(some) > 1]
+    return list({setting.name: setting for setting in settings}.values())
 
 
 def _first_of_knobs(rows: Iterable[Row]) -> list[Row]:
@@ -167,15 +134,3 @@ def _first_of_knobs(rows: Iterable[Row]) -> list[Row]:
     for row in rows:
         first.setdefault(row.setting.knob, row)
     return list(first.values())
-
-
-def _least_share(row: Row, own: Row) -> float | None:
-    """The least of its errors as a share of the job's own where that is not negligible, 1 without any.
-
-    None where an error has grown beyond the factor and is not negligible.
-    """
-    both = [name for name in row.errors if name in own.errors]
-    pairs = [(row.errors[name].value, own.errors[name].value, NEGLIGIBLE[ERRORS[name].unit]) for name in both]
-    if any(value > max(negligible, WORSE * mine) for value, mine, negligible in pairs):
-        return None
-    return min((value / mine for value, mine, negligible in pairs if mine > negligible), default=1.0)

@@ -1,17 +1,12 @@
 """Writes that fail after they were accepted, where another program is told of it first: no attempt commits them."""
 
-import contextlib
 import os
 import resource
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from schemas.dataset.commit import Span
-from schemas.dataset.layout import staging_path
 from schemas.errors import MachineError
 from tests.made_up_scenes import small_scene, terms
 from workers.store import file_system
@@ -90,30 +85,6 @@ def test_a_failed_write_from_before_an_attempt_is_no_business_of_it(tmp_path, er
     assert attempt.commit().won
 
 
-def test_without_syncfs_every_file_is_flushed_before_it_is_closed(tmp_path, monkeypatch):
-    monkeypatch.setattr(file_system, "_trusts_syncfs", lambda folder: False)
-    store, attempt = begun(tmp_path)
-    attempt.add_scene(small_scene(1))
-    flushed = set()
-    real = os.fsync
-
-    def fsync(descriptor: int) -> None:
-        if os.get_inheritable(descriptor) is False and os.path.isfile(
-            path := os.readlink(f"/proc/self/fd/{descriptor}")
-        ):
-            flags = Path(f"/proc/self/fdinfo/{descriptor}").read_text().split("flags:")[1].split()[0]
-            if int(flags, 8) & os.O_ACCMODE:  # the descriptor that wrote it
-                flushed.add(Path(path).name)
-        real(descriptor)
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    again = begin_attempt(store, Span(start=2, stop=4), terms(range_size=2))
-    for scene_id in (2, 3):
-        again.add_scene(small_scene(scene_id))
-    record = again.commit().record
-    assert {Path(entry.path).name for entry in record.files} <= flushed
-
-
 def test_with_64_open_files_an_attempt_commits_and_keeps_none_open(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (64, limits[1]))
@@ -136,45 +107,3 @@ def test_with_64_open_files_an_attempt_commits_and_keeps_none_open(tmp_path):
         assert len(os.listdir("/proc/self/fd")) <= before + 1
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-
-
-@contextlib.contextmanager
-def disk_that_loses_writes(folder: Path) -> Iterator[tuple[Path, Path]]:
-    """(an ext4 of 64 MB on a device that can hold 12 MB, the mount below it that may be made larger)."""
-    below, mounted = folder / "below", folder / "mounted"
-    commands = [
-        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(below)],
-        ["truncate", "-s", "64M", str(below / "image")],
-        ["mkfs.ext4", "-q", "-F", "-O", "^has_journal", str(below / "image")],
-        ["mount", "-o", "loop,errors=continue", str(below / "image"), str(mounted)],
-    ]
-    with contextlib.ExitStack() as stack:
-        for place in (below, mounted):
-            place.mkdir()
-        for command in commands:
-            try:
-                subprocess.run(command, check=True, capture_output=True)
-            except (OSError, subprocess.CalledProcessError) as error:
-                pytest.skip(f"no ext4 can be mounted here: {error}")
-            if command[0] == "mount":
-                stack.callback(subprocess.run, ["umount", command[-1]], check=True)
-        yield mounted, below
-
-
-@pytest.mark.root
-def test_on_a_real_disk_that_loses_writes_the_kernel_tells_the_attempt_and_no_late_descriptor(tmp_path):
-    with disk_that_loses_writes(tmp_path) as (mounted, below):
-        store = LocalStore(mounted / "out")
-        store.prepare()
-        staging = staging_path(0, "r0-mine")
-        stage = store.stage(staging)
-        other = "import os, sys; descriptor = os.open(sys.argv[1], os.O_RDONLY); input(); os.sync()\n"
-        other += "import ctypes; sys.exit(ctypes.CDLL(None).syncfs(descriptor) != 0)"
-        with subprocess.Popen([sys.executable, "-c", other, str(mounted)], stdin=subprocess.PIPE) as program:
-            stage.write("mug/big.png", os.urandom(30 << 20))
-            program.communicate(b"\n")
-            assert program.returncode == 1, "the other program was told"
-        subprocess.run(["mount", "-o", "remount,size=80m", str(below)], check=True)
-        file_system.sync_tree(store.path(staging))  # the old order: a descriptor that is opened now hears nothing
-        with pytest.raises(MachineError, match="disk"):
-            stage.flush()

@@ -17,16 +17,15 @@ from services.job.job_file import validate_job
 from services.merge.merge import merge
 from services.run import coordinator as module
 from services.run.coordinator import Coordinator, Limits
-from services.run.joining import Pattern
-from services.run.metrics import Tally
+from services.run.progress import Tally
 from services.run.range_planner import plan_ranges
 from services.run.ray_cluster import Slots
-from services.run.worker_entry import WorkerTerms
-from tests.kit.faults import REQUESTS, check_published, requests
+from services.run.worker_entry import Pattern, WorkerTerms
+from tests.kit.faults import REQUESTS, requests
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.assets.catalogue import Catalogue
 from workers.store.attempt import Attempt, attempts_at, begin_attempt, sweep
-from workers.store.commit import publish, read_record
+from workers.store.commit import read_record
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
@@ -97,19 +96,18 @@ def test_a_worker_that_lives_and_commits_while_it_is_given_up_keeps_its_files(
             worker.stdin.write("go\n")
             worker.stdin.flush()
             if chance.random() < 0.1:  # let it end, to learn how long it takes
-                told = worker.stdout.readline()
+                answer = worker.stdout.readline()
                 commit_s = time.perf_counter() - begun
                 coordinator._find_evidence([Span(start=start, stop=start + 2)])
             else:
                 time.sleep(chance.uniform(0.3, 1.1) * commit_s)
                 coordinator._find_evidence([Span(start=start, stop=start + 2)])
-                told = worker.stdout.readline()
+                answer = worker.stdout.readline()
             record = read_record(store, start)
-            assert told == "True\n" or record is None or not files_are_whole(store, record)
+            assert answer == "True\n" or record is None or not files_are_whole(store, record)
             committed += record is not None
             lost += record is not None and not files_are_whole(store, record)
     record_figure("records that won without their files", "passed" if not lost else "failed", lost, 0)
-    print(f"{trials} trials, {committed} committed, {lost} without their files")
     assert lost == 0
     assert 0 < committed < trials, "both outcomes are needed"
     for start, end in plan_ranges(0, 2 * trials, 2, list_commits(store).ranges):
@@ -149,7 +147,6 @@ def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run
         assert record is None or files_are_whole(store, record), f"request {at}"
         assert finish(store) == expected, f"request {at}"
         assert not list(store.files(STAGING)), f"request {at}"
-    print(f"{len(points)} points")
     assert outcomes == {True, False}
 
 
@@ -163,20 +160,6 @@ def test_the_scene_in_progress_is_evidence_while_the_range_before_it_is_committe
     assert coordinator._find_evidence(left) == (left[1], 3, False)
     assert not [name for start in (0, 2) for name in attempts_at(store, start)], "both attempts are given up"
     assert coordinator._find_evidence(left) == (left[0], None, False)
-
-
-def test_an_attempt_that_won_before_it_was_given_up_is_published(tmp_path, coordinator_of, monkeypatch):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    attempt = begin_attempt(store, Span(start=0, stop=2), terms(range_size=2), LABEL)
-    for scene_id in (0, 1):
-        attempt.add_scene(small_scene(scene_id))
-    with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda *_: None)
-        record = attempt.commit().record
-    coordinator_of(store)._find_evidence([Span(start=0, stop=2)])
-    check_published(store, record)
-    publish(store, record)
 
 
 def whole_attempt(store) -> Attempt:

@@ -23,8 +23,7 @@ MAY_READ_IT = {
     "services/queue/queue.py": "the time of an event, to be shown",
     "services/read/status.py": "the rate of the latest commits, to be shown",
     "services/look/live.py": "when a range was committed, to be shown",
-    "services/run/progress.py": "the time of an event, to be logged",
-    "services/run/metrics.py": "when a run began, for the time that is left",
+    "services/run/progress.py": "the time of an event, to be logged, and when a run began, to be shown",
     "workers/assets/library/collection.py": "whether a source changed: where times differ, its bytes are read",
     "workers/assets/library/reading.py": "the same, written beside a file's digest",
     "workers/assets/library/making.py": "the same, for the list of a folder's files",
@@ -59,22 +58,6 @@ def test_64_open_files_no_home_and_1_mb_of_shared_memory_are_enough(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["scenes"] == {"made": 4, "intrinsic": 0, "environmental": 0}
-
-
-@pytest.mark.root
-def test_without_a_temporary_folder_a_run_says_so(tmp_path):
-    """Every place that Python looks at, the working folder among them, is read-only."""
-    places = " && ".join(
-        f"mount --bind {place} {place} && mount -o remount,ro,bind {place}" for place in ("/tmp", "/var/tmp")
-    )
-    here = f"mount --bind {tmp_path} {tmp_path} && mount -o remount,ro,bind {tmp_path} && mount -t tmpfs none out"
-    (tmp_path / "out").mkdir()
-    done = run(tmp_path, f"{places} && {here}", TMPDIR=None)
-    assert done.returncode == 1, done.stderr
-    begun, line = done.stderr.splitlines()
-    assert "scenes to make; starting the workers" in begun
-    assert line.startswith("verso: No usable temporary directory found")
-    assert line.endswith("set TMPDIR to one that can be written")
 
 
 def test_nothing_is_decided_by_a_wall_clock_that_may_be_set_back():

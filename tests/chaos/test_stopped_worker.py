@@ -1,10 +1,8 @@
 """A worker that is stopped while it works: the run says so, ends it, and makes the dataset that it always makes."""
 
 import contextlib
-import shutil
 import signal
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from schemas.errors import MachineError
 from services.job.job_file import validate_job
 from services.read.query import query
 from services.run import coordinator
@@ -74,19 +71,3 @@ def test_a_worker_stopped_while_it_commits_is_told_and_ended_and_nothing_is_lost
     assert merged.scenes == {"made": 8, "intrinsic": 0, "environmental": 0}
     assert capfd.readouterr().err.count(", committing: no progress for ") == 1
     assert merged.digest == make(tmp_path.with_name("undisturbed")).digest
-
-
-def test_a_folder_that_is_removed_under_way_is_told_as_that(cluster, tmp_path):
-    out = tmp_path / "out"
-
-    def remove() -> None:
-        while not list(out.glob("manifest/_commits/*.json")):
-            time.sleep(0.01)
-        while out.exists():
-            shutil.rmtree(out, ignore_errors=True)
-
-    remover = threading.Thread(target=remove)
-    remover.start()
-    with pytest.raises(MachineError, match=f"{out} was removed while the run worked in it"):
-        make(out, scenes=4000)
-    remover.join()

@@ -9,7 +9,7 @@ import pytest
 import ray
 import yaml
 
-from services.run.metrics import Meter, Tally
+from services.run.progress import Meter, Tally
 from tests.kit.containers import ROOT, must, run
 
 DEPLOY = ROOT / "deploy"

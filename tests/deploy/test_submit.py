@@ -173,12 +173,12 @@ def test_without_the_token_nobody_submits(head):
 def test_wrong_words_are_refused_in_a_line(head):
     for words, told in (
         ((), "what it takes"),
-        (("--out", "x"), "the job comes first"),
+        (("--out", "x"), "what it takes"),
         (("nothing.yaml", "--out", "x"), "no job 'nothing.yaml': "),
         (("shapes.yaml",), "--out is missing"),
         (("shapes.yaml", "--out", "x", "--address", "auto"), "--address is this cluster's"),
         (("--follow", "nobody"), "nobody"),
-        (("--follow",), "the id of one job"),
+        (("--follow",), "what it takes"),
         (("shapes.yaml", "--out", "x", "surplus"), "unrecognized arguments: surplus"),
     ):
         code, _, err = head.submit(*words)

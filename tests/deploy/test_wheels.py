@@ -44,7 +44,6 @@ HEAVY = {
 }
 HEAVY |= {
     "mapbox_earcut",
-    "clarabel",
     "daqp",
     "reportlab",
     "rosbags",

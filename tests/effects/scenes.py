@@ -10,8 +10,7 @@ from unittest import mock
 import numpy as np
 
 import workers.scene.make_scene
-from schemas.job.identity import settings_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, settings_digest
 from schemas.scene.scene import ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.job_file import validate_job

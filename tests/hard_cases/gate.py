@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 from schemas.job.physics import Physics
 from schemas.scene.scene import Settled
+from schemas.scene.shape import Mesh
 from tests.hard_cases.measures import Made
-from tests.judge.judge import Verdict, judge
-from tests.judge.scenes import things_at_rest
+from tests.judge.judge import Thing, Verdict, judge
+from workers.geometry.frames import transform
 
 GAP_MM = 0.01
 """Of overlap and hover, of whatever rests, on whatever it rests."""
@@ -17,7 +18,12 @@ UNBALANCED = 0.01
 
 def verdicts(made: Made, rest: Sequence[Settled], physics: Physics) -> tuple[Verdict, ...]:
     """The judge's on each object. A contact's friction is the product of both bodies'."""
-    return judge(things_at_rest(made.starts, rest), made.table.mesh, physics.friction**2)
+    things = []
+    for start, end in zip(made.starts, rest, strict=True):
+        T, shape, mass = end.T_world_obj, start.asset.shape, start.asset.mass
+        mesh = Mesh(transform(T, shape.vertices), shape.faces)
+        things.append(Thing(mesh, mass.mass_kg, transform(T, mass.com[None, :])[0]))
+    return judge(things, made.table.mesh, physics.friction**2)
 
 
 def what_is_wrong(found: Sequence[Verdict]) -> str:

@@ -13,8 +13,9 @@ from schemas.job.job import Job
 from schemas.job.physics import Physics
 from schemas.scene.scene import Settled
 from tests.hard_cases.camera_cases import CAMERAS
-from tests.hard_cases.case import EITHER, FALL, SETTLE, UNDEFINED, Case, Made
+from tests.hard_cases.case import EITHER, FALL, SETTLE, UNDEFINED, Case, Made, nudged
 from tests.hard_cases.cases import CASES
+from tests.hard_cases.chaotic_cases import SEEDS
 from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
 from tests.physics.settling import recheck_group, settle_group
@@ -109,6 +110,14 @@ def test_a_hard_case_ends_as_declared(case, record_figure):
     what, figure, bound, wrong = judge(case, *first_ending(case))
     record_figure(f"{case.name}: {what}", case.outcome, figure, bound)
     assert not wrong
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("case", rows([case for case in CASES if not case.tier], again=False))
+def test_a_hard_case_ends_as_declared_however_it_is_moved_by_micrometres_at_release(case):
+    wrong = {seed: judge(case, *ending(case, functools.partial(nudged, seed=seed)))[-1] for seed in range(1, SEEDS)}
+    assert not any(wrong.values()), wrong
 
 
 @pytest.mark.parametrize("case", rows(CASES, again=True))

@@ -19,7 +19,7 @@ from schemas.dataset.tables import TABLES
 from tests.made_up_scenes import failed_scene, made_scene, terms
 from workers.store.commit import encode_record
 from workers.store.local import LocalStore
-from workers.store.manifest import sorted_rows, table_of_rows
+from workers.store.manifest import sorted_rows, table_of_rows, with_shape_files
 from workers.store.store import Entry
 
 PAIRS = 5
@@ -171,7 +171,8 @@ def _rows(failed: bool) -> dict[str, pa.Table]:
     for table in TABLES:
         for row in rows[table]:
             row.update({name: value for name, value in _own(table).items() if name in row})
-    return {table: sorted_rows(table, table_of_rows(table, rows[table])) for table in TABLES}
+    tables = {table: sorted_rows(table, table_of_rows(table, rows[table])) for table in TABLES}
+    return tables | {"assets": with_shape_files(tables["assets"], {})}
 
 
 def _own(table: str) -> dict[str, object]:

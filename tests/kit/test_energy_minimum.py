@@ -6,10 +6,11 @@ import trimesh
 
 from schemas.job.job import Job
 from tests.kit.energy_minimum import is_energy_minimum
-from tests.physics.population import draw
 from tests.physics.settling import settle_single
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import pose, rotation_about
+from workers.scene.chance import SceneChance
+from workers.scene.plan import plan_scene
 
 pytestmark = pytest.mark.minute
 
@@ -62,7 +63,7 @@ def test_what_settles_on_a_level_top_is_least_in_energy(pose_of_start, scenes, t
     catalogue = open_catalogue(job.assets, tmp_path, tuple(job.categories))
     found = []
     for scene_id in range(scenes):
-        plan = draw(job, catalogue, scene_id)
+        plan = plan_scene(job, catalogue, SceneChance(job.seed, scene_id))
         start, rest = plan.objects[0], settle_single(plan.objects[0], plan.table, job.physics)
         if rest.support == "flat_top":
             vertices = start.asset.shape.vertices

@@ -6,8 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from schemas.job.assets import CATEGORIES, Assets, ProceduralSource, offered_by
-from schemas.job.identity import PATHS, compare_jobs, differing_keys, job_digest, settings_digest
-from schemas.job.job import PRESETS, Job, with_preset
+from schemas.job.job import PATHS, PRESETS, Job, compare_jobs, differing_keys, job_digest, settings_digest, with_preset
 from schemas.job.physics import Start
 from schemas.job.views import Targets
 from tests.datasets import overlaid

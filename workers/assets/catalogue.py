@@ -27,7 +27,7 @@ from schemas.job.assets import (
     SplitShares,
     instance_id,
 )
-from schemas.job.identity import differing_keys
+from schemas.job.job import differing_keys
 from schemas.scene.shape import Asset
 from workers.geometry.frames import add_up
 

@@ -63,7 +63,7 @@ from workers.capture.results import (
 from workers.capture.surface.object_mask import Ground, down_to_board, silhouette
 from workers.capture.surface.posed_view import PosedView, distort_mask
 from workers.capture.surface.synthesize import Source, choose_sources, move_depth, prepare_source, synthesize_view
-from workers.capture.surface.tsdf import MOST_EDGE_DEG, fit_depth
+from workers.capture.surface.tsdf import fit_depth
 from workers.geometry.pixels import round_depth
 from workers.scene.pairs import front_distance, place_mirror_camera
 from workers.store.images import encode_mask, encode_png
@@ -325,7 +325,7 @@ class CaptureViews:
     def _source(self, number: int) -> Source:
         if number not in self._sources:
             view = self.posed(number)
-            fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics, MOST_EDGE_DEG)
+            fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics)
             self._sources[number] = prepare_source(view, fitted, silhouette(self.body, view.depth_camera))
             while len(self._sources) > max(KEPT, 2 * self.captures.synthesis.views):
                 self._sources.popitem(last=False)

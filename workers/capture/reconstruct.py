@@ -27,8 +27,8 @@ from workers.capture.results import own_files
 from workers.capture.surface.fusion import fuse_views
 from workers.capture.surface.object_mask import ObjectRegion, down_to_board, find_object
 from workers.capture.surface.posed_view import PosedView, pose_view
-from workers.capture.surface.tsdf import face_areas
 from workers.geometry.frames import invert
+from workers.geometry.mesh import face_areas
 from workers.scene.context import Stopwatch
 
 MANUAL = "its pose is that of the manual correction"
@@ -141,7 +141,7 @@ class Merged:
     @property
     def hidden_share(self) -> float:
         """Share of the body's area between the board and the clearance: nobody measured it, and it is in no cloud."""
-        areas = face_areas(self.body)
+        areas = face_areas(self.body.vertices, self.body.faces)
         return float(areas[len(self.surface.faces) :].sum() / areas.sum())
 
 

@@ -6,10 +6,7 @@ memory and in files, which may be deleted.
 
 import hashlib
 import io
-import os
-import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +15,7 @@ from typing import NamedTuple
 import manifold3d
 import numpy as np
 import shapely
-from cachetools import LRUCache
+from cachetools import LRUCache, cached
 from scipy.spatial import QhullError
 
 from schemas.base import Array, frozen_array
@@ -29,6 +26,7 @@ from workers.geometry.halving import halve, wrap
 from workers.geometry.hull import convex_hull
 from workers.geometry.lathe_decomposition import TOLERANCE, decompose_lofts
 from workers.geometry.mesh import components, concavity_m, is_convex_surface, mesh_of, solid_of, weld
+from workers.pool import Answers
 
 CAPACITY_BYTES = 64 * 1024 * 1024
 """Memory per process: a thousand mugs."""
@@ -50,63 +48,34 @@ USUAL_FOLDER = cache_folder("parts")
 def key_of(*inputs: str | bytes) -> str:
     """SHA-256 of everything that an answer depends on."""
     whole = hashlib.sha256()
-    for one in inputs:
-        data = one.encode() if isinstance(one, str) else one
+    for each in inputs:
+        data = each.encode() if isinstance(each, str) else each
         whole.update(len(data).to_bytes(8, "little") + data)
     return whole.hexdigest()
 
 
-class PartsCache:
-    """The parts used last that fit `capacity_bytes` together, and files of all parts if a folder is given.
-
-    A file begins with the SHA-256 of its content, by which a torn one is found and made again, and is renamed into place. A
-    folder that cannot be written is ignored.
-    """
-
-    def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
-        self._kept: LRUCache[str, Parts] = LRUCache(capacity_bytes, lambda parts: sum(c.nbytes for c in parts.clouds))
-
-    def get(self, key: str, folder: Path | None, make: Callable[[], Parts]) -> Parts:
-        """The parts of this key: from memory, from the folder, or made. An exception of `make` leaves no trace."""
-        if (parts := self._kept.get(key)) is not None:
-            return parts
-        parts = None if folder is None else _read(folder / key)
-        if parts is None:
-            parts = make()
-            if folder is not None:
-                with suppress(OSError):
-                    _write(folder, key, parts)
-        with suppress(ValueError):  # larger than all that is kept
-            self._kept[key] = parts
-        return parts
+_MEMORY: LRUCache[str, Parts] = LRUCache(CAPACITY_BYTES, lambda parts: sum(cloud.nbytes for cloud in parts.clouds))
 
 
-def _read(path: Path) -> Parts | None:
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return None
-    size = hashlib.sha256().digest_size
-    if hashlib.sha256(data[size:]).digest() != data[:size]:
-        return None
-    with np.load(io.BytesIO(data[size:])) as stored:
-        counts = stored["counts"]
-        clouds = np.split(stored["vertices"], np.cumsum(counts)[:-1]) if len(counts) else []
-        return Parts(tuple(frozen_array(cloud) for cloud in clouds), float(stored["depth_m"]))
+@cached(_MEMORY, key=lambda key, _: key)
+def _kept(key: str, make: Callable[[], Parts]) -> Parts:
+    """The parts of this key from memory, else made: those used last stay that fit `CAPACITY_BYTES` together."""
+    return make()
 
 
-def _write(folder: Path, key: str, parts: Parts) -> None:
-    content, counts = io.BytesIO(), [len(cloud) for cloud in parts.clouds]
-    np.savez(content, depth_m=parts.depth_m, vertices=np.concatenate([np.empty((0, 3)), *parts.clouds]), counts=counts)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
-        try:
-            file.write(hashlib.sha256(content.getvalue()).digest() + content.getvalue())
-            file.flush()
-            os.replace(file.name, folder / key)
-        except OSError:
-            Path(file.name).unlink(missing_ok=True)
-            raise
+def _stored(key: str, folder: Path | None, make: Callable[[], Parts]) -> Parts:
+    """The parts of this key from their file in the folder, else made and written there. A file cut off is not believed."""
+    answers = Answers(None if folder is None else folder / key)
+    data = answers.get(key)
+    if data is not None:
+        with np.load(io.BytesIO(data)) as stored:
+            clouds = np.split(stored["vertices"], np.cumsum(stored["counts"])[:-1])
+            return Parts(tuple(map(frozen_array, clouds)), float(stored["depth_m"]))
+    parts, content = make(), io.BytesIO()
+    counts = [len(cloud) for cloud in parts.clouds]
+    np.savez(content, depth_m=parts.depth_m, vertices=np.concatenate(parts.clouds), counts=counts)
+    answers.put(key, content.getvalue())
+    return parts
 
 
 THRESHOLD = 0.05
@@ -130,8 +99,6 @@ LIBRARIES = ("manifold3d", "numpy", "scipy")
 SCRAP = 1e-3
 """Thickness of a loose triangle, as a share of its distance from the middle of the mesh."""
 
-_CACHE = PartsCache()
-
 
 def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANCE) -> tuple[Array, ...]:
     """Vertices [N, 3], object frame, of each of an asset's convex parts: from its making if known, or else by halving.
@@ -144,7 +111,7 @@ def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANC
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     key = key_of("lofts", repr(share), asset.sha256, asset.shape.mesh.vertices.tobytes())
     try:
-        return _CACHE.get(key, None, lambda: Parts(decompose_lofts(lofted.lofts, share))).clouds
+        return _kept(key, lambda: Parts(decompose_lofts(lofted.lofts, share))).clouds
     except (ValueError, shapely.errors.GEOSException):
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 
@@ -156,7 +123,7 @@ def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Pat
     (None: nowhere).
     """
     key = key_of(version_of_parts(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
-    return _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
+    return _kept(key, lambda: _stored(key, folder, lambda: _decompose(mesh, threshold)))
 
 
 @cache

@@ -7,10 +7,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import clarabel
 import daqp
 import numpy as np
-from scipy.sparse import csc_array, eye_array
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import MassProperties
@@ -27,9 +25,6 @@ OPTIMAL, UNBOUNDED = 1, 1e30
 
 EXACT = 1e-10
 """Tolerance of the solver, in units in which 1 is the free fall of a step."""
-
-MANY = 51
-"""Bodies from which Clarabel is used. Of 8 DAQP takes a seventh of its time, of 25 half of it, of 100 ten times as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +66,7 @@ def step(
     The motion nearest to free fall, measured by kinetic energy, with `n . d + gap >= friction |t . d|` for the relative
     motion d at every contact: the convex relaxation of Coulomb's law by Anitescu (2006, "Optimization-based simulation of
     nonsmooth rigid multibody dynamics"). A least-distance problem, solved by DAQP (Arnstrom et al. 2022, "A dual active-set
-    solver for embedded quadratic programming") or Clarabel (Goulart and Chen 2024, "Clarabel: an interior-point solver for
-    conic programs with quadratic objectives"). Its multipliers are the contact forces; where nothing moves they balance the
+    solver for embedded quadratic programming"). Its multipliers are the contact forces; where nothing moves they balance the
     weights, which is static equilibrium. Raises JammedError.
     """
     # The inverse of the square root of each tensor of inertia
@@ -100,26 +94,11 @@ def _least_distance(matrix: Array, least: Array) -> tuple[Array, Array]:
     count, size = matrix.shape
     if count == 0:
         return np.zeros(size), np.zeros(0)
-    if size >= MANY * 6:
-        return _interior(matrix, least)
     bounds = np.full(count, UNBOUNDED), least, np.zeros(count, dtype=np.int32)
-    x, _, flag, found = daqp.solve(np.eye(size), np.zeros(size), matrix, *bounds, primal_tol=EXACT, dual_tol=EXACT)
+    x, _, flag, details = daqp.solve(np.eye(size), np.zeros(size), matrix, *bounds, primal_tol=EXACT, dual_tol=EXACT)
     if flag != OPTIMAL:
         raise JammedError
-    return x, np.maximum(0.0, -found["lam"])
-
-
-def _interior(matrix: Array, least: Array) -> tuple[Array, Array]:
-    """The same by an interior-point method, where each row has few numbers that are not zero."""
-    count, size = matrix.shape
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.tol_feas = settings.tol_gap_abs = settings.tol_gap_rel = 10.0 * EXACT  # rounding allows no less
-    problem = eye_array(size, format="csc"), np.zeros(size), csc_array(-matrix), -least
-    found = clarabel.DefaultSolver(*problem, [clarabel.NonnegativeConeT(count)], settings).solve()
-    if found.status != clarabel.SolverStatus.Solved:
-        raise JammedError
-    return np.array(found.x), np.array(found.z)
+    return x, np.maximum(0.0, -details["lam"])
 
 
 def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array, arms_m: Array) -> Array:
@@ -127,11 +106,11 @@ def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts,
     rows = np.zeros((*edges.shape[:2], len(bodies), 6))
     twists = arms_m[:, None] * contacts.normals[:, None]
     for number, (body, root) in enumerate(zip(bodies, roots, strict=True)):
-        own = np.flatnonzero(contacts.of(number))
-        sign = np.where(contacts.upper[own] == number, 1.0, -1.0)[:, None, None]
-        levers, along = contacts.points[own] - body.com, edges[own]
-        rows[own, :, number, :3] = sign * along / np.sqrt(body.mass_kg)
-        rows[own, :, number, 3:] = sign * (np.cross(levers[:, None], along) + twists[own]) @ root
+        its = np.flatnonzero(contacts.of(number))
+        sign = np.where(contacts.upper[its] == number, 1.0, -1.0)[:, None, None]
+        levers, along = contacts.points[its] - body.com, edges[its]
+        rows[its, :, number, :3] = sign * along / np.sqrt(body.mass_kg)
+        rows[its, :, number, 3:] = sign * (np.cross(levers[:, None], along) + twists[its]) @ root
     return rows.reshape(-1, 6 * len(bodies))
 
 

@@ -4,9 +4,11 @@ Objects are simulated until calm, brought to exact rest, measured, and refused w
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -44,7 +46,7 @@ from workers.physics.pour import (
     renumbered,
 )
 from workers.physics.release import LEFT_M, Drop, Pace, hold, moved_by, release, release_again
-from workers.physics.support import inside_margin, snap_to_face, vertical_gap
+from workers.physics.support import Face, inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
 """Share of the weight, and of weight times size, that the contacts of what rests may leave unbalanced."""
@@ -74,6 +76,10 @@ class LeftRoomError(Exception):
     """An object settled as if alone came where it may meet another."""
 
 
+class LeftTopError(Exception):
+    """A footprint left the flat top, so that the table's edges may matter."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Ending:
     """The objects of a drop at the poses [4, 4] of their rest, after `seconds` in all, with the speed that was left.
@@ -96,18 +102,18 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
     where a single object leaves its room.
     """
     forms, again = forms_of(drop.starts), dict[int, int]()
+    poses = tuple(start.T_world_obj for start in drop.starts)
     if not drop.effects.runs("dynamics"):
-        poses = tuple(start.T_world_obj for start in drop.starts)
-        return drop.starts, _describe(_Ending(drop, _place(drop, poses, forms), poses), "placed", judged=True)
-    for i, j, depth_m in find_overlaps_m(forms, [start.T_world_obj for start in drop.starts]):
+        return drop.starts, _describe(_Ending(drop, _place(drop, poses, forms), poses))
+    for i, j, depth_m in find_overlaps_m(forms, poses):
         if depth_m > PLACED_M:
             raise SettleError(
                 "objects_overlap",
                 f"regions {drop.starts[i].region_id} and {drop.starts[j].region_id} begin {depth_m * 1e3:.2f} mm inside one "
                 "another: let them go apart, or one above the other",
             )
-    if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
-        return drop.starts, _describe(placed, _support_of(placed), judged=True)
+    if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms, poses)) is not None:
+        return drop.starts, _describe(placed)
     if drop.pouring.waves:
         drop = dataclasses.replace(drop, clearances_m=clearances_m(drop.starts, drop.table))
     while True:
@@ -126,59 +132,43 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
     pouring, starts = drop.pouring, list(moved_to(drop.starts, lost.poses))
     kept = [number for number in range(len(starts)) if number not in lost.numbers]
     if pouring.remove and kept and lost.reason != "thrown":
-        lying, ready = (frozenset(kept.index(n) for n in kept if n in of) for of in (lost.fallen, drop.ready))
+        lying, ready = (frozenset(kept.index(n) for n in kept if n in some) for some in (lost.fallen, drop.ready))
         clear_m = tuple(drop.clearances_m[number] for number in kept) if drop.clearances_m else ()
         fewer = renumbered([starts[number] for number in kept])
         return dataclasses.replace(drop, starts=fewer, lying=lying, ready=ready, clearances_m=clear_m)
-    there = [points_of(starts[number]) for number in sorted(lost.fallen)]
+    others = [points_of(starts[number]) for number in sorted(lost.fallen)]
     for number in lost.numbers:
         region = starts[number].region_id
         again[region] = again.get(region, 0) + 1
         if pouring.draw is None or again[region] > pouring.most:
             raise lost
-        starts[number] = pouring.draw(drop.starts[number], again[region], there)
-        there.append(points_of(starts[number]))
+        starts[number] = pouring.draw(drop.starts[number], again[region], others)
+        others.append(points_of(starts[number]))
     ready = drop.ready.union(lost.numbers)
     return dataclasses.replace(drop, starts=tuple(starts), lying=lost.fallen, ready=ready)
 
 
 def _settle_in_ways(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
-    poured = _pour(drop, flat=not drop.effects.runs("table_mesh"))
-    if poured is None:
-        drop = _with_mesh(drop)
-        poured = _pour(drop, flat=False)
-    assert poured is not None  # only the flat top has an edge
-    drop = poured
-    *earlier, last = drop.ways
-    for paces in earlier:
+    """Settle at the first of the drop's paces at which what comes to rest is accepted."""
+    drop = _on_top_or_mesh(drop, _pour)
+    *earlier, last = (partial(_come_to_rest, forms=forms, paces=paces) for paces in drop.ways)
+    for way in earlier:
         with suppress(UnsupportedError):
-            return _settle(drop, forms, paces)
-    return _settle(drop, forms, last)
+            return _describe(_on_top_or_mesh(drop, way))
+    return _describe(_on_top_or_mesh(drop, last))
 
 
-def _settle(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace]) -> tuple[Settled, ...]:
+Result = TypeVar("Result")
+
+
+def _on_top_or_mesh(drop: Drop, run: Callable[[Drop, bool], Result]) -> Result:
+    """What `run` of the drop and whether the table is its flat top gives: of that alone if it may be, else of the mesh."""
     if not drop.effects.runs("table_mesh"):
-        ending = _come_to_rest(drop, forms, paces, flat=True)
-        if ending is not None:
-            return _describe(ending, _support_of(ending), drop.physics.exact_rest)
-        drop = _with_mesh(drop)
-    ending = _come_to_rest(drop, forms, paces, flat=False)
-    assert ending is not None  # only the flat top has an edge
-    return _describe(ending, _support_of(ending), drop.physics.exact_rest)
-
-
-def _with_mesh(drop: Drop) -> Drop:
-    late = called_for_with("table_mesh", drop.starts, drop.physics)
-    return dataclasses.replace(drop, effects=add_effects(drop.effects, late))
-
-
-def _support_of(ending: _Ending) -> SupportedBy:
-    """`flat_top` where the mesh was not called for and every object is over the flat top with all of its points."""
-    if ending.drop.effects.runs("table_mesh"):
-        return "mesh"
-    outline = ending.drop.table.top.outline
-    points = [transform(T, one.hull.vertices) for one, T in zip(ending.drop.starts, ending.poses, strict=True)]
-    return "flat_top" if inside_margin(np.concatenate(points)[:, :2], outline).min() >= 0.0 else "mesh"
+        with suppress(LeftTopError):
+            return run(drop, True)
+        late = called_for_with("table_mesh", drop.starts, drop.physics)
+        drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
+    return run(drop, False)
 
 
 def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
@@ -186,77 +176,81 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
     return dataclasses.replace(effects, ran=(*effects.ran, *names))
 
 
-def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat: bool) -> _Ending | None:
-    """Release at these paces until at rest; None where a footprint left the flat top, so that the table's edges may matter.
+def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence[Pace]) -> _Ending:
+    """Release at these paces until at rest.
 
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
-    as they tip or slip, and released again where that takes them far.
+    as they tip or slip, and released again where that takes them far. Raises LeftTopError, LeftRoomError and SettleError.
     """
-    seconds, placement = drop.seconds, None
-    most = POURED_RELEASES if drop.lying else MOST_RELEASES
+    exact, heaped, seconds = drop.physics.exact_rest, bool(drop.lying), drop.seconds
+    placement, moved = None, 0
+    most = POURED_RELEASES if heaped else MOST_RELEASES
     for _ in range(most):
-        brief = bool(drop.lying) and drop.physics.exact_rest
-        outcome = release(_briefly(drop, POURED_S) if brief else drop, flat, paces)
-        if outcome.stopped_by == "room":
-            raise LeftRoomError
-        if outcome.stopped_by == "edge":
-            return None
+        outcome = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces)
         seconds += outcome.seconds
-        _require_calm(drop, outcome, moving=brief)
-        exact = drop.physics.exact_rest
-        if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
-            return standing
+        _require_calm(drop, outcome, range(len(drop.starts)), moving=heaped and exact)
         placement = placement or _place(drop, outcome.poses, forms)
         ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s, bool(outcome.spinning))
         if not exact:
             return ending
+        if flat and drop.single and (standing := _stand(ending, outcome.face)) is not None:
+            return standing
         rested = hold(drop, placement, outcome.poses)
         if rested.still:
             return dataclasses.replace(ending, poses=rested.poses)
-        moved_m = [
-            farthest_m([one], [before], [after])
-            for one, before, after in zip(drop.starts, outcome.poses, rested.poses, strict=True)
-        ]
-        starts = (dataclasses.replace(one, T_world_obj=T) for one, T in zip(drop.starts, rested.poses, strict=True))
-        drop = dataclasses.replace(drop, starts=tuple(starts))
-    every = range(len(drop.starts))
+        pairs = zip(drop.starts, outcome.poses, rested.poses, strict=True)
+        moved = int(np.argmax([farthest_m([start], [before], [after]) for start, before, after in pairs]))
+        drop = dataclasses.replace(drop, starts=moved_to(drop.starts, rested.poses))
     raise UnsupportedError(
         "unsupported",
         f"{'it tips or slips' if drop.single else 'something tips or slips'} on without end: released {most} times, "
         f"for {seconds:.1f} s in all, it never came into balance: lower physics.rest.speed_mm_s, or raise physics.friction",
-        [int(np.argmax(moved_m))],
+        [moved],
         rested.poses,
-        every,
+        range(len(drop.starts)),
     )
 
 
-def _pour(drop: Drop, flat: bool) -> Drop | None:
-    """The drop with all waves but the last where they lie; None where one left the flat top."""
-    count, seconds = len(drop.starts), drop.seconds
+def _release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
+    outcome = release(drop, flat, paces)
+    if outcome.stopped_by == "room":
+        raise LeftRoomError
+    if outcome.stopped_by == "edge":
+        raise LeftTopError
+    return outcome
+
+
+def _pour(drop: Drop, flat: bool) -> Drop:
+    """The drop with all waves but the last where they lie. Raises LeftTopError and SettleError."""
     while drop.pouring.waves:
-        wave = next_wave(count, drop.lying)
-        starts = list(drop.starts)
-        for number in wave if drop.lying else ():
-            if number not in drop.ready:
-                now = [starts[each] for each in sorted(drop.lying.union(wave[: wave.index(number)]))]
-                starts[number] = lift(starts[number], now, drop.table, drop.clearances_m[number])
-        drop = dataclasses.replace(drop, starts=tuple(starts), ready=drop.ready.union(wave))
-        part = sorted(drop.lying.union(wave))
-        if len(part) == count:
+        drop, falling = _raise_next_wave(drop)
+        if len(falling) == len(drop.starts):
             break
-        few = _briefly(dataclasses.replace(drop, starts=tuple(starts[number] for number in part)), WAVE_S)
-        outcome = release(few, flat, drop.ways[0][:1])
-        if outcome.stopped_by == "edge":
-            return None
-        seconds += outcome.seconds
-        poses = [start.T_world_obj for start in starts]
-        for number, T in zip(part, outcome.poses, strict=True):
+        few = dataclasses.replace(drop, starts=tuple(drop.starts[number] for number in falling))
+        outcome = _release(_briefly(few, WAVE_S), flat, drop.ways[0][:1])
+        poses = [start.T_world_obj for start in drop.starts]
+        for number, T in zip(falling, outcome.poses, strict=True):
             poses[number] = T
-        lost, thrown = (tuple(part[k] for k in of) for of in (outcome.lost, outcome.thrown))
-        there = dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown))
-        _require_calm(drop, there, part, moving=True)
-        drop = dataclasses.replace(drop, starts=moved_to(starts, poses), lying=frozenset(part), seconds=seconds)
+        lost, thrown = (tuple(falling[k] for k in some) for some in (outcome.lost, outcome.thrown))
+        whole = dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown))
+        _require_calm(drop, whole, falling, moving=True)
+        seconds, starts = drop.seconds + outcome.seconds, moved_to(drop.starts, poses)
+        drop = dataclasses.replace(drop, starts=starts, lying=frozenset(falling), seconds=seconds)
     return drop
+
+
+def _raise_next_wave(drop: Drop) -> tuple[Drop, list[int]]:
+    """(the drop, with its next wave above what lies and above one another; the numbers of what lies and of that wave)."""
+    wave, starts = next_wave(len(drop.starts), drop.lying), list(drop.starts)
+    if drop.lying:
+        below = set(drop.lying)
+        for number in wave:
+            if number not in drop.ready:
+                others = [starts[each] for each in sorted(below)]
+                starts[number] = lift(starts[number], others, drop.table, drop.clearances_m[number])
+            below.add(number)
+    drop = dataclasses.replace(drop, starts=tuple(starts), ready=drop.ready.union(wave))
+    return drop, sorted(drop.lying.union(wave))
 
 
 def _briefly(drop: Drop, most_s: float) -> Drop:
@@ -265,11 +259,9 @@ def _briefly(drop: Drop, most_s: float) -> Drop:
     return dataclasses.replace(drop, physics=drop.physics.model_copy(update={"max_settle_s": seconds}))
 
 
-def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
+def _rest_as_placed(drop: Drop, forms: Sequence[Form], poses: tuple[Pose, ...]) -> _Ending | None:
     """Objects that begin in touch and in balance, as a stack that was built; None where they have to fall."""
-    poses = tuple(start.T_world_obj for start in drop.starts)
-    lowest_m = min(transform(T, one.hull.vertices)[:, 2].min() for T, one in zip(poses, drop.starts, strict=True))
-    if lowest_m > drop.table.top.height_m + PLACED_M:
+    if min(points_of(start)[:, 2].min() for start in drop.starts) > drop.table.top.height_m + PLACED_M:
         return None
     placement = _place(drop, poses, forms)
     if max(find_gaps_m(placement.forms, [*poses, np.eye(4)])[:-1]) > PLACED_M:
@@ -283,31 +275,23 @@ def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placemen
     return place(drop.starts, poses, forms, drop.table, drop.physics.friction**2)
 
 
-def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
+def _stand(ending: _Ending, face: Face | None) -> _Ending | None:
     """A single object turned onto the steady face of its hull that is below it, on the flat top; None where none is near."""
+    drop = ending.drop
     (start,), table = drop.starts, drop.table
-    known = None if drop.physics.collision == "box" else outcome.face  # a box has other faces than the object's hull
-    T = snap_to_face(outcome.poses[0], start.hull, start.asset.mass.com, known)
+    known = None if drop.physics.collision == "box" else face  # a box has other faces than the object's hull
+    T = snap_to_face(ending.poses[0], start.hull, start.asset.mass.com, known)
     if T is None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), table.mesh)) @ T
-    return _Ending(
-        drop,
-        place_on_top(start, T, table, drop.physics.friction**2),
-        (T,),
-        seconds,
-        outcome.speed_m_s,
-        bool(outcome.spinning),
-    )
+    return dataclasses.replace(ending, placement=place_on_top(start, T, table, drop.physics.friction**2), poses=(T,))
 
 
-def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = None, moving: bool = False) -> None:
+def _require_calm(drop: Drop, outcome: Outcome, fallen: Sequence[int], moving: bool) -> None:
     """Raises SettleError where objects were lost or still move, which they may where they are `moving`.
 
-    fallen: the numbers of those that were let go, if not all.
+    fallen: the numbers of those that were let go.
     """
-    known = range(len(drop.starts)) if fallen is None else list(fallen)
-    coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
     if outcome.thrown:
         raise UnsupportedError(
             "thrown",
@@ -315,14 +299,15 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Iterable[int] | None = N
             "of nearer masses",
             sorted(outcome.thrown.union(outcome.lost)),
             outcome.poses,
-            known,
+            fallen,
         )
     if outcome.rested and not outcome.lost:
         return
-    if lost := outcome.lost or [number for number in known if _is_low(drop, coms[number][2])]:
-        raise _left_table(drop, lost, outcome.poses, outcome.seconds, known)
+    coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
+    if lost := outcome.lost or [number for number in fallen if _is_low(drop, coms[number][2])]:
+        raise _left_table(drop, lost, outcome.poses, outcome.seconds, fallen)
     if not moving:
-        raise SettleError("not_at_rest", _what_moves(drop.physics, drop.starts[known[outcome.moves[0]]], outcome))
+        raise SettleError("not_at_rest", _what_moves(drop.physics, drop.starts[fallen[outcome.moves[0]]], outcome))
 
 
 def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
@@ -355,24 +340,24 @@ def _left_table(
     if not drop.single:
         whose = f" of region {start.region_id}"
         advice = "fewer objects_per_scene, a narrower start.offset_m or larger tables"
-    told = f"after {seconds:.2f} s the centre of mass{whose} was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off the table's top: {advice}"
-    return LostError("left_table", told, lost, poses, fallen)
+    message = (
+        f"after {seconds:.2f} s the centre of mass{whose} was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off the table's top"
+    )
+    return LostError("left_table", f"{message}: {advice}", lost, poses, fallen)
 
 
-def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Settled, ...]:
+def _describe(ending: _Ending) -> tuple[Settled, ...]:
     """The rest poses with their figures, measured between the true meshes and not taken from the simulator."""
     drop, supports = ending.drop, measure_supports(ending.placement, ending.poses)
-    each = list(zip(drop.starts, ending.poses, supports, strict=True))
+    coms = [_com(start, T) for start, T in zip(drop.starts, ending.poses, strict=True)]
     # What is this low may hang on the table by a handle, or stand on its foot
-    low = [
-        n
-        for n, (start, T, held) in enumerate(each)
-        if _is_low(drop, _com(start, T)[2]) and _is_low(drop, held.highest_m)
-    ]
+    low = [n for n, held in enumerate(supports) if _is_low(drop, coms[n][2]) and _is_low(drop, held.highest_m)]
     if low:
-        raise _left_table(drop, low, ending.poses, ending.seconds, range(len(each)))
-    for number in range(len(each)) if judged else ():
-        _require_support(ending, number, supports[number])
+        raise _left_table(drop, low, ending.poses, ending.seconds, range(len(supports)))
+    if drop.physics.exact_rest or not drop.effects.runs("dynamics"):
+        for number, held in enumerate(supports):
+            _require_support(ending, number, held)
+    support = _support_of(ending)
     return tuple(
         Settled(
             T_world_obj=frozen_array(T),
@@ -388,6 +373,17 @@ def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Sett
         )
         for T, held in zip(ending.poses, supports, strict=True)
     )
+
+
+def _support_of(ending: _Ending) -> SupportedBy:
+    """`flat_top` where the mesh was not called for and every object is over the flat top with all of its points."""
+    drop = ending.drop
+    if not drop.effects.runs("dynamics"):
+        return "placed"
+    if drop.effects.runs("table_mesh"):
+        return "mesh"
+    points = np.concatenate([points_of(start) for start in moved_to(drop.starts, ending.poses)])
+    return "flat_top" if inside_margin(points[:, :2], drop.table.top.outline).min() >= 0.0 else "mesh"
 
 
 def _require_support(ending: _Ending, number: int, held: Support) -> None:
@@ -447,17 +443,16 @@ def _settle_alone(
     began, settled, alone = list[ObjectStart](), list[Settled](), len(plan.objects) == 1
     for start, room_m in zip(plan.objects, rooms_m(plan.objects), strict=True):
         try:
-            (one,), (rest,) = settle(
-                Drop((start,), plan.table, physics, effects, room_m, pouring if alone else NOTHING_MORE)
-            )
+            more = pouring if alone else NOTHING_MORE
+            starts, rests = settle(Drop((start,), plan.table, physics, effects, room_m, more))
         except LostError as lost:
             if pouring.draw is not None and not alone:
                 raise LeftRoomError from None  # a new start has another room
             if not pouring.remove or (start is plan.objects[-1] and not began) or lost.reason == "thrown":
                 raise
             continue
-        began.append(one)
-        settled.append(rest)
+        began += starts
+        settled += rests
     return renumbered(began), tuple(settled)
 
 

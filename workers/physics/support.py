@@ -1,6 +1,5 @@
 """What objects stand on: the elevation of meshes, rest poses on a level support, and the level top of a table. Pure."""
 
-import math
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -25,9 +24,6 @@ VERTICAL_M2 = 1e-18
 
 SAME_HEIGHT_M = 1e-9
 """A vertex this near the highest crossing of its vertical line is the top of its mesh there."""
-
-FIRST_BAND_M = 1e-4
-"""Vertices this near the lowest one are compared with the ground first: they settle the gap of an object that stands."""
 
 
 def sample_elevation(points_xy: Array, ground: Mesh, highest: bool = True) -> Array:
@@ -76,7 +72,9 @@ def vertical_gap(upper: Mesh, lower: Mesh, band_m: float = 0.02) -> float:
     other; that is exact unless the nearest features are two crossing edges. Of the upper mesh only vertices within
     `band_m` of its lowest point are tried. inf where nothing is above anything.
     """
-    gap = _least_gap_below(upper.vertices, lower, band_m)
+    z = upper.vertices[:, 2]
+    lowest = upper.vertices[z <= z.min() + band_m]
+    gap = float(np.fmin.reduce(lowest[:, 2] - sample_elevation(lowest[:, :2], lower), initial=np.inf))
     bottom, top = bounds_of(upper.vertices)
     # The gap above a vertex of the lower mesh is at least its distance to the lowest point of the upper one.
     under = lower.vertices[bottom[2] - lower.vertices[:, 2] < gap]
@@ -85,18 +83,6 @@ def vertical_gap(upper: Mesh, lower: Mesh, band_m: float = 0.02) -> float:
         under = under[under[:, 2] >= sample_elevation(under[:, :2], lower) - SAME_HEIGHT_M]
         ceiling = sample_elevation(under[:, :2], upper, highest=False)
         gap = float(np.fmin.reduce(ceiling - under[:, 2], initial=gap))
-    return gap
-
-
-def _least_gap_below(vertices: Array, ground: Mesh, band_m: float) -> float:
-    """Least height of the lowest vertices [N, 3] above the ground; inf where there is none below any."""
-    z = vertices[:, 2]
-    points = vertices[z <= z.min() + band_m]
-    gap = np.inf
-    for part in (points[:, 2] <= z.min() + FIRST_BAND_M, points[:, 2] > z.min() + FIRST_BAND_M):
-        # A vertex at least the known gap above the ground's highest point cannot lessen the gap.
-        tried = points[part & (points[:, 2] - ground.vertices[:, 2].max() < gap)]
-        gap = float(np.fmin.reduce(tried[:, 2] - sample_elevation(tried[:, :2], ground), initial=gap))
     return gap
 
 
@@ -227,21 +213,12 @@ def inside_margin(points_xy: Array, outline: Array) -> Array:
 
     The least signed distance to the polygon's edge lines.
     """
-    return _least_distances(np.ascontiguousarray(points_xy), outline)
-
-
-@compiled_for("f8[:,::1], const(f8[:,::1])")
-def _least_distances(points: Array, outline: Array) -> Array:
-    """The least signed distance [N] of points to the lines through the edges of a polygon, those without length left out."""
-    least = np.full(len(points), np.inf)
-    for m in range(len(outline)):
-        start, end = outline[m], outline[(m + 1) % len(outline)]
-        x, y = end[0] - start[0], end[1] - start[1]
-        length = math.sqrt(x * x + y * y)
-        if length > 0.0:
-            for n in range(len(points)):
-                depth = (x * (points[n, 1] - start[1]) - y * (points[n, 0] - start[0])) / length
-                least[n] = min(least[n], depth)
+    x, y = (np.roll(outline, -1, axis=0) - outline).T
+    length = np.sqrt(x * x + y * y)
+    right, up = (points_xy[:, axis, None] - outline[:, axis] for axis in (0, 1))
+    with np.errstate(invalid="ignore"):
+        depth = (x * up - y * right) / length
+    least: Array = depth[:, length > 0.0].min(axis=1, initial=np.inf)
     return least
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 
 import cv2
 
-from schemas.job.identity import settings_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, settings_digest
 from workers.assets.catalogue import Catalogue
 from workers.render.raster.gbuffer import Renderer, shared_renderer
 

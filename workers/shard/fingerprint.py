@@ -13,8 +13,7 @@ import numpy as np
 from zlib_ng import zlib_ng
 
 from schemas.dataset.shard import Fingerprint
-from schemas.job.identity import settings_digest
-from schemas.job.job import Job
+from schemas.job.job import Job, settings_digest
 from schemas.job.views import Tier
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import pose, rotation_about

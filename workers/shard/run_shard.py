@@ -56,8 +56,8 @@ class LostScene(SceneError):
 def explain(error: Exception) -> LostScene:
     """The row of a scene that ended in this error."""
     if isinstance(error, MemoryError):
-        told = "a worker had too little memory for this scene: use fewer workers, then run with --retry-failed"
-        return LostScene("memory", f"{told} ({describe(error)})")
+        message = "a worker had too little memory for this scene: use fewer workers, then run with --retry-failed"
+        return LostScene("memory", f"{message} ({describe(error)})")
     return LostScene("bug", f"{describe(error)}: report this, then run with --retry-failed")
 
 
@@ -264,10 +264,10 @@ def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
 
 def _foreign(mine: Fingerprint, theirs: Fingerprint | None, digest: str) -> FingerprintError:
     """The error for a stack that is not the dataset's, which has this `digest`; `theirs` is None where it is not known."""
-    told = f": {'; '.join(mine.differences(theirs))}" if theirs else ""
+    message = f": {'; '.join(mine.differences(theirs))}" if theirs else ""
     remedy = mine.remedies(theirs) if theirs else "use the same stack (the image is one)"
     return FingerprintError(
-        f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's is {digest[:12]}{told}. To "
+        f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's is {digest[:12]}{message}. To "
         f"go on, {remedy}; or set run.fingerprint: record"
     )
 

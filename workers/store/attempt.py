@@ -110,9 +110,8 @@ def retry_of_attempt(name: str) -> int | None:
 
 def attempts_at(store: Store, start: int) -> list[str]:
     """Names of the attempts that have a folder for the range at `start`, except fenced ones."""
-    names = store.children(staging_path(start, "")[:-1])
-    known = (name for name in names if retry_of_attempt(name) is not None and not name.endswith(FENCED))
-    return [name for name in known if is_live(store, staging_path(start, name))]
+    names = [name for name in store.children(staging_path(start, "")[:-1]) if not name.endswith(FENCED)]
+    return [n for n in names if retry_of_attempt(n) is not None and is_live(store, staging_path(start, n))]
 
 
 def staged_attempts(store: Store) -> Iterator[tuple[int, str]]:
@@ -125,10 +124,9 @@ def staged_attempts(store: Store) -> Iterator[tuple[int, str]]:
 def blamed_scene(store: Store, start: int, attempt: str) -> int | None:
     """The scene that an attempt last noted as in progress; None where it was between scenes or is gone."""
     try:
-        current = json.loads(store.read(f"{staging_path(start, attempt)}/{CURRENT}"))
-    except (FileNotFoundError, ValueError):
+        scene_id = json.loads(store.read(f"{staging_path(start, attempt)}/{CURRENT}"))["scene_id"]
+    except (FileNotFoundError, ValueError, LookupError, TypeError):
         return None
-    scene_id = current.get("scene_id") if isinstance(current, dict) else None
     return scene_id if isinstance(scene_id, int) else None
 
 
@@ -168,9 +166,8 @@ class Attempt:
         outcome = outcome_of(output)
         entries = {file.path: _entry_of(file) for file in output.files}
         check_files(output, entries)
-        for path in self._files.keys() & entries.keys():
-            if self._files[path] != entries[path]:
-                raise ValueError(f"{path} was written twice with different bytes")
+        if differing := [path for path in self._files.keys() & entries.keys() if self._files[path] != entries[path]]:
+            raise ValueError(f"{differing[0]} was written twice with different bytes")
         new = {file.path: file.data for file in output.files if file.path not in self._files}
         with self._skip_if_swept():
             self._packing.add(new, tables)
@@ -218,7 +215,7 @@ class Attempt:
             if table == "assets":
                 rows = with_shape_files(rows, self._files)
                 listed = {entry.path for entry in files_of_assets(rows)}
-                entries += [one for path, one in self._files.items() if is_shape(path) and path not in listed]
+                entries += [entry for path, entry in self._files.items() if is_shape(path) and path not in listed]
             file = encoded_file(range_table_path(self.span.start, table, self.span.retry), encode_table(rows))
             with self._skip_if_swept():
                 self._stage.write(file.path, file.data)
@@ -236,12 +233,8 @@ class Attempt:
         )
 
     def _own_files(self, record: CommitRecord) -> list[FileEntry]:
-        """What `committed_files` would read from the tables: every file that this attempt wrote, sorted by path.
-
-        Raises ValueError naming one that is not the range's own.
-        """
-        by_path = self._terms.layout == "files"
-        listed = [entry for path, entry in self._files.items() if by_path or is_shape(path)]
+        """Every file that this attempt wrote, as `committed_files` has them. Raises ValueError naming one of another range."""
+        listed = [entry for path, entry in self._files.items() if self._terms.layout == "files" or is_shape(path)]
         if (foreign := foreign_path(listed, self.span, self._terms.pairs_per_scene)) is not None:
             raise ValueError(f"{foreign!r} is not a file of the range from scene {self.span.start}")
         return sorted({*record.files, *listed}, key=attrgetter("path"))
@@ -269,11 +262,10 @@ class Attempt:
 
     def _note(self, current: Mapping[str, object]) -> None:
         """Writes what is in progress, unless it is what was written last."""
-        if current == self._noted:
-            return
-        with self._skip_if_swept():
-            self._stage.write(CURRENT, json.dumps(current).encode().ljust(_NOTE_BYTES))
-        self._noted = current
+        if current != self._noted:
+            with self._skip_if_swept():
+                self._stage.write(CURRENT, json.dumps(current).encode().ljust(_NOTE_BYTES))
+            self._noted = current
 
     @contextlib.contextmanager
     def _skip_if_swept(self) -> Iterator[None]:
@@ -297,21 +289,19 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
     """
     removed = []
     for folder in store.children(STAGING):
-        start = parse_range_name(folder)
-        if start is None:
-            if fenced is None and f"{STAGING}/{folder}" not in (TEMPORARY, LOCK_CLAIMS):
-                store.remove_tree(f"{STAGING}/{folder}")
-            continue
-        for name in store.children(f"{STAGING}/{folder}"):
-            attempt = name.removesuffix(FENCED)
-            given_up = name.endswith(FENCED) or fenced is None or (start, attempt) in fenced
-            if sweep_attempt(store, start, attempt, given_up):
-                removed.append(attempt)
-        store.remove_empty(f"{STAGING}/{folder}")
-    commits = (entry.key for entry in store.files(COMMITS, sizes=False))
-    probes = [key for key in commits if key.startswith(f"{COMMITS}/{PROBE_PREFIX}")]
-    for key in [*probes, *(entry.key for entry in store.files(TEMPORARY))]:
-        store.remove(key)  # a living process writes its temporary file again
+        path, start = f"{STAGING}/{folder}", parse_range_name(folder)
+        if start is not None:
+            for name in store.children(path):
+                attempt = name.removesuffix(FENCED)
+                given_up = name.endswith(FENCED) or fenced is None or (start, attempt) in fenced
+                if sweep_attempt(store, start, attempt, given_up):
+                    removed.append(attempt)
+            store.remove_empty(path)
+        elif fenced is None and path not in (TEMPORARY, LOCK_CLAIMS):
+            store.remove_tree(path)
+    for entry in [*store.files(COMMITS, sizes=False), *store.files(TEMPORARY)]:
+        if entry.key.startswith((f"{COMMITS}/{PROBE_PREFIX}", TEMPORARY)):
+            store.remove(entry.key)  # a living process writes its temporary file again
     return removed
 
 

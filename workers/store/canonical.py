@@ -39,25 +39,21 @@ class _Stream:
 
     def update(self, array: pa.Array) -> None:
         """Takes the next values of the column."""
-        gaps = array.null_count > 0
         self.some |= array.null_count < len(array)
-        self._present.update(_bytes_of(array.is_valid(), "|u1") if gaps else b"\1" * len(array))
+        self._present.update(_bytes_of(array.is_valid(), "|u1"))
         if pa.types.is_struct(self._kind):
             for child, part in zip(self._children, array.flatten(), strict=True):
                 child.update(part)
         elif _is_list(self._kind):
-            lengths = pc.list_value_length(array)
-            self._lengths.update(_bytes_of(pc.fill_null(lengths, 0) if gaps else lengths, "<i8"))
+            self._lengths.update(_bytes_of(pc.fill_null(pc.list_value_length(array), 0), "<i8"))
             self._children[0].update(array.flatten())
         elif pa.types.is_string(self._kind):
-            filled = pc.fill_null(array, "") if gaps else array
+            filled = pc.fill_null(array, "")
             self._lengths.update(_bytes_of(pc.binary_length(filled), "<i8"))
             self._values.update(text_bytes(filled))
         else:
             dtype, nothing = _PRIMITIVES[self._kind]
-            self._values.update(
-                _bytes_of(pc.fill_null(array, pa.scalar(nothing, self._kind)) if gaps else array, dtype)
-            )
+            self._values.update(_bytes_of(pc.fill_null(array, pa.scalar(nothing, self._kind)), dtype))
 
     def digest(self) -> bytes:
         """[32] bytes: of all values so far."""

@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import json
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -31,6 +31,9 @@ from schemas.dataset.layout import (
 from schemas.errors import CommitConflict, CorruptError, OutputError, plain_line
 from workers.store.manifest import listed_files
 from workers.store.store import Store
+
+ReadTable = Callable[[Store, CommitRecord, str], bytes]
+"""Gives the bytes of a range's table at a path."""
 
 _HEX = 64
 
@@ -61,7 +64,7 @@ def encode_record(record: CommitRecord) -> bytes:
     raw = record.model_dump(mode="json", exclude={"files", "scenes"})
     raw["files"] = [[entry.path, entry.bytes, entry.sha256] for entry in record.files]
     raw["marks"] = "".join(scene.digest.ljust(MARK, "-") for scene in record.scenes)
-    raw["failed"] = [[one.scene_id, one.outcome, one.reason] for one in record.scenes if one.outcome != "made"]
+    raw["failed"] = [[mark.scene_id, mark.outcome, mark.reason] for mark in record.scenes if mark.outcome != "made"]
     return seal_record(raw)
 
 
@@ -82,9 +85,8 @@ def decode_record(data: bytes, name: str) -> CommitRecord:
         return CommitRecord.model_validate(_expanded(raw))
     except ValidationError as error:
         first = error.errors()[0]
-        where = plain_line("".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part), 100)
-        told = plain_line(first["msg"].removeprefix("Value error, "), 300)
-        raise CorruptError(f"{name} is not a commit record: {where}{told}") from error
+        reason = ": ".join([*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")])
+        raise CorruptError(f"{name} is not a commit record: {plain_line(reason, 300)}") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise CorruptError(f"{name} is not a commit record: {error!r}"[:300]) from error
 
@@ -165,7 +167,7 @@ def commits_digest(store: Store) -> str:
 
 
 def _codes_and_sizes(store: Store, sizes: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    codes, found = array("q"), array("q")
+    codes, bytes_ = array("q"), array("q")
     for entry in store.files(COMMITS, sizes):
         name = entry.key.removeprefix(f"{COMMITS}/")
         if name.startswith("."):
@@ -174,8 +176,8 @@ def _codes_and_sizes(store: Store, sizes: bool) -> tuple[NDArray[np.int64], NDAr
         if commit is None:
             raise CorruptError(f"{COMMITS}/{name} in {store.name} is not a commit of this program: move it away")
         codes.append(code_of(*commit))
-        found.append(entry.bytes)
-    return np.asarray(codes), np.asarray(found)
+        bytes_.append(entry.bytes)
+    return np.asarray(codes), np.asarray(bytes_)
 
 
 def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None:
@@ -199,24 +201,16 @@ def require_record(store: Store, start: int, retry: int = 0) -> CommitRecord:
     return record
 
 
-def check_retries(start: int, retries: Sequence[int]) -> None:
-    """Raises CorruptError where one of a range's retries is there and one before it is not."""
-    if list(retries) != list(range(len(retries))):
-        raise CorruptError(
-            f"{COMMITS} has retries {list(retries)} of the range from scene {start}, and must have all from 0: restore it"
-        )
-
-
-def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
+def committed_files(store: Store, record: CommitRecord, read: ReadTable | None = None) -> tuple[FileEntry, ...]:
     """Every file of a commit, sorted by path: images or tars, shapes and the range's tables.
 
-    The record names tables and tars. The range's `views` and `assets` name the others; they are read in place or staged.
-    Raises CorruptError naming a table that is missing, damaged, or lists a file that is not the range's own.
+    The record names tables and tars. The range's `views` and `assets` name the others; `read` gives their bytes in place of
+    `read_range_file`. Raises CorruptError naming a table that is missing, damaged, or lists a file that is not the range's own.
     """
     files = {entry.path: entry for entry in record.files}
     for table in ("assets", "views") if record.terms.layout == "files" else ("assets",):
         path = range_table_path(record.span.start, table, record.span.retry)
-        listed = listed_files(table, read_range_file(store, record, path), path)
+        listed = listed_files(table, (read or read_range_file)(store, record, path), path)
         if (foreign := foreign_path(listed, record.span, record.terms.pairs_per_scene)) is not None:
             raise CorruptError(f"{path} lists {foreign!r}, which is not a file of its range")
         files |= {entry.path: entry for entry in listed}
@@ -274,22 +268,21 @@ def compare_attempts(
     Of the files, shapes are compared; a scene's digest covers its images. Scenes that failed
     environmentally in either are left out: a killed scene says nothing about bytes.
     """
-    theirs = {scene.scene_id: scene for scene in winner.scenes}
+    theirs = {mark.scene_id: mark for mark in winner.scenes}
+    pairs = [(mark, theirs[mark.scene_id]) for mark in mine.scenes if mark.scene_id in theirs]
     different = [
-        f"scene {scene.scene_id}"
-        for scene in mine.scenes
-        if (other := theirs.get(scene.scene_id)) is not None
-        and "environmental" not in (scene.outcome, other.outcome)
-        and (scene.outcome, scene.digest) != (other.outcome, other.digest)
+        f"scene {mark.scene_id}"
+        for mark, other in pairs
+        if mark != other and "environmental" not in (mark.outcome, other.outcome)
     ]
     shapes = {entry.path: entry.sha256 for entry in its_files if is_shape(entry.path)}
     different += [entry.path for entry in my_files if shapes.get(entry.path, entry.sha256) != entry.sha256]
     if not different:
         return None
+    stacks = [f"{one.attempt} on fingerprint {one.terms.fingerprint}" for one in (winner, mine)]
     return (
         f"two attempts made other bytes at {', '.join(different[:5])}{' and more' if len(different) > 5 else ''}: "
-        f"{winner.attempt} (committed) on fingerprint {winner.terms.fingerprint}, "
-        f"{mine.attempt} on fingerprint {mine.terms.fingerprint}"
+        f"{stacks[0]} (committed), {stacks[1]}"
     )
 
 

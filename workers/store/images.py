@@ -2,6 +2,7 @@
 
 import io
 import struct
+from collections.abc import Iterator
 from typing import cast
 
 import numpy as np
@@ -93,8 +94,8 @@ def decode_png(data: bytes, name: str = "an image") -> Pixels:
 
     Raises CorruptError naming a file that is torn, altered or no PNG.
     """
-    _check_chunks(data, name)
-    if (pixels := _decode_unfiltered(data)) is not None:  # in half of Pillow's time
+    body = b"".join(chunk for kind, chunk in _read_chunks(data, name) if kind == b"IDAT")
+    if (pixels := _decode_unfiltered(data, body)) is not None:  # in half of Pillow's time
         return pixels
     if data[24:26] == _RGB_16:
         raise CorruptError(
@@ -109,20 +110,14 @@ def decode_png(data: bytes, name: str = "an image") -> Pixels:
         raise CorruptError(f"{name} is a PNG file that cannot be decoded: {error}") from error
 
 
-def _decode_unfiltered(data: bytes) -> Pixels | None:
-    """The pixels of a grey or 3 x 16-bit PNG with whole chunks, whose rows have no filter, as written here; None of others."""
+def _decode_unfiltered(data: bytes, body: bytes) -> Pixels | None:
+    """The pixels of a grey or 3 x 16-bit PNG whose rows have no filter, as written here; None of others."""
     width, height, bits, kind, *_, interlaced = struct.unpack_from(">IIBBBBB", data, len(_SIGNATURE) + _CHUNK.size)
     if (bits, kind) not in ((8, 0), (16, 0), (16, 2)) or interlaced:
         return None
-    channels = 3 if kind else 1
-    position, body, row = len(_SIGNATURE), [], 1 + width * channels * bits // 8
-    while position < len(data):
-        size, chunk = _CHUNK.unpack_from(data, position)
-        if chunk == b"IDAT":
-            body.append(data[position + _CHUNK.size : position + _CHUNK.size + size])
-        position += _CHUNK.size + size + 4
+    row = 1 + width * (3 if kind else 1) * bits // 8
     try:
-        raw = zlib_ng.decompressobj().decompress(b"".join(body), height * row + 1)
+        raw = zlib_ng.decompressobj().decompress(body, height * row + 1)
     except zlib_ng.error:  # type: ignore[misc]
         return None
     if len(raw) != height * row:
@@ -132,11 +127,11 @@ def _decode_unfiltered(data: bytes) -> Pixels | None:
         return None
     samples = np.ascontiguousarray(rows[:, 1:])
     pixels = samples.view(">u2").astype(np.uint16) if bits == 16 else samples
-    return pixels.reshape((height, width, 3) if channels == 3 else (height, width))
+    return pixels.reshape((height, width, 3) if kind else (height, width))
 
 
-def _check_chunks(data: bytes, name: str) -> None:
-    """Raises CorruptError unless every chunk is whole: a decoder may fill up what a damaged one lacks."""
+def _read_chunks(data: bytes, name: str) -> Iterator[tuple[bytes, bytes]]:
+    """(kind, data) of every chunk. Raises CorruptError unless all are whole: a decoder may fill up what a damaged one lacks."""
     position, kind = len(_SIGNATURE), b""
     if not data.startswith(_SIGNATURE):
         raise CorruptError(f"{name} is not a PNG file")
@@ -145,6 +140,7 @@ def _check_chunks(data: bytes, name: str) -> None:
         end = position + _CHUNK.size + size
         if data[end : end + 4] != zlib_ng.crc32(data[position + 4 : end]).to_bytes(4, "big"):
             raise CorruptError(f"{name} is torn or altered at byte {position}: a PNG chunk fails its checksum")
+        yield kind, data[position + _CHUNK.size : end]
         position = end + 4
 
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from schemas.dataset.commit import LEDGER_SCHEMA, CommitRecord, CommitSummary, Ledger, rows_of, summarize
 from schemas.dataset.commit import join_rows as join_summaries
-from schemas.dataset.layout import LEDGER_FILE, MAX_RETRIES, range_table_path
+from schemas.dataset.layout import COMMITS, LEDGER_FILE, MAX_RETRIES, range_table_path
 from schemas.dataset.tables import SORT_KEYS
 from schemas.errors import CorruptError, MachineError, RunError
-from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
+from workers.store.commit import ReadTable, list_codes, read_range_file, require_record, split_code
 from workers.store.manifest import PARQUET_OPTIONS, decode_table, join_rows
 from workers.store.store import Store, map_ahead
 
@@ -33,14 +33,27 @@ def iter_committed(store: Store) -> Iterator[list[CommitRecord]]:
     Raises CorruptError for a damaged or missing record, OutputError for one of a newer version. Some are read ahead
     where requests wait.
     """
-    ranges = groupby(map(split_code, list_codes(store)), key=itemgetter(0))
-    groups = ((start, [retry for _, retry in names]) for start, names in ranges)
-    return map_ahead(store, lambda group: read_range(store, *group), groups)
+    return map_ahead(store, lambda group: read_range(store, *group), _group(list_codes(store)))
+
+
+def _group(codes: NDArray[np.int64]) -> Iterator[tuple[int, list[int]]]:
+    """(start, retries) of every range. Raises as `read_range`."""
+    for start, group in groupby(map(split_code, codes), key=itemgetter(0)):
+        retries = [retry for _, retry in group]
+        _check_retries(start, retries)
+        yield start, retries
+
+
+def _check_retries(start: int, retries: Sequence[int]) -> None:
+    if list(retries) != list(range(len(retries))):
+        raise CorruptError(
+            f"{COMMITS} has retries {list(retries)} of the range from scene {start}, and must have all from 0: restore it"
+        )
 
 
 def read_range(store: Store, start: int, retries: Sequence[int]) -> list[CommitRecord]:
-    """The records of one range. Raises as `iter_committed`."""
-    check_retries(start, retries)
+    """The records of one range. Raises as `iter_committed`, CorruptError where a retry before another one is missing."""
+    _check_retries(start, retries)
     return [require_record(store, start, retry) for retry in retries]
 
 
@@ -52,27 +65,28 @@ def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[lis
     awaited = first_scene
     for records in iter_committed(store):
         start, stop = records[0].span.start, records[0].span.stop
-        if start != awaited:
-            raise RunError(
-                _gap(awaited, min(start, stop_scene)) if start > awaited else _beyond(start, first_scene, stop_scene)
-            )
+        if start > awaited:
+            raise _gap(awaited, min(start, stop_scene))
+        if start < awaited or stop > stop_scene:
+            scene = start if start < awaited else stop - 1
+            asked = f"the {first_scene} to {stop_scene - 1} that were asked for"
+            raise RunError(f"scene {scene} is committed, outside {asked}")
         awaited = stop
-        if awaited > stop_scene:
-            raise RunError(_beyond(awaited - 1, first_scene, stop_scene))
         yield records
     if awaited < stop_scene:
-        raise RunError(_gap(awaited, stop_scene))
+        raise _gap(awaited, stop_scene)
 
 
-def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.Table:
+def range_rows(
+    store: Store, records: Sequence[CommitRecord], table: str, read: ReadTable = read_range_file
+) -> pa.Table:
     """The rows of one range, sorted by key; a retry's rows replace those of the scenes that it tried again.
 
     Rows of `assets` come from all records and may be repeated. Raises CorruptError naming a file that does not match its
     commit.
     """
     paths = [range_table_path(record.span.start, table, record.span.retry) for record in records]
-    read = (read_range_file(store, *which) for which in zip(records, paths, strict=True))
-    parts = [decode_table(table, data, path) for data, path in zip(read, paths, strict=True)]
+    parts = [decode_table(table, read(store, record, path), path) for record, path in zip(records, paths, strict=True)]
     if len(parts) == 1:
         return parts[0]
     if "scene_id" in parts[0].column_names:
@@ -83,18 +97,12 @@ def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.
     return join_rows(table, parts).sort_by([(key, "ascending") for key in SORT_KEYS[table]])
 
 
-def _gap(start: int, stop: int) -> str:
-    return f"scenes {start} to {stop - 1} are not committed: run the job again to make them"
-
-
-def _beyond(scene: int, first_scene: int, stop_scene: int) -> str:
-    return f"scene {scene} is committed, outside the {first_scene} to {stop_scene - 1} that were asked for"
+def _gap(start: int, stop: int) -> RunError:
+    return RunError(f"scenes {start} to {stop - 1} are not committed: run the job again to make them")
 
 
 _BATCH = 4_096
 """Records that are read before their rows are packed into columns."""
-_AT_ONCE = 16
-"""Requests to an object store at once."""
 _SAMPLES = 4
 """Records that a kept summary is compared with: one of another dataset has another job digest in all of them."""
 SAVE_EACH = 1_024
@@ -111,9 +119,10 @@ def list_commits(store: Store) -> Ledger:
     version.
     """
     codes = list_codes(store)
-    _check_all_retries(codes)
+    for _ in _group(codes):
+        pass  # a missing one is told
     kept = _read_kept(store, codes)
-    known = np.asarray(kept.column("start")) * MAX_RETRIES + np.asarray(kept.column("retry"))
+    known = _codes_of(kept)
     lost = tuple(split_code(code) for code in np.setdiff1d(known, codes, assume_unique=True))
     if lost:
         kept = kept.filter(pa.array(np.isin(known, codes)))
@@ -143,48 +152,25 @@ class LedgerKeeper:
 
     def __init__(self, store: Store, ledger: Ledger) -> None:
         self._store = store
-        self._parts = [ledger.rows]
-        self._count = ledger.rows.num_rows
+        self._rows = ledger.rows
         self._unkept = len(ledger.unkept) + len(ledger.lost)
+        """How many commits the written summary lacks, or has too many."""
         self._waiting: list[CommitSummary] = []
-        self._save_if_due()
+        self.add(())
 
     def add(self, summaries: Iterable[CommitSummary]) -> None:
         """Takes new commits."""
         self._waiting += summaries
-        if len(self._waiting) >= _BATCH or self._unkept + len(self._waiting) >= SAVE_EACH:
-            self._pack()
-            self._save_if_due()
+        if self._unkept + len(self._waiting) >= max(SAVE_EACH, SAVE_SHARE * self._rows.num_rows):
+            self.close()
 
     def close(self) -> None:
         """Writes what is not written."""
-        self._pack()
-        if self._unkept:
-            self._save()
-
-    def _pack(self) -> None:
-        self._parts.append(rows_of(self._waiting))
-        self._count += len(self._waiting)
-        self._unkept += len(self._waiting)
-        self._waiting = []
-
-    def _save_if_due(self) -> None:
-        if self._unkept >= max(SAVE_EACH, SAVE_SHARE * self._count):
-            self._save()
-
-    def _save(self) -> None:
-        self._parts = [join_summaries(self._parts)]
-        with contextlib.suppress(MachineError):  # a full disk stops the run where data are written, not here
-            save_rows(self._store, self._parts[0])
-        self._unkept = 0
-
-
-def _check_all_retries(codes: NDArray[np.int64]) -> None:
-    start, retry = np.divmod(codes, MAX_RETRIES)
-    awaited = np.where(start[1:] == start[:-1], retry[:-1] + 1, 0)
-    if (broken := np.flatnonzero(retry != np.append(np.zeros(len(codes[:1]), np.int64), awaited))).size:
-        at = start[broken[0]]
-        check_retries(int(at), retry[start == at].tolist())
+        if self._unkept or self._waiting:
+            self._rows = join_summaries([self._rows, rows_of(self._waiting)])
+            self._unkept, self._waiting = 0, []
+            with contextlib.suppress(MachineError):  # a full disk stops the run where data are written, not here
+                save_rows(self._store, self._rows)
 
 
 def read_kept_rows(store: Store) -> pa.Table | None:
@@ -197,24 +183,25 @@ def read_kept_rows(store: Store) -> pa.Table | None:
         raise CorruptError(f"{LEDGER_FILE} is damaged: remove it, the next run writes it again")
     try:
         names = ["fingerprint", "job_digest"]
-        with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True, read_dictionary=names) as file:
-            return join_summaries([file.read().select(LEDGER_SCHEMA.names).cast(LEDGER_SCHEMA)])
+        rows = pq.read_table(pa.BufferReader(data), read_dictionary=names)
+        return join_summaries([rows.select(LEDGER_SCHEMA.names).cast(LEDGER_SCHEMA)])
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        raise CorruptError(
-            f"{LEDGER_FILE} cannot be read ({error}): remove it, the next run writes it again"
-        ) from error
+        raise CorruptError(f"{LEDGER_FILE} is damaged ({error}): remove it, the next run writes it again") from error
+
+
+def _codes_of(rows: pa.Table) -> NDArray[np.int64]:
+    return np.asarray(rows.column("start")) * MAX_RETRIES + np.asarray(rows.column("retry"))
 
 
 def _read_kept(store: Store, codes: NDArray[np.int64]) -> pa.Table:
     """The rows of the kept summary; none where it is missing, damaged, or of other commits than those that are there."""
     none = LEDGER_SCHEMA.empty_table()
-    try:
+    rows = None
+    with contextlib.suppress(CorruptError):
         rows = read_kept_rows(store)
-    except CorruptError:
-        rows = None
     if rows is None:
         return none
-    known = np.asarray(rows.column("start")) * MAX_RETRIES + np.asarray(rows.column("retry"))
+    known = _codes_of(rows)
     shared = np.intersect1d(known, codes, assume_unique=True)
     for code in shared[np.linspace(0, len(shared) - 1, min(_SAMPLES, len(shared))).astype(int)]:
         row = rows.slice(int(np.searchsorted(known, code)), 1)

@@ -11,17 +11,16 @@ from pathlib import Path
 from typing import IO
 
 from schemas.dataset.layout import BEGUN, COMMITS, FENCED, RANGES, STAGING, TEMPORARY, scratch_path
-from schemas.errors import MachineError, OutputError
+from schemas.errors import MachineError
 from workers.store.file_system import (
     OpenTree,
+    cannot_be_written,
     explain_disk_errors,
     ignore_missing,
     probe_folder,
     refuse_link_out,
-    remedy_of,
     sync_folders,
     sync_path,
-    sync_tree,
     temporary_file,
 )
 from workers.store.store import Entry, Stage, Store, retry_if_swept
@@ -62,15 +61,11 @@ class LocalStore(Store):
                 sync_path(self.path(folder).parent)
             sync_path(self.root)
         except OSError as error:
-            why = remedy_of(error) or error.strerror or error
-            raise OutputError(f"{self.name} cannot be written: {why}; or choose another --out") from error
+            raise cannot_be_written(self.name, error) from error
         retry_if_swept(lambda: probe_folder(self.root))
 
-    def put_if_absent(self, key: str, data: bytes) -> bool:
-        """Links a finished temporary file to `key`: the one step that refuses a second writer."""
-        return self._link(key, data, TEMPORARY)
-
-    def _link(self, key: str, data: bytes, folder: str) -> bool:
+    def put_if_absent(self, key: str, data: bytes, folder: str = TEMPORARY) -> bool:
+        """Links a finished file in `folder` to `key`: the one step that refuses a second writer."""
         return not os.path.exists(self._at(key)) and self._place(os.link, key, data, folder)
 
     def put(self, key: str, data: bytes, durable: bool = True) -> None:
@@ -119,8 +114,8 @@ class LocalStore(Store):
     def stat(self, key: str) -> Entry | None:
         """Size and time of modification, without following what is no file to a later error."""
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            found = os.stat(self._at(key))
-            return Entry(key, found.st_size, found.st_mtime, None)
+            status = os.stat(self._at(key))
+            return Entry(key, status.st_size, status.st_mtime, None)
         return None
 
     def files(self, prefix: str, sizes: bool = True) -> Iterator[Entry]:
@@ -132,16 +127,20 @@ class LocalStore(Store):
                     yield from self.files(key, sizes)
                 elif not sizes:
                     yield Entry(key, 0, 0.0, None)
-                elif (found := self.stat(key)) is not None:
-                    yield found
+                elif (stored := self.stat(key)) is not None:
+                    yield stored
 
     def children(self, prefix: str) -> list[str]:
         """Folders directly below `prefix`."""
-        return [entry.name for entry in self._scan(prefix) if entry.is_dir(follow_symlinks=False)]
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(prefix)) as entries:
+            return sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
+        return []
 
     def names(self, prefix: str) -> list[str]:
         """Everything directly below `prefix`."""
-        return [entry.name for entry in self._scan(prefix)]
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            return sorted(os.listdir(self.path(prefix)))
+        return []
 
     def remove(self, key: str) -> None:
         """Removes a file."""
@@ -166,9 +165,9 @@ class LocalStore(Store):
         # Whoever uses an earlier one loses first its name, in one step, then its contents.
         with contextlib.suppress(FileNotFoundError):
             os.rename(self._own(prefix), self.path(f"{prefix}.{uuid.uuid4().hex}"))
-        for other in self.children(STAGING):
-            if f"{STAGING}/{other}".startswith(f"{prefix}."):
-                self.remove_tree(f"{STAGING}/{other}")
+        for other in (f"{STAGING}/{folder}" for folder in self.children(STAGING)):
+            if other.startswith(f"{prefix}."):
+                self.remove_tree(other)
         try:
             with self._explained(f"a file of the {name}"):
                 os.makedirs(self._own(key))
@@ -222,12 +221,6 @@ class LocalStore(Store):
                 os.makedirs(self._at(TEMPORARY), exist_ok=True)
             return retry_if_swept(place_once)
 
-    def _scan(self, prefix: str) -> list[os.DirEntry[str]]:
-        """What is directly below a folder, by name; nothing where there is no folder."""
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            return sorted(os.scandir(self.path(prefix)), key=lambda entry: entry.name)
-        return []
-
     def _explained(self, key: str) -> contextlib.AbstractContextManager[None]:
         return explain_disk_errors(f"{key} in {self.name} could not be written")
 
@@ -251,13 +244,10 @@ class LocalStage(Stage):
         """
         key = f"{self._staging}/{path}"
         with self._store._explained(key):
-            try:
-                file = open(self._store._at(key), "wb", opener=_open_uncut)  # noqa: SIM115 - closed below, on every path
-            except FileNotFoundError:
-                for folder in reversed(_folders_above(path)):  # never the attempt's own
-                    with contextlib.suppress(FileExistsError):
-                        os.mkdir(self._store._at(f"{self._staging}/{folder}"))
-                file = open(self._store._at(key), "wb", opener=_open_uncut)  # noqa: SIM115
+            for folder in reversed(_folders_above(path)):  # never the attempt's own
+                with contextlib.suppress(FileExistsError):
+                    os.mkdir(self._store._at(f"{self._staging}/{folder}"))
+            file = open(self._store._at(key), "wb", opener=_open_uncut)  # noqa: SIM115 - closed below, on every path
             try:
                 yield file
                 if self._tree is not None:
@@ -272,7 +262,7 @@ class LocalStage(Stage):
         """Flushes the folder and the names that lead to it."""
         with self._store._explained(self._staging):
             if self._tree is None:
-                return sync_tree(self._store.path(self._staging))
+                raise FileNotFoundError(f"{self._staging} was swept")
             try:
                 self._tree.flush(self._store.root)
             finally:
@@ -280,7 +270,7 @@ class LocalStage(Stage):
 
     def put_if_absent(self, key: str, data: bytes) -> bool:
         """Links a finished file of the folder to `key`."""
-        return self._store._link(key, data, self._staging)
+        return self._store.put_if_absent(key, data, self._staging)
 
     def close(self) -> None:
         """Closes the folder."""

@@ -3,11 +3,9 @@
 import hashlib
 import io
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -22,72 +20,32 @@ from schemas.dataset.tables import (
     SCHEMAS,
     SHAPE_FILE_COLUMNS,
     SORT_KEYS,
+    TABLES,
 )
-from schemas.errors import CorruptError
+from schemas.errors import CorruptError, plain_line
 from schemas.scene.scene import SceneOutput
 
-_Check = Callable[[Any], None]
 
-
-def _check_of(where: str, field: pa.Field) -> _Check | None:
-    """What raises ValueError for an absent value that must be there, or a number that is not finite; None: any value does.
-
-    Rows are checked as Python values: a scene has few of them, and each call into Arrow costs more than a value.
-    """
-    kind, inside = field.type, None
+def _check_values(where: str, field: pa.Field, array: pa.Array) -> None:
+    """Raises ValueError where, at any depth, a value is absent that must be there, or a number is not finite."""
+    kind = field.type
+    if array.null_count:
+        if not field.nullable:
+            raise ValueError(f"{where} is missing")
+        array = array.drop_null()
     if pa.types.is_floating(kind):
-        inside = partial(_check_numbers, where, False)
+        numbers = array.to_numpy()
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{where} is not finite: {numbers[~np.isfinite(numbers)][0]}")
     elif pa.types.is_struct(kind):
-        children = [(child.name, check) for child in kind if (check := _check_of(f"{where}.{child.name}", child))]
-        inside = partial(_check_struct, children) if children else None
+        for child, values in zip(kind, array.flatten(), strict=True):
+            _check_values(f"{where}.{child.name}", child, values)
     elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        item = kind.value_field
-        if pa.types.is_floating(item.type):
-            inside = partial(_check_numbers, where, item.nullable)
-        elif check := _check_of(where, item):
-            inside = partial(_check_list, check)
-    if field.nullable:
-        return inside and partial(_check_value, None, inside)
-    return partial(_check_value, where, inside)
-
-
-def _check_value(required: str | None, inside: _Check | None, value: Any) -> None:
-    if value is not None:
-        if inside is not None:
-            inside(value)
-    elif required is not None:
-        raise ValueError(f"{required} is missing")
-
-
-def _check_numbers(where: str, may_be_absent: bool, value: Any) -> None:
-    numbers = [value] if isinstance(value, float) else np.ravel(value).tolist()
-    for number in numbers:
-        if number is None:
-            if not may_be_absent:
-                raise ValueError(f"{where} is missing")
-        elif not math.isfinite(number):
-            raise ValueError(f"{where} is not finite: {number}")
-
-
-def _check_struct(children: Sequence[tuple[str, _Check]], value: Any) -> None:
-    for name, check in children:
-        check(value.get(name))
-
-
-def _check_list(check: _Check, value: Any) -> None:
-    for one in value:
-        check(one)
+        _check_values(where, kind.value_field, array.flatten())
 
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
-_ROWS = {table: pa.struct(list(schema)) for table, schema in SCHEMAS.items()}
-"""The type of a row, by table: all columns of a table are made in one call."""
-_CHECKS = {
-    table: [(field.name, check) for field in schema if (check := _check_of(f"{table}.{field.name}", field))]
-    for table, schema in SCHEMAS.items()
-}
-_EMPTY = {table: schema.empty_table() for table, schema in SCHEMAS.items()}
 _RANGE_OPTIONS: dict[str, Any] = {
     "compression": "lz4",
     "write_page_checksum": True,
@@ -105,7 +63,7 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
     required one is absent or a number is not finite.
     """
     if not rows:
-        return _EMPTY[table]
+        return SCHEMAS[table].empty_table()
     schema = SCHEMAS[table]
     names = set(schema.names)
     for row in rows:
@@ -114,43 +72,29 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
             raise ValueError(f"{table}: a row has other columns than the schema: {', '.join(wrong)}")
         if table == "scenes" and row["capture"] is None and (absent := [n for n in ALWAYS_OF_SCENES if row[n] is None]):
             raise ValueError(f"scenes.{absent[0]} is missing in scene {row['scene_id']}")
-    try:
-        arrays = pa.array(rows, _ROWS[table]).flatten()
-    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
-        arrays = [_column(table, field, rows) for field in schema]  # says which column it is
-    for row in rows:
-        for name, check in _CHECKS[table]:
-            check(row[name])
+    arrays = []
+    for field in schema:
+        try:
+            arrays.append(pa.array([row[field.name] for row in rows], field.type))
+        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
+            raise ValueError(f"{table}.{field.name}: {error}") from error
+        _check_values(f"{table}.{field.name}", field, arrays[-1])
     return pa.Table.from_arrays(arrays, schema=schema)
-
-
-def _column(table: str, field: pa.Field, rows: Sequence[Mapping[str, object]]) -> pa.Array:
-    """One column of the rows. Raises ValueError naming it where a value has the wrong type."""
-    try:
-        return pa.array([row[field.name] for row in rows], field.type)
-    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
-        raise ValueError(f"{table}.{field.name}: {error}") from error
 
 
 def outcome_of(output: SceneOutput) -> Outcome:
     """How the scene ended. Raises ValueError unless its rows give exactly one outcome, of this scene alone."""
-    scene_id, tables = output.scene_id, output.rows
-    for table, rows in tables.items():
-        if any(row.get("scene_id", scene_id) != scene_id for row in rows):
-            raise ValueError(f"scene {scene_id} has rows of another scene in {table}")
-    made, failed, timed = (len(tables.get(table, ())) for table in ("scenes", "failures", "timings"))
-    if made + failed != 1 or timed > 1:
+    tables: dict[str, Sequence[Mapping[str, Any]]] = {table: output.rows.get(table, ()) for table in TABLES}
+    counts = {table: len(rows) for table, rows in tables.items() if rows}
+    kinds = ["made" for _ in tables["scenes"]] + [row["kind"] for row in tables["failures"]]
+    alone = all(row.get("scene_id", output.scene_id) == output.scene_id for rows in tables.values() for row in rows)
+    fits = "scenes" in counts or not counts.keys() & {"views", "objects", "assets"}
+    if not (alone and fits and len(kinds) == 1 and kinds[0] in get_args(Outcome) and counts.get("timings", 0) <= 1):
         raise ValueError(
-            f"scene {scene_id} has {made} rows in scenes and {failed} in failures, and must have one in all"
+            f"scene {output.scene_id} must have one row in scenes, or a failure of a known kind and nothing else, and no row "
+            f"of another scene: it ended as {kinds}, with rows {counts}"
         )
-    if made:
-        return "made"
-    if extra := [table for table in ("views", "objects", "assets") if tables.get(table)]:
-        raise ValueError(f"scene {scene_id} failed and has rows in {', '.join(extra)}")
-    kind = tables["failures"][0]["kind"]
-    if kind not in ("intrinsic", "environmental"):
-        raise ValueError(f"scene {scene_id} failed with the unknown kind {kind!r}")
-    return kind
+    return cast(Outcome, kinds[0])
 
 
 def check_files(output: SceneOutput, entries: Mapping[str, FileEntry]) -> None:
@@ -161,10 +105,9 @@ def check_files(output: SceneOutput, entries: Mapping[str, FileEntry]) -> None:
         if not is_plain_path(path) or path[0] in "_.":
             raise ValueError(f"{path!r} is not a path that a scene may write")
     listed = [(file["path"], file["bytes"], file["sha256"]) for file in files_of_rows(output.rows)]
-    told = {(path, entry.bytes, entry.sha256) for path, entry in entries.items() if not is_glb(path)}
-    if len(listed) != len(told) or set(listed) != told:
-        paths = {path for path, _, _ in listed}.symmetric_difference(path for path, _, _ in told)
-        wrong = sorted(paths) or ["sizes, digests or repetitions"]
+    written = [(path, entry.bytes, entry.sha256) for path, entry in entries.items() if not is_glb(path)]
+    if sorted(listed) != sorted(written):
+        wrong = sorted({path for path, *_ in set(listed) ^ set(written)}) or ["repetitions"]
         raise ValueError(f"scene {output.scene_id}: files and rows disagree about {', '.join(wrong[:5])}")
 
 
@@ -202,19 +145,19 @@ def sorted_rows(table: str, rows: pa.Table) -> pa.Table:
         distinct = {json.dumps(row): index for index, row in enumerate(rows.to_pylist())}
         if len(distinct) < rows.num_rows:
             rows = rows.take(pa.array(distinct.values(), pa.int64()))
-    keys = _keys(rows, names)
+    keys = row_keys(table, rows)
     if keys != sorted(keys):
         rows = rows.sort_by([(name, "ascending") for name in names])
-        keys = _keys(rows, names)
+        keys = row_keys(table, rows)
     for key, following in pairwise(keys):
         if key == following:
             raise ValueError(f"{table}: two rows have the key {', '.join(names)} = {', '.join(map(str, key))}")
     return rows
 
 
-def _keys(rows: pa.Table, names: Sequence[str]) -> list[tuple[Any, ...]]:
-    """The values of these columns, a tuple for each row."""
-    return list(zip(*(rows.column(name).to_pylist() for name in names), strict=True))
+def row_keys(table: str, rows: pa.Table) -> list[tuple[Any, ...]]:
+    """The key of each row."""
+    return list(zip(*(rows.column(name).to_pylist() for name in SORT_KEYS[table]), strict=True))
 
 
 def encode_table(rows: pa.Table) -> bytes:
@@ -228,21 +171,22 @@ def encode_table(rows: pa.Table) -> bytes:
 
 def with_shape_files(assets: pa.Table, files: Mapping[str, FileEntry]) -> pa.Table:
     """Rows of `assets` with the columns `SHAPE_FILE_COLUMNS`, from `files` by path."""
-    found = [files.get(asset_path(row["category"], row["instance_id"])) for row in assets.to_pylist()]
+    entries = [files.get(asset_path(row["category"], row["instance_id"])) for row in assets.to_pylist()]
     for field, name in zip(SHAPE_FILE_COLUMNS, ("bytes", "sha256"), strict=True):
-        assets = assets.append_column(field, pa.array([entry and getattr(entry, name) for entry in found], field.type))
+        values = [entry and getattr(entry, name) for entry in entries]
+        assets = assets.append_column(field, pa.array(values, field.type))
     return assets
 
 
 def files_of_assets(assets: pa.Table) -> list[FileEntry]:
     """The files that rows of a range's `assets` list: GLBs, and samples. Raises KeyError without `SHAPE_FILE_COLUMNS`."""
-    sizes, digests = (assets.column(field.name).to_pylist() for field in SHAPE_FILE_COLUMNS)
-    entries = []
     names = [name for name in ("category", "instance_id", "samples") if name in assets.column_names]
-    for row, size, sha256 in zip(assets.select(names).to_pylist(), sizes, digests, strict=True):
-        if sha256 is not None:
+    size, sha256 = (field.name for field in SHAPE_FILE_COLUMNS)
+    entries = []
+    for row in assets.select([*names, size, sha256]).to_pylist():
+        if row[sha256] is not None:
             path = asset_path(row["category"], row["instance_id"])
-            entries.append(FileEntry(path=path, bytes=size, sha256=sha256))
+            entries.append(FileEntry(path=path, bytes=row[size], sha256=row[sha256]))
         if (samples := row.get("samples")) is not None:
             entries.append(FileEntry(**{name: samples[name] for name in FileEntry.model_fields}))
     return entries
@@ -258,7 +202,7 @@ def listed_files(table: str, data: bytes, name: str) -> list[FileEntry]:
             return files_of_assets(rows)
         return [FileEntry.model_validate(entry) for entry in pc.list_flatten(rows.column("files")).to_pylist()]
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        raise CorruptError(f"{name} cannot be read: {' '.join(str(error).split())[:300]}") from error
+        raise _unreadable(name, error) from error
 
 
 def decode_table(table: str, data: bytes, name: str) -> pa.Table:
@@ -266,16 +210,16 @@ def decode_table(table: str, data: bytes, name: str) -> pa.Table:
 
     Raises CorruptError naming the file where a page fails its checksum, the file is torn, or it is another table.
     """
-    return conform(table, decode_rows(data, name), name)
-
-
-def decode_rows(data: bytes, name: str) -> pa.Table:
-    """The rows of Parquet bytes in the schema that they were written in. Raises CorruptError naming the file."""
     try:
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
-            return file.read(use_threads=False)  # a pool of threads takes longer than a range's few rows
+            rows = file.read(use_threads=False)  # a pool of threads takes longer than a range's few rows
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise CorruptError(f"{name} cannot be read: {error}; `verso verify` lists every damaged file") from error
+        raise _unreadable(name, error) from error
+    return conform(table, rows, name)
+
+
+def _unreadable(name: str, error: Exception) -> CorruptError:
+    return CorruptError(f"{name} cannot be read: {plain_line(str(error))}; `verso verify` lists every damaged file")
 
 
 def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
@@ -297,7 +241,7 @@ def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
     try:
         return rows.select(schema.names).cast(schema)  # Parquet has other names inside lists
     except (pa.ArrowException, ValueError) as error:
-        raise CorruptError(f"{name} cannot be read: {error}; `verso verify` lists every damaged file") from error
+        raise _unreadable(name, error) from error
 
 
 def _nulls(count: int, kind: pa.DataType) -> pa.Array:

@@ -64,10 +64,9 @@ class ObjectStore(Store):
         try:
             # A coordinator that already works here may sweep a probe away between its two puts.
             refused = any(self._refuses_a_second_put() for _ in range(3))
-        except (NotSupportedError, NotImplementedError):
-            refused = False
-        except (BaseError, OSError) as error:
-            if not any(word in str(error) for word in _NOT_IMPLEMENTED):
+        except (BaseError, OSError, NotImplementedError) as error:
+            known = isinstance(error, (NotSupportedError, NotImplementedError))
+            if not known and not any(word in str(error) for word in _NOT_IMPLEMENTED):
                 raise OutputError(f"{self.name} cannot be written: {_first_line(error)}") from error
             refused = False
         if not refused:
@@ -153,15 +152,15 @@ class ObjectStore(Store):
     def children(self, prefix: str) -> list[str]:
         """Common prefixes of keys, directly below `prefix`."""
         with self._explained(prefix):
-            found = obstore.list_with_delimiter(self._bucket, prefix)["common_prefixes"]
-        return sorted(path.rpartition("/")[2] for path in found)
+            below = obstore.list_with_delimiter(self._bucket, prefix)
+        return sorted(path.rpartition("/")[2] for path in below["common_prefixes"])
 
     def names(self, prefix: str) -> list[str]:
         """Objects and common prefixes of keys, directly below `prefix`."""
         with self._explained(prefix):
-            found = obstore.list_with_delimiter(self._bucket, prefix)
-        objects = [meta["path"] for meta in found["objects"]]
-        return sorted(path.rpartition("/")[2] for path in [*objects, *found["common_prefixes"]])
+            below = obstore.list_with_delimiter(self._bucket, prefix)
+        paths = [*below["common_prefixes"], *(meta["path"] for meta in below["objects"])]
+        return sorted(path.rpartition("/")[2] for path in paths)
 
     def remove(self, key: str) -> None:
         """Deletes an object."""
@@ -192,8 +191,8 @@ class ObjectStore(Store):
                     raise _replaced(key)
                 return Entry(key, size, 0.0, put["e_tag"])
         except (AlreadyExistsError, PreconditionError, FileNotFoundError) as error:
-            found = self.stat(key)
-            if found is None or found.bytes != size or self.read(key) != local.read_bytes():
+            stored = self.stat(key)
+            if stored is None or stored.bytes != size or self.read(key) != local.read_bytes():
                 raise _replaced(key) from error
             return None  # an answer was lost, or another put the same
 

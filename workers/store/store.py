@@ -84,8 +84,8 @@ class Store(Protocol):
 
     def size(self, key: str) -> int | None:
         """Bytes of the file at `key`, None where there is none."""
-        found = self.stat(key)
-        return found.bytes if found else None
+        entry = self.stat(key)
+        return entry.bytes if entry else None
 
     def files(self, prefix: str, sizes: bool = True) -> Iterator[Entry]:
         """Every file at any depth below the folder `prefix` (all there are for ""), in any order, one at a time.
@@ -157,9 +157,9 @@ def is_live(store: Store, staging: str) -> bool:
 
 def stat_all(store: Store, folders: Iterable[str], keys: Iterable[str]) -> dict[str, Entry]:
     """By key: every file at any depth below the folders, and those of `keys` that are there."""
-    asked: list[tuple[bool, str]] = [*((True, folder) for folder in folders), *((False, key) for key in keys)]
-    found = map_ahead(store, lambda one: [*store.files(one[1])] if one[0] else [store.stat(one[1])], asked)
-    return {entry.key: entry for entries in found for entry in entries if entry is not None}
+    asked = [*((True, folder) for folder in folders), *((False, key) for key in keys)]
+    answers = map_ahead(store, lambda item: [*store.files(item[1])] if item[0] else [store.stat(item[1])], asked)
+    return {entry.key: entry for entries in answers for entry in entries if entry is not None}
 
 
 def map_ahead(store: Store, function: Callable[[A], B], items: Iterable[A], at_once: int | None = None) -> Iterator[B]:
@@ -211,15 +211,16 @@ class Events:
     def __init__(self, store: Store, folder: str) -> None:
         self._store = store
         self._folder = folder
-        self._known: dict[int, bytes] = {}
-        """Events that were read, by number: they never change."""
+        self._known: list[bytes] = []
+        """Events that were read: they never change."""
 
     def read(self) -> list[bytes]:
         """All events from the first. Raises CorruptError where one is missing, or the folder holds what is none."""
         names = self._store.names(self._folder)
         if names != [event_path("", number)[1:] for number in range(len(names))]:
             raise CorruptError(f"{self._store.name}/{self._folder} lacks an event, or holds what is none")
-        return [self._read(number) for number in range(len(names))]
+        self._known += [self._store.read(f"{self._folder}/{name}") for name in names[len(self._known) :]]
+        return self._known[: len(names)]
 
     def append(self, decide: Callable[[Sequence[bytes]], bytes | None]) -> list[bytes] | None:
         """Adds the event that `decide` makes of all events before it, and returns all; None where it makes none.
@@ -237,11 +238,6 @@ class Events:
                 return [*before, event]
             time.sleep(pause_s)
             pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
-
-    def _read(self, number: int) -> bytes:
-        if number not in self._known:
-            self._known[number] = self._store.read(event_path(self._folder, number))
-        return self._known[number]
 
 
 def event_path(folder: str, number: int) -> str:

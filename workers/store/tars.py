@@ -60,10 +60,10 @@ def pose_labels(rows: Rows) -> dict[tuple[str, int], dict[str, Any]]:
             continue
         key = (view["category"], pose_id)
         label = labels.setdefault(key, {"pose_id": pose_id, "views": {}, **_of_scene(scene, assets)})
-        own = sorted(objects[view["pose_id"], view["role"]], key=lambda row: row["region_id"])
+        seen = sorted(objects[view["pose_id"], view["role"]], key=lambda row: row["region_id"])
         label["views"][view["role"]] = {
             **{name: value for name, value in view.items() if name not in NOT_OF_A_VIEW},
-            "objects": [{name: value for name, value in row.items() if name not in NOT_OF_AN_OBJECT} for row in own],
+            "objects": [{name: value for name, value in row.items() if name not in NOT_OF_AN_OBJECT} for row in seen],
         }
     return labels
 
@@ -99,22 +99,19 @@ def decode_label(data: bytes) -> dict[str, Any]:
     return label
 
 
-def label_differences(stored: Any, derived: Any, path: str = "") -> Iterator[str]:
+def label_differences(stored: Mapping[str, Any], derived: Mapping[str, Any]) -> list[str]:
     """Dotted paths at which a stored label differs from the tables'; of keys that were added since, none counts as equal."""
-    if isinstance(stored, dict) and isinstance(derived, dict):
-        for name in sorted(stored.keys() | derived.keys()):
-            if name not in stored and derived[name] is None:
-                continue
-            inner = f"{path}.{name}" if path else name
-            if name not in stored or name not in derived:
-                yield inner
-            else:
-                yield from label_differences(stored[name], derived[name], inner)
-    elif isinstance(stored, list) and isinstance(derived, list) and len(stored) == len(derived):
-        for number, (one, other) in enumerate(zip(stored, derived, strict=True)):
-            yield from label_differences(one, other, f"{path}.{number}")
-    elif type(stored) is not type(derived) or repr(stored) != repr(derived):
-        yield path
+    mine, theirs = dict(_leaves(stored)), dict(_leaves(derived))
+    return [path for path in sorted(mine.keys() | theirs) if mine.get(path, "None") != theirs.get(path)]
+
+
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """(dotted path, text) of every value that is not a list or a mapping with items."""
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    if not items or not value:
+        yield path, repr(value)
+    for key, inner in items:
+        yield from _leaves(inner, f"{path}.{key}".lstrip("."))
 
 
 _PATH = re.compile(
@@ -129,23 +126,23 @@ _CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
 
 def member_of(path: str) -> tuple[str, str]:
     """(category, member name) of an image. Raises ValueError where the path is not an image's."""
-    found = _match(_PATH, path)
-    index = "" if found["object"] is None else f".obj{found['object']}"
-    return found["category"], f"{found['pose']}.{found['content']}{'.patch' if found['patch'] else ''}{index}.png"
+    parts = _match(_PATH, path)
+    index = "" if parts["object"] is None else f".obj{parts['object']}"
+    return parts["category"], f"{parts['pose']}.{parts['content']}{'.patch' if parts['patch'] else ''}{index}.png"
 
 
 def path_of(category: str, member: str) -> str:
     """The path of the image that a member holds. Raises ValueError where the name is not a member's."""
-    found = _match(_MEMBER, member)
-    index = None if found["object"] is None else int(found["object"])
-    name, pose_id = cast(Content, found["content"]), int(found["pose"])
-    return (patch_path if found["patch"] else image_path)(category, name, pose_id, index)
+    parts = _match(_MEMBER, member)
+    index = None if parts["object"] is None else int(parts["object"])
+    name, pose_id = cast(Content, parts["content"]), int(parts["pose"])
+    return (patch_path if parts["patch"] else image_path)(category, name, pose_id, index)
 
 
 def member_order(path: str) -> tuple[int, int, bool, int]:
     """Sorts the images of a scene: by pose, then in the order of the article's figure 1, each before its patches."""
-    found = _match(_PATH, path)
-    return int(found["pose"]), _CONTENTS.index(found["content"]), bool(found["patch"]), int(found["object"] or 0)
+    parts = _match(_PATH, path)
+    return int(parts["pose"]), _CONTENTS.index(parts["content"]), bool(parts["patch"]), int(parts["object"] or 0)
 
 
 def label_member(pose_id: int) -> str:
@@ -177,12 +174,12 @@ def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tupl
     return faults
 
 
-def _label_fault(content: bytes, derived: Mapping[str, object] | None) -> str:
+def _label_fault(content: bytes, derived: Mapping[str, Any] | None) -> str:
     """How a stored label differs from the tables'; empty where it does not."""
     if derived is None:
         return "is of a pose that the tables do not have"
     try:
-        different = list(label_differences(decode_label(content), derived))
+        different = label_differences(decode_label(content), derived)
     except ValueError as error:
         return f"is no label: {plain_line(str(error))}"
     return f"differs from the tables at {', '.join(map(plain_line, different[:3]))}" if different else ""
@@ -224,7 +221,9 @@ class Packing:
             if not self._tar or is_shape(path):
                 self._stage.write(path, data)
         labels = pose_labels({table: tables[table].to_pylist() for table in LABEL_TABLES}) if images else {}
-        for (category, pose_id), paths in groupby(sorted(images, key=member_order), key=_sample_of):
+        for (category, pose_id), paths in groupby(
+            sorted(images, key=member_order), key=lambda path: (member_of(path)[0], member_order(path)[0])
+        ):
             if category not in self._archives:
                 name = tar_path(category, self._span.start, self._span.retry)
                 self._archives[category] = _Archive(name, self._stage.stream(name))
@@ -277,13 +276,8 @@ class _Archive:
         self._sha256.update(data)
 
 
-def _sample_of(path: str) -> tuple[str, int]:
-    """(category, pose id) of an image."""
-    return member_of(path)[0], member_order(path)[0]
-
-
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:
-    found = pattern.fullmatch(name)
-    if found is None or found["content"] not in _CONTENTS:
+    match = pattern.fullmatch(name)
+    if match is None or match["content"] not in _CONTENTS:
         raise ValueError(f"{name!r} is not the name of an image")
-    return found
+    return match

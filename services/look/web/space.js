@@ -43,7 +43,7 @@ function fill(data) {
     points.userData.tint = TINTS[cloud.role];
     space.parts[cloud.role] = points;
     space.clouds.push(points);
-    if (cloud.camera) cameras.add(cameraOf(cloud, target));
+    cameras.add(cameraOf(cloud, target));
   }
   data.bodies.forEach((body) => mesh.add(bodyOf(body)));
   Object.assign(space.parts, { mesh, cameras });

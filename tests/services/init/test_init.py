@@ -134,6 +134,27 @@ def test_wrong_input_is_one_clear_line_and_leaves_and_overwrites_nothing(tmp_pat
     assert code == 2 and "none of its meshes can be used: 1 left out" in err
 
 
+def test_a_disk_that_is_full_at_any_file_is_told_in_a_line_and_the_next_init_goes_on(tmp_path, capsys, monkeypatch):
+    write_mesh(tmp_path / "m/x/cup_1.stl", cup())
+    whole, out = Path.write_bytes, tmp_path / "lib"
+    for name in ("library.parquet", r"x-cup_1-\w+.glb", "sheet.jpg", "job.yaml"):
+
+        def write_or_fail(path, data, name=name):
+            if re.fullmatch(rf"\.{name}\.\d+", path.name):
+                raise OSError(28, "No space left on device")
+            return whole(path, data)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "write_bytes", write_or_fail)
+            code, _, err = init(tmp_path / "m", "--out", out, capsys=capsys)
+        assert code == 2 and re.search(rf"{name} cannot be written: No space left on device", err), (name, err)
+        assert "Traceback" not in err
+    assert init(tmp_path / "m", "--out", out, capsys=capsys)[0] == 0
+    (row,) = read_table(out).rows
+    assert row.parts > 3, "a cup is hollow"
+    assert not [path.name for path in out.rglob(".*") if path.name != ".lock"], "no part of a file stays"
+
+
 def test_without_opengl_there_is_a_library_and_no_picture(tmp_path, capsys, monkeypatch):
     def no_gl():
         raise MachineError("no OpenGL here: install libegl1")

@@ -13,15 +13,15 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from schemas.base import set_key
 from schemas.errors import JobError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
-from schemas.job.keys import set_key
 from services.cli.main import main
 from services.job.job_file import NEEDS, describe_idle, load_job, pack_job, validate_job
 from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
 from services.job.reference import allowed_keys, describe_allowed, list_keys, write_doc
-from services.run import dry_run
+from services.run import run_job
 from tests.mutations import mutated_bytes, mutated_tree
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -158,8 +158,8 @@ def test_what_is_no_job_file_is_told_and_not_read_for_ever(tmp_path):
 CHANGES = (
     ("nonsense", ["write it as path.to.key=value"]),
     ("=3", ["write it as path.to.key=value"]),
-    ("name.deeper=3", ["'name' is 'a' and has no keys"]),
-    ("name.deeper.more=3", ["'a' has no key 'deeper'"]),
+    ("name.deeper=3", ["'name' is 'a' and has no key 'deeper'"]),
+    ("name.deeper.more=3", ["'name' is 'a' and has no key 'deeper'"]),
     ("assets.objects.7.weight=1", ["'7' must be a position from 0 to 0"]),
     ("assets.objects.first.weight=1", ["'first' must be a position from 0 to 0"]),
     ("assets.objects." + "9" * 300 + "=1", ["assets.objects"]),
@@ -177,7 +177,7 @@ CHANGES = (
 
 
 def test_changes_reach_every_depth_and_one_that_cannot_be_made_is_told_in_a_line(tmp_path):
-    assert "there is nothing at 'cameras'" in fault(write(tmp_path, "name: a\ncameras:"), "cameras.more=3")
+    assert "'cameras' is None and has no key 'more'" in fault(write(tmp_path, "name: a\ncameras:"), "cameras.more=3")
     path = write(tmp_path, "name: a\nassets: {objects: [{source: procedural}]}")
     for change, words in CHANGES:
         message = fault(path, change)
@@ -291,7 +291,7 @@ def peak_mb() -> float:
 
 @pytest.mark.parametrize("numbers", [range(40), pytest.param(range(100, 2100), marks=pytest.mark.slow)], ids=len)
 def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(dry_run, "measure_scene", lambda job, catalogue: None)  # this is about reading jobs
+    monkeypatch.setattr(run_job, "measure_scene", lambda job, catalogue: None)  # this is about reading jobs
     path, out, outcomes = tmp_path / "job.yaml", str(tmp_path / "out"), Counter()
     main(["run", str(EXAMPLES[-1]), "--dry-run", "--out", out])  # loads what reading a job loads
     before = peak_mb()

@@ -6,7 +6,6 @@ import shutil
 import numpy as np
 import pyarrow as pa
 import pytest
-import trimesh
 
 from schemas.dataset.tables import SCHEMAS
 from services.look.collect import collect
@@ -68,7 +67,6 @@ ASSETS = [
 class Handmade:
     """Tables of rows, in batches of one and of the rest."""
 
-    merged: tuple[str, ...] = ()
     sampled = False
 
     def __init__(self, **tables) -> None:
@@ -94,18 +92,3 @@ def targets(tmp_path_factory) -> LocalStore:
     changes = {"scenes": 1, "objects_per_scene": 2, "categories": ["mug"], "start": {"offset_m": [-0.12, 0.12]}}
     images = {"views": list(VIEW_TARGETS), "layers": 2}
     return make_dataset(tmp_path_factory.mktemp("targets"), targets=images, **changes)[0]
-
-
-@pytest.fixture(scope="package")
-def sampled(targets, tmp_path_factory):
-    """The same scene with samples: the corners of each mesh as the surface, half as far out as inside, twice as outside."""
-    store = LocalStore(shutil.copytree(targets.root, tmp_path_factory.mktemp("sampled") / "sampled"))
-    for file in (store.root / "assets" / "mug").glob("*.glb"):
-        v = np.asarray(trimesh.load(file, force="mesh", process=False).vertices, np.float32)
-        colors = np.full((len(v), 3), (10, 200, 30), np.uint8)
-        distance = np.repeat(np.array([-1, 1], np.float32), len(v))
-        surface = {"surface_points": v, "surface_normals": np.zeros_like(v), "surface_colors": colors}
-        volume = {"volume_points": np.concatenate([v / 2, v * 2]), "volume_distance": distance}
-        volume |= {"volume_occupancy": np.uint8(distance < 0), "loc": np.zeros(3), "scale": np.float64(1)}
-        np.savez(file.with_suffix(".npz"), **surface, **volume)
-    return store

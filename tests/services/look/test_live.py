@@ -27,7 +27,6 @@ from services.look.live import (
     Progress,
     latest_scenes,
     live_html,
-    progress_of,
     read_progress,
     title_of,
 )
@@ -51,32 +50,21 @@ def test_a_folder_is_empty_made_stopped_finished_or_unreadable(tmp_path, unflush
     assert read_progress(store).phase == "empty"
     store.put("job.yaml", encode_job(record_job(Job(name="small", seed=1, scenes=8), "0" * 64, store.root)))
     progress = read_progress(store)
-    assert (progress.phase, progress.name, progress.asked) == ("empty", "small", 8)
+    assert (progress.phase, progress.name, progress.status.asked) == ("empty", "small", 8)
     attempt_at(store, 0, 4).commit()
     attempt_at(store, 4, 8).commit()  # scene 5 fails
     with hold_lock(store):
         progress = read_progress(store)
-    assert (progress.phase, progress.asked, progress.made, progress.done) == ("making", 8, 7, 8)
-    assert progress.failed == {"intrinsic: left_table": 1}
+    status = progress.status
+    assert (progress.phase, status.asked, status.made, progress.done) == ("making", 8, 7, 8)
+    assert status.failed == {"intrinsic: left_table": 1}
     assert read_progress(store).phase == "stopped"
     assert latest_scenes(store) == []  # their images are no PNG
     merge(store, 0, 8)
     assert read_progress(store).phase == "finished"
     store.put("job.yaml", b"verso: [")
     progress = read_progress(store)
-    assert progress.phase == "unreadable" and "job.yaml" in progress.told[0]
-
-
-def test_time_left_is_what_is_missing_at_the_rate_of_now_and_what_died_has_none():
-    running, failed = (Running(40, "a", 41), Running(50, "b", None)), {"intrinsic: x": 2}
-    status = Status(100, 38, failed, 60, 3.0, digest=None, running=running, holder=None)
-    now, gone = (progress_of("small", status, lives) for lives in (True, False))
-    assert (now.left_s, now.running) == (20.0, (41,))
-    assert progress_of("small", replace(status, scenes_per_s=None), True).left_s is None
-    assert (gone.phase, gone.scenes_per_s, gone.left_s, gone.running) == ("stopped", None, None, ())
-    digest = replace(status, digest="d" * 64)  # an extension that has not begun is not finished
-    assert progress_of("small", digest, False).phase == "stopped"
-    assert progress_of("small", replace(digest, missing=0), False).phase == "finished"
+    assert progress.phase == "unreadable" and "job.yaml" in progress.damage
 
 
 def test_the_latest_scenes_are_those_of_the_newest_commits(shown):
@@ -88,16 +76,22 @@ def test_the_latest_scenes_are_those_of_the_newest_commits(shown):
 
 
 def test_the_live_section_tells_done_rate_time_left_failures_and_scenes_and_is_no_markup_of_theirs():
-    making = Progress("making", "small", 1000, 380, {"intrinsic: left_table": 2}, 3.14159, 197.0, (41, 57))
+    at = tuple(Running(40, "a", scene_id) for scene_id in (41, None, 57, 3, 4, 5))
+    status = Status(1000, 380, {"intrinsic: left_table": 2}, 618, 3.14159, None, at[:3], None)
+    making = Progress("making", "small", status)
     html = live_html(making, [scene(3, "<i>box"), scene(4, "mug")], address)
-    assert "382 of 1,000 scenes · 3.1 a second · 3.3 min left · 2 failed · now at 41, 57" in html
+    assert "382 of 1,000 scenes · 2 failed · 3.1 a second · 3.3 min left · now at 41, 57" in html
     assert '<progress max="1000" value="382"' in html and "<li>2 failed, intrinsic: left table</li>" in html
     assert html.count("<img") == 4 and "<i>" not in html and title_of(making) == "38% · small"
-    assert "now at 1, 2, 3, 4 and more" in live_html(replace(making, running=(1, 2, 3, 4, 5)), (), address)
+    many = replace(making, status=replace(status, running=at, scenes_per_s=None))
+    assert "2 failed · now at 41, 57, 3, 4 and more" in live_html(many, (), address)
+    assert "second" not in live_html(replace(making, phase="stopped"), (), address)
     assert "There is no job yet." in live_html(Progress("empty"), (), address)
-    assert "The job small asks for 12 scenes." in live_html(Progress("empty", "small", 12), (), address)
+    assert "The job small asks for 12 scenes." in live_html(
+        Progress("empty", "small", replace(status, asked=12)), (), address
+    )
     assert title_of(Progress("empty")) == "Verso"
-    html = live_html(Progress("unreadable", told=("job.yaml is <broken>",)), [scene(3, "box")], address)
+    html = live_html(Progress("unreadable", damage="job.yaml is <broken>"), (), address)
     assert "<li>job.yaml is &lt;broken&gt;</li>" in html and "<img" not in html
 
 
@@ -171,13 +165,13 @@ def test_a_report_is_not_made_again_while_nothing_changes_nor_at_once(shown, mon
 
 def test_what_is_finished_is_told_at_once_also_after_a_report_that_took_long(shown, monkeypatch):
     follower, sections = Follower(shown, 2), []
-    begun = progress_of("x", Status(96, 80, {}, 16, 3.0, digest=None, running=(), holder=None), True)
+    begun = Progress("making", "x", Status(96, 80, {}, 16, 3.0, digest=None, running=(), holder=None))
     monkeypatch.setattr(follower, "_read_sections", lambda: sections.append(follower._shown.done) or ())
-    for done, phase, told in ((80, "making", [80]), (84, "making", [80]), (88, "finished", [80, 88])):
-        follower._shown = replace(begun, made=done, phase=phase)
+    for done, phase, expected in ((80, "making", [80]), (84, "making", [80]), (88, "finished", [80, 88])):
+        follower._shown = replace(begun, status=replace(begun.status, made=done), phase=phase)
         follower.report()
-        assert sections == told
-    follower._shown = replace(follower._shown, made=96, phase="making")  # somebody extends it
+        assert sections == expected
+    follower._shown = replace(begun, status=replace(begun.status, made=96))  # somebody extends it
     follower.report()
     assert sections == [80, 88] and follower._not_before > time.monotonic() + 5
 

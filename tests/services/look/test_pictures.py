@@ -7,14 +7,13 @@ import re
 
 import cv2
 import numpy as np
-import pyarrow as pa
 import pytest
 import trimesh
 from PIL import Image
 
 from schemas.errors import CorruptError, MachineError
 from services.look import clouds as module
-from services.look.clouds import Body, Cloud, Space, coarsen, pack_space, pack_spaces, read_space, read_spaces
+from services.look.clouds import Body, Cloud, Space, coarsen, pack_spaces, read_space, read_spaces
 from services.look.pictures import (
     FIXED_REGIONS,
     MOST_WIDTH,
@@ -31,7 +30,7 @@ from services.look.pictures import (
 from services.look.sections import space_html
 from services.look.sheets import compare_html, sheets_html
 from services.read.dataset_reader import file_reader, find_scene
-from tests.services.look.conftest import HOSTILE, address, scene
+from tests.services.look.conftest import HOSTILE, Handmade, address, scene
 
 VIRIDIS_ENDS = ((253, 231, 37), (68, 1, 84))
 """The last and the first colour of viridis, as its authors published them."""
@@ -91,29 +90,21 @@ def test_the_images_of_a_pair_are_those_in_its_files(shown):
         read_pair(lambda path: b"no PNG", views)
 
 
-class Rows:
-    """Scenes in two batches."""
-
-    def __init__(self, categories: list[str]) -> None:
-        self.rows = pa.table({"scene_id": range(10, 10 + len(categories)), "category": categories})
-
-    def batches(self, table, columns):
-        half = self.rows.num_rows // 2
-        yield from (self.rows.slice(0, half), self.rows.slice(half))
-
-
 def test_each_category_has_as_many_scenes_evenly_over_its_ids_and_at_least_one():
-    chosen = choose_scenes(Rows(["mug", "box"] * 50), {"box": 50, "mug": 50}, 4)
-    assert chosen == [10 + 2 * 12 + 1, 10 + 2 * 37 + 1, 10 + 2 * 12, 10 + 2 * 37]
-    rare, names = {"box": 1, "mug": 30}, ["mug"] * 30 + ["box"]
-    assert len(chosen := choose_scenes(Rows(names), rare, 6)) == 6 and 40 in chosen
-    assert len(choose_scenes(Rows(names), rare, 1)) == 2 and choose_scenes(Rows([]), {}, 4) == []
+    def chosen(categories: list[str], scenes: int) -> list[int]:
+        rows = [{"scene_id": 10 + i, "category": name} for i, name in enumerate(categories)]
+        return choose_scenes(Handmade(scenes=rows), scenes)
+
+    assert chosen(["mug", "box"] * 50, 6) == [11, 59, 109, 10, 58, 108]
+    rare = ["mug"] * 30 + ["box"]
+    assert len(chosen(rare, 6)) == 4 and 40 in chosen(rare, 6)
+    assert chosen(rare, 1) == [40, 10] and chosen([], 4) == []
 
 
 def test_a_scene_has_its_pictures_and_depth_is_counted_of_objects_alone(shown):
-    sample = show_scenes(shown, [0, 3])
-    assert [scene.scene_id for scene in sample.scenes] == [0, 3]
-    first = sample.scenes[0]
+    scenes, _ = show_scenes(shown, [0, 3])
+    assert [scene.scene_id for scene in scenes] == [0, 3]
+    first = scenes[0]
     roles = {f"{role} {kind}" for role in ("input", "mirror") for kind in ("rgb", "depth", "region")}
     patches = {"input rgb patch", "mirror rgb patch"}
     assert set(first.pictures) == roles | {"over"} | patches and all(
@@ -122,8 +113,8 @@ def test_a_scene_has_its_pictures_and_depth_is_counted_of_objects_alone(shown):
     assert 0.0 < first.visible["input"] <= 1.0 and 1.9 < first.d_z_m < 3.0
     crop = cv2.imread(str(shown.root / first.category / "patches" / "RGB00000.png"))[..., ::-1].astype(int)
     assert np.abs(decoded(first.pictures["input rgb patch"]) - crop).mean() < 12 and crop.std() > 12  # JPEG
-    depth = show_scenes(shown, [0]).depth
-    assert 0 < depth["input"].count < 160 * 120 / 10 and np.isfinite(depth["mirror"].mean)
+    _, depth = show_scenes(shown, [0])
+    assert 0 < depth["input"].count < 160 * 120 / 10 and depth["mirror"].count
     assert abs(depth["input"].percentile(0.02) - first.d_z_m) < 0.05
 
 
@@ -189,7 +180,7 @@ def test_what_is_packed_is_what_is_shown(space):
     def numbers(text: str, kind: str) -> np.ndarray:
         return np.frombuffer(base64.b64decode(text), kind).reshape(-1, 3)
 
-    packed = json.loads(pack_space(space))
+    (packed,) = json.loads(pack_spaces([space]))
     cloud = packed["clouds"][1]
     points = numbers(cloud["points"], "<i2") * packed["quantum"] + packed["target"]
     assert np.abs(points - space.clouds[1].points).max() < 1.1e-4

@@ -1,9 +1,7 @@
-"""Targets on the page: each image that is stored has its picture, and samples of shapes lie on the posed mesh."""
+"""Targets on the page: each image that is stored has its picture."""
 
 import io
-import json
 import re
-import shutil
 
 import cv2
 import numpy as np
@@ -11,7 +9,6 @@ import pytest
 from PIL import Image
 
 from schemas.scene.view import MODALITIES, Modality
-from services.look.clouds import INSIDE, OUTSIDE, pack_space, read_samples, read_space
 from services.look.pictures import (
     OBJECT_REGIONS,
     picture_of_codes,
@@ -20,11 +17,9 @@ from services.look.pictures import (
     show_scenes,
     view_pictures,
 )
-from services.look.sections import space_html
 from services.look.sheets import compare_html, sheets_html
 from services.read.dataset_reader import find_scene
 from tests.services.look.conftest import address, scene
-from workers.store.local import LocalStore
 
 LAYERS, DEPTHS = ("layer1", "layer2", "back"), ("layer1_00000", "layer2_00000", "back00000")
 ROW = {"depth_units_per_m": 5000.0}
@@ -36,7 +31,7 @@ def decoded(picture) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def shown_targets(targets):
-    return show_scenes(targets, [0]).scenes[0]
+    return show_scenes(targets, [0])[0][0]
 
 
 def test_sixteen_bits_are_shown_as_colours_and_a_silhouette_as_an_outline_over_what_hides_it():
@@ -98,33 +93,3 @@ def test_images_of_one_target_share_a_button_and_a_slider_and_without_targets_th
     html = compare_html(plain)
     assert re.findall(r'data-kind="([^"]*)"', html) == ["rgb"]
     assert "wipe-member" not in html and "wipe-close" not in html and "targets" not in sheets_html(plain, address)
-
-
-def test_samples_lie_on_the_posed_mesh_and_those_of_the_volume_have_the_colour_of_their_side(targets, sampled):
-    space = read_space(sampled, 0)
-    assert [cloud.role for cloud in space.clouds] == ["input", "mirror", "surface", "inside", "outside"]
-    row = find_scene(sampled, 0).scene(0)
-    surface, inside, outside = read_samples(sampled, row, 1_000_000)
-    corners = np.concatenate([body.vertices for body in space.bodies if body.kind == "object"])
-    assert np.abs(surface.points - corners).max() < 1e-6 and (surface.colors == (10, 200, 30)).all()
-    for cloud, share, color in ((inside, 1 / 2, INSIDE), (outside, 2, OUTSIDE)):
-        middles = (cloud.points - share * surface.points) / (1 - share)
-        assert len(np.unique(middles.round(5), axis=0)) == 2 and (cloud.colors == color).all()
-    assert all(50 < len(cloud.points) <= 100 for cloud in read_samples(sampled, row, 100))
-    assert read_samples(targets, row) == ()
-    assert [one["camera"] is None for one in json.loads(pack_space(space))["clouds"]] == [False] * 2 + [True] * 3
-    html = space_html([space], "{}")
-    boxes = re.findall(r'data-part="(\w+)"( checked)?> ([^<]*)<', html)
-    assert [(part, name) for part, on, name in boxes if not on] == [
-        ("surface", "surface samples"), ("inside", "volume inside"), ("outside", "volume outside"), ("tint", "colour by camera")
-    ]  # fmt: skip
-
-
-def test_the_page_says_which_samples_are_damaged_and_shows_the_rest(sampled, tmp_path):
-    store = LocalStore(shutil.copytree(sampled.root, tmp_path / "damaged"))
-    file = next((store.root / "assets" / "mug").glob("*.npz"))
-    file.write_bytes(file.read_bytes()[:1000])
-    told = rf" There are no samples: assets/mug/{file.name} cannot be read: [^.]*; `verso verify OUT` says what to do\."
-    space = read_space(store, 0)
-    assert re.fullmatch(told, space.missing) and [cloud.role for cloud in space.clouds] == ["input", "mirror"]
-    assert space.bodies and re.search(told, space_html([space], "{}"))

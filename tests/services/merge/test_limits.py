@@ -18,46 +18,35 @@ from tests.made_up_datasets import FIRST, STOP, dataset_at
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 
-def failed(store) -> str:
-    """What a merge said; empty where it had room."""
-    told = ""
-    try:
-        merge(store, FIRST, STOP)
-    except MachineError as error:
-        told = str(error)
-    assert "\n" not in told
-    assert not told or "could not write" in told or "could not be written" in told
-    return told
-
-
 def test_a_merge_without_room_at_any_size_of_a_file_says_so_and_can_be_done_again(merged, tmp_path):
     """Writes beyond so many bytes of a file fail, as on a full disk."""
     store = dataset_at(tmp_path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    told, limit = [], 64
+    limits = [64]
     while True:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limits[-1], before[1]))
         try:
-            told.append(failed(store))
+            merge(store, FIRST, STOP)
+            break
+        except MachineError as error:
+            message = str(error)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        if not told[-1]:
-            break
-        assert not list(store.files(STAGING)), limit
-        limit = limit * 8 // 5
-    assert len(told) > 12
+        assert "could not write" in message or "could not be written" in message
+        assert "\n" not in message and not list(store.files(STAGING))
+        limits.append(limits[-1] * 8 // 5)
+    assert len(limits) > 12
     assert merge(store, FIRST, STOP) == merged[1]
 
 
 MANY = """
 import json, sys, time
 from pathlib import Path
-from services.merge import reading, shared, tables
-from services.merge.merge import merge
+from services.merge import merge, reading, tables
 from tests.kit.many_ranges import ManyRanges
 
 folder, ranges, limits = Path(sys.argv[1]), int(sys.argv[2]), json.loads(sys.argv[3])
-tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, shared.CACHE_KIB = limits
+tables.ROWS_PER_GROUP, merge.ROWS_PER_BLOCK, reading.CACHE_KIB = limits
 
 class Watched(ManyRanges):
     rss_mib = {}
@@ -69,11 +58,9 @@ class Watched(ManyRanges):
         return super()._tables(scene_id)
 
 store = Watched(folder, ranges)
-store.prepare()
 begun = time.perf_counter()
-result = merge(store, 0, store.scenes)
-took = time.perf_counter() - begun
-print(json.dumps({"rows": result.rows, "rss_mib": list(store.rss_mib.values()), "seconds": took}))
+result = merge.merge(store, 0, store.scenes)
+print(json.dumps([result.rows, list(store.rss_mib.values()), time.perf_counter() - begun]))
 """
 
 
@@ -87,9 +74,9 @@ print(json.dumps({"rows": result.rows, "rss_mib": list(store.rss_mib.values()), 
 def test_a_merge_takes_as_much_memory_at_its_end_as_at_its_beginning(ranges, limits, most_mib, tmp_path, record_figure):
     """Limits of a tenth show with a tenth of the rows what those of the program hold."""
     command = [sys.executable, "-c", MANY, str(tmp_path), str(ranges), json.dumps(limits)]
-    figures = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    assert figures["rows"]["views"] == 10 * (ranges - ranges // 1000)
-    grown = figures["rss_mib"][-1] - figures["rss_mib"][2]
+    rows, rss_mib, seconds = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert rows["views"] == 10 * (ranges - ranges // 1000)
+    grown = rss_mib[-1] - rss_mib[2]
     record_figure(f"merge_grown_mib_in_{ranges}_ranges", "passed", grown, most_mib)
-    record_figure("merge_rows_per_s", "passed", sum(figures["rows"].values()) / figures["seconds"])
+    record_figure("merge_rows_per_s", "passed", sum(rows.values()) / seconds)
     assert grown < most_mib

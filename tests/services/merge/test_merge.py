@@ -133,13 +133,13 @@ def test_a_merge_whose_lock_is_lost_stops_before_it_replaces_anything(question, 
 def test_a_commit_that_arrives_during_the_merge_is_noticed(far, tmp_path, monkeypatch):
     store = ObjectStore(MemoryStore(), "memory://") if far else LocalStore(tmp_path)
     half_merged(store, store.layouts[0])
-    real = merge_module.Installation.put_files
+    real = merge_module.put_files
 
     def late(*arguments):
         attempt_at(store, 4, 6, terms(layout=store.layouts[0], range_size=2), small_scene).commit()
         return real(*arguments)
 
-    monkeypatch.setattr(merge_module.Installation, "put_files", late)
+    monkeypatch.setattr(merge_module, "put_files", late)
     with pytest.raises(RunError, match="committed while they were merged"):
         merge(store, 0, 4)
     assert read_success(store) is None

@@ -1,22 +1,17 @@
-"""Ranges on their way into a merge: blocks of rows, the files that they name, and what ranges share."""
+"""Ranges on their way into a merge: their rows, the files that they name, and what they share."""
 
 import contextlib
-import json
 
 import pyarrow as pa
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from obstore.store import MemoryStore
 
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
-from schemas.errors import CommitConflict, CorruptError, MachineError
+from schemas.errors import CorruptError
 from services.merge import reading
-from services.merge import shared as module
-from services.merge.reading import PublishedFiles, read_blocks
-from services.merge.shared import SharedRows, explain_full_disk, open_scratch
+from services.merge.reading import SharedRows, check_published, merge_folder, read_ranges, stored_sizes
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, terms
 from workers.store.attempt import begin_attempt
@@ -27,26 +22,17 @@ from workers.store.objects import ObjectStore
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 
-def test_blocks_hold_every_range_and_every_row_in_order(tmp_path, monkeypatch):
+def test_ranges_come_in_order_with_every_row_and_a_table_that_is_altered_or_missing_is_told_by_name(tmp_path):
     store = dataset_at(tmp_path)
-    expected = {table: plain_rows(table) for table in set(TABLES) - {"timings", "assets"}}
-    for ranges, rows, largest in ((1, 10**9, 1), (3, 10**9, 3), (10**9, 1, 1), (10**9, 10**9, 7)):
-        monkeypatch.setattr(reading, "RANGES_PER_BLOCK", ranges)
-        monkeypatch.setattr(reading, "ROWS_PER_BLOCK", rows)
-        blocks = list(read_blocks(store, FIRST, STOP))
-        assert max(len(block.ranges) for block in blocks) == largest
-        assert [records[0].span.start for b in blocks for records in b.ranges] == [*range(FIRST, STOP, 4)]
-        for table, whole in expected.items():
-            assert [row for block in blocks for row in block.rows[table].to_pylist()] == whole
-
-
-def test_a_table_that_is_altered_or_missing_is_told_by_name(tmp_path):
-    store = dataset_at(tmp_path, 0, 8)
-    path = tmp_path / range_table_path(4, "views")
+    ranges = list(read_ranges(store, FIRST, STOP))
+    assert [read.records[0].span.start for read in ranges] == [*range(FIRST, STOP, 4)]
+    for table in set(TABLES) - {"timings", "assets"}:
+        assert [row for read in ranges for row in read.rows[table].to_pylist()] == plain_rows(table)
+    path = tmp_path / range_table_path(FIRST + 4, "views")
     path.write_bytes(path.read_bytes()[::-1])
-    for told in ("does not", "is committed"):
-        with pytest.raises(CorruptError, match=f"{path.relative_to(tmp_path)} {told}"):
-            list(read_blocks(store, 0, 8))
+    for words in ("does not", "is committed"):
+        with pytest.raises(CorruptError, match=f"{path.relative_to(tmp_path)} {words}"):
+            list(read_ranges(store, FIRST, STOP))
         path.unlink(missing_ok=True)
 
 
@@ -71,24 +57,21 @@ def test_a_range_that_does_not_hold_each_scene_once_is_refused(tmp_path, moved, 
                 attempt._rows["failures"][-1] = table_of_rows("failures", rows)
         attempt.commit()
     with pytest.raises(CorruptError, match=f"range from scene {wrong} do not hold each scene once"):
-        list(read_blocks(store, 4, 12))
+        list(read_ranges(store, 4, 12))
 
 
 @pytest.mark.parametrize("place", ["files", "tar", "object store"])
 def test_a_published_file_that_is_missing_or_cut_is_told_by_name(place, tmp_path):
     store = ObjectStore(MemoryStore(), "memory://") if place == "object store" else LocalStore(tmp_path / "out")
     store.prepare()
+    layout = "files" if place == "files" else "tar"
     for start in (0, 4):
-        layout = "files" if place == "files" else "tar"
         attempt_at(store, start, start + 4, terms(layout=layout), made_scene).commit()
 
     def check_all():
-        scratch = tmp_path / "scratch"
-        scratch.mkdir(exist_ok=True)
-        (scratch / "listed.sqlite").unlink(missing_ok=True)
-        with contextlib.closing(PublishedFiles(store, scratch)) as published:
-            for block in read_blocks(store, 0, 8):
-                published.check(block)
+        with merge_folder(store) as folder, stored_sizes(store, folder) as size_of:
+            for read in read_ranges(store, 0, 8):
+                check_published(read, size_of)
 
     check_all()
     for kind in (".png" if place == "files" else ".tar", ".glb", "failures.parquet"):
@@ -106,80 +89,26 @@ def test_a_published_file_that_is_missing_or_cut_is_told_by_name(place, tmp_path
 
 # ------------------------------------------------------------------------------------------- what ranges share
 
-NAMES = st.text(st.characters(blacklist_categories=["Cs"]), max_size=4)
-SHAPE = "assets/mug/a.glb"
-
-
-@pytest.fixture
-def shared(tmp_path):
-    with contextlib.closing(SharedRows(tmp_path)) as rows:
-        yield rows
-
-
-@given(st.dictionaries(NAMES, NAMES, max_size=60))
-def test_files_come_back_sorted_by_the_bytes_of_their_paths(tmp_path_factory, files):
-    with contextlib.closing(SharedRows(tmp_path_factory.mktemp("shared"))) as shared:
-        shared.add_files(files.items())
-        expected = sorted(files.items(), key=lambda pair: pair[0].encode())
-        assert list(shared.files(mixed=False)) == list(shared.files(mixed=False)) == expected
-
 
 def test_more_files_than_fit_in_the_cache_come_back_sorted_and_are_not_sorted_when_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "CACHE_KIB", 64)
+    monkeypatch.setattr(reading, "CACHE_KIB", 64)
     with contextlib.closing(SharedRows(tmp_path)) as shared:
-        for number in range(0, 20_000, 100):
-            shared.add_files((f"{19_999 - i:05d}", f"{i:064d}") for i in range(number, number + 100))
-        asked = []
-        shared._db.set_trace_callback(asked.append)
-        found = list(shared.files(mixed=False))
-        list(shared.assets(mixed=False))
-        shared._db.set_trace_callback(None)
-        assert found == [(f"{19_999 - i:05d}", f"{i:064d}") for i in reversed(range(20_000))]
+        shared.add_files((f"{i:05d}", f"{i:064d}") for i in reversed(range(20_000)))
+        assert list(shared.files(mixed=False)) == [(f"{i:05d}", f"{i:064d}") for i in range(20_000)]
         assert (tmp_path / "shared.sqlite").stat().st_size > 64 << 10
-        plans = [str(list(shared._db.execute(f"EXPLAIN QUERY PLAN {sql}"))) for sql in asked]
-        assert len(plans) == 2 and not any("TEMP B-TREE" in plan for plan in plans)
+        plans = [
+            str(list(shared._db.execute(f"EXPLAIN QUERY PLAN {sql}"))) for sql in (reading._FILES, reading._ASSETS)
+        ]
+        assert not any("TEMP B-TREE" in plan for plan in plans)
 
 
-def test_the_images_of_views_are_counted_and_listed_and_one_named_twice_is_refused(shared):
-    output = made_scene(3)
-    shared.add_images(pa.Table.from_pylist(output.rows["views"], schema=SCHEMAS["views"]))
-    shared.add_images(SCHEMAS["views"].empty_table())
-    images = [file.path for file in output.files if not file.path.startswith("assets/")]
-    assert shared.images == len(images)
-    assert [path for path, _ in shared.files(mixed=False)] == sorted(images)
-    for path, again in (("mug/RGB99998.png", "aa"), ("mug/RGB99999.png", "bb")):
-        shared.add_files([(path, "aa"), (path, again)])
-        for mixed in (False, True):
+def test_images_are_counted_and_named_once(tmp_path):
+    with contextlib.closing(SharedRows(tmp_path)) as shared:
+        output = made_scene(3)
+        shared.add_images(pa.Table.from_pylist(output.rows["views"], schema=SCHEMAS["views"]))
+        images = sorted(file.path for file in output.files if not file.path.startswith("assets/"))
+        assert shared.images == len(images) and [path for path, _ in shared.files(mixed=False)] == images
+        for path, again in (("mug/RGB99998.png", "aa"), ("mug/RGB99999.png", "bb")):
+            shared.add_files([(path, "aa"), (path, again)])
             with pytest.raises(CorruptError, match=r"mug/RGB99998\.png belongs to two views"):
-                list(shared.files(mixed))
-
-
-def test_a_shape_that_ranges_share_is_listed_once_and_has_one_digest(shared):
-    shared.add_files([(SHAPE, "bb"), (SHAPE, "bb")])
-    assert list(shared.files(mixed=False)) == [(SHAPE, "bb")]
-    shared.add_files([(SHAPE, "aa")])
-    with pytest.raises(CommitConflict, match="two digests by one stack: aa, bb"):
-        list(shared.files(mixed=False))
-    assert list(shared.files(mixed=True)) == [(SHAPE, "aa")]
-
-
-def test_an_asset_comes_back_once_as_it_was_and_must_be_the_same_in_every_range(shared):
-    def rows_of(*splits: str) -> pa.Table:
-        row = made_scene(0).rows["assets"][0]
-        return pa.Table.from_pylist([{**row, "split": split} for split in splits], schema=SCHEMAS["assets"])
-
-    shared.add_assets(rows_of("train", "train"))
-    assert pa.concat_tables(shared.assets(mixed=False)).equals(rows_of("train"))
-    shared.add_assets(rows_of("test"))
-    with pytest.raises(CommitConflict, match="is described differently by two ranges"):
-        list(shared.assets(mixed=False))
-    (found,) = pa.concat_tables(shared.assets(mixed=True)).to_pylist()
-    assert json.dumps(found) == min(json.dumps(row) for row in rows_of("train", "test").to_pylist())
-
-
-def test_a_disk_that_is_full_or_a_folder_that_is_gone_is_explained(shared, tmp_path):
-    shared._db.execute("PRAGMA max_page_count = 4")
-    with pytest.raises(MachineError, match=r"could not write its files: .* full; free some space"):
-        shared.add_files((f"{i:05d}", f"{i:064d}") for i in range(1000))
-    with pytest.raises(MachineError, match="unable to open"), explain_full_disk():
-        open_scratch(tmp_path / "none" / "a.sqlite", "CREATE TABLE rows (text TEXT)")
+                list(shared.files(mixed=True))

@@ -9,7 +9,7 @@ from schemas.errors import CorruptError, InUseError, MachineError, OutputError, 
 from schemas.queue import submission_id
 from services.queue.drivers import EVERY_S, Ending, RayDrivers, Sharing, drive
 from services.queue.listing import follow_logs, format_rows, header, list_jobs, read_logs
-from services.run.ray_cluster import Slots, share_slots
+from services.run.ray_cluster import slots_of
 from tests.kit.queue_world import FakeDrivers, ids, queue_of, request_of
 from tests.made_up_datasets import dataset_at
 
@@ -106,7 +106,7 @@ def test_the_share_is_read_every_few_seconds_and_survives_a_store_that_fails(tmp
 def test_even_shares_use_every_core_and_none_is_without():
     for cores in range(1, 20):
         for jobs in range(1, 6):
-            slots = share_slots(Slots(cores, 2 * cores), lambda jobs=jobs: jobs).now()
+            slots = slots_of(cores, None, jobs)
             assert slots.in_flight == (2 * cores if jobs == 1 else math.ceil(cores / jobs))
             assert slots.in_flight >= 1 and jobs * slots.in_flight >= cores
 

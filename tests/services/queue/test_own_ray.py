@@ -23,7 +23,7 @@ from services.queue import drivers as module
 from services.queue.drivers import LogsHere, OwnDrivers, answers, own_ray
 from services.queue.queue import open_queue
 from services.queue.supervise import Driver, Rules, supervise
-from services.run.ray_cluster import private_folder
+from services.run.machine import private_folder
 from tests.datasets import run_here
 from tests.kit.killed_runs import chain_of, processes_with
 from tests.kit.network import free_port, listeners_of

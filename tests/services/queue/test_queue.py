@@ -60,7 +60,7 @@ def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path):
     event = events_folder(A)
     for number, (key, data, words) in enumerate(
         [
-            (request_path(A), b"{", "is damaged"),
+            (request_path(A), b"{", "was not written by this program"),
             (request_path(A), b'{"queue": 2}', "is newer than this program"),
             (request_path(A), b'{"queue": 1, "id": "j1"}', "was not written by this program"),
             (request_path(A), None, "is the request of another job"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.job.identity import job_digest
+from schemas.job.job import job_digest
 from services.job.job_file import validate_job
 from services.job.record import require_job
 from tests.datasets import SMALL, faults_of, overlaid, run_here

@@ -20,9 +20,9 @@ from schemas.dataset.shard import Fingerprint
 from schemas.errors import VersoError
 from services.cli.main import main
 from services.job.record import encode_job, read_success, require_job
+from services.merge import merge as merge_module
 from services.merge.merge import encode_success
 from services.read import verdict as told_of
-from services.read import verify as whole
 from services.read.verdict import COPY, Verdict, explain_damage
 from services.read.verify import encode_fingerprint, verify
 from services.read.verify_files import Success, check_success
@@ -307,7 +307,7 @@ def test_a_whole_dataset_has_no_fault_and_each_file_is_read_once(layout, request
     files = {path for path in reads if path.endswith((".png", ".tar", ".glb"))}
     assert len(files) > 3 and {reads[path] for path in files} == {1}
     assert found.files >= len(files) and found.bytes >= sum((store.root / path).stat().st_size for path in files)
-    monkeypatch.setattr(whole, "RANGES_PER_BLOCK", 2)
+    monkeypatch.setattr(merge_module, "RANGES_PER_BLOCK", 2)
     assert faults_of(store) == []
 
 

@@ -30,8 +30,8 @@ def job(tmp_path_factory) -> Path:
 PROBE = """
 import json, sys
 from dataclasses import replace
-from services.run.joining import check_nodes, terms_of_driver
-from services.run.ray_cluster import cluster_ray
+from services.run.ray_cluster import check_nodes, cluster_ray
+from services.run.worker_entry import terms_of_driver
 address, out = sys.argv[1:]
 open(f"{out}/_lock.json", "w").write(json.dumps({"token": "ours"}))
 terms = replace(terms_of_driver(), environment=(), out=out, proof=f"{out}/_lock.json", token="ours")

@@ -22,12 +22,10 @@ from services.run.coordinator import (
     Coordinator,
     Deaths,
     Limits,
-    LostNodes,
     count_under_way,
     hosts_of,
 )
-from services.run.joining import Pattern
-from services.run.metrics import Tally
+from services.run.progress import Tally
 from services.run.ray_cluster import Slots
 from services.run.watchdog import (
     COMMIT_FACTOR,
@@ -41,7 +39,7 @@ from services.run.watchdog import (
     scenes_in_progress,
     watch,
 )
-from services.run.worker_entry import WorkerTerms
+from services.run.worker_entry import Pattern, WorkerTerms
 from tests.made_up_scenes import small_scene, terms
 from workers.assets.catalogue import Catalogue
 from workers.store import attempt as module_store
@@ -151,16 +149,17 @@ def test_what_a_lost_host_had_is_handed_out_again_and_what_others_work_on_is_not
     assert sorted(map(str, list(shards.values())[4:])) == sorted(map(str, [spans(0), spans(2), spans(6, 8)]))
 
 
-def test_a_host_is_told_once_when_it_has_no_node_any_more():
-    alive, now = ["h1", "h2", "h2", "h3"], [0.0]
-    nodes = LostNodes(lambda: set(alive), lambda: now[0])
-    assert nodes.take() == set()
-    found = []
+def test_a_host_is_told_once_when_it_has_no_node_any_more(handed_out, monkeypatch):
+    coordinator, alive, now = handed_out[0], ["h1", "h2", "h2", "h3"], [0.0]
+    monkeypatch.setattr(module, "_hosts_by_node", lambda: dict(enumerate(alive)))
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    assert coordinator._take_lost_hosts() == set()
+    lost = []
     for alive[:] in (["h1", "h2", "h3"], ["h1", "h3"], ["h1", "h3"], ["h1", "h3", "h2"], ["h1"]):
-        assert nodes.take() == set(), "too soon to ask again"
+        assert coordinator._take_lost_hosts() == set(), "too soon to ask again"
         now[0] += LOOK_EVERY_S
-        found.append(nodes.take())
-    assert found == [set(), {"h2"}, set(), set(), {"h2", "h3"}]
+        lost.append(coordinator._take_lost_hosts())
+    assert lost == [set(), {"h2"}, set(), set(), {"h2", "h3"}]
 
 
 def test_a_shards_hosts_are_those_that_began_or_committed_its_ranges(tmp_path, monkeypatch):

@@ -32,7 +32,7 @@ def test_shards_have_parts_of_gpus_that_leave_no_core_idle_and_no_gpu_unused():
         ([(8, 2), (8, 0)], 16, {}, None),  # the second node would stand idle
         ([(8, 2), (8, 0)], 16, {"device": "gpu"}, 4),
     ]:
-        part = share_gpus(nodes, running, Run(**keys))
+        part = share_gpus([{"CPU": cores, "GPU": gpus} for cores, gpus in nodes], running, Run(**keys))
         assert (int(1 / part) if part else None) == workers, (nodes, running, keys)
         if part:
             assert workers * part <= 1 and part * RAY_PARTS == int(part * RAY_PARTS)

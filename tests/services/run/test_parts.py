@@ -1,6 +1,6 @@
 """Convex parts are found before the first scene, once for each mesh, and only for jobs that may need them."""
 
-import os
+import signal
 
 import pytest
 import trimesh
@@ -11,6 +11,7 @@ from services.run import parts
 from tests.services.init.own_meshes import cup, write_mesh
 from tests.workers.assets.libraries import library_of
 from workers.capture.results import open_sources
+from workers.pool import Answers
 
 
 @pytest.fixture
@@ -28,36 +29,43 @@ def job_of(tmp_path):
     return make
 
 
-def looked_at(monkeypatch, job, catalogue, folder):
-    """The files that are cut, by the lines that are shown."""
-    shown = []
-    monkeypatch.setattr(parts.ProgressLine, "show", lambda self, done, **more: shown.append(more["name"]))
+def count_cut(job, catalogue, folder):
+    """How many shapes were cut, and not known from before."""
+    before = len(Answers(folder / "cut"))
     parts.find_parts(job, catalogue, folder)
-    return sorted(shown)
+    return len(Answers(folder / "cut")) - before
 
 
 @pytest.mark.minute
-def test_each_mesh_is_cut_once_and_none_where_nothing_needs_parts(job_of, tmp_path, monkeypatch):
+def test_each_mesh_is_cut_once_and_none_where_nothing_needs_parts(job_of, tmp_path):
     single, several = job_of(), job_of(objects_per_scene=2)
-    assert looked_at(monkeypatch, *single, tmp_path / "kept") == []
-    assert looked_at(monkeypatch, *job_of(objects_per_scene=2, physics={"collision": "hull"}), tmp_path / "kept") == []
-    assert looked_at(monkeypatch, *several, tmp_path / "kept") == ["box.stl", "cup.stl"]
-    assert looked_at(monkeypatch, *several, tmp_path / "kept") == []
+    assert count_cut(*single, tmp_path / "kept") == 0
+    assert count_cut(*job_of(objects_per_scene=2, physics={"collision": "hull"}), tmp_path / "kept") == 0
+    assert count_cut(*several, tmp_path / "kept") == 2
+    assert count_cut(*several, tmp_path / "kept") == 0
     coarser = job_of(objects_per_scene=2, physics={"concavity": 0.2})
-    assert looked_at(monkeypatch, *coarser, tmp_path / "kept") == ["box.stl", "cup.stl"], (
-        "other parts, of another depth"
-    )
+    assert count_cut(*coarser, tmp_path / "kept") == 2, "other parts, of another depth"
 
 
 def killed(*_):
-    os._exit(9)
+    signal.raise_signal(signal.SIGKILL)
+
+
+def crash(*_):
+    signal.raise_signal(signal.SIGSEGV)
 
 
 @pytest.mark.minute
-def test_a_process_that_is_killed_is_told_and_its_mesh_is_looked_at_again(job_of, tmp_path, monkeypatch):
+def test_a_process_that_is_killed_is_told_and_its_mesh_cut_again_and_one_that_crashes_is_told_of_its_mesh(
+    job_of, tmp_path, monkeypatch, capsys
+):
     several = job_of(objects_per_scene=2)
     with monkeypatch.context() as patch:
         patch.setattr(parts, "cut_shape", killed)
         with pytest.raises(MachineError, match="what is cut stays"):
             parts.find_parts(*several, tmp_path / "kept")
-    assert looked_at(monkeypatch, *several, tmp_path / "kept") == ["box.stl", "cup.stl"]
+        patch.setattr(parts, "cut_shape", crash)
+        parts.find_parts(*several, tmp_path / "other")
+    message = capsys.readouterr().err
+    assert all(f"{name}: cannot be cut: it crashes its process" in message for name in ("box.stl", "cup.stl"))
+    assert count_cut(*several, tmp_path / "kept") == 2

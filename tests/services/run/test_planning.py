@@ -1,7 +1,6 @@
 """What of a dataset is still to be made, without ever an overlap; in which shards; and what it had once and has lost."""
 
 import itertools
-import json
 import tracemalloc
 
 import pytest
@@ -9,20 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.dataset.commit import CommitSummary, Ledger, Span, join_rows, rows_of
-from schemas.dataset.layout import LEDGER_FILE, SUCCESS_FILE, commit_path
+from schemas.dataset.layout import commit_path
 from schemas.errors import OutputError
 from schemas.job.job import Job
-from services.merge.merge import merge
 from services.run import range_planner as module
 from services.run.range_planner import (
     deal_shards,
     find_lost,
-    group_shards,
     plan_ranges,
     plan_retries,
     plan_spans,
 )
-from tests.made_up_datasets import FIRST, STOP, dataset_at
+from tests.made_up_datasets import dataset_at
 from tests.made_up_scenes import attempt_at, failed_scene
 from workers.store.ledger import list_commits, save_rows
 
@@ -30,10 +27,10 @@ pytestmark = pytest.mark.usefixtures("unflushed")
 
 
 def test_fewer_scenes_and_ranges_of_another_size_are_refused():
-    told = "scenes 0 to 7 are committed, more than the job's 0 to 5: fewer scenes"
+    fewer = "scenes 0 to 7 are committed, more than the job's 0 to 5: fewer scenes"
     other_size = "a dataset keeps the range_size of its first run"
     for first, stop, committed, words in (
-        (0, 6, [(0, 4), (4, 8)], told),
+        (0, 6, [(0, 4), (4, 8)], fewer),
         (4, 8, [(0, 4)], "are committed"),
         *((0, 12, ranges, other_size) for ranges in ([(0, 5)], [(1, 4)], [(0, 2), (3, 4)], [(0, 4), (2, 4)])),
     ):
@@ -93,8 +90,8 @@ def test_the_lazy_plan_is_that_of_a_list_over_every_cell(data):
 
 
 def summary(start, retry=0, failed=(), scenes=(), stop=None):
-    told = tuple((scene, kind, "left_table") for scene, kind in failed)
-    return CommitSummary(start, stop or start + 4, retry, 4 - len(failed), told, tuple(scenes))
+    failures = tuple((scene, kind, "left_table") for scene, kind in failed)
+    return CommitSummary(start, stop or start + 4, retry, 4 - len(failed), failures, tuple(scenes))
 
 
 def test_a_plan_of_a_thousand_million_scenes_is_made_on_demand():
@@ -136,7 +133,7 @@ def spans_of(scenes: int, size: int) -> list[Span]:
 
 def test_a_shard_is_whole_ranges_in_order_and_shards_get_smaller_towards_the_end():
     for size, grouped in ((1, [1, 1, 1, 1]), (4, [1, 1, 1, 1]), (5, [2, 2]), (100, [4])):
-        shards = list(group_shards(spans_of(14, 4), size))
+        shards = list(deal_shards(spans_of(14, 4), 14, 4, int, size))
         assert [len(shard) for shard in shards] == grouped
         assert [span for shard in shards for span in shard] == spans_of(14, 4)
     for scenes, slots, size, sizes in (
@@ -168,68 +165,23 @@ def test_slots_end_within_the_time_of_one_range(scenes, size, slots, chance):
     assert max(free_at) - min(free_at) <= size * 0.2 + 1e-9
 
 
-# ------------------------------------------------------------------------------------------------ what is lost
-
-NOT_THOSE = "the commits are not those that the finished dataset was merged from: "
-
-
-@pytest.fixture
-def finished(tmp_path):
-    """Scenes 3 to 29 in ranges of four, one with a retry, merged."""
+def test_ranges_that_are_gone_are_told_by_the_kept_summary_in_few_lines(tmp_path, monkeypatch):
+    """Scenes 3 to 29 in ranges of four, one with a retry."""
     store = dataset_at(tmp_path)
     attempt_at(store, 3, 7, retry=1, scenes=(5,), make=failed_scene).commit()
-    merge(store, FIRST, STOP)
-    return store
-
-
-def test_a_range_or_a_retry_that_is_gone_is_told_by_the_success_file(finished, tmp_path):
-    assert find_lost(finished) == []
-    assert finished.size(LEDGER_FILE) is None
-    for start, retry, told in (
-        (3, 1, NOT_THOSE),
-        (3, 0, "the commits of scenes 3 to 6 of the finished dataset are lost; "),
-        (15, 0, "the commits of scenes 15 to 18 of the finished dataset are lost; "),
-        (27, 0, "the commits of scenes 27 to 29 of the finished dataset are lost; "),
-    ):
-        whole = finished.read(commit_path(start, retry))
-        finished.remove(commit_path(start, retry))
-        (line,) = find_lost(finished)
-        assert line.startswith(told)
-        if (start, retry) != (3, 1):
-            finished.put(commit_path(start, retry), whole)
-    unfinished = dataset_at(tmp_path / "unfinished", stop=11)
-    unfinished.remove(commit_path(3))
-    assert find_lost(unfinished) == [], "it lacks scenes and has lost none"
-
-
-def test_ranges_that_are_gone_are_told_by_the_kept_summary_in_few_lines(finished, monkeypatch):
-    save_rows(finished, list_commits(finished).rows)
-    assert find_lost(finished) == []
+    save_rows(store, list_commits(store).rows)
+    assert find_lost(list_commits(store)) == []
     for start in range(3, 30, 4):
-        keys = [key for key in (commit_path(start), commit_path(start, 1)) if finished.size(key) is not None]
-        whole = {key: finished.read(key) for key in keys}
+        keys = [key for key in (commit_path(start), commit_path(start, 1)) if store.size(key) is not None]
+        whole = {key: store.read(key) for key in keys}
         for key in whole:
-            finished.remove(key)
-        line = find_lost(finished)[0]
-        told = f"{commit_path(start)} is lost: it was committed, and is gone; restore it from a copy, or run"
-        assert line.startswith(told) and "\n" not in line
+            store.remove(key)
+        line = find_lost(list_commits(store))[0]
+        lost = f"{commit_path(start)} is lost: it was committed, and is gone; restore it from a copy, or run"
+        assert line.startswith(lost) and "\n" not in line
         for key, data in whole.items():
-            finished.put(key, data)
+            store.put(key, data)
     monkeypatch.setattr(module, "MOST_TOLD", 3)
-    finished.remove_tree("manifest/_commits")
-    lines = find_lost(finished)
+    store.remove_tree("manifest/_commits")
+    lines = find_lost(list_commits(store))
     assert len(lines) == 4 and lines[-1].startswith("5 more commits are lost; ")
-    finished.remove(LEDGER_FILE)
-    assert find_lost(finished)[0].startswith("the commits of scenes 3 to 29 of the finished dataset are lost; ")
-
-
-def test_of_very_many_commits_the_counts_are_compared_and_a_damaged_success_file_ends_nothing(finished, monkeypatch):
-    monkeypatch.setattr(module, "DIGEST_UP_TO", 3)
-    assert find_lost(finished) == []
-    whole = json.loads(finished.read(SUCCESS_FILE))
-    for damage in ({"stop_scene": None}, {"stop_scene": "x"}, {"first_scene": []}):
-        finished.put(SUCCESS_FILE, json.dumps(whole | damage).encode())
-        assert find_lost(finished) == []
-    whole["scenes"]["made"] += 1
-    finished.put(SUCCESS_FILE, json.dumps(whole).encode())
-    assert find_lost(finished)[0].startswith(NOT_THOSE)

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 FAMILY = """
 import json, os, subprocess, sys, time
-from services.run.machine import adopt_orphans, descendants, end_descendants
+from services.run.machine import adopt_orphans, descendants, end_all
 adopt_orphans()
 stubborn = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
 orphan = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {stubborn!r}], start_new_session=True)"
@@ -31,7 +31,7 @@ stopped = subprocess.Popen(["sleep", "600"])
 stopped.send_signal(19)
 children[1].wait()
 found = sorted(process.pid for process in descendants(os.getpid()))
-print(json.dumps([found, [process.pid for process in end_descendants()]]))
+print(json.dumps([found, [process.pid for process in end_all(lambda: descendants(os.getpid()))]]))
 """
 
 
@@ -55,7 +55,7 @@ def test_orphans_in_other_sessions_stopped_and_stubborn_ones_are_ended_and_nobod
 
 def test_processes_are_known_by_their_environment_and_by_their_start(sleeper):
     assert [process.pid for process in marked("ONE=run")] == [sleeper.pid]
-    assert marked("ONE=ru") == marked("NE=run") == []
+    assert [*marked("ONE=ru"), *marked("NE=run")] == []
     process = read_process(sleeper.pid)
     assert process is not None and process in descendants(os.getpid())
     send(replace(process, born="0"), signal.SIGKILL)  # its id was given out again
@@ -72,20 +72,16 @@ QUOTA = {"cpu/cpu.cfs_quota_us": "400000\n", "cpu/cpu.cfs_period_us": "100000\n"
 
 def test_a_containers_quota_is_respected(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)))
-    for number, (membership, files, cores) in enumerate(
-        [
-            ("0::/\n", {"cpu.max": "200000 100000\n"}, 2),
-            ("0::/\n", {"cpu.max": "150000 100000\n"}, 2),
-            ("0::/\n", {"cpu.max": "50000 100000\n"}, 1),
-            ("0::/\n", {"cpu.max": "max 100000\n"}, 16),
-            ("0::/\n", {"cpu.max": "6400000 100000\n"}, 16),
-            ("0::/user/job\n", {"user/cpu.max": "300000 100000\n", "user/job/cpu.max": "max 100000\n"}, 3),
-            ("3:cpu,cpuacct:/\n", QUOTA, 4),
-            ("3:cpu:/docker/abc\n", QUOTA, 4),
-            ("3:cpu:/\n", {**QUOTA, "cpu/cpu.cfs_quota_us": "-1\n"}, 16),
-            ("3:cpuset:/\n", QUOTA, 16),
-        ]
-    ):
+    by_quota = {"200000": 2, "150000": 2, "50000": 1, "max": 16, "6400000": 16}
+    cases = [("0::/\n", {"cpu.max": f"{quota} 100000\n"}, cores) for quota, cores in by_quota.items()]
+    cases += [
+        ("0::/user/job\n", {"user/cpu.max": "300000 100000\n", "user/job/cpu.max": "max 100000\n"}, 3),
+        ("3:cpu,cpuacct:/\n", QUOTA, 4),
+        ("3:cpu:/docker/abc\n", QUOTA, 4),
+        ("3:cpu:/\n", {**QUOTA, "cpu/cpu.cfs_quota_us": "-1\n"}, 16),
+        ("3:cpuset:/\n", QUOTA, 16),
+    ]
+    for number, (membership, files, cores) in enumerate(cases):
         here = tmp_path / str(number)
         for name, text in {"cgroup": membership, **{f"sys/{name}": text for name, text in files.items()}}.items():
             (here / name).parent.mkdir(parents=True, exist_ok=True)
@@ -146,9 +142,9 @@ def start(body: str) -> subprocess.Popen[str]:
     return spawn(START.format(body=body))
 
 
-def begun(body: str = FOREVER) -> subprocess.Popen[str]:
+def begun(body: str = FOREVER, code: str = START, *arguments: str) -> subprocess.Popen[str]:
     """A command that has said the line `ready`."""
-    run = start(body)
+    run = spawn(code.replace("{body}", body), *arguments)
     assert run.stdout is not None
     run.stdout.readline()
     return run
@@ -162,8 +158,8 @@ def kill_each(pids: list[int], numbers: tuple[int, ...]) -> None:
 
 
 def end(run: subprocess.Popen[str]) -> tuple[int, str, str]:
-    told, wrong = run.communicate(timeout=60)
-    return run.returncode, told, wrong
+    said, wrong = run.communicate(timeout=60)
+    return run.returncode, said, wrong
 
 
 def wait_until_gone(*paths: Path) -> None:
@@ -219,12 +215,10 @@ def test_what_a_run_starts_below_another_run_has_the_marks_of_both(monkeypatch):
 
 
 def test_a_program_that_waits_for_json_gets_it_from_a_command_that_dies():
-    run = spawn(START.format(body=FOREVER).replace('"all is kept"', '"all is kept", answers=True'))
-    assert run.stdout is not None
-    run.stdout.readline()
+    run = begun(code=START.replace('"all is kept"', '"all is kept", answers=True'))
     os.kill(chain_of(run.pid)[2], signal.SIGKILL)
-    code, told, wrong = end(run)
-    answer = json.loads(told.splitlines()[-1])
+    code, said, wrong = end(run)
+    answer = json.loads(said.splitlines()[-1])
     assert code == 1 and answer["ok"] is False and wrong == f"verso: {answer['error']}\n"
 
 
@@ -262,9 +256,7 @@ def test_a_signal_that_the_user_ignores_stays_ignored():
     """As `nohup` does."""
     script = START.format(body="print('ready', flush=True); time.sleep(1); return 0")
     start_over = "os.execv(sys.executable, [sys.executable, '-c', sys.argv[1]])"
-    run = spawn(f"import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); {start_over}", script)
-    assert run.stdout is not None
-    run.stdout.readline()
+    run = begun("", f"import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); {start_over}", script)
     run.send_signal(signal.SIGHUP)
     assert end(run) == (0, "", "")
 

@@ -17,12 +17,10 @@ from schemas.errors import MachineError, OutputError, VersoError
 from schemas.job.job import Job
 from services.cli.main import main
 from services.job.record import encode_job, record_job
-from services.run import dry_run
 from services.run import progress as module
-from services.run.dry_run import describe_plan, measure_scene
-from services.run.metrics import Meter, Tally, serve
-from services.run.progress import ProgressLine, event_log, log_event
-from services.run.run_job import RunRequest, open_inputs
+from services.run import run_job
+from services.run.progress import Meter, ProgressLine, Tally, event_log, log_event, serve
+from services.run.run_job import RunRequest, describe_plan, measure_scene, open_inputs
 from tests.kit.network import free_port
 from tests.services.run.scraped import scrape
 
@@ -36,8 +34,8 @@ def request(out: Path, **keys) -> RunRequest:
 
 @pytest.fixture
 def timed(monkeypatch):
-    monkeypatch.setattr(dry_run, "measure_scene", lambda job, catalogue: (0.5, 2e6))
-    monkeypatch.setattr(dry_run, "usable_cores", lambda: 2)
+    monkeypatch.setattr(run_job, "measure_scene", lambda job, catalogue: (0.5, 2e6))
+    monkeypatch.setattr(run_job, "usable_cores", lambda: 2)
 
 
 @pytest.mark.usefixtures("timed")
@@ -51,7 +49,7 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
 
 def test_a_scene_is_measured_by_making_it():
     asked = request(Path("nowhere"))
-    seconds, size = measure_scene(asked.job, open_inputs(asked)[0])
+    seconds, size = measure_scene(asked.job, open_inputs(asked.job, asked.job_folder, asked.out)[0])
     assert 0.005 < seconds < 5.0
     assert 5e3 < size < 5e5  # some twelve pictures of 64 x 48
 
@@ -63,7 +61,7 @@ def test_another_jobs_folder_somebodys_files_and_a_place_that_cannot_be_written_
     (tmp_path / "file").write_text("")
     asked, out = request(tmp_path / "out"), tmp_path / "out"
     out.mkdir()
-    record = record_job(asked.job, open_inputs(asked)[0].digest, asked.job_folder)
+    record = record_job(asked.job, open_inputs(asked.job, asked.job_folder, asked.out)[0].digest, asked.job_folder)
     (out / "job.yaml").write_bytes(encode_job(record))
     assert "4 are left" in describe_plan(asked)[-2]
     refusals = [

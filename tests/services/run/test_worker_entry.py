@@ -20,9 +20,10 @@ from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_
 from schemas.errors import FingerprintError, MachineError, OutputError
 from services.job.job_file import validate_job
 from services.run import worker_entry as module
-from services.run.joining import Pattern, terms_of_driver, with_own_stack
+from services.run.ray_cluster import with_own_stack
 from services.run.worker_entry import (
     DRAIN,
+    Pattern,
     Sight,
     WorkerTerms,
     check_worker,
@@ -33,7 +34,7 @@ from services.run.worker_entry import (
     refusal_of,
     see,
     start_environment,
-    worker_environment,
+    terms_of_driver,
 )
 from workers.assets.catalogue import Catalogue
 from workers.render.raster.gbuffer import shared_renderer
@@ -83,8 +84,6 @@ def test_a_worker_of_a_node_that_joined_later_is_asked_for_the_output_folder(tmp
 def test_a_node_that_is_to_end_keeps_a_shard_for_a_moment_so_that_it_is_not_handed_out_in_a_circle(
     tmp_path, monkeypatch
 ):
-    monkeypatch.delenv(DRAIN, raising=False)
-    assert not is_draining()
     monkeypatch.setenv(DRAIN, str(tmp_path / "drain"))
     assert not is_draining()
     (tmp_path / "drain").touch()
@@ -129,15 +128,6 @@ def test_a_folder_is_the_drivers_if_its_file_holds_the_token_and_it_can_be_writt
     assert look_at_folder(proof, "ours", 0) == "it cannot be written (Read-only file system)"
 
 
-def test_a_token_that_arrives_late_is_waited_for(tmp_path):
-    """As on a network file system, or while the heartbeat is being written."""
-    file = tmp_path / "_lock.json"
-    later = f"import time; time.sleep(0.4); open({str(file)!r}, 'w').write('{{\"token\": \"ours\"}}')"
-    file.write_text("{")
-    with subprocess.Popen([sys.executable, "-c", later]):
-        assert look_at_folder(str(file), "ours", 10) == ""
-
-
 def test_a_node_tells_its_code_or_why_it_has_none(tmp_path):
     assert see((), "", "").code == code_digest()
     cloudpickle.register_pickle_by_value(module)
@@ -160,10 +150,10 @@ GOOD = Sight("h2", X86_64_V3 | {"sse2"}, ENVIRONMENT, "c" * 64)
 
 def test_a_driver_gives_what_it_has_of_the_stacks_variables_and_no_other(monkeypatch):
     mine = {**ENVIRONMENT, "OMP_NUM_THREADS": "4", "AWS_SECRET_ACCESS_KEY": "secret"}
-    assert worker_environment(mine) == {**ENVIRONMENT, "OMP_NUM_THREADS": "4"}
-    assert {*STACK_ENVIRONMENT, *ON_X86_64_V3} == set(worker_environment(mine))
-    assert worker_environment(FOR_SPEED) == dict(FOR_SPEED)
-    assert worker_environment({}) == worker_environment({"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}) == {}
+    assert dict(terms_of_driver(mine).environment) == {**ENVIRONMENT, "OMP_NUM_THREADS": "4"}
+    assert {*STACK_ENVIRONMENT, *ON_X86_64_V3} == {name for name, _ in terms_of_driver(mine).environment}
+    for others, expected in (({}, {}), ({"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}, {}), (FOR_SPEED, FOR_SPEED)):
+        assert dict(terms_of_driver(others).environment) == expected
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     terms = terms_of_driver()
@@ -174,33 +164,18 @@ def test_a_driver_gives_what_it_has_of_the_stacks_variables_and_no_other(monkeyp
     assert private.env_vars == {}, "those of a private Ray inherit them"
 
 
+LESS, NO_CODE = "h2 is below x86-64-v3 (no avx2, fma)", "No module named 'workers'"
+OTHER = (
+    "h2 has code dddddddddddd, and head, where the run was started, has cccccccccccc: install the same wheel or image"
+)
+NO_FOLDER = (
+    "h2 does not share the output folder /data/out with head, where the run was started: there is no such folder"
+)
 REFUSALS = [
-    ({"flags": X86_64_V3 - {"fma", "avx2"}}, MachineError, ["h2 is below x86-64-v3 (no avx2, fma)", "head"]),
-    (
-        {"code": "d" * 64},
-        FingerprintError,
-        [
-            "h2 has code dddddddddddd",
-            "head, where the run was started, has cccccccccccc",
-            "install the same wheel or image",
-        ],
-    ),
-    (
-        {"code": "", "no_code": "No module named 'workers'"},
-        FingerprintError,
-        ["h2 has no code of this project (No module named 'workers')"],
-    ),
-    (
-        {"folder": "there is no such folder"},
-        OutputError,
-        [
-            "h2 does not share the output folder /data/out with head",
-            "there is no such folder",
-            "NFS",
-            "s3://",
-            "output.layout=tar",
-        ],
-    ),
+    ({"flags": X86_64_V3 - {"fma", "avx2"}}, MachineError, [LESS, "head"]),
+    ({"code": "d" * 64}, FingerprintError, [OTHER]),
+    ({"code": "", "no_code": NO_CODE}, FingerprintError, [f"h2 has no code of this project ({NO_CODE})"]),
+    ({"folder": "there is no such folder"}, OutputError, [NO_FOLDER, "NFS", "s3://", "output.layout=tar"]),
 ]
 """What a node lacks, and what it is told; a worker is told the same."""
 

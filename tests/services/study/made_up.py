@@ -1,18 +1,17 @@
 """Studies of accuracy against time: rows that were made up, and the studies that are kept in docs/tradeoff."""
 
 import json
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from schemas.job.job import JobKind
 from services.study.model import Figure, Proof, Row, Setting, Study
-from services.study.page import STUDY_FILE, STUDY_VERSION
+from services.study.page import STUDY_VERSION
 
 EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"
 
 
-PROOF = Proof("step=60", 80, {"depth_mm": 0.1}, {"depth_mm": Figure(0.09, 0.08, 0.1, 0.09, 80)}, {})
+PROOF = Proof("step=60", 80, {"depth_mm": 0.1}, {"depth_mm": Figure(0.09, 0.08, 0.1, 0.08, 0.1, 80)}, {})
 """A recommendation that held, of an error that the setting did not measure itself."""
 
 
@@ -22,7 +21,7 @@ def row(
     """`row("step=240, tier=flat", 0.8, depth_mm=0.1)`; without a name the job itself. Intervals are 10 % to each side."""
     parts = tuple((part.split("=")[0], part.split("=")[1]) for part in name.split(", ")) if name else ()
     setting = Setting(parts, {f"made.{knob}": label for knob, label in parts})
-    figures = {error: Figure(value, value * 0.9, value * 1.1, value * 0.4, scenes) for error, value in errors.items()}
+    figures = {error: Figure(value, *(value * 0.9, value * 1.1) * 2, scenes) for error, value in errors.items()}
     noise = noise if parts else 0.0
     return Row(setting, 118.0 * ratio, ratio, ratio * (1 - noise), ratio * (1 + noise), 235.0, figures, failed)
 
@@ -30,13 +29,14 @@ def row(
 def study(*rows: Row, job_scenes: int = 64, notes: tuple[str, ...] = ()) -> Study:
     machine = {"cpu": "A made-up processor", "cores": 2, "gl_renderer": "llvmpipe", "versions": {"numpy": "2.4.6"}}
     command = "verso tradeoff deploy/jobs/tabletop.yaml --out data/tradeoff"
-    made = Study("tabletop", command, machine, 48, rows, "balanced", job_scenes, notes, 900.0, 871.5)
-    return replace(made, answer="Use step=60.", doubts=("whether step=30 (4 scenes)",), proofs=(PROOF,))
+    doubts, spent = ("whether step=30 (4 scenes)",), (900.0, 871.5)
+    about = ("tabletop", command, machine, 48, rows, "balanced", job_scenes, notes)
+    return Study(*about, *spent, "Use step=60.", "step=60", doubts, (PROOF,))
 
 
 def read_study(folder: Path) -> Study:
-    """What `write_tables` was given; a tuple among the values of changes or machine comes back as a list."""
-    tree = json.loads((folder / STUDY_FILE).read_text(encoding="utf-8"))
+    """What `write_study` was given; a tuple among the values of changes or machine comes back as a list."""
+    tree = json.loads((folder / "study.json").read_text(encoding="utf-8"))
     assert tree.pop("verso_study") == STUDY_VERSION
     tuples = {name: tuple(tree[name]) for name in ("notes", "doubts")}
     proofs = tuple(map(_proof, tree["proofs"]))

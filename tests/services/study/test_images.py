@@ -12,9 +12,9 @@ from schemas.base import Range, frozen_array
 from schemas.job.views import Images
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.shape import Appearance
-from schemas.scene.view import Agreement, Camera, Intrinsics, Pair, View
+from schemas.scene.view import Camera, Intrinsics, Pair, View
 from services.job.job_file import validate_job
-from services.study.images import Truth, measure_images, truth_of
+from services.study.images import Truth, measure_images
 from tests.effects.scenes import SMALL, context_of, merged
 from tests.kit.shapes import box, shape_of
 from workers.geometry.camera import look_at
@@ -72,11 +72,11 @@ def scene_of(things, *pairs, scene_id=5):
 def measure(things, *pairs, units=UNITS):
     scene = scene_of(things, *pairs)
     images = Images(depth_units_per_m=units, depth_range_m=Range(0.2, 2.1))
-    return measure_images(SimpleNamespace(job=SimpleNamespace(images=images)), scene, Truth(scene))
+    return measure_images(SimpleNamespace(job=SimpleNamespace(images=images)), scene, Truth(scene, {}))
 
 
-def pair_of(first, mirror=None, d_z_m=TOP_Z, aligned=None, projected=None, agreement=None) -> Pair:
-    return Pair(d_z_m, first, () if aligned is None else (aligned,), mirror, projected, agreement, agreement)
+def pair_of(first, mirror=None, d_z_m=TOP_Z, aligned=None, projected=None) -> Pair:
+    return Pair(d_z_m, first, () if aligned is None else (aligned,), mirror, projected, None, None)
 
 
 def made(**changes):
@@ -96,28 +96,20 @@ def seen():
 def test_views_that_are_as_the_formulas_say_have_no_error_and_what_has_no_meaning_is_left_out(seen):
     depth_m, region = seen
     first, mirror, projected = view(*seen), view(*seen, "mirror"), view(depth_m, None, "projected")
-    found = measure(
-        table_and(block()), pair_of(first, mirror, projected=projected, agreement=Agreement(0.0, 1, 900, 0))
-    )
-    assert found.pop("outline_share") < 0.02  # the one that pixels bound: the outline runs through pixels
-    assert found == pytest.approx(dict.fromkeys(found, 0.0), abs=1e-4)
-    labels = {"depth_mm", "table_depth_mm", "mask_share", "between_mm"}
-    assert set(found) == labels | {"mirror_mm", "agreement_mm", "unfilled_share", "hidden_share"}
-    assert set(measure(table_and(block()), pair_of(first))) == labels | {"outline_share"}
-    unsure = pair_of(first, first, agreement=Agreement(None, None, 3, None))
-    assert "agreement_mm" not in measure(table_and(block()), unsure)
+    errors = measure(table_and(block()), pair_of(first, mirror, projected=projected))
+    assert errors == pytest.approx(dict.fromkeys(errors, 0.0), abs=1e-4)
+    labels = {"depth_mm", "mask_share", "between_mm"}
+    assert set(errors) == labels | {"mirror_mm", "unfilled_share", "hidden_share"}
+    assert set(measure(table_and(block()), pair_of(first))) == labels
     nothing, empty = view(np.full_like(depth_m, TABLE_Z), np.full_like(region, 2)), view(0 * depth_m, None, "projected")
-    found = measure(table_and(block(at=(1.5, 0.0))), pair_of(nothing, nothing, projected=empty))
-    assert found == {"table_depth_mm": pytest.approx(0.0, abs=1e-6)}
+    assert measure(table_and(block(at=(1.5, 0.0))), pair_of(nothing, nothing, projected=empty)) == {}
 
 
-def test_depth_is_off_by_what_was_added_and_the_table_s_apart_from_the_object_s(seen):
+def test_depth_of_objects_is_off_by_what_was_added_and_the_table_s_does_not_count(seen):
     depth_m, region = seen
-    for mine, of, expected in ((3, +7, ("depth_mm", 1.4)), (2, -11, ("table_depth_mm", 2.2))):
-        found = measure(table_and(block()), pair_of(view(depth_m + np.where(region == mine, of / UNITS, 0.0), region)))
-        errors = dict.fromkeys(("depth_mm", "table_depth_mm", "between_mm"), 0.0) | dict([expected])
-        errors["between_mm"] = errors["depth_mm"]
-        assert {name: found[name] for name in errors} == pytest.approx(errors, abs=1e-3)
+    for mine, of, expected in ((3, +7, 1.4), (2, -11, 0.0)):
+        errors = measure(table_and(block()), pair_of(view(depth_m + np.where(region == mine, of / UNITS, 0.0), region)))
+        assert (errors["depth_mm"], errors["between_mm"]) == pytest.approx((expected, expected), abs=1e-3)
 
 
 def test_depth_that_one_pixel_in_fifty_has_wrong_counts_and_one_in_two_hundred_or_without_depth_does_not(seen):
@@ -162,8 +154,8 @@ def test_between_an_object_s_parts_mask_pixels_are_wrong_and_the_table_s_depth_d
     filled[(region == 3).any(axis=1), 60:100] = 3
     assert measure(things, pair_of(view(depth_m, region)))["mask_share"] == 0.0
     assert measure(things, pair_of(view(depth_m, filled)))["mask_share"] == pytest.approx(40 / 40)
-    found = measure(things, pair_of(view(depth_m + np.where(region == 2, 0.05, 0.0), region)))
-    assert (found["between_mm"], found["table_depth_mm"]) == pytest.approx((0.0, 50.0), abs=1e-3)
+    errors = measure(things, pair_of(view(depth_m + np.where(region == 2, 0.05, 0.0), region)))
+    assert errors["between_mm"] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_between_pixels_of_a_slanted_face_depth_is_off_by_its_slope():
@@ -181,18 +173,8 @@ def test_between_pixels_of_a_slanted_face_depth_is_off_by_its_slope():
         u = (np.arange(k.width) + 0.5 - k.cx) / k.fx
         z = np.broadcast_to((normal @ on_face) / (normal[0] * u + normal[2]), (k.height, k.width))
         first = view(z, np.full(z.shape, 3, np.uint8), camera=camera, units=30_000)
-        found = measure(table_and(plate), pair_of(first), units=30_000.0)
-        assert found["between_mm"] == pytest.approx(0.25 / scale * np.tan(angle) * 1.8 / F * 1e3, rel=0.06)
-
-
-def test_rays_by_a_straight_outline_are_wrong_by_the_strip_that_no_pixel_s_centre_is_in():
-    """A top from 52.2 to 107.8 across: pixels 52 to 107 have their centres in it, and no ray of its box crosses another. One
-    from 52.6 to 107.4 has 0.4 on each side in pixels whose centres are not in it. Down it is from 39.7 to 80.3, and has 0.3."""
-    for pixels, wrong in ((55.6, 0.0), (54.8, 0.8)):
-        x, y = pixels * TOP_Z / F, 40.6 * TOP_Z / F
-        found = measure(table_and(block(x, y)), pair_of(view(*seen_of_block(camera_above(), x, y))))
-        expected = 1 - (1 - wrong / pixels) * (1 - 0.6 / 40.6)
-        assert found["outline_share"] == pytest.approx(expected, abs=4 * np.sqrt(expected / 4096))
+        errors = measure(table_and(plate), pair_of(first), units=30_000.0)
+        assert errors["between_mm"] == pytest.approx(0.25 / scale * np.tan(angle) * 1.8 / F * 1e3, rel=0.06)
 
 
 # ---------------------------------------------------------------------------------------------- the other side
@@ -207,10 +189,9 @@ def test_the_mirror_camera_is_off_by_what_d_z_is_off_the_nearest_visible_point()
     ball = trimesh.creation.uv_sphere(radius=0.1, count=(64, 64))
     ball.apply_translation((0.0, 0.0, 0.1))
     assert mirror_mm(1.8 + 0.012, ball) == pytest.approx(12.0, abs=1e-3)
-    first, worst = view(*seen_of_block(camera_above())), ((0.001, 0.3), (-0.004, 0.2), (0.002, None))
-    pairs = [pair_of(first, first, TOP_Z + off, agreement=Agreement(median, 1.0, 900, 0.0)) for off, median in worst]
-    found = measure(table_and(block()), *pairs)  # of several pairs the worst is told
-    assert found["mirror_mm"] == pytest.approx(4.0, abs=1e-3) and found["agreement_mm"] == 0.3
+    first = view(*seen_of_block(camera_above()))
+    pairs = [pair_of(first, first, TOP_Z + off) for off in (0.001, -0.004, 0.002)]  # of several pairs the worst counts
+    assert measure(table_and(block()), *pairs)["mirror_mm"] == pytest.approx(4.0, abs=1e-3)
     needle = trimesh.creation.cone(radius=0.05, height=0.3, sections=7)  # its point is between all rays
     assert mirror_mm(1.7, needle) == pytest.approx(0.0, abs=1e-6)
     beyond = trimesh.util.concatenate([block(), box(0.2, 0.2, 0.6, (0.7, 0.0, 0.3))])  # a taller one beside the picture
@@ -231,8 +212,8 @@ def test_pixels_that_the_projection_leaves_empty_are_counted_where_both_cameras_
     mine = np.argwhere(region == 3)
     depth = np.where(region == 3, depth_m, 0.0)
     depth[tuple(mine[::3].T)] = 0.0
-    found = projected_errors(table_and(block()), view(*seen), depth)
-    assert found["unfilled_share"] == pytest.approx(len(mine[::3]) / len(mine))
+    errors = projected_errors(table_and(block()), view(*seen), depth)
+    assert errors["unfilled_share"] == pytest.approx(len(mine[::3]) / len(mine))
     # A camera on each side of a block, both 45 degrees up: each sees its top and one side.
     k = Intrinsics(width=WIDTH, height=HEIGHT, fx=300.0, fy=300.0, cx=80.0, cy=60.0)
     poses = (look_at(np.array([x, 0.0, 1.1]), np.array([0.0, 0.0, 0.1])) for x in (-1, 1))
@@ -243,8 +224,8 @@ def test_pixels_that_the_projection_leaves_empty_are_counted_where_both_cameras_
     top = (np.abs(at[..., 0]) < 0.1) & (np.abs(at[..., 1]) < 0.075)
     first = view(0 * depth_m, np.full_like(region, 2), camera=left)
     for filled, expected in ((top, 0.0), (~top, 1.0)):
-        found = projected_errors(table_and(block()), first, np.where(filled, 1.3, 0.0), right)
-        assert found["unfilled_share"] == pytest.approx(expected, abs=2 / np.count_nonzero(top))
+        errors = projected_errors(table_and(block()), first, np.where(filled, 1.3, 0.0), right)
+        assert errors["unfilled_share"] == pytest.approx(expected, abs=2 / np.count_nonzero(top))
 
 
 def test_a_projected_pixel_behind_the_surface_is_hidden_and_one_before_it_is_not(seen):
@@ -252,14 +233,14 @@ def test_a_projected_pixel_behind_the_surface_is_hidden_and_one_before_it_is_not
     drawn = np.where(region == 3, TABLE_Z, 0.0)  # the table, where the block hides it
     drawn[:5], drawn[5:7], drawn[7:8] = 1.0, TABLE_Z + 0.004, TABLE_Z + 0.006
     block_pixels = np.count_nonzero(region == 3)
-    found = projected_errors(table_and(block()), view(*seen), drawn)
-    assert found["hidden_share"] == pytest.approx((block_pixels + WIDTH) / (block_pixels + 8 * WIDTH))
+    errors = projected_errors(table_and(block()), view(*seen), drawn)
+    assert errors["hidden_share"] == pytest.approx((block_pixels + WIDTH) / (block_pixels + 8 * WIDTH))
     # Every second column of a large image filled, as a projection fills, and every second of these hidden.
     camera, drawn = camera_above(640, 480, 2000.0), np.zeros((480, 640))
     drawn[:, ::4], drawn[:, 2::4] = TABLE_Z, TABLE_Z + 0.1
     first = view(np.full(drawn.shape, TABLE_Z), np.full(drawn.shape, 2, np.uint8), camera=camera)
-    found = projected_errors(table_and(block(0.01, 0.01)), first, drawn, camera)
-    assert found["hidden_share"] == pytest.approx(1 / 2, abs=4 * np.sqrt(0.25 / 9600))
+    errors = projected_errors(table_and(block(0.01, 0.01)), first, drawn, camera)
+    assert errors["hidden_share"] == pytest.approx(1 / 2, abs=4 * np.sqrt(0.25 / 9600))
 
 
 # ---------------------------------------------------------------------------------------------- truth
@@ -270,38 +251,26 @@ def test_truth_is_kept_while_the_poses_are_the_same_and_no_longer(seen):
         meshes = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in placed.shape.parts]
         return Placed(placed.region_id, shape_of(*meshes), placed.T_world_shape.copy())
 
-    things, moved = table_and(block()), np.eye(4)
-    truth, again = Truth(scene_of(things)), tuple(map(copy, things))
+    things, moved, kept = table_and(block()), np.eye(4), {}
     moved[2, 3] = 1e-6
-    assert truth_of(scene_of(again), truth) is truth
-    others: Sequence = (
-        (things[0], thing(3, block(), moved)),
-        table_and(block(0.201)),
-        things[:1],
-        table_and(block(), block()),
-    )
-    assert not any(truth_of(scene_of(other), truth) is truth for other in others)
-    assert truth_of(scene_of(things, scene_id=6), truth) is not truth and truth_of(scene_of(things)) is not truth
 
+    def pixels(placed: Sequence[Placed], scene_id: int = 5) -> object:
+        return Truth(scene_of(placed, scene_id=scene_id), kept).pixels(camera_above())
 
-def test_a_camera_scaled_to_another_size_asks_for_the_same_rays():
-    truth = Truth(scene_of(table_and(block())))
-    f, scales = 525.3, (0.5, 0.7, 1.1, 1.3, 2.0)
-    assert len({f * scale / round(WIDTH * scale) for scale in scales}) > 1, "rounding must not tell them apart"
-    for scale in scales:
-        camera = camera_above(round(WIDTH * scale), round(HEIGHT * scale), f * scale)
-        assert truth.patch(camera, 0) is truth.patch(camera_above(f=f), 0)
-    assert truth.patch(camera_above(f=526.0), 0) is not truth.patch(camera_above(f=f), 0)
+    first = pixels(things)
+    assert pixels(tuple(map(copy, things))) is first
+    others = ((things[0], thing(3, block(), moved)), table_and(block(0.201)), things[:1], table_and(block(), block()))
+    assert not any(pixels(other) is first for other in others) and pixels(things, scene_id=6) is not first
 
 
 def test_the_patch_is_the_box_about_what_is_seen_of_the_object():
     """And not about its foot, which the top hides, nor about what another thing hides."""
     half = np.array([0.1, 0.075]) * F / TOP_Z
-    patch = Truth(scene_of(table_and(block()))).patch(camera_above(), 0)
+    patch = Truth(scene_of(table_and(block())), {}).patch(camera_above(), 0)
     expected = np.array([80 - half[0], 60 - half[1], 80 + half[0], 60 + half[1]])
     assert np.array(patch.box) * (WIDTH, HEIGHT, WIDTH, HEIGHT) == pytest.approx(expected, abs=0.3)
     things = table_and(block(), roof=box(0.4, 0.4, 0.01, (0.2, 0.0, 0.205)))  # its near edge is at the axis
-    assert Truth(scene_of(things)).patch(camera_above(), 0).box[2] * WIDTH == pytest.approx(80.0, abs=0.3)
+    assert Truth(scene_of(things), {}).patch(camera_above(), 0).box[2] * WIDTH == pytest.approx(80.0, abs=0.3)
 
 
 # ---------------------------------------------------------------------------------------------- made scenes
@@ -309,22 +278,21 @@ def test_the_patch_is_the_box_about_what_is_seen_of_the_object():
 
 def test_a_made_scene_has_the_errors_that_its_units_and_pixels_leave():
     """99 of 100 of errors that rounding spreads evenly are within 99 % of half a unit. Pixels twice as wide, and nothing
-    else changed, have twice the error between them, in as many more places along the outline."""
+    else changed, have twice the error between them."""
     fine, scene = made()
-    truth = truth_of(scene)
-    found = measure_images(fine, scene, truth)
-    assert found["depth_mm"] == pytest.approx(0.99 * 0.1, abs=0.004)
-    assert found["table_depth_mm"] == pytest.approx(0.99 * 0.1, abs=0.002)
-    assert found["mask_share"] < 0.01
+    kept: dict = {}
+    truth = Truth(scene, kept)
+    errors = measure_images(fine, scene, truth)
+    assert errors["depth_mm"] == pytest.approx(0.99 * 0.1, abs=0.004)
+    assert errors["mask_share"] < 0.01
     coarse, rough = made(images={"depth_units_per_m": 500.0, "patch": SMALL["images"]["patch"]})
-    again = measure_images(coarse, rough, truth_of(rough, truth))
-    assert again["depth_mm"] == pytest.approx(0.99, abs=0.04) and again["outline_share"] == found["outline_share"]
+    again = measure_images(coarse, rough, Truth(rough, kept))
+    assert again["depth_mm"] == pytest.approx(0.99, abs=0.04) and again["between_mm"] > errors["between_mm"]
     k = {"width": 320, "height": 240, "fx": 262.5, "fy": 262.5, "cx": 160.0, "cy": 120.0}
     large, larger = made(cameras={"sensor": k})
-    twice = measure_images(large, larger, truth_of(larger, truth))
-    assert found["between_mm"] / twice["between_mm"] == pytest.approx(2.0, rel=0.25)
-    assert found["outline_share"] / twice["outline_share"] == pytest.approx(2.0, rel=0.3)
-    assert abs(found["mirror_mm"] - twice["mirror_mm"]) < found["mirror_mm"]
+    twice = measure_images(large, larger, Truth(larger, kept))
+    assert errors["between_mm"] / twice["between_mm"] == pytest.approx(2.0, rel=0.25)
+    assert abs(errors["mirror_mm"] - twice["mirror_mm"]) < errors["mirror_mm"]
     camera = scene.pairs[0].mirror.camera
     depth_m, region, _ = cast_view(scene.posed.things, camera)
     pixels = truth.pixels(camera)

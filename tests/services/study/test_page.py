@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import io
 import json
 import math
 import re
@@ -9,9 +10,10 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
-from services.study.model import ERRORS, Setting, Study
-from services.study.page import page_of, wide_schema, write_page, write_tables
+from services.study.model import ERRORS, Figure, Setting, Study
+from services.study.page import draw_tradeoff, moving_rows, page_of, write_study
 from tests.kit.html import Reader
 from tests.services.study.made_up import read_study, row, stored, study
 
@@ -19,20 +21,23 @@ from tests.services.study.made_up import read_study, row, stored, study
 
 
 def test_a_study_comes_back_exactly_and_nothing_else_is_left(tmp_path: Path):
-    odd = row("a=1", 1e-300, flip=0.1 + 0.2, depth_mm=math.inf)
+    odd = row("a=1", 0.5, flip=0.1 + 0.2, depth_mm=1e-300)
+    odd = dataclasses.replace(odd, errors={**odd.errors, "gap_mm": Figure(0.1, 0.1, 0.1, 0.1, math.inf, 1)})
     changed = dataclasses.replace(
         odd, setting=Setting((("ä\n", '"'),), {"a": [None, True, -(2**60), [0.5]]}), notes=("", "é")
     )
     for made in (stored(), study(row(), changed, notes=("<&>",))):
         for _ in range(2):
-            written = write_tables(made, tmp_path / "new")
-        assert read_study(tmp_path / "new") == made and sorted((tmp_path / "new").iterdir()) == sorted(written)
+            write_study(made, tmp_path / "new")
+        files = {path.name for path in (tmp_path / "new").iterdir()}
+        assert read_study(tmp_path / "new") == made
+        assert files == {"tradeoff.parquet", "study.json", "tradeoff.png", "index.html"}
 
 
-def test_the_wide_table_has_a_row_a_setting_and_the_long_one_a_row_an_error(tmp_path: Path):
-    write_tables(study(row(depth_mm=0.1), row("step=240, tier=flat", 0.5, failed=0.01, flip=0.2)), tmp_path)
+def test_the_table_has_a_row_a_setting(tmp_path: Path):
+    write_study(study(row(depth_mm=0.1), row("step=240, tier=flat", 0.5, failed=0.01, flip=0.2)), tmp_path)
     table = pq.read_table(tmp_path / "tradeoff.parquet")
-    assert table.schema.equals(wide_schema()) and set(ERRORS) <= set(table.column_names)
+    assert {"depth_mm", "flip", "flip_low", "flip_high"} <= set(table.column_names)
     own, pair = table.to_pylist()
     assert (own["setting"], own["knob"], own["value"], own["depth_mm"], own["flip"]) == ("the job", "", "", 0.1, None)
     assert own["depth_mm_low"] == pytest.approx(0.09) and own["depth_mm_high"] == pytest.approx(0.11)
@@ -40,47 +45,40 @@ def test_the_wide_table_has_a_row_a_setting_and_the_long_one_a_row_an_error(tmp_
     assert json.loads(pair["changes"]) == {"made.step": "240", "made.tier": "flat"}
     assert (pair["ms"], pair["ratio"], pair["kilobytes"], pair["failed_share"]) == (59.0, 0.5, 235.0, 0.01)
     assert (pair["ratio_least"], pair["ratio_most"]) == pytest.approx((0.49, 0.51))
-    first, last = pq.read_table(tmp_path / "errors.parquet").to_pylist()
-    assert (first["setting"], first["error"], first["amount"]) == ("the job", "depth_mm", 0.1)
-    expected = {"setting": "step=240, tier=flat", "value": "240, flat", "error": "flip", "unit": "", "group": "colour"}
-    assert last.items() >= {**expected, "ms": 59.0, "amount": 0.2, "scenes": 48}.items()
 
 
 # ---------------------------------------------------------------------------------------------- the page
 
 
 def test_the_page_answers_first_and_needs_no_network_no_script_and_no_file(tmp_path: Path):
-    picture = tmp_path / "tradeoff.png"
-    picture.write_bytes(b"\x89PNG made up")
-    write_page(stored(), [picture, picture], tmp_path / "new" / "index.html")
+    write_study(stored(), tmp_path / "new")
     page = (tmp_path / "new" / "index.html").read_text(encoding="utf-8")
     reader = Reader(page)
     assert reader.texts["p"][0] == stored().answer
     assert reader.texts["h1"] == ["What accuracy costs in time: tabletop"]
-    assert len(reader.links) == 2 and all(link.startswith("data:image/png;base64,") for link in reader.links)
+    (picture,) = reader.links
+    assert (
+        base64.b64decode(picture.removeprefix("data:image/png;base64,")) == (tmp_path / "new/tradeoff.png").read_bytes()
+    )
     assert "script" not in reader.texts and "link" not in reader.texts
-    assert base64.b64decode(reader.links[0].partition(",")[2]) == picture.read_bytes()
     assert not re.search(r"https?:|url\(|@import", page)
-    assert Reader(page_of(study(row()), [])).texts["p"][:2] == [
-        "Use step=60.",
-        "Not decided: whether step=30 (4 scenes).",
-    ]
+    doubt = "Not decided: whether step=30 (4 scenes)."
+    assert Reader(page_of(study(row()), b"")).texts["p"][:2] == ["Use step=60.", doubt]
 
 
 def test_what_comes_from_outside_is_escaped():
     evil = '<script>alert("x")</script>&'
     rows = [row(depth_mm=0.1), row(f"{evil}={evil}", 0.5, depth_mm=0.2), row(f"a=1, {evil}={evil}", 0.4, depth_mm=0.3)]
     noted = tuple(dataclasses.replace(one, notes=(evil,)) for one in rows)
-    made = Study(evil, evil, {evil: {evil: [evil]}}, 1, noted, evil, 64, (evil,), answer=evil, doubts=(evil,))
-    page = page_of(made, [])
+    made = Study(evil, evil, {evil: {evil: [evil]}}, 1, noted, evil, 64, (evil,), 1.0, 1.0, evil, "", (evil,), ())
+    page = page_of(made, b"")
     assert "<script" not in page and evil in " ".join(Reader(page).texts["li"])
 
 
 def test_every_setting_and_error_is_in_tables_of_even_rows():
-    rows = Reader(page_of(stored(), [])).rows
+    rows = Reader(page_of(stored(), b"")).rows
     first = {cells[0] for cells in rows if cells}
-    for one in stored().rows:
-        assert (one.setting.name if len(one.setting.parts) != 1 else one.setting.parts[0][1]) in first
+    assert {each.setting.name for each in stored().rows} <= first
     assert set(ERRORS) | {"the job", "command"} <= first
     wide = 0
     for cells in rows[: next(place for place, cells in enumerate(rows) if cells and cells[0] == "target")]:
@@ -96,19 +94,43 @@ def test_a_row_says_what_the_job_costs_and_what_differs_by_more_than_colour():
         row("a=2", 2.0, depth_mm=0.05),
         row("a=3", 3.0, depth_mm=0.1),
     ]
-    cells = {cells[0]: cells for cells in Reader(page_of(study(*rows, job_scenes=100_000), [])).rows if len(cells) == 6}
-    assert (
-        cells["1"][-1].startswith("▲ 0.2") and cells["2"][-1].startswith("▼ 0.05") and cells["3"][-1].startswith("0.1")
-    )
-    assert cells["2"][1:5] == ["2 times1.96 – 2.04", "236 ms", "6.6 h6.56 core-hours", "24 GB"]
+    cells = {
+        cells[0]: cells for cells in Reader(page_of(study(*rows, job_scenes=100_000), b"")).rows if len(cells) == 6
+    }
+    marks = {"a=1": "▲ 0.2", "a=2": "▼ 0.05", "a=3": "0.1"}
+    assert all(cells[name][-1].startswith(mark) for name, mark in marks.items())
+    assert cells["a=2"][1:5] == ["2 times1.96 – 2.04", "236 ms", "6.6 h", "24 GB"]
 
 
-def test_the_machine_the_command_and_what_was_left_out_are_told():
+def test_the_machine_the_command_and_what_was_left_out_are_named():
     noted = [dataclasses.replace(row(name, depth_mm=0.1), notes=("31 scenes differ",)) for name in ("", "a=1")]
-    reader = Reader(page_of(study(*noted, notes=("sensor: not of this job",)), []))
-    assert reader.texts["li"] == ["sensor: not of this job", "31 scenes differ (the job, a=1)"]
-    assert Reader(page_of(study(row(depth_mm=0.1)), [])).texts["li"] == ["Nothing was left out."]
+    reader = Reader(page_of(study(*noted, notes=("sensor: not of this job",)), b""))
+    assert reader.texts["li"] == ["sensor: not of this job", "the job: 31 scenes differ", "a=1: 31 scenes differ"]
     rows = {cells[0]: cells[-1] for cells in reader.rows if len(cells) == 2}
     assert rows["command"] == "verso tradeoff deploy/jobs/tabletop.yaml --out data/tradeoff"
-    assert rows["cpu"] == "A made-up processor" and rows["versions"] == "numpy 2.4.6"
-    assert rows["the job's 64 scenes"] == "7.6 s on one core (0.0021 core-hours), 15 MB"
+    assert rows["cpu"] == "A made-up processor" and rows["versions"] == '{"numpy": "2.4.6"}'
+    assert rows["the job's 64 scenes"] == "0.0021 core-hours, 15 MB"
+
+
+# ---------------------------------------------------------------------------------------------- the picture
+
+
+def test_every_study_has_a_picture_and_the_same_study_the_same_bytes():
+    """Of long names, many knobs, points that lie on one another, errors of 0, and a job alone."""
+    names = [f"a long name of knob {n}=a long value of it {k}" for n in range(9) for k in range(4)]
+    crowd = [row(name, 0.9 + 0.005 * n, gap_mm=0.1 * (1 + n % 7), flip=0.1) for n, name in enumerate(names)]
+    own = row(gap_mm=0.1, depth_mm=0.1, mirror_mm=1.0)
+    zeros = [row("step=1", 3.0, gap_mm=0.0, mirror_mm=0.1), row("units=1", 0.9, depth_mm=0.5)]
+    for made in (stored(), study(own, *crowd), study(own, *zeros), study(row(gap_mm=0.0)), study(row())):
+        data = draw_tradeoff(made)
+        with Image.open(io.BytesIO(data)) as image:
+            width, height = image.size
+        assert width == 1800 and height >= 800
+        assert data == draw_tradeoff(made)
+
+
+def test_a_panel_has_the_knobs_that_move_its_error_and_their_combinations():
+    rows = [row(gap_mm=0.5), row("a=1", gap_mm=0.51), row("b=1", gap_mm=0.9), row("a=1, b=1", gap_mm=0.9)]
+    rows += [row("preset=fast", gap_mm=0.5), row("c=1", flip=0.1)]
+    assert [each.setting.name for each in moving_rows(rows, "gap_mm")] == ["the job", "b=1", "a=1, b=1", "preset=fast"]
+    assert len(moving_rows([row(gap_mm=1e-9), row("a=1", gap_mm=1e-3)], "gap_mm")) == 1  # negligible

@@ -15,7 +15,15 @@ from tests.workers.assets.libraries import library_of, open_folder
 from tests.workers.door.oracles import CUBE, picture, textured_cube, write
 from workers.assets.catalogue import choose_object, open_catalogue
 from workers.assets.library import collection, making, shapes, table
-from workers.assets.library.making import Making, decide_rows, locate_folder, locked, make_library, open_library
+from workers.assets.library.making import (
+    Making,
+    decide_rows,
+    locate_folder,
+    locked,
+    make_library,
+    open_library,
+    remake_library,
+)
 from workers.assets.library.reading import load_file, place_asset
 from workers.assets.library.shapes import load_shape, make_shapes, open_shape, shape_path, with_shape
 from workers.assets.library.table import SCHEMA, TABLE_FILE, read_table, write_table
@@ -24,9 +32,18 @@ TALL = CUBE.replace("v 0 1", "v 0 3").replace("v 1 1", "v 1 3")  # 1 x 3 x 1: +Y
 SETTINGS = LibrarySource(source="library", folder=".")
 
 
+USUAL = Making()
+
+
+def init(source, out, how=USUAL):
+    """The table as `verso init` writes it."""
+    with locked(out, wait=False):
+        return remake_library(source, out, how)
+
+
 def made(folder, **how):
     """A library beside a folder, with all its shapes."""
-    library = make_library(folder, folder.parent / "lib", Making(**how), edited=True)
+    library = init(folder, folder.parent / "lib", Making(**how))
     rows = {row.path: with_shape(library, row, shape) for row, shape in make_shapes(library, _used(library))}
     library = replace(library, rows=tuple(rows.get(row.path, row) for row in library.rows))
     write_table(library)
@@ -214,17 +231,17 @@ def test_two_makers_of_a_library_a_full_disk_and_a_folder_that_changes_are_told_
 ):
     write(tmp_path / "in/mug/a.obj", TALL)
     with locked(tmp_path / "lib", wait=False), pytest.raises(InUseError, match="another `verso init`"):
-        make_library(tmp_path / "in", tmp_path / "lib", Making(), edited=True)
+        init(tmp_path / "in", tmp_path / "lib")
     with monkeypatch.context() as patch:
         patch.setattr(table.Path, "write_bytes", _full)
         with pytest.raises(OutputError, match=r"library.parquet cannot be written: No space"):
-            make_library(tmp_path / "in", tmp_path / "new", Making(), edited=True)
+            init(tmp_path / "in", tmp_path / "new")
         assert not (tmp_path / "new").exists()
         library = make_library(tmp_path / "in", tmp_path / "cache", Making())  # a run goes on without
         assert load(library, library.rows[0]).watertight
         with pytest.raises(OutputError, match=r"\.glb cannot be written: No space"):
             list(make_shapes(library, library.rows, must_keep=True))
-    library = make_library(tmp_path / "in", tmp_path / "lib", Making(), edited=True)
+    library = init(tmp_path / "in", tmp_path / "lib")
     write(tmp_path / "in/mug/a.obj", CUBE)
     ((_, answer),) = make_shapes(library, library.rows)
     assert (answer.reason, answer.kind) == ("changed", "environmental") and "verso init" in answer.detail

@@ -145,7 +145,7 @@ def source_at(shift_m=0.0):
     depth_camera = Camera(K, frozen_array(HOME.T_world_cam @ translation(shift_m, 0, 0))) if shift_m else HOME
     depth, mask, _ = cast(THING, depth_camera)
     view = PosedView(0, HOME, depth_camera, cast(THING, HOME)[2], depth.astype(np.float32))
-    return prepare_source(view, fit_depth(view.depth_m, K, 75.0), mask)
+    return prepare_source(view, fit_depth(view.depth_m, K), mask)
 
 
 def test_depth_colour_and_mask_are_those_that_the_other_camera_has():
@@ -188,7 +188,7 @@ def test_colours_and_depth_follow_a_depth_camera_that_stands_elsewhere():
 
 def sources(sigma_m, count=24, seed=0):
     views = capture(THING, count=count, sigma_m=sigma_m, seed=seed)
-    return [prepare_source(view, fit_depth(view.depth_m, K, 75.0), cast(THING, view.camera)[1]) for view in views]
+    return [prepare_source(view, fit_depth(view.depth_m, K), cast(THING, view.camera)[1]) for view in views]
 
 
 @pytest.mark.parametrize("sigma_m", [0.002, pytest.param(0.004, marks=pytest.mark.minute)])
@@ -218,16 +218,14 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
 
 
 def test_the_nearest_surface_is_averaged_and_what_one_from_behind_hides_is_empty():
-    tiny = Camera(K.model_copy(update={"width": 4, "height": 3}), np.eye(4))
-
     def layer(depth_m, weight, code):
         full = [np.full((3, 4), value, np.float32) for value in (depth_m, weight)]
         return Layer(*full, np.full((3, 4, 3), code, np.uint8), np.ones((3, 4), bool))
 
-    rgb, depth, _ = merge_layers([layer(1.000, 1.0, 10), layer(1.002, 3.0, 50), layer(1.2, 9.0, 250)], tiny)
+    rgb, depth, _ = merge_layers([layer(1.000, 1.0, 10), layer(1.002, 3.0, 50), layer(1.2, 9.0, 250)])
     assert np.allclose(depth, 1.0015) and (rgb == 40).all()
-    assert not merge_layers([layer(1.0, 1.0, 10), layer(0.8, 0.0, 0)], tiny)[1].any()
-    assert np.allclose(merge_layers([layer(1.0, 1.0, 10), layer(1.1, 0.0, 0)], tiny)[1], 1.0)
+    assert not merge_layers([layer(1.0, 1.0, 10), layer(0.8, 0.0, 0)])[1].any()
+    assert np.allclose(merge_layers([layer(1.0, 1.0, 10), layer(1.1, 0.0, 0)])[1], 1.0)
 
 
 def halves():

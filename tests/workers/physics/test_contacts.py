@@ -22,7 +22,7 @@ from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.physics import exact_rest
 from workers.physics.contact_surface import crop, faces_within, find_near, skin_of, surface_of
 from workers.physics.contacts import Contacts, contacts_within
-from workers.physics.exact_rest import MANY, Motion, Rested, rest, step
+from workers.physics.exact_rest import Motion, Rested, rest, step
 from workers.physics.placement import FARTHEST_M, Form, Support, find_gaps_m, find_overlaps_m, measure_supports, place
 from workers.physics.placement import forms_of as forms
 
@@ -231,26 +231,6 @@ def test_energy_is_never_gained_where_nothing_overlaps():
         leaning = box((0.1, 0.08, 0.05), turn=rotation_about(UP, rng.uniform(0, 6)) @ tipped(rng.uniform(0.01, 0.4)))
         low = Mesh(leaning.vertices - [0, 0, leaning.vertices[:, 2].min()], leaning.faces)
         assert follow([low]).moves[0, 2] < 0.0
-
-
-def test_the_two_solvers_agree(monkeypatch):
-    """DAQP and Clarabel share no code: an active set and an interior point.
-
-    On boxes in columns of five, turned at random about the vertical, with 20 micrometres below each but the lowest.
-    """
-    rng, bodies = np.random.default_rng(7), []
-    for number in range(MANY):
-        turn = rotation_about(UP, rng.uniform(0, 6))
-        at = 0.09 * (number // 5), rng.uniform(-0.005, 0.005), 0.025 + 0.05002 * (number % 5)
-        bodies.append(box((0.06, 0.06, 0.05), at, turn))
-    for fall_m in (1e-4, 1e-2):
-        both = []
-        for least in (MANY, MANY + 1):
-            monkeypatch.setattr(exact_rest, "MANY", least)
-            both.append(follow(bodies, fall_m=fall_m))
-        assert both[0].moves == pytest.approx(both[1].moves, abs=1e-7 * fall_m)
-        assert both[0].turns == pytest.approx(both[1].turns, abs=1e-6 * fall_m)
-        assert np.abs(both[0].moves).max() > 0.1 * FALL_M and not np.array_equal(both[0].moves, both[1].moves)
 
 
 # ---------------------------------------------------------------------------------------------- until nothing moves

@@ -171,8 +171,8 @@ def test_a_bug_in_one_scene_is_a_row_names_what_was_in_it_and_the_others_are_mad
     (row,) = failures_of(tmp_path)
     assert (row["scene_id"], row["stage"], row["kind"], row["reason"]) == (1, "worker", "environmental", "bug")
     assert row["detail"].startswith("ZeroDivisionError: no such thing at test_run_shard.py:")
-    (told,) = span.bugs
-    assert told.startswith(f"scene 1 ({row['category']} ") and ", on table " in told and "\n" not in told
+    (message,) = span.bugs
+    assert message.startswith(f"scene 1 ({row['category']} ") and ", on table " in message and "\n" not in message
     kept = (tmp_path / "_logs" / "scene-1.txt").read_text()
     assert "ZeroDivisionError: no such thing" in kept and "Traceback" in kept
     assert describe(KeyError()) == "KeyError" and explain(RuntimeError("x" * 5000)).detail.count("x") < 250

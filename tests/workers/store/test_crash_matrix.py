@@ -208,8 +208,8 @@ def promised(store) -> str | None:
     success = read_success(store)
     if success is None:
         return None
-    found = {entry.key for entry in store.files("manifest") if not entry.key.startswith("manifest/_")}
-    stray = found - set(success["files"])
+    seen = {entry.key for entry in store.files("manifest") if not entry.key.startswith("manifest/_")}
+    stray = seen - set(success["files"])
     assert store.root is None or not stray
     assert not any(pq.read_metadata(io.BytesIO(store.read(key))).num_rows for key in stray)
     for path, file in success["files"].items():
@@ -247,8 +247,8 @@ def pause_on_disk(tmp_path: Path, stop: int):
         root = tmp_path / str(step)
         shutil.copytree(tmp_path / "seed", root)
         with disk(at=step, then=lambda: merge_newer(LocalStore(root), stop)) as watched:
-            told = refusal(LocalStore(root))
-        return watched.steps, LocalStore(root), told
+            message = refusal(LocalStore(root))
+        return watched.steps, LocalStore(root), message
 
     return pause
 
@@ -267,8 +267,8 @@ def pause_in_bucket(_: Path, stop: int):
             for module in (store_module, merge_module, reading, ledger):  # requests in the same order each time
                 patch.setattr(module, "map_ahead", lambda store, function, items, at_once=None: map(function, items))
             with requests(at=step, then=lambda: merge_newer(store, stop), names=REQUESTS) as watched:
-                told = refusal(store)
-        return watched.count, store, told
+                message = refusal(store)
+        return watched.count, store, message
 
     return pause
 
@@ -289,9 +289,9 @@ def test_paused_at_a_point_while_a_newer_merge_completes_one_of_them_stands(wher
     steps = pause(NEVER)[0]
     finished, refused = [], []
     for step in points(steps, every):
-        _, store, told = pause(step)
-        assert not told or "start again" in told or "outside the 0 to 3" in told
-        refused.append(bool(told))
+        _, store, message = pause(step)
+        assert not message or "start again" in message or "outside the 0 to 3" in message
+        refused.append(bool(message))
         with disk():
             digest = promised(store)
             assert digest in (None, expected[stop]), f"step {step}"

@@ -65,8 +65,8 @@ def store(tmp_path):
 
 def everything(folder: Path) -> dict[str, bytes | str]:
     """All files and links below a folder."""
-    found = [path for path in folder.rglob("*") if path.is_symlink() or path.is_file()]
-    return {str(path): os.readlink(path) if path.is_symlink() else path.read_bytes() for path in found}
+    seen = [path for path in folder.rglob("*") if path.is_symlink() or path.is_file()]
+    return {str(path): os.readlink(path) if path.is_symlink() else path.read_bytes() for path in seen}
 
 
 def refused(store: LocalStore, record, **changes) -> str:
@@ -74,10 +74,10 @@ def refused(store: LocalStore, record, **changes) -> str:
     raw = json.loads(encode_record(record))
     del raw["seal"]
     (store.root / KEY).write_bytes(seal_record(raw | changes))
-    with pytest.raises(CorruptError, match=r"manifest/_commits/0000000000\.json is not a commit record: ") as told:
+    with pytest.raises(CorruptError, match=r"manifest/_commits/0000000000\.json is not a commit record: ") as error:
         sweep(store, fenced=None)
-    assert len(str(told.value).splitlines()) == 1 and str(told.value).isprintable()
-    return str(told.value)
+    assert len(str(error.value).splitlines()) == 1 and str(error.value).isprintable()
+    return str(error.value)
 
 
 def test_a_path_that_is_not_one_of_the_range_is_refused_with_the_records_name(store, undecided, tmp_path):
@@ -99,8 +99,8 @@ def test_a_path_that_is_not_one_of_the_range_is_refused_with_the_records_name(st
 
 def test_a_name_or_a_span_that_is_none_is_refused_at_once(store, undecided):
     for attempt in ATTEMPTS:
-        told = refused(store, undecided, attempt=attempt)
-        assert "is not the name of an attempt" in told or len(attempt) > 200  # the message is cut there
+        message = refused(store, undecided, attempt=attempt)
+        assert "is not the name of an attempt" in message or len(attempt) > 200  # the message is cut there
     for span in SPANS:
         refused(store, undecided, span=dict(zip(FIELDS, span, strict=True)))
 
@@ -127,9 +127,11 @@ def test_nothing_is_published_or_merged_through_a_link_that_leads_out(store, und
         merge(store, 0, 12)
 
     before = link_into(store, key, tmp_path / "home")
-    with pytest.raises(OutputError, match=f"{key} is a symbolic link that leads out of .*: nothing is written") as told:
+    with pytest.raises(
+        OutputError, match=f"{key} is a symbolic link that leads out of .*: nothing is written"
+    ) as error:
         publish_and_merge()
-    assert len(str(told.value).splitlines()) == 1
+    assert len(str(error.value).splitlines()) == 1
     assert everything(tmp_path / "home") == before
 
 
@@ -203,9 +205,9 @@ def outcome(data: bytes, store: LocalStore) -> str:
         assert decode_record(encode_record(record), KEY).span == record.span
         with contextlib.suppress(CorruptError, CommitConflict):  # a file that it names is not there
             sweep(store, fenced=None)
-        found = read_record(store, 0)
-        assert found is not None
-        publish(store, found)
+        seen = read_record(store, 0)
+        assert seen is not None
+        publish(store, seen)
     except (CorruptError, CommitConflict, OutputError) as error:
         return "refused" if str(error).isprintable() and len(str(error)) < 1000 else "told badly"
     return "read"

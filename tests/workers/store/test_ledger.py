@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 from schemas.dataset.commit import LEDGER_SCHEMA, CommitSummary, join_rows, rows_of
-from schemas.dataset.layout import LEDGER_FILE, STAGING, commit_path, range_table_path
+from schemas.dataset.layout import LEDGER_FILE, commit_path
 from schemas.errors import CorruptError, MachineError, RunError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms
 from workers.store import ledger as module
@@ -59,19 +59,6 @@ def test_the_rows_of_a_retry_replace_those_of_its_scenes_alone_also_where_it_fai
     for table, scenes in (("scenes", [0, 1, 2]), ("failures", [3]), ("timings", [0, 1, 2, 3])):
         assert range_rows(store, records, table).column("scene_id").to_pylist() == scenes
     assert range_rows(store, records, "failures").column("kind").to_pylist() == ["intrinsic"]
-
-
-def test_a_range_is_read_while_it_is_published_and_a_damaged_or_missing_table_is_told_by_name(store, undecided):
-    (records,) = iter_ranges(store, 0, 4)
-    assert list(store.files(STAGING)) and range_rows(store, records, "scenes").num_rows == 4
-    attempt_at(store, 4, 8).commit()
-    (_, records), path = iter_ranges(store, 0, 8), range_table_path(4, "views")
-    store.put(path, store.read(path)[:-1] + b"X")
-    with pytest.raises(CorruptError, match=f"{path} does not match the SHA-256 in its commit"):
-        range_rows(store, records, "views")
-    store.remove(path)
-    with pytest.raises(CorruptError, match=f"{path} is committed and missing"):
-        range_rows(store, records, "views")
 
 
 @pytest.fixture

@@ -67,8 +67,8 @@ def test_files_are_put_listed_moved_and_removed(place):
     assert {one.key for one in place.files("mug", sizes=False)} == whole.keys()
     assert {"mug/a.png", "mugs/c.png"} < {one.key for one in place.files("")}
     assert place.names("mug") == ["a.png", "b.png", "patches"] and place.children("mug") == ["patches"]
-    found = place.stat("mugs/c.png")
-    assert (found.key, found.bytes, place.size("mugs/c.png")) == ("mugs/c.png", 3, 3)
+    seen = place.stat("mugs/c.png")
+    assert (seen.key, seen.bytes, place.size("mugs/c.png")) == ("mugs/c.png", 3, 3)
     with place.open("mugs/c.png") as file:
         assert (file.read(2), file.read(), file.tell()) == (b"12", b"3", 3)
     both = {"mug/patches/a.png", "mugs/c.png"}
@@ -234,12 +234,12 @@ def test_a_place_that_cannot_keep_a_dataset_or_stops_answering_is_refused_by_nam
     nowhere = {"allow_http": True}
     options = {"region": "us-east-1", "skip_signature": True, "retry_config": {"max_retries": 0}}
     nobody = S3Store("bucket", endpoint="http://127.0.0.1:1", client_options=nowhere, **options)
-    for place, told in (
+    for place, message in (
         (LocalStore(tmp_path / "file" / "out"), "file/out cannot be written"),
         (ObjectStore(HTTPStore("http://127.0.0.1:1/"), "http://web"), "http://web does not refuse a second put"),
         (ObjectStore(nobody, "s3://nobody"), "s3://nobody cannot be written"),
     ):
-        with pytest.raises(OutputError, match=told):
+        with pytest.raises(OutputError, match=message):
             place.prepare()
 
     def fails(*_, **__):

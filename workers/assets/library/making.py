@@ -167,29 +167,32 @@ def locked(folder: Path, wait: bool) -> Iterator[None]:
         os.close(handle)
 
 
-def make_library(
-    source: Path, out: Path | None, making: Making, watch: Watch = ignore, edited: bool = False
-) -> Library:
+def make_library(source: Path, out: Path | None, making: Making, watch: Watch = ignore) -> Library:
     """Decides about every candidate of a folder and writes the table into `out`, where it can be written.
 
-    edited: what a person has changed in an earlier table there stays, and who comes second is refused. Raises AssetSourceError
-    where the folder cannot be used.
+    Raises AssetSourceError where the folder cannot be used.
     """
     source = source.resolve()
-    if out is None:
-        return Library(Path(os.devnull), source, making.limits, decide_rows(source, making, watch))
-    try:
-        with locked(out, wait=not edited):
-            rows = decide_rows(source, making, watch)
-            if edited and (out / TABLE_FILE).exists():
-                rows = keep_edits(rows, read_table(out))
-            library = Library(out, source, making.limits, rows)
+    library = Library(out or Path(os.devnull), source, making.limits, ())
+    if out is not None:
+        with suppress(OutputError), locked(out, wait=True):
+            library = replace(library, rows=decide_rows(source, making, watch))
             write_table(library)
-            return library
-    except OutputError:
-        if edited:
-            raise
-        return Library(out, source, making.limits, decide_rows(source, making, watch))
+    return library if library.rows else replace(library, rows=decide_rows(source, making, watch))
+
+
+def remake_library(source: Path, out: Path, making: Making, watch: Watch = ignore) -> Library:
+    """As `make_library` in a `locked` folder; what a person has changed in an earlier table there stays.
+
+    Raises OutputError where the table cannot be written.
+    """
+    source = source.resolve()
+    rows = decide_rows(source, making, watch)
+    if (out / TABLE_FILE).exists():
+        rows = keep_edits(rows, read_table(out))
+    library = Library(out, source, making.limits, rows)
+    write_table(library)
+    return library
 
 
 def decide_rows(source: Path, making: Making, watch: Watch = ignore) -> tuple[Row, ...]:

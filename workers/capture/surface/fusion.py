@@ -15,7 +15,7 @@ from schemas.job.captures import Fusion
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.surface.object_mask import ObjectRegion
-from workers.capture.surface.posed_view import NEAREST_M, PosedView, pixel_of, visible_points
+from workers.capture.surface.posed_view import NEAREST_M, PosedView, sample_pixels, visible_points
 from workers.capture.surface.tsdf import (
     FRONT_VOXELS,
     MOST_EDGE_DEG,
@@ -44,28 +44,35 @@ SUREST = 2
 LEAST_LIGHT = 0.02
 """Darker colours, in linear light, say nothing about a view's exposure."""
 
+LEAST_COS = math.cos(math.radians(MOST_EDGE_DEG))
+
+LENIENT = 0.5
+"""Share of the smallest cosine of incidence down to which a point's own normal may turn away: it is rougher than the fit of
+the pixel, which keeps to the whole."""
+
+MARGIN_PX = 12
+"""Width by which a view's window is larger than the object's box."""
+
+LEAST_PART = 0.02
+"""Share of the largest part's area below which a loose part is noise."""
+
+FACING_AWAY = -1.0
+"""Whichever way a rough point's normal turns, it is seen where nothing hides it."""
+
+LIFT_VOXELS = 0.25
+"""Points are looked at from so far above the surface: its roughness hides less."""
+
+STEPS = 2
+"""Times that points are moved along their normals to where the views see the surface."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A view ready to be asked: its pictures, the fit of its depth about the object, and the smallest cosine of incidence."""
+    """A view ready to be asked: its pictures, and the fit of its depth in a window about the object, which `camera` sees."""
 
     view: PosedView
     fitted: SurfaceDepth
-    least_cos: float
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What a view says of points, each [N].
-
-    offset_m: along the normal to the surface that it sees; weight: 0 where it does not see the point within the limit asked
-    for; sure: that of the pixel, 0 where weight is 0; past: it sees something farther off there.
-    """
-
-    offset_m: Array
-    weight: Array
-    sure: NDArray[np.uint8]
-    past: NDArray[np.bool_]
+    camera: Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,37 +93,32 @@ class Support:
         return np.asarray(many | (self.sure & (self.past == 0)))
 
 
+Seen = tuple[Array, Array, NDArray[np.uint8], NDArray[np.bool_]]
+"""What a view says of points, each [N]: the offset along the normal to the surface that it sees, metres; its weight, 0 where it
+does not see the point; `SurfaceDepth.sure` of the pixel, 0 where weight is 0; whether it sees something farther off there."""
+
+
 def measure_support(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> Support:
     """Mean over the views, weighted by inverse variance, of the distance to the surface that they see there."""
     total, weight = np.zeros(len(points)), np.zeros(len(points))
     views, past = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     sure = np.zeros(len(points), np.bool_)
     for sight in sights:
-        seen = observe(points, normals, sight, within_m)
-        total += seen.offset_m * seen.weight
-        weight += seen.weight
-        views += seen.weight > 0.0
-        past += seen.past
-        sure |= seen.sure > 0
+        offset_m, seen, sure_here, past_here = observe(points, normals, sight, within_m)
+        total += offset_m * seen
+        weight += seen
+        views += seen > 0.0
+        past += past_here
+        sure |= sure_here > 0
     return Support(np.where(weight > 0.0, total / np.where(weight > 0.0, weight, 1.0), 0.0), views, past, sure)
 
 
 def observe(points: Array, normals: Array, sight: Sight, within_m: float) -> Seen:
-    """What a view says of points [N, 3] with unit normals [N, 3], board frame."""
-    count = len(points)
-    seen = Seen(np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), np.zeros(count, np.bool_))
-    camera, fitted = sight.view.depth_camera, sight.fitted
-    k = camera.intrinsics
-    intrinsics = (k.fx, k.fy, k.cx - fitted.left - 0.5, k.cy - fitted.top - 0.5)
-    T, limits = invert(camera.T_world_cam), (within_m, sight.least_cos)
+    """What a view says of points [N, 3] with unit normals [N, 3], board frame; `within_m` of the surface they are seen."""
+    k, fitted = sight.camera.intrinsics, sight.fitted
     pictures = (fitted.inverse, fitted.beyond, fitted.sure)
-    _observe(points, normals, T, intrinsics, pictures, limits, (seen.offset_m, seen.weight, seen.sure, seen.past))
-    return seen
-
-
-LENIENT = 0.5
-"""Share of the smallest cosine of incidence down to which a point's own normal may turn away: it is rougher than the fit of
-the pixel, which keeps to the whole."""
+    pinhole = (k.fx, k.fy, k.cx_opencv, k.cy_opencv)
+    return _observe(points, normals, invert(sight.camera.T_world_cam), pinhole, pictures, within_m)
 
 
 @compiled
@@ -126,13 +128,12 @@ def _observe(
     T: Array,
     k: tuple[float, float, float, float],
     pictures: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]],
-    limits: tuple[float, float],
-    out: tuple[Array, Array, NDArray[np.uint8], NDArray[np.bool_]],
-) -> None:
+    within_m: float,
+) -> Seen:
     """A difference of z times (normal . ray) is the distance along the normal; weights as in the distance field."""
     inverse, beyond, sures = pictures
-    within_m, least_cos = limits
-    offset, weight, sure, past = out
+    offset, weight = np.zeros(len(points)), np.zeros(len(points))
+    sure, past = np.zeros(len(points), np.uint8), np.zeros(len(points), np.bool_)
     height, width = inverse.shape
     for i in range(len(points)):
         p, n = points[i], normals[i]
@@ -146,17 +147,16 @@ def _observe(
             continue
         slope = 0.0  # of the ray against the normal
         for axis in range(3):
-            ray = T[0, axis] * ray_x + T[1, axis] * ray_y + T[2, axis]
-            slope -= n[axis] * ray
-        least = least_cos * math.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
+            slope -= n[axis] * (T[0, axis] * ray_x + T[1, axis] * ray_y + T[2, axis])
+        least = LEAST_COS * math.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
         row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
         past[i] = _sees_past(inverse, beyond, row, column, z, within_m / max(slope, least))
         q = sample_inverse(inverse, x, y)
         s = (z - 1.0 / q) * slope if q > 0.0 else np.inf
         if slope >= LENIENT * least and abs(s) < within_m:
-            offset[i] = s
+            offset[i], sure[i] = s, sures[row, column]
             weight[i] = slope * slope * q * q * q * q
-            sure[i] = sures[row, column]
+    return offset, weight, sure, past
 
 
 @compiled
@@ -184,12 +184,11 @@ def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_
     light = np.zeros((len(sights), len(points), 3), np.float32)
     score = np.zeros((len(sights), len(points)), np.float32)
     for number, sight in enumerate(sights):
-        found = observe(points, normals, sight, within_m)
+        _, weight, sure, _ = observe(points, normals, sight, within_m)
         # A pixel on an outline has the colour of what is beside it, as white of the board.
-        weight = np.where(found.sure == SUREST, found.weight, 0.0)
-        seen = np.flatnonzero(weight > 0.0)
-        colors, inside = sample_light(sight.view.rgb, sight.view.camera, points[seen])
-        light[number, seen] = colors
+        seen = np.flatnonzero((sure == SUREST) & (weight > 0.0))
+        camera = sight.view.camera
+        light[number, seen], inside = sample_pixels(sight.view.rgb, SRGB_STEPS, camera, points[seen])
         score[number, seen] = np.where(inside, weight[seen], 0.0)
     light *= exposure_gains(light, score)[:, None, None].astype(np.float32)
     # Squares, so that the best views decide, without a seam where their order changes.
@@ -225,111 +224,47 @@ def exposure_gains(light: NDArray[np.float32], score: NDArray[np.float32]) -> Ar
     return np.asarray(np.exp(np.clip(gains, -1.5, 1.5)))
 
 
-def sample_light(rgb: NDArray[np.uint8], camera: Camera, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(linear light [N, 3], inside the image [N]) of an image at points [N, 3], board frame; bilinear."""
-    k = camera.intrinsics
-    light, inside = np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
-    T = invert(camera.T_world_cam)
-    _sample_light(rgb, SRGB_STEPS, T, (k.fx, k.fy, k.cx_opencv, k.cy_opencv), points, light, inside)
-    return light, inside
+def sight_object(view: PosedView, region: ObjectRegion) -> Sight:
+    """A view's depth about the object, fitted.
 
-
-@compiled
-def _sample_light(
-    rgb: NDArray[np.uint8],
-    steps: Array,
-    T: Array,
-    k: tuple[float, float, float, float],
-    points: Array,
-    light: Array,
-    inside: NDArray[np.bool_],
-) -> None:
-    height, width = rgb.shape[0], rgb.shape[1]
-    for i in range(len(points)):
-        p = points[i]
-        x, y, z = pixel_of(T, k, p[0], p[1], p[2])
-        if not (z > 0.0 and 0.0 <= x < width - 1 and 0.0 <= y < height - 1):
-            continue
-        column, row = int(np.floor(x)), int(np.floor(y))
-        s, t = x - column, y - row
-        inside[i] = True
-        for c in range(3):
-            upper = steps[rgb[row, column, c]] * (1.0 - s) + steps[rgb[row, column + 1, c]] * s
-            lower = steps[rgb[row + 1, column, c]] * (1.0 - s) + steps[rgb[row + 1, column + 1, c]] * s
-            light[i, c] = upper * (1.0 - t) + lower * t
-
-
-MARGIN_PX = 12
-"""Width by which a view's window is larger than the object's box."""
-
-LEAST_PART = 0.02
-"""Share of the largest part's area below which a loose part is noise."""
-
-FACING_AWAY = -1.0
-"""Whichever way a rough point's normal turns, it is seen where nothing hides it."""
-
-LIFT_VOXELS = 0.25
-"""Points are looked at from so far above the surface: its roughness hides less."""
-
-STEPS = 2
-"""Times that points are moved along their normals to where the views see the surface."""
-
-
-def sight_object(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -> list[Sight]:
-    """Each view's depth about the object, fitted; views that see nothing of it are left out."""
-    least_cos = math.cos(math.radians(MOST_EDGE_DEG))
-    sights = []
-    for view in views:
-        window = object_window(region, view.depth_camera)
-        fitted = fit_object(view, region, MOST_EDGE_DEG, window)
-        if fitted.inverse.any():
-            sights.append(Sight(view, fitted, least_cos))
-    return sights
-
-
-def fit_object(
-    view: PosedView, region: ObjectRegion, max_edge_deg: float, window: tuple[int, int, int, int]
-) -> SurfaceDepth:
-    """The fit of the depth that is not the board's; of the board a view says where nothing is, and no plane mixes the two."""
-    top, left, bottom, right = window
+    Depth of the board says where nothing is, and no plane mixes the two.
+    """
+    rows, columns = object_window(region, view.depth_camera)
     k, T = view.depth_camera.intrinsics, view.depth_camera.T_world_cam
-    k = k.model_copy(update={"cx": k.cx - left, "cy": k.cy - top})
-    split = region.split_depth(view.depth_m[top:bottom, left:right], Camera(k, T))
-    fitted = fit_surfaces(split.object_m, k, max_edge_deg)
+    k = k.model_copy(update={"cx": k.cx - columns.start, "cy": k.cy - rows.start})
+    object_m, board_inverse, board_facing = region.split_depth(view.depth_m[rows, columns], Camera(k, T))
+    fitted = fit_surfaces(object_m, k)
     empty = fitted.inverse == 0.0
-    beyond = np.where(empty, split.board_inverse, fitted.inverse)
-    facing = np.where(empty, split.board_facing, fitted.facing)
-    return replace(fitted, top=top, left=left, facing=facing, beyond=beyond)
+    beyond = np.where(empty, board_inverse, fitted.inverse)
+    facing = np.where(empty, board_facing, fitted.facing)
+    return Sight(view, replace(fitted, facing=facing, beyond=beyond), Camera(k, T))
 
 
-def object_window(region: ObjectRegion, camera: Camera) -> tuple[int, int, int, int]:
-    """(top, left, bottom, right) of the pixels that can see the region's box."""
+def object_window(region: ObjectRegion, camera: Camera) -> tuple[slice, slice]:
+    """(rows, columns) of the pixels that can see the region's box."""
     low, high = region.low, region.high
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     k = camera.intrinsics
     left, top, right, bottom = project_bounds(transform(invert(camera.T_world_cam), corners), k, NEAREST_M)
     rows = np.clip([math.floor(top) - MARGIN_PX, math.ceil(bottom) + MARGIN_PX], 0, k.height)
     columns = np.clip([math.floor(left) - MARGIN_PX, math.ceil(right) + MARGIN_PX], 0, k.width)
-    return int(rows[0]), int(columns[0]), int(rows[1]), int(columns[1])
+    return slice(*rows.tolist()), slice(*columns.tolist())
 
 
 def fuse_views(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -> Reconstruction:
     """The object's surface. Raises CaptureError where too few views see it, or none of it is confirmed."""
-    sights = sight_object(views, region, spec)
+    sights = [sight for view in views if (sight := sight_object(view, region)).fitted.inverse.any()]
     if len(sights) < spec.min_views:
         raise CaptureError(
             "too_few_views",
             f"{len(sights)} of {len(views)} views have depth on the object, and fusion.min_views is {spec.min_views}: "
             "take more pictures, or lower it",
         )
-    volume = empty_volume(region.low, region.high, spec.voxel_m)
+    volume, within_m = empty_volume(region.low, region.high, spec.voxel_m), FRONT_VOXELS * spec.voxel_m
     for sight in sights:
-        integrate(volume, sight.fitted, sight.view.depth_camera)
-    within_m = FRONT_VOXELS * spec.voxel_m
-    mesh = extract_surface(volume)
-    mesh = _confirm(mesh, sights, spec)
-    mesh = _settle(mesh, sights, within_m)
-    mesh = _clean(mesh, region)
+        integrate(volume, sight.fitted, sight.camera)
+    mesh = _confirm(extract_surface(volume), sights, spec)
+    mesh = _clean(_settle(mesh, sights, within_m), region)
     if not len(mesh.faces):
         raise CaptureError(
             "no_surface",
@@ -340,15 +275,8 @@ def fuse_views(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -
     count = measure_support(mesh.vertices, normals, sights, within_m).views
     colors = color_points(mesh.vertices, normals, sights, within_m)
     seen = count > 0
-    return Reconstruction(
-        points=mesh.vertices[seen],
-        normals=normals[seen],
-        colors=colors[seen],
-        views=count[seen],
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        vertex_colors=colors,
-    )
+    cloud = mesh.vertices[seen], normals[seen], colors[seen], count[seen]
+    return Reconstruction(*cloud, mesh.vertices, mesh.faces, colors)
 
 
 def _confirm(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
@@ -356,17 +284,13 @@ def _confirm(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
 
     A pixel that mixes two surfaces looks into the object, and there the field has a second surface behind the first.
     """
-    if not len(mesh.faces):
-        return mesh
     normals = vertex_normals(mesh)
     confirmed = measure_support(mesh.vertices, normals, sights, FRONT_VOXELS * spec.voxel_m).confirmed(spec.min_views)
-    hiding, old = keep_vertices(mesh, confirmed)
-    if not len(hiding.faces):
-        return hiding
+    hiding = keep_vertices(mesh, confirmed)
+    normals = normals[np.unique(mesh.faces[confirmed[mesh.faces].all(axis=1)])]
     cameras = [sight.view.depth_camera for sight in sights]
     lift_m = LIFT_VOXELS * spec.voxel_m
-    seen = visible_points(hiding, hiding.vertices, normals[old], cameras, lift_m, FACING_AWAY)
-    return keep_vertices(hiding, seen)[0]
+    return keep_vertices(hiding, visible_points(hiding, hiding.vertices, normals, cameras, lift_m, FACING_AWAY))
 
 
 def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:
@@ -377,8 +301,6 @@ def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:
     """
     vertices = mesh.vertices
     for _ in range(STEPS):
-        if not len(mesh.faces):
-            break
         normals = vertex_normals(Mesh(vertices, mesh.faces))
         moved = measure_support(vertices, normals, sights, within_m).mean_m
         vertices = vertices + normals * _smooth(moved, mesh)[:, None]
@@ -401,5 +323,4 @@ def _clean(mesh: Mesh, region: ObjectRegion) -> Mesh:
     cut = cut_below(lifted, region.plane, region.clearance_m)
     mesh = Mesh(cut.vertices - UP * region.lift_m(cut.vertices)[:, None], cut.faces)
     # The cut lies on the clearance itself, and its points must not fall below it by rounding.
-    mesh, _ = keep_vertices(mesh, region.holds(mesh.vertices + 1e-6 * UP))
-    return keep_vertices(mesh, large_parts(mesh, LEAST_PART))[0]
+    return large_parts(keep_vertices(mesh, region.holds(mesh.vertices + 1e-6 * UP)), LEAST_PART)

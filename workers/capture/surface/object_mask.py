@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from schemas.base import Array
+from schemas.base import Array, Pose
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Fusion
 from schemas.scene.shape import Mesh
-from schemas.scene.view import Camera
+from schemas.scene.view import Camera, Intrinsics
 from workers.capture.board import TOUCHING_M, board_geometry
 from workers.capture.surface.posed_view import PosedView
-from workers.geometry.jit import compiled
+from workers.geometry.mesh import edge_keys
 from workers.geometry.zbuffer import draw_depth
 
 CELL_M = 0.004
@@ -73,18 +73,6 @@ class Ground:
 
 
 @dataclass(frozen=True, eq=False)
-class SplitDepth:
-    """object_m [H, W]: depth without the board's pixels; board_inverse, board_facing [H, W]: the board's plane in those.
-
-    float32, 0 elsewhere: 1/z, 1/m, and the cosine of incidence times the length of the ray at z = 1.
-    """
-
-    object_m: NDArray[np.float32]
-    board_inverse: NDArray[np.float32]
-    board_facing: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
 class ObjectRegion(Ground):
     """The object's surroundings, board frame, metres.
 
@@ -105,76 +93,67 @@ class ObjectRegion(Ground):
     def holds(self, points: Array) -> NDArray[np.bool_]:
         """[N] bool: points [N, 3] above the footprint and above the clearance."""
         high = self.height_m(points) + self.lift_m(points) > self.clearance_m
-        return np.asarray(self._cells(points, self.footprint) & high)
+        return np.asarray(self._cells((points[:, 0], points[:, 1]), self.footprint) & high)
 
     def lift_m(self, points: Array) -> Array:
         """[N] height to add to points [N, 3] above a floor, so that the clearance leaves of it what is above `floor_m`."""
-        return np.where(self._cells(points, self.floor), self.clearance_m - self.floor_m, 0.0)
+        return np.where(self._cells((points[:, 0], points[:, 1]), self.floor), self.clearance_m - self.floor_m, 0.0)
 
-    def split_depth(self, depth_m: NDArray[np.float32], camera: Camera) -> SplitDepth:
-        """A depth image [H, W], metres, of a camera in the board frame, in two: a pixel below the clearance is the board's.
+    def split_depth(
+        self, depth_m: NDArray[np.float32], camera: Camera
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """(object_m, board_inverse, board_facing), each [H, W] float32, of a depth image of a camera in the board frame.
 
-        Which it is the median of the pixels around says, because noise lifts single pixels of the board above the clearance.
+        object_m: depth without the board's pixels, which are below the clearance; in those, else 0, the board's plane: 1/z, and
+        the cosine of incidence times the length of the ray at z = 1. Which pixels are the board's the median of the pixels
+        around says, because noise lifts single ones above the clearance.
         """
-        k = camera.intrinsics
-        found = SplitDepth(*(np.zeros(depth_m.shape, np.float32) for _ in range(3)))
-        out = (found.object_m, found.board_inverse, found.board_facing)
-        ground = (self.plane, self.clearance_m, self.floor, self.corner)
-        quiet_m = depth_m
+        (a, b, c), T, z = self.plane, camera.T_world_cam, depth_m.astype(np.float64)
+        quiet = np.zeros_like(z)
         if depth_m.size:
-            quiet_m = np.asarray(cv2.medianBlur(np.ascontiguousarray(depth_m), MEDIAN_PX), np.float32)
-        _split(depth_m, quiet_m, (k.fx, k.fy, k.cx, k.cy), camera.T_world_cam, ground, out)
-        return found
+            quiet = cv2.medianBlur(np.ascontiguousarray(depth_m), MEDIAN_PX).astype(np.float64)
+        rays = _pixel_rays(camera.intrinsics, z.shape)
+        # The height of a pixel is z (up . ray) + above, with `up` the plane's upward normal in camera axes; it is 0 on the plane.
+        up, above = T[2, :3] - a * T[0, :3] - b * T[1, :3], T[2, 3] - a * T[0, 3] - b * T[1, 3] - c
+        along = up[0] * rays[0] + up[1] * rays[1] + up[2]
+        quiet = np.where(quiet > 0.0, quiet, z)
+        on_floor = self._cells(_to_board(T, rays, quiet)[:2], self.floor)
+        high = (quiet * along + above > self.clearance_m) | (z * along + above > LIFTED * self.clearance_m)
+        thing = (z > 0.0) & (on_floor | high)
+        board = (z > 0.0) & ~thing & (along < 0.0) & (above > 0.0)
+        size = np.sqrt(up[0] * up[0] + up[1] * up[1] + up[2] * up[2])
+        planes = (np.where(board, -along / divisor, 0.0).astype(np.float32) for divisor in (above, size))
+        return np.where(thing, depth_m, np.float32(0.0)), *planes
 
-    def _cells(self, points: Array, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """[N] bool: points above the cells that are named."""
-        at = np.floor((points[:, :2] - self.corner) / CELL_M).astype(np.int64)
-        inside = ((at >= 0) & (at < cells.shape)).all(axis=1)
-        at[~inside] = 0
-        return np.asarray(inside & cells[at[:, 0], at[:, 1]])
+    def _cells(self, places: tuple[Array, Array], cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """[...] bool: places (x, y), each [...], above the cells that are named."""
+        i, j = _cells_at(places, self.corner)
+        inside = (i >= 0) & (j >= 0) & (i < cells.shape[0]) & (j < cells.shape[1])
+        return np.asarray(inside & cells[np.where(inside, i, 0), np.where(inside, j, 0)])
 
 
-@compiled
-def _split(
-    depth_m: NDArray[np.float32],
-    quiet_m: NDArray[np.float32],
-    k: tuple[float, float, float, float],
-    T: Array,
-    ground: tuple[tuple[float, float, float], float, NDArray[np.bool_], Array],
-    out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
-) -> None:
-    """The height of a pixel is z (w . ray) + above, with w the plane's upward normal in camera axes; it is 0 on the plane."""
-    (a, b, c), clearance_m, floor, corner = ground
-    object_m, board_inverse, board_facing = out
-    w = np.empty(3)
-    for axis in range(3):
-        w[axis] = T[2, axis] - a * T[0, axis] - b * T[1, axis]
-    above = T[2, 3] - a * T[0, 3] - b * T[1, 3] - c
-    size = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    for row in range(depth_m.shape[0]):
-        y = (row + 0.5 - k[3]) / k[1]
-        for column in range(depth_m.shape[1]):
-            z = depth_m[row, column]
-            if not z > 0.0:
-                continue
-            q = quiet_m[row, column] if quiet_m[row, column] > 0.0 else z
-            x = (column + 0.5 - k[2]) / k[0]
-            along = w[0] * x + w[1] * y + w[2]
-            i = int(np.floor((q * (T[0, 0] * x + T[0, 1] * y + T[0, 2]) + T[0, 3] - corner[0]) / CELL_M))
-            j = int(np.floor((q * (T[1, 0] * x + T[1, 1] * y + T[1, 2]) + T[1, 3] - corner[1]) / CELL_M))
-            on_floor = 0 <= i < floor.shape[0] and 0 <= j < floor.shape[1] and floor[i, j]
-            if on_floor or q * along + above > clearance_m or z * along + above > LIFTED * clearance_m:
-                object_m[row, column] = z
-            elif along < 0.0 < above:
-                board_inverse[row, column] = -along / above
-                board_facing[row, column] = -along / size
+def _cells_at(places: tuple[Array, Array], corner: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    i, j = (np.floor((at - first) / CELL_M).astype(np.int64) for at, first in zip(places, corner, strict=True))
+    return i, j
+
+
+def _pixel_rays(k: Intrinsics, shape: tuple[int, ...], stride: int = 1) -> tuple[Array, Array]:
+    """(x [1, w], y [h, 1]) at z = 1 of every `stride`-th pixel of an image [H, W]."""
+    rows, columns = (np.arange(stride // 2, side, stride) + 0.5 for side in shape)
+    return ((columns - k.cx) / k.fx)[None, :], ((rows - k.cy) / k.fy)[:, None]
+
+
+def _to_board(T: Pose, rays: tuple[Array, Array], z: Array) -> tuple[Array, Array, Array]:
+    """(x, y, z), each [h, w], in the board frame, of depth z [h, w] along rays."""
+    x, y = rays[0] * z, rays[1] * z
+    bx, by, bz = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in T[:3])
+    return bx, by, bz
 
 
 def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> ObjectRegion:
     """The object of a capture. Raises CaptureError where the board has no depth, or nothing stands on it."""
     half = 0.5 * np.array([board.width_m, board.height_m]) * board.scale
     low_bins, tall_bins = _heights(views, half)
-    cells = low_bins.shape[:2]
     height, count = _medians(low_bins)
     usual = float(np.median(count[count > 0])) if count.any() else 0.0
     known = count >= np.clip(usual / 3.0, 1.0, LEAST_SAMPLES)
@@ -184,14 +163,13 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
             f"{len(views)} views have depth on {int(known.sum())} cells of 4 mm of the board: depth images are empty, "
             "or depth_units_per_m in camera.json is wrong",
         )
-    x, y = (-half[0] + (np.arange(cells[0]) + 0.5) * CELL_M, -half[1] + (np.arange(cells[1]) + 0.5) * CELL_M)
+    x, y = (-half[axis] + (np.arange(side) + 0.5) * CELL_M for axis, side in enumerate(known.shape))
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     plane, spread = _board_plane(grid[known], height[known])
     above = height - (grid @ np.array(plane[:2]) + plane[2])
     clearance = max(spec.board_clearance_m, 4.0 * spread)
-    stands = _stands(board, -half, cells)
-    found = known & (above > clearance) & ~stands
-    footprint, others = _largest(found, np.where(found, above, 0.0))
+    stands = _stands(board, -half, known.shape)
+    footprint, others = _largest(known & (above > clearance) & ~stands, above)
     if footprint is None:
         highest = float(above[known].max())
         raise CaptureError(
@@ -199,86 +177,62 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
             f"nothing on the board stands more than {clearance * 1e3:.1f} mm above it (highest: {highest * 1e3:.1f} mm): lower "
             f"fusion.board_clearance_m ({spec.board_clearance_m * 1e3:g} mm) if the object is flat",
         )
-    notes = [f"{others} other thing{'s' * (others > 1)} on the board left out"] if others else []
-    if clearance > spec.board_clearance_m:
-        notes.append(
-            f"the board's surface is uneven by {spread * 1e3:.2f} mm, so the clearance is {clearance * 1e3:.1f} mm"
-        )
-    if stands.any():
-        notes.append(
-            f"what stands within {STAND_M * 1e3:g} mm of markers out of the board's plane is no part of the object"
-        )
+    notes = {
+        f"{others} other thing{'s' * (others > 1)} on the board left out": others > 0,
+        f"the board's surface is uneven by {spread * 1e3:.2f} mm, so the clearance is {clearance * 1e3:.1f} mm": clearance
+        > spec.board_clearance_m,
+        f"what stands within {STAND_M * 1e3:g} mm of markers out of the board's plane is no part of the object": stands.any(),
+    }
     floor_m = min(max(FLOOR_M, 4.0 * spread), clearance)
     floor = _floor(footprint, known & (above > floor_m) & ~stands, known & (above <= floor_m))
-    ground = (plane, spread, clearance, floor_m)
-    return _region(footprint, floor, tall_bins, -half, ground, tuple(notes))
+    cells = _grow(footprint) | floor
+    low, high = _box(cells, -half, plane[2], _top_m(tall_bins, footprint))
+    told = tuple(note for note, holds in notes.items() if holds)
+    return ObjectRegion(plane, clearance, low, high, spread, cells, -half, floor, floor_m, told)
 
 
-def _heights(views: Sequence[PosedView], half: Array) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _heights(views: Sequence[PosedView], half: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(low_bins, tall_bins), each [cells in x, cells in y, bins]: how often the views measured each height over a board.
 
-    half [2]: half its width and height. low_bins are `BIN_M` high around its plane, tall_bins `REACH_M` from it on.
+    half [2]: half its width and height. low_bins are `BIN_M` high around its plane, tall_bins `REACH_M` from it on. With a mask,
+    what is outside of it cannot be higher than the board.
     """
     cells = np.ceil(2.0 * half / CELL_M).astype(np.int64)
-    low_bins = np.zeros((cells[0], cells[1], round(2 * REACH_M / BIN_M) + 2), np.int32)
-    tall_bins = np.zeros((cells[0], cells[1], round(TALLEST_M / REACH_M)), np.int32)
+    low_bins = np.zeros((cells[0], cells[1], round(2 * REACH_M / BIN_M) + 2), np.int64)
+    tall_bins = np.zeros((cells[0], cells[1], round(TALLEST_M / REACH_M)), np.int64)
     for view in views:
         k = view.depth_camera.intrinsics
         stride = max(1, int(np.sqrt(k.width * k.height / SAMPLES)))
-        intrinsics = (k.fx, k.fy, k.cx, k.cy)
-        mask = np.ones((1, 1), np.bool_) if view.mask is None else view.mask
-        _collect(view.depth_m, mask, stride, intrinsics, view.depth_camera.T_world_cam, -half, low_bins, tall_bins)
+        at = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+        z = view.depth_m[at].astype(np.float64)
+        x, y, height = _to_board(view.depth_camera.T_world_cam, _pixel_rays(k, view.depth_m.shape, stride), z)
+        i, j = _cells_at((x, y), -half)
+        known = (z > 0.0) & (i >= 0) & (j >= 0) & (i < cells[0]) & (j < cells[1]) & (height <= TALLEST_M)
+        if view.mask is not None:
+            known &= view.mask[at] | (height <= REACH_M)
+        for bins, seen, level in (
+            (low_bins, known, np.floor((height + REACH_M) / BIN_M) + 1),
+            (tall_bins, known & (height > 0.0), height / REACH_M),
+        ):
+            level = np.clip(level, 0, bins.shape[2] - 1).astype(np.int64)
+            np.add.at(bins, (i[seen], j[seen], level[seen]), 1)
     return low_bins, tall_bins
 
 
 def _stands(board: Board, corner: Array, cells: tuple[int, ...]) -> NDArray[np.bool_]:
     """[cells in x, cells in y]: those within `STAND_M` of the ground below markers that are out of the board's plane."""
-    found = np.zeros(cells, np.uint8)
+    stands = np.zeros(cells, np.uint8)
     places = board_geometry(board).corners
     for quad in places[np.abs(places[:, :, 2]).max(axis=1) > TOUCHING_M]:
         hull = cv2.convexHull(np.floor((quad[:, :2] - corner) / CELL_M).astype(np.int32))
-        cv2.fillConvexPoly(found, np.ascontiguousarray(hull[:, :, ::-1]), 1)  # OpenCV's x is the second axis
+        cv2.fillConvexPoly(stands, np.ascontiguousarray(hull[:, :, ::-1]), 1)  # OpenCV's x is the second axis
     size = 2 * round(STAND_M / CELL_M) + 1
-    return np.asarray(cv2.dilate(found, np.ones((size, size), np.uint8)) > 0)
+    return np.asarray(cv2.dilate(stands, np.ones((size, size), np.uint8)) > 0)
 
 
-@compiled
-def _collect(
-    depth_m: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    stride: int,
-    k: tuple[float, float, float, float],
-    T: Array,
-    corner: Array,
-    low_bins: NDArray[np.int32],
-    tall_bins: NDArray[np.int32],
-) -> None:
-    """Counts heights by cell; with a mask, what is outside of it cannot be higher than the board."""
-    has_mask = mask.shape[0] > 1
-    for row in range(stride // 2, depth_m.shape[0], stride):
-        ray_y = (row + 0.5 - k[3]) / k[1]
-        for column in range(stride // 2, depth_m.shape[1], stride):
-            z = depth_m[row, column]
-            if not z > 0.0:
-                continue
-            x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
-            bx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-            by = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-            h = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            i, j = int(np.floor((bx - corner[0]) / CELL_M)), int(np.floor((by - corner[1]) / CELL_M))
-            if i < 0 or j < 0 or i >= low_bins.shape[0] or j >= low_bins.shape[1] or h > TALLEST_M:
-                continue
-            if has_mask and not mask[row, column] and h > REACH_M:
-                continue
-            bin_ = int(np.floor((h + REACH_M) / BIN_M)) + 1
-            low_bins[i, j, min(max(bin_, 0), low_bins.shape[2] - 1)] += 1
-            if h > 0.0:
-                tall_bins[i, j, min(int(h / REACH_M), tall_bins.shape[2] - 1)] += 1
-
-
-def _medians(bins: NDArray[np.int32]) -> tuple[Array, NDArray[np.int64]]:
+def _medians(bins: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """(median height [X, Y], interpolated within its bin; samples [X, Y])."""
-    total = bins.sum(axis=2, dtype=np.int64)
+    total = bins.sum(axis=2)
     below = np.cumsum(bins, axis=2)
     at = (2 * below < total[..., None]).sum(axis=2).clip(0, bins.shape[2] - 1)
     here = np.take_along_axis(bins, at[..., None], axis=2)[..., 0]
@@ -316,13 +270,13 @@ def _mode(height: Array) -> float:
     return float(ordered[int(np.argmax(counts))]) + 0.002
 
 
-def _largest(found: NDArray[np.bool_], above: Array) -> tuple[NDArray[np.bool_] | None, int]:
+def _largest(high: NDArray[np.bool_], above: Array) -> tuple[NDArray[np.bool_] | None, int]:
     """(cells of the thing with the largest volume, or None; number of others that are a tenth as large)."""
-    bridged = ndimage.binary_dilation(found, np.ones((3, 3), bool), iterations=BRIDGE_CELLS)
+    bridged = ndimage.binary_dilation(high, np.ones((3, 3), bool), iterations=BRIDGE_CELLS)
     labels, count = ndimage.label(bridged)
-    labels = np.where(found, labels, 0)
+    labels = np.where(high, labels, 0)
     cells = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-    volume = np.bincount(labels.ravel(), weights=above.ravel(), minlength=count + 1)[1:]
+    volume = np.bincount(labels.ravel(), weights=np.where(high, above, 0.0).ravel(), minlength=count + 1)[1:]
     volume = np.where(cells >= LEAST_CELLS, volume, 0.0)
     if not volume.any():
         return None, 0
@@ -338,24 +292,23 @@ def _floor(footprint: NDArray[np.bool_], raised: NDArray[np.bool_], board: NDArr
     return np.asarray(ndimage.binary_dilation(part & apart, around, iterations=FLOOR_REACH_CELLS) & apart)
 
 
-def _region(
-    footprint: NDArray[np.bool_],
-    floor: NDArray[np.bool_],
-    tall_bins: NDArray[np.int32],
-    corner: Array,
-    ground: tuple[tuple[float, float, float], float, float, float],
-    notes: tuple[str, ...],
-) -> ObjectRegion:
-    """The region around a footprint, which grows by three cells, for what hangs over and for the error of its rim."""
-    plane, spread, clearance, floor_m = ground
+def _grow(footprint: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The footprint and three cells around it, for what hangs over and for the error of its rim."""
+    return np.asarray(ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3))
+
+
+def _top_m(tall_bins: NDArray[np.int64], footprint: NDArray[np.bool_]) -> float:
+    """The height of what stands on a footprint, rounded up to `REACH_M`."""
     levels = tall_bins[footprint].sum(axis=0)
     filled = np.flatnonzero(levels > max(LEAST_SAMPLES, 2e-4 * levels.sum()))
-    top = (int(filled[-1]) + 1 if len(filled) else 1) * REACH_M
-    grown = ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3) | floor
-    i, j = np.nonzero(grown)
-    low = np.array([corner[0] + i.min() * CELL_M, corner[1] + j.min() * CELL_M, plane[2] - 0.008])
-    high = np.array([corner[0] + (i.max() + 1) * CELL_M, corner[1] + (j.max() + 1) * CELL_M, plane[2] + top + 0.01])
-    return ObjectRegion(plane, clearance, low, high, spread, grown, corner, floor, floor_m, notes)
+    return (int(filled[-1]) + 1 if len(filled) else 1) * REACH_M
+
+
+def _box(cells: NDArray[np.bool_], corner: Array, ground_m: float, top_m: float) -> tuple[Array, Array]:
+    """(low [3], high [3]) corners of a box over cells, with some room below the ground and above the top."""
+    at = np.argwhere(cells)
+    low, high = corner + at.min(axis=0) * CELL_M, corner + (at.max(axis=0) + 1) * CELL_M
+    return np.append(low, ground_m - 0.008), np.append(high, ground_m + top_m + 0.01)
 
 
 RIM_M = 0.0005
@@ -388,6 +341,5 @@ def down_to_board(mesh: Mesh, ground: Ground) -> Mesh:
 def _open_edges(mesh: Mesh) -> NDArray[np.int64]:
     """[E, 2] the directed edges that one face alone has."""
     directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    key = np.sort(directed, axis=1) @ np.array([len(mesh.vertices), 1])
-    _, first, count = np.unique(key, return_index=True, return_counts=True)
+    _, first, count = np.unique(edge_keys(mesh.faces, len(mesh.vertices)), return_index=True, return_counts=True)
     return directed[first[count == 1]]

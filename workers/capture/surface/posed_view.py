@@ -56,15 +56,9 @@ def pose_view(view: CapturedView, camera: CaptureCamera, T_board_cam: Pose, dept
     return PosedView(view.number, Camera(k, frozen_array(T_board_cam)), Camera(k, T_board_depth), rgb, depth_m, mask)
 
 
-@compiled
 def correct_depth(stored: NDArray[np.uint16], metres: float, scale: float, offset_m: float) -> Depth:
     """[H, W] float32: stored depth in metres after a correction; 0 stays 0, and what is corrected to below 0 becomes 0."""
-    depth = np.zeros(stored.shape, np.float32)
-    for row in range(stored.shape[0]):
-        for column in range(stored.shape[1]):
-            if stored[row, column] > 0:
-                depth[row, column] = max(stored[row, column] * metres * scale + offset_m, 0.0)
-    return depth
+    return np.where(stored > 0, np.maximum(stored * metres * scale + offset_m, 0.0), 0.0).astype(np.float32)
 
 
 def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.bool_]:
@@ -99,6 +93,33 @@ def pixel_of(
 
 NEAREST_M = 0.05
 """What is nearer to a camera is not seen by it."""
+
+
+@compiled
+def project_pixels(points: Array, T: Array, k: tuple[float, float, float, float]) -> Array:
+    """[N, 3]: `pixel_of` of points [N, 3]."""
+    pixels = np.empty((len(points), 3))
+    for n in range(len(points)):
+        pixels[n, 0], pixels[n, 1], pixels[n, 2] = pixel_of(T, k, points[n, 0], points[n, 1], points[n, 2])
+    return pixels
+
+
+def sample_pixels(
+    rgb: NDArray[np.uint8], value_of: Array, camera: Camera, points: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(values [N, 3], inside the image [N]) of an image at points [N, 3], bilinear; value_of [256]: of each code."""
+    k = camera.intrinsics
+    pixels = project_pixels(points, invert(camera.T_world_cam), (k.fx, k.fy, k.cx_opencv, k.cy_opencv))
+    inside = (pixels[:, 2] > 0.0) & (pixels[:, :2] >= 0.0).all(axis=1)
+    inside &= (pixels[:, :2] < [k.width - 1, k.height - 1]).all(axis=1)
+    places, values = pixels[inside, :2], np.zeros((len(points), 3))
+    column, row = np.floor(places).astype(np.int64).T
+    s, t = (places - np.floor(places)).T[..., None]
+    upper = value_of[rgb[row, column]] * (1.0 - s) + value_of[rgb[row, column + 1]] * s
+    lower = value_of[rgb[row + 1, column]] * (1.0 - s) + value_of[rgb[row + 1, column + 1]] * s
+    values[inside] = upper * (1.0 - t) + lower * t
+    return values, inside
+
 
 UNSEEN = -2.0
 """Stands for the cosine of a point that is not in the image."""

@@ -15,12 +15,15 @@ from schemas.base import Array
 from schemas.capture import SynthesizedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
-from schemas.scene.view import Camera
-from workers.capture.surface.posed_view import PosedView, pixel_of
+from schemas.scene.view import Camera, Intrinsics
+from workers.capture.surface.posed_view import PosedView, project_pixels, sample_pixels
 from workers.capture.surface.tsdf import FittedDepth
-from workers.geometry.frames import invert
+from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
 from workers.geometry.zbuffer import draw_triangles
+
+Images = tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]
+"""(rgb [H, W, 3], depth_m [H, W] float64, mask [H, W] of the object)."""
 
 SAME_SURFACE = 0.012
 """Neighbouring pixels whose 1/z differs by a larger share are not joined."""
@@ -63,12 +66,12 @@ class Source:
 
 def prepare_source(view: PosedView, fitted: FittedDepth, mask: NDArray[np.bool_]) -> Source:
     """The source of a view whose depth is fitted in the whole image; `mask` is the object's in the depth camera."""
-    k = view.camera.intrinsics
-    T = invert(view.camera.T_world_cam) @ view.depth_camera.T_world_cam
-    rgb = view.rgb
-    if not np.array_equal(T, np.eye(4)):
-        rgb = np.zeros_like(view.rgb)
-        _carry_colours(view.rgb, fitted.inverse, (k.fx, k.fy, k.cx, k.cy), T, rgb)
+    k, rgb = view.camera.intrinsics, view.rgb
+    if not np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
+        known, points = _lift(fitted.inverse, k)
+        points = transform(view.depth_camera.T_world_cam, points)
+        rgb = np.zeros_like(rgb)
+        rgb[known] = sample_pixels(view.rgb, np.arange(256.0), view.camera, points)[0] + 0.5
     width = max(3, round(FEATHER_PX * k.fx / 912.0)) | 1
     inner = cv2.blur((fitted.inverse > 0.0).astype(np.float32), (width, width), borderType=cv2.BORDER_CONSTANT)
     known = np.clip(2.0 * inner - 1.0, 0.02, 1.0)
@@ -88,66 +91,30 @@ def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> 
 
 def warp(source: Source, camera: Camera, factor: float = 1.0) -> Layer:
     """The source as `camera` sees it; its weights times `factor`."""
-    k, m = source.camera.intrinsics, camera.intrinsics
-    T, inverse = invert(camera.T_world_cam) @ source.camera.T_world_cam, source.fitted.inverse
-    pixels, z = _carry(inverse, (k.fx, k.fy, k.cx, k.cy), T, (m.fx, m.fy, m.cx, m.cy))
+    k, inverse = camera.intrinsics, source.fitted.inverse
+    pixels, z = _carry(inverse, source.camera, camera)
     triangles = _join(inverse, z)
-    depth, found, shares = draw_triangles(pixels, z, triangles, (m.height, m.width), EDGE_SLACK, True)
-    return Layer(
-        depth.astype(np.float32),
-        *_paint(found, shares, triangles, pixels, source.weight * np.float32(factor), source.rgb, source.mask),
-    )
+    depth, drawn, shares = draw_triangles(pixels, z, triangles, (k.height, k.width), EDGE_SLACK, True)
+    weight = source.weight * np.float32(factor)
+    painted = _paint(drawn, shares, triangles, pixels, weight, source.rgb, source.mask)
+    return Layer(depth.astype(np.float32), *painted)
 
 
-@compiled
-def _carry_colours(
-    rgb: NDArray[np.uint8],
-    inverse: NDArray[np.float32],
-    k: tuple[float, float, float, float],
-    T: Array,
-    found: NDArray[np.uint8],
-) -> None:
-    """The colour that the colour camera has where each depth pixel's point projects to; T: depth to colour camera."""
-    height, width = inverse.shape
-    for row in range(height):
-        for column in range(width):
-            if not inverse[row, column] > 0.0:
-                continue
-            z = 1.0 / inverse[row, column]
-            x, y = (column + 0.5 - k[2]) / k[0] * z, (row + 0.5 - k[3]) / k[1] * z
-            u, v, Z = pixel_of(T, k, x, y, z)
-            u, v = u - 0.5, v - 0.5
-            if not (Z > 0.0 and 0.0 <= u < width - 1 and 0.0 <= v < height - 1):
-                continue
-            c, r = int(np.floor(u)), int(np.floor(v))
-            s, t = u - c, v - r
-            for i in range(3):
-                upper = rgb[r, c, i] * (1.0 - s) + rgb[r, c + 1, i] * s
-                lower = rgb[r + 1, c, i] * (1.0 - s) + rgb[r + 1, c + 1, i] * s
-                found[row, column, i] = np.uint8(upper * (1.0 - t) + lower * t + 0.5)
+def _lift(inverse: NDArray[np.float32], k: Intrinsics) -> tuple[NDArray[np.bool_], Array]:
+    """(pixels [h, w] that have depth, their points [N, 3] in camera coordinates)."""
+    rows, columns = np.nonzero(inverse > 0.0)
+    z = 1.0 / inverse[rows, columns].astype(np.float64)
+    points = np.stack([(columns + 0.5 - k.cx) / k.fx * z, (rows + 0.5 - k.cy) / k.fy * z, z], axis=1)
+    return inverse > 0.0, points
 
 
-@compiled
-def _carry(
-    inverse: NDArray[np.float32],
-    k: tuple[float, float, float, float],
-    T: Array,
-    m: tuple[float, float, float, float],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _carry(inverse: NDArray[np.float32], source: Camera, target: Camera) -> tuple[NDArray[np.float32], ...]:
     """(u and v [h * w, 2], z [h * w]): pixels of the target with centres on integers; z is 0 where nothing is in front of it."""
-    height, width = inverse.shape
+    known, points = _lift(inverse, source.intrinsics)
+    m, T = target.intrinsics, invert(target.T_world_cam) @ source.T_world_cam
+    seen = project_pixels(points, T, (m.fx, m.fy, m.cx, m.cy))
     pixels, depth = np.zeros((inverse.size, 2), np.float32), np.zeros(inverse.size, np.float32)
-    for row in range(height):
-        ray_y = (row + 0.5 - k[3]) / k[1]
-        for column in range(width):
-            if not inverse[row, column] > 0.0:
-                continue
-            z = 1.0 / inverse[row, column]
-            x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
-            u, v, Z = pixel_of(T, m, x, y, z)
-            if Z > 0.0:
-                n = row * width + column
-                pixels[n, 0], pixels[n, 1], depth[n] = u - 0.5, v - 0.5, Z
+    pixels[known.ravel()], depth[known.ravel()] = seen[:, :2] - 0.5, seen[:, 2]
     return pixels, depth
 
 
@@ -176,7 +143,7 @@ def _join(inverse: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.in
 
 @compiled
 def _paint(
-    found: NDArray[np.int32],
+    drawn: NDArray[np.int32],
     shares: Array,
     triangles: NDArray[np.int32],
     pixels: NDArray[np.float32],
@@ -185,15 +152,15 @@ def _paint(
     mask: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]]:
     """(weight, rgb, mask) of a layer, between the corners of the triangle that is drawn at each pixel."""
-    height, width = found.shape
+    height, width = drawn.shape
     weights, colours = np.zeros((height, width), np.float32), np.zeros((height, width, 3), np.uint8)
     inside = np.zeros((height, width), np.bool_)
     weight_of, rgb_of, mask_of = weight.ravel(), rgb.reshape(-1, 3), mask.ravel()
     for y in range(height):
         for x in range(width):
-            if found[y, x] < 0:
+            if drawn[y, x] < 0:
                 continue
-            a, b, c = triangles[found[y, x], 0], triangles[found[y, x], 1], triangles[found[y, x], 2]
+            a, b, c = triangles[drawn[y, x], 0], triangles[drawn[y, x], 1], triangles[drawn[y, x], 2]
             wa, wb, wc = shares[y, x, 0], shares[y, x, 1], shares[y, x, 2]
             across, down = pixels[b] - pixels[a], pixels[c] - pixels[a]
             if (across[0] * down[1] - down[0] * across[1] > 0.0) != (a < b):
@@ -209,22 +176,28 @@ STEP_M = 0.01
 """Depths that differ by more are of two surfaces; a pixel that both touch belongs to the farther one."""
 
 
-def fill_holes(
-    rgb: NDArray[np.uint8], depth_m: Array, mask: NDArray[np.bool_], size_px: int
-) -> tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]:
+def fill_holes(rgb: NDArray[np.uint8], depth_m: Array, mask: NDArray[np.bool_], size_px: int) -> Images:
     """(rgb, depth_m, mask) where small holes are filled from their rims inwards, and outer edges stay as they are.
 
     Small are gaps of up to about 2 * size_px across, and holes that are enclosed and have at most (4 * size_px)^2 pixels.
     """
-    if size_px == 0:
-        return rgb, depth_m, mask
     holes = np.argwhere(_small_holes(depth_m > 0.0, size_px))
-    rgb, depth_m, mask = rgb.copy(), depth_m.copy(), mask.copy()
+    framed = [np.pad(image, [(1, 1), (1, 1), (0, 0)][: image.ndim]) for image in (rgb, depth_m, mask)]
     while len(holes):
-        left = _fill_rim(rgb, depth_m, mask, holes)
-        if left.all():
+        around = [[image[holes[:, 0] + i, holes[:, 1] + j] for i in range(3) for j in range(3)] for image in framed]
+        colours, depths, inside = (np.array(values, np.float64) for values in around)
+        farthest = depths.max(axis=0)
+        rim = farthest > 0.0
+        if not rim.any():
             break
-        holes = holes[left]
+        shares = (depths > farthest - STEP_M)[:, rim]
+        count = shares.sum(axis=0)
+        at = tuple((holes[rim] + 1).T)
+        framed[0][at] = (colours[:, rim] * shares[..., None]).sum(axis=0) / count[:, None] + 0.5
+        framed[1][at] = (depths[:, rim] * shares).sum(axis=0) / count
+        framed[2][at] = (inside[:, rim] * shares).sum(axis=0) / count > 0.5
+        holes = holes[~rim]
+    rgb, depth_m, mask = (image[1:-1, 1:-1] for image in framed)
     return rgb, depth_m, mask
 
 
@@ -238,44 +211,6 @@ def _small_holes(known: NDArray[np.bool_], size_px: int) -> NDArray[np.bool_]:
     small = stats[:, cv2.CC_STAT_AREA] <= (4 * size_px) ** 2
     small[0] = False
     return np.asarray((gaps | small[label])[border:-border, border:-border])
-
-
-@compiled
-def _fill_rim(
-    rgb: NDArray[np.uint8], depth_m: Array, mask: NDArray[np.bool_], holes: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Fills the holes that have a known neighbour, all from what was known before; returns those that have none."""
-    height, width = depth_m.shape
-    left = np.ones(len(holes), np.bool_)
-    found = np.zeros((len(holes), 5))
-    for n in range(len(holes)):
-        row, column = holes[n]
-        farthest = 0.0
-        for y in range(max(row - 1, 0), min(row + 2, height)):
-            for x in range(max(column - 1, 0), min(column + 2, width)):
-                farthest = max(farthest, depth_m[y, x])
-        if farthest == 0.0:
-            continue
-        count = 0
-        for y in range(max(row - 1, 0), min(row + 2, height)):
-            for x in range(max(column - 1, 0), min(column + 2, width)):
-                if depth_m[y, x] > farthest - STEP_M:
-                    count += 1
-                    found[n, 0] += depth_m[y, x]
-                    found[n, 1] += mask[y, x]
-                    for c in range(3):
-                        found[n, 2 + c] += rgb[y, x, c]
-        for i in range(5):
-            found[n, i] /= count
-        left[n] = False
-    for n in range(len(holes)):
-        if not left[n]:
-            row, column = holes[n]
-            depth_m[row, column] = found[n, 0]
-            mask[row, column] = found[n, 1] > 0.5
-            for c in range(3):
-                rgb[row, column, c] = np.uint8(found[n, 2 + c] + 0.5)
-    return left
 
 
 AGREE_M = 0.006
@@ -309,69 +244,29 @@ def synthesize_view(sources: Sequence[Source], camera: Camera) -> SynthesizedVie
             "nothing_seen",
             f"none of the {len(numbers)} nearest views ({', '.join(map(str, numbers))}) shows anything to this camera",
         )
-    rgb, depth_m, mask = merge_layers(layers, camera)
-    filled = fill_holes(rgb, depth_m, mask, FILL_PX)
-    measured = depth_m > 0.0
-    return SynthesizedView(
-        rgb=filled[0],
-        depth_m=filled[1],
-        mask=filled[2],
-        measured=measured,
-        measured_share=float(measured.sum() / max(int((filled[1] > 0.0).sum()), 1)),
-        sources=tuple(numbers),
-    )
+    merged = merge_layers(layers)
+    rgb, depth_m, mask = fill_holes(*merged, FILL_PX)
+    measured = merged[1] > 0.0
+    share = float(measured.sum() / max(int((depth_m > 0.0).sum()), 1))
+    return SynthesizedView(rgb, depth_m, mask, measured, share, tuple(numbers))
 
 
-def merge_layers(layers: Sequence[Layer], camera: Camera) -> tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]:
+def merge_layers(layers: Sequence[Layer]) -> Images:
     """(rgb, depth_m, mask): at each pixel the mean of the layers' nearest surface; empty where one is seen from behind."""
-    shape = (camera.intrinsics.height, camera.intrinsics.width)
-    rgb, depth, mask = np.zeros((*shape, 3), np.uint8), np.zeros(shape), np.zeros(shape, np.bool_)
-    _merge(
-        np.stack([layer.depth_m for layer in layers]),
-        np.stack([layer.weight for layer in layers]),
-        np.stack([layer.rgb for layer in layers]),
-        np.stack([layer.mask for layer in layers]),
-        rgb,
-        depth,
-        mask,
-    )
-    return rgb, depth, mask
-
-
-@compiled
-def _merge(
-    depths: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    rgbs: NDArray[np.uint8],
-    masks: NDArray[np.bool_],
-    rgb: NDArray[np.uint8],
-    depth: Array,
-    mask: NDArray[np.bool_],
-) -> None:
-    for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            nearest = hidden = np.inf
-            for n in range(len(depths)):
-                z = depths[n, row, column]
-                if z > 0.0 and weights[n, row, column] > 0.0:
-                    nearest = min(nearest, z)
-                elif z > 0.0:
-                    hidden = min(hidden, z)
-            if not nearest < np.inf or hidden < nearest - AGREE_M:
-                continue
-            total = z_total = r = g = b = inside = 0.0
-            for n in range(len(depths)):
-                z, w = depths[n, row, column], weights[n, row, column]
-                if z > 0.0 and w > 0.0 and z < nearest + AGREE_M:
-                    total += w
-                    z_total += w * z
-                    r += w * rgbs[n, row, column, 0]
-                    g += w * rgbs[n, row, column, 1]
-                    b += w * rgbs[n, row, column, 2]
-                    if masks[n, row, column]:
-                        inside += w
-            depth[row, column] = z_total / total
-            rgb[row, column, 0] = np.uint8(r / total + 0.5)
-            rgb[row, column, 1] = np.uint8(g / total + 0.5)
-            rgb[row, column, 2] = np.uint8(b / total + 0.5)
-            mask[row, column] = inside > 0.5 * total
+    shape = layers[0].depth_m.shape
+    nearest, hidden, total, depth, inside = (np.full(shape, start) for start in (np.inf, np.inf, 0.0, 0.0, 0.0))
+    colour = np.zeros((*shape, 3))
+    for layer in layers:
+        z = np.where(layer.depth_m > 0.0, layer.depth_m, np.inf)
+        nearest = np.minimum(nearest, np.where(layer.weight > 0.0, z, np.inf))
+        hidden = np.minimum(hidden, np.where(layer.weight > 0.0, np.inf, z))
+    shown = (nearest < np.inf) & (hidden >= nearest - AGREE_M)
+    for layer in layers:
+        weight = np.where(shown & (layer.depth_m > 0.0) & (layer.depth_m < nearest + AGREE_M), layer.weight, 0.0)
+        total += weight
+        depth += weight * layer.depth_m
+        colour += weight[..., None] * layer.rgb
+        inside += weight * layer.mask
+    known = np.where(shown, total, 1.0)
+    rgb = np.where(shown[..., None], colour / known[..., None] + 0.5, 0.0).astype(np.uint8)
+    return rgb, depth / known, inside > 0.5 * total

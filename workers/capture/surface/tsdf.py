@@ -24,6 +24,7 @@ from schemas.scene.view import Camera, Intrinsics
 from workers.capture.surface.posed_view import pixel_of
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
+from workers.geometry.mesh import face_areas, piece_of
 
 REACHES = (2, 1)
 """Samples to each side: 5 x 5, and 3 x 3 where those do not lie on a plane, as at a rim."""
@@ -79,7 +80,7 @@ class FittedDepth:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDepth(FittedDepth):
-    """The fit with what is on an edge found out, of a window whose first pixel is the image's (`top`, `left`).
+    """The fit with its edges marked.
 
     sure [h, w] uint8: 1 where all samples were fitted, 2 where they were in the pixels around, too, else 0. beyond [h, w]
     float32: `inverse` and, where that is 0, 1/z of the board where the view shows it: there `facing` is the board's.
@@ -87,48 +88,33 @@ class SurfaceDepth(FittedDepth):
 
     sure: NDArray[np.uint8]
     beyond: NDArray[np.float32]
-    top: int = 0
-    left: int = 0
 
 
-def fit_depth(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float) -> FittedDepth:
+def fit_depth(depth_m: NDArray[np.float32], k: Intrinsics) -> FittedDepth:
     """The fit of depth [H, W]."""
-    inverse, facing, rough = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
-    _fit(depth_m, _focal(k), _stride(k), _least_cos(max_edge_deg), REACHES[0], inverse, facing, rough)
+    inverse, facing, _ = _fit_planes(depth_m, depth_m > 0.0, k, REACHES[0], MOST_EDGE_DEG)
     return FittedDepth(inverse, facing)
 
 
-def fit_surfaces(depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float) -> SurfaceDepth:
+def fit_surfaces(depth_m: NDArray[np.float32], k: Intrinsics) -> SurfaceDepth:
     """The fit of depth [H, W] with fewer samples where more do not lie on a plane, and without ramps between two surfaces."""
-    inverse, facing, rough = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
-    stride, least_cos = _stride(k), _least_cos(max_edge_deg)
-    _fit(depth_m, _focal(k), stride, least_cos, REACHES[0], inverse, facing, rough)
+    inverse, facing, rough = _fit_planes(depth_m, depth_m > 0.0, k, REACHES[0], MOST_EDGE_DEG)
     usual = float(np.median(rough[inverse > 0.0])) if inverse.any() else 0.0
     roughest = ROUGHEST * max(usual, LEAST_ROUGH)
     bent = rough > roughest
-    inverse[bent] = 0.0
-    whole = inverse > 0.0
-    rough[~bent] = SETTLED
-    least_cos = max(least_cos, _least_cos(SMALL_EDGE_DEG))
-    _fit(depth_m, _focal(k), stride, least_cos, REACHES[1], inverse, facing, rough)
-    inverse[rough > roughest] = 0.0
-    ramps = _ramps(inverse, facing, stride)
+    whole = (inverse > 0.0) & ~bent
+    fewer = _fit_planes(depth_m, bent, k, REACHES[1], SMALL_EDGE_DEG)
+    inverse[bent] = np.where(fewer[2] > roughest, 0.0, fewer[0])[bent]
+    facing[bent] = fewer[1][bent]
+    ramps = _ramps(inverse, facing, _stride(k))
     inverse[ramps] = 0.0
     whole &= ~ramps
     sure = whole.astype(np.uint8) + ndimage.binary_erosion(whole, np.ones((3, 3), np.bool_))
     return SurfaceDepth(inverse, facing, sure, inverse)
 
 
-def _focal(k: Intrinsics) -> tuple[float, float, float, float]:
-    return k.fx, k.fy, k.cx, k.cy
-
-
 def _stride(k: Intrinsics) -> int:
     return max(1, round(k.fx / STRIDE_FOCAL_PX))
-
-
-def _least_cos(max_edge_deg: float) -> float:
-    return math.cos(math.radians(max_edge_deg))
 
 
 def _ramps(inverse: NDArray[np.float32], facing: NDArray[np.float32], stride: int) -> NDArray[np.bool_]:
@@ -137,7 +123,7 @@ def _ramps(inverse: NDArray[np.float32], facing: NDArray[np.float32], stride: in
     Where two surfaces lie one behind the other by less than that, mixed pixels join them, and a plane fits the ramp.
     """
     (height, width), reach = inverse.shape, RAMP_REACH * stride
-    q, facing_around, found = np.pad(inverse, reach), np.pad(facing, reach), np.zeros(inverse.shape, np.bool_)
+    q, facing_around, ramps = np.pad(inverse, reach), np.pad(facing, reach), np.zeros(inverse.shape, np.bool_)
 
     def flattest(down: int, right: int) -> NDArray[np.float32]:
         best = np.zeros(inverse.shape, np.float32)
@@ -148,130 +134,127 @@ def _ramps(inverse: NDArray[np.float32], facing: NDArray[np.float32], stride: in
         return best
 
     for down, right in ((0, 1), (1, 0)):
-        found |= np.minimum(flattest(down, right), flattest(-down, -right)) > RAMP * facing
-    return found & (facing < STEEP)
+        ramps |= np.minimum(flattest(down, right), flattest(-down, -right)) > RAMP * facing
+    return ramps & (facing < STEEP)
 
 
-SETTLED = -1.0
-"""Roughness of a pixel that is not fitted again."""
+Fit = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""(inverse, facing, rough), each [h, w], 0 where no plane fits. rough: the scatter of 1/z about the plane, 1/m, times the slope
+`facing`, by which noise grows."""
+
+Plane = tuple[float, float, float]
+"""1/z = a + b i + c j of a pixel's neighbourhood, i columns and j rows from the pixel, in strides; a is 0 for no plane."""
+
+
+def _fit_planes(
+    depth_m: NDArray[np.float32], asked: NDArray[np.bool_], k: Intrinsics, reach: int, max_edge_deg: float
+) -> Fit:
+    """Fits a plane to the samples around each pixel that is asked for; `reach`: samples to each side."""
+    least_cos = math.cos(math.radians(max_edge_deg))
+    return _fit(depth_m, asked, (k.fx, k.fy, k.cx, k.cy), _stride(k), reach, least_cos)
 
 
 @compiled
 def _fit(
     depth_m: NDArray[np.float32],
+    asked: NDArray[np.bool_],
     k: tuple[float, float, float, float],
     stride: int,
-    least_cos: float,
     reach: int,
-    inverse: NDArray[np.float32],
-    facing: NDArray[np.float32],
-    rough: NDArray[np.float32],
-) -> None:
-    """Fits a plane 1/z = a + b i + c j to the samples around each pixel, i and j counted in strides.
-
-    It is fitted twice: to the samples at about the pixel's depth, then to those of them that are near the first plane.
-
-    `reach`: samples to each side. rough [h, w] is `SETTLED` where nothing is to be done; it becomes the scatter of 1/z
-    about the plane, 1/m, times the slope, by which noise grows.
-    """
-    side = 2 * reach + 1
-    least = int(np.ceil(LEAST_SHARE * side * side))
-    samples, plane = np.empty((3, side * side)), np.empty(3)
-    for row in range(depth_m.shape[0]):
+    least_cos: float,
+) -> Fit:
+    """Each plane is fitted twice: to the samples at about the pixel's depth, then to those of them near the first plane."""
+    height, width = depth_m.shape
+    inverse, facing = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    rough, samples = np.zeros((height, width), np.float32), np.empty(((2 * reach + 1) ** 2, 3))
+    least = int(np.ceil(LEAST_SHARE * len(samples)))
+    for row in range(height):
         ray_y = (row + 0.5 - k[3]) / k[1]
-        for column in range(depth_m.shape[1]):
-            z0 = depth_m[row, column]
-            if not z0 > 0.0 or rough[row, column] < 0.0:
-                continue
-            rough[row, column] = 0.0
-            count = _gather(depth_m, row, column, stride, reach, samples)
-            if count < least or not _solve(samples, count, plane):
+        for column in range(width):
+            if not asked[row, column]:
                 continue
             ray_x = (column + 0.5 - k[2]) / k[0]
             ray = np.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
+            count = _gather(depth_m, row, column, stride, reach, samples)
+            plane = _solve(samples, count, least)
+            if plane[0] == 0.0:
+                continue
             # dz = z^2 d(1/z), so a share of the depth is the same share of its inverse.
             gate = min(GATE * ray / _facing(plane, stride, k, ray_x, ray_y), WIDE) * plane[0]
             count = _keep_near(samples, count, plane, gate)
-            if count < least or not _solve(samples, count, plane):
+            plane = _solve(samples, count, least)
+            if plane[0] == 0.0:
                 continue
             slope = _facing(plane, stride, k, ray_x, ray_y)
-            if slope >= least_cos * ray and abs(1.0 / z0 - plane[0]) < gate:
-                inverse[row, column] = plane[0]
-                facing[row, column] = slope
+            if slope >= least_cos * ray and abs(1.0 / depth_m[row, column] - plane[0]) < gate:
+                inverse[row, column], facing[row, column] = plane[0], slope
                 rough[row, column] = slope * _scatter(samples, count, plane)
+    return inverse, facing, rough
 
 
 @compiled
 def _gather(depth_m: NDArray[np.float32], row: int, column: int, stride: int, reach: int, samples: Array) -> int:
-    """How many samples around a pixel are at about its depth; their 1/z, column and row in strides go into `samples`."""
+    """The number of samples around a pixel at about its depth; their (1/z, i, j) go into `samples`."""
     height, width = depth_m.shape
     z0, count = depth_m[row, column], 0
-    for i in range(-reach, reach + 1):
-        for j in range(-reach, reach + 1):
-            y, x = row + i * stride, column + j * stride
+    for j in range(-reach, reach + 1):
+        for i in range(-reach, reach + 1):
+            y, x = row + j * stride, column + i * stride
             if 0 <= y < height and 0 <= x < width and z0 * (1.0 - WIDE) < depth_m[y, x] < z0 * (1.0 + WIDE):
-                samples[0, count], samples[1, count], samples[2, count] = 1.0 / depth_m[y, x], j, i
+                samples[count, 0], samples[count, 1], samples[count, 2] = 1.0 / depth_m[y, x], i, j
                 count += 1
     return count
 
 
 @compiled
-def _off_plane(samples: Array, n: int, plane: Array) -> float:
-    """1/z of a sample less that of the plane there."""
-    return float(samples[0, n] - plane[0] - plane[1] * samples[1, n] - plane[2] * samples[2, n])
+def _solve(samples: Array, count: int, least: int) -> Plane:
+    """Least squares by Cramer's rule about the means; no plane for fewer than `least` samples, or samples in a line."""
+    if count < least:
+        return 0.0, 0.0, 0.0
+    mq = mi = mj = 0.0
+    for n in range(count):
+        mq, mi, mj = mq + samples[n, 0], mi + samples[n, 1], mj + samples[n, 2]
+    mq, mi, mj = mq / count, mi / count, mj / count
+    ii = jj = ij = iq = jq = 0.0
+    for n in range(count):
+        q, i, j = samples[n, 0] - mq, samples[n, 1] - mi, samples[n, 2] - mj
+        ii, jj, ij = ii + i * i, jj + j * j, ij + i * j
+        iq, jq = iq + i * q, jq + j * q
+    area = ii * jj - ij * ij
+    if not area > 1e-9:
+        return 0.0, 0.0, 0.0
+    b, c = (iq * jj - jq * ij) / area, (jq * ii - iq * ij) / area
+    return max(mq - b * mi - c * mj, 0.0), b, c
 
 
 @compiled
-def _keep_near(samples: Array, count: int, plane: Array, gate: float) -> int:
-    """Moves the samples that are nearer to the plane than `gate`, 1/m, to the front; how many they are."""
+def _off_plane(sample: Array, plane: Plane) -> float:
+    """1/z of a sample less that of the plane there."""
+    return float(sample[0] - plane[0] - plane[1] * sample[1] - plane[2] * sample[2])
+
+
+@compiled
+def _keep_near(samples: Array, count: int, plane: Plane, gate: float) -> int:
+    """Moves the samples that are nearer to the plane than `gate`, 1/m, to the front; their number."""
     kept = 0
     for n in range(count):
-        if abs(_off_plane(samples, n, plane)) < gate:
-            for axis in range(3):
-                samples[axis, kept] = samples[axis, n]
+        if abs(_off_plane(samples[n], plane)) < gate:
+            samples[kept] = samples[n]
             kept += 1
     return kept
 
 
 @compiled
-def _scatter(samples: Array, count: int, plane: Array) -> float:
+def _scatter(samples: Array, count: int, plane: Plane) -> float:
     """Standard deviation of 1/z of samples about their plane, which takes up three numbers."""
     total = 0.0
     for n in range(count):
-        error = _off_plane(samples, n, plane)
-        total += error * error
+        total += _off_plane(samples[n], plane) ** 2
     return float(np.sqrt(total / (count - 3)))
 
 
 @compiled
-def _solve(samples: Array, n: int, plane: Array) -> bool:
-    """Least squares of q = plane . (1, x, y) by Cramer's rule about the means; False where the samples lie in a line."""
-    q, x, y = samples[0], samples[1], samples[2]
-    mx = my = mq = 0.0
-    for i in range(n):
-        mx += x[i]
-        my += y[i]
-        mq += q[i]
-    mx, my, mq = mx / n, my / n, mq / n
-    cxx = cyy = cxy = cxq = cyq = 0.0
-    for i in range(n):
-        dx, dy, dq = x[i] - mx, y[i] - my, q[i] - mq
-        cxx += dx * dx
-        cyy += dy * dy
-        cxy += dx * dy
-        cxq += dx * dq
-        cyq += dy * dq
-    area = cxx * cyy - cxy * cxy
-    if not area > 1e-9:
-        return False
-    plane[1] = (cxq * cyy - cyq * cxy) / area
-    plane[2] = (cyq * cxx - cxq * cxy) / area
-    plane[0] = mq - plane[1] * mx - plane[2] * my
-    return bool(plane[0] > 0.0)
-
-
-@compiled
-def _facing(plane: Array, stride: int, k: tuple[float, float, float, float], ray_x: float, ray_y: float) -> float:
+def _facing(plane: Plane, stride: int, k: tuple[float, float, float, float], ray_x: float, ray_y: float) -> float:
     """Cosine of incidence times the ray's length: the plane is A x + B y + C z = 1 in camera coordinates."""
     A, B = plane[1] / stride * k[0], plane[2] / stride * k[1]
     C = plane[0] - A * ray_x - B * ray_y
@@ -301,37 +284,24 @@ class Volume:
 def empty_volume(low: Array, high: Array, voxel_m: float) -> Volume:
     """A volume without views that reaches from corner to corner, board frame, metres."""
     shape = np.maximum(np.ceil((high - low) / voxel_m).astype(np.int64) + 1, 2)
-    distance_m, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    return Volume(np.array(low), voxel_m, distance_m, weight)
+    return Volume(np.array(low), voxel_m, np.zeros(shape, np.float32), np.zeros(shape, np.float32))
 
 
 def integrate(volume: Volume, fitted: SurfaceDepth, camera: Camera) -> None:
-    """Adds one view's depth to the volume."""
-    k = camera.intrinsics
-    _integrate(
-        volume.distance_m,
-        volume.weight,
-        volume.origin,
-        volume.voxel_m,
-        invert(camera.T_world_cam),
-        (k.fx, k.fy, k.cx - fitted.left - 0.5, k.cy - fitted.top - 0.5),
-        fitted.inverse,
-        fitted.facing,
-        fitted.beyond,
-    )
+    """Adds the depth of one view, whose first pixel is the camera's, to the volume."""
+    k, T = camera.intrinsics, invert(camera.T_world_cam)
+    pinhole, pictures = (k.fx, k.fy, k.cx_opencv, k.cy_opencv), (fitted.inverse, fitted.facing, fitted.beyond)
+    _integrate(volume.distance_m, volume.weight, volume.origin, volume.voxel_m, T, pinhole, pictures)
 
 
 @compiled
 def sample_inverse(inverse: NDArray[np.float32], x: float, y: float) -> float:
-    """1/z at (x, y), pixel centres on integers, 0 where there is none.
+    """1/z at (x, y) within half a pixel of the image, pixel centres on integers, 0 where there is none.
 
     Bilinear where all four pixels are of one surface, else the nearest pixel's.
     """
     height, width = inverse.shape
-    near_column, near_row = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
-    if near_column < 0 or near_row < 0 or near_column >= width or near_row >= height:
-        return 0.0
-    nearest = inverse[near_row, near_column]
+    nearest = inverse[int(np.floor(y + 0.5)), int(np.floor(x + 0.5))]
     column, row = int(np.floor(x)), int(np.floor(y))
     if nearest == 0.0 or column < 0 or row < 0 or column + 1 >= width or row + 1 >= height:
         return nearest
@@ -344,6 +314,10 @@ def sample_inverse(inverse: NDArray[np.float32], x: float, y: float) -> float:
     return (a * (1.0 - s) + b * s) * (1.0 - t) + (c * (1.0 - s) + d * s) * t
 
 
+Pictures = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""`inverse`, `facing` and `beyond` of a `SurfaceDepth`."""
+
+
 @compiled
 def _integrate(
     distance_m: NDArray[np.float32],
@@ -352,18 +326,14 @@ def _integrate(
     voxel_m: float,
     T: Array,
     k: tuple[float, float, float, float],
-    inverse: NDArray[np.float32],
-    facing: NDArray[np.float32],
-    beyond: NDArray[np.float32],
+    pictures: Pictures,
 ) -> None:
-    """T: board to camera; k: fx, fy, cx, cy of the window with pixel centres on integers."""
+    """T: board to camera; k: fx, fy, cx, cy with pixel centres on integers."""
     for i in range(distance_m.shape[0]):
         for j in range(distance_m.shape[1]):
             for n in range(distance_m.shape[2]):
                 x, y, z = pixel_of(T, k, origin[0] + i * voxel_m, origin[1] + j * voxel_m, origin[2] + n * voxel_m)
-                if not z > 0.0:
-                    continue
-                s, w = _measure(x, y, z, voxel_m, inverse, facing, beyond)
+                s, w = _measure(x, y, z, voxel_m, pictures)
                 if w > 0.0:
                     total = weight[i, j, n] + w
                     distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
@@ -371,19 +341,12 @@ def _integrate(
 
 
 @compiled
-def _measure(
-    x: float,
-    y: float,
-    z: float,
-    voxel_m: float,
-    inverse: NDArray[np.float32],
-    facing: NDArray[np.float32],
-    beyond: NDArray[np.float32],
-) -> tuple[float, float]:
+def _measure(x: float, y: float, z: float, voxel_m: float, pictures: Pictures) -> tuple[float, float]:
     """(distance to the surface that pixel (x, y) sees from a voxel at depth z, its weight); weight 0 where that is unknown."""
+    inverse, facing, beyond = pictures
     back, full = BACK_VOXELS * voxel_m, 0.5 * BACK_VOXELS * voxel_m
     height, width = inverse.shape
-    if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
+    if not (z > 0.0 and -0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
         return 0.0, 0.0
     row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
     q, slope, behind = sample_inverse(inverse, x, y), facing[row, column], back
@@ -401,23 +364,22 @@ def _measure(
     return min(s, FRONT_VOXELS * voxel_m), w
 
 
-EMPTY = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
-
-
 def extract_surface(volume: Volume) -> Mesh:
     """The surface at distance 0 between voxels that were seen, wound outwards, board frame (Lewiner's marching cubes)."""
-    seen = volume.weight > 0.0
-    if not ((volume.distance_m > 0.0) & seen).any() or not ((volume.distance_m < 0.0) & seen).any():
-        return EMPTY
     # Voxels at the far corner of a cell whose eight voxels were seen: so skimage reads its mask.
-    whole = ndimage.binary_erosion(seen, np.ones((2, 2, 2), np.bool_))
+    whole = ndimage.binary_erosion(volume.weight > 0.0, np.ones((2, 2, 2), np.bool_))
     try:
         vertices, faces, _, _ = marching_cubes(
             volume.distance_m, 0.0, mask=whole, allow_degenerate=False, gradient_direction="descent"
         )
-    except RuntimeError:  # no surface in the cells that were seen
-        return EMPTY
+    except (RuntimeError, ValueError):  # no surface in the cells that were seen
+        return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
     return Mesh(volume.origin + volume.voxel_m * vertices.astype(np.float64), faces.astype(np.int32))
+
+
+def keep_vertices(mesh: Mesh, keep: NDArray[np.bool_]) -> Mesh:
+    """The faces whose three vertices are kept, with the vertices that they use."""
+    return piece_of(mesh, mesh.faces[keep[mesh.faces].all(axis=1)])
 
 
 def cut_below(mesh: Mesh, plane: tuple[float, float, float], height_m: float) -> Mesh:
@@ -433,46 +395,22 @@ def cut_below(mesh: Mesh, plane: tuple[float, float, float], height_m: float) ->
     return Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32).reshape(-1, 3))
 
 
-def keep_vertices(mesh: Mesh, keep: NDArray[np.bool_]) -> tuple[Mesh, NDArray[np.int64]]:
-    """(the faces whose three vertices are kept, with the vertices that they use; the old numbers of those)."""
-    faces = mesh.faces[keep[mesh.faces].all(axis=1)]
-    used = np.unique(faces)
-    number = np.zeros(len(mesh.vertices), np.int32)
-    number[used] = np.arange(len(used), dtype=np.int32)
-    return Mesh(mesh.vertices[used], number[faces]), used.astype(np.int64)
-
-
-def large_parts(mesh: Mesh, least_share: float) -> NDArray[np.bool_]:
-    """[V] bool: vertices of connected parts that have at least a share of the area of the largest one."""
-    count = len(mesh.vertices)
-    if not len(mesh.faces):
-        return np.zeros(count, bool)
-    i, j = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-    graph = sparse.coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(count, count))
-    parts, label = connected_components(graph, directed=False)
-    area = np.bincount(label[mesh.faces[:, 0]], weights=face_areas(mesh), minlength=parts)
-    large: NDArray[np.bool_] = (area >= least_share * area.max())[label]
-    return large
-
-
-def face_areas(mesh: Mesh) -> Array:
-    """[F] areas, m^2."""
-    return 0.5 * np.linalg.norm(_face_normals(mesh), axis=1)
+def large_parts(mesh: Mesh, least_share: float) -> Mesh:
+    """The connected parts that have at least a share of the area of the largest one."""
+    ends, count = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices)
+    graph = sparse.coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(count, count))
+    part = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    area = np.bincount(part, weights=face_areas(mesh.vertices, mesh.faces))
+    return piece_of(mesh, mesh.faces[area[part] >= least_share * area.max(initial=0.0)])
 
 
 def vertex_normals(mesh: Mesh) -> Array:
     """[V, 3] unit normals, the mean of the faces' weighted by their area; up where a vertex has no face."""
-    normals = np.zeros((len(mesh.vertices), 3))
-    across = _face_normals(mesh)
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    across, normals = np.cross(b - a, c - a), np.zeros((len(mesh.vertices), 3))
     for axis in range(3):
         for corner in range(3):
             normals[:, axis] += np.bincount(mesh.faces[:, corner], weights=across[:, axis], minlength=len(normals))
     length = np.linalg.norm(normals, axis=1)
     normals[length == 0.0] = [0.0, 0.0, 1.0]
     return normals / np.where(length == 0.0, 1.0, length)[:, None]
-
-
-def _face_normals(mesh: Mesh) -> Array:
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    across: Array = np.cross(b - a, c - a)
-    return across
