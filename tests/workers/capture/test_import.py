@@ -6,22 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.errors import CaptureError
 from tests.workers.door.recordings import (
     BOARD,
     COLOR,
     COLOR_LENS,
     PERIOD_US,
     START_US,
-    TAGS,
-    calibration,
     photograph,
     poses,
     recording,
-    renamed,
-    tracks,
     true_depth,
-    write_recording,
 )
 from workers.capture.board import marker_corners, open_dictionary
 from workers.capture.detect import detect_markers
@@ -114,17 +108,6 @@ def test_as_many_views_as_asked_are_taken_and_the_same_each_time(tmp_path):
     names = sorted(path.name for path in folder.path.iterdir())
     assert names == sorted(path.name for path in again.path.iterdir())
     assert all((folder.path / name).read_bytes() == (again.path / name).read_bytes() for name in names)
-
-
-def test_what_cannot_be_imported_is_refused_before_anything_is_written(tmp_path):
-    attached = json.dumps(calibration()).encode()
-    late = write_recording(tracks(1), attached, TAGS | {"K4A_DEPTH_DELAY_NS": "-20000000"})
-    other = write_recording(renamed(tracks(1), "DEPTH", width=288, height=320), attached, TAGS)
-    for name, data, told in (("a", late, "within half a frame's time"), ("b", other, "mode NFOV_2X2BINNED has")):
-        (tmp_path / name).mkdir()
-        with pytest.raises(CaptureError, match=told):
-            imported(tmp_path / name, data)
-        assert not list((tmp_path / name / "capture").iterdir())
 
 
 # ---------------------------------------------------------------------------------------------- pairs and losses

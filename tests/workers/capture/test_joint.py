@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from schemas.job.captures import Estimation
 from tests.workers.capture.drawn import (
     HALF,
     KINECT,
@@ -17,7 +16,7 @@ from tests.workers.capture.drawn import (
     project,
     with_pixels,
 )
-from workers.capture.poses.corners import CornerTerm, outward_motion
+from workers.capture.poses.corners import CornerTerm
 from workers.capture.poses.estimates import estimate_joint, object_groups
 from workers.capture.poses.joint import (
     INFLATION_OF_FEW,
@@ -27,14 +26,11 @@ from workers.capture.poses.joint import (
 )
 from workers.capture.poses.observation import Patches
 from workers.capture.poses.terms import (
-    NAMES,
     Shared,
-    correct_depth,
     motion_between,
     moved,
-    prior_sigma,
 )
-from workers.geometry.frames import translation, uniform_rotation
+from workers.geometry.frames import translation
 
 RNG = np.random.default_rng(0)
 STEP = np.array([0.01, -0.02, 0.01, 0.02, -0.01, 0.03, -0.02, 0.01, 0.005, 2e-4, 0.1, 0.01, 0.02, -0.01, 0.01, 0.02])
@@ -84,18 +80,6 @@ def test_derivatives_of_each_term_equal_finite_differences(name):
             assert own == pytest.approx(change / 2e-6, rel=1e-4, abs=2e-2)
 
 
-def test_sides_grow_in_the_plane_of_their_marker_wherever_it_stands_and_corners_of_a_chessboard_stay():
-    rng = np.random.default_rng(3)
-    flat = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    for _ in range(20):
-        R, place, side = uniform_rotation(rng), rng.normal(size=3), rng.uniform(0.01, 0.1)
-        small, large = (place + 0.5 * length * flat @ R.T for length in (side, side + 0.002))
-        corners = np.concatenate([small, rng.normal(size=(3, 3))])
-        moved = outward_motion(corners, np.arange(7) < 4)
-        np.testing.assert_allclose(corners[:4] + 0.002 * moved[:4], large, atol=1e-12)
-        assert not moved[4:].any()
-
-
 def test_a_smaller_world_does_not_fit_better():
     """Depth and poses scaled alike leave residuals over sigma as they are: noise shrinks with the world."""
     small = POSES.copy()
@@ -103,15 +87,6 @@ def test_a_smaller_world_does_not_fit_better():
     for name in ("board", "object"):
         before, after = TERMS[name].rows(POSES, Shared()), TERMS[name].rows(small, Shared(scale=0.9))
         assert after.residual == pytest.approx(before.residual)
-
-
-def test_priors_hold_what_is_believed_and_tell_what_is_identified():
-    by_print, by_depth = (prior_sigma(Estimation(trust=t), True) for t in ("print", "depth"))
-    assert by_print[NAMES.index("print_scale")] == 0 and by_depth[NAMES.index("print_scale")] > 0.1
-    assert by_depth[NAMES.index("scale")] == 0.001  # the specification of the camera
-    assert not prior_sigma(Estimation(), False)[:9].any()
-    sigma = np.where(np.arange(SIZE) == 2, 0.1, 0.9) * by_print
-    assert correct_depth(Shared(), sigma, by_print).identified == ("shift_x_m",)
 
 
 SLOPES = np.array([1.0, -1.0, 1.0, -1.0])[:, None]

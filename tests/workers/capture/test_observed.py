@@ -28,7 +28,6 @@ from workers.capture.poses.markers import (
     fit_markers,
     fit_pose,
     judge,
-    measured_corner_px,
 )
 from workers.capture.poses.observation import (
     MOST,
@@ -175,14 +174,6 @@ def test_a_frontal_board_is_no_trap_and_a_mirrored_one_or_too_few_markers_are_no
         assert found.fit is None and "mirrored" in found.reason
     found = fit_markers(observe(T0, rng, ids=[]), PINHOLE)
     assert found.fit is None and found.reason == "no markers of the board found"
-
-
-def test_the_sigma_of_a_corner_is_measured_over_all_views():
-    rng = np.random.default_rng(7)
-    for corner_px in (0.1, 0.2, 0.5):
-        evidence = evidence_of([observe(T, rng, corner_px=corner_px) for T in hand_held(rng, 10)])
-        assert evidence.corner_px == pytest.approx(corner_px, rel=0.1)
-    assert measured_corner_px([], SPEC) == SPEC.corner_px
 
 
 # ---------------------------------------------------------------------------------------------- the verdict
