@@ -12,10 +12,9 @@ from schemas.errors import CorruptError, InputError, OutputError, SceneError, Ve
 
 if TYPE_CHECKING:
     from schemas.job.job import Job
-    from services.dataset.correspondence import Correspondence
     from services.dataset.dataset import Dataset
     from services.dataset.dataset import open_dataset as open
-    from services.dataset.pair import Pair
+    from services.dataset.pair import Correspondence, Pair
     from services.dataset.view import Box, Cloud, Pixels, View
 
 __all__ = [
@@ -42,9 +41,8 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from schemas.job.job import Job
-    from services.dataset.correspondence import Correspondence
     from services.dataset.dataset import Dataset, open_dataset
-    from services.dataset.pair import Pair
+    from services.dataset.pair import Correspondence, Pair
     from services.dataset.view import Box, Cloud, Pixels, View
 
     names = {kind.__name__: kind for kind in (Box, Cloud, Correspondence, Dataset, Job, Pair, Pixels, View)}

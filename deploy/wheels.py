@@ -27,7 +27,7 @@ def _folder(room: str) -> Path:
 
 
 DOORS = (
-    *("verso", "services.dataset.correspondence", "services.dataset.dataset"),
+    *("verso", "services.dataset.dataset"),
     *("services.cli.commands", "services.cli.main", "services.cli.reference", "services.job.job_file"),
     *(
         f"{room}.{file.stem}"
@@ -75,7 +75,7 @@ def imports_of(path: Path) -> Iterator[str]:
 
 def reading_modules() -> tuple[dict[str, Path], set[str]]:
     """The files of every module that reading loads, by name; and the packages of others that these import."""
-    found: dict[str, Path] = {}
+    ours: dict[str, Path] = {}
     others: set[str] = set()
     waiting = list(DOORS)
     while waiting:
@@ -83,10 +83,10 @@ def reading_modules() -> tuple[dict[str, Path], set[str]]:
         path = file_of(name)
         if path is None:
             others.add(name.split(".")[0])
-        elif name not in found:
-            found[name] = path
+        elif name not in ours:
+            ours[name] = path
             waiting += imports_of(path)
-    return found, {name for name in others if name not in sys.stdlib_module_names}
+    return ours, {name for name in others if name not in sys.stdlib_module_names}
 
 
 def write_reader(folder: Path) -> None:

@@ -204,7 +204,7 @@ class CaptureEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """The estimates of one capture side by side, and the markers that they were made from.
+    """The estimates of one capture side by side.
 
     `chosen` names the one that the cloud and the dataset are made with; it is always among `by_name`. `seconds` of processor
     time of what all estimates share (read, detect, sample depth).
@@ -212,7 +212,6 @@ class Estimates:
 
     chosen: Estimate
     by_name: Mapping[Estimate, CaptureEstimate]
-    detections: tuple[Detection, ...]
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property

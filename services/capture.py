@@ -20,7 +20,7 @@ from schemas.job.views import Render
 from services.job.job_file import change_key, validate_job
 
 if TYPE_CHECKING:
-    from workers.capture.process import ProcessedFolder, StoredResult
+    from workers.capture.process import CaptureViews, ProcessedFolder
     from workers.capture.score import SurfaceErrors
 
 
@@ -244,7 +244,7 @@ def process(options: argparse.Namespace) -> int:
         final, surface = done.estimates.estimate, done.merged.surface
         answer = {"ok": True, "folder": str(options.folder), "estimate": final.estimate, "views": len(final.views)}
         answer |= {"used": len(final.used), "points": len(surface.points), "faces": len(surface.faces)}
-        answer |= {"notes": list(done.notes), "kept": list(done.users), "seconds": dict(done.seconds)}
+        answer |= {"notes": list(final.notes), "kept": list(done.users), "seconds": dict(done.seconds)}
         print(json.dumps(answer))
     return 0
 
@@ -256,7 +256,7 @@ def _print_processed(folder: Path, done: "ProcessedFolder") -> None:
     for view in done.estimates.estimate.views:
         if view.status != "used":
             print(f"view {view.number} {view.status}: {'; '.join(view.reasons)}")
-    for note in done.notes:
+    for note in done.estimates.estimate.notes:
         print(f"note: {note}")
     for name in done.users:
         print(f"kept: {name}, which processing did not write")
@@ -327,7 +327,7 @@ def evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _against_truth(result: "StoredResult") -> tuple["SurfaceErrors", dict[str, Any]]:
+def _against_truth(result: "CaptureViews") -> tuple["SurfaceErrors", dict[str, Any]]:
     from workers.capture.score import read_whole_truth, score_capture, score_measured
 
     truth = read_whole_truth(result.folder)
@@ -336,17 +336,17 @@ def _against_truth(result: "StoredResult") -> tuple["SurfaceErrors", dict[str, A
             "no_truth",
             f"{result.folder.path} has no truth/, which simulated captures have: give the object's mesh with --mesh",
         )
-    score = score_capture(result.estimate, result.surface, result.views, truth)
+    score = score_capture(result, truth)
     poses = {"pose_mm": score.summary.pose_mm, "pose_deg": score.summary.pose_deg}
-    poses |= {"pose_worst_mm": score.worst_mm, "pose_worst_deg": score.worst_deg}
+    poses |= {"pose_worst_mm": max(score.poses.mm), "pose_worst_deg": max(score.poses.deg)}
     print(f"poses    median {poses['pose_mm']:.3f} mm, {poses['pose_deg']:.4f} degrees")
-    print(f"         worst {score.worst_mm:.3f} mm, {score.worst_deg:.4f} degrees")
+    print(f"         worst {poses['pose_worst_mm']:.3f} mm, {poses['pose_worst_deg']:.4f} degrees")
     for number, errors in score.held_out.items():
         print(
             f"view {number} made of the others: depth {errors.depth_median_mm:.2f} mm (95 %: {errors.depth_p95_mm:.2f}), "
             f"colour {errors.color_error:.1f} of 255, covers {errors.covered:.1%}, {errors.measured_share:.1%} measured"
         )
-    depth = score_measured(result.surface, result.views, truth)
+    depth = score_measured(result, truth)
     print(
         f"depth    of {depth.measured_of_visible:.1%} of what was visible in any view; {depth.completeness_of_measured:.1%} of "
         "that has a point within 3 mm"
@@ -357,13 +357,13 @@ def _against_truth(result: "StoredResult") -> tuple["SurfaceErrors", dict[str, A
     return score.surface, answer
 
 
-def _against_mesh(result: "StoredResult", options: argparse.Namespace) -> tuple["SurfaceErrors", dict[str, Any]]:
+def _against_mesh(result: "CaptureViews", options: argparse.Namespace) -> tuple["SurfaceErrors", dict[str, Any]]:
     from workers.capture.score import read_mesh_file, score_against_mesh
 
-    surface, alignment = score_against_mesh(result, read_mesh_file(options.mesh))
-    print(f"{options.mesh} was aligned to the cloud by ICP, which leaves {alignment.rms_mm:.2f} mm rms:")
+    surface, T_board_obj, rms_mm = score_against_mesh(result, read_mesh_file(options.mesh))
+    print(f"{options.mesh} was aligned to the cloud by ICP, which leaves {rms_mm:.2f} mm rms:")
     print("poses are not scored, and errors that a rigid motion explains are not seen")
-    answer = {"aligned_by": "icp", "icp_rms_mm": alignment.rms_mm, "T_board_obj": alignment.T_board_obj.tolist()}
+    answer = {"aligned_by": "icp", "icp_rms_mm": rms_mm, "T_board_obj": T_board_obj.tolist()}
     return surface, {**dict.fromkeys(("pose_mm", "pose_deg", "depth_median_mm")), **answer}
 
 

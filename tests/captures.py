@@ -129,7 +129,7 @@ def estimates(views: int) -> Estimates:
         )
         return CaptureEstimate(name, found, DepthCorrection(0.002, 1.0, np.eye(4), ("offset_m",)), iterations=7)
 
-    return Estimates("joint", {"markers": one("markers", 0.5), "joint": one("joint", 0.2)}, ())
+    return Estimates("joint", {"markers": one("markers", 0.5), "joint": one("joint", 0.2)})
 
 
 def use_exact_captures(monkeypatch: pytest.MonkeyPatch) -> None:

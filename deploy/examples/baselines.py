@@ -135,9 +135,9 @@ def project_input(pair: Pair) -> Prediction:
     """The points of the input view in the mirror view, one pixel each."""
     view, mirror = pair.input, pair.mirror
     assert mirror is not None
-    found = forward_project(view.depth(), view.camera, mirror.camera, 1, view.depth_units_per_m)
+    projected = forward_project(view.depth(), view.camera, mirror.camera, 1, view.depth_units_per_m)
     colours = np.concatenate([view.rgb().reshape(-1, 3), np.zeros((1, 3), np.uint8)])  # -1 is a hole
-    return Prediction(found.depth_m, colours[found.source])
+    return Prediction(projected.depth_m, colours[projected.source])
 
 
 def project_and_fill(pair: Pair) -> Prediction:
@@ -172,11 +172,11 @@ def find_shapes(dataset: Dataset) -> Predictor:
 def silhouette(pair: Pair, region: int) -> NDArray[np.bool_]:
     """[SILHOUETTE_PX, SILHOUETTE_PX]: an object's mask in the input view about its middle; all False of one that is not seen."""
     places = np.argwhere(pair.input.segment() == region)
-    found = np.zeros((SILHOUETTE_PX, SILHOUETTE_PX), bool)
+    mask = np.zeros((SILHOUETTE_PX, SILHOUETTE_PX), bool)
     if len(places):
         at = places - (places.min(axis=0) + places.max(axis=0)) // 2 + SILHOUETTE_PX // 2
-        found[tuple(at[((at >= 0) & (at < SILHOUETTE_PX)).all(axis=1)].T)] = True
-    return found
+        mask[tuple(at[((at >= 0) & (at < SILHOUETTE_PX)).all(axis=1)].T)] = True
+    return mask
 
 
 def inside(points: NDArray, mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
@@ -194,12 +194,12 @@ def train_depth(dataset: Dataset) -> Predictor:
     depth.train(net, depth.load(dataset.place), depth.EPOCHS)
 
     def predict(pair: Pair) -> Prediction:
-        found = planes(pair)
+        depth_m = planes(pair)
         for region in regions_of(pair):
             if (example := mirror_depth.make_example(pair, region)) is not None:
                 window = tuple(slice(at, at + n) for at, n in zip(example.corner, mirror_depth.CROP, strict=True))
-                found[window] = mirror_depth.nearest(found[window], depth.complete(net, example))
-        return Prediction(found)
+                depth_m[window] = mirror_depth.nearest(depth_m[window], depth.complete(net, example))
+        return Prediction(depth_m)
 
     return predict
 
@@ -208,12 +208,12 @@ def planes(pair: Pair) -> NDArray[np.float32]:
     """[H, W] depth of table top and floor in the mirror view, metres."""
     assert pair.mirror is not None
     k = pair.mirror.camera.intrinsics
-    found = np.zeros((k.height, k.width), np.float32)
+    depth_m = np.zeros((k.height, k.width), np.float32)
     rows, columns = mirror_depth.CROP
     for row, column in product(range(0, k.height, rows), range(0, k.width, columns)):
-        here = found[row : row + rows, column : column + columns]
+        here = depth_m[row : row + rows, column : column + columns]
         here[:] = mirror_depth.put_planes(pair, pair.mirror, (row, column))[0][: here.shape[0], : here.shape[1]]
-    return found
+    return depth_m
 
 
 def train_volume(dataset: Dataset) -> Predictor:
@@ -228,8 +228,8 @@ def train_volume(dataset: Dataset) -> Predictor:
     def predict(pair: Pair) -> Prediction:
         examples = {region: occupancy.make_example(pair, region, uniform=False) for region in regions_of(pair)}
         none = {region: np.zeros(len(pair.samples(region)["volume_points"]), bool) for region in examples}
-        found = {region: volume.answer(net, one) for region, one in examples.items() if one is not None}
-        return Prediction(volumes=none | found)
+        answers = {region: volume.answer(net, example) for region, example in examples.items() if example}
+        return Prediction(volumes=none | answers)
 
     return predict
 
@@ -261,29 +261,29 @@ NETWORKS: Final = ("mirror-depth network", "occupancy network")
 # ---------------------------------------------------------------------------------------------------- predictions and scores
 
 
-def write(folder: Path, pair: Pair, found: Prediction) -> None:
+def write(folder: Path, pair: Pair, said: Prediction) -> None:
     """Puts a prediction into a folder as `verso score` reads it."""
     assert pair.mirror is not None
     name, files = f"{pair.mirror.pose_id:05d}", dict[str, Any]()
-    if found.depth_m is not None:
-        units = np.rint(found.depth_m * pair.mirror.depth_units_per_m)
+    if said.depth_m is not None:
+        units = np.rint(said.depth_m * pair.mirror.depth_units_per_m)
         files[f"depth/{name}.png"] = encode_png(np.clip(units, 0, 65535).astype(np.uint16))
-    if found.rgb is not None:
-        files[f"rgb/{name}.png"] = encode_png(found.rgb)
+    if said.rgb is not None:
+        files[f"rgb/{name}.png"] = encode_png(said.rgb)
     for region in regions_of(pair):
         stem = name + (f"obj{region - REGION_FIRST_OBJECT}" if region > REGION_FIRST_OBJECT else "")
-        if region in found.shapes:
-            files[f"shape/{stem}.ply"] = trimesh.exchange.ply.export_ply(found.shapes[region])
-        if region in found.volumes:
+        if region in said.shapes:
+            files[f"shape/{stem}.ply"] = trimesh.exchange.ply.export_ply(said.shapes[region])
+        if region in said.volumes:
             (folder / "volume").mkdir(parents=True, exist_ok=True)
-            np.save(folder / "volume" / f"{stem}.npy", found.volumes[region])
+            np.save(folder / "volume" / f"{stem}.npy", said.volumes[region])
     for path, data in files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(data)
-    if found.poses:
+    if said.poses:
         table = folder / "poses.csv"
         lines = [] if table.exists() else ["scene_id,im_id,obj_id,R,t\n"]
-        for region, T in found.poses.items():
+        for region, T in said.poses.items():
             R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
             lines.append(f"{pair.scene_id},{pair.mirror.pose_id},{region},{R},{t}\n")
         with table.open("a") as file:
@@ -345,11 +345,11 @@ def run(name: str, dataset: Dataset, out: Path) -> list[dict[str, Any]]:
             if predict is not None:
                 seen = sense_input(pair, dataset.job) if sensor == "noisy" else pair
                 begun = time.process_time()
-                found = predict(seen)
+                said = predict(seen)
                 seconds += time.process_time() - begun
-                write(folder, pair, found)
-        told = f"{seconds / max(len(levels), 1):.2g}" if predict is not None else ""
-        rows += [{**head, **row, "seconds": told} for row in rows_of(score(dataset, folder), levels, folder)]
+                write(folder, pair, said)
+        each_s = f"{seconds / max(len(levels), 1):.2g}" if predict is not None else ""
+        rows += [{**head, **row, "seconds": each_s} for row in rows_of(score(dataset, folder), levels, folder)]
     return rows
 
 
@@ -364,12 +364,9 @@ def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterato
             )
         figures = summarise(items)["metrics"]
         for metric in (one for one in METRICS if one in figures and figures[one]["items"]):
-            yield {"level": level, "metric": metric, **{key: number(value) for key, value in figures[metric].items()}}
-
-
-def number(value: float | int | None) -> str:
-    """Five digits, more than an interval leaves meaning to; empty for none."""
-    return "" if value is None else f"{value:.5g}"
+            # Five digits are more than an interval leaves meaning to
+            words = {key: "" if value is None else f"{value:.5g}" for key, value in figures[metric].items()}
+            yield {"level": level, "metric": metric, **words}
 
 
 # ---------------------------------------------------------------------------------------------------- table
@@ -393,8 +390,8 @@ def cell(metric: str, row: Mapping[str, Any]) -> str:
     """`3.1 (2.9–3.4)`; the value alone where there is no interval, or none to speak of."""
     scale = 1e3 if metric.endswith("_m") else 1.0
     value, low, high = (scale * float(row[key] or "nan") for key in ("value", "low", "high"))
-    told = [f"{one:.0f}" if abs(one) >= 1e3 else f"{one:.3g}" for one in (value, low, high)]
-    return f"{told[0]} ({told[1]}–{told[2]})" if low < high else told[0]
+    words = [f"{figure:.0f}" if abs(figure) >= 1e3 else f"{figure:.3g}" for figure in (value, low, high)]
+    return f"{words[0]} ({words[1]}–{words[2]})" if low < high else words[0]
 
 
 def read_options() -> argparse.Namespace:

@@ -6,17 +6,15 @@ view, the two cameras and the planes of table top and floor goes into it: the mi
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as Picture
-from PIL import ImageDraw
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from services.dataset.pair import Pair
 from services.dataset.view import Pixels, View
+from workers.geometry import camera
 
 CROP = (96, 128)
 """Rows and columns, as the article's patches."""
@@ -82,13 +80,7 @@ def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT) -> Example | Non
 def unproject(view: Pixels, depth: Image, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
     """[N, 3] points in the camera's frame, metres, of the chosen pixels that have depth."""
     rows, columns = np.nonzero(chosen & (depth > 0))
-    return rays_through(view, rows, columns) * depth[rows, columns, None]
-
-
-def rays_through(view: Pixels, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[N, 3] rays through the centres of pixels, in the camera's frame, with z = 1."""
-    k = view.camera.intrinsics
-    return np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(len(rows))], axis=1)
+    return camera.unproject(rows, columns, depth[rows, columns].astype(np.float64), view.camera.intrinsics)
 
 
 def transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -148,8 +140,8 @@ def close_holes(depth: Image) -> Image:
 
 def nearest(*layers: Image) -> Image:
     """The nearest known depth of several images; 0 is unknown."""
-    found = np.min([np.where(layer > 0, layer, np.inf) for layer in layers], axis=0)
-    return np.where(np.isfinite(found), found, 0).astype(np.float32)
+    depth = np.min([np.where(layer > 0, layer, np.inf) for layer in layers], axis=0)
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
 def plane_depth(mirror: View, height_m: float, corner: tuple[int, int]) -> Image:
@@ -160,9 +152,10 @@ def plane_depth(mirror: View, height_m: float, corner: tuple[int, int]) -> Image
 
 
 def crop_rays(mirror: View, corner: tuple[int, int]) -> NDArray[np.float64]:
-    """[H * W, 3] rays through the pixels of the crop, as `rays_through`."""
+    """[H * W, 3] rays with z = 1 through the centres of the crop's pixels, in the camera's frame."""
     rows, columns = np.indices(CROP).reshape(2, -1)
-    return rays_through(mirror, rows + corner[0], columns + corner[1])
+    ones = np.ones(len(rows))
+    return camera.unproject(rows + corner[0], columns + corner[1], ones, mirror.camera.intrinsics)
 
 
 def table_top(pair: Pair) -> tuple[float, NDArray[np.float64]]:
@@ -209,7 +202,8 @@ def stack_features(seen: Image, other: Image, background: Image, color: Image, g
 def is_unseen(view: View, depth: Image, mirror: View, truth: Image, corner: tuple[int, int]) -> NDArray[np.bool_]:
     """Whether the surface at each mirror pixel is not what the input view shows in its direction."""
     rows, columns = np.nonzero(truth > 0)
-    surface = rays_through(mirror, rows + corner[0], columns + corner[1]) * truth[rows, columns, None]
+    place, z = (rows + corner[0], columns + corner[1]), truth[rows, columns].astype(np.float64)
+    surface = camera.unproject(*place, z, mirror.camera.intrinsics)
     points = transform(np.linalg.inv(view.T_world_cam) @ mirror.T_world_cam, surface)
     y, x = pixels_of(view, points)
     inside = (y >= 0) & (x >= 0) & (y < depth.shape[0]) & (x < depth.shape[1])
@@ -221,70 +215,16 @@ def is_unseen(view: View, depth: Image, mirror: View, truth: Image, corner: tupl
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of predicted depth, millimetres, and its likeness to the truth."""
+    """Mean errors of predicted depth, millimetres."""
 
     l1_mm: float
     mask_l1_mm: float
     unseen_l1_mm: float
-    ms_ssim: float
 
 
 def score(predicted: Image, example: Example) -> Scores:
-    """L1 over all known pixels, over the object's mask and over its unseen part, and MS-SSIM of the crop."""
+    """L1 over all known pixels, over the object's mask and over its unseen part."""
     known = example.depth > 0
     error = 1000 * np.abs(predicted - example.depth)
     parts = (known, known & example.mask, known & example.unseen)
-    l1, in_mask, unseen = (float(error[part].mean()) if part.any() else float("nan") for part in parts)
-    return Scores(l1, in_mask, unseen, ms_ssim(np.where(known, predicted, 0), example.depth))
-
-
-ERROR_M = 0.02
-"""Error that is drawn white."""
-
-
-def draw_row(pair: Pair, example: Example, predicted: Image) -> NDArray[np.uint8]:
-    """[H, 4 W, 3] uint8 RGB: the input view about the object, true depth, predicted depth, and error, black to white."""
-    patch = pair.input.patch()
-    seen = cv2.resize((pair.input if patch is None else patch).rgb(), CROP[::-1], interpolation=cv2.INTER_AREA)
-    low, high = np.percentile(example.depth[example.depth > 0], [1, 99])
-    depths = (example.depth, predicted)
-    near = [255 * (1 - np.clip((one - low) / max(high - low, 1e-6), 0, 1)) for one in depths]
-    shown = [cv2.applyColorMap(one.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1] for one in near]
-    error = 255 * np.clip(np.where(example.depth > 0, np.abs(predicted - example.depth) / ERROR_M, 0), 0, 1)
-    grey = np.repeat(error.astype(np.uint8)[..., None], 3, axis=2)
-    return np.concatenate([seen, *shown, grey], axis=1).astype(np.uint8)
-
-
-def draw_sheet(rows: list[NDArray[np.uint8]]) -> Picture.Image:
-    """The rows below one another, with a line that says what they show."""
-    sheet = Picture.fromarray(np.concatenate([np.full((16, *rows[0].shape[1:]), 255, np.uint8), *rows]))
-    for at, words in enumerate(("input", "truth", "prediction", f"error, 0 to {1000 * ERROR_M:g} mm")):
-        ImageDraw.Draw(sheet).text((4 + at * CROP[1], 2), words, fill=0)
-    return sheet
-
-
-MS_SSIM_WEIGHTS = np.array([0.0448, 0.2856, 0.3001, 0.2363])
-"""Wang, Simoncelli and Bovik 2003; the fifth scale is left out: the crop is too small for it."""
-
-
-def ms_ssim(a: Image, b: Image, range_m: float = 1.0) -> float:
-    """Multi-scale structural similarity with a Gaussian window of 11 pixels (sigma 1.5); 1 for equal images."""
-    weights = MS_SSIM_WEIGHTS / MS_SSIM_WEIGHTS.sum()
-    c1, c2 = (0.01 * range_m) ** 2, (0.03 * range_m) ** 2
-    product = 1.0
-    for number, weight in enumerate(weights):
-        mean = [_blur(one) for one in (a, b)]
-        square = [_blur(one * one) - m * m for one, m in zip((a, b), mean, strict=True)]
-        cross = _blur(a * b) - mean[0] * mean[1]
-        structure = (2 * cross + c2) / (square[0] + square[1] + c2)
-        light = (2 * mean[0] * mean[1] + c1) / (mean[0] ** 2 + mean[1] ** 2 + c1)
-        last = number == len(weights) - 1
-        product *= max(float((structure * light if last else structure).mean()), 0.0) ** weight
-        a, b = (one[: one.shape[0] // 2 * 2, : one.shape[1] // 2 * 2] for one in (a, b))
-        a, b = (one.reshape(one.shape[0] // 2, 2, -1, 2).mean(axis=(1, 3)) for one in (a, b))
-    return product
-
-
-def _blur(image: NDArray) -> NDArray:
-    """The image under the window, where the window is whole."""
-    return cv2.GaussianBlur(image.astype(np.float64), (11, 11), 1.5)[5:-5, 5:-5]
+    return Scores(*(float(error[part].mean()) if part.any() else float("nan") for part in parts))

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from mirror_depth import CHANNELS, SCALE_M, Example, draw_row, draw_sheet, make_example, score
+from mirror_depth import CHANNELS, SCALE_M, Example, make_example, score
 from splits import pairs_of_split
 from torch import Tensor, nn
 from torch.nn import functional
@@ -119,32 +119,19 @@ def complete(net: Net, example: Example) -> np.ndarray:
     return np.where(logit[0, 0].numpy() > 0, depth[0, 0].numpy(), example.background).astype(np.float32)
 
 
-SHOWN = 12
-"""Rows of the sheet."""
+def evaluate(net: Net, place: str) -> dict[str, dict[str, float]]:
+    """Mean scores over the test split of the network, the baseline, its half turn and the planes alone."""
+    scores: dict[str, list[dict[str, float]]] = {}
+    for example in filter(None, map(make_example, pairs_of_split(open_dataset(place), "test"))):
+        answers = {"network": complete(net, example), "baseline": example.baseline, "half turn": example.turned}
+        for name, answer in {**answers, "planes alone": example.background}.items():
+            scores.setdefault(name, []).append(dataclasses.asdict(score(answer, example)))
+    return {name: {key: float(np.nanmean([item[key] for item in of])) for key in of[0]} for name, of in scores.items()}
 
 
-def evaluate(net: Net, place: str) -> tuple[dict[str, dict[str, float]], list[np.ndarray]]:
-    """(mean scores over the test split of the network, the baseline and the planes alone; rows of the sheet)."""
-    found: dict[str, list] = {"network": [], "baseline": [], "half turn": [], "planes alone": []}
-    rows: list[np.ndarray] = []
-    for pair in pairs_of_split(open_dataset(place), "test"):
-        example = make_example(pair)
-        if example is not None:
-            answers = (complete(net, example), example.baseline, example.turned, example.background)
-            for scores, answer in zip(found.values(), answers, strict=True):
-                scores.append(dataclasses.asdict(score(answer, example)))
-            if len(rows) < SHOWN:
-                rows.append(draw_row(pair, example, answers[0]))
-    means = {
-        name: {key: float(np.nanmean([one[key] for one in scores])) for key in scores[0]}
-        for name, scores in found.items()
-    }
-    return means, rows
-
-
-def read_options(told: str, epochs: int) -> argparse.Namespace:
+def read_options(about: str, epochs: int) -> argparse.Namespace:
     """The words of the command line: place, epochs, seed (which is set), out."""
-    parser = argparse.ArgumentParser(description=told.splitlines()[0])
+    parser = argparse.ArgumentParser(description=about.splitlines()[0])
     parser.add_argument("place", metavar="DATASET", help="a folder, or a bucket")
     parser.add_argument("--epochs", type=int, default=epochs, help=f"default: {epochs}")
     parser.add_argument("--seed", type=int, default=1)
@@ -164,27 +151,21 @@ def keep(net: nn.Module, scores: dict[str, dict[str, float]], options: argparse.
     """Write network.pt, if `--out` names a folder."""
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        told = {"weights": net.state_dict(), "scores": scores, "epochs": options.epochs, "seed": options.seed}
-        torch.save(told, options.out / "network.pt")
+        kept = {"weights": net.state_dict(), "scores": scores, "epochs": options.epochs, "seed": options.seed}
+        torch.save(kept, options.out / "network.pt")
 
 
 def main() -> None:
-    """Train, score, print, and keep the network and a sheet of pictures."""
+    """Train, score, print, and keep the network."""
     options = read_options(__doc__, EPOCHS)
-    data = load(options.place)
-    net = Net()
+    data, net = load(options.place), Net()
     tell_size(net, data)
     train(net, data, options.epochs)
-    scores, rows = evaluate(net, options.place)
+    scores = evaluate(net, options.place)
     keep(net, scores, options)
-    if options.out is not None:
-        draw_sheet(rows).save(options.out / "sheet.png")
-        print(f"{options.out}: network.pt, sheet.png")
-    print(f"{'':14}{'L1':>10}{'in mask':>10}{'unseen':>10}{'MS-SSIM':>10}")
-    for name, one in scores.items():
-        print(
-            f"{name:14}{one['l1_mm']:7.1f} mm{one['mask_l1_mm']:7.1f} mm{one['unseen_l1_mm']:7.1f} mm{one['ms_ssim']:10.4f}"
-        )
+    print(f"{'':14}{'L1':>10}{'in mask':>10}{'unseen':>10}")
+    for name, means in scores.items():
+        print(f"{name:14}{''.join(f'{value:7.1f} mm' for value in means.values())}")
     print(json.dumps(scores))
 
 

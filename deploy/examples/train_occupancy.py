@@ -80,15 +80,14 @@ def answer(net: OccupancyNet, example: Example) -> Flags:
 
 def evaluate(net: OccupancyNet, place: str) -> dict[str, dict[str, float]]:
     """Mean IoU over the test split, of all objects and of each category, of the network and of the baselines."""
-    found: dict[str, dict[str, list[float]]] = {name: defaultdict(list) for name in ("network", "half turn", "shadow")}
+    scores: dict[str, dict[str, list[float]]] = {name: defaultdict(list) for name in ("network", "half turn", "shadow")}
     for pair in pairs_of_split(open_dataset(place), "test"):
         if (example := make_example(pair)) is not None:
-            for kept, inside in zip(
-                found.values(), (answer(net, example), example.turned, example.shadow), strict=True
-            ):
-                for group in ("all", pair.category):
-                    kept[group].append(iou(inside, example.inside))
-    return {name: {group: float(np.nanmean(kept[group])) for group in sorted(kept)} for name, kept in found.items()}
+            answers = answer(net, example), example.turned, example.shadow
+            for of, inside in zip(scores.values(), answers, strict=True):
+                of["all"].append(iou(inside, example.inside))
+                of[pair.category].append(of["all"][-1])
+    return {name: {group: float(np.nanmean(of[group])) for group in sorted(of)} for name, of in scores.items()}
 
 
 def main() -> None:

@@ -207,9 +207,9 @@ def parse_commit_name(name: str) -> tuple[int, int] | None:
     if len(name) == _PLAIN_COMMIT and name.endswith(".json") and name[:10].isdecimal() and name.isascii():
         return int(name[:10]), 0  # nearly all of them, a million times
     match = re.fullmatch(r"([0-9]{10,16})(?:\.retry-([0-9]{1,4}))?\.json", name)
-    found = match and (int(match[1]), int(match[2] or 0))
-    inside = found and found[0] <= MAX_SCENE and found[1] < MAX_RETRIES
-    return found if found and inside and commit_path(*found) == f"{COMMITS}/{name}" else None
+    numbers = match and (int(match[1]), int(match[2] or 0))
+    inside = numbers and numbers[0] <= MAX_SCENE and numbers[1] < MAX_RETRIES
+    return numbers if numbers and inside and commit_path(*numbers) == f"{COMMITS}/{name}" else None
 
 
 def range_table_path(start: int, table: str, retry: int = 0) -> str:

@@ -92,8 +92,8 @@ def _usable(name: str) -> str:
     if name.lower() in _TAKEN:
         raise ValueError("a dataset has a folder of this name: choose another")
     if name.isdigit():
-        told = f"write a letter too, such as n{name}"
-        raise ValueError(f"digits alone would be read as a number by those who query the dataset: {told}")
+        remedy = f"write a letter too, such as n{name}"
+        raise ValueError(f"digits alone would be read as a number by those who query the dataset: {remedy}")
     return name
 
 
@@ -130,8 +130,8 @@ def with_categories(tree: dict[str, Any]) -> dict[str, Any]:
 
 def _sources(tree: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     assets = tree.get("assets")
-    found = assets.get("objects") if isinstance(assets, dict) else None
-    sources = found if isinstance(found, list) else [{"source": "procedural"}]
+    listed = assets.get("objects") if isinstance(assets, dict) else None
+    sources = listed if isinstance(listed, list) else [{"source": "procedural"}]
     return [source for source in sources if isinstance(source, dict)]
 
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,7 +19,7 @@ from schemas.job.job import Job
 from services.cli.environment import host_place
 from services.job.job_file import load_job, pack_job
 from services.job.record import read_job, require_dataset, require_job
-from services.read.verdict import Verdict, explain_damage
+from services.read.verdict import explain_damage
 from services.run.progress import ProgressLine
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -143,15 +143,23 @@ def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
     from services.read.verify import verify as read_back
 
-    store = _committed(options.out)
-    verdict = _with_progress(_scenes_asked(store), "verify", partial(read_back, store))
-    off = _tell_faults(verdict)
+    store = open_store(options.out)
+    if next(iter(store.files(COMMITS)), None) is None:  # it may have lost its job.yaml
+        require_dataset(store)
+    scenes = 0
+    with suppress(VersoError):  # of a damaged job.yaml, which is told below
+        scenes = record.job.scenes if (record := read_job(store)) else 0
+    verdict = _with_progress(scenes, "verify", partial(read_back, store))
+    for line in (*verdict.faults, *([f"and {verdict.untold} more"] if verdict.untold else [])):
+        print(line)
+    off = len(verdict.faults) + verdict.untold
     read = f"{plural(verdict.files, 'file')} ({verdict.bytes / 1e6:.1f} MB), {plural(verdict.scenes, 'scene')}"
     print(f"{options.out}: {read}, labels of {plural(verdict.pairs, 'pair')} derived again: {off or 'nothing'} off")
     if verdict.not_derived:
         print(f"files and tables alone were checked: {verdict.not_derived}")
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
-    for name, check, describe in _deep_checks() if options.independent or options.audit else ():
+    deep = _deep_checks() if options.independent or options.audit else ()
+    for name, check, describe in deep:
         if count := getattr(options, name):
             try:
                 with explain_damage(store):
@@ -175,22 +183,6 @@ def _deep_checks() -> tuple[tuple[str, Callable, Callable], ...]:
         ("independent", verify_independently, describe_independent),
         ("audit", audit, describe_audit),
     )
-
-
-def _tell_faults(verdict: Verdict) -> int:
-    """Prints what is off, a line each; how many there are."""
-    for line in (*verdict.faults, *([f"and {verdict.untold} more"] if verdict.untold else [])):
-        print(line)
-    return len(verdict.faults) + verdict.untold
-
-
-def _scenes_asked(store: Store) -> int:
-    """Scenes of a dataset's job; 0 where job.yaml is damaged."""
-    try:
-        record = read_job(store)
-    except VersoError:
-        return 0
-    return record.job.scenes if record else 0
 
 
 def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]], Found]) -> Found:
@@ -237,12 +229,6 @@ def replay(options: argparse.Namespace) -> int:
 def _dataset(out: str) -> Store:
     """The store of an output folder. Raises OutputError where it is none."""
     return require_dataset(open_store(out))
-
-
-def _committed(out: str) -> Store:
-    """The store of an output folder, also of one that lost its job.yaml. Raises OutputError where it is none."""
-    store = open_store(out)
-    return store if next(iter(store.files(COMMITS)), None) is not None else _dataset(out)
 
 
 def report(options: argparse.Namespace) -> int:

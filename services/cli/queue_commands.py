@@ -90,11 +90,9 @@ def logs(options: argparse.Namespace) -> int:
 def cancel(options: argparse.Namespace) -> int:
     """`verso cancel`."""
     queue = open_queue(_place(options))
-    view = queue.append(options.id, "cancel")
-    if view is None:
-        view = queue.read(options.id)
-        if view.state not in ("cancelling", "cancelled"):
-            raise RunError(f"job {options.id} is {view.state}: there is nothing to cancel")
+    view = queue.append(options.id, "cancel") or queue.read(options.id)
+    if view.state not in ("cancelling", "cancelled"):
+        raise RunError(f"job {options.id} is {view.state}: there is nothing to cancel")
     if view.state == "cancelling":
         _say(f"job {options.id} runs: its supervisor stops it; what is committed in {view.request.out} is kept")
         _say(_describe_supervisor(queue))
@@ -162,9 +160,8 @@ def _cluster_drivers(options: argparse.Namespace) -> "Drivers":
     try:
         drivers.states()
     except MachineError as error:
-        if options.address is not None:
-            raise
-        raise MachineError(f"{error}; or give the queue a Ray of its own on this machine: --address own") from error
+        own = "; or give the queue a Ray of its own on this machine: --address own" if options.address is None else ""
+        raise MachineError(f"{error}{own}") from error
     return drivers
 
 

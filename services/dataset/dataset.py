@@ -27,8 +27,7 @@ from services.dataset.pair import Pair, read_pair
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.dataset.view import Files
 from services.job.record import read_success, require_job
-from services.read.dataset_reader import find_records
-from services.read.stored_tables import StoredTables
+from services.read.dataset_reader import StoredTables, find_records
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -55,14 +54,14 @@ class Splits:
 
 def collect_ids(batches: Iterable[Iterable[Row]]) -> dict[str, set[str] | None]:
     """The instance ids of each category in rows of `assets`; None where there are more than `MOST_INSTANCES`."""
-    found: dict[str, set[str] | None] = {}
+    by_category: dict[str, set[str] | None] = {}
     for row in (row for rows in batches for row in rows):
-        ids = found.setdefault(row["category"], set())
+        ids = by_category.setdefault(row["category"], set())
         if ids is not None:
             ids.add(row["instance_id"])
             if len(ids) > MOST_INSTANCES:
-                found[row["category"]] = None
-    return found
+                by_category[row["category"]] = None
+    return by_category
 
 
 def split_by_category(instances: Mapping[str, Collection[str] | None], shares: SplitShares) -> dict[str, str]:
@@ -71,7 +70,7 @@ def split_by_category(instances: Mapping[str, Collection[str] | None], shares: S
     A category's instances stand in the order of their ids' hashes, as in `assets.split`, and are cut where the shares say;
     as long as there are enough, train has one, then test, then val. The same ids give the same splits.
     """
-    found: dict[str, str] = {}
+    splits: dict[str, str] = {}
     for names in instances.values():
         order = sorted(names or (), key=lambda name: hashlib.sha256(name.encode()).digest())
         room = len(order) - (shares.train > 0)
@@ -79,8 +78,8 @@ def split_by_category(instances: Mapping[str, Collection[str] | None], shares: S
         val = max(min(max(round(len(order) * shares.val), shares.val > 0), room - test), 0)
         train = len(order) - val - test if shares.train else 0
         kinds = ["train"] * train + ["val"] * (len(order) - train - test) + ["test"] * test
-        found |= dict(zip(order, kinds, strict=True))
-    return found
+        splits |= dict(zip(order, kinds, strict=True))
+    return splits
 
 
 PAIR_TABLES = ("scenes", "views", "assets")
@@ -110,9 +109,9 @@ def choose_pairs(table: pa.Table, where: pc.Expression | None) -> pa.Table:
     try:
         return table.filter(where)
     except (pa.ArrowException, NotImplementedError) as error:
-        told = str(error).splitlines()[0]
+        reason = str(error).splitlines()[0]
         raise InputError(
-            f"the filter cannot be used: {told[:200]}. Columns of a pair: {', '.join(table.column_names)}; those of a view "
+            f"the filter cannot be used: {reason[:200]}. Columns of a pair: {', '.join(table.column_names)}; those of a view "
             'or of the asset as pc.field("input", "visible_fraction") or pc.field("asset", "split")'
         ) from error
 
@@ -198,12 +197,12 @@ class Dataset:
     def pair(self, pose_id: int) -> Pair:
         """The pair with this id of its input view or of its mirror view. Raises InputError where it is not stored."""
         scene_id = pose_id // (2 * self.job.pairs_per_scene)
-        found = [pair for pair in self.scene(scene_id) if pair.pose_id == pose_id - pose_id % 2]
-        if not found:
+        pairs = [pair for pair in self.scene(scene_id) if pair.pose_id == pose_id - pose_id % 2]
+        if not pairs:
             raise InputError(
                 f"{self.place} has no pair {pose_id}: `verso status {self.place}` tells which scenes are there"
             )
-        return found[0]
+        return pairs[0]
 
     def scene(self, scene_id: int) -> tuple[Pair, ...]:
         """The pairs of one scene; none of a scene that failed. Raises InputError where it is not stored."""

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_camera, read_label, read_matrix
@@ -18,8 +18,8 @@ from schemas.dataset.layout import PixelKind, file_pose_id, patch_index
 from schemas.errors import InputError
 from schemas.job.views import Patch
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
-from schemas.scene.view import FULL, LAYERS, MODALITIES, Camera, Intrinsics, ObjectLabel, Role, crop_box
-from services.read.stored_tables import patch_paths, view_paths
+from schemas.scene.view import FULL, LAYERS, MODALITIES, Camera, ObjectLabel, Role, crop_box
+from services.read.dataset_reader import patch_paths, view_paths
 from workers.geometry.camera import project, unproject
 from workers.geometry.frames import invert, transform
 from workers.store.images import decode_png
@@ -59,26 +59,9 @@ class Box:
     image: Array
 
 
-def box_corners(extents_m: ArrayLike, T_cam_obj: Pose, intrinsics: Intrinsics) -> Box:
-    """The box of this size [3], whose middle is the origin of the object's frame."""
-    ends = np.array(list(product((-0.5, 0.5), repeat=3)))
-    corners = transform(T_cam_obj, ends * np.asarray(extents_m))
-    image, ahead = np.full((8, 2), np.nan), corners[:, 2] > 0.0
-    image[ahead] = np.stack(project(corners[ahead], intrinsics), axis=1)
-    return Box(corners, image)
-
-
 def pick(points: Array, count: int, rng: np.random.Generator) -> Array:
     """[count, 3]: some of points [N, 3], N > 0, in random order; none twice, unless there are fewer than `count`."""
     return points[rng.choice(len(points), count, replace=len(points) < count)]
-
-
-def sample_mesh(mesh: "trimesh.Trimesh", count: int, seed: int) -> Array:
-    """[count, 3] float64: points uniform over the area of a mesh."""
-    import trimesh  # takes as long to load as all the rest
-
-    points: Array = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0], dtype=np.float64)
-    return points
 
 
 class Files(Protocol):
@@ -141,8 +124,8 @@ class Pixels:
         """
         if kind not in self._paths:
             target = MODALITIES[kind].target if kind in MODALITIES and "region" in self._paths else None
-            told = f": a job stores it whose targets.views names {target}" if target else ""
-            raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}{told}")
+            hint = f": a job stores it whose targets.views names {target}" if target else ""
+            raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}{hint}")
         path = self._paths[kind]
         return decode_png(self._files.image(self._scene["scene_id"], path), path)
 
@@ -164,14 +147,20 @@ class Pixels:
 
     def normals(self) -> NDArray[np.float32]:
         """[H, W, 3] float32: unit normals in the camera's frame, towards the camera; 0 where there is none."""
-        return decode_normals(self.image("normals"))
+        codes = self.image("normals")  # (n + 1) / 2, and 0 where there is none
+        normals = codes * (2.0 / FULL) - 1.0
+        length = np.where(codes.any(axis=2), np.linalg.norm(normals, axis=2), np.inf)
+        return (normals / length[:, :, None]).astype(np.float32)
 
     def coordinates(self) -> Array:
         """[H, W, 3] float64: where on its object each pixel is, metres in the object's frame; nan where no object is seen."""
-        codes, named = self.image("coordinates"), ("coordinates_scale_m", "coordinates_offset_m")
-        rows = {region_id: [row[name] for name in named] for region_id, row in self.regions.items()}
-        scales = {region_id: (scale, offset) for region_id, (scale, offset) in rows.items() if scale is not None}
-        return decode_coordinates(codes, self.segment(), scales)
+        codes, mask = self.image("coordinates"), self.segment()
+        points = np.full(codes.shape, np.nan)
+        for region_id, row in self.regions.items():
+            if row["coordinates_scale_m"] is not None:
+                own = (mask == region_id) & codes.any(axis=2)
+                points[own] = codes[own] * (row["coordinates_scale_m"] / FULL) + row["coordinates_offset_m"]
+        return points
 
     def albedo(self) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB: base colours without light and shadow."""
@@ -192,8 +181,15 @@ class Pixels:
 
         nan but where the mask shows an object and every stored layer, and the last surface, is of that object.
         """
-        back = self.image("back") / self.depth_units_per_m, self.image("back_region")
-        return thickness_along_rays(*self.layers(), back, self.segment(), self.camera.intrinsics)
+        (depth_m, regions), mask = self.layers(), self.segment()
+        back_m, back_region = self.image("back") / self.depth_units_per_m, self.image("back_region")
+        counts = (mask >= REGION_FIRST_OBJECT) & (regions[0] == mask) & (back_region == mask)
+        counts &= ((regions == mask) | (regions == 0)).all(axis=0) & (depth_m[0] > 0.0) & (back_m > 0.0)
+        rows, columns = np.nonzero(counts)
+        rays = unproject(rows, columns, np.ones(len(rows)), self.camera.intrinsics)
+        thickness = np.full(mask.shape, np.nan, np.float32)
+        thickness[counts] = (back_m - depth_m[0])[counts] * np.linalg.norm(rays, axis=1)
+        return thickness
 
     def cloud(self, frame: Frame = "object", region: int | None = REGION_FIRST_OBJECT) -> Cloud:
         """The points that the pixels of a region see (of all regions for None), from the stored depth.
@@ -213,7 +209,11 @@ class Pixels:
     def box(self, region: int = REGION_FIRST_OBJECT) -> Box:
         """The box about an object, or the table (2), along the axes of its own frame. Raises InputError for another region."""
         row = self._labelled(region)
-        return box_corners(row["asset"]["extents_m"], read_matrix(row["T_cam_obj"]), self.camera.intrinsics)
+        ends = np.array(list(product((-0.5, 0.5), repeat=3))) * row["asset"]["extents_m"]
+        corners = transform(read_matrix(row["T_cam_obj"]), ends)
+        image, ahead = np.full((8, 2), np.nan), corners[:, 2] > 0.0
+        image[ahead] = np.stack(project(corners[ahead], self.camera.intrinsics), axis=1)
+        return Box(corners, image)
 
     def mesh(self, region: int = REGION_FIRST_OBJECT, *, welded: bool = False) -> "trimesh.Trimesh":
         """An object's whole shape (or the table's, 2) in the frame of this camera, metres; as `Pair.mesh`."""
@@ -222,7 +222,7 @@ class Pixels:
 
     def _labelled(self, region: int | None, first: int = REGION_TABLE) -> Mapping[str, Any]:
         """What is known of a region. Raises InputError where the view has no label of it, or its id is below `first`."""
-        known = [one for one in sorted(self.regions) if one >= first]
+        known = [region_id for region_id in sorted(self.regions) if region_id >= first]
         if region not in known:
             kind = "object" if first == REGION_FIRST_OBJECT else "object or table"
             raise InputError(f"region {region} is no {kind} of this view; its {kind}s are {known}")
@@ -256,7 +256,7 @@ class View(Pixels):
         box = crop_box(label, self.camera, self._files.patch)
         if box is None:
             return None
-        objects = sum(one.region_id >= REGION_FIRST_OBJECT for one in self.objects)
+        objects = sum(label.region_id >= REGION_FIRST_OBJECT for label in self.objects)
         k = self.camera.intrinsics
         size = {"width": self._files.patch.width, "height": self._files.patch.height}
         moved = k.model_copy(update={**size, "cx": k.cx - box[1].start, "cy": k.cy - box[0].start})
@@ -279,7 +279,7 @@ def read_view(row: Row, labels: Mapping[tuple[int, str], list[Row]], scene: Mapp
     return View(
         camera=read_camera(row),
         depth_units_per_m=row["depth_units_per_m"],
-        regions=MappingProxyType({one["region_id"]: MappingProxyType(one) for one in own}),
+        regions=MappingProxyType({label["region_id"]: MappingProxyType(label) for label in own}),
         _paths=view_paths(row),
         _scene=scene,
         _files=files,
@@ -306,49 +306,3 @@ def weld(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
     faces = at.reshape(-1)[mesh.faces]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     return trimesh.Trimesh(places, faces[whole], process=False)
-
-
-# ---------------------------------------------------------------------------------------------- stored codes as numbers
-
-
-def decode_normals(codes: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """[H, W, 3] float32: unit normals of codes (n + 1) / 2 [H, W, 3]; 0 where all three codes are 0, which says none."""
-    normals = codes * (2.0 / FULL) - 1.0
-    length = np.where(codes.any(axis=2), np.linalg.norm(normals, axis=2), np.inf)
-    return (normals / length[:, :, None]).astype(np.float32)
-
-
-def decode_coordinates(
-    codes: NDArray[np.uint16], region: NDArray[np.uint8], scales: Mapping[int, tuple[float, ArrayLike]]
-) -> Array:
-    """[H, W, 3] float64: points in their objects' frames, metres, of codes [H, W, 3]; nan where there are none.
-
-    scales: of each region of the mask `region` [H, W], (scale, offset [3]) in metres.
-    """
-    points = np.full(codes.shape, np.nan)
-    for region_id, (scale_m, offset_m) in scales.items():
-        own = (region == region_id) & codes.any(axis=2)
-        points[own] = codes[own] * (scale_m / FULL) + np.asarray(offset_m)
-    return points
-
-
-def thickness_along_rays(
-    layers_m: NDArray[np.float32],
-    layers_region: NDArray[np.uint8],
-    back: tuple[NDArray, NDArray],
-    own: NDArray,
-    k: Intrinsics,
-) -> NDArray[np.float32]:
-    """[H, W] float32: metres along each pixel's ray from its first surface to its last; nan where it does not count.
-
-    layers_m, layers_region [N, H, W]: depth and region of the first surfaces; back: those of the last one [H, W]; own
-    [H, W]: the mask. It counts where the mask shows an object and all these surfaces are that object's and have depth.
-    """
-    back_m, back_region = back
-    counts = (own >= REGION_FIRST_OBJECT) & (layers_region[0] == own) & (back_region == own)
-    counts &= ((layers_region == own) | (layers_region == 0)).all(axis=0) & (layers_m[0] > 0.0) & (back_m > 0.0)
-    rows, columns = np.nonzero(counts)
-    rays = unproject(rows, columns, np.ones(len(rows)), k)
-    thickness = np.full(own.shape, np.nan, np.float32)
-    thickness[counts] = (back_m - layers_m[0])[counts] * np.linalg.norm(rays, axis=1)
-    return thickness

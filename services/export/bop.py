@@ -4,14 +4,11 @@ Images of a scene are the input, aligned and mirror views of its pairs. Poses ar
 pixel centres on integers, as OpenCV has them. A scene's folder appears whole.
 """
 
-import csv
-import io
 import json
 import math
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -21,17 +18,15 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import plural
-from schemas.scene.shape import REGION_FIRST_OBJECT, Part
+from schemas.scene.shape import REGION_FIRST_OBJECT, Part, Shape
 from schemas.scene.view import DRAWN_ROLES, Role
-from services.export.folder import ExportFolder, Register
-from services.export.formats import Added, ExportRequest, Writer, encode_json
+from services.export.formats import LeftOut, Writer, encode_json
 from services.export.shapes import (
-    ColoredShape,
-    Shapes,
     Silhouette,
     box_of,
     reaches_edge,
     silhouette_of,
+    vertex_colors,
     whole_silhouette,
 )
 from services.export.source import ExportPair, ExportScene
@@ -40,6 +35,7 @@ from workers.store.images import decode_png, encode_mask
 
 NO_SHAPE: Final = "an object is hidden in part, and its shape is neither stored nor here"
 _MM = 1000.0
+_INFO, _NAMES = "models/models_info.json", "objects.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,47 +50,66 @@ class _Shot:
 
 
 class Bop(Writer):
-    """Writes train/, val/ and test/ with a folder for each scene, and models/."""
+    """Writes train/, val/ and test/ with a folder for each scene, and models/; `register` numbers the instances."""
 
-    FRESH: ClassVar = {"models": None, "camera": None, "splits": {}, "images": 0}
+    FRESH: ClassVar = {"camera": None, "splits": {}, "images": 0, "instances": 0, "models": 0}
+    HEADS: ClassVar = {_NAMES: "obj_id,category,instance_id,split,source,licence\n", _INFO: "{"}
 
-    def begin(self, request: ExportRequest, fresh: bool) -> None:
-        """Opens the list of objects."""
-        self._shapes = Shapes(self.record)
-        self._models = BopModels(self.folder, self.kept["models"])
-
-    def add(self, scene: ExportScene) -> Added:
+    def add(self, scene: ExportScene) -> LeftOut:
         """Writes the scene's folder with its pairs that are whole."""
-        place = self.folder.temporary("scene")
-        shutil.rmtree(place, ignore_errors=True)
-        numbers = {region: self._number(scene, name) for region, (_, name) in scene.instances.items()}
-        written: list[_Shot] = []
-        left_out = []
-        for pair in scene.pairs:
-            shots = [self._shot(scene, pair, role, numbers) for role in DRAWN_ROLES if role in pair.views]
-            if reason := next((shot for shot in shots if isinstance(shot, str)), None):
-                left_out.append((pair.pose_id, reason))
-                continue
-            for shot in (shot for shot in shots if isinstance(shot, _Shot)):
-                for path, data in shot.files.items():
-                    (place / path).parent.mkdir(parents=True, exist_ok=True)
-                    (place / path).write_bytes(data)
-                shot.files.clear()
-                written.append(shot)
-        if written:
-            self._install(place, f"{scene.split}/{scene.scene_id:06d}", written)
-            self.count("splits", scene.split, 1)
-            self.kept["images"] += len(written)
-            self.kept["camera"] = self.kept["camera"] or _sensor(written[0].view)
-        return Added(len(scene.pairs) - len(left_out), tuple(left_out))
+        self._shots: list[_Shot] = []
+        self._place = self.folder.temporary("scene")
+        shutil.rmtree(self._place, ignore_errors=True)
+        self._numbers = {region: self._number(scene, name) for region, (_, name) in scene.instances.items()}
+        return super().add(scene)
+
+    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+        """Writes the pair's images."""
+        shots = [self._shot(scene, pair, role) for role in pair.drawn]
+        for reason in (shot for shot in shots if isinstance(shot, str)):
+            return reason
+        for shot in (shot for shot in shots if isinstance(shot, _Shot)):
+            for path, data in shot.files.items():
+                (self._place / path).parent.mkdir(parents=True, exist_ok=True)
+                (self._place / path).write_bytes(data)
+            shot.files.clear()
+            self._shots.append(shot)
+        return ""
+
+    def end_scene(self, scene: ExportScene) -> None:
+        """Gives the scene's folder its name, unless a killed export did."""
+        trees = {
+            "camera": {shot.number: _camera(shot.view) for shot in self._shots},
+            "gt": {shot.number: shot.poses for shot in self._shots},
+            "gt_info": {shot.number: shot.infos for shot in self._shots},
+        }
+        for name, tree in trees.items():
+            (self._place / f"scene_{name}.json").write_bytes(encode_json(tree))
+        path = f"{scene.split}/{scene.scene_id:06d}"
+        if not (self.folder.root / path).exists():
+            self.folder.install(self._place, path)
+        self.count("splits", scene.split)
+        self.kept["images"] += len(self._shots)
+        self.kept["camera"] = self.kept["camera"] or _sensor(self._shots[0].view)
 
     def _number(self, scene: ExportScene, instance_id: str) -> int:
-        known = self._models.number(instance_id)
-        if known is not None:
-            return known
-        return self._models.add(scene.assets[instance_id], self._shapes.load(scene, instance_id))
+        """obj_id of an instance, from 1 in the order of appearance; a new one's model is written, where its shape is here."""
+        if known := self.register.of(instance_id):
+            return known[0][0]
+        number = self.register.add(instance_id)
+        asset, shape = scene.assets[instance_id], self.shapes.load(scene, instance_id)
+        names = ("category", "instance_id", "split", "source", "licence")
+        self.folder.append_row(_NAMES, (number, *(asset[name] for name in names)))
+        self.kept["instances"] += 1
+        if shape is not None:
+            self.folder.put(f"models/obj_{number:06d}.ply", b"".join(ply_lines(shape)))
+            comma = "," if self.kept["models"] else ""
+            entry = f'{comma}\n "{number}": {json.dumps(model_info(_MM * shape.vertices))}'
+            self.folder.append(_INFO, entry.encode())
+            self.kept["models"] += 1
+        return number
 
-    def _shot(self, scene: ExportScene, pair: ExportPair, role: Role, numbers: dict[int, int]) -> _Shot | str:
+    def _shot(self, scene: ExportScene, pair: ExportPair, role: Role) -> _Shot | str:
         """An image with its masks, or a reason why there is none."""
         rgb, region, depth = pair.image(role, "rgb"), pair.pixels(role, "region"), pair.image(role, "depth")
         if rgb is None or region is None or depth is None:
@@ -114,7 +129,7 @@ class Bop(Writer):
                 return NO_SHAPE
             name = f"{number:06d}_{len(shot.poses):06d}.png"
             shot.files[f"mask/{name}"], shot.files[f"mask_visib/{name}"] = encode_mask(whole.mask), encode_mask(visible)
-            shot.poses.append(_pose(numbers[label["region_id"]], label))
+            shot.poses.append(_pose(self._numbers[label["region_id"]], label))
             shot.infos.append(_info(whole, visible, pixels))
         return shot
 
@@ -128,52 +143,27 @@ class Bop(Writer):
         if stored is not None and not reaches_edge(stored):
             return silhouette_of(stored)
         hidden = label["visible_fraction"] < 1.0
-        colored = self._shapes.load(scene, label["instance_id"]) if hidden else None
-        whole = whole_silhouette(label, view, visible, None if colored is None else colored.shape)
+        shape = self.shapes.load(scene, label["instance_id"]) if hidden else None
+        whole = whole_silhouette(label, view, visible, shape)
         if stored is None:
             return whole
         return silhouette_of(stored) if whole is None else Silhouette(stored, whole.pixels, whole.box)
 
-    def _install(self, place: Path, path: str, shots: list[_Shot]) -> None:
-        """Gives a scene's folder its name, unless a killed export did."""
-        trees = {
-            "camera": {shot.number: _camera(shot.view) for shot in shots},
-            "gt": {shot.number: shot.poses for shot in shots},
-            "gt_info": {shot.number: shot.infos for shot in shots},
-        }
-        for name, tree in trees.items():
-            (place / f"scene_{name}.json").write_bytes(encode_json(tree))
-        if not (self.folder.root / path).exists():
-            self.folder.install(place, path)
-
-    def state(self) -> dict[str, Any]:
-        """Numbers of objects, and counts."""
-        return {**self.kept, "models": self._models.state()}
-
     def finish(self) -> None:
         """Writes camera.json and ends the list of models."""
-        self._models.finish()
+        self.folder.append(_INFO, b"\n}\n")
         self.folder.put("camera.json", encode_json(self.kept["camera"] or {}))
-
-    def close(self) -> None:
-        """Closes the list of objects."""
-        self._models.close()
 
     def describe(self) -> dict[str, Any]:
         """Counts, units and frames."""
-        missing = self._models.without
+        missing = self.kept["instances"] - self.kept["models"]
+        lost = [f"{plural(missing, 'model')}: neither their shapes nor the job's sources are here"] if missing else []
+        rest = "the table and the floor as objects, projected views, patches, textures (models have vertex colours)"
         return {
-            "bop_scenes": dict(sorted(self.kept["splits"].items())),
+            "bop_scenes": self.counts("splits"),
             "images": self.kept["images"],
-            "models": self._models.count - missing,
-            "not_exported": [
-                *(
-                    [f"{plural(missing, 'model')}: neither their shapes nor the job's sources are here"]
-                    if missing
-                    else []
-                ),
-                "the table and the floor as objects, projected views, patches, textures (models have vertex colours)",
-            ],
+            "models": self.kept["models"],
+            "not_exported": [*lost, rest],
             "poses": "model to camera, and world to camera; millimetres, optical frame (x right, y down, z forward)",
             "models_frame": "millimetres, z up, origin at the centre of the bounding box",
             "pixels": "cam_K has pixel centres on integers, as OpenCV has them",
@@ -217,57 +207,8 @@ def _info(whole: Silhouette, visible: NDArray[np.bool_], depth: NDArray) -> Row:
     }
 
 
-_INFO, _NAMES = "models/models_info.json", "objects.csv"
 _AT_ONCE = 512
 """Rows of a block of distances: some tens of megabytes at most."""
-
-
-class BopModels:
-    """Gives each instance its number, obj_id, from 1, and writes its model in millimetres when it first appears."""
-
-    def __init__(self, folder: ExportFolder, state: dict[str, Any] | None) -> None:
-        self._folder, begun = folder, state or {"objects": 0, "without_model": 0, "first": True}
-        self._register = Register(folder, begun["objects"])
-        self.count: int = begun["objects"]
-        """How many instances have a number."""
-        self.without: int = begun["without_model"]
-        """Objects whose shape is not here."""
-        self._first: bool = begun["first"]
-        if state is None:
-            folder.append(_NAMES, b"obj_id,category,instance_id,split,source,licence\n")
-            folder.append(_INFO, b"{")
-
-    def number(self, instance_id: str) -> int | None:
-        """The obj_id of an instance, None where it is new."""
-        return next((number for number, _ in self._register.of(instance_id)), None)
-
-    def add(self, asset: Row, shape: ColoredShape | None) -> int:
-        """The obj_id of a new instance, whose row of `assets` and shape these are."""
-        number = self.count = self._register.add(asset["instance_id"])
-        text = io.StringIO()
-        names = ("category", "instance_id", "split", "source", "licence")
-        csv.writer(text, lineterminator="\n").writerow((number, *(asset[name] for name in names)))
-        self._folder.append(_NAMES, text.getvalue().encode())
-        if shape is None:
-            self.without += 1
-            return number
-        self._folder.put(f"models/obj_{number:06d}.ply", b"".join(ply_lines(shape)))
-        entry = f'{"" if self._first else ","}\n "{number}": {json.dumps(model_info(_MM * shape.shape.vertices))}'
-        self._folder.append(_INFO, entry.encode())
-        self._first = False
-        return number
-
-    def state(self) -> dict[str, Any]:
-        """What a new one must know; the numbers themselves are safe on the disk."""
-        return {"objects": self._register.state(), "without_model": self.without, "first": self._first}
-
-    def finish(self) -> None:
-        """Ends models_info.json."""
-        self._folder.append(_INFO, b"\n}\n")
-
-    def close(self) -> None:
-        """Closes the file of numbers."""
-        self._register.close()
 
 
 def model_info(vertices_mm: Array) -> dict[str, float]:
@@ -297,16 +238,16 @@ def _diameter(points: Array) -> float:
     return largest
 
 
-def ply_lines(colored: ColoredShape) -> Iterator[bytes]:
+def ply_lines(shape: Shape) -> Iterator[bytes]:
     """An ASCII PLY file: vertices in millimetres, unit normals, colours, and triangles."""
-    shape, mesh = colored.shape, colored.shape.mesh
+    mesh, colors = shape.mesh, np.concatenate([vertex_colors(part) for part in shape.parts])
     normals = np.concatenate([_normals(part) for part in shape.parts])
     floats, letters = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
     header = ["ply", "format ascii 1.0", f"element vertex {len(mesh.vertices)}"]
     header += [f"property float {name}" for name in floats] + [f"property uchar {name}" for name in letters]
     header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
     yield "".join(f"{line}\n" for line in header).encode()
-    rows = zip((_MM * mesh.vertices).tolist(), normals.tolist(), colored.colors.tolist(), strict=True)
+    rows = zip((_MM * mesh.vertices).tolist(), normals.tolist(), colors.tolist(), strict=True)
     line = "%.9g %.9g %.9g %.6g %.6g %.6g %d %d %d\n"
     yield "".join(line % (*xyz, *normal, *rgb) for xyz, normal, rgb in rows).encode()
     yield "".join(f"3 {a} {b} {c}\n" for a, b, c in mesh.faces.tolist()).encode()
@@ -316,6 +257,4 @@ def _normals(part: Part) -> Array:
     """[V, 3]: those of the part, else the mean of the faces about each vertex, weighed by their angles."""
     if part.normals is not None:
         return part.normals
-    mesh, total = trimesh.Trimesh(part.vertices, part.faces, process=False), np.zeros(part.vertices.shape)
-    np.add.at(total, mesh.faces, mesh.face_angles[..., None] * mesh.face_normals[:, None])
-    return np.asarray(trimesh.unitize(total))
+    return np.asarray(trimesh.Trimesh(part.vertices, part.faces, process=False).vertex_normals)

@@ -1,8 +1,6 @@
 """`verso export`: a dataset in another layout, scene by scene in constant memory, gone on with after a kill."""
 
 import argparse
-import csv
-import io
 import json
 import sys
 import time
@@ -18,10 +16,11 @@ from numpy.typing import NDArray
 
 from schemas.errors import OutputError, plural
 from services.export.folder import ExportFolder
-from services.export.formats import Added, Choice, Chooser, ExportRequest, Writer
-from services.export.source import iter_ranges, scenes_of, splits_of
+from services.export.formats import Choice, Chooser, ExportRequest, Writer
+from services.export.source import iter_records, scenes_of, splits_of
 from services.export.table import FORMATS
 from services.job.record import JobRecord, read_success, require_dataset, require_job
+from services.read.dataset_reader import read_stored
 from services.read.verdict import explain_damage
 from services.run.progress import ProgressLine
 from workers.store.commit import list_codes
@@ -54,7 +53,7 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
     if root is not None and request.target.resolve().is_relative_to(Path(root).resolve()):  # it would be a foreign file
         raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
     record = require_job(request.store)
-    FORMATS[request.format].load().check(record.job)
+    FORMATS[request.format].load().check(request.format, record.job)
     chooser = Chooser(request.choice)
     folder = ExportFolder(request.target)
     plan = _plan(request, record)
@@ -63,69 +62,57 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
         return ExportResult(done, 0)
     with folder.claimed(plan) as progress:
         codes = _snapshot(request, folder, fresh=progress is None)
-        return _Export(request, record, chooser, folder, codes, progress).run(report)
+        begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
+        writer = FORMATS[request.format].load()(request, record, folder, begun["writer"])
+        with closing(writer):
+            return _Export(writer, codes, begun).run(chooser, report)
 
 
 class _Export:
-    """An export on its way: counts, the writer, and the scene to go on from."""
+    """An export on its way: the writer, the commits, and how far it came."""
 
-    def __init__(
-        self,
-        request: ExportRequest,
-        record: JobRecord,
-        chooser: Chooser,
-        folder: ExportFolder,
-        codes: NDArray[np.int64],
-        progress: dict[str, Any] | None,
-    ) -> None:
-        self._request, self._record, self._chooser, self._folder, self._codes = request, record, chooser, folder, codes
-        begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
-        asked, shares = request.choice, record.job.assets.split
-        self._splits = splits_of(request.store, codes, shares, asked.held_out, asked.split == "category")
+    def __init__(self, writer: Writer, codes: NDArray[np.int64], begun: dict[str, Any]) -> None:
+        self._writer, self._codes, self._folder = writer, codes, writer.folder
         self._finished: bool = begun["finished"]
         self._next_scene: int = begun["next_scene"]
         self._counts, self._left_out = Counter(begun["counts"]), Counter(begun["left_out"])
-        self._writer: Writer = FORMATS[request.format].load()(request, record, folder, begun["writer"])
-        if progress is None:
-            folder.append(LEFT_OUT, b"scene_id,pose_id,reason\n")
+        if begun["writer"] is None:
+            self._folder.append(LEFT_OUT, b"scene_id,pose_id,reason\n")
 
-    def run(self, report: Report) -> ExportResult:
+    def run(self, chooser: Chooser, report: Report) -> ExportResult:
         """Every chosen scene from the checkpoint on, then the manifest."""
         before = self._counts["pairs"]
-        with closing(self._writer):
-            if not self._finished:
-                self._write_scenes(report)
-                self._writer.finish()
-                self._finished = True
-                self._checkpoint(self._next_scene)
-            counts = {name: self._counts[name] for name in ("scenes", "pairs", "pairs_left_out")}
-            left_out, described = dict(sorted(self._left_out.items())), self._writer.describe()
+        if not self._finished:
+            self._write_scenes(chooser, report)
+            self._writer.finish()
+            self._finished = True
+            self._checkpoint(self._next_scene)
+        counts = {name: self._counts[name] for name in ("scenes", "pairs", "pairs_left_out")}
+        left_out = dict(sorted(self._left_out.items()))
         manifest = {**self._folder.plan, "ranges": len(self._codes), **counts, "left_out": left_out}
-        if reserved := sorted(described.keys() & manifest.keys()):
-            raise ValueError(
-                f"the writer of {self._request.format} describes {', '.join(reserved)}: export.json has that"
-            )
-        manifest |= described
+        manifest |= self._writer.describe()
+        self._writer.close()
         self._folder.finish(manifest)
         return ExportResult(manifest, self._counts["pairs"] - before)
 
-    def _write_scenes(self, report: Report) -> None:
-        store = self._request.store
-        for stored in iter_ranges(store, self._codes, self._next_scene):
-            chosen = [scene for scene in self._chooser.choose(stored) if scene >= self._next_scene]
-            for scene in scenes_of(store, stored, chosen, self._splits):
-                self._count(scene.scene_id, self._writer.add(scene))
+    def _write_scenes(self, chooser: Chooser, report: Report) -> None:
+        store, job, choice = self._writer.request.store, self._writer.record.job, self._writer.request.choice
+        splits = splits_of(store, self._codes, job.assets.split, choice.held_out, choice.split == "category")
+        for records in iter_records(store, self._codes):
+            if records[0].span.stop <= self._next_scene:
+                continue
+            stored = read_stored(store, records)
+            chosen = [scene for scene in chooser.choose(stored) if scene >= self._next_scene]
+            for scene in scenes_of(store, stored, chosen, splits):
+                left_out = self._writer.add(scene)
+                pairs = len(scene.pairs) - len(left_out)
+                self._counts.update(scenes=int(pairs > 0), pairs=pairs, pairs_left_out=len(left_out))
+                self._left_out.update(reason for _, reason in left_out)
+                for pose_id, reason in left_out:
+                    self._folder.append_row(LEFT_OUT, (scene.scene_id, pose_id, reason))
                 self._checkpoint(scene.scene_id + 1)
             self._checkpoint(max(self._next_scene, stored.stop))
-            report(stored.stop, self._record.job.stop_scene)
-
-    def _count(self, scene_id: int, added: Added) -> None:
-        self._counts.update(scenes=int(added.pairs > 0), pairs=added.pairs, pairs_left_out=len(added.left_out))
-        text = io.StringIO()
-        for pose_id, reason in added.left_out:
-            self._left_out[reason] += 1
-            csv.writer(text, lineterminator="\n").writerow((scene_id, pose_id, reason))
-        self._folder.append(LEFT_OUT, text.getvalue().encode())
+            report(stored.stop, job.stop_scene)
 
     def _checkpoint(self, next_scene: int) -> None:
         self._next_scene = next_scene
@@ -184,16 +171,16 @@ def main(options: argparse.Namespace) -> int:
             line.show(done)
 
         result = export(request, report)
-    _tell(options, result, time.monotonic() - begun)
+    _print_result(options, result, time.monotonic() - begun)
     return 0 if result.manifest["pairs"] else 1
 
 
-def _tell(options: argparse.Namespace, result: ExportResult, seconds: float) -> None:
+def _print_result(options: argparse.Namespace, result: ExportResult, seconds: float) -> None:
     """Prints what the export holds and what it leaves out."""
     manifest = result.manifest
     now = f" ({result.pairs_now} now, in {seconds:.1f} s)" if result.pairs_now else " (nothing was left to do)"
-    told = f"{plural(manifest['pairs'], 'pair')} of {plural(manifest['scenes'], 'scene')}"
-    print(f"{options.dir}: {options.format}, {told}{now}")
+    pairs, scenes = plural(manifest["pairs"], "pair"), plural(manifest["scenes"], "scene")
+    print(f"{options.dir}: {options.format}, {pairs} of {scenes}{now}")
     for reason, count in manifest["left_out"].items():
         print(f"  left out: {plural(count, 'pair')}, {reason}")
     if manifest["pairs_left_out"]:
@@ -201,8 +188,8 @@ def _tell(options: argparse.Namespace, result: ExportResult, seconds: float) -> 
     for line in manifest.get("not_exported", ()):
         print(f"  not exported: {line}")
     if not manifest["pairs"]:
-        told = "no scene was chosen" if not manifest["pairs_left_out"] else "every pair was left out"
-        print(f"verso: {options.dir} holds no pair: {told}", file=sys.stderr)
+        reason = "every pair was left out" if manifest["pairs_left_out"] else "no scene was chosen"
+        print(f"verso: {options.dir} holds no pair: {reason}", file=sys.stderr)
     if options.json:
         answer = {"ok": manifest["pairs"] > 0, "dir": options.dir, "pairs_now": result.pairs_now}
         print(json.dumps({**answer, **manifest}))

@@ -5,13 +5,15 @@ While it is being made, `_export/` in it holds what was asked, how far it came, 
 """
 
 import contextlib
+import csv
 import fcntl
+import io
 import json
 import os
 import shutil
 import sqlite3
 import urllib.parse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,6 @@ from schemas.errors import CorruptError, InUseError, OutputError
 WORK = "_export"
 MANIFEST = "export.json"
 _PLAN, _PROGRESS, _LOCK, _TEMPORARY, _PARTS = "plan.json", "progress.json", "lock", "tmp", "parts"
-_OF_THE_BEGINNING = ("dataset_digest",)
-"""What may change while an export is on its way: a run that went on is finished. The export is of what was there at first."""
 
 Tree = dict[str, Any]
 
@@ -48,23 +48,24 @@ class ExportFolder:
         try:
             names = sorted(os.listdir(self.root)) if self.root.exists() else []
             if names and WORK not in names:
-                told = f"{self.root} holds {', '.join(names[:3])}{' and more' if len(names) > 3 else ''}"
-                raise OutputError(f"{told}: an export goes into a new or an empty folder, choose another DIR")
+                message = f"{self.root} holds {', '.join(names[:3])}{' and more' if len(names) > 3 else ''}"
+                raise OutputError(f"{message}: an export goes into a new or an empty folder, choose another DIR")
             self.work.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            told = f"{self.root} cannot be written: {error.strerror or error}"
-            raise OutputError(f"{told}; choose another DIR") from error
+            message = f"{self.root} cannot be written: {error.strerror or error}"
+            raise OutputError(f"{message}; choose another DIR") from error
         with open(self.work / _LOCK, "ab") as file:  # a lock ends with the process, however it ends
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                told = f"another export writes into {self.root}: wait for it, or choose another DIR"
-                raise InUseError(told, str(self.root)) from error
+                message = f"another export writes into {self.root}: wait for it, or choose another DIR"
+                raise InUseError(message, str(self.root)) from error
             known = _read_tree(self.work / _PLAN)
             if known is None:
                 self._write_work(_PLAN, plan)
             else:
-                self.refuse_other(known, {**plan, **{key: known.get(key) for key in _OF_THE_BEGINNING}})
+                # A run that went on may have finished the dataset: the export is of what was there at first.
+                self.refuse_other(known, {**plan, "dataset_digest": known.get("dataset_digest")})
             self.plan = known or plan
             progress = _read_tree(self.work / _PROGRESS)
             self._cut_parts({} if progress is None else progress["parts"])
@@ -75,8 +76,8 @@ class ExportFolder:
     def refuse_other(self, known: Tree, plan: Tree) -> None:
         """Raises OutputError where the export in the folder is not the one that is asked for."""
         if differing := sorted(key for key in plan if known.get(key) != plan[key]):
-            told = "; ".join(f"{key}: {known.get(key)} there, {plan[key]} here" for key in differing)
-            raise OutputError(f"{self.root} holds another export, and these differ: {told}; choose another DIR")
+            message = "; ".join(f"{key}: {known.get(key)} there, {plan[key]} here" for key in differing)
+            raise OutputError(f"{self.root} holds another export, and these differ: {message}; choose another DIR")
 
     def finished(self) -> Tree | None:
         """What a finished export says of itself, None where there is none."""
@@ -106,6 +107,12 @@ class ExportFolder:
         self._waiting.setdefault(path, []).append(data)
         self._sizes[path] = self._sizes.get(path, 0) + len(data)
 
+    def append_row(self, path: str, row: Iterable[object]) -> None:
+        """Adds a line to a CSV file that grows."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(row)
+        self.append(path, text.getvalue().encode())
+
     def checkpoint(self, progress: Tree) -> None:
         """From here a killed export goes on: what was put and appended before counts, what comes after is made again."""
         for path, pieces in self._waiting.items():
@@ -134,8 +141,8 @@ class ExportFolder:
         for part, size in kept.items():
             with contextlib.suppress(FileNotFoundError):  # installed: it was about to finish
                 if part.stat().st_size < size:
-                    told = f"{part} is shorter than the export left it"
-                    raise CorruptError(f"{told}: remove {self.root}, and start again")
+                    message = f"{part} is shorter than the export left it"
+                    raise CorruptError(f"{message}: remove {self.root}, and start again")
                 os.truncate(part, size)
 
     def _part(self, path: str) -> Path:
@@ -194,49 +201,3 @@ class Register:
     def close(self) -> None:
         """Closes the file."""
         self._db.close()
-
-
-class Rounds:
-    """Opens shards by split; ends a round, which is one shard of each split at most, when the largest is full."""
-
-    def __init__(
-        self, folder: ExportFolder, open_shard: Callable[[Path], Any], pattern: str, most_bytes: int, state: dict | None
-    ) -> None:
-        self._folder, self._open, self._pattern, self._most = folder, open_shard, pattern, most_bytes
-        """The pattern has places for `split` and `number`."""
-        self._next: dict[str, int] = dict((state or {}).get("next", {}))
-        self._shards: dict[str, Any] = {}
-
-    def shard(self, split: str) -> Any:
-        """The open shard of a split."""
-        if split not in self._shards:
-            self._shards[split] = self._open(self._folder.temporary(f"{split}.shard"))
-        return self._shards[split]
-
-    def end_if_full(self) -> None:
-        """Ends the round where a shard has its size. To be called between scenes."""
-        if any(shard.bytes >= self._most for shard in self._shards.values()):
-            self.end()
-
-    def end(self) -> None:
-        """Gives every open shard its final name."""
-        for split in sorted(self._shards):
-            self._shards.pop(split).close()
-            number = self._next.get(split, 0)
-            path = self._pattern.format(split=split, number=number)
-            self._folder.install(self._folder.temporary(f"{split}.shard"), path)
-            self._next[split] = number + 1
-
-    def state(self) -> dict[str, Any] | None:
-        """The next number of each split; None within a round."""
-        return None if self._shards else {"next": self._next}
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Shards by split."""
-        return dict(sorted(self._next.items()))
-
-    def close(self) -> None:
-        """Closes what is open, unfinished."""
-        for shard in self._shards.values():
-            shard.close()

@@ -20,23 +20,17 @@ from schemas.dataset.layout import asset_path
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError, InputError
 from schemas.job.job import Job
-from schemas.job.views import ShapeTarget, ViewTarget
-from services.export.folder import ExportFolder, Register, Rounds
+from services.export.folder import ExportFolder, Register
+from services.export.shapes import Shapes
 from services.export.source import ExportPair, ExportScene
 from services.job.record import JobRecord
 from services.read.dataset_reader import StoredRange
+from services.read.query import LOCKED
+from services.read.scene_geometry import Sources
 from workers.store.manifest import table_of_rows
 from workers.store.store import Store
 
 _TABLES = ("scenes", "views", "objects", "assets")
-_LOCKED = {
-    "enable_external_access": "false",
-    "python_enable_replacements": "false",
-    "autoinstall_known_extensions": "false",
-    "autoload_known_extensions": "false",
-    "threads": "1",
-}
-"""The condition sees the tables of a range and no file, no network, no variable of this process."""
 
 
 class Choice(Frozen):
@@ -55,7 +49,6 @@ class Choice(Frozen):
     """Categories whose objects are all of `test`."""
 
 
-EVERYTHING: Final = Choice()
 _EXAMPLE: Final = "it is an SQL condition on the columns of scenes, such as 'support_margin_mm > 30'"
 
 
@@ -65,7 +58,7 @@ class Chooser:
     def __init__(self, choice: Choice) -> None:
         """Raises InputError where the condition is no SQL that these tables can answer."""
         self._choice = choice
-        self._db = duckdb.connect(":memory:", config=dict(_LOCKED))
+        self._db = duckdb.connect(":memory:", config={**LOCKED, "threads": "1"})
         if choice.where is not None:
             self._ask({table: SCHEMAS[table].empty_table() for table in _TABLES})
 
@@ -90,11 +83,11 @@ class Chooser:
         for name, table in tables.items():
             self._db.register(name, table)
         try:
-            found = self._db.execute(f"SELECT scene_id FROM scenes WHERE ({self._choice.where}\n)").fetchall()
+            rows = self._db.execute(f"SELECT scene_id FROM scenes WHERE ({self._choice.where}\n)").fetchall()
         except duckdb.Error as error:
             line = str(error).splitlines()[0]
             raise InputError(f"--where {self._choice.where!r} cannot be asked: {line}; {_EXAMPLE}") from error
-        return {scene_id for (scene_id,) in found}
+        return {scene_id for (scene_id,) in rows}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,53 +98,65 @@ class ExportRequest:
     target: Path
     format: str
     """A key of `services.export.table.FORMATS`."""
-    choice: Choice = EVERYTHING
+    choice: Choice
     shard_mb: int = 256
     """Size that ends a shard, of formats that have shards; 10^6 bytes."""
     points: int = 0
     """Points that formats with shards draw on each shape."""
 
 
-@dataclass(frozen=True)
-class Added:
-    """What became of a scene: how many of its pairs were written, and (pose id, reason) of those that were left out.
-
-    A reason is the same words for every pair of a kind.
-    """
-
-    pairs: int
-    left_out: tuple[tuple[int, str], ...] = ()
+LeftOut = list[tuple[int, str]]
+"""(pose id, reason) of the pairs of a scene that are left out. A reason is the same words for every pair of a kind."""
 
 
 class Writer:
     """Writes one format into an `ExportFolder`.
 
-    `kept` is what a new writer must know to go on from here, as JSON holds it; FRESH is that of the beginning.
+    `kept` is what a new writer must know to go on from here, as JSON holds it; FRESH is that of the beginning. HEADS: how the
+    lists begin that grow pair by pair. NEEDS: names by branch of the job's `targets`.
     """
 
     FRESH: ClassVar[dict[str, Any]]
+    HEADS: ClassVar[dict[str, str]] = {}
+    NEEDS: ClassVar[dict[str, Sequence[str]]] = {}
 
     @classmethod
-    def check(cls, job: Job) -> None:
-        """Raises InputError where a dataset of this job cannot have what the format is made of."""
+    def check(cls, name: str, job: Job) -> None:
+        """Raises InputError where the job does not ask for the targets that the format, called `name`, is made of."""
+        for branch, targets in cls.NEEDS.items():
+            if missing := [target for target in targets if target not in getattr(job.targets, branch)]:
+                wanted = f"a dataset whose job has targets.{branch}: [{', '.join(targets)}]"
+                raise InputError(f"{name} needs {wanted}; this one lacks {', '.join(missing)}: make it with them")
 
     def __init__(
         self, request: ExportRequest, record: JobRecord, folder: ExportFolder, kept: dict[str, Any] | None
     ) -> None:
-        self.store, self.record, self.folder = request.store, record, folder
-        self.kept = copy.deepcopy(self.FRESH) if kept is None else kept
-        self.begin(request, fresh=kept is None)
+        self.request, self.record, self.folder = request, record, folder
+        self.kept = copy.deepcopy({"register": 0, **self.FRESH}) if kept is None else kept
+        self.register = Register(folder, self.kept["register"])
+        self.sources = Sources(record)
+        self.shapes = Shapes(self.sources)
+        if kept is None:
+            for path, head in self.HEADS.items():
+                folder.append(path, head.encode())
 
-    def begin(self, request: ExportRequest, fresh: bool) -> None:
-        """Opens what the writer needs."""
+    def add(self, scene: ExportScene) -> LeftOut:
+        """Takes the pairs of the next scene, and then the scene, unless all its pairs are left out."""
+        left_out = [(pair.pose_id, reason) for pair in scene.pairs if (reason := self.take(scene, pair))]
+        if len(left_out) < len(scene.pairs):
+            self.end_scene(scene)
+        return left_out
 
-    def add(self, scene: ExportScene) -> Added:
-        """Takes the next scene."""
+    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+        """Writes a pair; why it is left out, or nothing."""
         raise NotImplementedError
+
+    def end_scene(self, scene: ExportScene) -> None:
+        """Writes what a scene has beside its pairs."""
 
     def state(self) -> dict[str, Any] | None:
         """`kept`; None while something that the writer took is not whole in the folder."""
-        return self.kept
+        return {**self.kept, "register": self.register.state()}
 
     def finish(self) -> None:
         """Writes what is still waiting. Afterwards `state` is not None."""
@@ -162,51 +167,33 @@ class Writer:
 
     def close(self) -> None:
         """Lets go of what is open; what is not in the last state may be lost."""
+        self.register.close()
 
-    def count(self, name: str, key: str, more: int) -> None:
+    def count(self, name: str, key: str, more: int = 1) -> None:
         """Adds to the count of `key` in `kept[name]`."""
         self.kept[name][key] = self.kept[name].get(key, 0) + more
 
+    def counts(self, name: str) -> dict[str, int]:
+        """The counts in `kept[name]`, sorted by key."""
+        return dict(sorted(self.kept[name].items()))
+
 
 class ObjectWriter(Writer):
-    """A format with a folder for each object, which gets the views of it scene by scene, numbered from 0."""
+    """A format with a folder for each object, which gets the views of it scene by scene, numbered from 0.
 
-    FRESH: ClassVar = {"register": 0, "views": {}}
+    `register` has an entry for each view, whose key is the object's folder.
+    """
 
-    def begin(self, request: ExportRequest, fresh: bool) -> None:
-        """Opens the list of views: an entry for each, whose key is the object's folder."""
-        self.register = Register(self.folder, self.kept["register"])
+    FRESH: ClassVar = {"views": {}}
 
-    def add(self, scene: ExportScene) -> Added:
-        """Takes every object of every pair; a pair of which nothing is taken is left out."""
-        left_out = []
-        for pair in scene.pairs:
-            reasons = [self.take(scene, pair, region_id) for region_id in scene.instances]
-            if all(reasons):
-                left_out.append((pair.pose_id, reasons[0]))
-        return Added(len(scene.pairs) - len(left_out), tuple(left_out))
+    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+        """Takes every object; a pair of which nothing is taken is left out."""
+        reasons = [self.take_object(scene, pair, region_id) for region_id in scene.instances]
+        return reasons[0] if all(reasons) else ""
 
-    def take(self, scene: ExportScene, pair: ExportPair, region_id: int) -> str:
+    def take_object(self, scene: ExportScene, pair: ExportPair, region_id: int) -> str:
         """Writes the views of an object in a pair; why there are none, or nothing."""
         raise NotImplementedError
-
-    def state(self) -> dict[str, Any]:
-        """The last view, and counts."""
-        return {**self.kept, "register": self.register.state()}
-
-    def close(self) -> None:
-        """Closes the list."""
-        self.register.close()
-
-
-def require_targets(
-    job: Job, format_name: str, views: Sequence[ViewTarget] = (), shape: Sequence[ShapeTarget] = ()
-) -> None:
-    """Raises InputError where the job does not ask for these targets."""
-    for key, wanted, asked in (("views", views, job.targets.views), ("shape", shape, job.targets.shape)):
-        if missing := [name for name in wanted if name not in asked]:
-            told = f"a dataset whose job has targets.{key}: [{', '.join(wanted)}]"
-            raise InputError(f"{format_name} needs {told}; this one lacks {', '.join(missing)}: make it with them")
 
 
 OF_SCENE: Final = ("scene_id", "category", "instance_id", "source", "table_id", "T_world_obj", "T_world_table")
@@ -214,35 +201,54 @@ OF_SCENE: Final = ("scene_id", "category", "instance_id", "source", "table_id", 
 
 
 class ShardedWriter(Writer):
-    """A format whose pairs share files, `rounds`, by split."""
+    """A format whose pairs share files, one for each split; all of them end when the largest is full."""
 
     PATTERN: ClassVar[str]
     """The name of a file, with places for `split` and `number`."""
-    rounds: Rounds
 
-    def begin(self, request: ExportRequest, fresh: bool) -> None:
-        """Goes on behind the last files that were ended."""
-        most_bytes, self._points = 1_000_000 * request.shard_mb, request.points
-        self.rounds = Rounds(self.folder, self.open_shard, self.PATTERN, most_bytes, self.kept["rounds"])
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._shards: dict[str, Any] = {}
 
     def open_shard(self, path: Path) -> Any:
         """A file with `add`, `bytes` and `close`."""
         raise NotImplementedError
 
+    def shard(self, split: str) -> Any:
+        """The open file of a split."""
+        if split not in self._shards:
+            self._shards[split] = self.open_shard(self.folder.temporary(f"{split}.shard"))
+        return self._shards[split]
+
+    def end_scene(self, scene: ExportScene) -> None:
+        """Writes the scene's shapes, and ends the files where one has its size."""
+        self._put_shapes(scene)
+        if any(shard.bytes >= 1_000_000 * self.request.shard_mb for shard in self._shards.values()):
+            self.end_round()
+
     def state(self) -> dict[str, Any] | None:
-        """None within a round."""
-        rounds = self.rounds.state()
-        return None if rounds is None else {**self.kept, "rounds": rounds}
+        """None while files are open."""
+        return None if self._shards else super().state()
+
+    def end_round(self) -> None:
+        """Gives every open file its final name."""
+        for split in sorted(self._shards):
+            self._shards.pop(split).close()
+            path = self.PATTERN.format(split=split, number=self.kept["files"].get(split, 0))
+            self.folder.install(self.folder.temporary(f"{split}.shard"), path)
+            self.count("files", split)
 
     def finish(self) -> None:
         """Ends the last files."""
-        self.rounds.end()
+        self.end_round()
 
     def close(self) -> None:
-        """Closes open files."""
-        self.rounds.close()
+        """Closes what is open, unfinished."""
+        for shard in self._shards.values():
+            shard.close()
+        super().close()
 
-    def put_shapes(self, scene: ExportScene) -> None:
+    def _put_shapes(self, scene: ExportScene) -> None:
         """Writes `shapes/<category>/<instance id>.glb` of all that stands in a scene, and points on it where asked for.
 
         Samples that the dataset has (`targets.shape`) are copied beside it, as `<instance id>.samples.npz`.
@@ -260,8 +266,9 @@ class ShardedWriter(Writer):
                 continue
             if samples is not None:
                 self.folder.put(f"{path}.samples.npz", scene.read(samples["path"]))
-            if self._points:
-                self.folder.put(f"{path}.npz", encode_npz(points_on(data, self._points, instance_id)))
+            if self.request.points:
+                mesh = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False).to_mesh()
+                self.folder.put(f"{path}.npz", encode_npz(sample_mesh(mesh, self.request.points, instance_id)))
             self.folder.put(f"{path}.glb", data)
 
     def conventions(self, depth: str) -> dict[str, Any]:
@@ -283,13 +290,8 @@ _TARGETS: Final = (
 )
 
 
-def points_on(glb: bytes, count: int, name: str) -> dict[str, NDArray]:
-    """points and normals [count, 3] float32, uniform over the surface, metres; `name` seeds the draw."""
-    return sample_mesh(trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False).to_mesh(), count, name)
-
-
 def sample_mesh(mesh: trimesh.Trimesh, count: int, name: str) -> dict[str, NDArray]:
-    """The same of a mesh."""
+    """points and normals [count, 3] float32, uniform over the surface, metres; `name` seeds the draw."""
     seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)[:2]
     return {"points": points.astype(np.float32), "normals": mesh.face_normals[faces].astype(np.float32)}

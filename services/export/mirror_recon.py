@@ -10,12 +10,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
 from schemas.errors import plural
 from schemas.scene.view import Role
-from services.export.formats import Added, ExportRequest, Writer
+from services.export.formats import Writer
 from services.export.source import ExportPair, ExportScene, in_units
 from services.merge.tables import escaped
 from workers.store.images import decode_png, encode_png
@@ -34,28 +35,20 @@ class MirrorRecon(Writer):
 
     FRESH: ClassVar = {"next": {}, "objects": {}}
     """The next even id by category; objects `with` all their patches and those `without`."""
+    HEADS: ClassVar = {_PAIRS: "category,id,scene_id,pose_id\n"}
 
-    def begin(self, request: ExportRequest, fresh: bool) -> None:
-        """Begins the list of pairs."""
-        if fresh:
-            self.folder.append(_PAIRS, b"category,id,scene_id,pose_id\n")
-
-    def add(self, scene: ExportScene) -> Added:
-        """Writes the scene's pairs that are whole."""
-        left_out = []
-        for pair in scene.pairs:
-            images, reason = _images_of(pair)
-            if reason:
-                left_out.append((pair.pose_id, reason))
-                continue
-            patches, reasons = _patches_of(pair, sorted(scene.instances))
-            if not patches:
-                left_out.append((pair.pose_id, reasons[0]))
-                continue
-            self._write(scene, pair, {**images, **patches})
-            self.count("objects", "without", len(reasons))
-            self.count("objects", "with", len(scene.instances) - len(reasons))
-        return Added(len(scene.pairs) - len(left_out), tuple(left_out))
+    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+        """Writes a pair that is whole."""
+        images, reason = _images_of(pair)
+        if reason:
+            return reason
+        patches, reasons = _patches_of(pair, sorted(scene.instances))
+        if not patches:
+            return reasons[0]
+        self._write(scene, pair, {**images, **patches})
+        self.count("objects", "without", len(reasons))
+        self.count("objects", "with", len(scene.instances) - len(reasons))
+        return ""
 
     def _write(self, scene: ExportScene, pair: ExportPair, images: dict[str, bytes]) -> None:
         even = self.kept["next"].get(scene.category, 0)
@@ -66,13 +59,13 @@ class MirrorRecon(Writer):
             lines = "".join(_object_line(row) for row in pair.labels(role))
             self.folder.put(f"{scene.category}/objects{even + more:05d}.dat", lines.encode())
             self.folder.append(f"{scene.category}/{_CAM_POSES}", _pose_line(even, more, pair.views[role]).encode())
-        self.folder.append(_PAIRS, f"{scene.category},{even},{scene.scene_id},{pair.pose_id}\n".encode())
+        self.folder.append_row(_PAIRS, (scene.category, even, scene.scene_id, pair.pose_id))
 
     def describe(self) -> dict[str, Any]:
         """Views by category, and the conventions."""
         lost = self.kept["objects"].get("without", 0)
         return {
-            "views": dict(sorted(self.kept["next"].items())),
+            "views": self.counts("next"),
             "objects": self.kept["objects"].get("with", 0),
             "not_exported": [f"patches of {plural(lost, 'object')}: in part outside an image"] if lost else [],
             "depth_units_per_m": UNITS_PER_M,
@@ -88,7 +81,7 @@ Images = dict[str, bytes]
 
 def _patches_of(pair: ExportPair, regions: list[int]) -> tuple[Images, list[str]]:
     """(the patches of every object that has all of them, the reason of each other one)."""
-    found: Images = {}
+    patches: Images = {}
     reasons = []
     for number, region in enumerate(regions):
         images, reason = _images_of(pair, (region, len(regions)), f"obj{number}")
@@ -96,8 +89,8 @@ def _patches_of(pair: ExportPair, regions: list[int]) -> tuple[Images, list[str]
             reasons.append(reason)
             continue
         distance = _distance_patch(pair, region, images[f"rgbIn{{even:05d}}yaw0obj{number}"])
-        found |= images | {f"distIn{{even:05d}}yaw0obj{number}": encode_png(distance)}
-    return found, reasons
+        patches |= images | {f"distIn{{even:05d}}yaw0obj{number}": encode_png(distance)}
+    return patches, reasons
 
 
 def _images_of(pair: ExportPair, patch: tuple[int, int] | None = None, place: str = "") -> tuple[Images, str]:
@@ -123,23 +116,8 @@ def _distance_patch(pair: ExportPair, region_id: int, patch: bytes) -> NDArray[n
     height, width = decode_png(patch).shape[:2]
     (label,) = (row for row in pair.labels("input") if row["region_id"] == region_id)
     top, left = label["v"] - height // 2, label["u"] - width // 2
-    distance = distance_to(region == region_id, slice(top, top + height), slice(left, left + width))
+    distance = distance_transform_edt(region != region_id)[top : top + height, left : left + width]
     return np.rint(distance).astype(np.uint16)
-
-
-def distance_to(mask: NDArray[np.bool_], rows: slice, columns: slice) -> NDArray[np.float64]:
-    """[h, w] distance in pixels from each pixel in `rows` and `columns` to the nearest one of `mask` [H, W], which has one.
-
-    First to the nearest above or below in each column, then over columns (Felzenszwalb and Huttenlocher 2012, section 2).
-    """
-    row = np.arange(len(mask))[:, None]
-    far = 2.0 * sum(mask.shape)
-    above = np.maximum.accumulate(np.where(mask, row, -far))
-    below = np.minimum.accumulate(np.where(mask, row, far)[::-1])[::-1]
-    used = np.flatnonzero(mask.any(axis=0))
-    along = np.minimum(row - above, below - row)[rows, used] ** 2
-    across = (np.arange(mask.shape[1])[columns, None] - used) ** 2
-    return np.sqrt(np.array([(line + across).min(axis=1) for line in along]))
 
 
 def _pose_line(even: int, more: int, view: Row) -> str:

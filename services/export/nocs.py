@@ -1,20 +1,10 @@
-"""Format `nocs`: the CAMERA layout of Normalized Object Coordinate Space (Wang 2019), ten images in a folder.
-
-    train/00000/0000_color.png      8-bit RGB
-    train/00000/0000_coord.png      8-bit normalised coordinates
-    train/00000/0000_depth.png      16 bits, millimetres
-    train/00000/0000_mask.png       the number of the object, from 1; 255 elsewhere
-    train/00000/0000_meta.txt       a line for each object: number, class, synset, instance id
-    obj_models/train/<synset>/<instance id>/model.obj, bbox.txt
-    images.csv                      scene, pose id, role and intrinsics of each image
+"""Format `nocs`: the CAMERA layout of Normalized Object Coordinate Space (Wang 2019; docs/export.md).
 
 A normalised coordinate is 0.5 in the middle of the object's box, whose diagonal is 1, with y up and x as in the dataset, so
 that its (x, y, z) is our (x, z, -y). Those loaders mirror z of coordinates and models, because theirs were drawn in a
 left-handed frame: so both are stored as (x, z, y).
 """
 
-import csv
-import io
 import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, Final
@@ -23,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.job.assets import BUILT_IN
-from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import DRAWN_ROLES, Role
-from services.export.formats import Added, ExportRequest, Writer, require_targets
-from services.export.shapes import Shapes
+from schemas.scene.view import Role
+from services.export.formats import Writer
 from services.export.source import MM_PER_M, ExportPair, ExportScene
 from services.merge.tables import escaped
 from workers.store.images import encode_png
@@ -46,34 +34,23 @@ _STORED_AXES = [0, 2, 1]
 class Nocs(Writer):
     """Writes every drawn view that has colour and coordinates."""
 
-    FRESH: ClassVar = {"images": {}, "classes": CLASSES, "models": {"with": 0, "without": 0}}
+    FRESH: ClassVar = {"images": {}, "classes": CLASSES}
+    HEADS: ClassVar = {_IMAGES: f"path,scene_id,pose_id,role,{','.join(_OF_VIEWS)}\n"}
 
-    @classmethod
-    def check(cls, job: Job) -> None:
-        """Raises InputError where the job has no target `coordinates`."""
-        require_targets(job, "nocs", views=("coordinates",))
+    NEEDS: ClassVar = {"views": ("coordinates",)}
 
-    def begin(self, request: ExportRequest, fresh: bool) -> None:
-        """Begins the list of images."""
-        self._shapes = Shapes(self.record)
-        if fresh:
-            self.folder.append(_IMAGES, f"path,scene_id,pose_id,role,{','.join(_OF_VIEWS)}\n".encode())
+    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+        """Writes the pair's images, where all have colour."""
+        if reason := pair.lacks_colour():
+            return reason
+        for role in pair.drawn:
+            self._write(scene, pair, role)
+        return ""
 
-    def add(self, scene: ExportScene) -> Added:
-        """Writes the scene's images, and models of what it shows."""
-        left_out = []
-        for pair in scene.pairs:
-            if missing := next(
-                (role for role in DRAWN_ROLES if role in pair.views and not pair.image(role, "rgb")), None
-            ):
-                left_out.append((pair.pose_id, f"no rgb of the {missing} view"))
-                continue
-            for role in (role for role in DRAWN_ROLES if role in pair.views):
-                self._write(scene, pair, role)
-        if len(left_out) < len(scene.pairs):
-            for category, instance_id in scene.instances.values():
-                self._write_model(scene, category, instance_id)
-        return Added(len(scene.pairs) - len(left_out), tuple(left_out))
+    def end_scene(self, scene: ExportScene) -> None:
+        """Writes models of what the scene shows."""
+        for category, instance_id in scene.instances.values():
+            self._write_model(scene, category, instance_id)
 
     def _write(self, scene: ExportScene, pair: ExportPair, role: Role) -> None:
         number, view = self.kept["images"].get(scene.split, 0), pair.views[role]
@@ -88,11 +65,9 @@ class Nocs(Writer):
         files = {"color.png": rgb, "coord.png": encode_png(coordinates_of(codes)), "depth.png": depth}
         for name, data in {**files, "mask.png": encode_png(mask_of(region)), "meta.txt": meta.encode()}.items():
             self.folder.put(f"{path}_{name}", data)
-        text = io.StringIO()
-        row = (path, scene.scene_id, view["pose_id"], role, *(view[name] for name in _OF_VIEWS))
-        csv.writer(text, lineterminator="\n").writerow(row)
-        self.folder.append(_IMAGES, text.getvalue().encode())
-        self.count("images", scene.split, 1)
+        columns = (view[name] for name in _OF_VIEWS)
+        self.folder.append_row(_IMAGES, (path, scene.scene_id, view["pose_id"], role, *columns))
+        self.count("images", scene.split)
 
     def _class(self, category: str) -> int:
         number: int = self.kept["classes"].setdefault(category, len(self.kept["classes"]) + 1)
@@ -105,18 +80,16 @@ class Nocs(Writer):
             return
         extents = np.array(scene.assets[instance_id]["extents_m"])
         size = extents[_STORED_AXES] / math.hypot(*extents)
-        colored = self._shapes.load(scene, instance_id)
-        if colored is not None:
-            lines = obj_lines(colored.shape.vertices / math.hypot(*extents), colored.shape.faces)
+        if (shape := self.shapes.load(scene, instance_id)) is not None:
+            lines = obj_lines(shape.vertices / math.hypot(*extents), shape.faces)
             self.folder.put(f"{path}/model.obj", "".join(lines).encode())
-        self.folder.put(
-            f"{path}/bbox.txt", "".join(" ".join(map(repr, (s * size).tolist())) + "\n" for s in (0.5, -0.5)).encode()
-        )
+        ends = (" ".join(map(repr, (sign * size).tolist())) for sign in (0.5, -0.5))
+        self.folder.put(f"{path}/bbox.txt", "".join(f"{end}\n" for end in ends).encode())
 
     def describe(self) -> dict[str, Any]:
         """Images by split, classes, and the conventions."""
         return {
-            "images": dict(sorted(self.kept["images"].items())),
+            "images": self.counts("images"),
             "classes": self.kept["classes"],
             "not_exported": ["the table and the floor as objects; projected views; textures of models"],
             "coordinates": "(x, y, z) of a loader that mirrors z is our (x, z, -y), 0.5 in the box's middle, its diagonal 1",

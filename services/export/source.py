@@ -17,10 +17,17 @@ from schemas.dataset.layout import PixelKind, patch_index
 from schemas.errors import CorruptError, InputError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import Role
+from schemas.scene.view import DRAWN_ROLES, Role
 from services.dataset.dataset import Splits, collect_ids, split_by_category
-from services.read.dataset_reader import ReadFile, StoredRange, decode_samples, file_reader, read_image, read_stored
-from services.read.stored_tables import patch_paths, view_paths
+from services.read.dataset_reader import (
+    ReadFile,
+    StoredRange,
+    decode_samples,
+    file_reader,
+    patch_paths,
+    read_image,
+    view_paths,
+)
 from workers.store.commit import read_committed, split_code
 from workers.store.images import decode_png, encode_png
 from workers.store.ledger import range_rows, read_range
@@ -28,8 +35,6 @@ from workers.store.store import Store
 
 SIDES: tuple[Role, ...] = ("input", "mirror")
 """Views from two sides; that of the depth camera beside the input camera shows what the input view does."""
-OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""A camera of OpenGL, as glTF and nerfstudio have it, looks along -z, and its y is up."""
 MM_PER_M = 1000.0
 
 _STRICTNESS = ("train", "val", "test")
@@ -50,48 +55,57 @@ class ExportPair:
         """Of the input pose."""
         return int(next(iter(self.views.values()))["parent_id"])
 
+    @property
+    def drawn(self) -> list[Role]:
+        """The roles of its views that are drawn, in order."""
+        return [role for role in DRAWN_ROLES if role in self.views]
+
+    def lacks_colour(self) -> str:
+        """Why it is left out of what needs the colour of every drawn view, or nothing."""
+        missing = [role for role in self.drawn if self.image(role, "rgb") is None]
+        return f"no rgb of the {missing[0]} view" if missing else ""
+
     def labels(self, role: Role) -> list[Row]:
         """Rows of `objects` of one view, by region: the table first."""
         return sorted((row for row in self.objects if row["role"] == role), key=itemgetter("region_id"))
-
-    def image(self, role: Role, kind: PixelKind) -> bytes | None:
-        """The PNG of an image, None where the job stores none. Raises CorruptError where it is committed and missing."""
-        row = self.views.get(role)
-        return None if row is None else self._read(view_paths(row).get(kind))
-
-    def stack(self, role: Role, kind: PixelKind) -> NDArray | None:
-        """[objects, H, W] of a kind of image that every object has one of, by region; None where there is none."""
-        images = self.images(role, kind)
-        return np.stack([decode_png(data) for data in images]) if images else None
-
-    def images(self, role: Role, kind: PixelKind) -> list[bytes]:
-        """The PNGs of a kind of image that every object has one of, by region; none where the job stores none."""
-        row = self.views.get(role)
-        paths = {} if row is None else view_paths(row)
-        names = [kind] if kind in paths else map(f"{kind}{{}}".format, itertools.count())
-        return [self.read(paths[name]) for name in itertools.takewhile(paths.__contains__, names)]
-
-    def depth(self, role: Role, units_per_m: float) -> bytes | None:
-        """The PNG of a view's depth in other units; what does not fit 16 bits becomes 0, as all depth out of range."""
-        data = self.image(role, "depth")
-        return None if data is None else in_units(data, self.views[role]["depth_units_per_m"], units_per_m)
 
     def label(self, role: Role, region_id: int) -> Row | None:
         """The row of `objects` of one region in one view, None where the view is not stored."""
         return next((row for row in self.labels(role) if row["region_id"] == region_id), None)
 
+    def image(self, role: Role, kind: PixelKind) -> bytes | None:
+        """The PNG of an image, None where the job stores none. Raises CorruptError where it is committed and missing."""
+        return self._read(view_paths(self.views[role]).get(kind)) if role in self.views else None
+
     def patch(self, role: Role, kind: PixelKind, region_id: int, objects: int) -> bytes | None:
         """The PNG of an object's patch, None where there is none: it would leave the image, or was not asked for."""
-        row = self.views.get(role)
-        return None if row is None else self._read(patch_paths(row, patch_index(region_id, objects)).get(kind))
+        if role not in self.views:
+            return None
+        return self._read(patch_paths(self.views[role], patch_index(region_id, objects)).get(kind))
+
+    def _read(self, path: str | None) -> bytes | None:
+        return None if path is None else self.read(path)
+
+    def images(self, role: Role, kind: PixelKind) -> list[bytes]:
+        """The PNGs of a kind of image that every object has one of, by region; none where the job stores none."""
+        paths = view_paths(self.views[role]) if role in self.views else {}
+        names = [kind] if kind in paths else map(f"{kind}{{}}".format, itertools.count())
+        return [self.read(paths[name]) for name in itertools.takewhile(paths.__contains__, names)]
+
+    def stack(self, role: Role, kind: PixelKind) -> NDArray | None:
+        """[objects, H, W] of the same images, None where there is none."""
+        images = self.images(role, kind)
+        return np.stack([decode_png(data) for data in images]) if images else None
 
     def pixels(self, role: Role, kind: PixelKind) -> NDArray | None:
         """An image decoded: [H, W, 3] uint8 RGB, [H, W] uint16 depth, [H, W] uint8 regions; None where there is none."""
         data = self.image(role, kind)
         return None if data is None else read_image(lambda _: data, f"{kind} of the {role} view of pose {self.pose_id}")
 
-    def _read(self, path: str | None) -> bytes | None:
-        return None if path is None else self.read(path)
+    def depth(self, role: Role, units_per_m: float) -> bytes | None:
+        """The PNG of a view's depth in other units; what does not fit 16 bits becomes 0, as all depth out of range."""
+        data = self.image(role, "depth")
+        return None if data is None else in_units(data, self.views[role]["depth_units_per_m"], units_per_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,23 +161,14 @@ def iter_records(store: Store, codes: NDArray[np.int64]) -> Iterator[list[Commit
         yield read_range(store, start, [retry for _, retry in group])
 
 
-def iter_ranges(store: Store, codes: NDArray[np.int64], first_scene: int) -> Iterator[StoredRange]:
-    """The committed ranges that `codes` name and that hold scenes from `first_scene` on, in order."""
-    for records in iter_records(store, codes):
-        if records[0].span.stop > first_scene:
-            yield read_stored(store, records)
-
-
 def splits_of(
     store: Store, codes: NDArray[np.int64], shares: SplitShares, held_out: Collection[str], by_category: bool
 ) -> Splits:
     """The splits of the instances in the ranges that `codes` name. Raises InputError for a category that none has."""
     if not by_category and not held_out:
         return Splits({})
-    columns = ["instance_id", "category"]
-    ids = collect_ids(
-        range_rows(store, records, "assets").select(columns).to_pylist() for records in iter_records(store, codes)
-    )
+    tables = (range_rows(store, records, "assets") for records in iter_records(store, codes))
+    ids = collect_ids(table.select(["instance_id", "category"]).to_pylist() for table in tables)
     if unknown := sorted(set(held_out) - ids.keys()):
         raise InputError(f"--held-out {unknown[0]}: the dataset has no such object; its are {', '.join(sorted(ids))}")
     return Splits(split_by_category(ids, shares) if by_category else {}, frozenset(held_out))
@@ -178,23 +183,18 @@ def scenes_of(store: Store, stored: StoredRange, chosen: Sequence[int], splits: 
     assets = {row["instance_id"]: {**row, "split": splits.of(row)} for row in stored.rows["assets"]}
     rows = {row["scene_id"]: row for row in stored.rows["scenes"]}
     for scene_id in chosen:
-        pairs = tuple(
-            ExportPair(number, views, tuple(objects), read)
-            for number, (views, objects) in enumerate(stored.pairs(scene_id))
-        )
-        yield ExportScene(rows[scene_id], pairs, assets, read_plain, stored)
+        pairs = enumerate(stored.pairs(scene_id))
+        pairs_read = tuple(ExportPair(number, views, tuple(objects), read) for number, (views, objects) in pairs)
+        yield ExportScene(rows[scene_id], pairs_read, assets, read_plain, stored)
 
 
 def _committed_reader(store: Store, stored: StoredRange) -> ReadFile:
     """Reads files of a range, published or, where a run is at work, not yet. Raises CorruptError for one that is missing."""
 
     def read(path: str) -> bytes:
-        with contextlib.suppress(FileNotFoundError):
-            return store.read(path)
-        *first, last = stored.records
-        for record in first:
+        for record in stored.records[:-1]:
             with contextlib.suppress(CorruptError):
                 return read_committed(store, record, path)
-        return read_committed(store, last, path)
+        return read_committed(store, stored.records[-1], path)
 
     return read

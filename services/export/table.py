@@ -1,6 +1,6 @@
 """The table of export formats: one row a format. It loads no writer, so that the command line starts at once.
 
-To add a format: write its file, a subclass of `services.export.formats.Writer`, and add its row here.
+To add a format: write a subclass of `services.export.formats.Writer`, and add its row here.
 """
 
 import importlib
@@ -26,11 +26,11 @@ class Format:
 FORMATS = {
     "mirror-recon": Format("mirror_recon", "MirrorRecon"),
     "bop": Format("bop", "Bop"),
-    "webdataset": Format("webdataset", "WebDataset", sharded=True),
-    "huggingface": Format("huggingface", "HuggingFace", sharded=True),
-    "gltf": Format("gltf", "Gltf"),
-    "occnet": Format("occnet", "OccNet"),
-    "pcn": Format("pcn", "Pcn"),
+    "webdataset": Format("shards", "WebDataset", sharded=True),
+    "huggingface": Format("shards", "HuggingFace", sharded=True),
+    "gltf": Format("graphics", "Gltf"),
+    "occnet": Format("objects", "OccNet"),
+    "pcn": Format("objects", "Pcn"),
     "nocs": Format("nocs", "Nocs"),
-    "nerf": Format("nerf", "Nerf"),
+    "nerf": Format("graphics", "Nerf"),
 }

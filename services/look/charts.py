@@ -64,7 +64,6 @@ def bars_of(histograms: Sequence[Histogram], most_bars: int) -> tuple[NDArray[np
 
 
 BARS = 40
-_LENGTHS = ((1e3, "m"), (1.0, "mm"), (1e-3, "µm"), (1e-6, "nm"))
 
 WIDTH, HEIGHT = 400, 120
 """Of the drawing, which is stretched to the space that it has."""
@@ -80,8 +79,6 @@ class Chart:
     """What the figure is, in a sentence."""
     tell: Callable[[float], str]
     """A value of the histogram in words, with its unit."""
-    note: str = ""
-    """What is told of values that the histograms do not have."""
 
 
 def chart_html(chart: Chart) -> str:
@@ -91,11 +88,9 @@ def chart_html(chart: Chart) -> str:
     """
     series = {name: histogram for name, histogram in chart.series.items() if histogram.count}
     lines = [(name, _summary(chart, histogram)) for name, histogram in series.items()]
-    words = "".join(_legend(at, *line) for at, line in enumerate(lines)) + (
-        _legend(0, "", chart.note) if chart.note else ""
-    )
-    if not words:
+    if not lines:
         return ""
+    words = "".join(_legend(at, *line) for at, line in enumerate(lines))
     head = f"<figcaption><h3>{escape(chart.title)}</h3><p>{escape(chart.about)}</p></figcaption>\n"
     varies = any(one.percentile(0.05) < one.percentile(0.95) for one in series.values())
     drawn = _drawing(chart, series, lines) if varies else ""
@@ -152,9 +147,3 @@ def _legend(at: int, name: str, line: str) -> str:
 def amount(value: float, unit: str) -> str:
     """Three digits and the unit; a degree sign stands at its number."""
     return f"{number(float(f'{value:.3g}'))}{'' if unit == '°' else ' '}{unit}"
-
-
-def length_of_decade(decade: float) -> str:
-    """The length of a power of ten of a millimetre: "1 nm", "31.6 µm"."""
-    mm = float(10.0**decade)
-    return next(amount(mm / one, unit) for one, unit in _LENGTHS if mm >= one * 0.9995 or unit == "nm")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from schemas.base import Array
@@ -150,14 +151,10 @@ def coarsen(body: Body) -> Body:
     """The mesh itself, or, where it has more than `MOST_FACES`, its corners moved to a grid and what collapsed left out."""
     if len(body.faces) <= MOST_FACES:
         return body
-    low = body.vertices.min(axis=0)
-    cell = float(np.ptp(body.vertices, axis=0).max()) / GRID_STEPS
-    keys, of = np.unique(np.round((body.vertices - low) / cell).astype(np.int64), axis=0, return_inverse=True)
-    faces = of.reshape(-1)[body.faces]
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return Body(body.kind, low + keys * cell, faces[np.sort(first)])
+    cell_m = float(np.ptp(body.vertices, axis=0).max()) / GRID_STEPS
+    mesh = trimesh.Trimesh(np.round(body.vertices / cell_m) * cell_m, body.faces)  # which merges equal corners
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    return Body(body.kind, np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 def pack_spaces(spaces: Sequence[Space]) -> str:

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from schemas.dataset.commit import CommitRecord
 from services.job.record import read_success
 from services.look.charts import Histogram
-from services.read.stored_tables import StoredTables
+from services.read.dataset_reader import StoredTables
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import range_rows, read_range
 from workers.store.manifest import join_rows
@@ -118,8 +118,6 @@ GROUNDS = ("table", "board")
 MOST_EXAMPLES = 5
 MOST_CAPTURES = 50
 DISTANCE_M = (0.0, 9.6)
-GAP_DECADES = (-6.0, 4.0)
-"""Range of the resting gap, from a nanometre to ten metres, as a power of ten of a millimetre."""
 
 
 @dataclass
@@ -143,10 +141,6 @@ class Figures:
     """By role, degrees below the horizontal."""
     distance: Histogram = field(default_factory=lambda: Histogram(*DISTANCE_M))
     """d_z of each pair, metres."""
-    gap: Histogram = field(default_factory=lambda: Histogram(*GAP_DECADES))
-    """Resting gaps of a nanometre and more, decimal logarithm of millimetres."""
-    no_gap: int = 0
-    """Scenes whose resting gap is less: none."""
     effects: dict[str, Cost] = field(default_factory=dict)
     """The costliest first."""
     stages: dict[str, Cost] = field(default_factory=dict)
@@ -175,12 +169,9 @@ def collect(tables: Tables) -> Figures:
 
 
 def _read_scenes(tables: Tables, figures: Figures) -> None:
-    columns = ("scene_id", "category", "effects", "skipped", "hover_gap_mm", "capture")
+    columns = ("scene_id", "category", "effects", "skipped", "capture")
     for rows in tables.batches("scenes", columns):
         figures.by_category.update(_counts(rows.column("category")))
-        gap_mm = _numbers(rows, "hover_gap_mm")
-        figures.no_gap += int((gap_mm < 10 ** GAP_DECADES[0]).sum())
-        figures.gap = figures.gap.add(np.log10(gap_mm[gap_mm >= 10 ** GAP_DECADES[0]]))
         for name, runs in _counts(_flat(rows, "effects")).items():
             figures.effects.setdefault(name, Cost()).runs += runs
         skipped = _flat(rows, "skipped")

@@ -21,8 +21,15 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import MODALITIES, PixelKind
 from services.look.charts import Histogram
 from services.look.collect import Tables, choose_spread
-from services.read.dataset_reader import ReadFile, StoredRange, file_reader, find_scene, read_image
-from services.read.stored_tables import patch_paths, view_paths
+from services.read.dataset_reader import (
+    ReadFile,
+    StoredRange,
+    file_reader,
+    find_scene,
+    patch_paths,
+    read_image,
+    view_paths,
+)
 from workers.store.store import Store
 
 MOST_WIDTH = 480

@@ -6,7 +6,7 @@ from html import escape
 
 from schemas.errors import describe_seconds, milliseconds, number, plural, size
 from schemas.job.job import Job
-from services.look.charts import Chart, Histogram, amount, chart_html, length_of_decade
+from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.clouds import Space
 from services.look.collect import Cost, Failure, Figures
 from services.look.pictures import SHOWN_ROLES
@@ -57,8 +57,10 @@ def overview_html(figures: Figures, job: Job, failed: int) -> str:
         for name, value, more in tiles
     )
     most = max(figures.by_category.values(), default=1)
+    frame = 'class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true"'
     rows = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td class="wide">{_bar(count / most)}</td><td>{count:,}</td></tr>'
+        f'<tr><th scope="row">{escape(name)}</th><td class="wide"><svg {frame}><rect class="bar" '
+        f'width="{100 * count / most:.1f}" height="8"/></svg></td><td>{count:,}</td></tr>'
         for name, count in figures.by_category.items()
     )
     table = f'<table class="bars"><caption>Scenes by category</caption><tbody>{rows}</tbody></table>' if rows else ""
@@ -87,15 +89,6 @@ def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
             lambda share: amount(100.0 * share, "%"),
         ),
         Chart("Inclination", figures.inclination, "Angle of the optical axis below the horizontal.", degrees),
-        Chart(
-            "Resting gap",
-            {"": figures.gap},
-            "Largest height at which an object of the scene hovers; logarithmic.",
-            length_of_decade,
-            f"0 in {figures.no_gap:,} of {plural(figures.no_gap + figures.gap.count, 'scene')}"
-            if figures.no_gap
-            else "",
-        ),
     )
     return f'<div class="charts">{"".join(map(chart_html, shown))}</div>'
 
@@ -176,13 +169,6 @@ def table_html(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str 
     )
     title = f"<caption>{escape(caption)}</caption>" if caption else ""
     return f"<table>{title}<thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _bar(share: float) -> str:
-    return (
-        '<svg class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
-        f'<rect class="bar" width="{100 * share:.1f}" height="8"/></svg>'
-    )
 
 
 def _why(cost: Cost) -> str:

@@ -74,7 +74,8 @@ class Merging:
         block, self._block = self._block, []
         if not block:
             return
-        rows = {table: join_rows(table, [tables[table] for tables in block]).combine_chunks() for table in TABLES}
+        parts = {table: [tables[table] for tables in block if table in tables] for table in TABLES}
+        rows = {table: join_rows(table, parts[table]).combine_chunks() for table in TABLES}
         self._shared.add_assets(rows["assets"])
         self._shared.add_images(rows["views"])
         self._poses.add(rows["views"], rows["objects"])

@@ -18,11 +18,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.dataset.commit import CommitRecord, FileEntry, Span
-from schemas.dataset.layout import is_shape
+from schemas.dataset.layout import is_shape, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CommitConflict, CorruptError, MachineError, RunError
 from workers.store.commit import committed_files, read_range_file
 from workers.store.ledger import iter_ranges, range_rows
+from workers.store.manifest import decode_rows
 from workers.store.store import Store, map_ahead
 
 SCRATCH = "merge"
@@ -40,7 +41,7 @@ class RangeRows:
     files: Sequence[FileEntry]
     """Of all records."""
     rows: Mapping[str, pa.Table]
-    """By table, sorted by key."""
+    """By table, sorted by key; of a range that was not retried, in the schema of its files, and without empty tables."""
 
 
 def read_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[RangeRows]:
@@ -60,17 +61,24 @@ def _read_range(store: Store, records: Sequence[CommitRecord]) -> RangeRows:
         return known[path]
 
     files = [entry for record in records for entry in committed_files(store, record, read_once)]
-    rows = {table: SCHEMAS[table].empty_table() for table in TABLES}
-    rows |= {t: range_rows(store, records, t, read_once) for t in TABLES if any(one.tables[t] for one in records)}
+    rows = {}
+    for table in TABLES:
+        path = range_table_path(records[0].span.start, table)
+        if len(records) > 1:
+            rows[table] = range_rows(store, records, table, read_once)
+        elif records[0].tables[table]:
+            rows[table] = decode_rows(read_once(store, records[0], path), path)
     _check_scenes(records[0].span, rows)
     return RangeRows(records, files, rows)
 
 
 def _check_scenes(span: Span, rows: Mapping[str, pa.Table]) -> None:
     """Raises CorruptError where a scene of the range was neither made nor failed, or both, or a row is of another scene."""
-    ids = {table: rows[table].column("scene_id").to_pylist() for table in TABLES if table != "assets"}
+    ids = {table: rows[table].column("scene_id").to_pylist() for table in rows if table != "assets"}
     scenes = list(range(span.start, span.stop))
-    if sorted(ids["scenes"] + ids["failures"]) != scenes or not set(scenes) >= set().union(*ids.values()):
+    if sorted(ids.get("scenes", []) + ids.get("failures", [])) != scenes or not set(scenes) >= set().union(
+        *ids.values()
+    ):
         raise CorruptError(f"the rows of the range from scene {span.start} do not hold each scene once")
 
 

@@ -25,7 +25,7 @@ from schemas.queue import (
 )
 from workers.door.opening import read_bytes
 from workers.store.local import open_store
-from workers.store.store import Events, Store, event_path, retry_if_swept
+from workers.store.store import Events, Store, retry_if_swept
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
 """waiting: for its output folder. lost: drivers died more often than they are started again."""
@@ -51,8 +51,6 @@ class JobView:
     began: bool = False
     """Whether the driver of the latest attempt has begun its work."""
     deaths: int = 0
-    busy: int = 0
-    """How often a driver found another run in the output folder, since one last began without."""
     note: str = ""
     """Why it is in this state, where that needs words."""
     code: int | None = None
@@ -87,26 +85,24 @@ def apply(view: JobView, event: JobEvent) -> JobView:
     """The job after one more event; the same job where the event does not apply."""
     if not applies(view, event):
         return view
-    cancelling = view.state == "cancelling"
-    after: dict[str, Any] = {"note": event.note}
-    match event.kind:
-        case "started":
-            after = {"state": "running", "attempt": event.attempt, "began": False, "note": ""}
-        case "began":
-            after = {"began": True}
-        case "cancel":
-            after["state"] = "cancelling" if view.held else "cancelled"
-        case "stopped":
-            after = {"state": "cancelled" if cancelling else "queued"}
-        case "busy":
-            after |= {"state": "cancelled" if cancelling else "waiting", "busy": view.busy + 1}
-        case "died":  # to be taken up again, unless it was cancelled or that happened too often
-            lost = view.deaths >= RESTARTS
-            after |= {"state": "cancelled" if cancelling else "lost" if lost else "queued", "deaths": view.deaths + 1}
-        case "ended":  # a cancelled job that was finished in time is done
-            after |= {"state": "done" if event.code == 0 else "cancelled" if cancelling else "failed", "busy": 0}
-            after |= {"code": event.code, "scenes": event.scenes, "digest": event.digest}
-    return replace(view, **after)
+    if event.kind == "began":
+        return replace(view, began=True)
+    if event.kind == "started":
+        return replace(view, state="running", attempt=event.attempt, began=False, note="")
+    states: dict[str, JobState] = {
+        "cancel": "cancelling" if view.held else "cancelled",
+        "stopped": "queued",
+        "busy": "waiting",
+        "died": "lost" if view.deaths >= RESTARTS else "queued",
+        "ended": "done" if event.code == 0 else "failed",
+    }
+    state = states[event.kind]
+    if view.state == "cancelling" and state != "done":  # one that was finished in time is done
+        state = "cancelled"
+    after: dict[str, Any] = {} if event.kind == "stopped" else {"note": event.note}
+    if event.kind == "ended":
+        after |= {"code": event.code, "scenes": event.scenes, "digest": event.digest}
+    return replace(view, state=state, deaths=view.deaths + (event.kind == "died"), **after)
 
 
 def applies(view: JobView, event: JobEvent) -> bool:
@@ -147,12 +143,10 @@ def _read_entry(store: Store, key: str) -> bytes:
 
 
 class _JobEvents(Events):
-    """The events of a job."""
+    """The events of a job, of which what is no file is refused."""
 
-    def _read(self, number: int) -> bytes:
-        if number not in self._known:
-            self._known[number] = _read_entry(self._store, event_path(self._folder, number))
-        return self._known[number]
+    def _read(self, key: str) -> bytes:
+        return _read_entry(self._store, key)
 
 
 class Queue:
@@ -276,20 +270,16 @@ def make_queue(url: str) -> Queue:
     cannot keep a queue.
     """
     store = open_store(url)
-    if store.size(MARK_FILE) is not None:
-        return open_queue(url)
     if store.root is not None and not store.root.parent.is_dir():
         raise InputError(
             f"--queue {url}: there is no folder {store.root.parent}: make it, or mount what should be there"
         )
     names = set(store.names(""))
-    if MARK_FILE in names:  # somebody else has made it since
+    if MARK_FILE in names:
         return open_queue(url)
     if foreign := sorted(names - OWN):
-        raise InputError(
-            f"--queue {url} is no queue: it holds {plain_line(', '.join(foreign[:3]))} and no {MARK_FILE}; choose a new or "
-            "an empty folder"
-        )
+        holds = f"it holds {plain_line(', '.join(foreign[:3]))} and no {MARK_FILE}"
+        raise InputError(f"--queue {url} is no queue: {holds}; choose a new or an empty folder")
     try:
         retry_if_swept(store.prepare)
     except (FileNotFoundError, OutputError) as error:

@@ -74,14 +74,14 @@ class Motion:
 
     def describe_excess(self) -> list[str]:
         """Values beyond their bounds, a phrase each."""
-        found = []
+        phrases = []
         if not self.moved_mm <= MOST_MM:
-            found.append(f"it moved {self.moved_mm:.4f} mm, the bound is {MOST_MM} mm")
+            phrases.append(f"it moved {self.moved_mm:.4f} mm, the bound is {MOST_MM} mm")
         if not self.turned_deg <= MOST_DEG:
-            found.append(f"it turned {self.turned_deg:.5f} degrees, the bound is {MOST_DEG}")
+            phrases.append(f"it turned {self.turned_deg:.5f} degrees, the bound is {MOST_DEG}")
         if self.pixels_outside:
-            found.append(f"{self.pixels_outside} mask pixels changed away from any silhouette")
-        return found
+            phrases.append(f"{self.pixels_outside} mask pixels changed away from any silhouette")
+        return phrases
 
 
 def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
@@ -89,9 +89,9 @@ def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
     facts = Facts(context.job, scene.plan, scene.raycast_checked)
     effects = plan_effects(facts, names_of_kind("approximation"))
     poses = release_again(scene.plan, scene.settled, context.job.physics, effects, RELEASE_S)
-    found = Motion()
+    largest = Motion()
     for start, rest, pose in zip(scene.plan.objects, scene.settled, poses, strict=True):
-        found = found.join(move_between(start.asset.shape, rest.T_world_obj, pose))
+        largest = largest.join(move_between(start.asset.shape, rest.T_world_obj, pose))
     at = {start.region_id: pose for start, pose in zip(scene.plan.objects, poses, strict=True)}
     things = (
         dataclasses.replace(thing, T_world_shape=at[thing.region_id]) if thing.region_id in at else thing
@@ -100,8 +100,8 @@ def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
     after = dataclasses.replace(scene.posed, things=tuple(things))
     for view in (view for pair in scene.pairs for view in pair.views if view.region is not None):
         changed, outside = compare_masks(context.renderer, scene.posed, after, view)
-        found = found.join(Motion(pixels_changed=changed, pixels_outside=outside))
-    return found
+        largest = largest.join(Motion(pixels_changed=changed, pixels_outside=outside))
+    return largest
 
 
 def move_between(shape: Shape, before: Pose, after: Pose) -> Motion:
@@ -211,14 +211,14 @@ def verify_independently(
     """Derive the labels of `count` scenes a second time. Raises OutputError where the folder is no dataset."""
     record = require_job(store)
     job = record.job.model_dump(mode="json")
-    found, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
+    verdict, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
     views: list[Row] = []
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
         stored = find_scene(store, scene_id)
         scene, images = stored.scene(scene_id), file_reader(store.read, stored)
         assert scene is not None
-        found.faults += check_forces(job, scene)
+        verdict.faults += check_forces(job, scene)
 
         def read(path: str, images: ReadFile = images) -> bytes:
             return store.read(path) if is_shape(path) else images(path)
@@ -226,28 +226,28 @@ def verify_independently(
         for pair_views, pair_objects in stored.pairs(scene_id):
             pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds)
             try:
-                found.faults += check_pair(pair)
+                verdict.faults += check_pair(pair)
             except CorruptError as error:
-                found.faults.append(str(error))
+                verdict.faults.append(str(error))
             if pair.absent:
-                found.underived.append(f"targets of scene {scene_id} are not derived: {pair.absent[0]} is not stored")
+                verdict.underived.append(f"targets of scene {scene_id} are not derived: {pair.absent[0]} is not stored")
             views += pair_views.values()
             objects += pair_objects
-            found.pairs += 1
-        found.scenes += 1
-        progress(found)
+            verdict.pairs += 1
+        verdict.scenes += 1
+        progress(verdict)
     if read_success(store) is not None:
-        found.faults += check_merged(store.read, views, objects)
-    return found
+        verdict.faults += check_merged(store.read, views, objects)
+    return verdict
 
 
-def describe_independent(found: IndependentVerdict) -> Iterator[str]:
+def describe_independent(verdict: IndependentVerdict) -> Iterator[str]:
     """Every fault, what was derived and what was not, line by line."""
-    yield from found.faults
-    labels = f"labels of {plural(found.pairs, 'pair')} of {plural(found.scenes, 'scene')}"
-    off = len(found.faults) or "nothing"
+    yield from verdict.faults
+    labels = f"labels of {plural(verdict.pairs, 'pair')} of {plural(verdict.scenes, 'scene')}"
+    off = len(verdict.faults) or "nothing"
     yield f"{labels} derived from the article's definitions, and their rest from contact forces: {off} off"
-    yield from (f"  {line}" for line in found.underived)
+    yield from (f"  {line}" for line in verdict.underived)
 
 
 RECEIPT = frozenset({"effects", "skipped"})
@@ -293,48 +293,48 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     tallies = {effect.name: Tally(effect.kind) for effect in EFFECTS if effect.kind != "asked"}
-    found = Audit(take_fingerprint(context.renderer, context.job.render.tier) == theirs, effects=tallies)
+    audited = Audit(take_fingerprint(context.renderer, context.job.render.tier) == theirs, effects=tallies)
     for scene_id in choose_scenes(store, count, record.job.seed):
-        _audit_scene(context, store, scene_id, found)
-        progress(found)
-    low, high = found.drops.interval
+        _audit_scene(context, store, scene_id, audited)
+        progress(audited)
+    low, high = audited.drops.interval
     if low > MOST_WAY or high < -MOST_WAY:
-        found.faults.append(f"what was left out changes how far objects go: {found.drops.describe().strip()}")
-    return found
+        audited.faults.append(f"what was left out changes how far objects go: {audited.drops.describe().strip()}")
+    return audited
 
 
-def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Audit) -> None:
+def _audit_scene(context: WorkerContext, store: Store, scene_id: int, audited: Audit) -> None:
     stored = find_scene(store, scene_id)
     row = stored.scene(scene_id)
     assert row is not None
-    left_out = sorted({one["effect"] for one in row["skipped"]} & found.effects.keys())
+    left_out = sorted({one["effect"] for one in row["skipped"]} & audited.effects.keys())
     for name in left_out:
-        found.effects[name].skipped += 1
-    found.scenes += 1
+        audited.effects[name].skipped += 1
+    audited.scenes += 1
     no_ops, approximations = (
-        [name for name in left_out if found.effects[name].kind == kind] for kind in ("no_op", "approximation")
+        [name for name in left_out if audited.effects[name].kind == kind] for kind in ("no_op", "approximation")
     )
     try:
         scene, output = make_forced(context, scene_id, no_ops)
     except SceneError as error:
-        found.faults.append(f"scene {scene_id} with {', '.join(no_ops) or 'nothing'} forced cannot be made: {error}")
+        audited.faults.append(f"scene {scene_id} with {', '.join(no_ops) or 'nothing'} forced cannot be made: {error}")
         return
-    found.forced += len(no_ops)
-    found.files += len(output.files)
-    found.bytes += sum(len(file.data) for file in output.files)
-    plain = None if found.same_stack else make_forced(context, scene_id)[1]
-    proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, found)
+    audited.forced += len(no_ops)
+    audited.files += len(output.files)
+    audited.bytes += sum(len(file.data) for file in output.files)
+    plain = None if audited.same_stack else make_forced(context, scene_id)[1]
+    proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, audited)
     if approximations:
         motion = measure_motion(context, scene)
-        drop_again(context, scene, found.drops)
-        found.released += 1
-        found.motion = found.motion.join(motion)
+        drop_again(context, scene, audited.drops)
+        audited.released += 1
+        audited.motion = audited.motion.join(motion)
         released = f"scene {scene_id}, {', '.join(approximations)}: released with every effect"
         excess = motion.describe_excess()
-        found.faults += [f"{released}, {one}" for one in excess]
+        audited.faults += [f"{released}, {one}" for one in excess]
         proven += [] if excess else approximations
     for name in proven:
-        found.effects[name].proven += 1
+        audited.effects[name].proven += 1
 
 
 def _prove_no_ops(
@@ -342,16 +342,16 @@ def _prove_no_ops(
     differences: Callable[[SceneOutput], list[str]],
     output: SceneOutput,
     no_ops: list[str],
-    found: Audit,
+    audited: Audit,
 ) -> list[str]:
     """The no-ops that change nothing; where the scene with all of them forced differs, each is forced by itself."""
     if not differences(output):
         return no_ops
     if again := differences(make_forced(context, output.scene_id)[1]):
-        found.faults.append(f"scene {output.scene_id}: made again with nothing forced, it differs: {again[0]}")
+        audited.faults.append(f"scene {output.scene_id}: made again with nothing forced, it differs: {again[0]}")
         return []
     changed = {name: differences(make_forced(context, output.scene_id, [name])[1]) for name in no_ops}
-    found.faults += [
+    audited.faults += [
         f"scene {output.scene_id}, {name}: forced, it changes {len(files)} files or tables: {files[0]}"
         for name, files in changed.items()
         if files
@@ -380,24 +380,24 @@ def _differences(store: Store, stored: StoredRange, plain: SceneOutput | None, o
     ]
 
 
-def describe_audit(found: Audit) -> Iterator[str]:
+def describe_audit(audited: Audit) -> Iterator[str]:
     """Every fault, the figures, and what was proven of each effect, line by line."""
-    yield from found.faults
+    yield from audited.faults
     against = (
-        "what is stored" if found.same_stack else "a plain scene made here, because another stack made what is stored"
+        "what is stored" if audited.same_stack else "a plain scene made here, because another stack made what is stored"
     )
     yield (
-        f"audit of {plural(found.scenes, 'scene')}: {plural(found.forced, 'no-op')} forced, {plural(found.files, 'file')} "
-        f"({found.bytes / 1e6:.1f} MB) compared to the byte with {against}"
+        f"audit of {plural(audited.scenes, 'scene')}: {plural(audited.forced, 'no-op')} forced, {plural(audited.files, 'file')} "
+        f"({audited.bytes / 1e6:.1f} MB) compared to the byte with {against}"
     )
-    motion = found.motion
+    motion = audited.motion
     yield (
-        f"  {found.released} released for 1 s with every effect: moved at most {motion.moved_mm:.4f} mm, turned at most "
+        f"  {audited.released} released for 1 s with every effect: moved at most {motion.moved_mm:.4f} mm, turned at most "
         f"{motion.turned_deg:.5f} degrees; {motion.pixels_changed} mask pixels changed, {motion.pixels_outside} of them "
         "away from any silhouette"
     )
-    yield found.drops.describe()
-    for name, tally in found.effects.items():
+    yield audited.drops.describe()
+    for name, tally in audited.effects.items():
         if tally.skipped:
             yield f"  {name} ({tally.kind}): left out in {plural(tally.skipped, 'scene')}, proven in {tally.proven}"
-    yield f"  {len(found.faults) or 'nothing'} off"
+    yield f"  {len(audited.faults) or 'nothing'} off"

@@ -1,21 +1,48 @@
-"""Stored rows and images of a dataset, range by range or scene by scene, finished or not."""
+"""Stored rows and images of a dataset, finished or being made, in a folder or a bucket.
+
+Range by range or scene by scene, and as tables: pyarrow datasets.
+"""
 
 import io
+import itertools
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from types import MappingProxyType
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.fs as fs
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import is_shape
-from schemas.dataset.tables import DETERMINISTIC_TABLES
-from schemas.errors import CorruptError, InputError
-from workers.store.commit import code_of, list_codes, split_code
+from schemas.dataset.layout import (
+    COMMITS,
+    IMAGES,
+    MANIFEST,
+    STAGING,
+    SUCCESS_FILE,
+    Content,
+    PixelKind,
+    image_path,
+    is_shape,
+    patch_path,
+    range_name,
+    range_table_path,
+)
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, TABLES
+from schemas.errors import CorruptError, InputError, OutputError
+from schemas.scene.view import MODALITIES
+from services.job.record import read_success
+from workers.store.commit import code_of, commit_names, list_codes, read_record, split_code
 from workers.store.images import decode_png
 from workers.store.ledger import list_commits, range_rows, read_range
+from workers.store.manifest import join_rows
 from workers.store.store import Store
 from workers.store.tars import read_tar
 
@@ -150,7 +177,7 @@ def decode_samples(data: bytes, name: str) -> dict[str, NDArray]:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             if (unpacked := sum(member.file_size for member in file.infolist())) > len(data):
                 raise ValueError(f"its {len(data):,} bytes would unpack to {unpacked:,}")
-            arrays = {one.filename.removesuffix(".npy"): _decode_array(file.read(one)) for one in file.infolist()}
+            arrays = {item.filename.removesuffix(".npy"): _decode_array(file.read(item)) for item in file.infolist()}
         _check_samples(arrays)
     except Exception as error:  # zipfile and numpy raise errors of many kinds for a damaged file
         raise CorruptError(f"{name} cannot be read: {error}; `verso verify OUT` says what to do") from error
@@ -178,3 +205,140 @@ def _check_samples(arrays: Mapping[str, NDArray]) -> None:
             raise ValueError(f"{key} is {array.dtype.str} {array.shape}, not {dtype} {shape}")
         if not np.isfinite(array).all():
             raise ValueError(f"{key} has a number that is not finite")
+
+
+def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:
+    """The paths of a view's images that are stored, by kind; `amodal0`, `amodal1` of one that each of several objects has."""
+    listed, named = {file["path"] for file in row["files"]}, dict[PixelKind, str]()
+    for kind, content in _contents(row):
+        named[kind] = image_path(row["category"], content, row["pose_id"])
+        if MODALITIES[kind].each:
+            each = (image_path(row["category"], content, row["pose_id"], n) for n in itertools.count())
+            named |= {f"{kind}{n}": path for n, path in enumerate(itertools.takewhile(listed.__contains__, each))}
+    return _those(named, listed)
+
+
+def patch_paths(row: Mapping[str, Any], index: int | None) -> Mapping[PixelKind, str]:
+    """The paths of the patches of a view's object that are stored, by kind."""
+    named = {kind: patch_path(row["category"], content, row["pose_id"], index) for kind, content in _contents(row)}
+    return _those(named, {file["path"] for file in row["files"]})
+
+
+def _contents(row: Mapping[str, Any]) -> Iterator[tuple[PixelKind, Content]]:
+    """Kinds of images that a view may have, with the word in their names."""
+    return ((image.pixels, image.content) for image in IMAGES if image.role == row["role"])
+
+
+def _those(named: Mapping[PixelKind, str], listed: Collection[str]) -> Mapping[PixelKind, str]:
+    return MappingProxyType({kind: path for kind, path in named.items() if path in listed})
+
+
+def file_system_of(store: Store) -> fs.FileSystem:
+    """Reads files by their keys: straight from a disk, from a bucket each as a whole when it is scanned."""
+    if store.root is not None:
+        return fs.SubTreeFileSystem(str(store.root), fs.LocalFileSystem())
+    return fs.PyFileSystem(_StoreFiles(store))
+
+
+class _StoreFiles(fs.FileSystemHandler):
+    """Reads whole objects; nothing can be written, and nothing is listed."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def get_type_name(self) -> str:
+        return "verso"
+
+    def normalize_path(self, path: str) -> str:
+        return path
+
+    def get_file_info(self, paths: list[str]) -> list[fs.FileInfo]:
+        # Files are not asked for: the commits or `_SUCCESS` name them.
+        return [fs.FileInfo(path, fs.FileType.File) for path in paths]
+
+    def open_input_file(self, path: str) -> pa.NativeFile:
+        try:
+            return pa.BufferReader(self._store.read(path))
+        except FileNotFoundError as error:
+            raise CorruptError(f"{path} is committed and missing: restore it from a copy") from error
+
+    open_input_stream = open_input_file
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise NotImplementedError("a dataset is only read here")
+
+    get_file_info_selector = create_dir = delete_dir = delete_dir_contents = delete_root_dir_contents = _refuse
+    delete_file = move = copy_file = open_output_stream = open_append_stream = _refuse
+
+
+Rows: TypeAlias = ds.Dataset | pa.Table
+
+_FORMAT = ds.ParquetFileFormat(
+    default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+)
+
+
+class StoredTables:
+    """The six tables as they are now; a table is looked up when it is asked for, and its rows are read when scanned.
+
+    A finished dataset is read from its merged tables, an unfinished one through its commits, where a retry's rows replace
+    the first try's. Raises OutputError where there is no dataset, CorruptError where `_SUCCESS` or a commit is damaged.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._done = read_success(store)
+        self._plain: list[int] = []
+        """Of an unfinished dataset, the ranges whose tables are in place, as they were made first."""
+        self._other: list[list[CommitRecord]] = []
+        """The ranges that are not published or have retries: their rows go through memory."""
+        if self._done is None:
+            self._find_ranges()
+
+    def _find_ranges(self) -> None:
+        names = commit_names(self._store)
+        if not names:
+            raise OutputError(
+                f"{self._store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet"
+            )
+        # Listed after the commits: a committed range without staging is published.
+        staged = set(self._store.children(STAGING))
+        for start, group in groupby(names, key=lambda name: name[0]):
+            retries = [retry for _, retry, _ in group]
+            if retries == [0] and range_name(start) not in staged:
+                self._plain.append(start)
+            else:
+                records = (read_record(self._store, start, retry) for retry in retries)
+                self._other.append([record for record in records if record is not None])
+
+    @cached_property
+    def _merged_files(self) -> list[str]:
+        """The merged files that `_SUCCESS` names. Raises CorruptError where it does not name a file of each table."""
+        files = (self._done or {}).get("files")
+        if isinstance(files, dict) and all(
+            any(key.startswith(f"{MANIFEST}/{table}/") for key in files) for table in TABLES
+        ):
+            return list(files)
+        fault = f"{SUCCESS_FILE} in {self._store.name} does not name its merged files"
+        raise CorruptError(f"{fault}: remove it, and run the job again")
+
+    def parts(self, table: str) -> list[Rows]:
+        """The rows of one table in one or two pieces. In `assets` of an unfinished dataset an instance may be repeated."""
+        schema, files = SCHEMAS[table], file_system_of(self._store)
+        if self._done is not None:
+            folder = f"{MANIFEST}/{table}"
+            keys = [key for key in self._merged_files if key.startswith(f"{folder}/")]
+            hive: Any = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
+            options = {"filesystem": files, "partition_base_dir": folder, "partitioning": hive}
+            return [ds.dataset(keys, schema, _FORMAT, **options)]
+        rows = [range_rows(self._store, records, table) for records in self._other]
+        parts: list[Rows] = [join_rows(table, [schema.empty_table(), *rows])]
+        if self._plain:
+            paths = [range_table_path(start, table) for start in self._plain]
+            parts.append(ds.dataset(paths, schema, _FORMAT, filesystem=files))
+        return parts
+
+    def dataset(self, table: str) -> ds.Dataset:
+        """The rows of one table as one pyarrow dataset, as `parts`."""
+        parts = [part if isinstance(part, ds.Dataset) else ds.dataset(part) for part in self.parts(table)]
+        return parts[0] if len(parts) == 1 else ds.dataset(parts)

@@ -14,11 +14,11 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, VersoError
-from services.read.stored_tables import StoredTables
+from services.read.dataset_reader import StoredTables
 from services.read.verdict import explain_damage
 from workers.store.store import Store
 
-_LOCKED = {
+LOCKED = {
     "enable_external_access": "false",
     "python_enable_replacements": "false",
     "autoinstall_known_extensions": "false",
@@ -43,7 +43,7 @@ def ask(store: Store, sql: str) -> Iterator[pa.RecordBatchReader]:
     the first try's. Raises, also while the reader is read, InputError with the database's message where the SQL is wrong,
     OutputError where there is no dataset, CorruptError where a file is damaged.
     """
-    with duckdb.connect(":memory:", config=dict(_LOCKED)) as connection:
+    with duckdb.connect(":memory:", config=dict(LOCKED)) as connection:
         with _explained(store):
             _register(connection, store)
             connection.execute("SET enable_progress_bar = false")  # it goes to standard output, into the answer
@@ -135,7 +135,7 @@ def write_rows(rows: pa.RecordBatchReader, style: Format, sink: IO[bytes], wide:
         sink.write(_box(rows, wide).encode())
         return
     if style == "parquet":
-        with pq.ParquetWriter(_Counted(sink), rows.schema, compression="zstd") as writer:
+        with pq.ParquetWriter(pa.PythonFile(sink, mode="w"), rows.schema, compression="zstd") as writer:
             for group in _row_groups(rows):
                 writer.write_table(group)
         return
@@ -153,28 +153,6 @@ def _row_groups(rows: pa.RecordBatchReader) -> Iterator[pa.Table]:
             kept = []
     if kept:
         yield pa.Table.from_batches(kept)
-
-
-class _Counted(io.RawIOBase):
-    """A pipe that Parquet can be written to: it knows how many bytes went through."""
-
-    def __init__(self, sink: IO[bytes]) -> None:
-        self._sink = sink
-        self._written = 0
-
-    def writable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._written
-
-    def write(self, data: object) -> int:
-        count = self._sink.write(memoryview(data).cast("B"))  # type: ignore[arg-type]
-        self._written += count
-        return count
-
-    def close(self) -> None:
-        """Leaves the pipe open."""
 
 
 def _records(rows: pa.RecordBatchReader) -> Iterator[Record]:

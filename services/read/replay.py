@@ -134,10 +134,10 @@ def compare_rows(stored: StoredRange, output: SceneOutput, ignored: frozenset[st
                 table_of_rows(table, made).to_pylist(),
             )
         )
-        told = [f"{len(before)} stored, {len(now)} made now"] if before.keys() != now.keys() else []
+        phrases = [f"{len(before)} stored, {len(now)} made now"] if before.keys() != now.keys() else []
         names = [name for name in SCHEMAS[table].names if name not in ignored]
         both = [(before[one], now[one]) for one in before.keys() & now.keys()]
-        told += [name for name in sorted(names) if any(repr(a.get(name)) != repr(b.get(name)) for a, b in both)]
-        if told:
-            differences.append(f"rows of {table}: {', '.join(told)}")
+        phrases += [name for name in sorted(names) if any(repr(a.get(name)) != repr(b.get(name)) for a, b in both)]
+        if phrases:
+            differences.append(f"rows of {table}: {', '.join(phrases)}")
     return differences

@@ -46,14 +46,14 @@ class Sources:
         path = asset_path(category, instance_id)
         if self._record.job.captures is not None:
             raise CorruptError(f"{path} is missing: `verso verify OUT` says what to do")
-        told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off), and"
-        with needs_making(told):
+        missing = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off), and"
+        with needs_making(missing):
             from workers.assets.catalogue import load_asset
             from workers.scene.chance import SceneChance
             from workers.scene.plan import choose_assets
         catalogue = self._opened
         if isinstance(catalogue, InputError):
-            raise InputError(f"{told} its source cannot be read here: {catalogue}") from catalogue
+            raise InputError(f"{missing} its source cannot be read here: {catalogue}") from catalogue
         if isinstance(catalogue, Exception):
             raise catalogue
         objects, table = choose_assets(self._record.job, catalogue, SceneChance(self._record.job.seed, scene_id))

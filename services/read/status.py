@@ -60,8 +60,8 @@ def read_status(store: Store, first_scene: int, stop_scene: int) -> Status:
     if not ledger.rows.num_rows and not ledger.lost and not store.children(STAGING):
         raise OutputError(f"{store.name} holds no dataset: there is nothing in {COMMITS}")
     failures = ledger.failures
-    told = pc.binary_join_element_wise(failures.column("kind"), failures.column("reason"), ": ")
-    failed = Counter(told.to_pylist())
+    reasons = pc.binary_join_element_wise(failures.column("kind"), failures.column("reason"), ": ")
+    failed = Counter(reasons.to_pylist())
     asked = stop_scene - first_scene
     running = tuple(
         Running(start, attempt, blamed_scene(store, start, attempt))

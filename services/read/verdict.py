@@ -84,6 +84,15 @@ def describe_os_error(error: OSError) -> str:
     return f"cannot be read ({error.strerror or error})"
 
 
+def read_or_tell(store: Store, key: str, verdict: Verdict, remedy: str, part: Part) -> bytes | None:
+    """The bytes of a file; None where it cannot be read, which is told."""
+    try:
+        return store.read(key)
+    except OSError as error:
+        verdict.tell(f"{key}: {describe_os_error(error)}", remedy, part)
+        return None
+
+
 @contextlib.contextmanager
 def explain_damage(store: Store) -> Iterator[None]:
     """Raises CorruptError with one line where the block meets a file that cannot be read as what it should be."""
@@ -93,12 +102,12 @@ def explain_damage(store: Store) -> Iterator[None]:
         raise
     except OSError as error:
         where = str(error.filename or store.name)
-        told = f"{where}: {describe_os_error(error)}"
+        fault = f"{where}: {describe_os_error(error)}"
     except (ValueError, pa.ArrowException) as error:
-        told = f"{store.name} holds a damaged file: {(str(error).splitlines() or [type(error).__name__])[0]}"
+        fault = f"{store.name} holds a damaged file: {(str(error).splitlines() or [type(error).__name__])[0]}"
     else:
         return
-    raise CorruptError(f"{printable(told)}; `verso verify {store.name}` lists every damaged file")
+    raise CorruptError(f"{printable(fault)}; `verso verify {store.name}` lists every damaged file")
 
 
 _TABLE = "CREATE TABLE paths (path BLOB PRIMARY KEY, sha256 TEXT) WITHOUT ROWID"
@@ -124,8 +133,8 @@ class PathIndex:
         self._db.executemany("INSERT INTO paths VALUES (?, '') ON CONFLICT DO NOTHING", rows)
 
     def __contains__(self, path: str) -> bool:
-        found = self._db.execute("SELECT 1 FROM paths WHERE path = ?", (os.fsencode(path),))
-        return found.fetchone() is not None
+        row = self._db.execute("SELECT 1 FROM paths WHERE path = ?", (os.fsencode(path),))
+        return row.fetchone() is not None
 
     def close(self) -> None:
         """Closes the file."""

@@ -7,12 +7,11 @@ by one: memory does not grow with the dataset.
 import contextlib
 import errno
 import sqlite3
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-from pydantic import ValidationError
 
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import (
@@ -32,7 +31,7 @@ from schemas.job.job import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
 from services.merge.reading import RangeRows
-from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error
+from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error, read_or_tell
 from services.read.verify_files import (
     Known,
     Success,
@@ -42,14 +41,18 @@ from services.read.verify_files import (
     read_stored_success,
     tell_strays,
 )
-from services.read.verify_range import RangeCheck, Spans, commit_groups, read_records
+from services.read.verify_range import (
+    Reading,
+    ReadRange,
+    Spans,
+    commit_groups,
+    find_label_check,
+    read_records,
+)
 from workers.store.commit import commits_digest
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
 from workers.store.store import Store
-
-MOST_TOLD = 100
-"""Different jobs or stacks that are remembered with a commit of theirs."""
 
 
 @dataclass(frozen=True)
@@ -67,22 +70,19 @@ class StoredJob:
 
 def read_stored_job(store: Store, verdict: Verdict) -> StoredJob:
     """job.yaml, and what is wrong with it by itself."""
+    if (data := read_or_tell(store, JOB_FILE, verdict, COPY, "job")) is None:
+        return StoredJob()
     try:
-        data = store.read(JOB_FILE)
-        record = decode_job(data, JOB_FILE)
-    except OSError as error:
-        verdict.tell(f"{JOB_FILE}: {describe_os_error(error)}", COPY, "job")
-        return StoredJob()
+        job = StoredJob(decode_job(data, JOB_FILE), is_job_sealed(data))
     except CorruptError as error:
-        told = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
-        verdict.tell(f"{JOB_FILE}: {told}", COPY, "job")
+        fault = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
+        verdict.tell(f"{JOB_FILE}: {fault}", COPY, "job")
         return StoredJob()
-    found = StoredJob(record, is_job_sealed(data))
-    if not found.whole:
+    if not job.whole:
         verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", COPY, "job")
-    elif record.digest != found.digest:
+    elif job.record is not None and job.record.digest != job.digest:
         verdict.tell(f"{JOB_FILE}: its digest is not that of its keys", COPY, "job")
-    return found
+    return job
 
 
 @dataclass
@@ -97,13 +97,9 @@ class Terms:
     def take(self, record: CommitRecord) -> None:
         """Remembers what a commit says."""
         key, terms = commit_path(record.span.start, record.span.retry), record.terms
-        stack = (terms.fingerprint, terms.fingerprint_mode)
-        known: tuple[tuple[dict[Any, str], object], ...] = (
-            *((self.jobs, terms.job_digest), (self.range_sizes, terms.range_size), (self.stacks, stack)),
-        )
-        for commits, term in known:
-            if len(commits) < MOST_TOLD:
-                commits.setdefault(term, key)
+        self.jobs.setdefault(terms.job_digest, key)
+        self.range_sizes.setdefault(terms.range_size, key)
+        self.stacks.setdefault((terms.fingerprint, terms.fingerprint_mode), key)
 
 
 def check_terms(job: StoredJob, terms: Terms, verdict: Verdict) -> None:
@@ -112,41 +108,37 @@ def check_terms(job: StoredJob, terms: Terms, verdict: Verdict) -> None:
         return
     if job.digest not in terms.jobs:
         digest, key = next(iter(terms.jobs.items()))
-        told = f"{JOB_FILE}: its keys or asset files (digest {str(job.digest)[:12]}) are not those of {key} ({digest[:12]})"
-        verdict.tell(told, f"{COPY}, or change them back", "job")
+        what = f"its keys or asset files (digest {str(job.digest)[:12]}) are not those of {key} ({digest[:12]})"
+        verdict.tell(f"{JOB_FILE}: {what}", f"{COPY}, or change them back", "job")
     else:
         for digest, key in terms.jobs.items():
             if digest != job.digest:
                 verdict.tell(f"{key}: is a commit of another job ({digest[:12]}) than {JOB_FILE}", COPY)
     size = job.record.job.range_size
-    if size not in terms.range_sizes and terms.range_sizes:
-        told = f"{JOB_FILE}: run.range_size is {size}, that of the commits {next(iter(terms.range_sizes))}"
-        verdict.tell(told, f"{COPY}, or change it back", "job")
+    if size not in terms.range_sizes:
+        what = f"run.range_size is {size}, that of the commits {next(iter(terms.range_sizes))}"
+        verdict.tell(f"{JOB_FILE}: {what}", f"{COPY}, or change it back", "job")
 
 
 def check_fingerprint(store: Store, terms: Terms, verdict: Verdict) -> None:
     """Compares the stored fingerprint with those of the commits, to the byte."""
+    if (data := read_or_tell(store, FINGERPRINT_FILE, verdict, COPY, "job")) is None:
+        return
     try:
-        data = store.read(FINGERPRINT_FILE)
         stored = Fingerprint.model_validate_json(data)
-    except OSError as error:
-        verdict.tell(f"{FINGERPRINT_FILE}: {describe_os_error(error)}", COPY, "job")
-        return
-    except (ValidationError, ValueError):
-        verdict.tell(f"{FINGERPRINT_FILE}: is damaged: it is no fingerprint", COPY, "job")
-        return
-    if not terms.stacks:
-        return
-    if data != encode_fingerprint(stored):
+    except ValueError:
+        stored = None
+    if stored is None or data != encode_fingerprint(stored):
         verdict.tell(f"{FINGERPRINT_FILE}: was altered after a worker wrote it", COPY, "job")
-    elif stored.digest not in {stack for stack, _ in terms.stacks} and not _is_in_card(store, stored):
-        told = f"{FINGERPRINT_FILE}: is the fingerprint {stored.digest[:12]}, which no commit has"
-        verdict.tell(told, COPY, "job")
+    elif stored.digest not in {stack for stack, _ in terms.stacks}:
+        if terms.stacks and not _is_in_card(store, stored):
+            what = f"{FINGERPRINT_FILE}: is the fingerprint {stored.digest[:12]}, which no commit has"
+            verdict.tell(what, COPY, "job")
     else:
         for (stack, mode), key in terms.stacks.items():
             if mode == "strict" and stack != stored.digest:
-                told = f"{key}: has the fingerprint {stack[:12]}, the dataset's is {stored.digest[:12]}"
-                verdict.tell(told, "two stacks made one dataset although run.fingerprint was strict; make it anew")
+                what = f"{key}: has the fingerprint {stack[:12]}, the dataset's is {stored.digest[:12]}"
+                verdict.tell(what, "two stacks made one dataset although run.fingerprint was strict; make it anew")
 
 
 def encode_fingerprint(fingerprint: Fingerprint) -> bytes:
@@ -166,34 +158,23 @@ TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE,
 """Files with one place each; whether they are whole is checked by name."""
 
 
-@dataclass
-class Ranges:
-    """What reading the ranges found."""
-
-    spans: Spans
-    terms: Terms
-    mergeable: bool = True
-    """Whether the rows of every range went into the merge."""
-    staged: int = 0
-    """Files that are committed and not published."""
-
-
 def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     """Reads everything back. Raises OutputError where a newer version wrote it, MachineError where TMPDIR is full."""
     verdict = Verdict(store.name)
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
+        reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
+        spans, terms = _spans(job, success, verdict), Terms()
         (folder / "merged").mkdir()
         with contextlib.closing(Merging(folder / "merged")) as merging:
-            check = RangeCheck(store, job.record, job.digest, index, verdict)
-            found = _read_ranges(store, _spans(job, success, verdict), check, merging, progress)
-            check_terms(job, found.terms, verdict)
-            check_fingerprint(store, found.terms, verdict)
-            remade = _merge_again(merging, found, verdict)
-        _check_finished(store, success, found, remade, index, verdict)
+            _read_ranges(reading, spans, terms, merging, progress)
+            remade = _merge_again(merging, spans, verdict)
+        check_terms(job, terms, verdict)
+        check_fingerprint(store, terms, verdict)
+        _check_finished(store, success, spans, remade, index, verdict)
         _check_ledger(store, verdict)
         index.add_all(TOP_FILES)
-        lost = sorted([*found.spans.gaps, *found.spans.unreadable])
+        lost = sorted([*spans.gaps, *spans.unreadable])
         pairs = job.record.job.pairs_per_scene if job.record else 1
         tell_strays(store, Known(index, success.data is None, tuple(lost), 2 * pairs), verdict)
     return verdict
@@ -209,36 +190,43 @@ def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
 
 
 def _read_ranges(
-    store: Store, spans: Spans, check: RangeCheck, merging: Merging, progress: Callable[[Verdict], None]
-) -> Ranges:
-    """Reads every range in order, and merges it again."""
-    found = Ranges(spans, Terms())
-    for start, retries in commit_groups(store):
-        records = read_records(store, start, retries, check.verdict)
-        check.index.add_all(commit_path(start, retry) for retry in retries)
-        spans.take(start, records)
-        if not records:
+    reading: Reading, spans: Spans, terms: Terms, merging: Merging, progress: Callable[[Verdict], None]
+) -> None:
+    """Reads every range in order, and merges it again, as long as all can be."""
+    check_scene = None
+    try:
+        check_scene = find_label_check()
+    except MachineError as error:
+        reading.verdict.not_derived = str(error)
+    groups = commit_groups(reading.store)
+    following = [*(start for start, _ in groups[1:]), sys.maxsize]
+    for (start, retries), next_start in zip(groups, following, strict=True):
+        reading.index.add_all(commit_path(start, retry) for retry in retries)
+        records = read_records(reading.store, start, retries, reading.verdict)
+        if not records:  # nothing says where it ends
+            spans.take(start, min(start + spans.range_size, next_start), False)
             continue
+        spans.take(start, records[0].span.stop, True)
         for record in records:
-            found.terms.take(record)
-        one = check.check(records)
-        found.staged += one.staged
-        if one.rows is None:
-            spans.unreadable.append((start, records[0].span.stop))
-        elif found.mergeable and spans.fits:
+            terms.take(record)
+        read = ReadRange(reading, records)
+        read.check(check_scene)
+        spans.staged += read.staged
+        if read.rows is not None and spans.fits:
             try:
-                merging.add(RangeRows(one.records, one.files, one.rows))
+                merging.add(RangeRows(records, read.files, read.rows))
             except CorruptError as error:
-                found.mergeable = False
-                check.verdict.tell(str(error), COPY)
-        progress(check.verdict)
+                reading.verdict.tell(str(error), COPY)
+                read.rows = None
+        if read.rows is None:
+            spans.unreadable.append((start, records[0].span.stop))
+        progress(reading.verdict)
     spans.finish()
-    return found
 
 
-def _merge_again(merging: Merging, found: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
+def _merge_again(merging: Merging, spans: Spans, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
     """`_SUCCESS` and the merged files as the commits give them; None where not every range can be read."""
-    if not (found.mergeable and found.spans.fits and found.spans.done):
+    if not spans.fits or not spans.done:
         return None
     try:
         return merging.finish()
@@ -250,7 +238,7 @@ def _merge_again(merging: Merging, found: Ranges, verdict: Verdict) -> tuple[dic
 def _check_finished(
     store: Store,
     success: Success,
-    found: Ranges,
+    spans: Spans,
     remade: tuple[dict[str, Any], dict[str, Path]] | None,
     index: PathIndex,
     verdict: Verdict,
@@ -260,18 +248,18 @@ def _check_finished(
         index.add_all(remade[1])
     index.add_all(success.files)
     if success.data is None:
-        _tell_unfinished(found, remade and remade[0], verdict)
+        _tell_unfinished(spans, remade and remade[0], verdict)
         return
-    if found.staged:
-        verdict.tell(f"{found.staged} committed files are in _staging, and not in their places", verdict.run_again)
-    digest = success.told.get("digest")
+    if spans.staged:
+        verdict.tell(f"{spans.staged} committed files are in _staging, and not in their places", verdict.run_again)
+    digest = success.tree.get("digest")
     if remade is None:
         check_merged(store, success, {}, verdict)
     else:
         expected, files = remade
-        first, stop = found.spans.asked or (0, 0)
+        first, stop = spans.asked or (0, 0)
         entries = check_merged(store, success, files, verdict)
-        commits = success.told.get("commits")
+        commits = success.tree.get("commits")
         with contextlib.suppress(CorruptError):  # a foreign file among the commits is told as a stray
             commits = commits_digest(store)
         asked = {"first_scene": first, "stop_scene": stop, "commits": commits}
@@ -299,19 +287,19 @@ def _check_ledger(store: Store, verdict: Verdict) -> None:
             verdict.tell(f"{commit_path(int(start), int(retry))}: is missing, {LEDGER_FILE} names it", COPY)
 
 
-def _tell_unfinished(found: Ranges, remade: dict[str, Any] | None, verdict: Verdict) -> None:
+def _tell_unfinished(spans: Spans, remade: dict[str, Any] | None, verdict: Verdict) -> None:
     """Says why there is no `_SUCCESS`, which is a fault: a dataset is whole or it is not."""
     missing = f"{SUCCESS_FILE}: is missing, not finished:"
     if remade is None:
-        asked = found.spans.asked
-        told = f"{found.spans.done} of {asked[1] - asked[0]} scenes" if asked else f"{found.spans.done} scenes"
-        verdict.tell(f"{missing} {told} are committed", verdict.run_again)
+        asked = spans.asked
+        words = f"{spans.done} of {asked[1] - asked[0]} scenes" if asked else f"{spans.done} scenes"
+        verdict.tell(f"{missing} {words} are committed", verdict.run_again)
     elif again := remade["scenes"]["environmental"]:
-        told = f"{again} scenes failed for environmental reasons"
-        verdict.tell(f"{missing} {told}", f"{verdict.run_again} --retry-failed")
+        words = f"{again} scenes failed for environmental reasons"
+        verdict.tell(f"{missing} {words}", f"{verdict.run_again} --retry-failed")
     else:
-        told = "every scene is committed, and they were not merged, or the file was removed"
-        verdict.tell(f"{missing} {told}", verdict.run_again, "merge")
+        words = "every scene is committed, and they were not merged, or the file was removed"
+        verdict.tell(f"{missing} {words}", verdict.run_again, "merge")
 
 
 @contextlib.contextmanager
@@ -320,14 +308,8 @@ def _temporary_folder() -> Iterator[Path]:
     with temporary_folder("verify") as folder:
         try:
             yield folder
-        except OSError as error:
-            if error.errno != errno.ENOSPC:
+        except (OSError, sqlite3.Error) as error:
+            if isinstance(error, OSError) and error.errno != errno.ENOSPC:
                 raise
-            raise MachineError(
-                f"{folder} is full: verify keeps the merged tables there; set TMPDIR to a folder with more room"
-            ) from error
-        except sqlite3.Error as error:
-            raise MachineError(
-                f"the list of a dataset's files could not be kept in the temporary folder: {error}; free some space there, "
-                "or set TMPDIR to a folder with more"
-            ) from error
+            keeps = "verify keeps the merged tables and the list of files there"
+            raise MachineError(f"{folder}: {error}; {keeps}: set TMPDIR to a folder with more room") from error

@@ -31,7 +31,7 @@ from schemas.dataset.layout import (
 )
 from services.merge.merge import encode_success, file_entry
 from services.merge.tables import is_card_sealed
-from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable
+from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable, read_or_tell
 from workers.store.file_system import sha256_of
 from workers.store.store import Store
 
@@ -94,10 +94,10 @@ def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
 
 def _tell_file(store: Store, key: str, verdict: Verdict) -> None:
     """Tells of a file that no commit names, and of the commit that would name it, where that is gone."""
-    found = _RANGE.match(key)
-    if found and store.size(commit := commit_path(int(found[1]), int(found[2] or 0))) is None:
-        told = f"{key}: is in no commit, and {commit} is missing"
-        verdict.tell(told, f"restore that from a copy, or {verdict.run_again} --retry-failed", "stray")
+    range_of = _RANGE.match(key)
+    if range_of and store.size(commit := commit_path(int(range_of[1]), int(range_of[2] or 0))) is None:
+        what = f"{key}: is in no commit, and {commit} is missing"
+        verdict.tell(what, f"restore that from a copy, or {verdict.run_again} --retry-failed", "stray")
     else:
         verdict.tell(f"{key}: is in no commit", MOVE, "stray")
 
@@ -153,19 +153,19 @@ class Success:
 
     data: bytes | None
     """None where there is no file that can be read."""
-    told: dict[str, Any]
+    tree: dict[str, Any]
     """Its keys; none where it is damaged."""
 
     @property
     def files(self) -> dict[str, dict[str, Any]]:
         """{bytes, sha256} of each merged file that it names, as far as it is well formed."""
-        files = self.told.get("files")
+        files = self.tree.get("files")
         return {key: one for key, one in files.items() if isinstance(one, dict)} if isinstance(files, dict) else {}
 
     @property
     def asked(self) -> tuple[int, int] | None:
         """First scene and stop."""
-        ends = [self.told.get(key) for key in ("first_scene", "stop_scene")]
+        ends = [self.tree.get(key) for key in ("first_scene", "stop_scene")]
         return (ends[0], ends[1]) if all(type(end) is int and end >= 0 for end in ends) else None  # type: ignore[return-value]
 
 
@@ -179,23 +179,23 @@ def read_stored_success(store: Store, verdict: Verdict) -> Success:
         verdict.tell(f"{SUCCESS_FILE}: {describe_os_error(error)}", verdict.merge_again, "merge")
         return Success(b"", {})
     try:
-        told = json.loads(data)
+        tree = json.loads(data)
     except (ValueError, RecursionError):
-        told = None
-    if isinstance(told, dict):
-        return Success(data, told)
+        tree = None
+    if isinstance(tree, dict):
+        return Success(data, tree)
     verdict.tell(f"{SUCCESS_FILE}: is {'damaged' if data else 'empty'}", verdict.merge_again, "merge")
     return Success(data, {})
 
 
 def check_success(success: Success, expected: Mapping[str, Any], verdict: Verdict) -> None:
     """Compares `_SUCCESS`, to the byte, with what merging the commits again gives."""
-    if success.data is None or not success.told or success.data == encode_success(expected):
+    if success.data is None or not success.tree or success.data == encode_success(expected):
         return
-    wrong = sorted(key for key in {*success.told, *expected} if success.told.get(key) != expected.get(key))
-    told = f"its {', '.join(map(printable, wrong))} {'is' if len(wrong) == 1 else 'are'} not what the commits give"
+    wrong = sorted(key for key in {*success.tree, *expected} if success.tree.get(key) != expected.get(key))
+    what = f"its {', '.join(map(printable, wrong))} {'is' if len(wrong) == 1 else 'are'} not what the commits give"
     verdict.tell(
-        f"{SUCCESS_FILE}: {told if wrong else 'was altered after the merge wrote it'}", verdict.merge_again, "merge"
+        f"{SUCCESS_FILE}: {what if wrong else 'was altered after the merge wrote it'}", verdict.merge_again, "merge"
     )
 
 
@@ -209,25 +209,22 @@ def check_merged(
     """
     entries = {path: file_entry(local) for path, local in sorted(remade.items())} or dict(success.files)
     for path, entry in entries.items():
-        found = _hash_file(store, path, verdict)
-        vouched = found == success.files.get(path)
-        if isinstance(found, str):
-            verdict.tell(f"{path}: {found}", verdict.merge_again, "merge")
-        elif found != entry and not vouched:
+        stored = _hash_file(store, path, verdict)
+        vouched = stored == success.files.get(path)
+        if isinstance(stored, str):
+            verdict.tell(f"{path}: {stored}", verdict.merge_again, "merge")
+        elif stored != entry and not vouched:
             verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.merge_again, "merge")
-        elif found != entry and path.endswith(".parquet") and _same_rows(store, path, remade[path]):
-            entries[path] = found
-        elif found != entry:
+        elif stored != entry and path.endswith(".parquet") and _same_rows(store, path, remade[path]):
+            entries[path] = stored
+        elif stored != entry:
             verdict.tell(f"{path}: does not hold the rows of the commits", verdict.merge_again, "merge")
     return entries
 
 
 def check_card(store: Store, digest: str, verdict: Verdict) -> None:
     """DATASET.md: as it was written, and of this dataset."""
-    try:
-        data = store.read(README_FILE)
-    except OSError as error:
-        verdict.tell(f"{README_FILE}: {describe_os_error(error)}", verdict.merge_again, "card")
+    if (data := read_or_tell(store, README_FILE, verdict, verdict.merge_again, "card")) is None:
         return
     if not is_card_sealed(data):
         verdict.tell(

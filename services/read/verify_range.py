@@ -2,10 +2,10 @@
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, groupby
+from itertools import groupby, pairwise
 from operator import itemgetter
 
 import pyarrow as pa
@@ -13,9 +13,8 @@ import pyarrow as pa
 from schemas.dataset.commit import CommitRecord, FileEntry
 from schemas.dataset.layout import COMMITS, RANGES, commit_path, is_shape, parse_commit_name, stored_roles
 from schemas.dataset.tables import DETERMINISTIC_TABLES, TABLES
-from schemas.errors import CorruptError, MachineError, needs_making
+from schemas.errors import CorruptError, needs_making
 from schemas.job.job import Job
-from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image
 from services.read.verdict import COPY, MOST_FAULTS, PathIndex, Verdict, describe_os_error
 from workers.store.commit import committed_files, read_committed, read_record
@@ -24,12 +23,11 @@ from workers.store.store import Store
 from workers.store.tars import check_labels
 
 
-def commit_groups(store: Store) -> Iterator[tuple[int, list[int]]]:
+def commit_groups(store: Store) -> list[tuple[int, list[int]]]:
     """(start, retries) of every range that has a commit record, in order. Other files are left to the search for strays."""
     files = (entry.key.removeprefix(f"{COMMITS}/") for entry in store.files(COMMITS, sizes=False))
     names = sorted(name for file in files if (name := parse_commit_name(file)) is not None)
-    for start, group in groupby(names, key=itemgetter(0)):
-        yield start, [retry for _, retry in group]
+    return [(start, [retry for _, retry in group]) for start, group in groupby(names, key=itemgetter(0))]
 
 
 class Spans:
@@ -40,82 +38,56 @@ class Spans:
         """First scene and stop; None where neither job.yaml nor `_SUCCESS` says it."""
         self.gaps: list[tuple[int, int]] = []
         self.unreadable: list[tuple[int, int]] = []
-        """Scenes [start, stop) of a damaged range; stop is a guess where its record cannot be read."""
+        """Scenes [start, stop) of damaged ranges."""
         self.done = 0
         """Committed scenes."""
-        self.foreign = False
+        self.staged = 0
+        """Files that are committed and not published."""
+        self.range_size = range_size
+        self._foreign = False
         """Whether scenes are committed twice, or outside of those asked."""
-        self._range_size = range_size
         self._finished = finished
-        self._verdict = verdict
-        self._awaited = None if asked is None else asked[0]
-        self._torn: int | None = None
-        """Start of the damaged range just before, whose stop is not known."""
+        self.verdict = verdict
+        self._stop = None if asked is None else asked[0]
+        """Where the ranges taken so far end."""
 
     @property
     def fits(self) -> bool:
         """Whether the ranges taken so far can be merged; after the last, whether every scene asked is committed once."""
-        return not (self.gaps or self.unreadable or self.foreign or self._torn is not None)
+        return not (self.gaps or self.unreadable or self._foreign)
 
-    def take(self, start: int, records: tuple[CommitRecord, ...]) -> None:
-        """The next range, with its retries; without records where they cannot be read."""
-        self._reach(start)
-        if not records:
-            self._torn = start
+    def take(self, start: int, stop: int, readable: bool) -> None:
+        """The scenes [start, stop) of the next range, and whether its records can be read."""
+        if self._stop is not None and start > self._stop:
+            self._tell_gap(self._stop, start)
+        elif self._stop is not None and start < self._stop:
+            self._foreign = True
+            self.verdict.tell(f"{commit_path(start)}: scene {start} is committed twice", COPY)
+        self._stop = stop
+        if not readable:
+            self.unreadable.append((start, stop))
             return
-        stop = records[0].span.stop
         self.done += stop - start
         if self.asked is not None and not self.asked[0] <= start < stop <= self.asked[1]:
-            self.foreign = True
-            told = f"{commit_path(start)}: scenes {start} to {stop - 1} are committed, outside of those asked"
-            self._verdict.tell(told, f"{self.asked[0]} to {self.asked[1] - 1} are, by job.yaml or _SUCCESS; {COPY}")
-        self._awaited = stop
+            self._foreign = True
+            what = f"{commit_path(start)}: scenes {start} to {stop - 1} are committed, outside of those asked"
+            self.verdict.tell(what, f"{self.asked[0]} to {self.asked[1] - 1} are, by job.yaml or _SUCCESS; {COPY}")
 
     def finish(self) -> None:
         """After the last range."""
-        self._reach(self.asked[1] if self.asked else None)
-
-    def _reach(self, start: int | None) -> None:
-        """Goes on to the range at `start`, or to the end."""
-        if self._torn is not None:
-            guess = self._torn + self._range_size
-            self.unreadable.append((self._torn, min(guess, start) if start is not None else guess))
-            self._awaited = self.unreadable[-1][1]
-            self._torn = None
-        if start is None or self._awaited is None:
-            return
-        if start > self._awaited:
-            self._tell_gap(self._awaited, start)
-        elif start < self._awaited and (self.asked is None or start != self.asked[1]):
-            self.foreign = True
-            self._verdict.tell(f"{commit_path(start)}: scene {start} is committed twice", COPY)
+        if self.asked is not None and self._stop is not None and self._stop < self.asked[1]:
+            self._tell_gap(self._stop, self.asked[1])
 
     def _tell_gap(self, start: int, stop: int) -> None:
-        """Names each missing commit of a finished dataset, the scenes of an unfinished one."""
+        """Names each missing commit of a finished dataset, unless they are too many, and the scenes of an unfinished one."""
         self.gaps.append((start, stop))
         first = self.asked[0] if self.asked else start
-        size, run = self._range_size, self._verdict.run_again
-        line = first + ((start - first) // size + 1) * size
-        starts = [start, *range(line, stop, size)] if (stop - start) // size < MOST_FAULTS else [start]
-        if not self._finished or len(starts) == 1:
-            told = f"{commit_path(start)}: " if self._finished else ""
-            self._verdict.tell(f"{told}scenes {start} to {stop - 1} are not committed", f"{run} to make them")
-            return
-        for begin, end in zip(starts, [*starts[1:], stop], strict=True):
-            told = f"{commit_path(begin)}: is missing: scenes {begin} to {end - 1} are not committed"
-            self._verdict.tell(told, f"{run} to make them")
-
-
-@dataclass
-class ReadRange:
-    """A range as it was found: its records, and its rows by table where all tables are whole."""
-
-    records: tuple[CommitRecord, ...]
-    files: tuple[FileEntry, ...] = ()
-    """Of all its records."""
-    rows: dict[str, pa.Table] | None = None
-    staged: int = 0
-    """Files that are committed and not in their final places yet."""
+        others = range(start + self.range_size - (start - first) % self.range_size, stop, self.range_size)
+        starts = [start, *others] if self._finished and len(others) < MOST_FAULTS else [start]
+        for begin, end in pairwise([*starts, stop]):
+            commit = f"{commit_path(begin)}: is missing: " if self._finished else ""
+            remedy = f"{self.verdict.run_again} to make them"
+            self.verdict.tell(f"{commit}scenes {begin} to {end - 1} are not committed", remedy)
 
 
 def read_records(store: Store, start: int, retries: Sequence[int], verdict: Verdict) -> tuple[CommitRecord, ...]:
@@ -126,154 +98,137 @@ def read_records(store: Store, start: int, retries: Sequence[int], verdict: Verd
     for retry in retries:
         key = commit_path(start, retry)
         try:
-            record = read_record(store, start, retry)
+            records.append(read_record(store, start, retry))
         except CorruptError as error:
-            told = _without_remedy(error).removeprefix(key).lstrip(": ")
-            verdict.tell(f"{key}: {told}", verdict.make_again(start))
+            fault = _without_remedy(error).removeprefix(key).lstrip(": ")
+            verdict.tell(f"{key}: {fault}", verdict.make_again(start))
         except OSError as error:
             verdict.tell(f"{key}: {describe_os_error(error)}", COPY)
-        else:
-            if record is not None:
-                records.append(record)
-    whole = len(records) == len(retries) == max(retries) + 1
-    return tuple(records) if whole else ()
+    whole = [record for record in records if record is not None]
+    return tuple(whole) if len(whole) == len(retries) == max(retries) + 1 else ()
 
 
-class RangeCheck:
-    """Reads ranges back, and keeps in `index` the path of every file that they name."""
+@dataclass(frozen=True)
+class Reading:
+    """What every range is read back with."""
 
-    def __init__(
-        self, store: Store, job: JobRecord | None, job_digest: str | None, index: PathIndex, verdict: Verdict
-    ) -> None:
-        self._store = store
-        self._job = job.job if job else None
-        self._job_digest = job_digest
-        """Of the keys of job.yaml as they are: labels of commits of another job cannot be derived."""
-        self.index = index
-        self.verdict = verdict
-        self._check_scene: CheckScene | None = None
-        try:
-            self._check_scene = _label_check()
-        except MachineError as error:
-            verdict.not_derived = str(error)
+    store: Store
+    job: Job | None
+    job_digest: str | None
+    """Of the keys of job.yaml as they are: labels of commits of another job cannot be derived."""
+    index: PathIndex
+    """Gets the path of every file that the ranges name."""
+    verdict: Verdict
 
-    def check(self, records: tuple[CommitRecord, ...]) -> ReadRange:
-        """Reads one range with its retries."""
-        found = ReadRange(records)
-        damaged: set[str] = set()
+
+class ReadRange:
+    """A range with its retries as it was found.
+
+    `rows` are its rows by table, None where a table is not whole; `files` are the files of all its records; `staged` counts
+    those that are committed and not in their final places yet.
+    """
+
+    def __init__(self, reading: Reading, records: tuple[CommitRecord, ...]) -> None:
+        self.records = records
+        self.files: tuple[FileEntry, ...] = ()
+        self.rows: dict[str, pa.Table] | None = None
+        self.staged = 0
+        self._reading, self.verdict, self._start = reading, reading.verdict, records[0].span.start
+        self._damaged: set[str] = set()
+        self._digests: dict[str, str] = {}
+        """SHA-256 of the files that were read, by path."""
+
+    def check(self, check_scene: "CheckScene | None") -> None:
+        """Reads every file once: tables first, then what labels are derived from, then the rest."""
         unknown: list[str] = []
-        entries = [self._entries(record, unknown) for record in records]
-        found.files = tuple(chain.from_iterable(entries))
-        for files in entries:
-            self._check_files([one for one in files if is_table(one)], {}, damaged, found)
-        if unknown and not damaged:
+        for record in self.records:
+            try:
+                self.files += committed_files(self._reading.store, record)
+            except CorruptError as error:
+                self.files += record.files
+                unknown.append(_without_remedy(error))
+        self._check_files([entry for entry in self.files if is_table(entry)])
+        if unknown and not self._damaged:
             self.verdict.tell(unknown[0], COPY)
-        damaged |= set(unknown)
-        if not damaged:
-            found.rows = self._read_rows(records)
-        digests: dict[str, str] = {}
-        told = self._check_scenes(found, found.rows, digests) if found.rows is not None else []
-        for files in entries:
-            self._check_files([one for one in files if not is_table(one)], digests, damaged, found)
-        self._tell_labels(found, told, damaged)
-        return found
+        elif not self._damaged:
+            self.rows = self._read_rows()
+        faults = self._check_scenes(self.rows, check_scene) if self.rows is not None else []
+        self._check_files([entry for entry in self.files if not is_table(entry)])
+        if self.rows is not None:
+            self._tell_labels(self.rows, faults)
 
-    def _entries(self, record: CommitRecord, unknown: list[str]) -> tuple[FileEntry, ...]:
-        """The files of a commit, as far as they can be known; adds to `unknown` why there may be more."""
-        try:
-            return committed_files(self._store, record)
-        except CorruptError as error:
-            unknown.append(_without_remedy(error))
-            return record.files
-
-    def _check_files(
-        self,
-        entries: Sequence[FileEntry],
-        digests: dict[str, str],
-        damaged: set[str],
-        found: ReadRange,
-    ) -> None:
-        """Tells of files that are missing or differ from their SHA-256. Reads those without a digest yet."""
+    def _check_files(self, entries: Sequence[FileEntry]) -> None:
+        """Tells of files that are missing or differ from their SHA-256. Reads those that were not read yet."""
         for entry in entries:
-            known = self.index.add(entry.path, entry.sha256)
-            if known is not None:
-                if not is_shape(entry.path):
-                    self.verdict.tell(f"{entry.path}: is named by two commits", COPY)
-                if known == entry.sha256:
-                    continue
-            if fault := self._check_file(entry, digests, found):
-                damaged.add(entry.path)
-                self.verdict.tell(
-                    f"{entry.path}: {fault}", self.verdict.make_again(found.records[0].span.start), "file"
-                )
+            known = self._reading.index.add(entry.path, entry.sha256)
+            if known is not None and not is_shape(entry.path):
+                self.verdict.tell(f"{entry.path}: is named by two commits", COPY)
+            if known != entry.sha256 and (fault := self._check_file(entry)):
+                self._damaged.add(entry.path)
+                self.verdict.tell(f"{entry.path}: {fault}", self.verdict.make_again(self._start), "file")
 
-    def _check_file(self, entry: FileEntry, digests: dict[str, str], found: ReadRange) -> str | None:
+    def _check_file(self, entry: FileEntry) -> str | None:
         try:
-            if entry.path not in digests:
-                self._read(found, entry.path, digests)
+            if entry.path not in self._digests:
+                self._read(entry.path)
         except FileNotFoundError:
             return "is committed and missing"
         except OSError as error:
             return f"is committed and {describe_os_error(error)}"
-        return None if digests[entry.path] == entry.sha256 else "does not match the SHA-256 in its commit"
+        return None if self._digests[entry.path] == entry.sha256 else "does not match the SHA-256 in its commit"
 
-    def _read(self, found: ReadRange, path: str, digests: dict[str, str]) -> bytes:
+    def _read(self, path: str) -> bytes:
         """A file of the range, published or not yet, counted and hashed. Raises FileNotFoundError."""
         try:
-            data = self._store.read(path)
+            data = self._reading.store.read(path)
         except FileNotFoundError:
-            data = self._read_staged(found, path)
-        digests[path] = hashlib.sha256(data).hexdigest()
+            data = self._read_staged(path)
+        self._digests[path] = hashlib.sha256(data).hexdigest()
         self.verdict.files += 1
         self.verdict.bytes += len(data)
         return data
 
-    def _read_staged(self, found: ReadRange, path: str) -> bytes:
-        for record in found.records:
+    def _read_staged(self, path: str) -> bytes:
+        for record in self.records:
             with contextlib.suppress(CorruptError):
-                data = read_committed(self._store, record, path)
-                found.staged += 1
+                data = read_committed(self._reading.store, record, path)
+                self.staged += 1
                 return data
         raise FileNotFoundError(path)
 
-    def _read_rows(self, records: tuple[CommitRecord, ...]) -> dict[str, pa.Table] | None:
+    def _read_rows(self) -> dict[str, pa.Table] | None:
         """The rows by table. None, which is told, where they cannot be read although their bytes are as committed."""
         try:
-            return {table: range_rows(self._store, records, table) for table in TABLES}
+            return {table: range_rows(self._reading.store, self.records, table) for table in TABLES}
         except (CorruptError, OSError) as error:
             self.verdict.tell(_without_remedy(error), COPY)
             return None
 
-    def _check_scenes(
-        self, found: ReadRange, tables: dict[str, pa.Table], digests: dict[str, str]
-    ) -> list[tuple[int, str]]:
+    def _check_scenes(self, tables: dict[str, pa.Table], check_scene: "CheckScene | None") -> list[tuple[int, str]]:
         """Counts the range's scenes, and derives every pair's labels again: (scene id, fault)."""
         rows = {table: tables[table].to_pylist() for table in DETERMINISTIC_TABLES}
-        records, span = found.records, found.records[0].span
-        stored = StoredRange(span.start, span.stop, records, rows)
-        made = {row["scene_id"]: row for row in rows["scenes"]}
+        made, span = {row["scene_id"]: row for row in rows["scenes"]}, self.records[0].span
         ended = sorted([*made, *(row["scene_id"] for row in rows["failures"])])
         self.verdict.scenes += len(ended)
         if ended != list(span.scene_ids):
             what = f"{commit_path(span.start)}: some of its scenes {span.start} to {span.stop - 1} have no row, or two"
             self.verdict.tell(what, COPY)
-        job = self._job
-        if job is None or {record.terms.job_digest for record in records} != {self._job_digest}:
+        job, digests = self._reading.job, {record.terms.job_digest for record in self.records}
+        if job is None or digests != {self._reading.job_digest}:
             return []
-        faults: list[tuple[int, str]] = []
+        stored, faults = StoredRange(span.start, span.stop, self.records, rows), list[tuple[int, str]]()
 
         def read_file(path: str) -> bytes:
-            data = self._read(found, path, digests)
+            data = self._read(path)
             if path.endswith(".tar"):
-                off = check_labels(path.partition("/")[0], data, path, rows)
-                faults.extend((pose_id // (2 * job.pairs_per_scene), fault) for pose_id, fault in off)
+                wrong = check_labels(path.partition("/")[0], data, path, rows)
+                faults.extend((pose_id // (2 * job.pairs_per_scene), fault) for pose_id, fault in wrong)
             return data
 
         try:
             read = file_reader(read_file, stored)
         except (CorruptError, OSError):
             return []  # the archive is told by its digest
-        check_scene = self._check_scene
         if check_scene is None:
             return faults
         for scene_id, scene in made.items():
@@ -281,20 +236,18 @@ class RangeCheck:
             self.verdict.pairs += len({row["parent_id"] for row in rows["views"] if row["scene_id"] == scene_id})
         return faults
 
-    def _tell_labels(self, found: ReadRange, told: list[tuple[int, str]], damaged: set[str]) -> None:
+    def _tell_labels(self, rows: dict[str, pa.Table], faults: list[tuple[int, str]]) -> None:
         """Tells of wrong labels, unless they follow from a damaged file, which is told already."""
-        if not told or found.rows is None:
-            return
-        packed = any(path.endswith(".tar") for path in damaged)
+        packed = any(path.endswith(".tar") for path in self._damaged)
         spoilt = {
             row["scene_id"]
-            for row in found.rows["views"].select(["scene_id", "files"]).to_pylist()
-            if packed or any(file["path"] in damaged for file in row["files"])
+            for row in (rows["views"].select(["scene_id", "files"]).to_pylist() if faults else ())
+            if packed or any(file["path"] in self._damaged for file in row["files"])
         }
-        for scene_id, fault in told:
+        for scene_id, fault in faults:
             if scene_id not in spoilt:
-                remedy = f"its files are as committed; `verso replay {self.verdict.out} {scene_id}` makes it again and compares"
-                self.verdict.tell(fault, remedy)
+                again = f"`verso replay {self.verdict.out} {scene_id}` makes it again and compares"
+                self.verdict.tell(fault, f"its files are as committed; {again}")
 
 
 def is_table(entry: FileEntry) -> bool:
@@ -306,7 +259,7 @@ CheckScene = Callable[[Job, StoredRange, dict, ReadFile], list[str]]
 """Labels of one scene that do not follow from its images, rows and job, a sentence each."""
 
 
-def _label_check() -> CheckScene:
+def find_label_check() -> CheckScene:
     """Derives labels by the producer's functions. Raises MachineError where these are not installed."""
     with needs_making("deriving labels again"):
         from workers.scene.check_stored import check_stored_pair, check_stored_scene

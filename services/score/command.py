@@ -182,7 +182,6 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
     sections = [
         Section("answer", "Answer", answer),
         Section("metrics", "Metrics", f'{_metrics(summary["metrics"])}<p class="note">{note}</p>'),
-        Section("groups", "By group", "".join(_group(name, of) for name, of in summary["by"].items())),
         Section("distributions", "Distributions", _charts(table)),
     ]
     page = Page(
@@ -217,18 +216,6 @@ def _metrics(metrics: Mapping[str, Figure]) -> str:
         else ""
     )
     return table_html(head, first) + more
-
-
-def _group(title: str, groups: Mapping[str, Mapping[str, Figure]]) -> str:
-    names = [name for name in HEADLINES if any(group.get(name, {}).get("items") for group in groups.values())][:6]
-    rows = [
-        (
-            escape(word),
-            *(f"{in_words(name, group[name]['value'])}<small>{interval(name, group[name])}</small>" for name in names),
-        )
-        for word, group in groups.items()
-    ]
-    return table_html((title.replace("_", " "), *map(words, names)), rows) if rows else ""
 
 
 def _charts(table: pa.Table) -> str:

@@ -6,7 +6,7 @@ kind_metric_unit, for parts of an image kind_metric_part_unit: `depth_mae_m` is 
 the part of it that the input view does not see.
 
 Parts of the mirror view: `object`, all pixels of objects; `seen` and `hidden`, those of them whose surface the input view
-sees and does not (services/dataset/correspondence.py); `boundary`, within two pixels of an object's outline; `scene`, all
+sees and does not (services/dataset/pair.py); `boundary`, within two pixels of an object's outline; `scene`, all
 with truth. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they would
 drown it.
 """
@@ -25,8 +25,7 @@ from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
-from services.dataset.correspondence import carry
-from services.dataset.pair import Pair
+from services.dataset.pair import Pair, carry
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
 from services.score.pose import INVERTED, box_of, check_distance, score_pose, score_volume, symmetries_of
@@ -81,7 +80,7 @@ def column(kind: str, name: str) -> str:
 
 
 def score_pair(
-    pair: Pair, folder: Path, found: Mapping[Key, tuple[str, ...]], asked: Asked, blame: str = ""
+    pair: Pair, folder: Path, predicted: Mapping[Key, tuple[str, ...]], asked: Asked, blame: str = ""
 ) -> list[Row]:
     """A row for each item of a pair; with `blame`, why its predictions are refused unread.
 
@@ -103,7 +102,7 @@ def score_pair(
                 "visible_fraction": pair.input.visible_fraction,
                 "diagonal_m": truth.diagonal_m(region or REGION_FIRST_OBJECT),
             }
-            names = found.get((kind, pair.mirror.pose_id, region), ())
+            names = predicted.get((kind, pair.mirror.pose_id, region), ())
             if names and blame:
                 rows.append(row | {"status": "refused", "reason": blame})
             else:
@@ -205,21 +204,21 @@ class Truth:
 
 def _outline(segment: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """[H, W]: pixels within `BOUNDARY_PX` of another region, if either is of an object."""
-    found = np.zeros(segment.shape, np.bool_)
+    outline = np.zeros(segment.shape, np.bool_)
     rows, columns = np.divmod(
         np.flatnonzero(segment >= REGION_FIRST_OBJECT), segment.shape[1]
     )  # 4 times nonzero's speed
     if not len(rows):
-        return found
+        return outline
     near = tuple(
         slice(max(int(at.min()) - BOUNDARY_PX - 1, 0), int(at.max()) + BOUNDARY_PX + 2) for at in (rows, columns)
     )
     crop = np.where(segment[near] >= REGION_FIRST_OBJECT, segment[near], 0)
     size = 2 * BOUNDARY_PX + 1
-    found[near] = ndimage.maximum_filter(crop, size, mode="nearest") != ndimage.minimum_filter(
+    outline[near] = ndimage.maximum_filter(crop, size, mode="nearest") != ndimage.minimum_filter(
         crop, size, mode="nearest"
     )
-    return found
+    return outline
 
 
 # ---------------------------------------------------------------------------------------------- one item of each kind
@@ -258,8 +257,8 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) ->
     units = _UNITS | {units_per_m: "the units of stored images", 1e3 / units_per_m: "a PNG of millimetres"}
     for factor, unit in units.items():
         if max(factor, 1.0 / factor) > SIZE_SLACK and max(ratio / factor, factor / ratio) < UNIT_SLACK:
-            told = f"{units_per_m:g} units a metre in a PNG, metres in an array"
-            raise InputError(f"depth is {ratio:.4g} times the truth: it seems to be {unit}; write {told}")
+            remedy = f"{units_per_m:g} units a metre in a PNG, metres in an array"
+            raise InputError(f"depth is {ratio:.4g} times the truth: it seems to be {unit}; write {remedy}")
 
 
 def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
@@ -288,12 +287,12 @@ def check_box(points: Array, true: Array, true_in: Callable[[PredictedFrame], Ar
     ratio = size / true_size
     if not 1.0 / SIZE_SLACK <= ratio <= SIZE_SLACK:
         fits = [unit for factor, unit in _UNITS.items() if 1.0 / SIZE_SLACK <= ratio / factor <= SIZE_SLACK]
-        told = f": it seems to be in {fits[0]}" if fits else ""
-        raise InputError(f"the box is {ratio:.4g} times the true one{told}; shapes are in metres")
+        remedy = f": it seems to be in {fits[0]}" if fits else ""
+        raise InputError(f"the box is {ratio:.4g} times the true one{remedy}; shapes are in metres")
     if np.linalg.norm(centre - true_centre) > SIZE_SLACK * true_size:
         fits = [name for name in FRAMES if np.linalg.norm(centre - box_of(true_in(name))[0]) < true_size]
-        told = f": it fits --frame {fits[0]}" if fits else ""
-        raise InputError(f"the box is {np.linalg.norm(centre - true_centre):.3g} m from the true one{told}")
+        remedy = f": it fits --frame {fits[0]}" if fits else ""
+        raise InputError(f"the box is {np.linalg.norm(centre - true_centre):.3g} m from the true one{remedy}")
 
 
 def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:

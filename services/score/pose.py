@@ -90,8 +90,8 @@ def symmetries_of(mesh: Mesh) -> list[Pose]:
     for axis in range(3):
         whole = all(same(axis, 180.0 * n * (math.sqrt(5.0) - 1.0)) for n in range(1, 6))  # no two alike by any fold
         folds = [fold for fold in (2, 3, 4) if not whole and same(axis, 360.0 / fold)]
-        found = {0.0} | {360.0 * k / fold for fold in folds for k in range(fold)}
-        turns.append(np.arange(0.0, 360.0, STEP_DEG).tolist() if whole else sorted(found))
+        angles = {0.0} | {360.0 * k / fold for fold in folds for k in range(fold)}
+        turns.append(np.arange(0.0, 360.0, STEP_DEG).tolist() if whole else sorted(angles))
     if sum(len(one) > 12 for one in turns) > 1:  # a ball: products would fill all rotations
         return [turn(axis, angle) for axis, some_turns in enumerate(turns) for angle in some_turns]
     products = [turn(2, c) @ turn(1, b) @ turn(0, a) for a, b, c in itertools.product(*turns)]

@@ -63,19 +63,19 @@ class Predictions:
     """
 
     folder: Path
-    found: Mapping[Key, tuple[str, ...]]
+    names: Mapping[Key, tuple[str, ...]]
     strays: tuple[tuple[str, str], ...]
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds that there are."""
-        there = {kind for kind, _, _ in self.found} | {kind for kind, _ in self.strays}
+        there = {kind for kind, _, _ in self.names} | {kind for kind, _ in self.strays}
         return tuple(kind for kind in KINDS if kind in there)
 
 
 def find_predictions(folder: Path) -> Predictions:
     """Everything in the folder, by names alone. Raises InputError where there is nothing."""
-    found, strays = defaultdict[Key, list[str]](list), list[tuple[str, str]]()
+    names, strays = defaultdict[Key, list[str]](list), list[tuple[str, str]]()
     for kind, suffixes in SUFFIXES.items():
         for path in sorted((folder / kind).iterdir()) if (folder / kind).is_dir() else ():
             name = _NAME.fullmatch(path.stem)
@@ -85,19 +85,19 @@ def find_predictions(folder: Path) -> Predictions:
                 strays.append((kind, f"{plain_line(path.name)} is no pose id"))
                 continue
             region = REGION_FIRST_OBJECT + int(name[2] or 0) if kind in ("shape", "volume") else 0
-            found[kind, int(name[1]), region].append(path.name)
+            names[kind, int(name[1]), region].append(path.name)
     if os.path.lexists(folder / POSES_FILE):
         try:
             for key, text in _read_poses(folder / POSES_FILE, strays):
-                found[key].append(text)
+                names[key].append(text)
         except InputError as error:
             strays.append(("pose", str(error)))
-    if not found and not strays:
+    if not names and not strays:
         places = ", ".join(f"{kind}/ID{suffixes[0]}" for kind, suffixes in SUFFIXES.items())
         raise InputError(
             f"{folder} has no predictions: put them into {places} or {POSES_FILE}, named by the mirror pose's id"
         )
-    return Predictions(folder, {key: tuple(found[key]) for key in sorted(found)}, tuple(strays))
+    return Predictions(folder, {key: tuple(names[key]) for key in sorted(names)}, tuple(strays))
 
 
 def digest_of(folder: Path, key: Key, name: str) -> str:

@@ -102,7 +102,7 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
             import services.score.shape  # noqa: F401
     out.mkdir(parents=True, exist_ok=True)
     todo, scored = list(_ranges(store, predictions, asked)), list[_Range]()
-    unknown, metrics = set(predictions.found), set[str]()
+    unknown, metrics = set(predictions.names), set[str]()
     with closing(ProgressLine(len(todo), "score", "range")) as line:
         while todo:
             again: list[_Range] = []
@@ -127,7 +127,7 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
 def _ranges(store: Store, predictions: Predictions, asked: Asked) -> Iterator[_Range]:
     pairs = require_job(store).job.pairs_per_scene
     by_scene = defaultdict[int, dict[Key, tuple[str, ...]]](dict)
-    for key, names in predictions.found.items():
+    for key, names in predictions.names.items():
         by_scene[key[1] // (2 * pairs)][key] = names
     code = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
     code_digest = hashlib.sha256(b"".join(code)).hexdigest()

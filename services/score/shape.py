@@ -66,19 +66,19 @@ def score_shape(
     if not (_is_usable(predicted) and _is_usable(true) and 0.0 < diagonal_m < math.inf):
         return scores
     points, normals = draw_points(true, np.random.default_rng([seed, 0]), samples)
-    found: dict[str, Estimate | None] = {}
+    estimates: dict[str, Estimate | None] = {}
     if isinstance(predicted, Mesh):
         own, own_normals = draw_points(predicted, np.random.default_rng([seed, 1]), samples)
         there, met = _nearest(own, true)
         back, met_back = _nearest(points, predicted)
         dots = [np.abs((a * b).sum(axis=1)) for a, b in ((own_normals, met), (normals, met_back))]
-        found["normal_consistency"] = _half(_mean(dots[0]), _mean(dots[1]))
-        found["iou"] = _iou(predicted, true, np.random.default_rng([seed, 2]), samples)
+        estimates["normal_consistency"] = _half(_mean(dots[0]), _mean(dots[1]))
+        estimates["iou"] = _iou(predicted, true, np.random.default_rng([seed, 2]), samples)
     else:
         there = _nearest(np.asarray(predicted, np.float64), true)[0]
         back = np.asarray(cKDTree(predicted).query(points)[0])
-    found |= _of_distances(there, back, isinstance(predicted, Mesh), diagonal_m)
-    for name, estimate in found.items():
+    estimates |= _of_distances(there, back, isinstance(predicted, Mesh), diagonal_m)
+    for name, estimate in estimates.items():
         scores[name], scores[f"{name}.sampling"] = estimate or (None, None)
     return scores
 

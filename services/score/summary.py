@@ -1,4 +1,4 @@
-"""What the items say together: means with intervals, by category and by visible fraction, and two predictions compared. Pure.
+"""What the items say together: means with intervals, and two predictions compared. Pure.
 
 A mean is over the items of a kind that are scored or refused; missing ones are counted and not in it. A refused item, and
 one that predicts nothing where there is truth, counts as worst: 0 for likenesses and shares of good points; for errors the
@@ -8,8 +8,7 @@ Tibshirani 1993, section 8); they are null for a single scene.
 """
 
 import re
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -26,7 +25,7 @@ HEADLINES: Final = (
     *("shape_chamfer_l1_m", "shape_fscore_2mm", "shape_normal_consistency", "shape_iou"),
     *("volume_iou", "volume_distance_mae_m", "pose_add_m", "pose_add_s_m", "pose_rotation_deg", "pose_translation_m"),
 )
-"""The metrics that are told first, and by groups."""
+"""The metrics that are told first."""
 
 _BETTER_HIGH = re.compile(
     r"_(psnr_db|ssim|ms_ssim|delta\d|within_\d+mm|fscore_\w+|iou|normal_consistency)(_[a-z]+)?$|^volume_accuracy$"
@@ -96,12 +95,9 @@ def _worst(table: pa.Table, name: str, scored: Array) -> Array:
 
 
 def summarise(table: pa.Table) -> dict[str, Any]:
-    """Counts; `metrics` of all items; `by` category and quarter of the visible fraction, of the headlines alone."""
+    """Counts, also by kind, and `metrics` of all items."""
     names = metrics_of(table)
     values = np.stack([values_of(table, name) for name in names], axis=1) if names else np.zeros((table.num_rows, 0))
-    scenes, everything = _scenes(table), np.ones(table.num_rows, np.bool_)
-    shown = [place for place, name in enumerate(names) if name in HEADLINES]
-    groups = {"category": _categories(table), "visible_fraction": _quarters(table)}
     statuses = [_equal(table, "status", word) for word in ("ok", "missing", "refused")]
     return {
         "items": table.num_rows,
@@ -113,32 +109,24 @@ def summarise(table: pa.Table) -> dict[str, Any]:
             }
             for kind in pc.unique(table["kind"]).to_pylist()
         },
-        "metrics": dict(zip(names, figures(values, scenes, everything), strict=True)),
-        "by": {
-            group: {
-                word: dict(zip([names[place] for place in shown], figures(values[:, shown], scenes, mask), strict=True))
-                for word, mask in masks.items()
-            }
-            for group, masks in groups.items()
-        },
+        "metrics": dict(zip(names, figures(values, _scenes(table)), strict=True)),
     }
 
 
-def figures(values: Array, scenes: NDArray[np.int64], chosen: NDArray[np.bool_]) -> list[Figure]:
-    """A figure for each column of values [N, M], of the items that are chosen [N]; scenes [N]: numbers from 0 up."""
+def figures(values: Array, scenes: NDArray[np.int64]) -> list[Figure]:
+    """A figure for each column of values [N, M]; scenes [N]: the number of each item's."""
     if not values.shape[1]:
         return []
-    counts = np.isfinite(values) & chosen[:, None]
-    there = np.unique(scenes[chosen])
-    at = np.searchsorted(there, scenes[chosen])
+    counts = np.isfinite(values)
+    there, at = np.unique(scenes, return_inverse=True)
+    number = len(there)
     sums, items = (
-        np.stack([np.bincount(at, column, len(there)) for column in array[chosen].T], axis=1)
+        np.stack([np.bincount(at, column, number) for column in array.T], axis=1)
         for array in (np.where(counts, values, 0.0), counts.astype(np.float64))
     )
     rng = np.random.default_rng(SEED)
     draws = [
-        np.bincount(rng.integers(0, len(there), len(there)), minlength=len(there))
-        for _ in range(RESAMPLES if len(there) > 1 else 0)
+        np.bincount(rng.integers(0, number, number), minlength=number) for _ in range(RESAMPLES if number > 1 else 0)
     ]
     with np.errstate(invalid="ignore", divide="ignore"):
         means = np.array([(weights @ sums) / (weights @ items) for weights in draws]).reshape(-1, values.shape[1])
@@ -171,7 +159,7 @@ def compare(a: pa.Table, b: pa.Table) -> dict[str, Any]:
         values = values_of(both, name)[pairs]
         values[~np.isfinite(values).all(axis=1)] = np.nan
         columns = np.column_stack([values, values[:, 1] - values[:, 0]])
-        mine, theirs, apart = figures(columns, scenes, np.ones(len(pairs), np.bool_))
+        mine, theirs, apart = figures(columns, scenes)
         if apart["value"] is None:
             continue
         better, low, high = None, apart["low"], apart["high"]
@@ -197,21 +185,3 @@ def _equal(table: pa.Table, name: str, word: str) -> NDArray[np.bool_]:
 def _scenes(table: pa.Table) -> NDArray[np.int64]:
     """[N] numbers of scenes from 0 up; items without a scene are one together."""
     return np.unique(_numbers(table, "scene_id"), return_inverse=True)[1].reshape(-1)
-
-
-def _categories(table: pa.Table) -> dict[str, NDArray[np.bool_]]:
-    names: Sequence[str] = sorted(name for name in pc.unique(table["category"]).to_pylist() if name is not None)
-    return {name: np.asarray(pc.equal(table["category"], name).fill_null(False).to_numpy(), np.bool_) for name in names}
-
-
-def _quarters(table: pa.Table) -> dict[str, NDArray[np.bool_]]:
-    """Items by quarters of the visible fraction, as far as it differs."""
-    seen = _numbers(table, "visible_fraction")
-    known = seen[np.isfinite(seen)]
-    edges = np.unique(np.percentile(known, (0, 25, 50, 75, 100))) if len(known) else np.array([])
-    found = {}
-    for low, high in pairwise(edges):
-        inside = (seen >= low) & ((seen < high) | (high == edges[-1]) & (seen <= high))
-        if inside.any():
-            found[f"{low:.3g} to {high:.3g}"] = inside
-    return found

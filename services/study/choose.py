@@ -5,17 +5,14 @@ from collections.abc import Callable, Sequence
 
 from schemas.errors import InputError, RunError, describe_seconds, did_you_mean, milliseconds, plural, size
 from schemas.job.job import Job
-from services.study.model import ERRORS, Figure, Proof, Row, Setting, Targets, amount, short, times, unit
-from services.study.table import PARTS, Part, Table
+from services.study.model import ERRORS, Figure, Proof, Row, Targets, amount, short, times
 
 AS_CHEAP = 1.05
 """Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %."""
 
-FEWEST_SCENES = 4
-"""Fewer scenes recommend nothing, and compare nothing: a setting that is better in one or two is so by chance."""
-
-MORE_FAILED = 0.01
-"""A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
+FEWEST_SCENES, MORE_FAILED = 4, 0.01
+"""Fewer scenes recommend nothing, as what is better in one or two is so by chance; and the share of scenes that a setting may
+fail more than the job, because one that fails more is cheap as it leaves work out."""
 
 DEFAULT_TARGETS: Targets = {kind.name: kind.target for kind in ERRORS.values() if kind.target is not None}
 """The targets without a wish of the user: the accuracy that a dataset's labels promise."""
@@ -35,17 +32,11 @@ def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
 
     A setting measures only the errors that its knobs can move.
     """
-    if name == "failed_share" and name not in row.errors:
-        value = row.failed_share
-        return Figure(value, value, value, value, value, 0)
     return row.errors.get(name) or own_row(rows).errors.get(name)
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
-    """The Pareto front of time and an error, from the cheapest setting to the best, of those measured in a few scenes at least.
-
-    Of settings equal in both, the first by name is kept.
-    """
+    """The Pareto front of time and an error, the cheapest setting first, of those measured in a few scenes; of ties by name."""
     kept: list[Row] = []
     known = [row for row in rows if tells(row, error)]
     for row in sorted(known, key=lambda row: (row.ratio, row.errors[error].value, row.setting.name)):
@@ -57,9 +48,6 @@ def front(rows: Sequence[Row], error: str) -> list[Row]:
 def tells(row: Row, error: str) -> bool:
     """Whether a setting measured an error in enough scenes to say that it is better or worse than another."""
     return error in row.errors and row.errors[error].scenes >= FEWEST_SCENES
-
-
-# ---------------------------------------------------------------------------------------------- the choice
 
 
 def recommend(rows: Sequence[Row], targets: Targets | None) -> Row:
@@ -94,7 +82,7 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
     limits = {**(bounds or {}), **targets}
     able = [row for row in candidates(rows, targets) if excess(row, limits, rows, "value") == 0.0]
     if not able:
-        raise TargetError(describe_miss(rows, targets, default=bounds is not None))
+        raise TargetError(describe_miss(rows, targets))
     if bounds is not None:
         return cheapest(able, rows)
     if few := [short(name) for name in targets if name in own.errors and not tells(own, name)]:
@@ -108,26 +96,16 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
 
 
 def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
-    """The settings that may be chosen.
-
-    The job itself, and those that were measured in a few scenes at least and do not fail `MORE_FAILED` more scenes, unless
-    failed scenes are a target themselves.
-    """
-    most = math.inf if "failed_share" in targets else own_row(rows).failed_share + MORE_FAILED
-    scenes = {
-        row.setting.name: min((figure.scenes for figure in row.errors.values()), default=FEWEST_SCENES) for row in rows
-    }
-    return [
-        row
-        for row in rows
-        if row.failed_share <= most and (not row.setting.parts or scenes[row.setting.name] >= FEWEST_SCENES)
-    ]
+    """The job itself, and settings that were measured in a few scenes and do not fail `MORE_FAILED` more, or their target."""
+    most = targets.get("failed_share", own_row(rows).failed_share + MORE_FAILED)
+    kept = [row for row in rows if row.failed_share <= most]
+    return [row for row in kept if not row.setting.parts or all(tells(row, name) for name in row.errors)]
 
 
 def excess(row: Row, targets: Targets, rows: Sequence[Row], end: str) -> float:
     """How many times its target the value or the bound (`most`) of a setting's worst error is; 0 where all are met.
 
-    Infinite where one was never measured. A bound is held against what is negligible at least, a value against a millionth.
+    Infinite where one was never measured. A bound is held against what is negligible at least.
     """
     above = [0.0]
     for name, target in targets.items():
@@ -158,27 +136,21 @@ def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
     return min((row for row in some if row.ratio <= least_ratio * AS_CHEAP), key=order)
 
 
-def describe_miss(rows: Sequence[Row], targets: Targets, default: bool) -> str:
+def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
     """The nearest setting, whose greatest excess is the least, and by how much it misses the targets."""
     near = candidates(rows, targets)
     nearest = min(near, key=lambda row: (excess(row, targets, rows, "value"), row.ratio, row.setting.name))
-    figures = {name: error_of(nearest, name, rows) for name in targets}
-    missed = [
-        f"{name} of {amount(name, figure.value)} instead of {amount(name, targets[name])}"
-        if figure
-        else f"{name}, not measured with it"
-        for name, figure in figures.items()
-        if figure is None or figure.value > targets[name]
-    ]
+    missed = []
+    for name, target in targets.items():
+        figure = error_of(nearest, name, rows)
+        if figure is None or figure.value > target:
+            value = "unknown" if figure is None else amount(name, figure.value)
+            missed.append(f"{name}, which is {value} instead of {amount(name, target)}")
     words = listed(missed) or "none of them, and is worse than the job in another error"
-    wish = "the default targets" if default else ",".join(f"{name}={most:g}" for name, most in targets.items())
     return (
-        f"no setting meets {wish}. The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses "
-        f"{words}. Set others with --target"
+        f"no setting meets {','.join(f'{name}={most:g}' for name, most in targets.items())}. The nearest is "
+        f"{nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses {words}. Set others with --target"
     )
-
-
-# ---------------------------------------------------------------------------------------------- the answer in words
 
 
 def describe_answer(
@@ -233,15 +205,6 @@ def _doubt(row: Row, targets: Targets, rows: Sequence[Row]) -> str:
     return f" It is not sure to 95 %: scenes that were not measured may have {listed(unsure)}." if unsure else ""
 
 
-def describe_doubt(table: Table, part: Part, rivals: Sequence[Setting]) -> str:
-    """Which settings of a part are not decided with 95 % confidence."""
-    names = ", ".join(f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rivals)
-    return f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %, a longer --budget tells more: {names}"
-
-
-# ---------------------------------------------------------------------------------------------- what a user types
-
-
 def parse_targets(text: str) -> dict[str, float]:
     """From "penetration_mm=0.1,depth_mm=0.5"; `kept_share` is 1 minus `lost_share`. Raises InputError with the remedy."""
     targets: dict[str, float] = {}
@@ -262,8 +225,7 @@ def parse_targets(text: str) -> dict[str, float]:
         if name in targets:
             raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {most:g}")
         if not 0.0 <= most < math.inf:
-            example = ", a share such as 0.001 for 0.1 %" if unit(name) == "%" else ""
-            raise InputError(f"--target {part.strip()}: must be a number from 0 up{example}")
+            raise InputError(f"--target {part.strip()}: must be a number from 0 up, such as 0.001 for 0.1 %")
         targets[name] = most
     return targets
 

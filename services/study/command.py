@@ -61,13 +61,9 @@ def main(options: argparse.Namespace) -> int:
     with closing(ProgressLine(round(plan.budget_s), "tradeoff", unit="second")) as progress:
         study = run_study(plan, journal, progress, began, notes=notes, **about)
     write_study(study, options.out)
-    for word, lines in (
-        ("note", study.notes),
-        ("not decided", study.doubts),
-        ("proof", map(describe_proof, study.proofs)),
-    ):
-        for line in lines:
-            print(f"{word:12} {line}")
+    said = {"note": study.notes, "not decided": study.doubts, "proof": map(describe_proof, study.proofs)}
+    for line in (f"{word:12} {line}" for word, lines in said.items() for line in lines):
+        print(line)
     print(study.answer)
     return finish(study, options, targets)
 

@@ -55,32 +55,21 @@ class Truth:
         regions = bytes(thing.region_id for thing in self.things)
         self._geometry = self.scene_id, regions, *(hash(array.tobytes()) for some in arrays for array in some)
 
-    def _cast(self, cast: Callable[[], Any], name: str, *cameras: Camera, pair: int = 0) -> Any:
-        views = [part for c in cameras for part in (*c.intrinsics.model_dump().values(), c.T_world_cam.tobytes())]
-        key = name, pair, *self._geometry, *views
+    def cast(self, cast: Callable[..., Any], *arguments: object) -> Any:
+        """What `cast` answers for the scene's things; cameras count by their values."""
+        values = [(a.intrinsics, a.T_world_cam.tobytes()) if isinstance(a, Camera) else a for a in arguments]
+        key = cast, *self._geometry, *values
         if key not in self._kept:
-            self._kept[key] = cast()
+            self._kept[key] = cast(self.things, *arguments)
         return self._kept[key]
 
     def pixels(self, camera: Camera) -> Pixels:
         """The view at its pixels."""
-        return self._cast(lambda: cast_pixels(self.things, camera), "pixels", camera)
-
-    def patch(self, camera: Camera, pair: int) -> Patch:
-        """The objects in a pair's input view."""
-        return self._cast(lambda: cast_patch(self.things, camera, self.scene_id, pair), "patch", camera, pair=pair)
-
-    def both(self, camera: Camera, other: Camera) -> NDArray[np.bool_]:
-        """[N] bool: which pixels of `pixels(camera).box` show an object point that the other camera sees too."""
-        seen = self.pixels(camera).box
-        return self._cast(lambda: seen_by_other(self.things, camera, seen, other), "both", camera, other)
+        return self.cast(cast_pixels, camera)
 
 
-PERCENTILE = 99.0
-"""Percentile of pixels: leaves out the few where a ray grazes an edge."""
-
-HIDDEN_M = 0.005
-"""A projected pixel this far behind the surface that the mirror camera sees shows a hidden surface."""
+PERCENTILE, HIDDEN_M = 99.0, 0.005
+"""Of pixels, which leaves out the few where a ray grazes an edge; and how far behind what a camera sees a surface is hidden."""
 
 
 def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[str, float]:
@@ -93,15 +82,13 @@ def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[s
     - between_mm: over `BETWEEN` random rays in the box about the objects' visible part in the input view: the median
       of |stored depth of the pixel that the ray crosses - ray's z|, where mask and ray name the same object.
     - mirror_mm: |d_z - z of the objects' nearest point that the input camera sees|, the largest of all pairs: `mirror_pose`
-      sets the mirror camera off by exactly this, along the input camera's optical axis, and does not turn it.
-    - unfilled_share: of the mirror view's object pixels by ray whose point the input camera sees too, the share that the
-      projected depth leaves empty.
-    - hidden_share: of the projected depth's filled pixels, evenly over the image: the share that lies more than `HIDDEN_M`
-      behind what the mirror camera's ray meets.
+      sets the mirror camera off by exactly this, along the input camera's optical axis.
+    - unfilled_share: the share of object pixels of the mirror view, of points that both cameras see, without projected depth.
+    - hidden_share: the share of projected pixels, all over the image, more than `HIDDEN_M` behind what a ray meets there.
     """
     images = context.job.images
     views = [view for pair in scene.pairs for view in pair.views if view.region is not None]
-    patches = [truth.patch(pair.input.camera, number) for number, pair in enumerate(scene.pairs)]
+    patches = [truth.cast(cast_patch, pair.input.camera, truth.scene_id, n) for n, pair in enumerate(scene.pairs)]
     projected = [pair for pair in scene.pairs if pair.projected is not None]
     return (
         _of_labels([(view, truth.pixels(view.camera).box) for view in views], images)
@@ -145,7 +132,7 @@ def _of_projections(pairs: Sequence[Pair], truth: Truth, images: Images) -> dict
         assert pair.projected is not None
         camera, depth = pair.projected.camera, pair.projected.depth
         seen = truth.pixels(camera)
-        empty.append(seen.box.of(depth)[truth.both(camera, pair.input.camera)] == 0)
+        empty.append(seen.box.of(depth)[truth.cast(seen_by_other, camera, seen.box, pair.input.camera)] == 0)
         drawn, z = seen.spread.of(depth), seen.spread.depth_m
         hidden.append(((z > 0.0) & (dequantise_depth(drawn, images) > z + HIDDEN_M))[drawn > 0])
     flags = {"unfilled_share": empty, "hidden_share": hidden}
@@ -164,13 +151,10 @@ def _percentile(name: str, errors: Iterable[Array], percent: float) -> dict[str,
     return {name: float(np.percentile(values, percent))} if len(values) else {}
 
 
-CONVERGED_PATHS = 256
-"""Two truths with other seeds differ by 0.012 to 0.02 in FLIP, a tenth of what tiers do."""
+CONVERGED_PATHS, FINE_WIDTH = 256, 2560
+"""Two truths of so many paths differ by 0.012 to 0.02 in FLIP, a tenth of what tiers do; and 4 times the compared width."""
 
 INPUT_ALONE = dict.fromkeys(("cameras.depth.enabled", "cameras.mirror.enabled", "images.projection.enabled"), False)
-
-FINE_WIDTH = 2560
-"""Pixels: 4 times the width that colours are compared at."""
 
 
 def measure_drawn(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, Answer]:

@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from schemas.base import Array
-from schemas.capture import CaptureScore, SynthesizedView
+from schemas.capture import SynthesizedView
 from schemas.errors import SceneError
 from schemas.job.job import Job, settings_digest
 from schemas.scene.scene import ObjectStart, Settled
@@ -32,7 +32,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.make_capture import require_captures, simulate_one
 from workers.capture.process import CaptureViews
-from workers.capture.reconstruct import ProcessorClock, estimate_surface, given_files
+from workers.capture.reconstruct import estimate_surface, given_files, processor_clock
 from workers.capture.score import read_whole_truth, score_capture
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import motion_between, transform
@@ -41,14 +41,12 @@ from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.make_scene import Laid, lay_scene, plan_with_effects
 from workers.shard.run_shard import describe, run_scene
 
-# ---------------------------------------------------------------------------------------------- a process of the pool
-
 
 @dataclass(frozen=True)
 class Unit:
     """One scene to measure with these settings on top of a base setting.
 
-    `job`: the job as JSON, beside the folder that its paths are of; `scratch`: a folder that all processes share; `part`: one of
+    `job`: as JSON, beside the folder that its paths are of; `scratch`: a folder that all processes share; `part`: of `PARTS` in
     services/study/table.py; `limit_s`: seconds of processor that one setting may take.
     """
 
@@ -66,40 +64,37 @@ def answer_unit(unit: Unit) -> bytes:
     """Answers by the settings' names, as JSON."""
     from services.study.images import measure_colour, measure_drawn  # imports this file
 
-    context = _based(unit.job, unit.folder, json.dumps(dict(unit.base.changes)))
+    context = _worker(unit.job, unit.folder, json.dumps(dict(unit.base.changes)))
     LIMIT["s"], RESTS["folder"] = unit.limit_s, Path(unit.scratch)
     measures = {"rest": measure_rest, "draw": measure_drawn, "colour": measure_colour, "capture": measure_capture}
     began = time.monotonic()
-    answers = measures[unit.part](context, shuffled(unit.settings, unit.scene_id), unit.scene_id)
+    # Another order in each scene, so that what a process does first is no setting's disadvantage.
+    order = np.random.default_rng([unit.scene_id, len(unit.settings)]).permutation(len(unit.settings))
+    answers = measures[unit.part](context, [unit.settings[place] for place in order], unit.scene_id)
     shared_s = (time.monotonic() - began - sum(answer["took"] for answer in answers.values())) / len(answers)
     for answer in answers.values():
         answer["took"] += shared_s  # what was made for all
     return json.dumps(answers).encode()
 
 
+WARM_SCENES = (2_000_000, 2_000_001)
+"""Scenes of one object that compile a process's loops and shaders; no study measures them."""
+
+
 @cache
-def _opened(job: str, folder: str) -> WorkerContext:
-    """The worker of the job itself, after scenes of one object that compile its loops and shaders."""
+def _worker(job: str, folder: str, changes: str) -> WorkerContext:
+    """The worker of the job, or the same one with a base setting's job: one object each, because caches know it."""
+    if changes != "{}":
+        own = _worker(job, folder, "{}")
+        return replace(own, job=apply(own.job, json.loads(changes)))
     parsed = Job.model_validate_json(job)
     context = open_worker(parsed, open_catalogue(parsed.assets, Path(folder), tuple(parsed.categories)))
     if parsed.captures is None:
         few = replace(context, job=apply(parsed, {"objects_per_scene": 1}))
-        for number in range(WARM_SCENES):
-            run_scene(few, WARM_SCENE + number, Stopwatch())
+        for scene_id in WARM_SCENES:
+            run_scene(few, scene_id, Stopwatch())
     return context
 
-
-@cache
-def _based(job: str, folder: str, changes: str) -> WorkerContext:
-    """The job's worker, with a base setting's job: one object each, because caches know it."""
-    own, based = _opened(job, folder), json.loads(changes)
-    return replace(own, job=apply(own.job, based)) if based else own
-
-
-WARM_SCENES, WARM_SCENE = 2, 2_000_000
-"""How many scenes warm a process up, and the id of the first, which no study measures."""
-
-# ---------------------------------------------------------------------------------------------- one answer
 
 Answer = dict[str, Any]
 
@@ -166,13 +161,6 @@ def context_for(context: WorkerContext, setting: Setting) -> WorkerContext:
     return replace(context, job=apply(context.job, setting.changes))
 
 
-def shuffled(settings: Sequence[Setting], scene_id: int) -> list[Setting]:
-    """Another order in each scene, so that what a process does first is no setting's disadvantage."""
-    return [settings[k] for k in np.random.default_rng([scene_id, len(settings)]).permutation(len(settings))]
-
-
-# ---------------------------------------------------------------------------------------------- how a scene comes to rest
-
 _seen: set[int] = set()
 """Scenes whose shapes this process has built."""
 
@@ -182,9 +170,8 @@ def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: 
 
     `s` is the time to rest, and `planned_s` that of the plan before it. Errors: penetration_mm, gap_mm, unbalanced_share, slid_mm
     and rolled_deg (sideways travel of the centre of mass, and turn, since the object was released; the largest of several
-    objects). Beside them `lost` and `planned` objects, and `corners`, mm, of each object's box in the world. The job
-    itself also has `plan_s`, what a scene takes besides rest with new shapes: a process's first rest of a scene makes them, and
-    is the job's answer only where it is too slow to be done again.
+    objects). Beside them `lost` and `planned` objects, and `corners`, mm, of each object's box in the world. The job itself has
+    `plan_s`: what a scene takes besides rest with new shapes, which a process's first rest of a scene makes.
     """
     answers: dict[str, Answer] = {}
     cold: Answer = {}
@@ -204,7 +191,7 @@ def measure_rest(context: WorkerContext, settings: Sequence[Setting], scene_id: 
 
 
 def _rest(worker: WorkerContext, scene_id: int, setting: Setting) -> Answer:
-    planning, watch = ProcessorClock(), ProcessorClock()
+    planning, watch = processor_clock(), processor_clock()
     plan, _ = plan_with_effects(worker, scene_id, planning)
     planned = len(plan.objects)
     try:
@@ -239,12 +226,10 @@ def _errors_of(rest: Rest) -> dict[str, float]:
 
 def _corners_mm(start: ObjectStart, end: Settled) -> Array:
     """[8, 3] the corners of the object's own box in the world, mm, to a nanometre."""
-    low, high = start.hull.vertices.min(axis=0), start.hull.vertices.max(axis=0)
-    corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    ends = np.stack([start.hull.vertices.min(axis=0), start.hull.vertices.max(axis=0)], axis=1)
+    corners = np.array(list(itertools.product(*ends)))
     return np.round(1e3 * transform(end.T_world_obj, corners), DIGITS)
 
-
-# ---------------------------------------------------------------------------------------------- the job's own rest
 
 RESTS = {"folder": Path(os.devnull)}
 """Where the processes of a study keep how its slow scenes rest, for each other: a bin settles for half a minute, and is drawn in
@@ -281,8 +266,6 @@ def laid_for(context: WorkerContext, worker: WorkerContext, scene_id: int) -> La
     plan, effects = plan_with_effects(worker, scene_id, Stopwatch())
     return Laid(replace(plan, objects=rest.starts), effects, rest)
 
-
-# ---------------------------------------------------------------------------------------------- a simulated capture
 
 POINT_BYTES, VERTEX_BYTES, FACE_BYTES = 3 * 4 + 3 * 4 + 3, 3 * 4 + 3, 3 * 4
 """As a cloud and a mesh are written: float32 coordinates and normals, 8-bit colours, 32-bit indices."""
@@ -339,31 +322,23 @@ class TimedViews(CaptureViews):
 
 
 def _process(context: WorkerContext, worker: WorkerContext, scene_id: int) -> Answer:
-    watch, captures = ProcessorClock(), require_captures(worker.job)
+    watch, captures = processor_clock(), require_captures(worker.job)
     whole = _simulated(context, captures.simulate.image_scale, scene_id)
-    folder = fewer_views(whole, captures.simulate.views)
+    chosen = spread_evenly(len(whole.numbers), captures.simulate.views)
+    folder = replace(whole, numbers=tuple(whole.numbers[place] for place in chosen))
     with watch.stage("read"):
         given = given_files(folder, captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
-    views = TimedViews(given, estimates.estimate, captures, merged.body)
     truth, surface = read_whole_truth(folder), merged.surface
-    score = None if truth is None else score_capture(estimates.estimate, surface, views, truth, HELD_OUT).summary
+    assert truth is not None  # a simulated capture has it
+    views = TimedViews(given, captures, estimates.estimate, surface, merged.body)
+    score = score_capture(views, truth, HELD_OUT).summary
     mirrors_s = fmean(views.seconds) * len(estimates.estimate.used) if views.seconds else 0.0
+    figures = {name: getattr(score, figure) for name, figure in ERRORS_OF_SCORE.items()}
+    figures["missing_share"] = None if score.completeness is None else 1.0 - score.completeness
     points, vertices, faces = map(len, (surface.points, surface.vertices, surface.faces))
     return {
         "s": sum(watch.seconds.values()) + mirrors_s,
-        "errors": errors_of(score or CaptureScore()),
+        "errors": {name: float(value) for name, value in figures.items() if value is not None},
         "bytes": points * POINT_BYTES + vertices * VERTEX_BYTES + faces * FACE_BYTES,
     }
-
-
-def fewer_views(folder: CaptureFolder, views: int) -> CaptureFolder:
-    """The same capture with some of its views only, evenly over the path."""
-    return replace(folder, numbers=tuple(folder.numbers[place] for place in spread_evenly(len(folder.numbers), views)))
-
-
-def errors_of(score: CaptureScore) -> dict[str, float]:
-    """The study's errors from a score; what was not measured is left out."""
-    figures = {name: getattr(score, figure) for name, figure in ERRORS_OF_SCORE.items()}
-    figures["missing_share"] = None if score.completeness is None else 1.0 - score.completeness
-    return {name: float(value) for name, value in figures.items() if value is not None}

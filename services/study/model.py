@@ -135,7 +135,6 @@ class Study:
     machine: Mapping[str, Any]
     scenes: int
     rows: tuple[Row, ...]
-    preset: str
     job_scenes: int
     notes: tuple[str, ...]
     budget_s: float
@@ -145,8 +144,6 @@ class Study:
     doubts: tuple[str, ...]
     proofs: tuple[Proof, ...]
 
-
-# ---------------------------------------------------------------------------------------------- errors
 
 _SHAPES = "the stored shapes"
 _RAYS = "a ray caster in float64 at the same pixel centres"
@@ -180,7 +177,7 @@ class ErrorKind:
 
     @property
     def most(self) -> float:
-        """What it can be at most: shares at most 1."""
+        """Shares are at most 1."""
         return float("inf") if self.unit else 1.0
 
 
@@ -213,8 +210,6 @@ ERRORS = {row[0]: ErrorKind(*row) for row in (
 # fmt: on
 """By name, of each group first those that a picture shows rather."""
 
-# ---------------------------------------------------------------------------------------------- in words
-
 
 def short(name: str) -> str:
     """An error's name in a few words."""
@@ -241,17 +236,15 @@ def times(ratio: float) -> str:
     return f"{number(round(ratio, 2) if 0.9 <= ratio < 1.1 else float(f'{ratio:.2g}'))} times"
 
 
-# ---------------------------------------------------------------------------------------------- knobs
-
 Knobs = Mapping[str, Mapping[str, Changes]]
 """By name, the values of a knob by their labels, from coarse to fine where they have an order."""
 
-_FINE = {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400}
-_FINEST = {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400}
-
-REFERENCES: tuple[Setting, ...] = (
-    Setting((("reference", "fine"),), {f"physics.{key}": value for key, value in _FINE.items()}),
-    Setting((("reference", "finest"),), {f"physics.{key}": value for key, value in _FINEST.items()}),
+REFERENCES = tuple(
+    Setting(
+        (("reference", name),),
+        {"physics.step_hz": hz, "physics.max_step_travel_mm": travel_mm, "physics.solver_iterations": 400},
+    )
+    for name, hz, travel_mm in (("fine", 3840, 0.03), ("finest", 7680, 0.015))
 )
 """Settings of physics finer than every measured value. The first gives the distribution of outcomes; a pose has a truth where
 both agree."""
@@ -270,13 +263,19 @@ def knobs_of(job: Job) -> Knobs:
             "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
             "image_scale": _values("captures.simulate.image_scale", (0.25, 0.5, 1.0)),
         }
+    rasters = (("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4))
+    paths = (1, 4, 16) if find_spec("mitsuba") else ()
+    tiers = {
+        **{label: {"render.tier": tier, "render.samples": samples} for label, tier, samples in rasters},
+        **{f"path-{n}": {"render.tier": "pathtraced", "render.path_samples": n} for n in paths},
+    }
     splat, removal = "images.projection.splat", "images.projection.hidden_point_removal"
     return {
         "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
         "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
         "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
         "rest": _values("physics.rest.speed_mm_s", (30.0, 10.0, 3.0, 1.0, 0.3)),
-        "collision": _collisions(job),
+        "collision": _values("physics.collision", ("box", "hull", "planned", "parts")),
         "concavity": _values("physics.concavity", (0.2, 0.1, 0.05, 0.02)),
         "exact_rest": {"off": {"physics.exact_rest": False}, "on": {"physics.exact_rest": True}},
         "size": {str(width): resized(job, width) for width in (160, 320, 640, 1280)},
@@ -290,24 +289,12 @@ def knobs_of(job: Job) -> Knobs:
             for size, removed in itertools.product((1, 3, 5), (False, True))
         },
         "png_level": _values("images.png_level", (0, 1, 2, 6, 9)),
-        "colour": _tiers(),
+        "colour": tiers,
     }
 
 
 def _values(key: str, values: Iterable[float | str]) -> dict[str, Changes]:
     return {value if isinstance(value, str) else f"{value:g}": {key: value} for value in values}
-
-
-def _collisions(job: Job) -> dict[str, Changes]:
-    """From coarse to fine; parts of meshes from outside at several tolerances (parts of built-in shapes have none).
-
-    The mesh itself is no value, because Bullet moves convex shapes alone.
-    """
-    key, depth = "physics.collision", "physics.concavity"
-    if all(source.source == "procedural" for source in job.assets.objects):
-        return _values(key, ("box", "hull", "planned", "parts"))
-    parts = {f"parts to {d:g}": {key: "parts", depth: d} for d in (0.1, 0.05, 0.02)}
-    return {**_values(key, ("box", "hull", "planned")), **parts}
 
 
 def resized(job: Job, width: int) -> Changes:
@@ -316,15 +303,6 @@ def resized(job: Job, width: int) -> Changes:
     scaled = {name: value * width / sensor.width for name, value in sensor}
     values = scaled | {"width": width, "height": max(1, round(scaled["height"]))}
     return {f"cameras.sensor.{name}": value for name, value in values.items()}
-
-
-def _tiers() -> dict[str, Changes]:
-    rasters = (("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4))
-    paths = (1, 4, 16) if find_spec("mitsuba") else ()
-    return {
-        **{label: {"render.tier": tier, "render.samples": samples} for label, tier, samples in rasters},
-        **{f"path-{n}": {"render.tier": "pathtraced", "render.path_samples": n} for n in paths},
-    }
 
 
 def choose_knobs(knobs: Knobs, names: Sequence[str] | None) -> Knobs:

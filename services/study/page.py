@@ -24,9 +24,6 @@ from schemas.errors import describe_seconds, milliseconds, number, size
 from services.study.choose import front, own_row, tells
 from services.study.model import ERRORS, Proof, Row, Study, amount, short, shown, times, unit
 
-STUDY_VERSION = 2
-"""The version of the JSON file's format."""
-
 _COST = ("ms", "ratio", "ratio_least", "ratio_most", "kilobytes", "failed_share")
 
 
@@ -54,7 +51,7 @@ def write_study(study: Study, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     table, picture = io.BytesIO(), draw_tradeoff(study)
     pq.write_table(table_of(study.rows), table)
-    text = json.dumps({"verso_study": STUDY_VERSION, **asdict(study)}, indent=1) + "\n"
+    text = json.dumps({"verso_study": 2, **asdict(study)}, indent=1) + "\n"
     for name, data in {
         "tradeoff.parquet": table.getvalue(),
         "study.json": text.encode(),
@@ -65,8 +62,6 @@ def write_study(study: Study, folder: Path) -> None:
         partial.write_bytes(data)
         os.replace(partial, folder / name)
 
-
-# ---------------------------------------------------------------------------------------------- the page
 
 GROUPS = {
     "physics": "How objects rest",
@@ -89,25 +84,14 @@ def page_of(study: Study, picture: bytes) -> str:
         doubts="".join(f'<p class="doubt">Not decided: {escape(line)}.</p>' for line in study.doubts),
         tradeoff=f'<img class="plot" alt="Errors over processor time" src="data:image/png;base64,{data}">',
         groups="\n".join(f"<h2>{name}</h2>{table}" for name, table in tables.items()),
-        errors=_errors(study),
-        notes="".join(f"<li>{escape(line)}</li>" for line in (*study.notes, *notes)),
-        machine=_machine(study),
+        errors=_list(_errors(study)),
+        notes=_list([*study.notes, *notes]),
+        machine=_list(f"{name}: {value}" for name, value in _machine(study).items()),
     )
 
 
-def _table(lines: str, head: Sequence[str] = (), kind: str = "words") -> str:
-    """A table of lines in HTML, with its head, of which there may be none."""
-    heads = f"<thead><tr>{_cells('th', head)}</tr></thead>" if head else ""
-    return f'<div class="scroll"><table class="{kind}">{heads}\n<tbody>{lines}</tbody></table></div>'
-
-
-def _lines(rows: Iterable[Sequence[str]]) -> str:
-    """Lines of words."""
-    return "".join(f"<tr>{_cells('td', row)}</tr>\n" for row in rows)
-
-
-def _cells(kind: str, words: Iterable[str]) -> str:
-    return "".join(f"<{kind}>{escape(word)}</{kind}>" for word in words)
+def _list(lines: Iterable[str]) -> str:
+    return "".join(f"<li>{escape(line)}</li>" for line in lines)
 
 
 def describe_proof(proof: Proof) -> str:
@@ -122,29 +106,25 @@ def describe_proof(proof: Proof) -> str:
     return f"{proof.setting} on {proof.scenes} fresh scenes: {'; '.join(words)}: {end}"
 
 
-def _errors(study: Study) -> str:
-    measured = {name for row in study.rows for name in row.errors}
-    rows = [
-        (kind.name, kind.short, kind.title, kind.unit or "0 to 1", kind.truth,
-         "all scenes together" if kind.pooled else "95th percentile", "yes" if kind.name in measured else "no")
-        for kind in ERRORS.values()
-    ]  # fmt: skip
-    head = ("target", "in short", "what it says", "unit", "held against", "over scenes", "measured")
-    return _table(_lines(rows), head)
+def _errors(study: Study) -> list[str]:
+    kinds = [kind for name, kind in ERRORS.items() if any(name in row.errors for row in study.rows)]
+    over = {True: "all scenes together", False: "95th percentile of scenes"}
+    return [
+        f"{kind.name} ({kind.unit or '0 to 1'}), {kind.short}: {kind.title}, against {kind.truth}; {over[kind.pooled]}"
+        for kind in kinds
+    ]
 
 
-def _machine(study: Study) -> str:
+def _machine(study: Study) -> dict[str, str]:
     own = own_row(study.rows)
     hours = number(own.ms * study.job_scenes / 3.6e6)
-    rows = {
+    return {
         "command": study.command,
         "scenes": sample(study),
         "time spent": f"{describe_seconds(study.seconds)} of a budget of {describe_seconds(study.budget_s)}",
-        "preset of the job": study.preset,
         f"the job's {study.job_scenes:,} scenes": f"{hours} core-hours, {size(own.kilobytes * study.job_scenes)}",
         **{name: value if isinstance(value, str) else json.dumps(value) for name, value in study.machine.items()},
     }
-    return _table(_lines(rows.items()))
 
 
 def sample(study: Study) -> str:
@@ -162,7 +142,9 @@ def _group_table(study: Study, group: str) -> str:
     order = {"own": 0, "preset": 1, "single": 2, "several": 3}
     rows = [row for row in study.rows if set(row.errors) & set(names)]
     lines = [_line(study, row, best) for row in sorted(rows, key=lambda row: order[row.setting.kind])]
-    return _table("".join(lines), head, "") if lines else ""
+    heads = "".join(f"<th>{escape(word)}</th>" for word in head)
+    table = f"<table><thead><tr>{heads}</tr></thead>\n<tbody>{''.join(lines)}</tbody></table>"
+    return f'<div class="scroll">{table}</div>' if lines else ""
 
 
 def _line(study: Study, row: Row, best: Mapping[str, Sequence[Row]]) -> str:
@@ -195,16 +177,9 @@ def _figure(name: str, row: Row, own: Row, is_best: bool) -> str:
     return f'<td class="{side}{" front" * is_best}">{mark}{value}<small>{low} – {high}</small></td>'
 
 
-# ---------------------------------------------------------------------------------------------- the picture
-
-PANELS = 4
-"""The most panels of a picture."""
-
-MOVED = 0.05
-"""What is no more than this share of the job's own error is negligible too."""
-
-REACH = 4.0
-"""An interval is cut where it reaches beyond this many times its middle, which would otherwise fill the axis."""
+PANELS, MOVED, REACH = 4, 0.05, 4.0
+"""The most panels of a picture; changes up to this share of the job's own error are negligible too; and an interval is cut
+where it reaches beyond this many times its middle, which would otherwise fill the axis."""
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#6F6800")
 """Okabe and Ito's palette for colour-blind readers, the yellow darker so that it is seen on white."""

@@ -38,26 +38,21 @@ class Standing(NamedTuple):
     verdict: str
     is_missing: bool
     ratio: Figure | None
-    scenes: int
 
 
 def standings(table: Table, part: Part, targets: Targets) -> list[Standing]:
     """The settings that can still win: the job itself, then those that meet the targets so far, the cheapest first."""
-    own = table.figures(part, OWN)
-    asked = {name: most for name, most in targets.items() if part_of(name) == part and name in own}
-
-    def standing(setting: Setting) -> Standing:
+    asked = {name: most for name, most in targets.items() if part_of(name) == part and name in table.figures(part, OWN)}
+    every = []
+    for setting in (setting for setting in table.split.measured[part] if setting not in REFERENCES):
         figures = table.figures(part, setting)
-        verdicts = {figures[name].verdict(most) if name in figures else "open" for name, most in asked.items()}
-        verdict = next((name for name in ("misses", "open") if name in verdicts), "meets")
+        verdicts = [figures[name].verdict(most) if name in figures else "open" for name, most in asked.items()]
+        verdict = "misses" if "misses" in verdicts else "open" if "open" in verdicts else "meets"
         is_missing = any(figures[name].value > most for name, most in asked.items() if name in figures)
-        scenes = len(table.answers(part, setting))
-        return Standing(setting, verdict, is_missing, table.ratio(part, setting), scenes)
-
-    every = [standing(setting) for setting in table.split.measured[part] if setting not in REFERENCES]
-    judged = [some for some in every if some.scenes >= min(LEAST, PARTS[part].scenes)]
-    best = min((some.ratio.high for some in judged if some.ratio and some.verdict == "meets"), default=math.inf)
-    out = [some for some in judged if some.verdict == "misses" or (some.ratio and some.ratio.low > best * AS_CHEAP)]
+        every.append(Standing(setting, verdict, is_missing, table.ratio(part, setting)))
+    known = [some for some in every if len(table.answers(part, some.setting)) >= min(LEAST, PARTS[part].scenes)]
+    best = min((some.ratio.high for some in known if some.ratio and some.verdict == "meets"), default=math.inf)
+    out = [some for some in known if some.verdict == "misses" or (some.ratio and some.ratio.low > best * AS_CHEAP)]
     left = [some for some in every if some not in out or some.setting == OWN]
     return sorted(left, key=lambda s: (s.setting != OWN, s.is_missing, s.ratio.value if s.ratio else 1.0))
 
@@ -97,12 +92,6 @@ def seconds(table: Table, wanted: Sequence[Wanted]) -> float:
     return sum(table.cost_s(item.part, item.setting) for item in wanted)
 
 
-# ---------------------------------------------------------------------------------------------- combinations
-
-SAVES = 0.98
-"""A value saves time at this share of the job's own."""
-
-
 def promising(rows: Sequence[Row], targets: Targets | None) -> list[Setting]:
     """Settings of two and more knobs to measure next. `rows`: the job's own first, then one value of one knob each.
 
@@ -118,19 +107,13 @@ def promising(rows: Sequence[Row], targets: Targets | None) -> list[Setting]:
     kept = [
         row for row in singles if all(row.errors[name].value <= held[name] for name in held.keys() & row.errors.keys())
     ]
-    saving = _first_of_knobs(row for row in kept if row.ratio < SAVES)
+    saving = [row for row in kept if row.ratio < 0.98]
     mending: list[Row] = []
     for name in (name for name in held if own[name].value > limits[name]):
         mending += [row for row in kept if name in row.errors and row.errors[name].value <= limits[name]][:1]
-    together = [saving, _first_of_knobs(mending), _first_of_knobs([*mending, *saving])]
-    # In the order of the table, whatever the ranks, so that names do not depend on noise.
-    settings = [joined([row.setting for row in rows if row in some]) for some in together if len(some) > 1]
+    settings = []
+    for some in (saving, mending, [*mending, *saving]):
+        first = {row.setting.knob: row for row in reversed(some)}.values()  # of each knob
+        if len(first) > 1:  # in the order of the table, whatever the ranks, so that names do not depend on noise
+            settings.append(joined([row.setting for row in rows if row in first]))
     return list({setting.name: setting for setting in settings}.values())
-
-
-def _first_of_knobs(rows: Iterable[Row]) -> list[Row]:
-    """The first value of each knob, in the order of the rows."""
-    first: dict[str, Row] = {}
-    for row in rows:
-        first.setdefault(row.setting.knob, row)
-    return list(first.values())

@@ -19,7 +19,7 @@ from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, r
 from services.study.measure import Unit, answer_unit
 from services.study.model import OWN, Proof, Row, Setting, Study, Targets, joined
 from services.study.rounds import LEAST, Wanted, missing, next_round, promising, seconds, undecided
-from services.study.table import PARTS, UNTIMED, Part, Table, figures_of, part_of, split_settings, unit_name
+from services.study.table import AT_REST, PARTS, Part, Table, figures_of, part_of, split_settings, unit_name
 from workers.pool import Answers, Ended, Pool
 
 
@@ -35,12 +35,8 @@ class Plan:
     processes: int
 
 
-# ---------------------------------------------------------------------------------------------- what was measured before
-
-JOURNAL_FILE = "answers"
-
-HEADER, SPENT = "study", "spent"
-"""Keys of a journal beside those of answers: what was studied, and seconds of the budget."""
+JOURNAL_FILE, HEADER, SPENT = "answers", "study", "spent"
+"""The file of a journal, and its keys beside those of answers: what was studied, and seconds of the budget."""
 
 
 class Journal(dict[str, Any]):
@@ -69,8 +65,6 @@ class Journal(dict[str, Any]):
         self._kept.put(key, json.dumps(answer).encode())
 
 
-# ---------------------------------------------------------------------------------------------- measuring within a budget
-
 FIRST_SHARE, PILOT_SHARE, RACE_SHARE = 0.5, 0.3, 0.75
 """By these shares of the budget the job's own first scenes must be there, the first round ends, and the last, so that a proof
 still fits. The first scenes have more time than the first round, because processes start before them."""
@@ -78,11 +72,8 @@ still fits. The first scenes have more time than the first round, because proces
 LATE_SHARE = 0.03
 """What is under way then may take this share more, because a process that is ended takes seconds to come back."""
 
-PAGE_S = 6.0
-"""Seconds of the budget that are kept for the table, the picture and the page."""
-
-UNIT_SHARE = 0.01
-"""A unit of several settings takes about this share of the budget at most."""
+PAGE_S, UNIT_SHARE = 6.0, 0.01
+"""Seconds of the budget that are kept for the page, and the share that a unit of several settings takes at most, about."""
 
 SLOW, LEAST_LIMIT_S = 3.0, 40.0
 """A scene that takes this many times the longest of the job's own, and so many seconds of processor at least, is a time out."""
@@ -103,7 +94,7 @@ class Measurement:
     def __post_init__(self) -> None:
         """Splits the plan's settings."""
         self.targets = self.plan.targets or DEFAULT_TARGETS
-        self.split = split_settings(self.plan.settings, self.plan.job.captures is not None)
+        self.add(())
 
     @property
     def spent_s(self) -> float:
@@ -171,13 +162,15 @@ def run_study(plan: Plan, journal: Journal, progress: ProgressLine, began: float
         notes.append(f"not reached within the budget: {', '.join(late)}")
     for part in bench.split.measured:
         if rivals := undecided(table, part, bench.targets):
-            doubts.append(choose.describe_doubt(table, part, rivals))
+            names = [f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rivals]
+            doubts.append(
+                f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %: {', '.join(names)}"
+            )
     answer, chosen = choose.describe_answer(able, plan.targets, proofs, plan.job.scenes)
     return Study(
         job=plan.job.name,
         scenes=max(len(table.answers(part, OWN)) for part in bench.split.measured),
         rows=tuple(rows),
-        preset=plan.job.preset,
         job_scenes=plan.job.scenes,
         notes=tuple(notes),
         budget_s=plan.budget_s,
@@ -252,26 +245,20 @@ def combinations(bench: Measurement) -> list[Setting]:
     return together
 
 
-# ---------------------------------------------------------------------------------------------- the choice and its proof
-
-FRESH_SCENE = 1_000_000
-"""How far from the job's first scene those begin that prove a recommendation: no study measures them before."""
-
-PROVED = 200
-"""The most scenes of a proof; the fewest are `FEWEST_SCENES`."""
+FRESH_SCENE, PROVED = 1_000_000, 200
+"""How far from the job's first scene those begin that prove a recommendation, which no study measures before, and the most."""
 
 
 def crossed_rows(bench: Measurement, rows: Sequence[Row]) -> list[Row]:
-    """Of every setting that changes rest alone with every one that changes what is drawn alone."""
-    table, of = bench.table(), bench.split.of
-    alone: dict[Part, list[Setting]] = {"rest": [], "draw": []}
-    for setting in (row.setting for row in rows if row.setting.kind != "preset"):
-        changed = [part for part, some in of[setting.name].items() if some != OWN and part != UNTIMED]
-        if len(changed) == 1 and changed[0] in alone:
-            alone[changed[0]].append(setting)
-    pairs = itertools.product(alone["rest"], alone["draw"])
-    crossed = [table.row(joined(pair), {**of[pair[1].name], "rest": of[pair[0].name]["rest"]}) for pair in pairs]
-    return [row for row in crossed if row is not None and row not in rows]
+    """Of every setting that changes rest alone with every one that changes what is drawn alone; their parts were measured."""
+    known = [row.setting for row in rows if row.setting.kind in ("single", "several")]
+    resting, drawn = (
+        [some for some in known if all(key.startswith(AT_REST) == is_rest for key in some.changes)]
+        for is_rest in (True, False)
+    )
+    crossed = [joined(pair) for pair in itertools.product(resting, drawn)]
+    table = Table(split_settings((*bench.plan.settings, *crossed), bench.plan.job.captures is not None), bench.journal)
+    return [row for setting in crossed if (row := table.row(setting))]
 
 
 def choose_and_prove(bench: Measurement) -> tuple[list[Row], list[Row], list[Proof]]:

@@ -28,8 +28,6 @@ Answer = Mapping[str, Any]
 Answers = Mapping[int, Answer]
 """By scene."""
 
-# ---------------------------------------------------------------------------------------------- parts of a scene
-
 Part = str
 
 AT_REST = ("physics.", "start.", "assets.")
@@ -92,8 +90,6 @@ def split_settings(settings: Iterable[Setting], captured: bool) -> Split:
         measured["rest"] += REFERENCES
     return Split(measured, of)
 
-
-# ---------------------------------------------------------------------------------------------- over scenes
 
 PERCENTILE = 95.0
 """The percentile of the scenes' figures that is a setting's error."""
@@ -183,8 +179,6 @@ def _resampled(count: int) -> NDArray[np.int64]:
     return np.vstack([np.arange(count), samples])
 
 
-# ---------------------------------------------------------------------------------------------- errors of one setting
-
 AGREE_MM = 0.05
 """Two references agree where their poses are nearer than this; only then is there a true pose."""
 
@@ -232,9 +226,6 @@ def pose_error(answer: Answer, references: Sequence[Answer]) -> float | None:
 def _apart_mm(answer: Answer, other: Answer) -> float:
     mine, theirs = np.array(answer["corners"]), np.array(other["corners"])
     return float(np.linalg.norm(mine - theirs, axis=-1).max()) if mine.shape == theirs.shape else SCENE_MM
-
-
-# ---------------------------------------------------------------------------------------------- the table
 
 
 def unit_name(part: Part, scene_id: int, setting: Setting) -> str:
@@ -309,9 +300,9 @@ class Table:
         value, low, high = (1.0 + weight * (ratio - 1.0) for ratio in (figure.value, figure.low, figure.high))
         return Figure(value, low, high, low, high, figure.scenes)
 
-    def row(self, setting: Setting, of: Mapping[Part, Setting] | None = None) -> Row | None:
-        """A setting's row, put together of these settings of its parts; None where one of them has no time yet."""
-        mine = of or self.split.of[setting.name]
+    def row(self, setting: Setting) -> Row | None:
+        """A setting's row, put together of its parts; None where one of them has no time yet."""
+        mine = self.split.of[setting.name]
         changed = {part: changes for part, changes in mine.items() if changes != OWN}
         ratios = [self.ratio(part, changes) for part, changes in changed.items() if part != UNTIMED]
         known = [ratio for ratio in ratios if ratio is not None]
@@ -326,28 +317,9 @@ class Table:
         drawn = [self.answers(part, mine[part]).values() for part in ("draw", "capture") if part in mine]
         sizes = [answer["bytes"] for answers in drawn for answer in answers if "bytes" in answer]
         kilobytes = fmean(sizes) / 1e3 if sizes else 0.0
-        failed = self._failed_share(mine)
-        notes = self._notes(mine)
+        every = [self.answers(part, some).values() for part, some in mine.items()]
+        failed = max(sum("failed" in answer for answer in answers) / max(1, len(answers)) for answers in every)
+        failures = [answer for answers in every for answer in answers if "failed" in answer]
+        reasons = Counter(answer.get("broken", answer["failed"]) for answer in failures)
+        notes = tuple(f"{reason}: {plural(count, 'scene')}" for reason, count in sorted(reasons.items()))
         return Row(setting, self.own_ms * ratio, ratio, ratio - less, ratio + more, kilobytes, errors, failed, notes)
-
-    def _notes(self, mine: Mapping[Part, Setting]) -> tuple[str, ...]:
-        """The reasons of scenes that fail, with their counts; and where it was measured in fewer scenes than the job."""
-        answers = [answer for part, setting in mine.items() for answer in self.answers(part, setting).values()]
-        reasons = [answer.get("broken", answer["failed"]) for answer in answers if "failed" in answer]
-        notes = [f"{reason}: {plural(count, 'scene')}" for reason, count in sorted(Counter(reasons).items())]
-        counts = [(len(self.answers(part, setting)), len(self.answers(part, OWN))) for part, setting in mine.items()]
-        if fewer := [count for count, own in counts if count < own]:
-            notes.append(
-                f"measured in {min(fewer)} scenes and the job in more: percentiles are the job's, times the ratio in the same"
-            )
-        return tuple(notes)
-
-    def _failed_share(self, mine: Mapping[Part, Setting]) -> float:
-        """The share of scenes that fail, of rest or of a capture, and of those that are drawn more than the job's own."""
-        failed = {part: [self._failed(part, setting), self._failed(part, OWN)] for part, setting in mine.items()}
-        first, own = failed.get("rest") or failed["capture"], failed.get("draw", [0.0, 0.0])
-        return min(1.0, first[0] + max(0.0, own[0] - own[1]))
-
-    def _failed(self, part: Part, setting: Setting) -> float:
-        answers = self.answers(part, setting).values()
-        return sum("failed" in answer for answer in answers) / max(1, len(answers))

@@ -10,7 +10,6 @@ import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -34,31 +33,23 @@ from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Scene
 
-# ---------------------------------------------------------------------------------------------- rays
-
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""
-
-Index = NDArray[np.int64]
 
 SAME_M = 1e-4
 """A ray to a point meets it where z is this near: half of a stored unit, and a hundred times the error of Embree's float32
 rays at a grazing surface."""
 
-SPREAD_PIXELS = 19_200
-"""The most pixels, about, that are cast evenly over the image: a sixteenth of 640 x 480."""
-
-SPREAD_SEED = 0x5B4EAD
+SPREAD_PIXELS, SPREAD_SEED = 19_200, 0x5B4EAD
+"""Pixels at random that are cast all over the image, as many as a sixteenth of 640 x 480, and their random stream. A grid would
+fall in step with the pattern of pixels that a projection fills."""
 
 DENSE = 256
 """Rays along each side of the box about the objects: 16 in a pixel and more while that box has at most 4,096 of a 640 x 480
 image's pixels, as the objects of the built-in jobs have."""
 
-BETWEEN = 4096
-"""Rays at random in the objects' patch. A median of as many is off by 2 % of the spread."""
-
-BETWEEN_SEED = 0x0B5E55ED
-"""The random stream of those rays, which no job's seed reaches."""
+BETWEEN, BETWEEN_SEED = 4096, 0x0B5E55ED
+"""Rays at random in the objects' patch, and their random stream. A median of as many is off by 2 % of the spread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +59,8 @@ class Seen:
     rows [N], columns [N] int64; depth_m [N] float64, z along the optical axis, 0 without a hit; region [N] uint8.
     """
 
-    rows: Index
-    columns: Index
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
     depth_m: Array
     region: NDArray[np.uint8]
 
@@ -151,22 +142,10 @@ def cast_pixels(things: Sequence[Placed], camera: Camera) -> Pixels:
     eye = Eye(things, camera)
     left, top, right, bottom = eye.box() or (0.0, 0.0, 0.0, 0.0)
     rows, columns = np.mgrid[math.floor(top) : math.ceil(bottom), math.floor(left) : math.ceil(right)]
-    places = (rows.ravel(), columns.ravel()), _spread(eye.k.width, eye.k.height)
+    random = np.random.default_rng([SPREAD_SEED, eye.k.width, eye.k.height])
+    spread = np.divmod(random.permutation(eye.k.height * eye.k.width)[:SPREAD_PIXELS], eye.k.width)
+    places = (rows.ravel(), columns.ravel()), spread
     return Pixels(*(Seen(v, u, *eye.cast(u.astype(float) + 0.5, v.astype(float) + 0.5)) for v, u in places))
-
-
-@cache
-def _spread(width: int, height: int) -> tuple[Index, Index]:
-    """(rows, columns) of about `SPREAD_PIXELS` pixels: one at random in each square of pixels, the same in every image.
-
-    A grid would fall in step with the pattern of pixels that a projection fills.
-    """
-    step = max(1, round(math.sqrt(width * height / SPREAD_PIXELS)))
-    rows, columns = (corner.ravel() for corner in np.mgrid[0:height:step, 0:width:step])
-    within = np.random.default_rng([SPREAD_SEED, width, height]).integers(step, size=(2, len(rows)))
-    rows, columns = rows + within[0], columns + within[1]
-    there = (rows < height) & (columns < width)
-    return rows[there], columns[there]
 
 
 def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
@@ -206,9 +185,6 @@ def seen_by_other(things: Sequence[Placed], camera: Camera, seen: Seen, other: C
     return both
 
 
-# ---------------------------------------------------------------------------------------------- colour
-
-
 def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
     """The mean of FLIP's map, from 0 for equal images to 1. Both are [H, W, 3] uint8 sRGB of one size. Raises ValueError."""
     import flip_evaluator  # of the extra `study`
@@ -224,15 +200,11 @@ def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
 WIDTH, HEIGHT = 640, 480
 """The size of the image that colours are compared at, whatever the size of the image under test. Only a crop is traced."""
 
-MARGIN_SHARE = 0.25
-MARGIN_PX = 4
+MARGIN_SHARE, MARGIN_PX = 0.25, 4
 """Margin about the objects that is compared too, because their contact shadows fall there."""
 
-BOUNCES = 16
-"""Bounces of the truth's paths, whatever the job's: glass before glass takes eight."""
-
-TRUTH_SEED = 0xC0107
-"""The random stream of the truth's paths, which no job's seed reaches."""
+BOUNCES, TRUTH_SEED = 16, 0xC0107
+"""Bounces of the truth's paths, whatever the job's, as glass before glass takes eight; and their random stream."""
 
 
 class Crop(NamedTuple):

@@ -15,7 +15,7 @@ from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
 from workers.capture.board import PREDEFINED, Geometry, board_geometry, id_words
 from workers.geometry.colour import SRGB_STEPS
-from workers.geometry.lens import project_points, rays_of_pixels
+from workers.geometry.pixels import project_points, rays_of_pixels
 
 SAMPLES = 24
 """Profiles across one edge."""

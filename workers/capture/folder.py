@@ -34,7 +34,7 @@ from schemas.job.captures import Board, BoardFrame
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
 from workers.door.recordings.pictures import PictureError, change_camera, decode_depth, pinhole_maps, remap
-from workers.geometry.lens import pixel_rays
+from workers.geometry.pixels import pixel_rays
 from workers.geometry.zbuffer import register_depth
 from workers.store.images import encode_mask, encode_png
 

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,33 +49,25 @@ ROUGHNESS = 0.8
 NOTE = "reconstructed from a capture: what no view saw, and what lies below the clearance above the board, is missing"
 
 
-@dataclass(frozen=True)
-class CaptureNames:
-    """What an object is called: the capture's instance id, category, licence, and `source` of its shape."""
-
-    instance_id: str
-    category: str
-    licence: str
-    source: str
-
-
-def reconstructed_asset(found: Reconstruction, names: CaptureNames, settings: Assets) -> tuple[Asset, Pose]:
+def reconstructed_asset(
+    surface: Reconstruction, names: tuple[str, str, str, str], settings: Assets
+) -> tuple[Asset, Pose]:
     """The merged mesh in its object frame, and T_board_obj [4, 4]: the origin at the middle of the bounding box.
 
-    The axes are the board's. Mass is that of a thin shell, unless the mesh is closed.
+    The axes are the board's. Mass is that of a thin shell, unless the mesh is closed. `names`: as `_asset` has them.
     """
-    centre = 0.5 * (found.vertices.min(axis=0) + found.vertices.max(axis=0))
-    opaque = np.full((len(found.vertex_colors), 1), 255, np.uint8)
+    centre = 0.5 * (surface.vertices.min(axis=0) + surface.vertices.max(axis=0))
+    opaque = np.full((len(surface.vertex_colors), 1), 255, np.uint8)
     part = Part(
         "surface",
-        frozen_array(found.vertices - centre),
-        frozen_array(found.faces, np.int32),
+        frozen_array(surface.vertices - centre),
+        frozen_array(surface.faces, np.int32),
         Material(base_color=(1.0, 1.0, 1.0, 1.0), roughness=ROUGHNESS),
-        colors=frozen_array(np.concatenate([found.vertex_colors, opaque], axis=1), np.uint8),
+        colors=frozen_array(np.concatenate([surface.vertex_colors, opaque], axis=1), np.uint8),
     )
     shape = Shape((part,), closed=is_solid(part.vertices, part.faces.astype(np.int64)))
-    T_board_obj = frozen_array(translation(*centre))
-    return _asset(names, shape, settings, frozen_array(translation(*-centre)), (NOTE,)), T_board_obj
+    asset = _asset(names, shape, settings, NOTE)
+    return replace(asset, T_source_to_object=frozen_array(translation(*-centre))), frozen_array(translation(*centre))
 
 
 def board_asset(board: Board, settings: Assets) -> Asset:
@@ -87,29 +79,29 @@ def board_asset(board: Board, settings: Assets) -> Asset:
     if board.markers:
         keys = board.model_dump_json(exclude=board.unwritten)
         size = f"{len(board.markers)}-markers-{hashlib.sha256(keys.encode()).hexdigest()[:8]}"
-    names = CaptureNames(f"{board.dictionary}-{size}", BOARD, "CC0-1.0", BOARD)
-    return _asset(names, shape, settings, frozen_array(np.eye(4)), ("its markers are not drawn",))
+    names = f"{board.dictionary}-{size}", BOARD, "CC0-1.0", BOARD
+    return _asset(names, shape, settings, "its markers are not drawn")
 
 
-def _asset(
-    names: CaptureNames, shape: Shape, settings: Assets, T_source_to_object: Pose, notes: tuple[str, ...]
-) -> Asset:
+def _asset(names: tuple[str, str, str, str], shape: Shape, settings: Assets, note: str) -> Asset:
+    """`names`: instance id, category, licence, and `source` of the shape."""
+    instance_id, category, licence, source = names
     mass = mass_properties(shape, settings.density_kg_m3, settings.shell_kg_m2)
     return Asset(
-        instance_id=names.instance_id,
-        category=names.category,
-        source=names.source,
-        licence=names.licence,
+        instance_id=instance_id,
+        category=category,
+        source=source,
+        licence=licence,
         path=None,
         sha256=shape_digest(shape),
         shape=shape,
         mass=mass,
-        T_source_to_object=T_source_to_object,
+        T_source_to_object=frozen_array(np.eye(4)),
         scale=1.0,
         watertight=mass.solid,
         volume_m3=mass.mass_kg / settings.density_kg_m3 if mass.solid else None,
         shareable=True,
-        notes=notes,
+        notes=(note,),
     )
 
 
@@ -118,10 +110,10 @@ def process_capture(folder: CaptureFolder, captures: Captures, watch: Stopwatch)
     with watch.stage("read"):
         given = given_files(folder, captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
-    views = CaptureViews(given, estimates.estimate, captures, merged.body)
+    views = CaptureViews(given, captures, estimates.estimate, merged.surface, merged.body)
     with watch.stage("score"):
         truth = read_whole_truth(folder)
-        score = None if truth is None else score_capture(estimates.estimate, merged.surface, views, truth).summary
+        score = None if truth is None else score_capture(views, truth).summary
     return ProcessedCapture(
         name=folder.about.name,
         category=folder.about.category,
@@ -146,39 +138,30 @@ SOURCE, SIMULATED = "capture", "simulated_capture"
 """`scenes.source` and `assets.source` of captures; those of scenes are the source of the shape."""
 
 
-@dataclass(frozen=True)
-class Opened:
-    """A folder to process, the name of its object where the job knows it, and where it came from."""
-
-    path: Path
-    name: str | None
-    origin: Origin
-
-
 def run_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> SceneOutput:
     """Simulate or open, estimate, merge, draw the mirror views, score, record. Raises SceneError where it cannot be used."""
     job, captures = context.job, require_captures(context.job)
-    with open_capture(context, scene_id, watch) as opened:
-        folder = open_folder(opened.path)
+    with open_capture(context, scene_id, watch) as origin:
+        folder = open_folder(origin.path)
         done = process_capture(folder, captures, watch)
-        done = replace(done, name=opened.name or done.name)
+        done = replace(done, name=origin.name or done.name)
         category = done.category if "category" in folder.about.model_fields_set else UNNAMED
         with watch.stage("labels"):
-            source = SOURCE if read_truth(opened.path) is None else SIMULATED
+            source = SOURCE if read_truth(origin.path) is None else SIMULATED
             thing = place_capture(job, scene_id, done, category, source)
-        return record_capture(context, thing, done, opened.origin, make_pairs(context, thing, done, watch), watch)
+        return record_capture(context, thing, done, origin, make_pairs(context, thing, done, watch), watch)
 
 
 def place_capture(job: Job, scene_id: int, done: ProcessedCapture, category: str, source: str) -> CapturedObject:
     """The reconstructed object and the board as assets, where they are. Each capture of an object is an instance."""
-    names = CaptureNames(f"{done.name}-{scene_id:05d}", category, done.licence, source)
+    names = f"{done.name}-{scene_id:05d}", category, done.licence, source
     asset, T_world_obj = reconstructed_asset(done.surface, names, job.assets)
     board = board_asset(done.board, job.assets)
     return CapturedObject(scene_id, asset, T_world_obj, done.board, board, image_effects(job))
 
 
 @contextmanager
-def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Iterator[Opened]:
+def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Iterator[Origin]:
     """The folder of a capture: one of the job's, or a simulated one that is gone afterwards."""
     captures = require_captures(context.job)
     if captures.folders:
@@ -186,14 +169,14 @@ def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Ite
         with watch.stage("read"):
             if digest_inputs(listing.folder) != listing.sha256:
                 raise CaptureError("changed", f"{listing.folder} does not hold what it held when the run began")
-        yield Opened(listing.folder, None, Origin(False, listing.sha256))
+        yield Origin(listing.folder, None, listing.sha256)
         return
     with temporary_folder("capture") as scratch:
         path = scratch / "capture"
         with watch.stage("simulate"):
             instance_id = simulate_one(context, scene_id, path)
-            ran, skipped = read_receipt(path)
-        yield Opened(path, instance_id, Origin(True, None, ran, skipped))
+            effects, skipped = read_receipt(path)
+        yield Origin(path, instance_id, None, effects, skipped)
 
 
 def simulate_one(context: WorkerContext, scene_id: int, path: Path) -> str:
@@ -216,11 +199,11 @@ def make_pairs(
             with watch.stage("views"):
                 images = done.images(number)
                 pair = make_capture_pair(context.job, thing, images, at, done.synthesize, context.renderer.count_pixels)
-            one: CapturedPair | LeftOut = with_targets(context.job, thing, pair, watch)
+            item: CapturedPair | LeftOut = with_targets(context.job, thing, pair, watch)
             made += 1
         except (ViewError, CaptureError) as error:
-            one = LeftOut(number, "no_pair", error.detail)
-        yield one
+            item = LeftOut(number, "no_pair", error.detail)
+        yield item
     for number in sorted(set(used) - set(chosen)):
         yield LeftOut(number, "spare", f"pairs_per_scene is {context.job.pairs_per_scene}")
     if not made:

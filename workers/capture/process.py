@@ -4,6 +4,7 @@ import io
 import json
 from collections import OrderedDict
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -42,10 +43,10 @@ from workers.capture.folder import (
 from workers.capture.reconstruct import (
     Given,
     Merged,
-    ProcessorClock,
     corrections_of,
     estimate_surface,
     given_files,
+    processor_clock,
     read_posed,
 )
 from workers.capture.results import (
@@ -55,9 +56,8 @@ from workers.capture.results import (
     PROCESS_FILE,
     cloud_ply,
     mesh_ply,
-    read_cloud,
-    read_mesh,
     read_record,
+    read_surface,
     write_results,
 )
 from workers.capture.surface.object_mask import Ground, down_to_board, silhouette
@@ -65,27 +65,28 @@ from workers.capture.surface.posed_view import PosedView, distort_mask
 from workers.capture.surface.synthesize import Source, choose_sources, move_depth, prepare_source, synthesize_view
 from workers.capture.surface.tsdf import fit_depth
 from workers.geometry.pixels import round_depth
+from workers.scene.context import Stopwatch
 from workers.scene.pairs import front_distance, place_mirror_camera
 from workers.store.images import encode_mask, encode_png
 
-_f64, _i64, _str = pa.float64(), pa.int64(), pa.string()
-_OF_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv")
+_VIEWS = SCHEMAS["views"]
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv")
 
 SCHEMA = pa.schema(
     [
-        pa.field("number", _i64, False),
-        pa.field("estimate", _str, False),
+        pa.field("number", pa.int64(), False),
+        pa.field("estimate", pa.string(), False),
         pa.field("chosen", pa.bool_(), False),
-        pa.field("status", _str, False),
-        pa.field("reasons", pa.list_(_str), False),
-        SCHEMAS["views"].field("T_world_cam").with_nullable(True),
-        *(SCHEMAS["views"].field(name) for name in _OF_CAMERA),
-        pa.field("markers", _i64, False),
+        pa.field("status", pa.string(), False),
+        pa.field("reasons", pa.list_(pa.string()), False),
+        _VIEWS.field("T_world_cam").with_nullable(True),
+        *(_VIEWS.field(name) for name in _CAMERA),
+        pa.field("markers", pa.int64(), False),
         *(
-            pa.field(name, _f64)
+            (name, pa.float64())
             for name in ("reprojection_before_px", "reprojection_px", "depth_before_mm", "depth_mm")
         ),
-        *(pa.field(name, _f64) for name in ("sigma_mm", "sigma_deg")),
+        *((name, pa.float64()) for name in ("sigma_mm", "sigma_deg")),
     ]
 )
 """Camera columns are those of the table `views` of a dataset, the board frame being the world; `before` is by markers alone.
@@ -120,11 +121,11 @@ def pose_table(estimates: Estimates, camera: CaptureCamera) -> bytes:
 
 
 def _pose_row(view: ViewEstimate, before: ViewEstimate | None, camera: CaptureCamera) -> Row:
-    columns = camera_columns(Camera(camera.intrinsics, np.eye(4) if view.T_board_cam is None else view.T_board_cam))
+    pose = np.eye(4) if view.T_board_cam is None else view.T_board_cam
     sigma_mm, sigma_deg = _sigmas(view)
     return {
-        **columns,
-        "T_world_cam": None if view.T_board_cam is None else columns["T_world_cam"],
+        **camera_columns(Camera(camera.intrinsics, pose)),
+        **({"T_world_cam": None} if view.T_board_cam is None else {}),
         **residual_columns(view, before),
         "status": view.status,
         "reasons": list(view.reasons),
@@ -169,17 +170,12 @@ def read_poses(path: Path) -> tuple[ViewEstimate, ...]:
 
 @dataclass(frozen=True, eq=False)
 class ProcessedFolder:
-    """What processing found and wrote; `users`: files that the user gave and that stayed."""
+    """What processing made and wrote; `users`: files that the user gave and that stayed."""
 
     estimates: Estimates
     merged: Merged
     seconds: Mapping[str, float]
     users: tuple[str, ...]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What the user must know of poses and surface."""
-        return self.estimates.estimate.notes
 
 
 def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
@@ -188,23 +184,21 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     Started again on the same folder it writes the same bytes, but for the seconds in process.json. Raises CaptureError where
     the capture cannot be used; nothing is written then.
     """
-    watch = ProcessorClock()
+    watch = processor_clock()
     with watch.stage("read"):
-        folder = open_folder(path)
-        given = given_files(folder, captures.estimation)
+        given = given_files(open_folder(path), captures.estimation)
     estimates, merged = estimate_surface(given, captures, watch)
     with watch.stage("masks"):
         files = {**_pose_files(given, estimates), **_mask_files(given, estimates.estimate, merged.body)}
     surface = merged.surface
     with watch.stage("encode"):
-        files[CLOUD_FILE] = cloud_ply(surface.points, surface.normals, surface.colors, surface.views)
-        files[MESH_FILE] = mesh_ply(surface.vertices, surface.faces, surface.vertex_colors)
+        files[CLOUD_FILE] = cloud_ply(surface)
+        files[MESH_FILE] = mesh_ply(surface)
         files[POSES_FILE] = pose_table(estimates, given.folder.camera)
     seconds = {name: round(s, 3) for name, s in _all_seconds(estimates, watch).items()}
-    masks = [f"mask_{number:05d}.png" for number in folder.numbers if given.has_mask(number)]
-    stayed = write_results(
-        path, files, _record(captures, estimates, merged, given.folder.camera) | {"seconds": seconds}
-    )
+    masks = [f"mask_{number:05d}.png" for number in given.folder.numbers if given.has_mask(number)]
+    record = _record(captures, estimates.estimate, merged, given.folder.camera) | {"seconds": seconds}
+    stayed = write_results(path, files, record)
     return ProcessedFolder(estimates, merged, seconds, tuple(sorted([*stayed, *masks])))
 
 
@@ -227,35 +221,25 @@ def _mask_files(given: Given, estimate: CaptureEstimate, body: Mesh) -> dict[str
     return files
 
 
-def _all_seconds(estimates: Estimates, watch: ProcessorClock) -> dict[str, float]:
+def _all_seconds(estimates: Estimates, watch: Stopwatch) -> dict[str, float]:
     """Seconds of processor time by stage, those of the estimates in place of their sum."""
-    own: dict[str, float] = {f"poses_{name}": s for name, s in estimates.seconds.items()}
+    seconds: dict[str, float] = {f"poses_{name}": s for name, s in estimates.seconds.items()}
     for name, estimate in estimates.by_name.items():
-        own[f"poses_{name}"] = sum(estimate.seconds.values())
+        seconds[f"poses_{name}"] = sum(estimate.seconds.values())
     rest = {name: s for name, s in watch.seconds.items() if name != "estimate"}
-    return {**own, **rest, "total": sum(watch.seconds.values())}
+    return {**seconds, **rest, "total": sum(watch.seconds.values())}
 
 
-def _record(captures: Captures, estimates: Estimates, merged: Merged, camera: CaptureCamera) -> dict[str, Any]:
+def _record(captures: Captures, chosen: CaptureEstimate, merged: Merged, camera: CaptureCamera) -> dict[str, Any]:
     """process.json without the seconds and the files."""
-    chosen, region = estimates.estimate, merged.region
-    depth = chosen.depth
+    region = merged.region
     return {
         "settings": captures.model_dump(mode="json", include={"estimation", "fusion", "synthesis"}),
         "camera": describe_camera(camera).model_dump(mode="json"),
         "estimate": chosen.estimate,
-        "depth": {
-            "offset_m": depth.offset_m,
-            "scale": depth.scale,
-            "T_cam_depth": depth.T_cam_depth.tolist(),
-            "identified": list(depth.identified),
-        },
+        "depth": vars(chosen.depth) | {"T_cam_depth": chosen.depth.T_cam_depth.tolist()},
         "print_scale": chosen.print_scale,
-        "board_as_measured": {
-            "plane": list(region.plane),
-            "spread_m": region.spread_m,
-            "clearance_m": region.clearance_m,
-        },
+        "board_as_measured": {name: getattr(region, name) for name in ("plane", "spread_m", "clearance_m")},
         "hidden_by_clearance": merged.hidden_share,
         "cloud_points": len(merged.surface.points),
         "mesh_faces": len(merged.surface.faces),
@@ -269,13 +253,17 @@ KEPT = 12
 
 @dataclass(eq=False)
 class CaptureViews:
-    """Reads and prepares views when they are needed, and keeps the latest. `body` is the object down to the board."""
+    """A processed capture: the final poses, the surface, and `body`, the object down to the board.
+
+    Views are read and prepared when they are needed, and the latest are kept.
+    """
 
     given: Given
-    estimate: CaptureEstimate
     captures: Captures
+    estimate: CaptureEstimate
+    surface: Reconstruction
     body: Mesh
-    _sources: OrderedDict[int, Source] = field(default_factory=OrderedDict)
+    _sources: OrderedDict[int, Source] = field(init=False, default_factory=OrderedDict)
 
     def __post_init__(self) -> None:
         self.cameras = {
@@ -312,14 +300,14 @@ class CaptureViews:
         chosen = choose_sources(axes, camera, self.captures.synthesis)
         return synthesize_view([self._source(number) for number in chosen], camera)
 
-    def mirror(self, number: int, mirror: Mirror | None = None) -> tuple[Camera, float, SynthesizedView]:
+    def mirror(self, number: int) -> tuple[Camera, float, SynthesizedView]:
         """(camera, d_z in metres, view) from the other side of the object, half a turn about the board's normal.
 
         d_z comes from the object's own depth pixels. Raises ViewError where the view has none, CaptureError.
         """
         images = self.images(number)
-        d_z = front_distance(images.depth_m, images.mask, mirror or Mirror())
-        camera = place_mirror_camera(images.camera, d_z, mirror or Mirror())
+        d_z = front_distance(images.depth_m, images.mask, Mirror())
+        camera = place_mirror_camera(images.camera, d_z, Mirror())
         return camera, d_z, self.synthesize(camera)
 
     def _source(self, number: int) -> Source:
@@ -333,18 +321,7 @@ class CaptureViews:
         return self._sources[number]
 
 
-@dataclass(frozen=True, eq=False)
-class StoredResult:
-    """The folder, the settings it was processed with, the estimate with its final poses, the surface, and its views."""
-
-    folder: CaptureFolder
-    captures: Captures
-    estimate: CaptureEstimate
-    surface: Reconstruction
-    views: CaptureViews
-
-
-def read_result(path: Path) -> StoredResult:
+def read_result(path: Path) -> CaptureViews:
     """What processing wrote. Raises CaptureError where the folder was not processed, or a file is missing or damaged."""
     folder, record = open_folder(path), read_record(path)
     if record is None:
@@ -353,63 +330,56 @@ def read_result(path: Path) -> StoredResult:
         captures = Captures.model_validate(record["settings"])
         if captures.estimation.calibrate:
             folder = replace(folder, camera=camera_of(CameraFile.model_validate(record["camera"])))
-        estimate = _estimate(path, record)
-        ground = Ground(tuple(record["board_as_measured"]["plane"]), float(record["board_as_measured"]["clearance_m"]))
+        depth, board = record["depth"], record["board_as_measured"]
+        correction = DepthCorrection(
+            float(depth["offset_m"]),
+            float(depth["scale"]),
+            frozen_array(depth["T_cam_depth"]),
+            tuple(depth["identified"]),
+        )
+        ground = Ground(tuple(board["plane"]), float(board["clearance_m"]))
+        estimate = CaptureEstimate(record["estimate"], read_poses(path), correction, float(record["print_scale"]))
     except (KeyError, TypeError, ValueError) as error:
         raise CaptureError("unreadable", f"{path / PROCESS_FILE} is damaged ({error!r}): process it again") from error
-    points, normals, colors, views = read_cloud(path)
-    vertices, faces, vertex_colors = read_mesh(path)
-    surface = Reconstruction(points, normals, colors, views, vertices, faces, vertex_colors)
-    body = down_to_board(Mesh(vertices, faces), ground)
-    return StoredResult(
-        folder, captures, estimate, surface, CaptureViews(given_files(folder), estimate, captures, body)
-    )
-
-
-def _estimate(path: Path, record: dict[str, Any]) -> CaptureEstimate:
-    depth = record["depth"]
-    correction = DepthCorrection(
-        float(depth["offset_m"]), float(depth["scale"]), frozen_array(depth["T_cam_depth"]), tuple(depth["identified"])
-    )
-    return CaptureEstimate(record["estimate"], read_poses(path), correction, float(record["print_scale"]))
+    surface = read_surface(path)
+    body = down_to_board(Mesh(surface.vertices, surface.faces), ground)
+    return CaptureViews(given_files(folder), captures, estimate, surface, body)
 
 
 FARTHEST_UNITS = 65_535.0
 
 
-def write_synthesized(result: StoredResult, T_board_cam: Pose, out: Path, number: int = 0) -> dict[str, Any]:
+def write_synthesized(result: CaptureViews, T_board_cam: Pose, out: Path, number: int = 0) -> dict[str, Any]:
     """The view from one pose. Returns what is said of it; raises CaptureError where nothing is seen from there."""
     camera = Camera(result.folder.camera.intrinsics, frozen_array(T_board_cam))
-    return _finish(result, out, [_write(result, result.views.synthesize(camera), camera, out, number)])[0]
+    return _finish(result, out, [_write(result, result.synthesize(camera), camera, out, number)])[0]
 
 
-def write_mirrors(result: StoredResult, out: Path) -> list[dict[str, Any]]:
+def write_mirrors(result: CaptureViews, out: Path) -> list[dict[str, Any]]:
     """The mirror view of every used view, with the number of that view; views that see nothing of the object have none."""
     made = []
     for view in result.estimate.used:
-        try:
-            camera, d_z, shown = result.views.mirror(view.number)
-        except (ViewError, CaptureError):
-            continue
-        made.append(_write(result, shown, camera, out, view.number) | {"d_z_m": d_z})
+        with suppress(ViewError, CaptureError):
+            camera, d_z, shown = result.mirror(view.number)
+            made.append(_write(result, shown, camera, out, view.number) | {"d_z_m": d_z})
     return _finish(result, out, made)
 
 
-def _write(result: StoredResult, view: SynthesizedView, camera: Camera, out: Path, number: int) -> dict[str, Any]:
+def _write(result: CaptureViews, view: SynthesizedView, camera: Camera, out: Path, number: int) -> dict[str, Any]:
     if out.resolve() == result.folder.path.resolve():
         raise OutputError(f"{out} is the capture itself: name another folder")
     out.mkdir(parents=True, exist_ok=True)
     units = result.folder.camera.depth_units_per_m
     depth = round_depth(view.depth_m, 0.0, FARTHEST_UNITS / units, units)
-    (out / f"rgb_{number:05d}.png").write_bytes(encode_png(view.rgb))
-    (out / f"depth_{number:05d}.png").write_bytes(encode_png(depth))
-    (out / f"mask_{number:05d}.png").write_bytes(encode_mask(view.mask))
-    (out / f"measured_{number:05d}.png").write_bytes(encode_mask(view.measured))
+    files = {"rgb": encode_png(view.rgb), "depth": encode_png(depth)}
+    files |= {"mask": encode_mask(view.mask), "measured": encode_mask(view.measured)}
+    for kind, data in files.items():
+        (out / f"{kind}_{number:05d}.png").write_bytes(data)
     write_pose(out / f"board_{number:05d}.txt", camera.T_world_cam)
     return {"name": f"{number:05d}", "measured_share": view.measured_share, "sources": list(view.sources)}
 
 
-def _finish(result: StoredResult, out: Path, made: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _finish(result: CaptureViews, out: Path, made: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """views.json: the pinhole camera, pixel centres at 0.5, and what is said of each view."""
     if made:
         k = result.folder.camera.intrinsics

@@ -3,16 +3,14 @@
 What the user wrote into the folder wins over every estimate.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.base import Pose, frozen_array
-from schemas.capture import CaptureEstimate, Detection, Estimates, Reconstruction, ViewEstimate
+from schemas.base import Pose
+from schemas.capture import CaptureEstimate, Estimates, Reconstruction
 from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Captures, Estimate, Estimation, Fusion
 from schemas.scene.shape import Mesh
@@ -31,7 +29,6 @@ from workers.geometry.frames import invert
 from workers.geometry.mesh import face_areas
 from workers.scene.context import Stopwatch
 
-MANUAL = "its pose is that of the manual correction"
 FEW_POINTS = 500
 """The user is told of a cloud with fewer."""
 
@@ -74,59 +71,26 @@ def given_files(folder: CaptureFolder, spec: Estimation | None = None) -> Given:
     given = Given(folder, own_files(folder.path))
     if spec is None or not spec.calibrate:
         return given
-    camera = estimate_joint(_observe(given, spec, ProcessorClock())[1]).camera
+    camera = estimate_joint(_observe(given, spec, processor_clock())).camera
     if camera is None:
         return given
     note = f"the camera is the markers' in place of camera.json's: {compare_cameras(camera, folder.camera)}"
     return replace(given, folder=replace(folder, camera=camera), notes=(note,))
 
 
-def board_poses(given: Given, estimates: Estimates) -> dict[int, Pose]:
-    """T_board_cam of `board_` files by view: the user's, else that of the markers, else of the chosen estimate."""
-    views = (*estimates.estimate.views, *estimates.by_markers.values())
-    poses: dict[int, Pose] = {view.number: view.T_board_cam for view in views if view.T_board_cam is not None}
-    for number in given.folder.numbers:
-        if (T := given.pose("board", number)) is not None:
-            poses[number] = T
-    return poses
-
-
-def correct_manually(given: Given, estimates: Estimates) -> Estimates:
-    """The estimates, whose chosen one has the user's poses where correction_ files are the user's: correction · board.
-
-    Raises CaptureError for a correction of a view that has no pose to be corrected.
-    """
-    corrections = {n: T for n in given.folder.numbers if (T := given.pose("correction", n)) is not None}
-    if not corrections:
-        return estimates
-    boards = board_poses(given, estimates)
-    if lost := sorted(set(corrections) - set(boards)):
-        name = f"correction_{lost[0]:05d}.txt"
-        raise CaptureError(
-            "correction", f"{name} corrects a pose that is not known: write board_{lost[0]:05d}.txt, or delete {name}"
-        )
-    chosen = estimates.estimate
-
-    def corrected(view: ViewEstimate) -> ViewEstimate:
-        if view.number not in corrections:
-            return view
-        T = frozen_array(corrections[view.number] @ boards[view.number])
-        return replace(view, status="used", T_board_cam=T, covariance=None, reasons=(*view.reasons, MANUAL))
-
-    views = tuple(corrected(view) for view in chosen.views)
-    note = f"{len(corrections)} pose{'s' * (len(corrections) > 1)} from manual corrections"
-    made: CaptureEstimate = replace(chosen, views=views, notes=(*chosen.notes, note))
-    return replace(estimates, by_name={**estimates.by_name, estimates.chosen: made})
-
-
 def corrections_of(given: Given, estimates: Estimates) -> dict[int, tuple[Pose, Pose]]:
-    """(board, correction) of each view with a pose in the chosen estimate: T_board_cam = correction · board."""
-    boards = board_poses(given, estimates)
-    return {
-        view.number: (boards[view.number], view.T_board_cam @ invert(boards[view.number]))
-        for view in estimates.estimate.views
-        if view.T_board_cam is not None
-    }
+    """(board, correction) of each view with a pose in the chosen estimate: T_board_cam = correction · board.
+
+    `board` is the user's, else that of the markers, else the pose itself.
+    """
+    pairs = {}
+    for view in estimates.estimate.views:
+        if view.T_board_cam is not None:
+            markers = estimates.by_markers.get(view.number, view)
+            known = (given.pose("board", view.number), markers.T_board_cam, view.T_board_cam)
+            board = next(T for T in known if T is not None)
+            pairs[view.number] = board, view.T_board_cam @ invert(board)
+    return pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +100,7 @@ class Merged:
     region: ObjectRegion
     surface: Reconstruction
     body: Mesh
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def hidden_share(self) -> float:
@@ -147,13 +111,13 @@ class Merged:
 
 def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedView:
     """One view with its pose in an estimate; the mask is the user's. Raises CaptureError where it has no pose or no depth."""
-    own = next(view for view in estimate.views if view.number == number)
-    if own.T_board_cam is None:
-        raise CaptureError("no_pose", f"view {number} has no pose: {'; '.join(own.reasons)}")
+    view = next(view for view in estimate.views if view.number == number)
+    if view.T_board_cam is None:
+        raise CaptureError("no_pose", f"view {number} has no pose: {'; '.join(view.reasons)}")
     stored = read_view(given.folder, number)
     if not given.has_mask(number):
         stored = replace(stored, mask=None)
-    return pose_view(stored, given.folder.camera, own.T_board_cam, estimate.depth)
+    return pose_view(stored, given.folder.camera, view.T_board_cam, estimate.depth)
 
 
 def read_used(given: Given, estimate: CaptureEstimate) -> Iterator[PosedView]:
@@ -165,9 +129,8 @@ def read_used(given: Given, estimate: CaptureEstimate) -> Iterator[PosedView]:
                 yield posed
 
 
-def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: Stopwatch | None = None) -> Merged:
+def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: Stopwatch) -> Merged:
     """Merge the used views. Raises CaptureError where no view has depth, or no object is found or confirmed."""
-    watch = watch or Stopwatch()
     with watch.stage("read"):
         views = list(read_used(given, estimate))
     if not views:
@@ -180,39 +143,28 @@ def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: St
         region = find_object(views, given.folder.board, spec)
     with watch.stage("fuse"):
         surface = fuse_views(views, region, spec)
-    notes, missing, points = [*region.notes], len(estimate.used) - len(views), surface.points
+    merged = Merged(region, surface, down_to_board(Mesh(surface.vertices, surface.faces), region))
+    return replace(merged, notes=(*region.notes, *_notes(merged, len(estimate.used) - len(views))))
+
+
+def _notes(merged: Merged, missing: int) -> Iterator[str]:
+    """What the user must know of a surface; `missing` used views have no depth."""
+    points, region = merged.surface.points, merged.region
     if missing:
-        notes.append(f"{missing} used views have no depth")
+        yield f"{missing} used views have no depth"
     if len(points) < FEW_POINTS:
-        extent = 1e3 * np.ptp(points, axis=0).max(initial=0.0) if len(points) else 0.0
-        notes.append(
-            f"the cloud has {len(points)} points over {extent:.0f} mm: the object is small, or has little depth"
+        extent = 1e3 * np.ptp(points, axis=0).max() if len(points) else 0.0
+        yield f"the cloud has {len(points)} points over {extent:.0f} mm: the object is small, or has little depth"
+    if merged.hidden_share > MUCH_HIDDEN:
+        yield (
+            f"{merged.hidden_share:.0%} of the surface lies within {region.clearance_m * 1e3:.1f} mm of the board and is not "
+            f"in the cloud: fusion.board_clearance_m may be as little as {region.floor_m * 1e3:.1f} mm here"
         )
-    body = down_to_board(Mesh(surface.vertices, surface.faces), region)
-    merged = Merged(region, surface, body, tuple(notes))
-    if merged.hidden_share <= MUCH_HIDDEN:
-        return merged
-    told = (
-        f"{merged.hidden_share:.0%} of the surface lies within {region.clearance_m * 1e3:.1f} mm of the board and is not in the "
-        f"cloud: fusion.board_clearance_m may be as little as {region.floor_m * 1e3:.1f} mm here"
-    )
-    return replace(merged, notes=(*notes, told))
 
 
-@dataclass(frozen=True)
-class ProcessorClock(Stopwatch):
-    """A stopwatch that counts this process's own time, all its threads together."""
-
-    @contextmanager
-    def _time(self, *entries: tuple[dict[str, float], str | None]) -> Iterator[None]:
-        begun = time.process_time()
-        try:
-            yield
-        finally:
-            elapsed = time.process_time() - begun
-            for clock, name in entries:
-                if name is not None:
-                    clock[name] = clock.get(name, 0.0) + elapsed
+def processor_clock() -> Stopwatch:
+    """A stopwatch that counts this process's own time."""
+    return Stopwatch(now=time.process_time)
 
 
 FEW_MARKERS = 4
@@ -229,59 +181,71 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
 
     Raises CaptureError where a file cannot be read or the estimate that is asked for has no usable view.
     """
-    folder, clock = given.folder, ProcessorClock()
-    detections, evidence = _observe(given, spec, clock)
-    given_poses = any(seen.manual_T_board_cam is not None for seen in evidence.observations)
-    if not given_poses and not any(len(found.ids) for found in detections):
-        raise CaptureError("markers", _no_markers(folder))
+    clock = processor_clock()
+    evidence = _observe(given, spec, clock)
+    if not any(seen.markers or seen.manual_T_board_cam is not None for seen in evidence.observations):
+        raise CaptureError("markers", _no_markers(given.folder))
     check_depth(evidence)
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):
-        own = ProcessorClock()
-        with own.stage(name):
+        stages = processor_clock()
+        with stages.stage(name):
             made = MAKE[name](evidence)
-        by_name[name] = dataclasses.replace(made, seconds=own.seconds)
-    estimates = Estimates(spec.estimate, by_name, tuple(detections), clock.seconds)
-    if not estimates.estimate.used:
-        raise CaptureError("poses", _no_pose(estimates.estimate, folder))
-    return estimates
+        by_name[name] = replace(made, seconds=stages.seconds)
+    by_name[spec.estimate] = _corrected(by_name[spec.estimate], evidence)
+    if not by_name[spec.estimate].used:
+        raise CaptureError("poses", _no_pose(by_name[spec.estimate], given.folder))
+    return Estimates(spec.estimate, by_name, clock.seconds)
 
 
-def _observe(given: Given, spec: Estimation, clock: ProcessorClock) -> tuple[list[Detection], Evidence]:
-    """What is found in each view, in order of number; no two views' images are held at once."""
+def _corrected(estimate: CaptureEstimate, evidence: Evidence) -> CaptureEstimate:
+    """The chosen estimate with the user's poses where correction_ files are the user's, also that of the markers."""
+    manual = {seen.number: seen for seen in evidence.observations if "correction_" in seen.given_by}
+    if not manual:
+        return estimate
+    views = []
+    for view in estimate.views:
+        if (seen := manual.get(view.number)) is not None:
+            reasons = tuple(dict.fromkeys((*view.reasons, seen.given_by)))
+            view = replace(view, status="used", T_board_cam=seen.manual_T_board_cam, covariance=None, reasons=reasons)
+        views.append(view)
+    note = f"{len(manual)} pose{'s' * (len(manual) > 1)} from manual corrections"
+    return replace(estimate, views=tuple(views), notes=(*estimate.notes, note))
+
+
+def _observe(given: Given, spec: Estimation, clock: Stopwatch) -> Evidence:
+    """What is seen in each view, in order of number; no two views' images are held at once."""
     folder = given.folder
     setup = Setup(folder.camera, folder.board, spec)
     dictionary = open_dictionary(folder.board, folder.path)
-    detections, observations, poses = [], [], []
+    observations, poses = [], []
     for number in folder.numbers:
         with clock.stage("read"):
             view = read_view(folder, number)
         with clock.stage("detect"):
             detection = detect_markers(view.rgb, folder.board, dictionary, number)
         with clock.stage("sample"):
-            observation, found = observe_view(detection, view.depth, setup)
-        observation = _with_given_pose(observation, found, given)
-        detections.append(detection)
-        observations.append(observation)
-        poses.append(found)
-    return detections, Evidence.of(setup, observations, poses)
+            observation, pose = observe_view(detection, view.depth, setup)
+        observations.append(_with_given_pose(observation, pose, given))
+        poses.append(pose)
+    return Evidence.of(setup, observations, poses)
 
 
-def _with_given_pose(seen: Observation, found: MarkerPose, given: Given) -> Observation:
+def _with_given_pose(seen: Observation, markers: MarkerPose, given: Given) -> Observation:
     """The view with the pose that others gave it: correction · board, or the board pose of a view without markers."""
     T, correction = (given.pose(prefix, seen.number) for prefix in ("board", "correction"))
     name = f"board_{seen.number:05d}.txt"
     if correction is not None:
         name = f"correction_{seen.number:05d}.txt"
-        T = found.fit.T_board_cam if T is None and found.fit is not None else T
+        T = markers.fit.T_board_cam if T is None and markers.fit is not None else T
         if T is None:
             raise CaptureError(
                 "correction", f"{given.folder.path / name} corrects nothing: the view has no markers and no board_"
             )
         T = correction @ T
-    elif found.fit is not None or T is None:
+    elif markers.fit is not None or T is None:
         return seen
-    return dataclasses.replace(seen, manual_T_board_cam=T, given_by=f"the pose of {name} is kept as it was given")
+    return replace(seen, manual_T_board_cam=T, given_by=f"the pose of {name} is kept as it was given")
 
 
 def _other_markers(folder: CaptureFolder) -> str:
@@ -303,18 +267,13 @@ def _no_pose(estimate: CaptureEstimate, folder: CaptureFolder) -> str:
 
 
 def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tuple[Estimates, Merged]:
-    """The estimates with the user's corrections, and the merged views, whose notes the chosen estimate has too.
+    """The estimates, and the merged views; the chosen estimate has the notes of all, each once.
 
     Raises CaptureError where the capture cannot be used.
     """
     with watch.stage("estimate"):
-        estimates = correct_manually(given, estimate_poses(given, captures.estimation))
-    merged = reconstruct(given, estimates.estimate, captures.fusion, watch)
-    return with_notes(estimates, (*given.notes, *merged.notes)), merged
-
-
-def with_notes(estimates: Estimates, notes: tuple[str, ...]) -> Estimates:
-    """The estimates with further notes in the chosen one, each once."""
+        estimates = estimate_poses(given, captures.estimation)
     chosen = estimates.estimate
-    told = replace(chosen, notes=tuple(dict.fromkeys((*chosen.notes, *notes))))
-    return replace(estimates, by_name={**estimates.by_name, estimates.chosen: told})
+    merged = reconstruct(given, chosen, captures.fusion, watch)
+    noted = replace(chosen, notes=tuple(dict.fromkeys((*chosen.notes, *given.notes, *merged.notes))))
+    return replace(estimates, by_name={**estimates.by_name, estimates.chosen: noted}), merged

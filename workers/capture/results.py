@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
-from schemas.capture import CaptureListing
+from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
@@ -74,14 +73,16 @@ def write_results(path: Path, files: Mapping[str, bytes], record: Mapping[str, A
     return users
 
 
-def cloud_ply(points: Array, normals: Array, colors: NDArray[np.uint8], views: NDArray) -> bytes:
-    """A binary PLY of points [N, 3] with normals, colours and numbers of views."""
-    return _ply(_CLOUD, *points.T, *normals.T, *colors.T, np.minimum(views, 65_535))
+def cloud_ply(surface: Reconstruction) -> bytes:
+    """A binary PLY of the points with normals, colours and numbers of views."""
+    views = np.minimum(surface.views, 65_535)
+    return _ply(_CLOUD, *surface.points.T, *surface.normals.T, *surface.colors.T, views)
 
 
-def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
-    """A binary PLY of a mesh with coloured vertices."""
-    return _ply(_VERTEX, *vertices.T, *colors.T, face={"vertex_indices": faces.astype(np.int32)})
+def mesh_ply(surface: Reconstruction) -> bytes:
+    """A binary PLY of the mesh with coloured vertices."""
+    faces = {"vertex_indices": surface.faces.astype(np.int32)}
+    return _ply(_VERTEX, *surface.vertices.T, *surface.vertex_colors.T, face=faces)
 
 
 def _ply(kind: np.dtype, *columns: NDArray, **faces: Element) -> bytes:
@@ -90,18 +91,19 @@ def _ply(kind: np.dtype, *columns: NDArray, **faces: Element) -> bytes:
     return encode_ply("board frame, metres", vertex=vertex, **faces)
 
 
-def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
-    """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
-    rows = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"]
-    places, normals = (_columns(rows, names).astype(np.float64) for names in (_PLACE, _NORMAL))
-    return places, normals, _columns(rows, _COLOR), rows["views"].astype(np.int32)
-
-
-def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
-    """(vertices, faces, colours) of mesh.ply. Raises CaptureError where it is not there or another's."""
-    found = _read_ply(path / MESH_FILE, _VERTEX)
-    rows, faces = found["vertex"], found["face"]["vertex_indices"]
-    return _columns(rows, _PLACE).astype(np.float64), faces.astype(np.int32), _columns(rows, _COLOR)
+def read_surface(path: Path) -> Reconstruction:
+    """The surface of cloud.ply and mesh.ply. Raises CaptureError where one is not there or another's."""
+    cloud, mesh = _read_ply(path / CLOUD_FILE, _CLOUD)["vertex"], _read_ply(path / MESH_FILE, _VERTEX)
+    vertices = mesh["vertex"]
+    return Reconstruction(
+        _columns(cloud, _PLACE).astype(np.float64),
+        _columns(cloud, _NORMAL).astype(np.float64),
+        _columns(cloud, _COLOR),
+        cloud["views"].astype(np.int32),
+        _columns(vertices, _PLACE).astype(np.float64),
+        mesh["face"]["vertex_indices"].astype(np.int32),
+        _columns(vertices, _COLOR),
+    )
 
 
 def _columns(rows: Element, names: Sequence[str]) -> NDArray:
@@ -109,14 +111,13 @@ def _columns(rows: Element, names: Sequence[str]) -> NDArray:
 
 
 def _read_ply(file: Path, kind: np.dtype) -> dict[str, Element]:
-    with suppress(InputError), as_refusal(file):
-        elements = parse_ply(file.read_bytes())
-        if {name: column.dtype for name, column in elements["vertex"].items()} == {
-            name: kind[name] for name in kind.names or ()
-        }:
-            return elements
     if not file.exists():
         raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`")
+    with suppress(InputError), as_refusal(file):
+        elements = parse_ply(file.read_bytes())
+        types = {name: column.dtype for name, column in elements["vertex"].items()}
+        if types == {name: kind[name] for name in kind.names or ()}:
+            return elements
     raise CaptureError("unreadable", f"{file} is not what `verso capture process` wrote, or ends early: delete it")
 
 
@@ -127,22 +128,15 @@ def _digest_of(file: Path) -> str | None:
         return None
 
 
-def list_inputs(path: Path) -> list[Path]:
-    """Every file that decides the result, sorted by name: descriptions, images, corrections, truth, a dictionary of markers.
-
-    Results that processing wrote beside them are none of them. Raises CaptureError where process.json cannot be read.
-    """
-    ours = own_files(path)
-    top = [file for file in path.iterdir() if file.is_file() and _is_input(file.name) and file.name not in ours]
-    truth = [file for file in (path / TRUTH).rglob("*") if file.is_file()] if (path / TRUTH).is_dir() else []
-    return sorted([*top, *truth, *_dictionary(path)])
-
-
 def digest_inputs(path: Path) -> str:
-    """64 hex characters: SHA-256 over the name and the SHA-256 of every input file. Raises CaptureError naming the folder."""
+    """64 hex characters: SHA-256 over the name and the SHA-256 of every file that decides the result, sorted by name.
+
+    Those are descriptions, images, corrections, truth, a dictionary of markers; results that processing wrote beside them are
+    none. Raises CaptureError naming the folder.
+    """
     total = hashlib.sha256(b"verso capture 1\n")
     try:
-        for file in list_inputs(path):
+        for file in _list_inputs(path):
             with open(file, "rb") as stream:
                 content = hashlib.file_digest(stream, "sha256").hexdigest()
             total.update(f"{file.relative_to(path).as_posix()}\n{content}\n".encode())
@@ -153,18 +147,18 @@ def digest_inputs(path: Path) -> str:
     return total.hexdigest()
 
 
+def _list_inputs(path: Path) -> list[Path]:
+    top = [file for file in path.iterdir() if file.is_file()]
+    inputs = {file.name for file in top if _is_input(file.name)} - own_files(path)
+    if BOARD_FILE in inputs:  # it may name a file of markers beside it
+        named = re.search(rb'"dictionary"\s*:\s*"([^"/\\]+)"', (path / BOARD_FILE).read_bytes())
+        inputs |= {named[1].decode(errors="replace")} if named else set()
+    truth = [file for file in (path / TRUTH).rglob("*") if file.is_file()]
+    return sorted([*(file for file in top if file.name in inputs), *truth])
+
+
 def _is_input(name: str) -> bool:
     return name in (CAMERA_FILE, BOARD_FILE, CAPTURE_FILE) or FILE_OF_VIEW.fullmatch(name) is not None
-
-
-def _dictionary(path: Path) -> Iterator[Path]:
-    """The file of markers that board.json names, if it lies beside it."""
-    try:
-        found = re.search(rb'"dictionary"\s*:\s*"([^"/\\]+)"', (path / BOARD_FILE).read_bytes())
-    except FileNotFoundError:
-        return
-    if found and (file := path / found[1].decode(errors="replace")).is_file() and not _is_input(file.name):
-        yield file
 
 
 def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:
@@ -175,16 +169,16 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
     if job.captures is None or not job.captures.folders:
         return catalogue
-    listings = []
-    for number, name in enumerate(job.captures.folders):
-        watch("captures", number, len(job.captures.folders))
-        listings.append(list_capture((job_folder / Path(name).expanduser()).resolve(), f"captures.folders.{number}"))
-    watch("captures", len(listings), len(listings))
+    listings, folders = [], job.captures.folders
+    for number, name in enumerate(folders):
+        watch("captures", number, len(folders))
+        listings.append(_list_capture((job_folder / Path(name).expanduser()).resolve(), f"captures.folders.{number}"))
+    watch("captures", len(folders), len(folders))
     whole = "\n".join([catalogue.digest, *(listing.sha256 for listing in listings)])
     return replace(catalogue, captures=tuple(listings), digest=hashlib.sha256(whole.encode()).hexdigest())
 
 
-def list_capture(folder: Path, key: str) -> CaptureListing:
+def _list_capture(folder: Path, key: str) -> CaptureListing:
     """A folder and the digest of its input files. Raises AssetSourceError that names the key of the job file."""
     if not folder.is_dir():
         raise AssetSourceError(f"{key}: {folder} is no folder")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,13 +146,14 @@ SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completenes
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a capture came from.
+    """A folder to process, the name of its object where the job knows it, and where it came from.
 
-    `simulated` inside the job; `input_sha256` of its folder, None where it was simulated; `skipped`: [{effect, why}].
+    `input_sha256` of the folder, None where it was simulated; `effects` that were simulated; `skipped`: [{effect, why}].
     """
 
-    simulated: bool
-    input_sha256: str | None = None
+    path: Path
+    name: str | None
+    input_sha256: str | None
     effects: tuple[str, ...] = ()
     skipped: tuple[Mapping[str, str], ...] = ()
 
@@ -180,17 +182,17 @@ def record_capture(
     objects: list[Row] = []
     shares: list[float] = []
     left_out: list[LeftOut] = []
-    for one in pairs:
-        if isinstance(one, LeftOut):
-            left_out.append(one)
+    for item in pairs:
+        if isinstance(item, LeftOut):
+            left_out.append(item)
             continue
-        shares += [one.mirror.measured_share] if one.mirror is not None else []
+        shares += [item.mirror.measured_share] if item.mirror is not None else []
         with watch.stage("encode"):
-            for view in one.pair.views:
-                own = encode_view(view, one.pair, job.images)
-                files += own
-                row = view_row(scene_id, one.pair, view, own, job)
-                views.append(row | {"capture": view_columns(done, one, view.role)})
+            for view in item.pair.views:
+                encoded = encode_view(view, item.pair, job.images)
+                files += encoded
+                row = view_row(scene_id, item.pair, view, encoded, job)
+                views.append(row | {"capture": view_columns(done, item, view.role)})
                 objects += object_rows(scene_id, view, job, thing.things)
     with watch.stage("encode"):
         path = asset_path(thing.asset.category, thing.asset.instance_id)
@@ -228,7 +230,7 @@ def scene_row(
         "T_world_table": matrix_column(np.eye(4)),
         "redraws": 0,
         "effects": [*origin.effects, *thing.effects.ran],
-        "skipped": [dict(one) for one in origin.skipped],
+        "skipped": [dict(effect) for effect in origin.skipped],
         "raycast_checked": False,
         "settings_digest": context.settings_digest,
         "capture": quality_columns(done, origin, shares, left_out),
@@ -267,17 +269,17 @@ def quality_columns(
         "iterations": chosen.iterations,
         "cloud_points": len(done.surface.points),
         "measured_share": _median(list(shares)),
-        "left_out": [vars(one) for one in sorted([*refused, *left_out], key=lambda one: one.number)],
+        "left_out": [vars(view) for view in sorted([*refused, *left_out], key=lambda view: view.number)],
         "notes": list(chosen.notes),
         **{name: getattr(done.score, name) if done.score is not None else None for name in SCORES},
     }
 
 
-def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
+def view_columns(done: ProcessedCapture, pair: CapturedPair, role: Role) -> Row:
     """The column `capture` of `views`: residuals and errors of the captured view, and of what the mirror view is made."""
-    view = next(view for view in done.estimates.estimate.views if view.number == one.number)
-    score = done.score.views.get(one.number, ViewScore()) if done.score is not None else ViewScore()
-    made = one.mirror if role == "mirror" else None
+    view = next(view for view in done.estimates.estimate.views if view.number == pair.number)
+    score = done.score.views.get(pair.number, ViewScore()) if done.score is not None else ViewScore()
+    made = pair.mirror if role == "mirror" else None
     return {
         **residual_columns(view, done.estimates.by_markers.get(view.number)),
         "pose_mm": score.pose_mm,

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,18 +10,19 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
-from schemas.capture import CaptureEstimate, CaptureScore, Reconstruction, SynthesizedView, ViewScore
+from schemas.capture import CaptureScore, Reconstruction, SynthesizedView, ViewScore
 from schemas.errors import CaptureError, ViewError
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.folder import MESH_FILE, TRUTH, CaptureFolder, read_truth
-from workers.capture.process import CaptureViews, StoredResult
+from workers.capture.process import CaptureViews
 from workers.capture.surface.posed_view import PosedView, facing_cosine, placed, visible_points
 from workers.geometry.camera import project, spread_evenly
 from workers.geometry.distance import distance_to_mesh
-from workers.geometry.frames import angle_between, invert, pose, rotation_about, transform
+from workers.geometry.frames import UP, angle_between, invert, pose, rotation_about, transform
 from workers.geometry.raycast import cast_view
 
 SAMPLES = 40_000
@@ -37,13 +39,20 @@ MEASURED_M = 0.004
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Distance and angle between estimated and true camera poses: median and worst."""
+    """Distance and angle between estimated and true camera poses, of each."""
 
-    median_mm: float
-    worst_mm: float
-    median_deg: float
-    worst_deg: float
-    views: int
+    mm: Sequence[float]
+    deg: Sequence[float]
+
+    @property
+    def median_mm(self) -> float:
+        """Median distance."""
+        return float(np.median(self.mm))
+
+    @property
+    def median_deg(self) -> float:
+        """Median angle."""
+        return float(np.median(self.deg))
 
 
 @dataclass(frozen=True)
@@ -79,13 +88,13 @@ class MeasuredSurface:
 class ViewErrors:
     """A synthesised view against the true one, on pixels of the object that both have.
 
-    color_error: mean absolute difference of 8-bit codes, None where the true colours are unknown; covered: share of the true
-    object's pixels that the view has; beyond: share of the view's object pixels that are none.
+    color_error: mean absolute difference of 8-bit codes; covered: share of the true object's pixels that the view has; beyond:
+    share of the view's object pixels that are none.
     """
 
     depth_median_mm: float
     depth_p95_mm: float
-    color_error: float | None
+    color_error: float
     covered: float
     beyond: float
     measured_share: float
@@ -97,7 +106,7 @@ def compare_poses(estimated: Sequence[Pose], true: Sequence[Pose]) -> PoseErrors
         raise CaptureError("no_pose", "no view has a pose that could be compared with the truth")
     mm = [1e3 * float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in zip(estimated, true, strict=True)]
     deg = [float(np.degrees(angle_between(a[:3, :3], b[:3, :3]))) for a, b in zip(estimated, true, strict=True)]
-    return PoseErrors(float(np.median(mm)), max(mm), float(np.median(deg)), max(deg), len(mm))
+    return PoseErrors(mm, deg)
 
 
 def sample_surface(mesh: Mesh, count: int = SAMPLES) -> tuple[Array, Array]:
@@ -137,22 +146,20 @@ def true_view(mesh: Mesh, camera: Camera) -> Array:
     return cast_view([placed(mesh)], camera)[0]
 
 
-def compare_view(
-    view: SynthesizedView,
-    depth_m: Array,
-    mask: NDArray[np.bool_],
-    rgb: NDArray[np.uint8] | None = None,
-) -> ViewErrors:
-    """The errors of a synthesised view. Raises CaptureError where it has no pixel of the object in common with the truth."""
-    both = view.mask & mask & (view.depth_m > 0.0) & (depth_m > 0.0)
+def compare_view(view: SynthesizedView, depth_m: Array, rgb: NDArray[np.uint8]) -> ViewErrors:
+    """The errors of a synthesised view, of the object's true depth [H, W], 0 where it is not seen.
+
+    Raises CaptureError where it has no pixel of the object in common with the truth.
+    """
+    mask = depth_m > 0.0
+    both = view.mask & mask & (view.depth_m > 0.0)
     if not both.any():
         raise CaptureError("nothing_seen", "a synthesised view shows nothing of the object where it is")
     off_mm = 1e3 * np.abs(view.depth_m - depth_m)[both]
-    color = None if rgb is None else float(np.abs(view.rgb[both].astype(np.float64) - rgb[both]).mean())
     return ViewErrors(
         depth_median_mm=float(np.median(off_mm)),
         depth_p95_mm=float(np.quantile(off_mm, 0.95)),
-        color_error=color,
+        color_error=float(np.abs(view.rgb[both].astype(np.float64) - rgb[both]).mean()),
         covered=float(both.sum() / mask.sum()),
         beyond=float((view.mask & ~mask).sum() / max(int(view.mask.sum()), 1)),
         measured_share=view.measured_share,
@@ -168,36 +175,28 @@ TRIM = 0.9
 """Share of the nearest pairs that count: what one side lacks must not pull."""
 
 
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """T_board_obj [4, 4] of the mesh, and the root mean square distance of the cloud to it, trimmed, millimetres."""
+def align_mesh(points: Array, mesh: Mesh) -> tuple[Pose, float]:
+    """(T_board_obj [4, 4], millimetres) of the mesh, z up, metres, that fits points [N, 3] best.
 
-    T_board_obj: Pose
-    rms_mm: float
-
-
-def align_mesh(points: Array, mesh: Mesh) -> Alignment:
-    """The pose of a mesh, z up, metres, that fits points [N, 3] best. Raises CaptureError for fewer than 100 points."""
+    The millimetres are the root mean square distance of the points to it, trimmed. Raises CaptureError for fewer than 100 points.
+    """
     if len(points) < 100:
         raise CaptureError("no_surface", f"a cloud of {len(points)} points cannot be aligned")
     samples, normals = sample_surface(mesh, MANY)
     tree = cKDTree(samples)
-    few = points[:: max(1, len(points) // FEW)]
-    best: tuple[float, Pose] = (np.inf, np.eye(4))
+    few, many = (points[:: max(1, len(points) // count)] for count in (FEW, MANY))
+    goal = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    tries = []
     for turn in range(TURNS):
-        R = rotation_about(np.array([0.0, 0.0, 1.0]), 2.0 * np.pi * turn / TURNS)
+        R = rotation_about(UP, 2.0 * np.pi * turn / TURNS)
         turned = mesh.vertices @ R.T
-        middle = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
-        goal = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        goal[2] += (
-            points[:, 2].max() - goal[2] - (turned[:, 2].max() - middle[2])
-        )  # tops together: the foot is not seen
-        start = pose(R, goal - middle)
-        best = min(best, _iterate(few, samples, normals, tree, start, STEPS_TRY), key=lambda found: found[0])
-    many = points[:: max(1, len(points) // MANY)]
-    _, T = _iterate(many, samples, normals, tree, best[1], STEPS_FINE)
+        shift = goal - 0.5 * (turned.min(axis=0) + turned.max(axis=0))
+        shift[2] = points[:, 2].max() - turned[:, 2].max()  # tops together: the foot is not seen
+        tries.append(_iterate(few, samples, normals, tree, pose(R, shift), STEPS_TRY))
+    start = min(tries, key=lambda error_and_pose: error_and_pose[0])[1]
+    _, T = _iterate(many, samples, normals, tree, start, STEPS_FINE)
     distance = np.sort(distance_to_mesh(transform(invert(T), many), mesh)[0])[: int(TRIM * len(many))]
-    return Alignment(T, 1e3 * float(np.sqrt((distance**2).mean())))
+    return T, 1e3 * float(np.sqrt((distance**2).mean()))
 
 
 def _iterate(points: Array, samples: Array, normals: Array, tree: cKDTree, T: Pose, steps: int) -> tuple[float, Pose]:
@@ -211,10 +210,8 @@ def _iterate(points: Array, samples: Array, normals: Array, tree: cKDTree, T: Po
         p, q, n = local[keep], samples[nearest[keep]], normals[nearest[keep]]
         A = np.concatenate([np.cross(p, n), n], axis=1)
         step = np.linalg.lstsq(A, ((q - p) * n).sum(axis=1), rcond=None)[0]
-        angle = float(np.linalg.norm(step[:3]))
-        R = np.eye(3) if angle < 1e-15 else rotation_about(step[:3] / angle, angle)
-        T = T @ invert(pose(R, step[3:]))
-        if angle < 1e-8 and np.linalg.norm(step[3:]) < 1e-8:
+        T = T @ invert(pose(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]))
+        if np.abs(step).max() < 1e-8:
             break
     return error, T
 
@@ -233,28 +230,26 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """All that was compared: the summary that a dataset stores, the surface, and the views that were left out, by number."""
+    """All that was compared: the summary that a dataset stores, and by number the views that were left out in turn."""
 
     summary: CaptureScore
+    poses: PoseErrors
     surface: SurfaceErrors
     held_out: Mapping[int, ViewErrors]
-    worst_mm: float | None
-    worst_deg: float | None
 
 
 def read_mesh_file(path: Path) -> Mesh:
     """The triangles of a mesh file. Raises CaptureError where it cannot be read or has none."""
+    if not path.exists():
+        raise CaptureError("missing", f"{path} is not there")
     try:
-        found = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=path.suffix[1:].lower(), process=False)
-        mesh = found.to_mesh()
-    except FileNotFoundError:
-        raise CaptureError("missing", f"{path} is not there") from None
+        stream = io.BytesIO(path.read_bytes())
+        mesh = trimesh.load_scene(stream, file_type=path.suffix[1:].lower(), process=False).to_mesh()
     except Exception as error:  # readers of many formats raise errors of many kinds
         raise CaptureError("unreadable", f"{path} is no mesh that can be read: {error!r}") from error
-    faces = np.array(getattr(mesh, "faces", ()), np.int32).reshape(-1, 3)
-    if not len(faces):
+    if not len(mesh.faces):
         raise CaptureError("unreadable", f"{path} has no triangles")
-    return Mesh(np.array(mesh.vertices, np.float64), faces)
+    return Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int32))
 
 
 def read_whole_truth(folder: CaptureFolder) -> Truth | None:
@@ -267,31 +262,26 @@ def read_whole_truth(folder: CaptureFolder) -> Truth | None:
     return Truth(poses, Mesh(transform(truth.T_board_obj, mesh.vertices), mesh.faces))
 
 
-def score_capture(
-    estimate: CaptureEstimate, surface: Reconstruction, views: CaptureViews, truth: Truth, held_out: int = HELD_OUT
-) -> Score:
+def score_capture(views: CaptureViews, truth: Truth, held_out: int = HELD_OUT) -> Score:
     """The errors of poses, surface and synthesised views. Raises CaptureError where no used view has a true pose."""
-    used = {view.number: view.T_board_cam for view in estimate.used if view.T_board_cam is not None}
+    used = {view.number: view.T_board_cam for view in views.estimate.used if view.T_board_cam is not None}
     known = sorted(set(used) & set(truth.T_board_cam))
     poses = compare_poses([used[n] for n in known], [truth.T_board_cam[n] for n in known])
     cameras = [Camera(views.folder.camera.intrinsics, truth.T_board_cam[n]) for n in known]
-    errors = score_surface(surface, truth.surface, cameras)
+    surface = score_surface(views.surface, truth.surface, cameras)
     left_out = score_held_out(views, truth, known, held_out)
-    by_view = {}
-    for n in known:
-        one = compare_poses([used[n]], [truth.T_board_cam[n]])
-        depth = left_out[n].depth_median_mm if n in left_out else None
-        by_view[n] = ViewScore(one.median_mm, one.median_deg, depth)
+    depth_mm = {n: errors.depth_median_mm for n, errors in left_out.items()}
+    by_view = {n: ViewScore(mm, deg, depth_mm.get(n)) for n, mm, deg in zip(known, poses.mm, poses.deg, strict=True)}
     summary = CaptureScore(
         pose_mm=poses.median_mm,
         pose_deg=poses.median_deg,
-        cloud_median_mm=errors.cloud_median_mm,
-        cloud_p95_mm=errors.cloud_p95_mm,
-        completeness=errors.completeness,
-        depth_median_mm=float(np.median([e.depth_median_mm for e in left_out.values()])) if left_out else None,
+        cloud_median_mm=surface.cloud_median_mm,
+        cloud_p95_mm=surface.cloud_p95_mm,
+        completeness=surface.completeness,
+        depth_median_mm=float(np.median(list(depth_mm.values()))) if depth_mm else None,
         views=by_view,
     )
-    return Score(summary, errors, left_out, poses.worst_mm, poses.worst_deg)
+    return Score(summary, poses, surface, left_out)
 
 
 def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]) -> SurfaceErrors:
@@ -312,7 +302,7 @@ def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]
     )
 
 
-def score_measured(surface: Reconstruction, views: CaptureViews, truth: Truth) -> MeasuredSurface:
+def score_measured(views: CaptureViews, truth: Truth) -> MeasuredSurface:
     """How much of what was visible had depth in any used view, and how much of that has a point within 3 mm."""
     samples, normals = sample_surface(truth.surface)
     numbers = sorted(set(views.cameras) & set(truth.T_board_cam))
@@ -321,32 +311,31 @@ def score_measured(surface: Reconstruction, views: CaptureViews, truth: Truth) -
     measured = np.zeros(len(samples), np.bool_)
     for number in numbers:
         measured |= measured_points(samples, normals, views.posed(number))
-    distance, _ = cKDTree(surface.points).query(samples)
+    distance, _ = cKDTree(views.surface.points).query(samples)
     both = visible & measured
-    return MeasuredSurface(
-        float(both.sum() / max(int(visible.sum()), 1)),
-        float((distance[both] <= COMPLETE_M).mean()) if both.any() else 0.0,
-    )
+    share = float((distance[both] <= COMPLETE_M).mean()) if both.any() else 0.0
+    return MeasuredSurface(float(both.sum() / max(int(visible.sum()), 1)), share)
 
 
 def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most: int) -> dict[int, ViewErrors]:
     """Views made of the others, from their true poses, against the true depth and what was photographed."""
-    found: dict[int, ViewErrors] = {}
+    errors: dict[int, ViewErrors] = {}
     for number in (known[place] for place in spread_evenly(len(known), most)):
         camera = Camera(views.folder.camera.intrinsics, truth.T_board_cam[number])
-        depth_m: Array = true_view(truth.surface, camera)
-        try:
+        depth_m = true_view(truth.surface, camera)
+        with suppress(CaptureError, ViewError):  # the view sees nothing of the object, or nothing beside it does
             made = views.synthesize(camera, without=number)
-            found[number] = compare_view(made, depth_m, depth_m > 0.0, views.posed(number).rgb)
-        except (CaptureError, ViewError):  # the view sees nothing of the object, or nothing beside it does
-            continue
-    return found
+            errors[number] = compare_view(made, depth_m, views.posed(number).rgb)
+    return errors
 
 
-def score_against_mesh(result: StoredResult, mesh: Mesh) -> tuple[SurfaceErrors, Alignment]:
-    """The surface's errors after the mesh is aligned to the cloud; what is visible follows from the estimated poses."""
-    alignment = align_mesh(result.surface.points, mesh)
-    placed = Mesh(transform(alignment.T_board_obj, mesh.vertices), mesh.faces)
+def score_against_mesh(result: CaptureViews, mesh: Mesh) -> tuple[SurfaceErrors, Pose, float]:
+    """The surface's errors after the mesh is aligned to the cloud, and what `align_mesh` gives.
+
+    What is visible follows from the estimated poses.
+    """
+    T_board_obj, rms_mm = align_mesh(result.surface.points, mesh)
+    aligned = Mesh(transform(T_board_obj, mesh.vertices), mesh.faces)
     k = result.folder.camera.intrinsics
     cameras = [Camera(k, view.T_board_cam) for view in result.estimate.used if view.T_board_cam is not None]
-    return score_surface(result.surface, placed, cameras), alignment
+    return score_surface(result.surface, aligned, cameras), T_board_obj, rms_mm

@@ -158,7 +158,7 @@ def _search(
     here = np.empty(3)
     stack = np.empty(128, np.int64)
     for n in range(len(points)):
-        best, found = np.inf, -1
+        best, nearest = np.inf, -1
         stack[0], height = 0, 1
         while height > 0:
             height -= 1
@@ -176,5 +176,5 @@ def _search(
                 nearest_on_triangle(points[n], corners[order[i]], here)
                 d2 = (here[0] - points[n, 0]) ** 2 + (here[1] - points[n, 1]) ** 2 + (here[2] - points[n, 2]) ** 2
                 if d2 < best:
-                    best, found = d2, order[i]
-        distance[n], face[n] = np.sqrt(best), found
+                    best, nearest = d2, order[i]
+        distance[n], face[n] = np.sqrt(best), nearest

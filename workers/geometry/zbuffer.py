@@ -19,7 +19,7 @@ from schemas.scene.shape import Mesh, Shape
 from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled, compiled_for
-from workers.geometry.lens import pixel_rays, project_points
+from workers.geometry.pixels import pixel_rays, project_points
 
 STEEPEST = math.tan(math.radians(84.0))
 """Neighbouring pixels whose depth differs as on a surface seen at a larger angle of incidence lie on two surfaces.
@@ -113,7 +113,7 @@ def draw_triangles(
     `both_sides` are.
     """
     height, width = shape
-    depth, found = np.zeros(shape, z.dtype), np.full(shape, -1, np.int32)
+    depth, nearest = np.zeros(shape, z.dtype), np.full(shape, -1, np.int32)
     weights = np.zeros((height, width, 3))
     for t in range(len(triangles)):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
@@ -133,10 +133,10 @@ def draw_triangles(
                 if wa < -slack or wb < -slack or wc < -slack:
                     continue
                 at = 1.0 / (wa / z[a] + wb / z[b] + wc / z[c])
-                if found[y, x] < 0 or depth[y, x] > at:
-                    depth[y, x], found[y, x] = at, t
+                if nearest[y, x] < 0 or depth[y, x] > at:
+                    depth[y, x], nearest[y, x] = at, t
                     weights[y, x, 0], weights[y, x, 1], weights[y, x, 2] = wa, wb, wc
-    return depth, found, weights
+    return depth, nearest, weights
 
 
 NEAREST_M = 0.1

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.distance import dot, nearest_on_segments, nearest_on_triangle
-from workers.geometry.jit import compiled_for
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import bounds_of, edge_keys, face_normals, has_rim, numbers_in, weld
 
 SLOPE = 0.02
@@ -28,7 +28,7 @@ Index = NDArray[np.int64]
 )
 def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Array) -> tuple[Index, Array, Array]:
     """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
-    found, count = np.empty(len(features), np.int64), 0
+    numbers, count = np.empty(len(features), np.int64), 0
     least, most = np.empty((len(features), 3)), np.empty((len(features), 3))
     for f in range(len(features)):
         near = True
@@ -41,9 +41,9 @@ def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Ar
                 break
             least[count, k], most[count, k] = down, up
         if near:
-            found[count] = f
+            numbers[count] = f
             count += 1
-    return found[:count], least[:count], most[:count]
+    return numbers[:count], least[:count], most[:count]
 
 
 def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:
@@ -169,18 +169,26 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
     for f in range(len(faces)):
         below, above = True, True
         for c in range(3):
-            corner = faces[f, c]
-            for m in range(starts[corner], starts[corner + 1]):
-                up = length2 = 0.0
-                for k in range(3):
-                    line = vertices[members[m], k] - vertices[corner, k]
-                    up += line * normals[f, k]
-                    length2 += line * line
-                slack = SLOPE * np.sqrt(length2)
-                below = below and up <= slack
-                above = above and up >= -slack
+            rises, falls = neighbours_lie(vertices, faces[f, c], starts, members, normals[f])
+            above, below = above and rises, below and falls
         side[f] = np.int64(below) - np.int64(above)
     return side
+
+
+@compiled
+def neighbours_lie(vertices: Array, corner: int, starts: Index, members: Index, normal: Array) -> tuple[bool, bool]:
+    """Whether all neighbours of a vertex lie above it along a normal [3], and whether all lie below, to within `SLOPE`."""
+    above, below = True, True
+    for m in range(starts[corner], starts[corner + 1]):
+        up = length2 = 0.0
+        for k in range(3):
+            line = vertices[members[m], k] - vertices[corner, k]
+            up += line * normal[k]
+            length2 += line * line
+        slack = SLOPE * np.sqrt(length2)
+        above = above and up >= -slack
+        below = below and up <= slack
+    return above, below
 
 
 @compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], i8[::1], b1")

@@ -12,7 +12,7 @@ from workers.geometry.distance import nearest_on_triangle
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import bounds_of
-from workers.physics.contact_surface import SLOPE, Index, Surface, bounds_in, find_near
+from workers.physics.contact_surface import SLOPE, Index, Surface, bounds_in, find_near, neighbours_lie
 
 DEEPEST_M = 3e-3
 """Overlap from which bodies are moved apart, metres: coarse parts may be smaller than a quarter of a metre's shape by half of
@@ -66,7 +66,7 @@ def find_near_features(surfaces: Sequence[Surface], points: Sequence[Array], wit
 
     points: the vertices [V, 3] of each surface, world.
     """
-    found = []
+    near = []
     bounds = [bounds_of(each) for each in points]
     for i, j in itertools.combinations(range(len(surfaces)), 2):
         low, high = np.maximum(bounds[i][0], bounds[j][0]) - within_m, np.minimum(bounds[i][1], bounds[j][1]) + within_m
@@ -74,8 +74,8 @@ def find_near_features(surfaces: Sequence[Surface], points: Sequence[Array], wit
             continue
         here, there = (_boxes(surfaces[k], points[k], low, high) for k in (i, j))
         pairs = ((here[0], there[1]), (there[0], here[1]), (here[2], there[2]))
-        found.append(Near(i, j, *(_pairs(*each, within_m) for each in pairs)))
-    return found
+        near.append(Near(i, j, *(_pairs(*each, within_m) for each in pairs)))
+    return near
 
 
 _Boxes = tuple[Index, Array, Array]
@@ -108,10 +108,10 @@ def find_contacts(
     """The contacts with gaps from -`deepest_m` to `within_m` among features that are near."""
     rows, upper, lower = [np.empty((0, 7))], [], []
     for pair in near:
-        for found in _between(surfaces, points, pair, (within_m, deepest_m)):
-            rows.append(found)
-            upper += [pair.upper] * len(found)
-            lower += [pair.lower] * len(found)
+        for contacts in _between(surfaces, points, pair, (within_m, deepest_m)):
+            rows.append(contacts)
+            upper += [pair.upper] * len(contacts)
+            lower += [pair.lower] * len(contacts)
     every = np.concatenate(rows)
     above, below = (np.array(numbers, dtype=np.int64) for numbers in (upper, lower))
     return Contacts(above, below, every[:, :3], every[:, 3:6], every[:, 6])
@@ -163,7 +163,7 @@ def corners_on_faces(
     -`deepest` to `within`, is negative where the corner lies below the face. A corner touches a face where all its
     neighbours lie on one side of the face's plane, to within `SLOPE`, and the face's own neighbours not on the same side.
     """
-    found, which, count = np.empty((64, 7)), np.empty((64, 2), np.int64), 0
+    contacts, which, count = np.empty((64, 7)), np.empty((64, 2), np.int64), 0
     triangle, normal, foot, nearest = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     u, v = np.empty(3), np.empty(3)
     for row in range(len(pairs)):
@@ -187,31 +187,22 @@ def corners_on_faces(
             beside2 += (nearest[k] - foot[k]) ** 2
         if beside2 > BORDER_M * BORDER_M:
             continue
-        over, under = True, True
-        for m in range(starts[n], starts[n + 1]):
-            up = length2 = 0.0
-            for k in range(3):
-                along = vertices[members[m], k] - vertices[n, k]
-                up += normal[k] * along
-                length2 += along * along
-            slack = SLOPE * np.sqrt(length2)
-            over = over and up >= -slack
-            under = under and up <= slack
+        over, under = neighbours_lie(vertices, n, starts, members, normal)
         # About the deepest face of a hollow everything rises, as about the underside of a body: there the corner tells
         upright, turned = over and (side[f] >= 0 or not under), under and side[f] <= 0
         gap = height if upright else -height
         if not (upright or turned) or gap > within or gap < -deepest:
             continue
-        if count == len(found):
-            found, which = np.concatenate((found, found)), np.concatenate((which, which))
+        if count == len(contacts):
+            contacts, which = np.concatenate((contacts, contacts)), np.concatenate((which, which))
         sign = 1.0 if upright else -1.0
         for k in range(3):
-            found[count, k] = 0.5 * (vertices[n, k] + foot[k])
-            found[count, 3 + k] = sign * normal[k]
-        found[count, 6] = gap
+            contacts[count, k] = 0.5 * (vertices[n, k] + foot[k])
+            contacts[count, 3 + k] = sign * normal[k]
+        contacts[count, 6] = gap
         which[count, 0], which[count, 1] = n, f
         count += 1
-    return found[:count], which[:count]
+    return contacts[:count], which[:count]
 
 
 @compiled
@@ -237,7 +228,7 @@ def edges_across_edges(
     Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges. An edge crosses another where the faces about
     the one lie above the plane between them and those about the other below, to within `SLOPE`.
     """
-    found, count = np.empty((64, 7)), 0
+    contacts, count = np.empty((64, 7)), 0
     n, u, v, r = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for row in range(len(pairs)):
         i, j = pairs[row, 0], pairs[row, 1]
@@ -272,11 +263,11 @@ def edges_across_edges(
         gap = sign * nr / length
         if not (positive or negative) or gap > within or gap < -deepest:
             continue
-        if count == len(found):
-            found = np.concatenate((found, found))
+        if count == len(contacts):
+            contacts = np.concatenate((contacts, contacts))
         for k in range(3):
-            found[count, k] = 0.5 * (a[k] + s * u[k] + b[k] + t * v[k])
-            found[count, 3 + k] = sign * n[k] / length
-        found[count, 6] = gap
+            contacts[count, k] = 0.5 * (a[k] + s * u[k] + b[k] + t * v[k])
+            contacts[count, 3 + k] = sign * n[k] / length
+        contacts[count, 6] = gap
         count += 1
-    return found[:count]
+    return contacts[:count]

@@ -1,6 +1,6 @@
 """Convex parts of a body that is not convex: of built-in shapes by their making, of meshes from outside by halving.
 
-See `workers.geometry.lathe_decomposition` and `workers.geometry.halving`, which ends on every mesh. Parts of meshes are kept in
+See `workers.geometry.lathe_decomposition` and `workers.geometry.hull`, which ends on every mesh. Parts of meshes are kept in
 memory and in files, which may be deleted.
 """
 
@@ -22,8 +22,7 @@ from schemas.base import Array, frozen_array
 from schemas.environment import cache_folder
 from schemas.scene.shape import Asset, Mesh
 from workers.geometry import mesh as convexity
-from workers.geometry.halving import halve, wrap
-from workers.geometry.hull import convex_hull
+from workers.geometry.hull import convex_hull, halve, wrap
 from workers.geometry.lathe_decomposition import TOLERANCE, decompose_lofts
 from workers.geometry.mesh import components, concavity_m, is_convex_surface, mesh_of, solid_of, weld
 from workers.pool import Answers

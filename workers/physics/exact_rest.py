@@ -216,33 +216,26 @@ def rest(
             near, known_m = find_near_features(surfaces, points, DEEPEST_M + REACH_M), REACH_M
         contacts = find_contacts(surfaces, points, near, REACH_M, DEEPEST_M)
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
+        given = inertias, contacts, friction
         try:
             spun_m = spinning_m if number >= MOST_STEPS else 0.0
-            motion, jammed = _step_past_seams(inertias, contacts, friction, fall_m, spun_m)
-            moved_m = _farthest(motion, reaches)
-            if moved_m <= STILL * fall_m and nudges < MOST_NUDGES and not jammed:
-                nudge, nudges = _nudge(inertias, contacts, friction, reaches, spun_m), nudges + 1
+            motion, jammed = _step_past_seams(*given, fall_m, spun_m)
+            if _farthest(motion, reaches) <= STILL * fall_m and nudges < MOST_NUDGES and not jammed:
+                nudge, nudges = _nudge(*given, reaches, spun_m), nudges + 1
                 if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
-                    motion, moved_m, pushed = nudge, _farthest(nudge, reaches), np.zeros(0)
+                    motion, pushed = nudge, np.zeros(0)
         except JammedError:
             return Rested(at, False, number)
+        moved_m = _farthest(motion, reaches)
         if moved_m <= STILL * fall_m:
             return Rested(at, not jammed, number)
         share = min(1.0, REACH_M / 2 / moved_m)
-        at = tuple(
-            _moved(T, body.com, share * move, share * turn)
-            for T, body, move, turn in zip(at, inertias, motion.moves, motion.turns, strict=True)
-        )
-        known_m -= share * moved_m
+        at, known_m = _moved(at, inertias, motion, share), known_m - share * moved_m
         before, pushed = pushed, np.concatenate([motion.moves, motion.turns * reaches[:, None]]).ravel() / fall_m
         if len(before) and _swings_wider(before, pushed):
             longest_m = fall_m = max(FALL_M, fall_m / 4)
-            continue
-        # So that bodies move by something below half of `REACH_M`
-        if moved_m > REACH_M / 2:
-            fall_m = max(FALL_M, fall_m / 2)
-        elif moved_m < REACH_M / 4:
-            fall_m = min(longest_m, 2 * fall_m)
+        else:
+            fall_m = _next_fall_m(fall_m, longest_m, moved_m)
     return Rested(at, False, MOST_STEPS)
 
 
@@ -289,7 +282,20 @@ def _nudge(bodies: Sequence[Inertia], contacts: Contacts, friction: float, reach
     return max(motions, key=lambda motion: _farthest(motion, reaches))
 
 
-def _moved(T: Pose, com: Array, move: Array, turn: Array) -> Pose:
+def _next_fall_m(fall_m: float, longest_m: float, moved_m: float) -> float:
+    """The free fall of the next step, so that bodies move by something below half of `REACH_M`."""
+    if moved_m > REACH_M / 2:
+        return max(FALL_M, fall_m / 2)
+    return min(longest_m, 2 * fall_m) if moved_m < REACH_M / 4 else fall_m
+
+
+def _moved(poses: Sequence[Pose], bodies: Sequence[Inertia], motion: Motion, share: float) -> tuple[Pose, ...]:
+    """Poses [4, 4] after this share of a motion."""
+    every = zip(poses, bodies, motion.moves, motion.turns, strict=True)
+    return tuple(_turned(T, body.com, share * move, share * turn) for T, body, move, turn in every)
+
+
+def _turned(T: Pose, com: Array, move: Array, turn: Array) -> Pose:
     """A pose [4, 4] turned by a rotation vector [3] about its centre of mass, which is moved."""
     angle = float(np.linalg.norm(turn))
     R = rotation_about(turn / angle, angle) if angle > 0.0 else np.eye(3)

@@ -211,8 +211,8 @@ def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:
 def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Support, ...]:
     """How every object rests at these `T_world_obj`, by contacts of at most `TOUCHING_M`."""
     gaps_m = find_gaps_m(placement.forms, (*poses, np.eye(4)))
-    found = contacts_within(placement.surfaces, (*poses, np.eye(4)), TOUCHING_M)
-    contacts = replace(found, gaps=np.zeros_like(found.gaps))
+    touching = contacts_within(placement.surfaces, (*poses, np.eye(4)), TOUCHING_M)
+    contacts = replace(touching, gaps=np.zeros_like(touching.gaps))
     inertias = [thing.inertia(T) for T, thing in zip(poses, placement.things, strict=True)]
     motion = step(inertias, contacts, placement.friction, FALL_M * DOWN, GRAVITY_M_S2)
     return tuple(

@@ -37,7 +37,7 @@ def sample_elevation(points_xy: Array, ground: Mesh, highest: bool = True) -> Ar
 @compiled_for("f8[:,::1], const(f8[:,::1]), const(i4[:,::1]), b1")
 def _crossings(points: Array, vertices: Array, faces: NDArray[np.int32], highest: bool) -> Array:
     """[N] the highest or the lowest height at which vertical lines cross triangles [F, 3]; nan where they miss all."""
-    found = np.full(len(points), np.nan)
+    heights = np.full(len(points), np.nan)
     left, right, front, back = np.inf, -np.inf, np.inf, -np.inf
     for n in range(len(points)):
         left, right = min(left, points[n, 0]), max(right, points[n, 0])
@@ -60,9 +60,9 @@ def _crossings(points: Array, vertices: Array, faces: NDArray[np.int32], highest
             if wc >= -EDGE_SLACK and wb + wc <= 1.0 + EDGE_SLACK:
                 az = vertices[a, 2]
                 z = az + wb * (vertices[b, 2] - az) + wc * (vertices[c, 2] - az)
-                if not (found[n] >= z if highest else found[n] <= z):
-                    found[n] = z
-    return found
+                if not (heights[n] >= z if highest else heights[n] <= z):
+                    heights[n] = z
+    return heights
 
 
 def vertical_gap(upper: Mesh, lower: Mesh, band_m: float = 0.02) -> float:

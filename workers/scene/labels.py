@@ -11,8 +11,15 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Agreement, Camera, Intrinsics, ObjectLabel, View, crop_box
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
-from workers.geometry.lens import distort
-from workers.geometry.pixels import Extent, count_filled, facing_cosine, gather_colours, measure_regions, quantise_depth
+from workers.geometry.pixels import (
+    Extent,
+    count_filled,
+    distort,
+    facing_cosine,
+    gather_colours,
+    measure_regions,
+    quantise_depth,
+)
 from workers.geometry.projection import Bounds, Projected, Seen, compare_covisible, forward_project, in_frame
 from workers.geometry.zbuffer import count_covered
 

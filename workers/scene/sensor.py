@@ -23,8 +23,7 @@ from schemas.job.views import DepthNoise, Distortion, Exposure, Images, RgbNoise
 from schemas.scene.scene import EffectPlan
 from schemas.scene.view import Camera, Intrinsics, View
 from workers.geometry.colour import decode_codes, encode_codes
-from workers.geometry.lens import undistort
-from workers.geometry.pixels import dequantise_depth, facing_cosine, quantise_depth
+from workers.geometry.pixels import dequantise_depth, facing_cosine, quantise_depth, undistort
 
 EDGE_STEP_M = 0.03
 """Smallest second difference of 1/depth, times depth squared, that counts as an edge [assumed]."""

@@ -181,7 +181,7 @@ def with_shape_files(assets: pa.Table, files: Mapping[str, FileEntry]) -> pa.Tab
 def files_of_assets(assets: pa.Table) -> list[FileEntry]:
     """The files that rows of a range's `assets` list: GLBs, and samples. Raises KeyError without `SHAPE_FILE_COLUMNS`."""
     names = [name for name in ("category", "instance_id", "samples") if name in assets.column_names]
-    size, sha256 = (field.name for field in SHAPE_FILE_COLUMNS)
+    size, sha256 = _SHAPE_FILES
     entries = []
     for row in assets.select([*names, size, sha256]).to_pylist():
         if row[sha256] is not None:
@@ -194,7 +194,7 @@ def files_of_assets(assets: pa.Table) -> list[FileEntry]:
 
 def listed_files(table: str, data: bytes, name: str) -> list[FileEntry]:
     """The files that a range's `views` (images) or `assets` (shapes) list. Raises CorruptError as `decode_table`."""
-    columns = ["category", "instance_id", "samples", *(field.name for field in SHAPE_FILE_COLUMNS)]
+    columns = ["category", "instance_id", "samples", *_SHAPE_FILES]
     try:
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
             rows = file.read(columns=["files"] if table == "views" else columns)
@@ -210,16 +210,23 @@ def decode_table(table: str, data: bytes, name: str) -> pa.Table:
 
     Raises CorruptError naming the file where a page fails its checksum, the file is torn, or it is another table.
     """
+    return conform(table, decode_rows(data, name), name)
+
+
+def decode_rows(data: bytes, name: str) -> pa.Table:
+    """The rows of Parquet bytes in the schema that they were written in. Raises CorruptError naming the file."""
     try:
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
-            rows = file.read(use_threads=False)  # a pool of threads takes longer than a range's few rows
+            return file.read(use_threads=False)  # a pool of threads takes longer than a range's few rows
     except (pa.ArrowException, OSError, ValueError) as error:
         raise _unreadable(name, error) from error
-    return conform(table, rows, name)
 
 
 def _unreadable(name: str, error: Exception) -> CorruptError:
     return CorruptError(f"{name} cannot be read: {plain_line(str(error))}; `verso verify` lists every damaged file")
+
+
+_SHAPE_FILES = [field.name for field in SHAPE_FILE_COLUMNS]
 
 
 def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
@@ -228,9 +235,10 @@ def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
     A schema only grows. So rows that lack a column and have an unknown one have a damaged column name.
     """
     schema = SCHEMAS[table]
-    missing = [column for column in schema.names if column not in rows.column_names]
-    known = {*schema.names, *(field.name for field in SHAPE_FILE_COLUMNS)}
-    foreign = [column for column in rows.column_names if column not in known]
+    present = rows.column_names  # made anew each time
+    wanted = schema.names
+    missing = [column for column in wanted if column not in present]
+    foreign = [column for column in present if column not in wanted and column not in _SHAPE_FILES]
     if missing and foreign:
         raise CorruptError(f"{name} lacks the column {missing[0]} of the table {table}, and has {foreign[0]!r}")
     for column in missing:
@@ -239,7 +247,7 @@ def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
             raise CorruptError(f"{name} lacks the column {column} of the table {table}")
         rows = rows.append_column(field, _nulls(rows.num_rows, field.type))
     try:
-        return rows.select(schema.names).cast(schema)  # Parquet has other names inside lists
+        return rows.select(wanted).cast(schema)  # Parquet has other names inside lists
     except (pa.ArrowException, ValueError) as error:
         raise _unreadable(name, error) from error
 
@@ -256,7 +264,8 @@ def _nulls(count: int, kind: pa.DataType) -> pa.Array:
 
 
 def join_rows(table: str, parts: Sequence[pa.Table]) -> pa.Table:
-    """Rows one after another, in today's schema."""
-    schema = SCHEMAS[table]
-    fitted = [part if part.schema == schema else conform(table, part, table) for part in parts]
-    return pa.concat_tables(fitted) if fitted else schema.empty_table()
+    """Rows one after another, in today's schema. Parts are nearly always of one schema, so it is adapted once."""
+    if len({part.schema for part in parts}) > 1:
+        parts = [part if part.schema == SCHEMAS[table] else conform(table, part, table) for part in parts]
+    rows = pa.concat_tables(parts or [SCHEMAS[table].empty_table()])
+    return rows if rows.schema == SCHEMAS[table] else conform(table, rows, table)

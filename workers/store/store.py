@@ -219,8 +219,11 @@ class Events:
         names = self._store.names(self._folder)
         if names != [event_path("", number)[1:] for number in range(len(names))]:
             raise CorruptError(f"{self._store.name}/{self._folder} lacks an event, or holds what is none")
-        self._known += [self._store.read(f"{self._folder}/{name}") for name in names[len(self._known) :]]
+        self._known += [self._read(f"{self._folder}/{name}") for name in names[len(self._known) :]]
         return self._known[: len(names)]
+
+    def _read(self, key: str) -> bytes:
+        return self._store.read(key)
 
     def append(self, decide: Callable[[Sequence[bytes]], bytes | None]) -> list[bytes] | None:
         """Adds the event that `decide` makes of all events before it, and returns all; None where it makes none.

@@ -74,7 +74,7 @@ class StoredPair:
     """Decoded images by role and kind of pixel."""
     shapes: dict[str, Any] = field(default_factory=dict)
     """Shapes that were read, by path; `floor`, which is in no file, where it is known."""
-    found: list[Any] = field(default_factory=list)
+    findings: list[Any] = field(default_factory=list)
     """Findings of targets, of every view."""
     absent: list[str] = field(default_factory=list)
     """Why targets were not judged: shapes that are not stored."""
@@ -342,14 +342,14 @@ def _check_body(body: Row, friction: float) -> Iterator[str]:
 
 def _check_reactions(bodies: list[Row]) -> Iterator[str]:
     """Two bodies press one another with one force at one point."""
-    found = dict[tuple[int, int], Array]()
+    forces = dict[tuple[int, int], Array]()
     for body in bodies:
         for contact in body["contacts"]:
             if contact["with_region"] != TABLE:
                 pair = (body["region_id"], contact["with_region"])
-                total = found.setdefault(pair, np.zeros(3))
+                total = forces.setdefault(pair, np.zeros(3))
                 total += contact["force"]
-    for (one, other), force in found.items():
-        back = found.get((other, one), np.zeros(3))
+    for (one, other), force in forces.items():
+        back = forces.get((other, one), np.zeros(3))
         if not np.allclose(force, -back, rtol=1e-9, atol=1e-9):
             yield f"region {one} presses region {other} with another force than that region it"

@@ -48,10 +48,8 @@ def check_board(pair: StoredPair) -> Iterator[str]:
             continue
         depth, region = pair.images[role, "depth"], pair.images[role, "region"]
         points, _ = unproject(pair.views[role], np.where(region == TABLE, depth, 0))
-        if (
-            points.shape[1]
-            and (off := float(np.median(np.abs(matrix(pair.views[role], "T_world_cam")[2] @ points)))) > BOARD_M
-        ):
+        height_m = np.abs(matrix(pair.views[role], "T_world_cam")[2] @ points)
+        if len(height_m) and (off := float(np.median(height_m))) > BOARD_M:
             yield f"board pixels of {role} lie {off * 1e3:.1f} mm off the board's plane in the median"
 
 
@@ -111,21 +109,21 @@ _CAMERA_COLUMNS = (
 
 def list_underived(job: Mapping[str, Any]) -> list[str]:
     """Stored values that have no second derivation for this job, a sentence each."""
-    told = ["visible_fraction, mirror_agreement and projected_hidden_share are not derived"]
+    lines = ["visible_fraction, mirror_agreement and projected_hidden_share are not derived"]
     sensor, projection = job["sensor"], job["images"]["projection"]
     if job.get("captures") is not None:
-        told.append(
+        lines.append(
             "poses of input cameras, and depth and colour of mirror views, follow from photographs: not derived"
         )
     if projection["enabled"] and not _has_plain_points(job):
-        told.append("projected images are not derived: images.projection.splat or hidden_point_removal is on")
+        lines.append("projected images are not derived: images.projection.splat or hidden_point_removal is on")
     elif projection["enabled"] and sensor["distortion"]:
-        told.append("colours of projected images are not derived: sensor.distortion is on")
+        lines.append("colours of projected images are not derived: sensor.distortion is on")
     if sensor["depth_noise"]:
-        told.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
+        lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
     if views := job.get("targets", {}).get("views"):
-        told += ["albedo of the floor is not derived: its look is in no file"] if "albedo" in views else []
-    return told
+        lines += ["albedo of the floor is not derived: its look is in no file"] if "albedo" in views else []
+    return lines
 
 
 def _has_plain_points(job: Mapping[str, Any]) -> bool:
@@ -167,8 +165,8 @@ def check_merged(read: Callable[[str], bytes], views: Sequence[Row], objects: Se
     ):
         try:
             lines = [line.split(",") if header else line.split(" ") for line in read(path).decode().splitlines()]
-            if header and (found := lines.pop(0)) != header:
-                yield f"{path}: the header is {','.join(found)}"
+            if header and (first := lines.pop(0)) != header:
+                yield f"{path}: the header is {','.join(first)}"
             yield from (f"{path}: {fault}" for fault in _check_lines(lines, columns, key, rows))
         except (FileNotFoundError, ValueError, KeyError, IndexError) as error:
             yield f"{path}: cannot be read: {error}"

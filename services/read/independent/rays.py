@@ -59,6 +59,14 @@ class Faces:
         return normal / np.maximum(twice_area, 1e-300)[:, None], twice_area / np.maximum(longest, 1e-300)
 
 
+def bare_faces(points: Array) -> Faces:
+    """Faces of these corners [F, 3, 3], metres, without a look: of region 0 and of no body, exact."""
+    count = len(points)
+    none, every = np.full(count, -1), np.zeros(count, int)
+    colors, uv = np.full(points.shape, np.nan), np.zeros((count, 3, 2))
+    return Faces(points, np.zeros(points.shape), colors, uv, none, (), every, np.zeros(count, bool), np.zeros(count))
+
+
 def read_shape(data: bytes) -> Faces:
     """The faces of a binary glTF file of one node, object frame, region 0. Raises ValueError or KeyError where it is another."""
     length, kind = struct.unpack_from("<I4s", data, 12)
@@ -83,18 +91,15 @@ def read_shape(data: bytes) -> Faces:
         corners = array(primitive["indices"]).reshape(-1, 3).astype(np.int64)
         points = array(has["POSITION"]).astype(np.float64)[corners]
         flat = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-        normals = (
-            array(has["NORMAL"]).astype(np.float64)[corners] if "NORMAL" in has else np.repeat(flat[:, None], 3, axis=1)
-        )
-        colors = array(has["COLOR_0"])[corners][..., :3] if "COLOR_0" in has else np.ones(points.shape)
-        number = (
-            sources[look["baseColorTexture"]["index"]] if "baseColorTexture" in look and "TEXCOORD_0" in has else -1
-        )
-        uv = (
-            array(has["TEXCOORD_0"]).astype(np.float64)[corners]
-            if "TEXCOORD_0" in has
-            else np.zeros((*corners.shape, 2))
-        )
+
+        def corners_of(name: str, default: Array, has: dict = has, corners: NDArray = corners) -> Array:
+            return array(has[name])[corners].astype(np.float64) if name in has else default
+
+        normals = corners_of("NORMAL", np.repeat(flat[:, None], 3, axis=1))
+        colors = corners_of("COLOR_0", np.ones(points.shape))[..., :3]
+        uv = corners_of("TEXCOORD_0", np.zeros((*corners.shape, 2)))
+        textured = "baseColorTexture" in look and "TEXCOORD_0" in has
+        number = sources[look["baseColorTexture"]["index"]] if textured else -1
         base = look.get("baseColorFactor", [1.0] * 4)[:3]
         parts.append((points, normals, colors * np.array(base), uv, np.full(len(corners), number)))
     points, normals, colors, uv, texture = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -221,15 +226,8 @@ def _reach(faces: Faces, edges: Array, view: Row) -> tuple[NDArray[np.int64], ND
     u = view["fx"] * faces.points[..., 0] / safe + view["cx"]
     v = view["fy"] * faces.points[..., 1] / safe + view["cy"]
     # A face that reaches nearer has no box: its pixels may be anywhere.
-    left, right, top, bottom = (
-        np.where(whole, bound, beyond)
-        for bound, beyond in (
-            (u.min(axis=1), -np.inf),
-            (u.max(axis=1), np.inf),
-            (v.min(axis=1), -np.inf),
-            (v.max(axis=1), np.inf),
-        )
-    )
+    left, top = (np.where(whole, at.min(axis=1), -np.inf) for at in (u, v))
+    right, bottom = (np.where(whole, at.max(axis=1), np.inf) for at in (u, v))
     seen = z.max(axis=1) > NEAR_M
     first, last = _centres(top, bottom, view["height"])
     face, row = _ranges(first, np.where(seen, last, first - 1))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.read.independent.derive import FIRST_OBJECT, FLOOR, TABLE, Array, Kind, Row, StoredPair, matrix
-from services.read.independent.rays import Faces, Hits, cast, place_shapes, read_shape
+from services.read.independent.rays import Faces, Hits, bare_faces, cast, place_shapes, read_shape
 
 STEP = 1.0 / 65_535.0
 """Of images of 16 bits."""
@@ -65,7 +65,7 @@ def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
         return
     yield from _check_columns(pair, view, faces)
     for one in judge_images(pair, view, faces):
-        pair.found.append(one)
+        pair.findings.append(one)
         if one.wrong:
             at = f"pixel {one.first} is the first, the worst away from edges is {one.worst:.3g} {one.unit}"
             yield f"{one.target}: {one.wrong} of {one.pixels} pixels are not what the shapes show: {at}"
@@ -97,10 +97,8 @@ def faces_of(pair: StoredPair, view: Row) -> Faces:
 def _plane() -> Faces:
     """A floor or a board, without a colour."""
     corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    points, some = corners[[[0, 1, 2], [0, 2, 3]]], np.zeros(2)
-    normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    none = np.full(2, -1), (), np.zeros(2, int), np.zeros(2, bool)
-    return Faces(points, normals, np.full(points.shape, np.nan), points[..., :2], *none, some)
+    points = corners[[[0, 1, 2], [0, 2, 3]]]
+    return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
 
 
 def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
@@ -120,9 +118,9 @@ def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
         for name, value in expected.items():
             if row[name] != value:
                 yield f"region {region}: {name} is {row[name]}, its image gives {value}"
-        told = row["coordinates_scale_m"], row["coordinates_offset_m"]
+        stored = row["coordinates_scale_m"], row["coordinates_offset_m"]
         if region < FIRST_OBJECT or "coordinates" not in asked:
-            if told != (None, None):
+            if stored != (None, None):
                 yield f"region {region}: it has coordinates' scale and offset, and no such image"
             continue
         body = shapes[region]
@@ -130,8 +128,8 @@ def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
         low, high = points.min(axis=0), points.max(axis=0)
         diagonal = float(np.linalg.norm(high - low))
         offset = (low + high) / 2.0 - diagonal / 2.0
-        if not np.allclose([told[0], *told[1]], [diagonal, *offset], rtol=0.0, atol=1e-6 * diagonal):
-            yield f"region {region}: coordinates' scale and offset are {told}, its shape gives {diagonal}, {offset}"
+        if not np.allclose([stored[0], *stored[1]], [diagonal, *offset], rtol=0.0, atol=1e-6 * diagonal):
+            yield f"region {region}: coordinates' scale and offset are {stored}, its shape gives {diagonal}, {offset}"
 
 
 def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
@@ -140,13 +138,13 @@ def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
     region = pair.images[view["role"], "region"].reshape(-1)
     own = hits.where(faces.region[hits.face] == region[hits.pixel])
     seen = (kind for kind in pair.kinds(view["role"]).values() if kind.formula is not None)
-    found = [_judge_seen(kind, pair, view, faces, own) for kind in seen]
+    findings = [_judge_seen(kind, pair, view, faces, own) for kind in seen]
     objects = hits.where(faces.region[hits.face] >= FIRST_OBJECT)
     if "amodal" in asked:
-        found += [_judge_amodal(pair, view, faces, objects, number) for number in pair.regions]
+        findings += [_judge_amodal(pair, view, faces, objects, number) for number in pair.regions]
     if "layers" in asked:
-        found.append(_judge_layers(pair, view, faces, objects))
-    return found
+        findings.append(_judge_layers(pair, view, faces, objects))
+    return findings
 
 
 def choices(faces: Faces, hits: Hits) -> Iterator[NDArray[np.int64]]:
@@ -288,8 +286,8 @@ def _coordinates(pair: StoredPair, view: Row, faces: Faces, hits: Hits, stored: 
         own = region == row["region_id"]
         T_obj_cam, some = np.linalg.inv(matrix(row, "T_cam_obj")), hits.where(own)
         points = rays[own] * _levels(some)
-        told = row["coordinates_scale_m"] * (stored[own] * STEP) + row["coordinates_offset_m"]
-        error[own] = _beyond(points @ T_obj_cam[:3, :3].T + T_obj_cam[:3, 3], told).max(axis=1, initial=0.0)
+        points_stored = row["coordinates_scale_m"] * (stored[own] * STEP) + row["coordinates_offset_m"]
+        error[own] = _beyond(points @ T_obj_cam[:3, :3].T + T_obj_cam[:3, 3], points_stored).max(axis=1, initial=0.0)
         error[own] /= row["coordinates_scale_m"]
     return error, np.full(len(error), MOST_SHARE)
 

@@ -11,7 +11,7 @@ from scipy.spatial.distance import pdist
 
 from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
-from services.export.shapes import box_of, color_vertices, reaches_edge, whole_silhouette
+from services.export.shapes import box_of, reaches_edge, whole_silhouette
 from services.job.record import require_job
 from tests.datasets import make_dataset
 from tests.services.export.bop_reader import load_model, load_shots, points_in_model, read_picture
@@ -235,7 +235,7 @@ def test_a_shape_without_normals_gets_those_of_its_faces_and_a_flat_one_has_a_di
         assert model_info(cloud)["diameter"] == pytest.approx(pdist(cloud).max(), rel=1e-12)
     ball = trimesh.creation.icosphere(4, 30.0)
     assert model_info(ball.vertices)["diameter"] == pytest.approx(pdist(ball.vertices).max(), rel=1e-12)
-    (tmp_path / "box.ply").write_bytes(b"".join(ply_lines(color_vertices(plain_shape(box)))))
+    (tmp_path / "box.ply").write_bytes(b"".join(ply_lines(plain_shape(box))))
     model = load_model(tmp_path / "box.ply")
     np.testing.assert_allclose(model.vertices, 1000.0 * box.vertices, atol=1e-6)
     np.testing.assert_allclose(model.normals, box.vertex_normals, atol=1e-5)

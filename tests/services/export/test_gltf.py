@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from services.export.gltf import NO_SOURCES
+from services.export.graphics import NO_SOURCES
 from services.job.record import require_job
 from tests.services.export.exported import export_to, source_poses, source_rows
 from workers.store.local import LocalStore

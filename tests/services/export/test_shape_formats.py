@@ -8,8 +8,7 @@ import pytest
 import trimesh
 
 from schemas.errors import InputError
-from services.export.occnet import NO_SAMPLES
-from services.export.pcn import NO_POINTS
+from services.export.objects import NO_POINTS, NO_SAMPLES
 from services.export.source import ExportScene
 from tests.datasets import make_dataset
 from tests.judge.nearest import distances_to_faces, winding_numbers

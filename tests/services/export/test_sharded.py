@@ -13,7 +13,7 @@ import yaml
 
 from schemas.dataset.layout import ARTICLE
 from schemas.dataset.tables import SCHEMAS
-from services.export.huggingface import card_text
+from services.export.shards import card_text
 from tests.services.export.exported import export_to, source_image, source_poses, source_rows
 
 WORDS = {

@@ -1,7 +1,6 @@
 """Exports of any format: killed, repeated, narrowed, refused, of tars and buckets, or made while the dataset is."""
 
 import contextlib
-import dataclasses
 import hashlib
 import itertools
 import json
@@ -14,29 +13,22 @@ from pathlib import Path
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
-import trimesh
 
 from schemas.errors import CorruptError, InputError, InUseError, OutputError
 from schemas.job.assets import SplitShares
-from schemas.job.job import Job
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
-from schemas.scene.view import Camera, Intrinsics
+from schemas.scene.shape import Material, Part
 from services.cli.main import main
 from services.dataset import dataset as splits
 from services.dataset.dataset import Splits, collect_ids, split_by_category
-from services.export.folder import ExportFolder, Register, Rounds
-from services.export.shapes import Shapes, color_vertices, covered
-from services.export.source import iter_ranges, scenes_of
+from services.export.folder import ExportFolder
+from services.export.shapes import Shapes, vertex_colors
+from services.export.source import iter_records, scenes_of
 from services.export.table import FORMATS
 from services.job.record import require_job
+from services.read.dataset_reader import read_stored
 from services.read.scene_geometry import Sources
 from tests.datasets import in_a_bucket, make_dataset
-from tests.kit.shapes import shape_of
 from tests.services.export.exported import contents, export_to, source_rows
-from workers.geometry.camera import NEAR_M
-from workers.geometry.frames import pose, transform, uniform_rotation
-from workers.geometry.raycast import cast_view
 from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
 
@@ -104,14 +96,6 @@ def test_an_export_that_is_killed_anywhere_goes_on_to_the_same_bytes(points, nam
         shutil.rmtree(target)
 
 
-@pytest.mark.parametrize("key", ["pairs", "left_out", "format", "ranges"])
-def test_a_writer_that_describes_what_every_manifest_has_is_refused(key, files, tmp_path, monkeypatch):
-    monkeypatch.setattr(FORMATS["gltf"].load(), "describe", lambda _: {key: 1})
-    with pytest.raises(ValueError, match=f"the writer of gltf describes {key}: "):
-        export_to(files, tmp_path / "out", "gltf", first_scene=0, last_scene=0)
-    assert not (tmp_path / "out/export.json").exists()
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, request, tmp_path):
     files, tars = map(request.getfixturevalue, OF.get(name, ("files", "tars")))
@@ -120,9 +104,8 @@ def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, request, t
         export_to(store, tmp_path / place, name, shard_mb=0)
     plain, tarred, far = (contents(tmp_path / place) for place in sources)
     assert tarred == far
-    assert {key for key in {*plain, *tarred} if plain.get(key) != tarred.get(key)} == {
-        "export.json"
-    }  # other job digest
+    differing = {key for key in {*plain, *tarred} if plain.get(key) != tarred.get(key)}
+    assert differing == {"export.json"}  # other job digest
 
 
 # ------------------------------------------------------------------------------------------------ the folder
@@ -151,40 +134,6 @@ def test_a_folder_that_is_not_an_exports_is_refused(files, tmp_path):
         with pytest.raises(OutputError, match=told):
             export_to(files, target, "mirror-recon")
     assert contents(tmp_path / "mine") == {"thesis.tex": b""}
-
-
-def test_what_was_appended_after_the_last_checkpoint_is_taken_back(tmp_path):
-    folder, place = ExportFolder(tmp_path / "new"), tmp_path / "new"
-    with folder.claimed({"format": "x", "dataset_digest": None}) as progress:
-        assert progress is None
-        folder.append("a/list.txt", b"one\n")
-        folder.checkpoint({"next_scene": 1})
-        folder.append("a/list.txt", b"two\n")
-        folder.append("b.txt", b"b")
-    (part,) = (place / "_export" / "parts").iterdir()
-    part.write_bytes(part.read_bytes() + b"tw")
-    again = ExportFolder(place)
-    with again.claimed({"format": "x", "dataset_digest": "of the run that went on"}) as progress:
-        assert progress is not None and progress["next_scene"] == 1 and not (place / "a").exists()
-        again.append("a/list.txt", b"three\n")
-        again.checkpoint({"next_scene": 2})
-        again.finish({"pairs": 1})
-    assert (place / "a" / "list.txt").read_bytes() == b"one\nthree\n"
-    assert sorted(path.name for path in place.iterdir()) == ["a", "export.json"]
-    assert ExportFolder(place).finished() == {"pairs": 1}
-
-
-def test_entries_of_a_register_after_the_last_checkpoint_are_taken_back(tmp_path):
-    folder = ExportFolder(tmp_path / "new")
-    with folder.claimed({}):
-        register = Register(folder, 0)
-        assert [register.add("mug/b", "x"), register.add("mug/a"), register.state()] == [1, 2, 2]
-        assert [register.add("mug/a", "late"), register.state()] == [3, 3]  # and no checkpoint
-        register.close()
-        again = Register(folder, 2)
-        assert list(again.counts()) == [("mug/a", 1), ("mug/b", 1)] and again.of("mug/b") == [(1, "x")]
-        assert again.add("mug/a", "new") == 3 and again.of("mug/a") == [(2, ""), (3, "new")]
-        again.close()
 
 
 def test_an_unfinished_export_that_is_anothers_or_damaged_is_refused(tmp_path):
@@ -217,37 +166,6 @@ def test_two_processes_do_not_write_one_export(tmp_path):
         process.kill()
     with ExportFolder(tmp_path / "new").claimed({}):
         pass
-
-
-class Lines:
-    def __init__(self, path: Path) -> None:
-        self.file, self.bytes = path.open("wb"), 0
-
-    def add(self, data: bytes) -> None:
-        self.bytes += self.file.write(data)
-
-    def close(self) -> None:
-        self.file.close()
-
-
-def test_a_round_ends_for_every_split_when_one_shard_is_full(tmp_path):
-    folder = ExportFolder(tmp_path / "new")
-    with folder.claimed({}):
-        rounds = Rounds(folder, Lines, "{split}-{number:02d}.txt", 4, None)
-        rounds.shard("train").add(b"abc")
-        rounds.end_if_full()
-        assert rounds.state() is None
-        rounds.shard("test").add(b"x")
-        rounds.shard("train").add(b"d")
-        rounds.end_if_full()
-        assert rounds.state() == {"next": {"test": 1, "train": 1}}
-        again = Rounds(folder, Lines, "{split}-{number:02d}.txt", 4, rounds.state())
-        again.shard("train").add(b"e")
-        again.end()
-        again.shard("val").add(b"not ended")
-        again.close()
-    files = {path.name: path.read_bytes() for path in (tmp_path / "new").glob("*.txt")}
-    assert files == {"train-00.txt": b"abcd", "test-00.txt": b"x", "train-01.txt": b"e"}
 
 
 # ------------------------------------------------------------------------------------------------ which scenes
@@ -294,7 +212,7 @@ def test_an_image_that_is_lost_is_an_error_and_never_left_out(copy, tmp_path):
 
 
 def first_scene(store):
-    (scene,) = scenes_of(store, next(iter_ranges(store, list_codes(store), 0)), [0], Splits({}))
+    (scene,) = scenes_of(store, read_stored(store, next(iter_records(store, list_codes(store)))), [0], Splits({}))
     return scene
 
 
@@ -350,7 +268,7 @@ def test_each_split_has_its_share_of_every_category_and_what_is_held_out_is_test
 def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_path):
     def load(store):
         scene = first_scene(store)
-        return Shapes(require_job(store)).load(scene, scene.row["instance_id"])
+        return Shapes(Sources(require_job(store))).load(scene, scene.row["instance_id"])
 
     for path in (tmp_path / "copy" / "assets").rglob("*.glb"):
         path.write_bytes(b"glTF")
@@ -359,34 +277,12 @@ def test_a_stored_shape_is_the_one_that_the_jobs_sources_make(files, copy, tmp_p
     shutil.rmtree(tmp_path / "copy" / "assets")
     stored, made = load(files), load(copy)
     assert stored is not None and made is not None
-    np.testing.assert_allclose(stored.shape.vertices, made.shape.vertices, atol=1e-7)
-    np.testing.assert_array_equal(stored.shape.faces, made.shape.faces)
-    assert np.abs(stored.colors.astype(int) - made.colors).max() <= 1
+    np.testing.assert_allclose(stored.vertices, made.vertices, atol=1e-7)
+    np.testing.assert_array_equal(stored.faces, made.faces)
+    colors = [np.concatenate([vertex_colors(part) for part in shape.parts]) for shape in (stored, made)]
+    assert np.abs(colors[0].astype(int) - colors[1]).max() <= 1
     extents = next(row["extents_m"] for row in source_rows(files.root, "assets") if row["category"] != "table")
-    assert np.ptp(stored.shape.vertices, axis=0).max() < 2 * max(extents)
-    record = require_job(copy)
-    gone = {"objects": [{"source": "library", "folder": "gone"}]}
-    job = Job.model_validate({"name": "t", "assets": gone})
-    sources = Sources(dataclasses.replace(record, job=job, folder=str(tmp_path)))
-    with pytest.raises(InputError, match="gone"):
-        sources.asset(0, "mug", "x")
-
-
-def test_a_silhouette_is_where_rays_of_embree_meet_the_mesh_also_across_the_near_plane():
-    rng, k = np.random.default_rng(3), Intrinsics(width=160, height=120, fx=150.0, fy=155.0, cx=75.3, cy=61.7)
-    meshes = [
-        trimesh.creation.torus(0.1, 0.03),
-        trimesh.creation.box((0.2, 0.1, 0.05)),
-        trimesh.creation.annulus(0.05, 0.1, 0.1),
-    ]
-    crossing = 0
-    for shape in map(shape_of, meshes * 8):
-        T = pose(uniform_rotation(rng), np.array([*rng.uniform(-0.15, 0.15, 2), rng.uniform(0.04, 0.4)]))
-        points = transform(T, shape.vertices)
-        _, region, _ = cast_view([Placed(1, shape, T)], Camera(k, np.eye(4)))
-        assert np.array_equal(covered(points, shape.faces, k), region > 0)
-        crossing += bool((points[:, 2] < NEAR_M).any() and (region > 0).any())
-    assert crossing > 2
+    assert np.ptp(stored.vertices, axis=0).max() < 2 * max(extents)
 
 
 def test_a_vertex_has_the_colour_of_its_texel_times_the_base_colour():
@@ -396,8 +292,12 @@ def test_a_vertex_has_the_colour_of_its_texel_times_the_base_colour():
     material = Material(base_color=(1.0, 0.5, 1.0, 1.0), texture=texture)
     part = Part("a", np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32), material, uv=uv)
     plain = Part("b", np.zeros((1, 3)), np.zeros((0, 3), np.int32), Material((0.2, 0.4, 0.6, 1.0)))
-    colors = color_vertices(Shape((part, plain))).colors
-    assert colors.tolist() == [[200, 50, 0], [0, 50, 200], [200, 50, 0], [51, 102, 153]]
+    assert [*vertex_colors(part).tolist(), *vertex_colors(plain).tolist()] == [
+        [200, 50, 0],
+        [0, 50, 200],
+        [200, 50, 0],
+        [51, 102, 153],
+    ]
 
 
 # ------------------------------------------------------------------------------------------------ the command

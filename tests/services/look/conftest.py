@@ -33,11 +33,11 @@ def address(picture: Picture) -> str:
 
 
 SCENES = [
-    {"scene_id": 0, "category": "mug", "effects": ["drop", "rgb"], "hover_gap_mm": 0.01,
+    {"scene_id": 0, "category": "mug", "effects": ["drop", "rgb"],
      "skipped": [{"effect": "glass", "why": "no glass"}]},
-    {"scene_id": 1, "category": "mug", "effects": ["drop"], "hover_gap_mm": -0.0,
+    {"scene_id": 1, "category": "mug", "effects": ["drop"],
      "skipped": [{"effect": "glass", "why": "no glass"}, {"effect": "rgb", "why": "off"}]},
-    {"scene_id": 3, "category": "box", "effects": ["drop", "rgb"], "hover_gap_mm": 0.001,
+    {"scene_id": 3, "category": "box", "effects": ["drop", "rgb"],
      "skipped": [{"effect": "glass", "why": "not asked"}]},
 ]  # fmt: skip
 FILES = [{"bytes": 100, "path": "a", "sha256": "0"}, {"bytes": 50, "path": "b", "sha256": "0"}]

@@ -13,7 +13,7 @@ import pytest
 from schemas.dataset.layout import SUCCESS_FILE
 from schemas.job.job import Job
 from services.look import collect as module
-from services.look.charts import FINE, HEIGHT, Chart, Histogram, amount, bars_of, chart_html, length_of_decade
+from services.look.charts import FINE, HEIGHT, Chart, Histogram, amount, bars_of, chart_html
 from services.look.collect import CaptureQuality, Cost, Failure, choose_spread, collect, open_tables
 from services.look.sections import captures_html, charts_html, effects_html, failures_html, overview_html
 from tests.made_up_scenes import attempt_at
@@ -35,8 +35,6 @@ def test_tables_made_by_hand_give_the_figures_that_can_be_counted(figures):
     assert figures.visibility["mirror"].most == 1.0
     assert (figures.inclination["input"].least, figures.inclination["input"].most) == pytest.approx((45.0, 47.0))
     assert (figures.distance.count, figures.distance.least, figures.distance.most) == (2, 2.1, 2.5)
-    assert (figures.gap.count, figures.gap.least, figures.gap.most) == (2, -3.0, pytest.approx(-2.0))
-    assert figures.no_gap == 1  # a gap of 0 is none, and no nanometre
     first, second = figures.failures
     assert (first.reason, first.scenes, first.examples, first.detail) == ("left_table", 2, (2, 4), "at 0.7 m")
     assert (second.reason, second.scenes) == ("no_rest", 1)
@@ -56,7 +54,6 @@ def test_captures_have_their_quality():
     figures = collect(Handmade(scenes=scenes))
     (one,) = figures.captures
     assert (one.name, one.views, one.left_out, one.pose_mm, one.cloud_median_mm) == ("shots/mug", 22, 1, 0.4, None)
-    assert figures.gap.count == 0
     html = captures_html(figures)
     assert all(words in html for words in ("0.21 px", "0.4 mm", "98 %", "1 left out", "<td>–</td>"))
     assert captures_html(collect(Handmade())) == ""
@@ -149,16 +146,10 @@ def test_bars_are_as_high_as_their_counts_and_told_in_words():
     assert "<svg" in chart(input=[2.5] * 9, mirror=[0.0, 0.1])
     html = chart(input=[2.5] * 99 + [2.0])
     assert "<svg" not in html and "nearly always 2.5 m; 2 m to 2.5 m, n = 100" in html
-    lengths = {-6.0: "1 nm", -4.5: "31.6 nm", -3.0: "1 µm", -2.0: "10 µm", 0.0: "1 mm", 3.0: "1 m"}
-    assert {decade: length_of_decade(decade) for decade in lengths} == lengths
     assert (amount(45.678, "°"), amount(0.5, "%")) == ("45.7°", "0.5 %")
 
 
 # ---------------------------------------------------------------------------------------------- sections
-
-
-def html_of_gap(figures) -> str:
-    return charts_html(figures, {}).partition("<h3>Resting gap</h3>")[2]
 
 
 def test_sections_say_what_was_asked_made_left_out_and_failed(figures):
@@ -178,10 +169,8 @@ def test_sections_say_what_was_asked_made_left_out_and_failed(figures):
     assert "left table" in html and "at 0.7 m" in html and "scene 2, 4" in html
     assert failures_html((), 9) == '<p class="empty">No scene failed of 9.</p>'
     html = charts_html(figures, {"input": Histogram(0.0, 9.6)})
-    titles = ["Distance to the object", "Visibility", "Inclination", "Resting gap"]  # no depth: it has no values
-    assert re.findall("<h3>(.*?)</h3>", html) == titles and "0 in 1 of 3 scenes" in html
-    still = html_of_gap(replace(figures, gap=Histogram(-6.0, 4.0), no_gap=64))
-    assert "0 in 64 of 64 scenes" in still and "<svg" not in still and "nm" not in still
+    titles = ["Distance to the object", "Visibility", "Inclination"]  # no depth: it has no values
+    assert re.findall("<h3>(.*?)</h3>", html) == titles
 
 
 def test_what_comes_from_the_dataset_is_text_and_never_markup(figures):

@@ -27,7 +27,8 @@ def test_ranges_come_in_order_with_every_row_and_a_table_that_is_altered_or_miss
     ranges = list(read_ranges(store, FIRST, STOP))
     assert [read.records[0].span.start for read in ranges] == [*range(FIRST, STOP, 4)]
     for table in set(TABLES) - {"timings", "assets"}:
-        assert [row for read in ranges for row in read.rows[table].to_pylist()] == plain_rows(table)
+        tables = [read.rows[table] for read in ranges if table in read.rows]
+        assert [row for rows in tables for row in rows.to_pylist()] == plain_rows(table)
     path = tmp_path / range_table_path(FIRST + 4, "views")
     path.write_bytes(path.read_bytes()[::-1])
     for words in ("does not", "is committed"):

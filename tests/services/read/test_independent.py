@@ -112,13 +112,6 @@ def ties_to_the_highest_index(original: Callable) -> Callable:
     return planted
 
 
-def thinned_cloud(original: Callable) -> Callable:
-    """Every other source row is left out."""
-    return lambda depth, *rest: original(
-        np.where(np.arange(len(depth))[:, None] % 2, depth, depth.dtype.type(0)), *rest
-    )
-
-
 def box_without_its_last_column(original: Callable) -> Callable:
     def narrow(extent):
         x, y, width, height = extent.bbox_xywh
@@ -143,22 +136,19 @@ def patch_too_far_left(original: Callable) -> Callable:
     return planted
 
 
-def words_changed(separator: str, change: Callable[[list[str]], list]) -> Callable:
-    """Changes the words of each line of a merged file."""
+def transposed(original: Callable) -> Callable:
+    """The matrix of each line of a merged file column by column."""
 
-    def wrong(original: Callable) -> Callable:
-        def planted(rows):
-            lines = [change(line.split(separator)) for line in original(rows).decode().splitlines()]
-            return "".join(separator.join(map(str, words)) + "\n" for words in lines).encode()
+    def planted(rows):
+        words = [line.split(",") for line in original(rows).decode().splitlines()]
+        lines = [[*line[:2], *np.array(line[2:]).reshape(4, 4).T.ravel()] for line in words]
+        return "".join(",".join(map(str, line)) + "\n" for line in lines).encode()
 
-        return planted
-
-    return wrong
+    return planted
 
 
 WRONG = {
     "mirrored phi": (pairs.mirror_pose, lambda _: turned_mirror(-1.0), "T_world_cam of mirror is off"),
-    "T_z": (pairs.mirror_pose, farther_mirror, "T_world_cam of mirror is off by 0.0"),
     "nearest for percentile": (
         pairs.front_distance,
         lambda f: lambda z, own, mirror: f(z, own, mirror.model_copy(update={"percentile": 0.0})),
@@ -176,50 +166,20 @@ WRONG = {
         lambda f: lambda renderer, things, look, seen, *rest: f(renderer, things, look, shifted(seen, 0, 0.5), *rest),
         "mm off the floor's plane",
     ),
-    "units": (
-        pixels.round_depth,
-        lambda f: lambda depth_m, low, high, units: f(depth_m, low, high, 1.001 * units),
-        "mm off the floor's plane",
-    ),
     "half a pixel in projection": (
         projection.forward_project,
         lambda f: lambda depth, source, *rest: f(depth, shifted(source, 0.5), *rest),
         "depth pixels are not those of the input cloud",
     ),
-    "thinned": (projection.forward_project, thinned_cloud, "depth pixels are not those of the input cloud"),
     "ties": (projection.forward_project, ties_to_the_highest_index, "ties do not go to the lowest source index"),
     "box": (pixels.measure_regions, box_without_its_last_column, "bbox_xywh is"),
     "coordinates": (camera.image_coordinates, rounded_image_coordinates, "is not the pixel of the object's origin"),
     "patch": (labels.crop_box, patch_too_far_left, "is not the crop about"),
-    "transposed poses": (
-        tables.cam_pose_lines,
-        words_changed(",", lambda words: [*words[:2], *np.array(words[2:]).reshape(4, 4).T.ravel()]),
-        "camPoses.csv: T01, T02, T03, ",
-    ),
-    "cx and cy": (
-        tables.camera_lines,
-        words_changed(",", lambda words: [*words[:7], words[8], words[7], *words[9:]]),
-        "cameras.csv: cx, cy in the line of pose_id",
-    ),
-    "u and v": (
-        tables.object_lines,
-        words_changed(" ", lambda words: [*words[:4], words[5], words[4], *words[6:]]),
-        "objects.dat: u, v in the line of pose_id",
-    ),
+    "transposed poses": (tables.cam_pose_lines, transposed, "camPoses.csv: T01, T02, T03, "),
 }
-"""(the right formula, the wrong one made of it, what is told)."""
-MORE = {
-    "T_z",
-    "yaw",
-    "units",
-    "half a pixel in projection",
-    "thinned",
-    "coordinates",
-    "cx and cy",
-    "u and v",
-    "cx_opencv",
-}
-"""Those whose kind (a camera, an image, a label, a merged file) another one stands for by default."""
+"""(the right formula, the wrong one made of it, what is told); one for each thing that is derived."""
+MORE = {"yaw", "half a pixel in projection", "coordinates", "cx_opencv"}
+"""Those whose kind (a camera, an image, a label) another one stands for by default."""
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError
 from services.job.record import read_success
 from services.merge.merge import merge
+from services.read.dataset_reader import StoredTables, file_system_of
 from services.read.query import Format, ask, query, write_rows
-from services.read.stored_tables import StoredTables, file_system_of, read_merged
 from tests.datasets import in_a_bucket
 from tests.made_up_scenes import attempt_at, failed_scene, fails, scene
 from workers.store.commit import publish
@@ -180,12 +180,6 @@ def test_a_bucket_has_the_rows_of_the_folder_and_only_the_tables_asked_are_read(
         files.open_output_stream("t/new")
     with pytest.raises(CorruptError, match=r"9\.parquet is committed and missing"):
         ds.dataset(["t/9.parquet"], pa.schema([("n", pa.int64())]), "parquet", filesystem=files).to_table()
-
-
-def test_a_merged_file_alone_has_the_category_of_its_folder(tiny):
-    for path in tiny.root.glob("manifest/scenes/*/*.parquet"):
-        rows = read_merged("scenes", path.relative_to(tiny.root).as_posix(), path.read_bytes())
-        assert set(rows["category"].to_pylist()) == {path.parent.name.removeprefix("category=")}
 
 
 def format_rows(rows: pa.Table, style: Format) -> bytes:

@@ -11,22 +11,26 @@ import trimesh
 
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError
-from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
 from services.cli.main import main
 from services.job.record import encode_job, record_job
 from services.merge.merge import merge
 from services.read.columns_page import describe_columns, list_columns, write_page
-from services.read.dataset_reader import choose_evenly, choose_scenes, file_reader, find_scene, read_image
+from services.read.dataset_reader import (
+    choose_evenly,
+    choose_scenes,
+    file_reader,
+    find_scene,
+    patch_paths,
+    read_image,
+    view_paths,
+)
 from services.read.query import query
 from services.read.scene_geometry import posed_scene
 from services.read.status import read_status
-from services.read.stored_tables import patch_paths, view_paths
 from services.run.lock import hold_lock
 from tests.datasets import make_dataset
 from tests.made_up_scenes import attempt_at, failed_scene, scene
-from workers.assets.builtin.make import make_asset
-from workers.assets.glb import mesh_of_part
 from workers.store.ledger import list_commits, save_rows
 from workers.store.local import LocalStore
 
@@ -110,20 +114,6 @@ def test_a_scene_as_glb_has_every_object_where_its_row_puts_it_in_the_colours_of
     assert {"floor", "table"} <= {node.split("/")[0].split(" ")[0] for node in found.graph.nodes_geometry}
     with pytest.raises(InputError, match="scene 7 is not in"):
         posed_scene(pile, 7)
-
-
-def test_a_part_keeps_its_corners_faces_and_colour_as_a_mesh():
-    for category in ("mug", "laptop", "table"):
-        for part in make_asset(category, ProceduralSource(source="procedural"), 3, 500.0).shape.parts:
-            mesh = mesh_of_part(part)
-            assert np.array_equal(mesh.vertices, part.vertices) and np.array_equal(mesh.faces, part.faces)
-            if part.material.texture is not None:
-                assert np.array_equal(np.asarray(mesh.visual.material.baseColorTexture), part.material.texture)
-            elif part.colors is None:
-                srgb = np.array(part.material.base_color[:3])
-                linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-                found = np.asarray(mesh.visual.material.baseColorFactor) / 255
-                assert found[:3] == pytest.approx(linear, abs=0.5 / 255 + 1e-9)
 
 
 # ---------------------------------------------------------------------------------------------- status

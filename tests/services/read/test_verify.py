@@ -228,7 +228,7 @@ COMMITS: dict[str, tuple[tuple[Damage, ...], tuple[str, ...]]] = {
         ("job.yaml: its digest is not that of its keys", f"job.yaml: its keys or asset files * {NOT_JOB}"),
     ),
     "fewer scenes": ((job(scenes=2),), (f"{COMMIT(2)}: scenes 2 to 2 are committed, outside of those asked",)),
-    "more scenes": ((job(scenes=4),), (f"{COMMIT(3)}: scenes 3 to 3 are not committed",)),
+    "more scenes": ((job(scenes=4),), (f"{COMMIT(3)}: is missing: scenes 3 to 3 are not committed",)),
     "another stack": ((other_stack,), (f"{FINGERPRINT}: is the fingerprint * which no commit has",)),
     "a damaged record": ((edit(COMMIT(1), "span", "spin"),), (f"{COMMIT(1)}: was altered after it was written",)),
     "records in wrong places": (
@@ -238,7 +238,7 @@ COMMITS: dict[str, tuple[tuple[Damage, ...], tuple[str, ...]]] = {
         ),
         (
             f"{COMMIT(4)}: holds the record of another range",
-            f"{COMMIT(3)}: scenes 3 to 3 are not committed",
+            f"{COMMIT(3)}: is missing: scenes 3 to 3 are not committed",
             f"{COMMIT(2)}: is missing, and later tries of its range are there",
             "manifest/_commits/0000000002.retry-1.json: holds the record of another range",
         ),
@@ -250,8 +250,14 @@ COMMITS: dict[str, tuple[tuple[Damage, ...], tuple[str, ...]]] = {
             "can/patches: is an empty folder",
         ),
     ),
-    "the last range dropped": ((drop_range(2),), (f"{COMMIT(2)}: scenes 2 to 2 are not committed: {AGAIN}",)),
-    "a commit lost, and its files there": ((remove(COMMIT(1)),), (f"{COMMIT(1)}: scenes 1 to 1 are not committed",)),
+    "the last range dropped": (
+        (drop_range(2),),
+        (f"{COMMIT(2)}: is missing: scenes 2 to 2 are not committed: {AGAIN}",),
+    ),
+    "a commit lost, and its files there": (
+        (remove(COMMIT(1)),),
+        (f"{COMMIT(1)}: is missing: scenes 1 to 1 are not committed",),
+    ),
     "a range dropped before the merge": (
         (lambda out: reopen(LocalStore(out)), drop_range(1)),
         (f"scenes 1 to 1 are not committed: {AGAIN}", f"{NOT_FINISHED}2 of 3 scenes are committed: {AGAIN}"),

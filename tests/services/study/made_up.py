@@ -6,7 +6,6 @@ from pathlib import Path
 
 from schemas.job.job import JobKind
 from services.study.model import Figure, Proof, Row, Setting, Study
-from services.study.page import STUDY_VERSION
 
 EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"
 
@@ -30,14 +29,14 @@ def study(*rows: Row, job_scenes: int = 64, notes: tuple[str, ...] = ()) -> Stud
     machine = {"cpu": "A made-up processor", "cores": 2, "gl_renderer": "llvmpipe", "versions": {"numpy": "2.4.6"}}
     command = "verso tradeoff deploy/jobs/tabletop.yaml --out data/tradeoff"
     doubts, spent = ("whether step=30 (4 scenes)",), (900.0, 871.5)
-    about = ("tabletop", command, machine, 48, rows, "balanced", job_scenes, notes)
+    about = ("tabletop", command, machine, 48, rows, job_scenes, notes)
     return Study(*about, *spent, "Use step=60.", "step=60", doubts, (PROOF,))
 
 
 def read_study(folder: Path) -> Study:
     """What `write_study` was given; a tuple among the values of changes or machine comes back as a list."""
     tree = json.loads((folder / "study.json").read_text(encoding="utf-8"))
-    assert tree.pop("verso_study") == STUDY_VERSION
+    assert tree.pop("verso_study") == 2
     tuples = {name: tuple(tree[name]) for name in ("notes", "doubts")}
     proofs = tuple(map(_proof, tree["proofs"]))
     return Study(**(tree | tuples | {"rows": tuple(map(_row, tree["rows"])), "proofs": proofs}))

@@ -10,20 +10,18 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from schemas.capture import CaptureScore
 from schemas.errors import InputError, MachineError
 from schemas.job.job import Job
 from services.cli.main import main
 from services.job.job_file import load_job
 from services.study import command
 from services.study.choose import refuse_unmeasured
-from services.study.measure import RESTS, Unit, answer_unit, errors_of, fewer_views, measure_capture
+from services.study.measure import RESTS, Unit, answer_unit, measure_capture
 from services.study.model import Setting
 from services.study.study import HEADER, JOURNAL_FILE, SPENT, Journal
 from tests.services.cli.test_commands import TABLETOP, told
 from tests.services.study.made_up import read_study
 from workers.assets.catalogue import open_catalogue
-from workers.capture.folder import open_folder
 from workers.pool import run_pool
 from workers.scene.context import open_worker
 
@@ -164,8 +162,6 @@ def test_files_from_outside_are_read_by_processes_of_their_own_also_in_a_study(t
     assert not [each["broken"] for each in answers if "broken" in each] and any("errors" in each for each in answers)
 
 
-# ---------------------------------------------------------------------------------------------- captures
-
 OWN, COARSE = Setting(), Setting((("voxel", "0.008"),), {"captures.fusion.voxel_m": 0.008})
 MERGED = Setting((("merged_views", "1"),), {"captures.synthesis.views": 1})
 HOPELESS = Setting((("views", "1"),), {"captures.simulate.views": 1})
@@ -191,14 +187,6 @@ def test_a_setting_has_its_time_its_bytes_and_its_errors_or_a_reason(tmp_path, m
     assert answers[MERGED.name]["s"] < 0.9 * answers[OWN.name]["s"]  # every photograph has a view from the other side
     assert answers[COARSE.name]["bytes"] < answers[OWN.name]["bytes"] / 3
     assert answers[OWN.name]["errors"]["cloud_mm"] < answers[COARSE.name]["errors"]["cloud_mm"]
-    (place,) = tmp_path.iterdir()
-    folder = open_folder(place)
-    assert fewer_views(folder, 3).numbers == (0, 2, 5) and fewer_views(folder, 99).numbers == folder.numbers
-
-
-def test_what_was_not_scored_is_left_out():
-    scored = errors_of(CaptureScore(pose_mm=0.5, completeness=0.98))
-    assert scored == {"camera_mm": 0.5, "missing_share": pytest.approx(0.02)}
 
 
 def test_captures_without_truth_and_targets_that_a_job_cannot_have_are_refused():

@@ -15,6 +15,7 @@ from schemas.scene.shape import Appearance
 from schemas.scene.view import Camera, Intrinsics, Pair, View
 from services.job.job_file import validate_job
 from services.study.images import Truth, measure_images
+from services.study.truths import cast_patch
 from tests.effects.scenes import SMALL, context_of, merged
 from tests.kit.shapes import box, shape_of
 from workers.geometry.camera import look_at
@@ -22,7 +23,6 @@ from workers.geometry.frames import rotation_about
 from workers.geometry.raycast import cast_view
 from workers.scene.context import Stopwatch
 from workers.scene.make_scene import make_scene
-from workers.scene.pairs import mirror_pose
 
 UNITS = 5000.0
 WIDTH, HEIGHT, F = 160, 120, 500.0
@@ -90,9 +90,6 @@ def seen():
     return seen_of_block(camera_above())
 
 
-# ---------------------------------------------------------------------------------------------- depth and masks
-
-
 def test_views_that_are_as_the_formulas_say_have_no_error_and_what_has_no_meaning_is_left_out(seen):
     depth_m, region = seen
     first, mirror, projected = view(*seen), view(*seen, "mirror"), view(depth_m, None, "projected")
@@ -144,20 +141,6 @@ def test_mask_pixels_that_differ_count_per_pixel_of_the_object(seen):
         assert measure(table_and(block()), *pairs)["mask_share"] == pytest.approx(expected)
 
 
-def test_between_an_object_s_parts_mask_pixels_are_wrong_and_the_table_s_depth_does_not_count():
-    """One object of two thin plates 0.2 m above the table, 20 pixels wide, with 40 between."""
-    wide, middle = 20 * TOP_Z / F, 30 * TOP_Z / F
-    plates = [box(wide, 0.15, 2e-4, (x, 0.0, 0.2 - 1e-4)) for x in (-middle, middle)]
-    views = [seen_of_block(camera_above(), wide, 0.15, (x, 0.0)) for x in (-middle, middle)]
-    depth_m, region = np.minimum(views[0][0], views[1][0]), np.maximum(views[0][1], views[1][1])
-    things, filled = table_and(trimesh.util.concatenate(plates)), region.copy()
-    filled[(region == 3).any(axis=1), 60:100] = 3
-    assert measure(things, pair_of(view(depth_m, region)))["mask_share"] == 0.0
-    assert measure(things, pair_of(view(depth_m, filled)))["mask_share"] == pytest.approx(40 / 40)
-    errors = measure(things, pair_of(view(depth_m + np.where(region == 2, 0.05, 0.0), region)))
-    assert errors["between_mm"] == pytest.approx(0.0, abs=1e-3)
-
-
 def test_between_pixels_of_a_slanted_face_depth_is_off_by_its_slope():
     """A face turned by 30 degrees about the image's y axis; at the axis dz/du = tan(30) z / f, and the nearest pixel is a
     quarter of a pixel away in the median. The face is small, so that the slope is the same everywhere to 3 %."""
@@ -175,9 +158,6 @@ def test_between_pixels_of_a_slanted_face_depth_is_off_by_its_slope():
         first = view(z, np.full(z.shape, 3, np.uint8), camera=camera, units=30_000)
         errors = measure(table_and(plate), pair_of(first), units=30_000.0)
         assert errors["between_mm"] == pytest.approx(0.25 / scale * np.tan(angle) * 1.8 / F * 1e3, rel=0.06)
-
-
-# ---------------------------------------------------------------------------------------------- the other side
 
 
 def mirror_mm(d_z_m, *meshes, roof=None):
@@ -198,9 +178,6 @@ def test_the_mirror_camera_is_off_by_what_d_z_is_off_the_nearest_visible_point()
     assert mirror_mm(1.8, beyond) == pytest.approx(0.0, abs=1e-6)
     under = trimesh.util.concatenate([block(0.05), box(0.05, 0.05, 0.4, (0.15, 0.0, 0.2))])  # a taller one under a roof
     assert mirror_mm(1.8, under, roof=box(0.2, 0.4, 0.01, (0.15, 0.0, 0.5))) == pytest.approx(0.0, abs=1e-6)
-    T = look_at(np.array([1.2, -0.7, 1.9]), np.zeros(3))
-    right, off = mirror_pose(T, 2.0), mirror_pose(T, 2.0125)
-    assert off[:3, 3] - right[:3, 3] == pytest.approx(0.0125 * T[:3, 2]) and np.array_equal(off[:3, :3], right[:3, :3])
 
 
 def projected_errors(things, first, depth_m, camera=None):
@@ -243,9 +220,6 @@ def test_a_projected_pixel_behind_the_surface_is_hidden_and_one_before_it_is_not
     assert errors["hidden_share"] == pytest.approx(1 / 2, abs=4 * np.sqrt(0.25 / 9600))
 
 
-# ---------------------------------------------------------------------------------------------- truth
-
-
 def test_truth_is_kept_while_the_poses_are_the_same_and_no_longer(seen):
     def copy(placed: Placed) -> Placed:
         meshes = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in placed.shape.parts]
@@ -266,14 +240,11 @@ def test_truth_is_kept_while_the_poses_are_the_same_and_no_longer(seen):
 def test_the_patch_is_the_box_about_what_is_seen_of_the_object():
     """And not about its foot, which the top hides, nor about what another thing hides."""
     half = np.array([0.1, 0.075]) * F / TOP_Z
-    patch = Truth(scene_of(table_and(block())), {}).patch(camera_above(), 0)
+    patch = cast_patch(table_and(block()), camera_above())
     expected = np.array([80 - half[0], 60 - half[1], 80 + half[0], 60 + half[1]])
     assert np.array(patch.box) * (WIDTH, HEIGHT, WIDTH, HEIGHT) == pytest.approx(expected, abs=0.3)
     things = table_and(block(), roof=box(0.4, 0.4, 0.01, (0.2, 0.0, 0.205)))  # its near edge is at the axis
-    assert Truth(scene_of(things), {}).patch(camera_above(), 0).box[2] * WIDTH == pytest.approx(80.0, abs=0.3)
-
-
-# ---------------------------------------------------------------------------------------------- made scenes
+    assert cast_patch(things, camera_above()).box[2] * WIDTH == pytest.approx(80.0, abs=0.3)
 
 
 def test_a_made_scene_has_the_errors_that_its_units_and_pixels_leave():

@@ -30,8 +30,6 @@ from workers.scene.make_scene import make_scene
 HERE = truths.importlib.util.find_spec("mitsuba") is not None
 traced = pytest.mark.skipif(not HERE, reason="Mitsuba is not installed: truth of colour goes untested")
 
-# ---------------------------------------------------------------------------------------------- FLIP
-
 
 def plain(color, shape=(60, 80)):
     return np.broadcast_to(np.array(color, np.uint8), (*shape, 3))
@@ -58,9 +56,6 @@ def test_images_of_two_sizes_or_of_another_kind_are_refused_and_end_no_process()
             flip_between(one, other)
 
 
-# ---------------------------------------------------------------------------------------------- what is compared
-
-
 def test_points_are_where_the_crop_of_the_image_has_them():
     # 80 pixels wide: a margin of 24, inside the image alone.
     assert crop_about((0.0, 0.5, 0.125, 0.5 + 20 / 480)) == Crop(0, 240 - 24, 80 + 24, 260 + 24)
@@ -85,9 +80,6 @@ def test_images_of_all_sizes_are_cropped_to_the_same_part_of_the_picture():
         assert cut.shape == (30, 80, 3)
         assert np.abs(cut[..., 0] - 2 * (across - 80)).max() <= 1.0
         assert np.abs(cut[..., 1] - 6 * (down - 54)[:, None]).max() <= 1.0
-
-
-# ---------------------------------------------------------------------------------------------- the truth
 
 
 def scene_with(**changes):

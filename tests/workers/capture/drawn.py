@@ -19,7 +19,7 @@ from workers.capture.poses.observation import Corners, Observation, Setup
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import angle_between, invert, rotation_about, translation
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 KINECT = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.94, cy=548.79)
 HALF = Intrinsics(width=960, height=540, fx=456.185, fy=456.125, cx=480.97, cy=274.395)

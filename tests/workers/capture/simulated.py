@@ -31,7 +31,7 @@ from workers.capture.folder import CaptureFolder, open_folder, read_truth
 from workers.capture.process import ProcessedFolder, process_folder
 from workers.capture.simulate.photograph import build_studio, photograph, place_object
 from workers.capture.simulate.simulate import plan_path, simulate_capture
-from workers.geometry.lens import opencv_lens
+from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
 
@@ -133,4 +133,4 @@ def true_estimates(path: Path, without: tuple[int, ...] = ()) -> Estimates:
         for n in folder.numbers
     )
     markers, joint = CaptureEstimate("markers", views), CaptureEstimate("joint", views, depth)
-    return Estimates("joint", {"markers": markers, "joint": joint}, ())
+    return Estimates("joint", {"markers": markers, "joint": joint})

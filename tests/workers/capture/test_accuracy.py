@@ -21,7 +21,7 @@ from workers.capture.folder import open_folder, read_truth
 from workers.capture.make_capture import process_capture
 from workers.capture.poses.terms import motion_between
 from workers.capture.process import CaptureViews
-from workers.capture.reconstruct import ProcessorClock, estimate_poses, given_files
+from workers.capture.reconstruct import estimate_poses, given_files, processor_clock
 from workers.capture.score import compare_poses, read_whole_truth, score_measured
 from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth, place_object
 from workers.capture.simulate.simulate import simulate_capture
@@ -80,14 +80,14 @@ def pose_errors(path: Path, estimates: Estimates) -> dict:
 
 def assess(path: Path, record, what: str) -> tuple[dict, list]:
     """Process and score a capture and record its figures: pose errors by estimate, and (name, figure, bound) of the missed."""
-    clock = ProcessorClock()
+    clock = processor_clock()
     folder = open_folder(path)
     done = process_capture(folder, Captures(), clock)
     poses, score, truth = pose_errors(path, done.estimates), done.score, read_whole_truth(folder)
     assert score is not None and truth is not None
     mesh = Mesh(done.surface.vertices, done.surface.faces)
-    views = CaptureViews(given_files(folder), done.estimates.estimate, Captures(), mesh)
-    unmeasured = 1.0 - score_measured(done.surface, views, truth).measured_of_visible
+    views = CaptureViews(given_files(folder), Captures(), done.estimates.estimate, done.surface, mesh)
+    unmeasured = 1.0 - score_measured(views, truth).measured_of_visible
     figures = {
         "joint_mm": (poses["joint"][0], 0.5),
         "joint_deg": (poses["joint"][1], 0.05),
@@ -121,7 +121,7 @@ def test_a_capture_is_as_exact_as_promised(category, number, tmp_path, record_fi
         if what == "twice the noise":
             missed += assess(other, record_figure, f"{category} {number}, {what}")[1]
             continue
-        done = process_capture(open_folder(other), Captures(), ProcessorClock())
+        done = process_capture(open_folder(other), Captures(), processor_clock())
         poses = pose_errors(other, done.estimates)
         better = poses["article"][0] / poses["joint"][0]
         record_figure(f"{category} {number}, {what}: article over joint", "passed", better, 3.0)
@@ -153,10 +153,10 @@ def test_a_print_that_is_two_percent_too_large_is_told_or_measured_by_depth(cate
     simulate = NOISE.model_copy(update={"print_scale": 1.02})
     simulate_capture(simulate, Board(), asset_of(category, number), chance_of(number), tmp_path / "capture")
     folder = open_folder(tmp_path / "capture")
-    done = process_capture(folder, Captures(), ProcessorClock())
+    done = process_capture(folder, Captures(), processor_clock())
     assert any("ruler" in note for note in done.estimates.estimate.notes), done.estimates.estimate.notes
     trusting = Captures.model_validate({"estimation": {"trust": "depth"}})
-    poses = pose_errors(folder.path, process_capture(folder, trusting, ProcessorClock()).estimates)
+    poses = pose_errors(folder.path, process_capture(folder, trusting, processor_clock()).estimates)
     better = poses["markers"][0] / poses["joint"][0]
     record_figure(
         f"{category} {number}, print 2 % too large: markers over joint that trusts depth", "passed", better, 3.0

@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 import trimesh
 
-from schemas.capture import CaptureCamera, CapturedView, CaptureTruth
+from schemas.capture import CaptureCamera, CapturedView, CaptureTruth, Reconstruction
 from schemas.errors import CaptureError
 from schemas.job.captures import GRID_KEYS, Board
 from schemas.job.views import Distortion
@@ -34,12 +34,10 @@ from workers.capture.folder import (
 from workers.capture.results import (
     cloud_ply,
     digest_inputs,
-    list_inputs,
     mesh_ply,
     own_files,
-    read_cloud,
-    read_mesh,
     read_record,
+    read_surface,
     write_results,
 )
 from workers.geometry.frames import pose, uniform_rotation
@@ -50,10 +48,9 @@ RNG = np.random.default_rng(0)
 DEPTH = RNG.integers(0, 65536, (30, 40)).astype(np.uint16)
 VIEW = CapturedView(0, RNG.integers(0, 256, (30, 40, 3), np.uint8), DEPTH, RNG.random((30, 40)) < 0.5)
 POINTS = RNG.normal(0, 0.1, (50, 3))
-NORMALS = POINTS / np.linalg.norm(POINTS, axis=1)[:, None]
 COLORS = RNG.integers(0, 256, (50, 3)).astype(np.uint8)
-VIEWS = RNG.integers(1, 40, 50).astype(np.int32)
 FACES = RNG.integers(0, 50, (30, 3)).astype(np.int32)
+SURFACE = Reconstruction(POINTS, -POINTS, COLORS, RNG.integers(1, 40, 50).astype(np.int32), POINTS, FACES, COLORS)
 QUAD = [[-0.05, 0.05, 0.0], [0.05, 0.05, 0.0], [0.05, -0.05, 0.0], [-0.05, -0.05, 0.0]]
 GRIDLESS: dict[str, object] = dict.fromkeys(GRID_KEYS)
 """Takes a grid's keys out of board.json."""
@@ -215,17 +212,15 @@ def test_poses_and_truth_are_read_back_to_the_bit_and_what_is_none_is_refused(tm
 
 
 def test_a_cloud_and_a_mesh_are_read_back_and_trimesh_reads_them_too(tmp_path):
-    (tmp_path / "cloud.ply").write_bytes(cloud_ply(POINTS, NORMALS, COLORS, VIEWS))
-    points, normals, colors, views = read_cloud(tmp_path)
-    assert np.allclose(points, POINTS, atol=1e-7) and np.allclose(normals, NORMALS, atol=1e-6)
-    assert np.array_equal(colors, COLORS) and np.array_equal(views, VIEWS)
-    other = trimesh.load(tmp_path / "cloud.ply")
-    assert np.allclose(other.vertices, POINTS, atol=1e-7) and np.array_equal(np.asarray(other.colors)[:, :3], COLORS)
-    (tmp_path / "mesh.ply").write_bytes(mesh_ply(POINTS, FACES, COLORS))
-    vertices, faces, colors = read_mesh(tmp_path)
-    assert np.allclose(vertices, POINTS, atol=1e-7) and np.array_equal(faces, FACES) and np.array_equal(colors, COLORS)
-    other = trimesh.load(tmp_path / "mesh.ply", process=False)
-    assert np.allclose(other.vertices, POINTS, atol=1e-7) and np.array_equal(other.faces, FACES)
+    (tmp_path / "cloud.ply").write_bytes(cloud_ply(SURFACE))
+    (tmp_path / "mesh.ply").write_bytes(mesh_ply(SURFACE))
+    again = read_surface(tmp_path)
+    for name, values in vars(SURFACE).items():
+        assert np.allclose(getattr(again, name), values, atol=1e-6)
+    for name in ("cloud", "mesh"):
+        other = trimesh.load(tmp_path / f"{name}.ply", process=False)
+        assert np.allclose(other.vertices, POINTS, atol=1e-7)
+    assert np.array_equal(other.faces, SURFACE.faces)
 
 
 def test_files_that_were_changed_or_given_are_the_users_and_a_run_that_was_cut_off_leaves_none(tmp_path, monkeypatch):
@@ -257,15 +252,12 @@ def test_files_that_were_changed_or_given_are_the_users_and_a_run_that_was_cut_o
 
 
 def test_results_that_are_missing_or_damaged_are_refused(tmp_path):
-    def refused_cloud(words):
+    whole = cloud_ply(SURFACE)
+    for data, words in ((None, "verso capture process"), (b"ply nonsense", "is not what"), (whole[:-1], "ends early")):
+        if data is not None:
+            (tmp_path / "cloud.ply").write_bytes(data)
         with pytest.raises(CaptureError, match=words):
-            read_cloud(tmp_path)
-
-    refused_cloud("verso capture process")
-    (tmp_path / "cloud.ply").write_bytes(b"ply nonsense")
-    refused_cloud("is not what `verso capture process` wrote")
-    (tmp_path / "cloud.ply").write_bytes(cloud_ply(POINTS, NORMALS, COLORS, VIEWS)[:-1])
-    refused_cloud("ends early")
+            read_surface(tmp_path)
     assert read_record(tmp_path) is None
     for text in ("{", "[]", '{"files": 3}'):
         (tmp_path / "process.json").write_text(text)
@@ -279,8 +271,6 @@ def test_every_byte_and_name_of_the_inputs_is_in_their_digest_and_nothing_else(f
     (folder / "mine.yml").write_text("markers")
     (folder / "truth").mkdir()
     (folder / "truth" / "truth.json").write_text("{}")
-    names = [file.relative_to(folder).as_posix() for file in list_inputs(folder)]
-    assert names == sorted(names) and "mine.yml" in names
     before = digest_inputs(folder)
     for name in ("rgb_00003.png", "camera.json", "board.json", "mine.yml", "truth/truth.json"):
         data = (folder / name).read_bytes()
@@ -427,7 +417,7 @@ def test_depth_of_any_encoding_and_colour_as_jpeg_are_read(tmp_path):
         view = read_view(folder, 0)
         assert view.depth.dtype == np.uint16
         assert np.array_equal(view.depth[1:], units[1:]), ending
-        assert digest_inputs(path) and file in list_inputs(path)
+        assert digest_inputs(path)
         file.unlink()
     assert np.abs(view.rgb.astype(int) - ramp).max() <= 4  # a smooth picture through JPEG of the usual quality
     size = f"{WIDE.width} x {WIDE.height}"

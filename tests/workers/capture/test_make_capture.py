@@ -24,7 +24,6 @@ from workers.assets.glb import asset_glb, read_shape
 from workers.capture import make_capture
 from workers.capture.folder import open_folder, read_truth, write_pose
 from workers.capture.make_capture import (
-    CaptureNames,
     board_asset,
     image_effects,
     is_corrected,
@@ -106,7 +105,7 @@ def surface(closed: bool = True) -> Reconstruction:
 
 
 def test_the_reconstructed_object_stands_at_the_middle_of_its_box_and_reads_back_with_its_colours():
-    names = CaptureNames("box-00003", "box", "CC0-1.0", "capture")
+    names = "box-00003", "box", "CC0-1.0", "capture"
     (asset, T), (open_, _) = (reconstructed_asset(surface(closed), names, Assets()) for closed in (True, False))
     np.testing.assert_allclose(T[:3, 3], [0.05, -0.02, 0.15], atol=1e-15)
     np.testing.assert_allclose(asset.extents_m, [0.1, 0.2, 0.3], atol=1e-15)
@@ -244,7 +243,7 @@ def context() -> WorkerContext:
 def rows_of(context: WorkerContext, done=DONE, scene_id: int = 0, more: tuple = ()) -> dict[str, list]:
     placed = place_capture(context.job, scene_id, done, "mug", "capture")
     pairs = [*make_pairs(context, placed, done, Stopwatch()), *more]
-    return record_capture(context, placed, done, Origin(False, "f" * 64), pairs, Stopwatch()).rows
+    return record_capture(context, placed, done, Origin(Path(), None, "f" * 64), pairs, Stopwatch()).rows
 
 
 def test_quality_columns_are_those_of_the_used_views_and_errors_are_absent_without_truth(context):

@@ -52,7 +52,7 @@ from workers.capture.simulate.simulate import (
 )
 from workers.geometry.colour import SRGB_STEPS, decode_codes, decode_srgb, encode_codes, encode_srgb
 from workers.geometry.frames import angle_between, invert, pose, transform, uniform_rotation
-from workers.geometry.lens import opencv_lens, opencv_matrix
+from workers.geometry.pixels import opencv_lens, opencv_matrix
 from workers.geometry.raycast import cast_view
 from workers.scene.chance import SceneChance
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture

@@ -44,6 +44,7 @@ from workers.capture.surface.tsdf import (
 )
 from workers.geometry.camera import look_at
 from workers.geometry.distance import distance_to_mesh
+from workers.scene.context import Stopwatch
 
 NOTHING = Thing(sphere=None, boxes=[])
 
@@ -352,7 +353,7 @@ def test_the_mug_of_an_independent_caster_is_whole_and_its_rim_is_not_frayed(nam
     """A rim that hangs over a wall of 1.1 mm, and a floor from 1 to 4 mm above the board."""
     data = SHARED_DATA / "captures"
     given = given_files(open_folder(data / name))
-    merged = reconstruct(given, estimate_poses(given, Estimation(compare=False)).estimate, Fusion())
+    merged = reconstruct(given, estimate_poses(given, Estimation(compare=False)).estimate, Fusion(), Stopwatch())
     true = read_mesh_file(data / "mug.truth.ply")
     poses = np.load(data / "mug.truth.npy")
     cameras = [Camera(given.folder.camera.intrinsics, frozen_array(poses[n])) for n in given.folder.numbers]

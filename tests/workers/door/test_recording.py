@@ -32,7 +32,7 @@ from workers.door.recordings.kinect import (
     read_frames,
 )
 from workers.geometry.frames import transform
-from workers.geometry.lens import pixel_rays, project_points
+from workers.geometry.pixels import pixel_rays, project_points
 
 ATTACHED = json.dumps(calibration()).encode()
 

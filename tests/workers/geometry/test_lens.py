@@ -7,7 +7,7 @@ import pytest
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
 from tests.workers.geometry.made_up_kinect import COLOR, COLOR_LENS, DEPTH, DEPTH_LENS, opencv_rays, smaller
-from workers.geometry.lens import (
+from workers.geometry.pixels import (
     WIDEST,
     distort,
     opencv_lens,

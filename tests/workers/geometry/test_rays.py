@@ -27,7 +27,7 @@ from tests.workers.geometry.made_up_kinect import (
 from tests.workers.render.random_scenes import facing, quad
 from workers.geometry.camera import NEAR_M, look_at, orbit_pose, project
 from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
-from workers.geometry.lens import project_points
+from workers.geometry.pixels import project_points
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 from workers.geometry.zbuffer import LARGEST_PX, NEAREST_M, count_covered, draw_depth, register_depth
 

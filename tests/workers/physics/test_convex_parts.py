@@ -24,13 +24,12 @@ from tests.kit.contacts import mesh_of
 from tests.kit.shapes import box
 from workers.assets.builtin.make import make_asset
 from workers.geometry.distance import distance_to_mesh
-from workers.geometry.halving import wrap
-from workers.geometry.hull import convex_hull
+from workers.geometry.hull import convex_hull, wrap
 from workers.geometry.lathe_decomposition import COARSE, partition_outlines
 from workers.geometry.mesh import mesh_of as surface_of
-from workers.geometry.mesh import solid_of, weld
+from workers.geometry.mesh import weld
 from workers.physics import convex_parts as module
-from workers.physics.convex_parts import Parts, decompose, parts_of
+from workers.physics.convex_parts import decompose, parts_of
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -120,20 +119,6 @@ def test_parts_of_a_built_in_shape_are_the_shape(category, number):
     assert ConvexHull(np.concatenate(parts)).volume == pytest.approx(ConvexHull(mesh.vertices).volume, rel=1e-12)
 
 
-def test_parts_have_the_volume_of_the_shape():
-    """Parts are made larger by a hundred-thousandth, so that no two faces lie in one plane."""
-    for category, number in (("mug", 2), ("laptop", 1), ("box", 4)):
-        asset = built_in(category, number)
-        solid = solid_of(weld(asset.shape.mesh))
-        hulls = [
-            manifold3d.Manifold.hull_points(np.ascontiguousarray(1.00001 * part - 0.00001 * part.mean(axis=0)))
-            for part in parts_of(asset)
-        ]
-        both = manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add)
-        assert (both - solid).volume() < 2e-4 * solid.volume()
-        assert (solid - both).volume() < 1e-5 * solid.volume()
-
-
 def test_built_in_shapes_are_not_halved(monkeypatch):
     monkeypatch.setattr(module, "_decompose", lambda *_: pytest.fail("halved"))
     for category in CATEGORIES:
@@ -161,15 +146,6 @@ def test_a_solid_that_large_tolerances_leave_with_more_faces_is_made_coarser_in_
         simpler, moved_m = module._simplified(solid, step_m)
         assert simpler.num_tri() <= ends
         assert distance_to_mesh(surface_of(simpler).vertices, surface)[0].max() <= moved_m
-
-
-def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(monkeypatch):
-    def fails(*_: object) -> None:
-        raise shapely.errors.GEOSException("TopologyException: side location conflict")
-
-    monkeypatch.setattr(module, "decompose_lofts", fails)
-    monkeypatch.setattr(module, "decompose", lambda mesh, digest, threshold: Parts((mesh.vertices,)))
-    assert len(parts_of(built_in("laptop", 77))) == 1
 
 
 def test_coarser_parts_are_fewer_and_reach_out_no_further_than_they_may():
@@ -211,13 +187,6 @@ def beyond_m(parts, mesh) -> float:
     """How far parts reach out of the mesh's hull."""
     hull = convex_hull(mesh.vertices)
     return float((np.concatenate(parts.clouds) @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max())
-
-
-def test_nothing_stands_in_a_tray_and_nothing_out_of_it():
-    parts = decompose(tray(), "tray", folder=None)
-    assert beyond_m(parts, tray()) < 1e-12
-    assert not any(holds(parts, point) for point in ((0, 0, 0), (0.08, 0.08, 0.02), (-0.08, 0, 0.0)))
-    assert all(holds(parts, point) for point in ((0, 0, -0.0225), (0.0975, 0, 0), (-0.0975, -0.09, 0.02)))
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,7 @@ from tests.kit.planes import HERE, IMAGES, THERE, K, plane_view
 from tests.kit.shapes import asset_of, box, table
 from workers.geometry.camera import inclination, look_at, orbit_pose
 from workers.geometry.frames import half_turn, pose, rotation_about, translation
-from workers.geometry.lens import distort
-from workers.geometry.pixels import Extent
+from workers.geometry.pixels import Extent, distort
 from workers.scene.chance import SceneChance
 from workers.scene.labels import (
     carry_depth,

@@ -35,7 +35,7 @@ from workers.capture.poses.terms import (
     pose_halves,
     robust,
 )
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 MODES = (2, 1, 5)
 """How many of the eight coordinates of a marker's corners are its place, the growth of its sides, and the rest: its shape."""

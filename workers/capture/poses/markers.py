@@ -28,7 +28,7 @@ from workers.capture.poses.observation import (
 )
 from workers.capture.poses.terms import MAD, POSE, SHARED, Problem, Shared, minimise
 from workers.geometry.frames import angle_between, invert, pose, transform
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 ROUNDS = 5
 """How often a pose and the spread of its residuals are found one by the other, at most."""

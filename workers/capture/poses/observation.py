@@ -16,7 +16,7 @@ from workers.capture.board import TOUCHING_M, Geometry, board_geometry
 from workers.capture.detect import unbend_corners
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import invert, transform
-from workers.geometry.lens import project_points, rays_of_pixels
+from workers.geometry.pixels import project_points, rays_of_pixels
 
 
 def pixels_of_points(points_board: Array, T_board_cam: Pose, camera: CaptureCamera) -> Array:

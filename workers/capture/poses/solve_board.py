@@ -24,7 +24,7 @@ from workers.capture.poses.corners import outward_motion
 from workers.capture.poses.markers import opencv_poses
 from workers.capture.poses.terms import cross_matrix, moved
 from workers.geometry.frames import invert, transform
-from workers.geometry.lens import rays_of_pixels
+from workers.geometry.pixels import rays_of_pixels
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 """Corners of a tag of side 1, clockwise from the upper left, as OpenCV's IPPE_SQUARE has them."""

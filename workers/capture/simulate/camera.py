@@ -27,7 +27,7 @@ from workers.capture.board import marker_corners
 from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import pose, rotation_about
 from workers.geometry.jit import compiled
-from workers.geometry.lens import undistort
+from workers.geometry.pixels import undistort
 
 SAMPLES = 9
 """Images that are averaged into one photograph."""

@@ -43,7 +43,7 @@ from workers.capture.simulate.camera import (
 )
 from workers.geometry.colour import SRGB_STEPS
 from workers.geometry.frames import UP, pose, rotation_about, translation
-from workers.geometry.lens import opencv_lens
+from workers.geometry.pixels import opencv_lens
 from workers.geometry.zbuffer import register_depth
 from workers.render.pathtraced import draw_view
 from workers.render.raster.gbuffer import shared_renderer

@@ -42,7 +42,7 @@ from workers.capture.simulate.photograph import (
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_codes
 from workers.geometry.frames import pose, rotation_about
-from workers.geometry.lens import opencv_lens
+from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
 from workers.scene.plan import choose_assets

@@ -17,7 +17,7 @@ from workers.door.recordings.pictures import pinhole_maps, remap
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
-from workers.geometry.lens import opencv_matrix
+from workers.geometry.pixels import opencv_matrix
 from workers.geometry.projection import in_frame
 from workers.geometry.raycast import first_hit
 

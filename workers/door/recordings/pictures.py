@@ -15,7 +15,7 @@ from PIL import Image, UnidentifiedImageError
 
 from schemas.base import Array
 from schemas.scene.view import Intrinsics
-from workers.geometry.lens import opencv_matrix
+from workers.geometry.pixels import opencv_matrix
 
 Size = tuple[int, int]
 """Width and height, pixels."""

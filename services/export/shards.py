@@ -1,12 +1,15 @@
-"""Format `huggingface`: Parquet files with embedded images that `datasets.load_dataset(DIR)` reads, and a dataset card.
+"""Formats whose pairs share files of bounded size, by split: `webdataset` and `huggingface` (docs/export.md).
 
-A row is a pair. Its columns come from the manifest's schemas: what a view has is a struct `<role>_view`, its images are
-the columns `<role>_rgb`, `<role>_depth`, `<role>_region` and image targets, PNG files as they are stored. Targets of 3 x 16
-bits are plain bytes, because Pillow, which decodes images for `datasets`, makes 8 bits of them without a word.
+In `webdataset` numbers are no PNG, because the usual decoders of WebDataset turn every picture into colours: 16 bits into 8, and
+region ids into shares of 255. In `huggingface` targets of 3 x 16 bits are plain bytes, because Pillow, which decodes images for
+`datasets`, makes 8 bits of them without a word. Its columns come from the manifest's schemas: what a view has is a struct
+`<role>_view`, its images are the columns `<role>_rgb`, `<role>_depth`, `<role>_region` and image targets.
 """
 
 import hashlib
+import io
 import json
+import tarfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -20,9 +23,90 @@ from schemas.dataset.layout import ARTICLE, PixelKind, stored_images, stored_rol
 from schemas.dataset.tables import OF_TARGETS, SCHEMAS
 from schemas.errors import plural
 from schemas.job.job import Job
-from schemas.scene.view import MODALITIES, Role
-from services.export.formats import OF_SCENE, Added, ShardedWriter
+from schemas.scene.view import MODALITIES, ROLES, Role
+from services.export.formats import OF_SCENE, ShardedWriter, encode_npz
 from services.export.source import ExportPair, ExportScene
+
+_COLOURS: Final = tuple(name for name, kind in MODALITIES.items() if (kind.channels, kind.dtype) == (3, "uint8"))
+"""Modalities that are stored as PNG files; those of numbers are arrays."""
+_OF_SCENE: Final = (*OF_SCENE, "effects")
+_NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "capture")
+"""Columns that stand elsewhere in a sample."""
+_NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
+
+
+class WebDataset(ShardedWriter):
+    """Writes train-000000.tar and so on; every pair that the dataset has is a sample."""
+
+    FRESH: ClassVar = {"files": {}, "samples": {}, "without_shape": []}
+    PATTERN = "{split}-{number:06d}.tar"
+
+    def open_shard(self, path: Path) -> "_Tar":
+        """A tar."""
+        return _Tar(path)
+
+    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+        """Writes a sample."""
+        for name, data in members_of(scene, pair):
+            self.shard(scene.split).add(f"{pair.pose_id:09d}.{name}", data)
+        self.count("samples", scene.split)
+        return ""
+
+    def describe(self) -> dict[str, Any]:
+        """Shards and samples by split, and the conventions."""
+        counts = {"shards": self.counts("files"), "samples": self.counts("samples")}
+        return {**counts, **self.conventions("uint16")}
+
+
+def members_of(scene: ExportScene, pair: ExportPair) -> list[tuple[str, bytes]]:
+    """(name behind the key, bytes) of every member of a sample, in order."""
+    members: list[tuple[str, bytes]] = []
+    for kind, modality in MODALITIES.items():
+        if kind in _COLOURS:
+            images = {role: pair.image(role, kind) for role in ROLES}
+            members += [(f"{role}.{kind}.png", data) for role, data in images.items() if data is not None]
+        else:
+            read = pair.stack if modality.each else pair.pixels
+            arrays = {role: array for role in ROLES if (array := read(role, kind)) is not None}
+            if arrays or modality.target is None:
+                members.append((f"{kind}.npz", encode_npz(arrays)))
+    return [*members, ("json", _json(scene, pair))]
+
+
+def _json(scene: ExportScene, pair: ExportPair) -> bytes:
+    """The rows of a pair, without what is stored elsewhere in the sample."""
+    tree: Row = {name: scene.row[name] for name in _OF_SCENE}
+    tree |= {"split": scene.split, "pose_id": pair.pose_id, "views": {}}
+    for role in ROLES:
+        if (view := pair.views.get(role)) is not None:
+            labels = [_label(row) for row in pair.labels(role)]
+            columns = {name: value for name, value in view.items() if name not in _NOT_OF_VIEWS}
+            tree["views"][role] = {**columns, "objects": labels}
+    return json.dumps(tree).encode()
+
+
+def _label(row: Row) -> Row:
+    """A row of `objects` without what is stored elsewhere in the sample, and without columns of targets that are not there."""
+    absent = [name for name in OF_TARGETS["objects"] if row[name] is None]
+    return {name: value for name, value in row.items() if name not in (*_NOT_OF_OBJECTS, "role", *absent)}
+
+
+class _Tar:
+    """A tar being written; its members have no owner and no time."""
+
+    def __init__(self, path: Path) -> None:
+        self._tar = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115 - `close` closes it
+        self.bytes = 0
+
+    def add(self, name: str, data: bytes) -> None:
+        header = tarfile.TarInfo(name)
+        header.size = len(data)
+        self._tar.addfile(header, io.BytesIO(data))
+        self.bytes += len(data) + tarfile.BLOCKSIZE
+
+    def close(self) -> None:
+        self._tar.close()
+
 
 SPLITS: Final = {"train": "train", "val": "validation", "test": "test"}
 """Ours, and Hugging Face's name for it."""
@@ -35,14 +119,11 @@ IMAGES: Final = pa.list_(IMAGE)
 """One for each object, by region."""
 _PICTURES: Final = (IMAGE, IMAGES, pa.binary())
 
-_NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "role", "capture")
-_NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
-
 
 class HuggingFace(ShardedWriter):
     """Writes data/train-00000.parquet and so on, and README.md."""
 
-    FRESH: ClassVar = {"rounds": None, "rows": {}, "licences": [], "without_shape": []}
+    FRESH: ClassVar = {"files": {}, "rows": {}, "licences": [], "without_shape": []}
     PATTERN = "data/{split}-{number:05d}.parquet"
 
     @cached_property
@@ -53,18 +134,17 @@ class HuggingFace(ShardedWriter):
         """A Parquet file."""
         return _Parquet(path, self._schema)
 
-    def add(self, scene: ExportScene) -> Added:
-        """Writes a row for each pair of the scene, and its shapes."""
-        self.put_shapes(scene)
-        split = SPLITS[scene.split]
-        shard = self.rounds.shard(split)
-        for pair in scene.pairs:
-            shard.add(row_of(self._schema, scene, pair))
-        self.count("rows", split, len(scene.pairs))
+    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+        """Writes the row of a pair."""
+        self.shard(SPLITS[scene.split]).add(row_of(self._schema, scene, pair))
+        self.count("rows", SPLITS[scene.split])
+        return ""
+
+    def end_scene(self, scene: ExportScene) -> None:
+        """Remembers the licences of what the scene shows."""
         names = (scene.row["table_id"], *(name for _, name in scene.instances.values()))
         self.kept["licences"] = sorted({*self.kept["licences"], *(scene.assets[name]["licence"] for name in names)})
-        self.rounds.end_if_full()
-        return Added(len(scene.pairs))
+        super().end_scene(scene)
 
     def finish(self) -> None:
         """Ends the last files, and writes the card."""
@@ -78,7 +158,7 @@ class HuggingFace(ShardedWriter):
 
     def describe(self) -> dict[str, Any]:
         """Files and rows by split, and the conventions."""
-        counts = {"files": self.rounds.counts, "rows": dict(sorted(self.kept["rows"].items()))}
+        counts = {"files": self.counts("files"), "rows": self.counts("rows")}
         return {**counts, "licences": self.kept["licences"], **self.conventions("16-bit PNG")}
 
 
@@ -86,7 +166,7 @@ def schema_of_pairs(job: Job) -> pa.Schema:
     """The columns of a pair, of the types that the manifest gives them; only views and images that the job stores."""
     fields = [SCHEMAS["scenes"].field(name) for name in OF_SCENE]
     fields += [pa.field("split", pa.string()), pa.field("pose_id", pa.int64())]
-    views = pa.struct([field for field in SCHEMAS["views"] if field.name not in _NOT_OF_VIEWS])
+    views = pa.struct([field for field in SCHEMAS["views"] if field.name not in (*_NOT_OF_VIEWS, "role")])
     for role in stored_roles(job):
         fields += [pa.field(f"{role}_{image.pixels}", _type_of(image.pixels)) for image in stored_images(role, job)]
         fields.append(pa.field(f"{role}_view", views))
@@ -178,14 +258,7 @@ def _feature(kind: pa.DataType) -> dict[str, Any]:
         return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
     if pa.types.is_list(kind):
         return {"feature": _feature(kind.value_type), "_type": "List"}
-    names = {
-        pa.int64(): "int64",
-        pa.float64(): "float64",
-        pa.string(): "string",
-        pa.bool_(): "bool",
-        pa.binary(): "binary",
-    }
-    return {"dtype": names[kind], "_type": "Value"}
+    return {"dtype": "float64" if kind == pa.float64() else str(kind), "_type": "Value"}
 
 
 def card_text(name: str, export: str, schema: pa.Schema, rows: Mapping[str, int], licences: Sequence[str]) -> str:
@@ -251,7 +324,7 @@ def _describe(field: pa.Field) -> str:
     if field.type in (IMAGES, pa.binary()):
         return "list of images, one for each object" if field.type == IMAGES else "PNG of 3 x 16 bits, as bytes"
     if pa.types.is_list(field.type):
-        return "list of " + ", ".join(f"`{one.name}`" for one in field.type.value_type)
+        return "list of " + ", ".join(f"`{item.name}`" for item in field.type.value_type)
     if pa.types.is_struct(field.type):
-        return "struct of " + ", ".join(f"`{one.name}`" for one in field.type)
+        return "struct of " + ", ".join(f"`{item.name}`" for item in field.type)
     return "matrix" if pa.types.is_fixed_size_list(field.type) else str(field.type)
