@@ -1,7 +1,6 @@
 """The commands `verso capture ...`: each reads its options, prints what it did, and returns the exit code."""
 
 import argparse
-import dataclasses
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -66,21 +65,18 @@ def board(options: argparse.Namespace) -> int:
     elif kind != ".json":
         raise InputError(f"{path}: name a file that ends in .pdf, .png or .json")
     described, new = _describe_board(path, spec, data)
-    answer: dict[str, Any] = {
-        "board_file": str(described),
-        "board": spec.model_dump(mode="json", exclude=spec.unwritten),
-    }
+    written = spec.model_dump(mode="json", exclude=spec.unwritten)
+    answer = {"ok": True, "board_file": str(described), "board": written}
     size = "" if spec.markers else f" of {spec.marker_m * 1000:g} mm"
     if data is not None:
-        told = "A4 pages to glue" if options.tiles else "print at 100 %"
-        print(f"{path}: {spec.words}{size} ({spec.dictionary}); {told}")
+        how = "A4 pages to glue" if options.tiles else "print at 100 %"
+        print(f"{path}: {spec.words}{size} ({spec.dictionary}); {how}")
         answer["file"] = str(path)
-    print(f"{described}: {'the board, for --board' if new else 'was there and is kept'}")
-    if data is not None:
         ruler = f"measure the printed ruler; if it is not {spec.ruler_m * 1000:g} mm"
         print(f"{ruler}, say so in {described} (measured_ruler_m)")
+    print(f"{described}: {'the board, for --board' if new else 'was there and is kept'}")
     if options.json:
-        print(json.dumps({"ok": True, **answer}))
+        print(json.dumps(answer))
     return 0
 
 
@@ -120,9 +116,9 @@ def _solved_board(options: argparse.Namespace) -> Board:
     if not options.marker or options.size or options.pitch:
         raise InputError("--solve needs --marker, the side of every tag in metres, and no --size or --pitch")
     dictionary = options.dictionary or Board().dictionary
-    found = solve_board(open_folder(options.solve, Board()), options.marker, dictionary)
-    print("\n".join(describe(found)))
-    return found.board
+    solved = solve_board(open_folder(options.solve, Board()), options.marker, dictionary)
+    print("\n".join(describe(solved)))
+    return solved.board
 
 
 def _describe_board(path: Path, spec: Board, data: bytes | None) -> tuple[Path, bool]:
@@ -157,8 +153,6 @@ def simulate(options: argparse.Namespace) -> int:
     job = capture_job(options.changes, keys)
     assert job.captures is not None
     path, begun = Path(options.out), time.perf_counter()
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise OutputError(f"{path} is there already: name a new or an empty folder")
     from workers.assets.catalogue import open_catalogue
     from workers.capture.make_capture import load_object
     from workers.capture.simulate.simulate import simulate_capture
@@ -171,7 +165,7 @@ def simulate(options: argparse.Namespace) -> int:
     catalogue = open_catalogue(job.assets, Path.cwd(), job.categories)
     asset = load_object(job, catalogue, chance)
     plan = plan_capture(settings)
-    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, path)
+    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, _make_empty(path))
     seconds, ran = time.perf_counter() - begun, [name for name in CAPTURE_EFFECTS if plan.runs(name)]
     views = len(truth.T_board_cam)
     print(
@@ -211,8 +205,14 @@ def import_recording(options: argparse.Namespace) -> int:
     if not options.board:
         print(f"  no --board: board.json is the default board ({board.words}, {board.dictionary})")
     if options.json:
-        told = {"ok": True, "out": str(out), "frames": made.frames, "notes": notes, "default_board": not options.board}
-        print(json.dumps({**told, "losses": asdict(made.losses), "views": [asdict(view) for view in made.views]}))
+        answer = {
+            "ok": True,
+            "out": str(out),
+            "frames": made.frames,
+            "notes": notes,
+            "default_board": not options.board,
+        }
+        print(json.dumps({**answer, **asdict(made)}))
     return 0
 
 
@@ -221,7 +221,7 @@ def _make_empty(out: Path) -> Path:
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
-            raise OutputError(f"{out} is not empty: name a new folder, or remove it")
+            raise OutputError(f"{out} is not empty: name a new or an empty folder")
     except OSError as error:
         raise OutputError(f"{out} cannot be made: {error.strerror}") from error
     return out
@@ -243,18 +243,9 @@ def process(options: argparse.Namespace) -> int:
     _print_processed(options.folder, done)
     if options.json:
         final, surface = done.estimates.estimate, done.merged.surface
-        answer = {
-            "ok": True,
-            "folder": str(options.folder),
-            "estimate": final.estimate,
-            "views": len(final.views),
-            "used": len(final.used),
-            "points": len(surface.points),
-            "faces": len(surface.faces),
-            "notes": list(done.estimates.estimate.notes),
-            "kept": list(done.users),
-            "seconds": dict(done.seconds),
-        }
+        answer = {"ok": True, "folder": str(options.folder), "estimate": final.estimate, "views": len(final.views)}
+        answer |= {"used": len(final.used), "points": len(surface.points), "faces": len(surface.faces)}
+        answer |= {"notes": list(final.notes), "kept": list(done.users), "seconds": dict(done.seconds)}
         print(json.dumps(answer))
     return 0
 
@@ -279,16 +270,15 @@ def _print_processed(folder: Path, done: "ProcessedFolder") -> None:
 def _describe_estimate(estimate: CaptureEstimate) -> str:
     pixels = [view.reprojection_px for view in estimate.used if view.reprojection_px is not None]
     depth = [view.depth_mm for view in estimate.used if view.depth_mm is not None]
-    words = [f"{len(estimate.used)} of {len(estimate.views)} views"]
-    words += [f"corners {np.median(pixels):.2f} px"] if pixels else []
-    words += [f"depth off the board {np.median(depth):.1f} mm"] if depth else []
-    correction = estimate.depth
-    words += (
-        [f"depth offset {1e3 * correction.offset_m:+.1f} mm, scale {correction.scale:.4f}"]
-        if correction.identified
-        else []
-    )
-    words += [f"print scale {estimate.print_scale:.4f}"] if estimate.print_scale != 1.0 else []
+    words, correction = [f"{len(estimate.used)} of {len(estimate.views)} views"], estimate.depth
+    if pixels:
+        words.append(f"corners {np.median(pixels):.2f} px")
+    if depth:
+        words.append(f"depth off the board {np.median(depth):.1f} mm")
+    if correction.identified:
+        words.append(f"depth offset {1e3 * correction.offset_m:+.1f} mm, scale {correction.scale:.4f}")
+    if estimate.print_scale != 1.0:
+        words.append(f"print scale {estimate.print_scale:.4f}")
     return ", ".join(words)
 
 
@@ -311,9 +301,11 @@ def synthesize(options: argparse.Namespace) -> int:
         made = [write_synthesized(result, T_board_cam, out)]
     if not made:
         raise CaptureError("nothing_seen", f"no view of {options.folder} has a view from the other side")
-    for one in made:
-        what = f"{one['name']}: {one['measured_share']:.1%} measured, from views {', '.join(map(str, one['sources']))}"
-        print(f"{what}; d_z {one['d_z_m']:.3f} m" if "d_z_m" in one else what)
+    for view in made:
+        what = (
+            f"{view['name']}: {view['measured_share']:.1%} measured, from views {', '.join(map(str, view['sources']))}"
+        )
+        print(f"{what}; d_z {view['d_z_m']:.3f} m" if "d_z_m" in view else what)
     print(f"{out}: {plural(len(made), 'view')}")
     if options.json:
         print(json.dumps({"ok": True, "out": str(out), "views": made}))
@@ -332,7 +324,7 @@ def evaluate(options: argparse.Namespace) -> int:
     _print_surface(surface)
     if options.json:
         known = {"ok": True, "folder": str(options.folder), "estimate": result.estimate.estimate}
-        print(json.dumps({**known, **answer, **dataclasses.asdict(surface)}))
+        print(json.dumps({**known, **answer, **asdict(surface)}))
     return 0
 
 
@@ -346,9 +338,10 @@ def _against_truth(result: "CaptureViews") -> tuple["SurfaceErrors", dict[str, A
             f"{result.folder.path} has no truth/, which simulated captures have: give the object's mesh with --mesh",
         )
     score = score_capture(result, truth)
-    one = score.summary
-    print(f"poses    median {one.pose_mm:.3f} mm, {one.pose_deg:.4f} degrees")
-    print(f"         worst {max(score.poses.mm):.3f} mm, {max(score.poses.deg):.4f} degrees")
+    poses = {"pose_mm": score.summary.pose_mm, "pose_deg": score.summary.pose_deg}
+    poses |= {"pose_worst_mm": max(score.poses.mm), "pose_worst_deg": max(score.poses.deg)}
+    print(f"poses    median {poses['pose_mm']:.3f} mm, {poses['pose_deg']:.4f} degrees")
+    print(f"         worst {poses['pose_worst_mm']:.3f} mm, {poses['pose_worst_deg']:.4f} degrees")
     for number, errors in score.held_out.items():
         print(
             f"view {number} made of the others: depth {errors.depth_median_mm:.2f} mm (95 %: {errors.depth_p95_mm:.2f}), "
@@ -357,15 +350,12 @@ def _against_truth(result: "CaptureViews") -> tuple["SurfaceErrors", dict[str, A
     measured, complete = score_measured(result, truth)
     print(f"depth    of {measured:.1%} of what was visible in any view; {complete:.1%} of that has a point within 3 mm")
     answer = {
+        **poses,
         "measured_of_visible": measured,
         "completeness_of_measured": complete,
         "aligned_by": None,
-        "pose_mm": one.pose_mm,
-        "pose_deg": one.pose_deg,
-        "pose_worst_mm": max(score.poses.mm),
-        "pose_worst_deg": max(score.poses.deg),
-        "depth_median_mm": one.depth_median_mm,
-        "held_out": {str(number): dataclasses.asdict(errors) for number, errors in score.held_out.items()},
+        "depth_median_mm": score.summary.depth_median_mm,
+        "held_out": {str(number): asdict(errors) for number, errors in score.held_out.items()},
     }
     return score.surface, answer
 
@@ -376,13 +366,8 @@ def _against_mesh(result: "CaptureViews", options: argparse.Namespace) -> tuple[
     surface, T_board_obj, rms_mm = score_against_mesh(result, read_mesh_file(options.mesh))
     print(f"{options.mesh} was aligned to the cloud by ICP, which leaves {rms_mm:.2f} mm rms:")
     print("poses are not scored, and errors that a rigid motion explains are not seen")
-    answer = {
-        **dict.fromkeys(("pose_mm", "pose_deg", "depth_median_mm")),
-        "aligned_by": "icp",
-        "icp_rms_mm": rms_mm,
-        "T_board_obj": T_board_obj.tolist(),
-    }
-    return surface, answer
+    answer = {"aligned_by": "icp", "icp_rms_mm": rms_mm, "T_board_obj": T_board_obj.tolist()}
+    return surface, {**dict.fromkeys(("pose_mm", "pose_deg", "depth_median_mm")), **answer}
 
 
 def _print_surface(errors: "SurfaceErrors") -> None:

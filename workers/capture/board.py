@@ -57,19 +57,19 @@ def board_geometry(board: Board) -> Geometry:
     sides = np.linalg.norm(squares[pairs[:, 0] // 4, 1] - squares[pairs[:, 0] // 4, 0], axis=1)
     nearest = cKDTree(corners.reshape(-1, 3)).query(chess)[0] if len(chess) else np.zeros(0)
     free_m = np.minimum(nearest / math.sqrt(2.0), 0.5 * sides)  # a marker's corner lies on the diagonal
-    ids = np.sort(np.array([m.id for m in board.markers], np.int64)) if board.markers else _grid_ids(board)
+    ids = (
+        np.sort([m.id for m in board.markers])
+        if board.markers
+        else board.first_id + np.arange(board.columns * board.rows)
+    )
     return Geometry(ids, corners, squares, chess, pairs // 4, pairs % 4, free_m, right, below)
-
-
-def _grid_ids(board: Board) -> NDArray[np.int64]:
-    return board.first_id + np.arange(board.columns * board.rows)
 
 
 def _opposite(corners: Array, edge: tuple[int, int], other: tuple[int, int]) -> NDArray[np.int64]:
     """[N]: the nearest marker whose corners `other` lie straight beyond a marker's corners `edge`, or -1."""
     inward = corners[:, edge[0]] - corners[:, other[0]]  # across the marker, out of its edge
     side = np.linalg.norm(inward, axis=1)
-    found = np.full(len(corners), -1)
+    facing = np.full(len(corners), -1)
     middle, faced = (corners[:, list(pair)].mean(axis=1) for pair in (edge, other))
     for n, near in enumerate(cKDTree(faced).query_ball_point(middle, side * (1.0 + SAME_SHARE))):
         gaps = corners[near][:, list(other)] - corners[n, list(edge)]
@@ -77,8 +77,8 @@ def _opposite(corners: Array, edge: tuple[int, int], other: tuple[int, int]) -> 
         straight = np.abs(gaps - along[:, None, None] * inward[n] / side[n]).max(axis=(1, 2), initial=0.0)
         fits = (straight < SAME_SHARE * side[n]) & (along > SAME_SHARE * side[n])
         if fits.any():
-            found[n] = np.array(near)[fits][np.argmin(along[fits])]
-    return found
+            facing[n] = np.array(near)[fits][np.argmin(along[fits])]
+    return facing
 
 
 SAME_SHARE = 0.01
@@ -131,8 +131,8 @@ def id_words(ids: NDArray[np.int64]) -> str:
     """Ascending ids in words: `3 to 37`, or one by one."""
     if len(ids) > 1 and ids[-1] - ids[0] == len(ids) - 1:
         return f"{ids[0]} to {ids[-1]}"
-    shown = ", ".join(map(str, ids[:MOST_SHOWN]))
-    return shown if len(ids) <= MOST_SHOWN else f"{shown}, ... {ids[-1]}"
+    last = [f"... {ids[-1]}"] if len(ids) > MOST_SHOWN else []
+    return ", ".join([*map(str, ids[:MOST_SHOWN]), *last])
 
 
 MOST_SHOWN = 12
@@ -148,7 +148,15 @@ def open_dictionary(board: Board, folder: Path | None = None) -> "cv2.aruco.Dict
     if board.dictionary in PREDEFINED:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     else:
-        dictionary = _read_dictionary(board.dictionary, folder)
+        path = None if folder is None or "/" in board.dictionary else folder / board.dictionary
+        if path is None or not path.is_file():
+            known = "neither one of OpenCV's (DICT_4X4_50, ...) nor a file beside it"
+            raise CaptureError("dictionary", f"board.json names the dictionary {board.dictionary!r}, which is {known}")
+        file, dictionary = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ), cv2.aruco.Dictionary()
+        if not dictionary.readDictionary(file.root()):
+            raise CaptureError(
+                "dictionary", f"{path.name} is no dictionary in OpenCV's format (nmarkers, markersize, marker_0)"
+            )
     count, needed = len(dictionary.bytesList), int(board_geometry(board).ids[-1]) + 1
     if count < needed:
         raise CaptureError(
@@ -157,25 +165,8 @@ def open_dictionary(board: Board, folder: Path | None = None) -> "cv2.aruco.Dict
     return dictionary
 
 
-def _read_dictionary(name: str, folder: Path | None) -> "cv2.aruco.Dictionary":
-    path = None if folder is None or "/" in name else folder / name
-    if path is None or not path.is_file():
-        raise CaptureError(
-            "dictionary",
-            f"board.json names the dictionary {name!r}, which is neither one of OpenCV's (DICT_4X4_50, ...) nor a file beside it",
-        )
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    dictionary = cv2.aruco.Dictionary()
-    if not dictionary.readDictionary(file.root()):
-        raise CaptureError(
-            "dictionary", f"{path.name} is no dictionary in OpenCV's format (nmarkers, markersize, marker_0)"
-        )
-    return dictionary
-
-
 MARGIN_M = 0.02
 """Least width of the sheet beside the grid, where ruler and text stand."""
-
 TICK_M = 0.00025
 """Width of the ruler's ticks."""
 
@@ -262,14 +253,12 @@ def upright(cells: NDArray[np.bool_], corners: Array) -> tuple[NDArray[np.bool_]
 def _black_runs(cells: NDArray[np.bool_], left: float, top: float, whole: float) -> Array:
     """[N, 4]: runs of black cells along rows and along columns, so that no renderer shows a seam between two of them."""
     side = whole / len(cells)
-    runs = [(start, row, stop, row + 1) for row, line in enumerate(cells) for start, stop in _runs(line)]
-    runs += [(column, start, column + 1, stop) for column, line in enumerate(cells.T) for start, stop in _runs(line)]
+    runs = []
+    for lines, turned in ((cells, False), (cells.T, True)):
+        for n, line in enumerate(lines):
+            ends = np.flatnonzero(np.diff(line, prepend=False, append=False)).reshape(-1, 2).tolist()
+            runs += [(n, start, n + 1, stop) if turned else (start, n, stop, n + 1) for start, stop in ends]
     return np.array([[left + a * side, top - d * side, left + c * side, top - b * side] for a, b, c, d in runs])
-
-
-def _runs(line: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], line, [False]])))
-    return list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
 
 
 def _ruler(x: float, top: float, length_m: float) -> tuple[Array, list[Words]]:

@@ -7,7 +7,7 @@ OpenCV's camera calibration.
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ from workers.geometry.frames import pose, rotation_from_quaternion, transform
 
 SHEET_M = 0.03
 """White around all that is printed: ruler and text stand there."""
-
+UPRIGHT = np.array([[0.0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]])
+"""Corners of an upright square of side 1 from its lower left corner, clockwise from the upper left."""
 TURNED = ("16h5", "25h9", "36h11")
 """Families of AprilTags that OpenCV draws upside down, by the codes of the AprilTag library; 36h10 is not checked."""
 
@@ -76,27 +77,24 @@ def make_charuco(sizes: BoardSizes, legacy: bool = False) -> Board:
     squares = sizes.pitch_m * (unit + [[[c, r, 0]] for c, r in cells])
     ours = [(quads - [0.5 * width, 0.5 * height, 0.0]) * [1.0, -1.0, 1.0] for quads in (markers, squares)]
     ids = np.asarray(theirs.getIds()).ravel().tolist()
-    return _layout(sizes.dictionary, ids, ours[0], ours[1], (width, height))
+    return board_of_markers(sizes.dictionary, ids, ours[0], ours[1], (width, height))
 
 
 def make_aprilgrid(sizes: BoardSizes) -> Board:
     """Kalibr's grid of AprilTags: ids from the lower left, along the rows, then up; black squares at every tag's corners."""
     _predefined(sizes.dictionary)
-    gap = sizes.pitch_m - sizes.marker_m
-    width, height = ((n - 1) * sizes.pitch_m + sizes.marker_m for n in (sizes.columns, sizes.rows))
-    ids = np.arange(sizes.columns * sizes.rows)
-    places = np.stack([ids % sizes.columns, ids // sizes.columns], axis=1) * sizes.pitch_m
-    lower_left = np.pad(places - [0.5 * width, 0.5 * height], ((0, 0), (0, 1)))
-    markers = lower_left[:, None] + sizes.marker_m * np.array([[0.0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]])
-    small = [
-        (c * sizes.pitch_m - gap, r * sizes.pitch_m - gap)
-        for r in range(sizes.rows + 1)
-        for c in range(sizes.columns + 1)
-    ]
-    corner = np.pad(np.array(small) - [0.5 * width, 0.5 * height], ((0, 0), (0, 1)))
-    squares = corner[:, None] + gap * np.array([[0.0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]])
-    size = (width + 2 * gap, height + 2 * gap)
-    return _layout(sizes.dictionary, ids.tolist(), _as_drawn(markers, sizes.dictionary), squares, size, border_bits=2)
+    pitch, gap = sizes.pitch_m, sizes.pitch_m - sizes.marker_m
+    width, height = ((n - 1) * pitch + sizes.marker_m for n in (sizes.columns, sizes.rows))
+
+    def quads(columns: int, rows: int, from_m: float, side_m: float) -> Array:
+        """[N, 4, 3]: squares of a side, a pitch apart from `from_m` on, along the rows, then up."""
+        places = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * pitch + from_m
+        return np.pad(places - [0.5 * width, 0.5 * height], ((0, 0), (0, 1)))[:, None] + side_m * UPRIGHT
+
+    markers = _as_drawn(quads(sizes.columns, sizes.rows, 0.0, sizes.marker_m), sizes.dictionary)
+    squares = quads(sizes.columns + 1, sizes.rows + 1, -gap, gap)
+    ids = list(range(len(markers)))
+    return board_of_markers(sizes.dictionary, ids, markers, squares, (width + 2 * gap, height + 2 * gap), border_bits=2)
 
 
 KINDS: dict[str, Callable[[BoardSizes], Board]] = {
@@ -116,7 +114,7 @@ def _as_drawn(upright: Array, dictionary: str) -> Array:
 NO_SQUARES: Array = frozen_array(np.zeros((0, 4, 3)))
 
 
-def _layout(
+def board_of_markers(
     dictionary: str,
     ids: list[int],
     markers: Array,
@@ -125,11 +123,8 @@ def _layout(
     border_bits: int = 1,
 ) -> Board:
     """The board of markers [N, 4, 3] and squares [S, 4, 3]; `size_m` is the print's, by default what the markers cover."""
-    reach = (
-        2.0 * np.abs(np.concatenate([markers, squares]).reshape(-1, 3)[:, :2]).max(axis=0)
-        if len(markers)
-        else (0.0, 0.0)
-    )
+    points = np.concatenate([markers, squares, np.zeros((1, 4, 3))]).reshape(-1, 3)
+    reach = 2.0 * np.abs(points[:, :2]).max(axis=0)
     width, height = (float(x) + 2 * SHEET_M for x in (size_m or reach))
     return _board(
         dictionary=dictionary,
@@ -140,11 +135,6 @@ def _layout(
         markers=[{"id": n, "corners": quad} for n, quad in zip(ids, _rounded(markers), strict=True)],
         squares=_rounded(squares),
     )
-
-
-def board_of_markers(dictionary: str, ids: list[int], corners: Array, border_bits: int = 1) -> Board:
-    """The board of tags with these corners [N, 4, 3], board frame, metres."""
-    return _layout(dictionary, ids, corners, border_bits=border_bits)
 
 
 def _rounded(points: Array) -> list[Any]:
@@ -185,28 +175,25 @@ def read_board_file(path: Path) -> Board:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     tree = _parse(path, data) if len(data) <= MOST_BYTES else None
-    for kind in FILES:
-        if isinstance(tree, dict) and kind.key in tree:
+    for key, (name, read) in FILES.items():
+        if isinstance(tree, dict) and key in tree:
             try:
-                return kind.read(tree)
+                return read(tree)
             except (KeyError, TypeError, ValueError, IndexError) as error:
-                raise InputError(f"{path} is {kind.name}, and cannot be used: {_told(error)}") from error
+                why = f"it has no {error.args[0]!r}" if isinstance(error, KeyError) else str(error)
+                raise InputError(f"{path} is {name}, and cannot be used: {why}") from error
             except InputError as error:
                 raise InputError(f"{path}: {error}") from error
-    known = "; ".join(f"{kind.name} (key {kind.key})" for kind in FILES)
+    known = "; ".join(f"{name} (key {key})" for key, (name, _) in FILES.items())
     raise InputError(f"{path} describes no board that is known: {known}")
-
-
-def _told(error: Exception) -> str:
-    return f"it has no {error.args[0]!r}" if isinstance(error, KeyError) else str(error)
 
 
 def _parse(path: Path, data: bytes) -> Any:
     """YAML, also as OpenCV writes it, or OpenCV's XML: None where it is neither."""
     text = data.decode("utf-8", "replace")
     if "<opencv_storage>" in text:
-        found = re.findall(r"<(\w+)>\s*\"?([^<\"]*?)\"?\s*</\1>", text)
-        return {name: yaml.safe_load(value) if value else None for name, value in found}
+        values = re.findall(r"<(\w+)>\s*\"?([^<\"]*?)\"?\s*</\1>", text)
+        return {name: yaml.safe_load(value) if value else None for name, value in values}
     lines = [line for line in text.splitlines() if not line.startswith("%YAML")]  # OpenCV writes %YAML:1.0
     spaced = re.sub(r"(?<=[{, ])(\w+):(?=[\w\[\"-])", r"\1: ", "\n".join(lines))  # and {id:0}
     try:
@@ -237,22 +224,20 @@ def _read_ros(tree: dict[str, Any]) -> Board:
             "known: leave one bundle, or one tag"
         )
     tags = bundles[0]["layout"] if bundles else alone
-    places = [list(_pose_of_tag(tag)) for tag in tags]
-    dictionary = f"DICT_APRILTAG_{family}"
+    dictionary, border_bits = f"DICT_APRILTAG_{family}", int(tree.get("tag_border", 1))
     _predefined(dictionary)
-    corners = _as_drawn(np.array(places, np.float64).reshape(-1, 4, 3), dictionary)
-    return _layout(dictionary, [int(tag["id"]) for tag in tags], corners, border_bits=int(tree.get("tag_border", 1)))
+    corners = _as_drawn(np.array([_corners_of_tag(tag) for tag in tags], np.float64).reshape(-1, 4, 3), dictionary)
+    return board_of_markers(dictionary, [int(tag["id"]) for tag in tags], corners, border_bits=border_bits)
 
 
-def _pose_of_tag(tag: dict[str, Any]) -> Iterator[Array]:
-    """The corners [3] of an upright tag, from the upper left clockwise, in the bundle's frame."""
+def _corners_of_tag(tag: dict[str, Any]) -> Array:
+    """[4, 3]: the corners of an upright tag, from the upper left clockwise, in the bundle's frame."""
     w, x, y, z = (float(tag.get(name, name == "qw")) for name in ("qw", "qx", "qy", "qz"))
     if not np.isclose(w * w + x * x + y * y + z * z, 1.0, atol=1e-3):
         raise ValueError(f"the quaternion of tag {tag['id']} has not length 1")
     R = rotation_from_quaternion(np.array([x, y, z, w]))
     T = pose(R, np.array([float(tag.get(name, 0.0)) for name in "xyz"]))
-    half = 0.5 * float(tag["size"])
-    yield from transform(T, half * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]))
+    return transform(T, float(tag["size"]) * (UPRIGHT - [0.5, 0.5, 0.0]))
 
 
 def _read_map(tree: dict[str, Any]) -> Board:
@@ -262,7 +247,9 @@ def _read_map(tree: dict[str, Any]) -> Board:
     markers = tree["aruco_bc_markers"]
     corners = np.array([marker["corners"] for marker in markers], np.float64)
     dictionary = str(tree.get("aruco_bc_dict", "ARUCO_MIP_36h12"))
-    return _layout(f"DICT_{dictionary.removeprefix('DICT_')}", [int(marker["id"]) for marker in markers], corners)
+    return board_of_markers(
+        f"DICT_{dictionary.removeprefix('DICT_')}", [int(marker["id"]) for marker in markers], corners
+    )
 
 
 def _read_settings(tree: dict[str, Any]) -> Board:
@@ -283,20 +270,11 @@ def _read_settings(tree: dict[str, Any]) -> Board:
     return make_charuco(sizes)
 
 
-@dataclass(frozen=True)
-class BoardFileKind:
-    """A kind of file: its name, the key that tells it, and what makes a board of its keys."""
-
-    name: str
-    key: str
-    read: Callable[[dict[str, Any]], Board]
-
-
-FILES = (
-    BoardFileKind("a target of Kalibr", "target_type", _read_kalibr),
-    BoardFileKind("a bundle of tags of apriltag_ros", "tag_bundles", _read_ros),
-    BoardFileKind("a tag of apriltag_ros", "standalone_tags", _read_ros),
-    BoardFileKind("a marker map of ArUco", "aruco_bc_markers", _read_map),
-    BoardFileKind("the settings of OpenCV's calibration", "Calibrate_Pattern", _read_settings),
-)
-"""Files of other programs that are read."""
+FILES: dict[str, tuple[str, Callable[[dict[str, Any]], Board]]] = {
+    "target_type": ("a target of Kalibr", _read_kalibr),
+    "tag_bundles": ("a bundle of tags of apriltag_ros", _read_ros),
+    "standalone_tags": ("a tag of apriltag_ros", _read_ros),
+    "aruco_bc_markers": ("a marker map of ArUco", _read_map),
+    "Calibrate_Pattern": ("the settings of OpenCV's calibration", _read_settings),
+}
+"""Files of other programs that are read: by the key that tells one its name, and what makes a board of its keys."""

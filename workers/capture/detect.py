@@ -2,13 +2,9 @@
 
 An edge is found on short profiles across it, at the centroid of the gradient of light, which blur moves less than it
 moves the corner itself. Measured on pictures drawn in linear light and stored in sRGB: 0.04 px (rms an axis); OpenCV's
-refinements leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there. On the one real photograph at hand it
-fits the nominal board worse than the contours do (median 1.01 px against 0.44 to a free homography), and best of all
-(0.23 against 0.28) once the side of the printed marker is free: 41.5 mm in place of 40, which AprilTag's corners say as
-well.
+refinements leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there. On a real photograph it fits best of all,
+0.23 px to a free homography against 0.28, once the side of the printed marker is free, as AprilTag's corners say as well.
 """
-
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -37,7 +33,6 @@ ROUNDS = 5
 """Under its weight a centroid shows half of a shift where an edge is as wide as the weight: each round halves what is left."""
 MAX_SHIFT = 1.0
 """A corner that moves by more than this many halves of a profile is kept as it was: the edge is not what it seemed."""
-
 LINEAR = SRGB_STEPS.astype(np.float32)
 """[256]: light of each code. Blur adds up light: in codes the middle of a blurred edge lies 0.1 to 0.2 px on its dark side."""
 
@@ -150,7 +145,6 @@ def unbend_corners(corners_px: Array, camera: CaptureCamera) -> Array:
 
 MIN_PERIMETER = 0.01
 """Smallest perimeter of a marker over the larger side of the image: 19 px of 1920, below which bits cannot be read."""
-
 CLEAR_PERIMETER = 0.06
 SEVERAL = 4
 """Another dictionary is named for so many markers of at least this size: fewer may be chance."""
@@ -160,10 +154,10 @@ def detect_markers(
     rgb: NDArray[np.uint8], board: Board, dictionary: "cv2.aruco.Dictionary", number: int = 0
 ) -> Detection:
     """The board's markers in an image [H, W, 3]; ids that are not on the board, or that are seen twice, are dropped."""
-    gray, geometry, border = _gray(rgb), board_geometry(board), board.border_bits
-    quads, ids = _quads(gray, dictionary, border)
+    geometry = board_geometry(board)
+    gray, quads, ids = _find_quads(rgb, dictionary, board.border_bits)
     kept, dropped = _usable(ids, geometry.ids)
-    corners = _refined(gray, [quads[k] for k in kept], dictionary, border)
+    corners = refine_corners(gray, quads[kept], dictionary.markerSize + 2 * board.border_bits)
     chess, chess_px = _find_chess(gray, geometry, ids[kept], corners)
     for pixels in (corners, chess_px):
         pixels += 0.5
@@ -175,40 +169,27 @@ def find_markers(
     rgb: NDArray[np.uint8], dictionary: "cv2.aruco.Dictionary", border_bits: int
 ) -> tuple[NDArray[np.int64], Array]:
     """(ids [M], corners [M, 4, 2], centres at +0.5) of all markers of a dictionary, but those that are seen twice."""
-    gray = _gray(rgb)
-    quads, ids = _quads(gray, dictionary, border_bits)
-    once = [k for k in range(len(ids)) if (ids == ids[k]).sum() == 1]
-    return ids[once], _refined(gray, [quads[k] for k in once], dictionary, border_bits) + 0.5
+    gray, quads, ids = _find_quads(rgb, dictionary, border_bits)
+    values, counts = np.unique(ids, return_counts=True)
+    once = np.isin(ids, values[counts == 1])
+    return ids[once], refine_corners(gray, quads[once], dictionary.markerSize + 2 * border_bits) + 0.5
 
 
-def _refined(
-    gray: NDArray[np.uint8], quads: Sequence[NDArray], dictionary: "cv2.aruco.Dictionary", border_bits: int
-) -> Array:
-    """[M, 4, 2]: refined corners of OpenCV's quads [1, 4, 2], pixel centres at integers."""
-    corners = np.array(quads, dtype=np.float64).reshape(-1, 4, 2)
-    return refine_corners(gray, corners, dictionary.markerSize + 2 * border_bits)
-
-
-def _gray(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
-
-
-def _quads(
-    gray: NDArray[np.uint8], dictionary: "cv2.aruco.Dictionary", border_bits: int
-) -> tuple[Sequence[NDArray], NDArray[np.int64]]:
-    quads, found, _ = _detector(dictionary, border_bits=border_bits).detectMarkers(gray)
-    return quads, np.zeros(0, np.int64) if found is None else found.ravel().astype(np.int64)
+def _find_quads(
+    rgb: NDArray[np.uint8], dictionary: "cv2.aruco.Dictionary", border_bits: int
+) -> tuple[NDArray[np.uint8], Array, NDArray[np.int64]]:
+    """(grey image, [N, 4, 2] corners as OpenCV has them, pixel centres at integers, [N] ids)."""
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+    quads, ids, _ = _detector(dictionary, border_bits=border_bits).detectMarkers(gray)
+    return gray, np.array(quads, np.float64).reshape(-1, 4, 2), np.array([] if ids is None else ids, np.int64).ravel()
 
 
 NEAR_MARKERS = 4
 """A square is looked for where so many of the nearest markers put it: farther ones know less of the lens."""
-
 CHESS_REACH = 1.5
 """Farthest marker that tells of a square, in sides of it."""
-
 BESIDE = 0.6
 """Where light is looked at to tell a corner, as a share of the way to the nearest marker."""
-
 CONTRAST = 0.3
 """Least difference of light between white and black at a corner, over that of the brightest and the darkest there."""
 UNEVEN_PX = 0.5

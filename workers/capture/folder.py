@@ -144,16 +144,10 @@ def open_folder(path: Path, board: Board | None = None) -> CaptureFolder:
     """
     if not path.is_dir():
         raise CaptureError("missing", f"{path} is no folder")
-    numbers = _view_numbers(path)
-    spec = _read_json(path / CAMERA_FILE, CameraFile)
-    about = (
-        _read_json(path / CAPTURE_FILE, CaptureFile)
-        if (path / CAPTURE_FILE).exists()
-        else CaptureFile(name=derive_name(path.resolve().name))
-    )
-    return CaptureFolder(
-        path, about, camera_of(spec), board or _read_json(path / BOARD_FILE, Board), tuple(numbers), spec
-    )
+    numbers, spec, about = _view_numbers(path), _read_json(path / CAMERA_FILE, CameraFile), path / CAPTURE_FILE
+    described = _read_json(about, CaptureFile) if about.exists() else CaptureFile(name=derive_name(path.resolve().name))
+    board = board or _read_json(path / BOARD_FILE, Board)
+    return CaptureFolder(path, described, camera_of(spec), board, tuple(numbers), spec)
 
 
 def derive_name(words: str) -> str:
@@ -163,24 +157,24 @@ def derive_name(words: str) -> str:
 
 def _view_numbers(path: Path) -> list[int]:
     """Numbers of the views, ascending. Raises CaptureError for a file of a view whose rgb_ is missing, and for odd names."""
-    found: dict[str, set[int]] = {}
+    numbers: dict[str, set[int]] = {"rgb": set()}
     for file in sorted(path.iterdir()):
         if FILE_OF_VIEW.fullmatch(file.name):
-            kind, _, rest = file.name.partition("_")
-            digits, _, ending = rest.partition(".")
-            if digits != f"{int(digits):05d}":
-                raise CaptureError("name", f"{file} must be named {kind}_{int(digits):05d}.{ending}")
-            if int(digits) in found.setdefault(kind, set()):
+            kind, digits, ending = re.split("[_.]", file.name)
+            number = int(digits)
+            if digits != f"{number:05d}":
+                raise CaptureError("name", f"{file} must be named {kind}_{number:05d}.{ending}")
+            if number in numbers.setdefault(kind, set()):
                 raise CaptureError("name", f"{path} has two files {kind}_{digits}: keep one of them")
-            found[kind].add(int(digits))
-    rgb = found.pop("rgb", set())
+            numbers[kind].add(number)
+    rgb = numbers["rgb"]
     if not rgb:
         raise CaptureError(
             "missing", f"{path} has no rgb_00000.png: images are named rgb_, depth_ and mask_ with a number"
         )
-    for kind, numbers in found.items():
-        if alone := sorted(numbers - rgb):
-            name, counts = f"{kind}_{alone[0]:05d}", f"{len(rgb)} rgb_ and {len(numbers)} {kind}_"
+    for kind, of_kind in numbers.items():
+        if alone := sorted(of_kind - rgb):
+            name, counts = f"{kind}_{alone[0]:05d}", f"{len(rgb)} rgb_ and {len(of_kind)} {kind}_"
             raise CaptureError("counts", f"{path}: {name} has no rgb_{alone[0]:05d}.png ({counts}): copy it again")
     return sorted(rgb)
 
@@ -194,67 +188,61 @@ def read_board(path: Path) -> Board:
 
 def read_view(folder: CaptureFolder, number: int) -> CapturedView:
     """One view's images. Raises CaptureError where one cannot be read or has the wrong size."""
-    own = _own_intrinsics(folder, number)
-    rgb = _read_image(folder, "rgb", number, cv2.IMREAD_COLOR_RGB)
-    if rgb is None:
-        raise CaptureError("missing", f"{folder.path} has no rgb_{number:05d}.png")
-    mask = _read_image(folder, "mask", number, cv2.IMREAD_GRAYSCALE)
-    rgb = _as_read(folder, rgb, own, between=True)
-    mask = None if mask is None else _as_read(folder, mask, own, between=False) > 0
-    return CapturedView(number, rgb, _read_depth(folder, number, own), mask)
-
-
-def _own_intrinsics(folder: CaptureFolder, number: int) -> Intrinsics:
-    """Of the files of one view."""
     common, path = folder.camera.intrinsics, folder.file("camera", number)
-    return common if path is None else _intrinsics(folder.stored, _read_json(path, ViewFile))
+    k = common if path is None else _intrinsics(folder.stored, _read_json(path, ViewFile))
+    images = {}
+    for kind, flags, ndim in (("rgb", cv2.IMREAD_COLOR_RGB, 3), ("mask", cv2.IMREAD_GRAYSCALE, 2)):
+        if path := folder.file(kind, number):
+            image = _decoded(folder, path, flags | cv2.IMREAD_IGNORE_ORIENTATION, np.uint8, ndim)
+            images[kind] = _as_read(folder, image, k, between=kind == "rgb")
+    if "rgb" not in images:
+        raise CaptureError("missing", f"{folder.path} has no rgb_{number:05d}.png")
+    mask = images["mask"] > 0 if "mask" in images else None
+    return CapturedView(number, images["rgb"], _read_depth(folder, number, k), mask)
 
 
-def _as_read(folder: CaptureFolder, image: NDArray, own: Intrinsics, between: bool) -> NDArray:
-    """An image of a view's own intrinsics and of any lens as the folder's camera has it."""
+def _as_read(folder: CaptureFolder, image: NDArray, k: Intrinsics, between: bool) -> NDArray:
+    """An image of a view's intrinsics and of any lens as the folder's camera has it."""
     stored = folder.stored
-    common = _intrinsics(stored, stored)
-    image = change_camera(image, own, common, between) if own != folder.camera.intrinsics else image
+    common = _intrinsics(stored, stored)  # the markers' camera may be in place of it
+    if k != folder.camera.intrinsics:
+        image = change_camera(image, k, common, between)
     if not _is_taken_out(stored):
         return image
     return remap(image, pinhole_maps(common, tuple(stored.distortion), stored.lens_model == "fisheye"), between)
 
 
-def _read_depth(folder: CaptureFolder, number: int, own: Intrinsics) -> NDArray[np.uint16] | None:
+def _read_depth(folder: CaptureFolder, number: int, k: Intrinsics) -> NDArray[np.uint16] | None:
     """[H, W] in the folder's camera and units, None where the view has none."""
-    path, spec = folder.file("depth", number), folder.stored.depth_camera
+    path, spec, to = folder.file("depth", number), folder.stored.depth_camera, folder.camera
     if path is None:
         return None
-    if path.suffix == ".png" and spec is None:
-        units = _as_read(folder, _checked(folder, path, _decoded(path, cv2.IMREAD_UNCHANGED), np.uint16, 2), own, False)
-        return depth_along_axis(units, folder.camera) if folder.camera.depth == "ray" else units
     size = (folder.stored.width, folder.stored.height) if spec is None else (spec.width, spec.height)
-    try:
-        depth_m = decode_depth(path.read_bytes(), size, folder.stored.depth_units_per_m)
-    except PictureError as error:
-        raise CaptureError("unreadable", f"{path} {error}") from error
-    by_ray = folder.camera.depth == "ray"
-    if spec is None:
-        depth_m = _as_read(folder, depth_m, own, between=False)
-        depth_m = _over_ray_length(depth_m, folder.camera.intrinsics, folder.camera.lens) if by_ray else depth_m
+    if path.suffix == ".png" and spec is None:
+        depth_m = _decoded(folder, path, cv2.IMREAD_UNCHANGED, np.uint16, 2) / folder.stored.depth_units_per_m
     else:
-        camera = DepthCamera(
-            _intrinsics(folder.stored, spec), _eight(spec.distortion), frozen_array(np.array(spec.T_color_depth))
-        )
-        depth_m = _over_ray_length(depth_m, camera.intrinsics, camera.lens) if by_ray else depth_m
-        depth_m = register_depth(depth_m, camera, folder.camera.intrinsics, folder.camera.lens)
-    units = np.rint(depth_m * folder.camera.depth_units_per_m)
-    return np.where(units < 65536.0, units, 0.0).astype(np.uint16)  # depth beyond what 16 bits hold is none
+        try:
+            depth_m = decode_depth(path.read_bytes(), size, folder.stored.depth_units_per_m)
+        except PictureError as error:
+            raise CaptureError("unreadable", f"{path} {error}") from error
+    if spec is None:
+        camera = DepthCamera(to.intrinsics, to.lens, np.eye(4))
+        depth_m = _as_read(folder, depth_m, k, between=False)
+    else:
+        T_color_depth = frozen_array(np.array(spec.T_color_depth))
+        camera = DepthCamera(_intrinsics(folder.stored, spec), _eight(spec.distortion), T_color_depth)
+    if to.depth == "ray":  # 0 where the lens has no ray
+        rays = pixel_rays(camera.intrinsics, camera.lens)
+        depth_m = np.nan_to_num(depth_m / np.sqrt(1.0 + (rays**2).sum(axis=2)))
+    if spec is not None:
+        depth_m = register_depth(depth_m, camera, to.intrinsics, to.lens)
+    return stored_depth(depth_m, to)
 
 
-def depth_along_axis(along_ray: NDArray[np.uint16], camera: CaptureCamera) -> NDArray[np.uint16]:
-    """[H, W] z of distances along the ray [H, W], in the same units; 0 where the lens has no ray."""
-    return np.rint(_over_ray_length(along_ray, camera.intrinsics, camera.lens)).astype(np.uint16)
-
-
-def _over_ray_length(along_ray: NDArray, k: Intrinsics, lens: Array) -> Array:
-    rays = pixel_rays(k, lens)
-    return np.nan_to_num(along_ray / np.sqrt(1.0 + (rays**2).sum(axis=2)))
+def stored_depth(depth_m: Array, camera: CaptureCamera) -> NDArray[np.uint16]:
+    """Depth [H, W] in units of the camera; what is beyond 16 bits is none."""
+    units = np.rint(depth_m * camera.depth_units_per_m)
+    return np.where(units < 65536.0, units, 0.0).astype(np.uint16)
 
 
 def write_view(path: Path, view: CapturedView) -> None:
@@ -280,7 +268,7 @@ def describe_camera(camera: CaptureCamera) -> CameraFile:
         cx=k.cx_opencv,
         cy=k.cy_opencv,
         pixel_centre="0",
-        distortion=[float(x) for x in camera.lens] if camera.has_lens else [],
+        distortion=camera.lens.tolist() if camera.has_lens else [],
         depth_units_per_m=camera.depth_units_per_m,
         depth=camera.depth,
     )
@@ -291,9 +279,8 @@ def read_pose(path: Path) -> Pose | None:
     if not path.exists():
         return None
     try:
-        T = np.array(
-            [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()], np.float64
-        )
+        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        T = np.array(rows, np.float64)
     except ValueError as error:
         raise CaptureError("unreadable", f"{path} is no matrix of numbers: {error}") from error
     if T.shape != (4, 4) or not np.isfinite(T).all() or not _is_rigid(T):
@@ -359,32 +346,18 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _read_image(folder: CaptureFolder, kind: str, number: int, flags: int) -> NDArray | None:
-    """Of colour or a mask, None where the view has none."""
-    path = folder.file(kind, number)
-    if path is None:
-        return None
-    ndim = 3 if flags == cv2.IMREAD_COLOR_RGB else 2
-    return _checked(folder, path, _decoded(path, flags | cv2.IMREAD_IGNORE_ORIENTATION), np.uint8, ndim)
-
-
-def _decoded(path: Path, flags: int) -> NDArray:
+def _decoded(folder: CaptureFolder, path: Path, flags: int, dtype: type, ndim: int) -> NDArray:
+    """An image of the camera's size."""
     image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), flags)
     if image is None:
         raise CaptureError("unreadable", f"{path} is no image that can be read: take it out, or copy it again")
-    return image
-
-
-def _checked(folder: CaptureFolder, path: Path, image: NDArray, dtype: type, ndim: int) -> NDArray:
     k = folder.stored
     if image.dtype != dtype or image.shape[:2] != (k.height, k.width) or image.ndim != ndim:
-        kind = (
-            f"{image.shape[1]} x {image.shape[0]} of {image.dtype}, {1 if image.ndim == 2 else image.shape[2]} channels"
-        )
-        told = " (another size of depth: describe depth_camera)" if dtype is np.uint16 and image.dtype == dtype else ""
-        raise CaptureError(
-            "size", f"{path} is {kind}, and camera.json says {k.width} x {k.height} ({np.dtype(dtype)}){told}"
-        )
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        kind = f"{image.shape[1]} x {image.shape[0]} of {image.dtype}, {channels} channels"
+        depth = " (another size of depth: describe depth_camera)" if image.dtype == dtype == np.uint16 else ""
+        wanted = f"{k.width} x {k.height} ({np.dtype(dtype)})"
+        raise CaptureError("size", f"{path} is {kind}, and camera.json says {wanted}{depth}")
     return image
 
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from schemas.capture import CapturedView, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
 from schemas.scene.view import Intrinsics
-from workers.capture.folder import CaptureFile, write_description, write_view
+from workers.capture.folder import CaptureFile, stored_depth, write_description, write_view
 from workers.door.opening import as_refusal
 from workers.door.recordings.formats import open_any
 from workers.door.recordings.pictures import change_camera
@@ -42,17 +43,14 @@ def pair_frames(color_us: Stamps, depth_us: Stamps, period_us: float, delay_us: 
 
     Depth stamps are `delay_us` later than the colour stamps they belong to. Both ascending.
     """
-    pairs: dict[int, int] = {}
-    if len(depth_us) == 0:
-        return pairs
+    if not len(depth_us):
+        return {}
     shifted = depth_us - delay_us
     after = np.searchsorted(shifted, color_us)
-    for i, stamp in enumerate(color_us.tolist()):
-        near = [k for k in (int(after[i]) - 1, int(after[i])) if 0 <= k < len(shifted)]
-        best = min(near, key=lambda k: abs(float(shifted[k]) - stamp))
-        if abs(float(shifted[best]) - stamp) < 0.5 * period_us:
-            pairs[i] = best
-    return pairs
+    near = np.clip(np.stack([after - 1, after]), 0, len(shifted) - 1)
+    gaps = np.abs(shifted[near] - color_us)
+    best, gap = np.take_along_axis(near, gaps.argmin(axis=0)[None], axis=0)[0], gaps.min(axis=0)
+    return {int(i): int(best[i]) for i in np.flatnonzero(gap < 0.5 * period_us)}
 
 
 def count_losses(color_us: Stamps, pairs: int, damaged: int, period_us: float, duration_us: float | None) -> Losses:
@@ -65,28 +63,21 @@ def count_losses(color_us: Stamps, pairs: int, damaged: int, period_us: float, d
 
 def describe_losses(losses: Losses) -> list[str]:
     """Sentences for the user, none where nothing is missing."""
-    told = []
-    if losses.cut is None:
-        told.append(
-            "the recorder was interrupted and wrote no length: nobody knows how many frames are lost at the end"
-        )
-    elif losses.cut:
-        told.append(f"the recording is cut: about {losses.cut} frames are lost at its end")
-    if losses.dropped:
-        told.append(f"{losses.dropped} frames are missing between the first and the last")
-    if losses.damaged:
-        told.append(f"{losses.damaged} frames are damaged")
-    if losses.without_depth:
-        told.append(f"{losses.without_depth} colour frames have no depth")
-    return told
+    sentences = {
+        "the recorder was interrupted and wrote no length: nobody knows how many frames are lost at the end": losses.cut
+        is None,
+        f"the recording is cut: about {losses.cut} frames are lost at its end": losses.cut,
+        f"{losses.dropped} frames are missing between the first and the last": losses.dropped,
+        f"{losses.damaged} frames are damaged": losses.damaged,
+        f"{losses.without_depth} colour frames have no depth": losses.without_depth,
+    }
+    return [sentence for sentence, count in sentences.items() if count]
 
 
 LOOK = (32, 18)
 """Width and height of the small picture by which frames are compared."""
-
 BLURRED = 0.5
 """A frame with less than this share of the usual sharpness is taken only where there are too few others."""
-
 NEAR = 0.5
 """Two frames whose looks, of length 1, differ by less show much the same: a correlation of 0.875."""
 
@@ -206,13 +197,9 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
         ImportedView(n, int(color_us[i]), int(depth_us[pairs[i]]), measures[i].sharpness) for n, i in enumerate(chosen)
     )
     _write_views(recording, made, out)
-    told = {
-        "recording": path.name,
-        **recording.told,
-        "losses": asdict(losses),
-        "views": [asdict(view) for view in made],
-    }
-    (out / RECORDING_FILE).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    origin: dict[str, Any] = {"recording": path.name, **recording.told}
+    origin |= {"losses": asdict(losses), "views": [asdict(view) for view in made]}
+    (out / RECORDING_FILE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
     write_description(out, about, recording.color, board)
     return Imported(made, len(pairs), losses)
 
@@ -261,13 +248,12 @@ def _view(recording: Recorded, number: int, color: RecordedFrame, depth: Recorde
     rgb, depth_m = _load(recording, color, False), _load(recording, depth, False)
     if rgb is None or depth_m is None:
         raise CaptureError("unreadable", f"{recording.path}: the colour frame of view {number} cannot be decoded")
-    common, units_per_m = recording.color, recording.color.depth_units_per_m
-    own = color.camera if isinstance(color.camera, Intrinsics) else common.intrinsics
+    common = recording.color
+    k = color.camera if isinstance(color.camera, Intrinsics) else common.intrinsics
     camera = depth.camera if isinstance(depth.camera, DepthCamera) else recording.depth
     if camera is None:
-        depth_m = change_camera(depth_m, own, common.intrinsics, between=False)
+        depth_m = change_camera(depth_m, k, common.intrinsics, between=False)
     else:
         depth_m = register_depth(depth_m, camera, common.intrinsics, common.lens)
-    units = np.rint(depth_m * units_per_m)  # depth beyond what 16 bits hold is none
-    rgb = change_camera(rgb, own, common.intrinsics, between=True)
-    return CapturedView(number, rgb, np.where(units < 65536.0, units, 0.0).astype(np.uint16), None)
+    rgb = change_camera(rgb, k, common.intrinsics, between=True)
+    return CapturedView(number, rgb, stored_depth(depth_m, common), None)

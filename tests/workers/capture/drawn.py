@@ -169,6 +169,12 @@ def observe(T, rng, *, number=0, camera=PINHOLE, ids=None, corner_px=0.2, scale=
     )
 
 
+def with_pixels(view: Observation, pixels: Array, camera: CaptureCamera = PINHOLE) -> Observation:
+    """The view with its corners at other pixels, which are read with this camera."""
+    rays = rays_of_pixels(pixels, camera.intrinsics, camera.lens)
+    return dataclasses.replace(view, corners=dataclasses.replace(view.corners, pixels=pixels, rays=rays))
+
+
 def with_corner_depth(
     view: Observation, T: Pose, rng: np.random.Generator, *, sigma_m=0.002, bias_m=0.0
 ) -> Observation:

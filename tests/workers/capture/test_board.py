@@ -162,22 +162,9 @@ tag_bundles:
     assert geometry.corners[0] == pytest.approx(upright[[2, 3, 0, 1]])
     stands = np.array([[0.1, 0.18, 0.07], [0.1, 0.22, 0.07], [0.1, 0.22, 0.03], [0.1, 0.18, 0.03]])
     assert geometry.corners[1] == pytest.approx(stands[[2, 3, 0, 1]], abs=1e-7)
-    file = cv2.FileStorage(str(tmp_path / "map.yml"), cv2.FILE_STORAGE_WRITE)
-    file.write("aruco_bc_dict", "ARUCO_MIP_36h12")
-    file.write("aruco_bc_mInfoType", 1)
-    file.startWriteStruct("aruco_bc_markers", cv2.FILE_NODE_SEQ)
-    file.startWriteStruct("", cv2.FILE_NODE_MAP | cv2.FILE_NODE_FLOW)
-    file.write("id", 17)
-    file.startWriteStruct("corners", cv2.FILE_NODE_SEQ | cv2.FILE_NODE_FLOW)
-    for x, y in upright[:, :2]:
-        file.startWriteStruct("", cv2.FILE_NODE_SEQ | cv2.FILE_NODE_FLOW)
-        for value in (x, y, 0.0):
-            file.write("", value)
-        file.endWriteStruct()
-    for _ in range(3):
-        file.endWriteStruct()
-    file.release()
-    mapped = read_board_file(tmp_path / "map.yml")
+    corners = ", ".join(f"[ {x}, {y}, 0. ]" for x, y in upright[:, :2])  # as OpenCV writes it
+    marker_map = "%YAML:1.0\n---\naruco_bc_dict: ARUCO_MIP_36h12\naruco_bc_mInfoType: 1\naruco_bc_markers:\n"
+    mapped = read("map.yml", f"{marker_map}   - {{ id:17, corners:[ {corners} ] }}\n")
     assert mapped.markers[0].id == 17 and np.array(mapped.markers[0].corners) == pytest.approx(upright)
     keys = {"BoardSize_Width": 7, "BoardSize_Height": 5, "Square_Size": 40, "Marker_Size": 30}
     words = "".join(f"<{name}>{value}</{name}>" for name, value in keys.items())
@@ -216,18 +203,6 @@ def test_dictionary_that_does_not_exist_or_is_too_small_is_refused():
 # ---------------------------------------------------------------------------------------------- the sheet
 
 
-def test_the_black_rectangles_are_the_black_cells_of_the_markers():
-    layout = lay_out_print(BOARD)
-    left, bottom, right, top = layout.markers.T
-    for cells, corners in zip(marker_cells(BOARD), marker_corners(BOARD), strict=True):
-        side = BOARD.marker_m / len(cells)
-        for row, column in np.ndindex(cells.shape):
-            x, y = corners[0, 0] + (column + 0.5) * side, corners[0, 1] - (row + 0.5) * side
-            assert ((left < x) & (x < right) & (bottom < y) & (y < top)).any() == cells[row, column]
-    measured = lay_out_print(BOARD.model_copy(update={"measured_ruler_m": 0.19}))  # a print is made at nominal size
-    assert np.array_equal(measured.markers, layout.markers)
-
-
 def test_ruler_words_and_arrow_are_on_the_sheet_and_clear_of_the_markers():
     layout = lay_out_print(BOARD)
     left, bottom, right, top = layout.ruler.T
@@ -243,6 +218,8 @@ def test_ruler_words_and_arrow_are_on_the_sheet_and_clear_of_the_markers():
         assert x < layout.markers[:, 0].min() or words.x_m > layout.markers[:, 2].max()
     assert layout.arrow[2, 1] > layout.arrow[:2, 1].max()
     assert sum("measured_ruler_m" in words.words for words in layout.words) == 1
+    measured = lay_out_print(BOARD.model_copy(update={"measured_ruler_m": 0.19}))  # a print is made at nominal size
+    assert np.array_equal(measured.markers, layout.markers)
 
 
 def test_a_sheet_is_wide_enough_for_its_ruler_or_refused():

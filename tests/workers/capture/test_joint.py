@@ -1,54 +1,36 @@
 """The pieces of the joint problem: derivatives by finite differences, noise by its own residuals, pairs of patches."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from schemas.job.captures import Estimation
 from tests.workers.capture.drawn import (
-    BOX,
     HALF,
     KINECT,
     LENS,
     PINHOLE,
     Virtual,
-    errors,
     evidence_of,
     hand_held,
     make,
     observe,
     project,
+    with_pixels,
 )
-from workers.capture.poses.corners import CornerTerm, outward_motion
+from workers.capture.poses.corners import CornerTerm
 from workers.capture.poses.estimates import estimate_joint, object_groups
 from workers.capture.poses.joint import (
-    FLOOR_M,
     INFLATION_OF_FEW,
-    REACH_M,
-    VIEW_FLOOR_M,
     BoardTerm,
     ObjectTerm,
-    gather,
     inflation,
-    match_patches,
-    patch_sigma,
-    placed,
-    row_inflation,
 )
-from workers.capture.poses.observation import Patches, no_patches
+from workers.capture.poses.observation import Patches
 from workers.capture.poses.terms import (
-    NAMES,
-    Problem,
     Shared,
-    correct_depth,
-    minimise,
     motion_between,
     moved,
-    prior_sigma,
 )
-from workers.geometry.frames import translation, uniform_rotation
-from workers.geometry.pixels import rays_of_pixels
+from workers.geometry.frames import translation
 
 RNG = np.random.default_rng(0)
 STEP = np.array([0.01, -0.02, 0.01, 0.02, -0.01, 0.03, -0.02, 0.01, 0.005, 2e-4, 0.1, 0.01, 0.02, -0.01, 0.01, 0.02])
@@ -57,7 +39,7 @@ SHARED = Shared().moved(STEP)
 POSES = np.stack(hand_held(RNG, 3))
 VIEW = RNG.integers(0, 3, 12)
 RAY = np.column_stack([RNG.uniform(-0.3, 0.3, (12, 2)), np.ones(12)])
-PATCHES = Patches(RAY * RNG.uniform(0.5, 1.2, (12, 1)), RAY, -RAY, np.full(12, 9), np.full(12, 0.001))
+PATCHES = Patches(RAY * RNG.uniform(0.5, 1.2, (12, 1)), RAY, -RAY, np.full(12, 0.001))
 PAIRS = np.array([[0, 1], [2, 5], [3, 9]])
 PAIRS = PAIRS[VIEW[PAIRS[:, 0]] != VIEW[PAIRS[:, 1]]]
 SEEN = [observe(T, RNG, camera=LENS, ids=range(n, 35, 9)).corners for n, T in enumerate(POSES)]
@@ -98,18 +80,6 @@ def test_derivatives_of_each_term_equal_finite_differences(name):
             assert own == pytest.approx(change / 2e-6, rel=1e-4, abs=2e-2)
 
 
-def test_sides_grow_in_the_plane_of_their_marker_wherever_it_stands_and_corners_of_a_chessboard_stay():
-    rng = np.random.default_rng(3)
-    flat = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    for _ in range(20):
-        R, place, side = uniform_rotation(rng), rng.normal(size=3), rng.uniform(0.01, 0.1)
-        small, large = (place + 0.5 * length * flat @ R.T for length in (side, side + 0.002))
-        corners = np.concatenate([small, rng.normal(size=(3, 3))])
-        moved = outward_motion(corners, np.arange(7) < 4)
-        np.testing.assert_allclose(corners[:4] + 0.002 * moved[:4], large, atol=1e-12)
-        assert not moved[4:].any()
-
-
 def test_a_smaller_world_does_not_fit_better():
     """Depth and poses scaled alike leave residuals over sigma as they are: noise shrinks with the world."""
     small = POSES.copy()
@@ -119,72 +89,8 @@ def test_a_smaller_world_does_not_fit_better():
         assert after.residual == pytest.approx(before.residual)
 
 
-def test_shared_parameters_are_what_was_added_and_what_others_are_told():
-    exact = SHARED.derivative(PATCHES)
-    for axis, step in enumerate(1e-6 * np.eye(SIZE)):
-        change = SHARED.moved(step).corrected(PATCHES) - SHARED.moved(-step).corrected(PATCHES)
-        assert exact[:, :, axis] == pytest.approx(change / 2e-6, abs=1e-7)
-    depth = correct_depth(SHARED, np.ones(SIZE), np.ones(SIZE))
-    p = PATCHES.ray_z * depth.scale + depth.offset_m * PATCHES.ray
-    assert SHARED.corrected(PATCHES) == pytest.approx(p @ depth.T_cam_depth[:3, :3].T + depth.T_cam_depth[:3, 3])
-    assert SHARED.deviation() == pytest.approx(STEP) and not Shared().deviation().any()
-
-
-def test_priors_hold_what_is_believed_and_tell_what_is_identified():
-    by_print, by_depth = (prior_sigma(Estimation(trust=t), True) for t in ("print", "depth"))
-    assert by_print[NAMES.index("print_scale")] == 0 and by_depth[NAMES.index("print_scale")] > 0.1
-    assert by_depth[NAMES.index("scale")] == 0.001  # the specification of the camera
-    assert not prior_sigma(Estimation(), False)[:9].any()
-    sigma = np.where(np.arange(SIZE) == 2, 0.1, 0.9) * by_print
-    assert correct_depth(Shared(), sigma, by_print).identified == ("shift_x_m",)
-
-
 SLOPES = np.array([1.0, -1.0, 1.0, -1.0])[:, None]
 """Two corners of each edge move against one another."""
-
-
-# ---------------------------------------------------------------------------------------------- the solution
-
-
-def corner_problem(truth, rng, corner_px=0.2, prior=None, fixed=None):
-    seen = [observe(T, rng, corner_px=corner_px).corners for T in truth]
-    term = CornerTerm.of(seen, PINHOLE, np.full(4, max(corner_px, 0.1)))
-    free = np.zeros(len(truth), bool) if fixed is None else np.array(fixed)
-    return Problem([term], np.zeros(SIZE) if prior is None else prior, free)
-
-
-def test_without_noise_every_pose_is_the_true_one_in_few_iterations():
-    rng = np.random.default_rng(0)
-    truth = hand_held(rng, 5)
-    start = np.stack([moved(T, rng.normal(0, 0.02, 6)) for T in truth])
-    found = minimise(corner_problem(truth, rng, 0), start, Shared(), 50)
-    assert found.converged and found.iterations < 15
-    assert max(max(errors(a, b)) for a, b in zip(found.poses, truth, strict=True)) < 1e-4
-    found = minimise(corner_problem(truth, rng), start, Shared(), 1)
-    assert found.iterations == 1 and not found.converged
-
-
-def test_a_fixed_pose_stays_and_a_parameter_without_data_stays_at_its_prior():
-    rng = np.random.default_rng(1)
-    truth = hand_held(rng, 3)
-    start = np.stack([moved(T, rng.normal(0, 0.01, 6)) for T in truth])
-    prior = prior_sigma(Estimation(), True)
-    found = minimise(corner_problem(truth, rng, 0.2, prior, [False, True, False]), start, Shared(), 50)
-    assert np.abs(found.poses[1] - start[1]).max() < 1e-14
-    assert np.abs(found.shared.deviation()[:9]).max() < 1e-9  # of depth; corners tell the growth of a side
-    sigma = np.sqrt(np.diag(found.covariance()))
-    assert not sigma[6:12].any()
-    assert sigma[18 + NAMES.index("offset_m")] == pytest.approx(prior[0], rel=1e-3)
-
-
-def test_the_covariance_is_the_scatter_of_the_solution():
-    rng, off = np.random.default_rng(2), []
-    truth = hand_held(rng, 1)
-    for _ in range(60):
-        found = minimise(corner_problem(truth, rng), np.stack(truth), Shared(), 20)
-        off.append(motion_between(truth[0], found.poses[0]))
-    scatter = np.sqrt(np.mean(np.square(off), axis=0))
-    assert scatter == pytest.approx(np.sqrt(np.diag(found.covariance()[:6, :6])), rel=0.3)
 
 
 # ---------------------------------------------------------------------------------------------- noise of corners
@@ -214,8 +120,7 @@ def test_markers_of_uneven_size_and_shape_move_no_camera_more_than_its_sigma_say
             quads = grown(quads, rng.normal(-0.2, growth_px, len(quads)))
             noisy = rng.normal(0, 0.05, quads.shape) + shape_px * rng.standard_normal((len(quads), 1, 2)) * SLOPES
             pixels = (quads + noisy).reshape(-1, 2)
-            rays = rays_of_pixels(pixels, KINECT, PINHOLE.lens)
-            seen.append(dataclasses.replace(one, corners=dataclasses.replace(one.corners, pixels=pixels, rays=rays)))
+            seen.append(with_pixels(one, pixels))
         evidence = evidence_of(seen)
         found = estimate_joint(evidence)
         assert found.camera is None and not any("camera.json" in note for note in found.notes)
@@ -244,10 +149,7 @@ def test_rows_read_in_turn_by_a_moving_camera_are_told_and_are_in_the_sigma_and_
                         [project(p[None], own, PINHOLE)[0] for p, own in zip(one.corners.board, poses, strict=True)]
                     )
                 pixels = pixels + rng.normal(0, 0.05, pixels.shape)
-                rays = rays_of_pixels(pixels, KINECT, PINHOLE.lens)
-                seen.append(
-                    dataclasses.replace(one, corners=dataclasses.replace(one.corners, pixels=pixels, rays=rays))
-                )
+                seen.append(with_pixels(one, pixels))
             found = estimate_joint(evidence_of(seen))
             assert any("while the rows of an image were read" in note for note in found.notes) == moves
             for view, T in zip(found.views, truth, strict=True):
@@ -281,44 +183,7 @@ def test_patches_that_err_alike_are_inflated_and_misfit_that_unknown_poses_expla
     assert inflation(residual[few], J[few], OF_VIEW[few], none) == INFLATION_OF_FEW
 
 
-def test_the_sigma_of_a_patch_is_at_1_m_and_no_view_is_better_than_its_floor():
-    rng = np.random.default_rng(5)
-    growth = rng.uniform(0.3, 1.5, 5000)
-    assert patch_sigma(rng.normal(0, 0.002, 5000) * growth, growth) == pytest.approx(0.002, rel=0.05)
-    assert patch_sigma(np.zeros(9), np.ones(9)) == FLOOR_M == patch_sigma(np.zeros(0), np.zeros(0))
-    sigma = np.full(101, 0.001)
-    factor = row_inflation(1.0, sigma, np.array([0] * 100 + [1])[:, None])
-    assert 1 / np.sqrt((1 / (sigma**2 * factor))[:100].sum()) == pytest.approx(VIEW_FLOOR_M)
-    assert factor[100] == 1.0  # few patches keep their weight
-
-
 # ---------------------------------------------------------------------------------------------- patches of the object
-
-
-@pytest.fixture(scope="module")
-def around():
-    """(true poses [V, 4, 4], the object's patches of all views, the view of each)."""
-    truth, evidence = make(Virtual(views=14, k=HALF))
-    parts = [o.object_patches for o in evidence.observations]
-    patches, view = gather(parts)
-    assert list(np.bincount(view)) == [len(p) for p in parts]
-    assert np.array_equal(patches.ray_z[view == 1], parts[1].ray_z)
-    return np.stack(truth), patches, view
-
-
-def test_pairs_are_of_two_views_near_each_other_and_on_one_face(around):
-    poses, patches, view = around
-    found = match_patches(patches, view, poses, Shared())
-    a, b = found.pairs.T
-    points, normals = placed(patches, view, poses, Shared())
-    assert len(found.pairs) > 500
-    assert (view[a] != view[b]).all() and (a < b).all() and len(np.unique(found.pairs, axis=0)) == len(found.pairs)
-    assert np.linalg.norm(points[a] - points[b], axis=1).max() <= REACH_M
-    assert np.median(np.abs(((points[a] - points[b]) * found.normal).sum(axis=1))) < 1e-3
-    top = points[:, 2] > BOX[1][2] - 0.002
-    assert top.sum() > 20 and np.median(normals[top, 2]) > 0.97
-    assert (normals * (points - (BOX[0] + BOX[1]) / 2)).sum(axis=1).min() > 0
-    assert match_patches(no_patches(), np.zeros(0, np.int64), poses, Shared()).pairs.shape == (0, 2)
 
 
 STOOD = {
@@ -341,11 +206,10 @@ def test_views_are_grouped_by_where_the_object_stood(how):
         assert found == [list(group) for group in STOOD[how]], seed
 
 
-def test_views_without_depth_or_too_unsure_of_their_poses_are_not_said_to_see_another_place(around):
-    truth, _, _ = around
+def test_views_without_depth_or_too_unsure_of_their_poses_are_not_said_to_see_another_place():
+    truth, evidence = make(Virtual(views=14, k=HALF))
     seen = [observe(T, np.random.default_rng(0)) for T in truth]
     assert object_groups(seen, truth, Shared(), 0.001, np.zeros(14)) == [list(range(14))]
-    _, evidence = make(Virtual(views=14, k=HALF))
     poses = np.stack([translation(0.01 * (n >= 7), 0, 0) @ T for n, T in enumerate(truth)])
     for unsure_m, groups in ((0.0, 2), (0.01, 1)):
         unsure = np.where(np.arange(14) >= 7, unsure_m, 0.0)

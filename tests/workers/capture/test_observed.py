@@ -4,8 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 
 from schemas.capture import CaptureCamera, DepthCorrection, Detection
 from schemas.job.captures import Board, Estimation
@@ -15,15 +13,12 @@ from tests.workers.capture.drawn import (
     KINECT,
     LENS,
     PINHOLE,
-    QUARTER,
     DepthErrors,
-    Virtual,
     errors,
     evidence_of,
     hand_held,
     measured_depth,
     observe,
-    one_view,
     project,
 )
 from workers.capture.board import marker_corners
@@ -33,8 +28,6 @@ from workers.capture.poses.markers import (
     fit_markers,
     fit_pose,
     judge,
-    measured_corner_px,
-    observe_view,
 )
 from workers.capture.poses.observation import (
     MOST,
@@ -42,51 +35,18 @@ from workers.capture.poses.observation import (
     Patches,
     Setup,
     board_patches,
-    corners_of,
-    depth_at,
     fit_patches,
     no_patches,
     object_patches,
-    pixels_of_points,
 )
-from workers.capture.poses.terms import cross_matrix, motion_between, moved
+from workers.capture.poses.terms import moved
 from workers.geometry.camera import look_at
-from workers.geometry.frames import invert, pose, transform, translation
-from workers.geometry.pixels import rays_of_pixels
+from workers.geometry.frames import invert, transform, translation
 
 SPEC = Estimation()
 FOCAL = np.array([KINECT.fx, KINECT.fy])
 SETUP = Setup(CaptureCamera(HALF, np.zeros(8)), Board(), SPEC)
 T0 = hand_held(np.random.default_rng(0), 1)[0]
-
-
-# ---------------------------------------------------------------------------------------------- rays and corners
-
-
-@pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])
-def test_rays_and_pixels_are_inverse_and_agree_with_opencv(camera):
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-0.2, 0.2, (50, 2)), rng.uniform(0, 0.1, 50)])
-    pixels = project(points, T0, camera)
-    assert pixels_of_points(points, T0, camera) == pytest.approx(pixels, abs=1e-9)
-    p = transform(invert(T0), points)
-    rays = rays_of_pixels(pixels, camera.intrinsics, camera.lens)
-    assert rays == pytest.approx(p[:, :2] / p[:, 2:], abs=1e-7)
-    assert np.isnan(pixels_of_points((T0[:3, 3] - T0[:3, 2])[None], T0, camera)).all(), "behind the camera"
-
-
-def test_corners_are_paired_by_id_and_left_out_where_the_lens_folds():
-    board = Board(first_id=5, measured_ruler_m=0.202)
-    points = marker_corners(board)
-    pixels = project(points.reshape(-1, 3), T0, PINHOLE).reshape(-1, 4, 2)
-    corners = corners_of(Detection(0, np.array([6, 30]), pixels[[1, 25]]), board, PINHOLE)
-    assert corners.board == pytest.approx(points[[1, 25]].reshape(-1, 3))
-    assert list(corners.markers) == [6] * 4 + [30] * 4
-    assert Observation(0, corners).markers == 2 and not corners.depth_m.any()
-    folding = CaptureCamera(KINECT, np.array([-0.6, 0, 0, 0, 0, 0, 0, 0]))
-    square = np.array([[-8, -8], [8, -8], [8, 8], [-8, 8.0]])
-    detection = Detection(0, np.array([5, 6]), np.stack([square + np.array([960, 540]), square + 9]))
-    assert list(corners_of(detection, board, folding).markers) == [5] * 4
 
 
 # ---------------------------------------------------------------------------------------------- patches of depth
@@ -129,14 +89,6 @@ def test_flying_pixels_and_missing_ones_do_not_move_a_patch_and_too_little_depth
     assert len(fit_patches(rays[:3], few)) == 1 and len(fit_patches(rays[:0], z[:0])) == 0
 
 
-def test_depth_of_a_corner_is_the_median_around_it():
-    depth = np.full((20, 20), 800, np.uint16)
-    depth[9:12, 9:12], depth[8, 8] = 0, 5000
-    assert depth_at(depth, np.array([[10.5, 10.5], [0.2, 19.9]]), 1000) == pytest.approx([0.8, 0.8])
-    assert depth_at(np.zeros_like(depth), np.array([[10.5, 10.5]]), 1000) == [0.0]
-    assert depth_at(depth, np.zeros((0, 2)), 1000).shape == (0,)
-
-
 def test_the_objects_patches_lie_on_the_faces_of_the_box_and_face_the_camera():
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -155,32 +107,7 @@ def test_the_objects_patches_lie_on_the_faces_of_the_box_and_face_the_camera():
         assert len(object_patches(depth, T, no_patches(), SETUP)) == 0
 
 
-def test_a_view_comes_to_corners_pose_and_samples_of_depth():
-    rng, setup = np.random.default_rng(0), Setup(CaptureCamera(QUARTER, np.zeros(8)), Board(), SPEC)
-    seen, found = one_view(4, T0, Virtual(), setup, rng)
-    assert (seen.corners.depth_m > 0).all() and len(seen.board_patches) > 20 and len(seen.object_patches) > 10
-    assert errors(found.fit.T_board_cam, T0)[0] < 1.5
-    nothing = Detection(2, np.zeros(0, np.int64), np.zeros((0, 4, 2)))
-    for depth in (None, np.zeros((270, 480), np.uint16)):
-        seen, found = observe_view(nothing, depth, setup)
-        assert found.fit is None and seen.markers == 0 and not len(seen.board_patches) + len(seen.object_patches)
-
-
 # ---------------------------------------------------------------------------------------------- motions and fits
-
-
-def test_small_motions_are_scipys_and_made_in_the_axes_of_the_camera():
-    rng = np.random.default_rng(0)
-    for length in (0.0, 1e-14, 1e-9, 1e-4, 0.5, 3.0):
-        vector = rng.standard_normal(3)
-        vector *= length / np.linalg.norm(vector)
-        turned = moved(np.eye(4), np.r_[0, 0, 0, vector])
-        assert turned[:3, :3] == pytest.approx(expm(cross_matrix(vector)), abs=1e-13)
-        assert motion_between(np.eye(4), turned)[3:] == pytest.approx(vector, abs=1e-12)
-    R = Rotation.from_euler("xyz", [0.3, -0.4, 0.5]).as_matrix()
-    T = moved(pose(R, np.array([1.0, 2, 3])), np.array([0.1, 0, 0, 0, 0, 0.2]))
-    assert T[:3, 3] == pytest.approx(np.array([1, 2, 3]) + 0.1 * R[:, 0])
-    assert T[:3, :3] == pytest.approx(R @ Rotation.from_rotvec([0, 0, 0.2]).as_matrix())
 
 
 def test_a_fit_is_the_truth_through_a_lens_and_wrong_corners_move_it_by_little():
@@ -249,14 +176,6 @@ def test_a_frontal_board_is_no_trap_and_a_mirrored_one_or_too_few_markers_are_no
     assert found.fit is None and found.reason == "no markers of the board found"
 
 
-def test_the_sigma_of_a_corner_is_measured_over_all_views():
-    rng = np.random.default_rng(7)
-    for corner_px in (0.1, 0.2, 0.5):
-        evidence = evidence_of([observe(T, rng, corner_px=corner_px) for T in hand_held(rng, 10)])
-        assert evidence.corner_px == pytest.approx(corner_px, rel=0.1)
-    assert measured_corner_px([], SPEC) == SPEC.corner_px
-
-
 # ---------------------------------------------------------------------------------------------- the verdict
 
 
@@ -264,7 +183,7 @@ def patches_on_board(lift_m=0.0):
     """Nine patches of the board whose depth says that it lies `lift_m` higher."""
     x, y = np.meshgrid([-0.2, 0, 0.2], [-0.1, 0, 0.1])
     p = transform(invert(T0), np.column_stack([x.ravel(), y.ravel(), np.full(9, lift_m)]))
-    return Patches(p, p / p[:, 2:], np.zeros((9, 3)), np.full(9, 50), np.full(9, 0.001))
+    return Patches(p, p / p[:, 2:], np.zeros((9, 3)), np.full(9, 0.001))
 
 
 def test_a_view_is_used_flagged_or_refused_with_the_number_measured():

@@ -248,6 +248,16 @@ WEAK = 1e-3
 """Of what one view tells of the camera, directions with less than this share of the strongest are left aside."""
 
 
+FITS_NOT = (
+    "camera.json does not fit: the markers say {numbers}, which moves the poses by {by}. Calibrate the camera at this size of "
+    "image, or use --calibrate (estimation.calibrate), which takes what the markers say"
+)
+FITS_NONE = (
+    "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is wrong: "
+    "calibrate the camera at this size of image, or take views from more sides"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class CameraFit(Doubt):
     """The camera by the markers of all views; significant: they ask for another than camera.json's.
@@ -302,11 +312,12 @@ def fit_camera(
     of_camera, by_camera = covariance[-size:, -size:], covariance[:-SHARED, -size:].reshape(count, POSE, size)
     of_poses = np.einsum("vij,jk,vlk->vil", by_camera, np.linalg.inv(of_camera), by_camera)
     shift_m, unsure_m = np.linalg.norm(motion[:, :3], axis=1), np.sqrt(np.trace(of_poses[:, :3, :3], axis1=1, axis2=2))
-    numbers, camera = np.array(free.shared.camera), corrected_camera(seen[1], free.shared.camera)
-    note = ""
+    camera, note = corrected_camera(seen[1], free.shared.camera), ""
     if significant and float(np.max(shift_m / np.linalg.norm(begun.poses[:, :3, 3], axis=1))) >= MATERIAL:
-        sure = np.abs(numbers) > SIGNIFICANT * np.sqrt(np.diag(of_camera))
-        note = _camera_note(compare_cameras(camera, seen[1], sure), float(np.median(shift_m)))
+        sure = np.abs(free.shared.camera) > SIGNIFICANT * np.sqrt(np.diag(of_camera))
+        numbers = compare_cameras(camera, seen[1], sure)
+        by = f"{1000 * float(np.median(shift_m)):.1f} mm"
+        note = FITS_NOT.format(numbers=numbers, by=by) if numbers else FITS_NONE
     is_known = significant and bool(np.median(shift_m) > np.median(unsure_m))
     return CameraFit(motion, of_poses, note, camera, significant, is_known)
 
@@ -326,18 +337,6 @@ def _scatter(rows: Rows, views: int, variance: float) -> float:
         along = directions[:, kept].T @ (by.T @ residual)
         ratios.append(float((along**2 / strength[kept]).mean()) / variance)
     return float(np.mean(ratios)) if ratios else 1.0
-
-
-def _camera_note(numbers: str, shift_m: float) -> str:
-    if not numbers:
-        return (
-            "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is "
-            "wrong: calibrate the camera at this size of image, or take views from more sides"
-        )
-    return (
-        f"camera.json does not fit: the markers say {numbers}, which moves the poses by {1000 * shift_m:.1f} mm. Calibrate the "
-        "camera at this size of image, or use --calibrate (estimation.calibrate), which takes what the markers say"
-    )
 
 
 def compare_cameras(camera: CaptureCamera, given: CaptureCamera, chosen: NDArray[np.bool_] | None = None) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
@@ -75,8 +76,7 @@ def _align(points: Array, goals: Array, weight: Array) -> Pose:
     """[4, 4]: the rigid transform of points [N, 3] with the least weighted squares of distance to goals [N, 3]."""
     share = weight / weight.sum()
     middle, goal = share @ points, share @ goals
-    U, _, V = np.linalg.svd(((goals - goal) * share[:, None]).T @ (points - middle))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+    R = Rotation.align_vectors(goals - goal, points - middle, weights=share)[0].as_matrix()
     return pose(R, goal - R @ middle)
 
 
@@ -90,8 +90,8 @@ def _by_markers(index: int, evidence: Evidence, depth: DepthCorrection) -> ViewE
     """The pose from markers with its covariance, and whether it is ambiguous."""
     view, judgement = evidence.markers[index], Judged(None, faults=(evidence.markers[index].reason,))
     if view.fit is not None:
-        told = "ambiguous: a pose of another tilt fits the markers as well (planar target)"
-        faults = (told,) if view.is_ambiguous(evidence.corner_px) else ()
+        doubt = "ambiguous: a pose of another tilt fits the markers as well (planar target)"
+        faults = (doubt,) if view.is_ambiguous(evidence.corner_px) else ()
         judgement = Judged(view.fit.T_board_cam, view.fit.covariance(evidence.corner_px), faults)
     return judge(evidence.observations[index], judgement, evidence, depth)
 
@@ -130,28 +130,25 @@ def object_groups(
     each pose does to a point of the object. A view that was compared with no other stays in the first group.
     """
     agree, through = _compare(seen, poses, shared, sigma_m, unsure_m)
+    compared = agree + through
     groups = [[number] for number in range(len(seen))]
-
-    def share(one: list[int], other: list[int], more: float) -> float:
-        place = np.ix_(one, other)
-        count = float(agree[place].sum() + through[place].sum())
-        return float(through[place].sum()) / (count + more) if count else 1.0
-
-    while pairs := [
-        (share(one, other, FEW_PATCHES) + 1 / (agree[np.ix_(one, other)].sum() + FEW_PATCHES), i, j)
-        for j, other in enumerate(groups)
-        for i, one in enumerate(groups[:j])
-        if share(one, other, 0.0) <= MOVED_SHARE
-    ]:
-        _, i, j = min(pairs)
-        groups[i] += groups.pop(j)
+    while len(groups) > 1:
+        i, j = np.triu_indices(len(groups), 1)
+        count = agree[i, j] + through[i, j]
+        score = (through[i, j] / (count + FEW_PATCHES)) + 1 / (agree[i, j] + FEW_PATCHES)
+        score[(count == 0) | (through[i, j] > MOVED_SHARE * count)] = np.inf
+        if np.isinf(score.min()):
+            break
+        kept, merged = i[score.argmin()], j[score.argmin()]
+        groups[kept] += groups.pop(merged)
+        for counts in (agree, through):
+            counts[kept] += counts[merged]
+            counts[:, kept] += counts[:, merged]
+        agree, through = (np.delete(np.delete(c, merged, axis=0), merged, axis=1) for c in (agree, through))
     groups.sort(key=lambda group: (-len(group), min(group)))
-    first = groups[0]
-    alone = [
-        group for group in groups[1:] if not (agree[np.ix_(group, first)].sum() + through[np.ix_(group, first)].sum())
-    ]
-    apart = [sorted(group) for group in groups[1:] if group not in alone]
-    return [sorted([*first, *(number for group in alone for number in group)]), *apart]
+    apart = [sorted(group) for group in groups[1:] if compared[np.ix_(group, groups[0])].any()]
+    elsewhere = {number for group in apart for number in group}
+    return [[number for number in range(len(seen)) if number not in elsewhere], *apart]
 
 
 def _compare(
@@ -159,18 +156,18 @@ def _compare(
 ) -> tuple[Array, Array]:
     """(agree, through), each [V, V] symmetric: patches by which two views agree, and those that one sees through."""
     points, normals = [], []
-    for own, T in zip(seen, poses, strict=True):
-        patches, _ = gather([own.object_patches, own.board_patches])
+    for view, T in zip(seen, poses, strict=True):
+        patches, _ = gather([view.object_patches, view.board_patches])
         p, normal = shared.corrected(patches), patches.normal @ shared.T_cam_depth[:3, :3].T
         # What hides a part of a gap between markers bends its plane.
         kept = (normal @ T[2, :3] > LEVEL) & (np.abs(transform(T, p)[:, 2]) < NEAR_BOARD_M)
-        kept[: len(own.object_patches)] = True
+        kept[: len(view.object_patches)] = True
         points.append(p[kept])
         normals.append(normal[kept])
     trees = [cKDTree(p[:, :2] / p[:, 2:]) if len(p) else None for p in points]
     counts = np.zeros((2, len(seen), len(seen)))
-    for number, own in enumerate(seen):
-        on_board = transform(poses[number], points[number][: len(own.object_patches)])
+    for number, view in enumerate(seen):
+        on_board = transform(poses[number], points[number][: len(view.object_patches)])
         for other, tree in enumerate(trees):
             if other == number or tree is None or not len(on_board):
                 continue

@@ -118,19 +118,14 @@ PARTNERS = 3
 """Of the nearest patches of other views, so many are paired with each."""
 
 
-def placed(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shared) -> tuple[Array, Array]:
-    """(points [P, 3], normals [P, 3]) of patches in the board frame; the normal of depth that is stretched is kept."""
-    R, t = poses[view, :3, :3], poses[view, :3, 3]
-    points = np.einsum("pij,pj->pi", R, shared.corrected(patches)) + t
-    return points, np.einsum("pij,pj->pi", R, patches.normal @ shared.T_cam_depth[:3, :3].T)
-
-
 def match_patches(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shared) -> ObjectTerm:
     """The pairs at the present poses, each once, in order of index; as noisy as patches at 1 m are, times their growth."""
     none = np.zeros(0)
     if len(patches) < 2:
         return ObjectTerm(view, patches, np.zeros((0, 2), np.int64), np.zeros((0, 3)), none, none)
-    points, normals = placed(patches, view, poses, shared)
+    R, t = poses[view, :3, :3], poses[view, :3, 3]
+    points = np.einsum("pij,pj->pi", R, shared.corrected(patches)) + t
+    normals = np.einsum("pij,pj->pi", R, patches.normal @ shared.T_cam_depth[:3, :3].T)  # kept where depth is stretched
     count = min(NEIGHBOURS + 1, len(points))
     distance, neighbour = cKDTree(points).query(points, k=count, distance_upper_bound=REACH_M)
     near = np.isfinite(distance)
@@ -162,11 +157,6 @@ INFLATION_OF_FEW = 30.0
 VIEW_FLOOR_M = 5e-4
 """All the patches of a view together are not taken to be better than this: errors of depth that change with place and
 distance, and that no correction of the capture has, do not average out. Good corners place a camera to 0.1 mm."""
-
-
-def patch_sigma(residual_m: Array, growth: Array) -> float:
-    """Sigma of a patch at 1 m, metres, from residuals [P] that grow as `growth` [P] (the distance squared)."""
-    return max(FLOOR_M, MAD * float(np.median(np.abs(residual_m / growth)))) if len(residual_m) else FLOOR_M
 
 
 def inflation(residual: Array, by_view: Array, view: NDArray[np.int64], pose_covariance: Array) -> float:
@@ -321,7 +311,7 @@ def _with_sigma(term: Depth, views: Views, solution: Solution) -> tuple[Depth, R
     growth = term.growth
     rows = dataclasses.replace(term, sigma_m=growth).rows(solution.poses, solution.shared)
     chosen = views.sure(rows.view)
-    sigma = patch_sigma(rows.residual[chosen] * growth[chosen], growth[chosen])
+    sigma = max(FLOOR_M, MAD * float(np.median(np.abs(rows.residual[chosen]))))  # of a patch at 1 m
     term = dataclasses.replace(term, sigma_m=sigma * growth)
     return term, term.rows(solution.poses, solution.shared), chosen
 

@@ -45,14 +45,13 @@ class Patches:
     """Small pieces of surface measured by depth, P of them.
 
     ray_z [P, 3]: mean of ray z, metres; ray [P, 3]: mean of the rays (x, y, 1): with these a correction of depth by scale and
-    offset is exact; normal [P, 3]: unit, towards the camera, camera axes; pixels [P]: how many were averaged; sigma_m [P]:
-    standard deviation of a pixel about the patch's own plane.
+    offset is exact; normal [P, 3]: unit, towards the camera, camera axes; sigma_m [P]: standard deviation of a pixel about the
+    patch's own plane.
     """
 
     ray_z: Array
     ray: Array
     normal: Array
-    pixels: NDArray[np.int64]
     sigma_m: Array
 
     def __len__(self) -> int:
@@ -62,7 +61,7 @@ class Patches:
 def no_patches() -> Patches:
     """None at all."""
     none = np.zeros((0, 3))
-    return Patches(none, none, none, np.zeros(0, np.int64), np.zeros(0))
+    return Patches(none, none, none, np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +114,8 @@ MARGIN = 0.1
 MIN_SAMPLES = 12
 MIN_SHARE = 0.25
 """A piece needs so many samples with depth, and such a share of them."""
+ALONE = 1e-9
+"""What keeps the equations of samples in one line solvable: far below what a pixel adds to them, (1 / focal length)^2."""
 OUTLIER = 3.5
 """A sample farther from its piece's plane than this many standard deviations is left out."""
 CORNER_WINDOW_PX = 2
@@ -140,9 +141,9 @@ def board_patches(depth: NDArray[np.uint16], detection: Detection, board: Board,
 
 def _gaps(places: NDArray[np.intp], corners: Array, geometry: Geometry) -> Array:
     """[G, 4, 2] pixels: the areas between markers found side by side or one above the other; corners [M, 4, 2]."""
-    found, gaps = {int(place): n for n, place in enumerate(places)}, []
-    for place, n in found.items():
-        right, below = found.get(int(geometry.right[place])), found.get(int(geometry.below[place]))
+    index, gaps = {int(place): n for n, place in enumerate(places)}, []
+    for place, n in index.items():
+        right, below = index.get(int(geometry.right[place])), index.get(int(geometry.below[place]))
         if right is not None:
             gaps.append([corners[n, 1], corners[right, 0], corners[right, 3], corners[n, 2]])
         if below is not None:
@@ -166,36 +167,24 @@ def fit_patches(rays: Array, z: Array) -> Patches:
     count = (z > 0).sum(axis=1)
     enough = (count >= MIN_SAMPLES) & (count >= MIN_SHARE * z.shape[1])
     rays, z = np.where((z > 0)[..., None], rays, 0.0)[enough], z[enough]
-    basis = np.concatenate([rays, np.ones((*z.shape, 1))], axis=2)
-    inverse = np.where(z > 0, 1.0 / np.where(z > 0, z, 1.0), 0.0)
-    used = z > 0
-    plane, sigma = np.zeros((len(z), 3)), np.full(len(z), np.inf)
+    if not len(z):
+        return no_patches()
+    basis, used = np.concatenate([rays, np.ones((*z.shape, 1))], axis=2), z > 0
+    inverse = np.where(used, 1.0 / np.where(used, z, 1.0), 0.0)
     for _ in range(3):
-        plane = _planes(basis, inverse, used)
+        chosen = basis * used[..., None]
+        plane = np.linalg.solve(
+            chosen.transpose(0, 2, 1) @ chosen + ALONE * np.eye(3), chosen.transpose(0, 2, 1) @ inverse[..., None]
+        )[..., 0]
         off = (inverse - np.einsum("psk,pk->ps", basis, plane)) * z**2  # metres along z, to first order
-        sigma = 1.4826 * np.nanmedian(np.where(used, np.abs(off), np.nan), axis=1) if len(z) else np.zeros(0)
+        sigma = 1.4826 * np.nanmedian(np.where(used, np.abs(off), np.nan), axis=1)
         used = (z > 0) & (np.abs(off) <= OUTLIER * np.maximum(sigma, 1e-4)[:, None])
     total = np.maximum(used.sum(axis=1), 1)
     ray = (basis * used[..., None]).sum(axis=1) / total[:, None]
     ray_z = (basis * (z * used)[..., None]).sum(axis=1) / total[:, None]
     normal = -plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
     good = (used.sum(axis=1) >= MIN_SAMPLES) & (ray_z[:, 2] > 0)
-    return Patches(ray_z[good], ray[good], normal[good], total[good], sigma[good])
-
-
-def _planes(basis: Array, inverse: Array, used: NDArray[np.bool_]) -> Array:
-    """[P, 3]: least squares of inverse depth [P, S] on the basis [P, S, 3] over the samples used.
-
-    The basis is centred first, because the rays of a small piece are nearly one.
-    """
-    total = np.maximum(used.sum(axis=1), 1)[:, None]
-    middle = (basis[..., :2] * used[..., None]).sum(axis=1) / total
-    mean = (inverse * used).sum(axis=1, keepdims=True) / total
-    dx = (basis[..., :2] - middle[:, None]) * used[..., None]
-    matrix = np.einsum("psi,psj->pij", dx, dx)
-    matrix += 1e-9 * (np.trace(matrix, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(2)
-    slope = np.linalg.solve(matrix, np.einsum("psi,ps->pi", dx, inverse - mean)[..., None])[..., 0]
-    return np.concatenate([slope, mean - (slope * middle).sum(axis=1, keepdims=True)], axis=1)
+    return Patches(ray_z[good], ray[good], normal[good], sigma[good])
 
 
 def depth_at(depth: NDArray[np.uint16], pixels: Array, units_per_m: float) -> Array:
@@ -205,11 +194,10 @@ def depth_at(depth: NDArray[np.uint16], pixels: Array, units_per_m: float) -> Ar
     column = np.clip(np.floor(pixels[:, 0]).astype(np.int64)[:, None] + reach, 0, width - 1)
     row = np.clip(np.floor(pixels[:, 1]).astype(np.int64)[:, None] + reach, 0, height - 1)
     window = depth[row[:, :, None], column[:, None, :]].reshape(len(pixels), len(reach) ** 2)
-    few = (window > 0).sum(axis=1) * 3 < window.shape[1]
-    ordered = np.sort(np.where(window > 0, window, np.iinfo(np.uint16).max), axis=1)
-    half = np.maximum((window > 0).sum(axis=1) - 1, 0) // 2
-    median = ordered[np.arange(len(pixels)), half]
-    return np.where(few, 0.0, median / units_per_m)
+    many = (window > 0).mean(axis=1) >= 1 / 3
+    median = np.zeros(len(pixels))
+    median[many] = np.nanmedian(np.where(window > 0, window, np.nan)[many], axis=1)
+    return median / units_per_m
 
 
 SIDE_RAD = 0.012
@@ -235,7 +223,7 @@ def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patch
     side = max(ACROSS, round(SIDE_RAD * camera.intrinsics.fx))
     blocks = _blocks_over_board(T_board_cam, board, camera, side)
     if not len(blocks):
-        return sample_patches(depth, np.zeros((0, 1, 2), np.int64), camera)
+        return no_patches()
     # The board's plane n p = d in camera axes: the pose tells the normal, depth the distance.
     normal = T_board_cam[2, :3]
     distance = float(np.median(on_board.ray_z @ normal)) if len(on_board) else float(-T_board_cam[2, 3])
@@ -248,10 +236,10 @@ def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patch
         blocks = blocks[(z > 0) & (points @ normal - distance > CLEARANCE_M)]
     reach = np.arange(0, side, side // ACROSS)
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
-    found = sample_patches(depth, blocks[:, None] + offsets, camera)
-    keep = np.flatnonzero(_on_object(found, found.ray_z @ normal - distance, T_board_cam, setup))
+    patches = sample_patches(depth, blocks[:, None] + offsets, camera)
+    keep = np.flatnonzero(_on_object(patches, patches.ray_z @ normal - distance, T_board_cam, setup))
     keep = keep[spread_evenly(len(keep), MOST)]
-    return Patches(found.ray_z[keep], found.ray[keep], found.normal[keep], found.pixels[keep], found.sigma_m[keep])
+    return Patches(patches.ray_z[keep], patches.ray[keep], patches.normal[keep], patches.sigma_m[keep])
 
 
 def _blocks_over_board(T_board_cam: Pose, board: Board, camera: CaptureCamera, side: int) -> NDArray[np.int64]:
@@ -261,23 +249,19 @@ def _blocks_over_board(T_board_cam: Pose, board: Board, camera: CaptureCamera, s
     pixels = pixels_of_points(space, T_board_cam, camera)
     k = camera.intrinsics
     size = np.array([k.width, k.height])
-    if np.isfinite(pixels).all():
-        low, high = np.clip(pixels.min(axis=0), 0, size), np.clip(pixels.max(axis=0), 0, size)
-    else:
-        low, high = np.zeros(2), size
-    first = np.ceil(low / side).astype(np.int64)
-    last = np.floor(high / side).astype(np.int64)
+    if not np.isfinite(pixels).all():
+        pixels = np.array([[0, 0], size])
+    first = np.ceil(np.clip(pixels.min(axis=0), 0, size) / side).astype(np.int64)
+    last = np.floor(np.clip(pixels.max(axis=0), 0, size) / side).astype(np.int64)
     columns, rows = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
     return np.stack([columns.ravel(), rows.ravel()], axis=1) * side
 
 
-def _on_object(found: Patches, height: Array, T_board_cam: Pose, setup: Setup) -> NDArray[np.bool_]:
+def _on_object(patches: Patches, height: Array, T_board_cam: Pose, setup: Setup) -> NDArray[np.bool_]:
     """[P]: patches of a smooth surface, not seen at a grazing angle, within the space over the board; height [P] over it."""
-    cosine = -(found.normal * found.ray).sum(axis=1) / np.linalg.norm(found.ray, axis=1)
-    smooth = found.sigma_m <= NOISY * DEPTH_SIGMA_M * np.maximum(found.ray_z[:, 2], 0.5) ** 2
+    cosine = -(patches.normal * patches.ray).sum(axis=1) / np.linalg.norm(patches.ray, axis=1)
+    smooth = patches.sigma_m <= NOISY * DEPTH_SIGMA_M * np.maximum(patches.ray_z[:, 2], 0.5) ** 2
     half = 0.5 * setup.board.scale * np.array([setup.board.width_m, setup.board.height_m])
-    inside = (np.abs(transform(T_board_cam, found.ray_z)[:, :2]) < half).all(axis=1)
-    on_object: NDArray[np.bool_] = (
-        (height > CLEARANCE_M) & (height < TALLEST_M) & (cosine > MIN_COSINE) & smooth & inside
-    )
-    return on_object
+    inside = (np.abs(transform(T_board_cam, patches.ray_z)[:, :2]) < half).all(axis=1)
+    above: NDArray[np.bool_] = (height > CLEARANCE_M) & (height < TALLEST_M)
+    return above & (cosine > MIN_COSINE) & smooth & inside

@@ -12,7 +12,6 @@ from itertools import combinations
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.errors import CaptureError
@@ -23,22 +22,18 @@ from workers.capture.detect import find_markers, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
 from workers.capture.poses.markers import opencv_poses
-from workers.capture.poses.terms import cross_matrix
+from workers.capture.poses.terms import cross_matrix, moved
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import rays_of_pixels
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 """Corners of a tag of side 1, clockwise from the upper left, as OpenCV's IPPE_SQUARE has them."""
-
 ROBUST_PX = 0.3
 """Residuals beyond this count by their size alone: three times what a refined corner is off."""
-
 GROW_PX = 0.3
 """Sigma of what sharpening, tone curves and spread ink add to each end of a side."""
-
 FLAT_M = 0.005
 """Tags whose corners are so near to a plane lie in it: sheets are not flat."""
-
 AMBIGUOUS_M = 0.01
 """Worse agreement of two views on where a tag stands is none."""
 
@@ -79,23 +74,23 @@ def solve_board(folder: CaptureFolder, side_m: float, dictionary: str, border_bi
     ids = sorted(tags)
     corners = _in_plane(np.array([transform(tags[n], square) for n in ids]), ids.index(next(iter(tags))), views)
     flat = int((np.abs(corners[..., 2]).max(axis=1) < FLAT_M).sum())
-    lost = tuple(sorted({n for one in seen.values() for n in one} - set(ids)))
-    board = board_of_markers(dictionary, ids, corners, border_bits)
+    lost = tuple(sorted({n for tags_seen in seen.values() for n in tags_seen} - set(ids)))
+    board = board_of_markers(dictionary, ids, corners, border_bits=border_bits)
     return SolvedBoard(board, flat, len(views), residual_px, float(np.median(sigma)), float(sigma.max()), lost)
 
 
-def describe(found: SolvedBoard) -> list[str]:
+def describe(solved: SolvedBoard) -> list[str]:
     """What is known of it, in words, line by line."""
+    places = f"{solved.sigma_m * 1e3:.3f} mm, the worst to {solved.worst_m * 1e3:.3f} mm, beside the first"
     lines = [
-        f"{found.board.words} in {found.views} photographs: corners {found.residual_px:.3f} px off, their places known to "
-        f"{found.sigma_m * 1e3:.3f} mm, the worst to {found.worst_m * 1e3:.3f} mm, beside the first; all scale with --marker"
+        f"{solved.board.words} in {solved.views} photographs: corners {solved.residual_px:.3f} px off, their places known to "
+        f"{places}; all scale with --marker"
     ]
-    if found.flat < len(found.board.markers):
-        lines.append(
-            f"z = 0, what the object stands on, is the plane of {found.flat} of them: move the corners if it is another"
-        )
-    if found.left_out:
-        lines.append(f"left out, no photograph shows them beside the others: {id_words(np.array(found.left_out))}")
+    if solved.flat < len(solved.board.markers):
+        under = f"z = 0, what the object stands on, is the plane of {solved.flat} of them"
+        lines.append(f"{under}: move the corners if it is another")
+    if solved.left_out:
+        lines.append(f"left out, no photograph shows them beside the others: {id_words(np.array(solved.left_out))}")
     return lines
 
 
@@ -121,7 +116,7 @@ def _join(seen: Seen, square: Array) -> tuple[dict[int, Pose], dict[int, Pose]]:
     for both in single.values():
         for a, b in combinations(sorted(both), 2):
             pairs.setdefault((a, b), []).append([invert(Ta) @ Tb for Ta in both[a] for Tb in both[b]])
-    joined = {pair: _most_alike(found, square) for pair, found in pairs.items()}
+    joined = {pair: _most_alike(options, square) for pair, options in pairs.items()}
     counts = Counter(n for tags in seen.values() for n in tags)
     if not counts:
         return {}, {}
@@ -146,15 +141,15 @@ def _most_alike(views: list[list[Pose]], square: Array) -> tuple[Pose, float, in
     """(of the candidates of each view the pose that is most like one of every view; metres apart, median; views)."""
     corners = [np.array([transform(T, square).ravel() for T in some]) for some in views]
     best: tuple[float, Pose] = np.inf, views[0][0]
-    for own, some in zip(corners, views, strict=True):
-        for candidate, T in zip(own, some, strict=True):
+    for of_view, options in zip(corners, views, strict=True):
+        for candidate, T in zip(of_view, options, strict=True):
             gaps = [np.linalg.norm(other - candidate, axis=1).min() / 2.0 for other in corners]
-            best = min(best, (float(np.median(gaps)), T), key=lambda one: one[0])
+            best = min(best, (float(np.median(gaps)), T), key=lambda pair: pair[0])
     return best[1], best[0], len(views)
 
 
 def _views_of(seen: Seen, places: Mapping[int, Pose], square: Array) -> dict[int, Pose]:
-    found = {}
+    poses = {}
     for view, tags in seen.items():
         known = [n for n in tags if n in places]
         if len(known) < 2:
@@ -162,8 +157,8 @@ def _views_of(seen: Seen, places: Mapping[int, Pose], square: Array) -> dict[int
         points = np.concatenate([transform(places[n], square) for n in known])
         rays = np.concatenate([tags[n] for n in known])
         for T in opencv_poses(points, rays, cv2.SOLVEPNP_SQPNP)[:1]:
-            found[view] = T
-    return found
+            poses[view] = T
+    return poses
 
 
 def _adjust(
@@ -179,8 +174,8 @@ def _adjust(
     begun = np.array([*views.values(), *(tags[n] for n in free)])
 
     def at(x: Array) -> tuple[Array, Array]:
-        moved = begun @ _motions(x[:-1].reshape(-1, 6))
-        return moved[: len(views)], np.concatenate([tags[held][None], moved[len(views) :]])
+        T = moved(begun, x[:-1].reshape(-1, 6))
+        return T[: len(views)], np.concatenate([tags[held][None], T[len(views) :]])
 
     def off(x: Array) -> Array:
         T_cam_board, T_board_tag = at(x)
@@ -189,24 +184,19 @@ def _adjust(
         px = focal * (p[..., :2] / p[..., 2:] - rays) + 2.0 * x[-1] * outward
         return np.append(px.ravel(), x[-1] * ROBUST_PX / GROW_PX)
 
-    found = least_squares(off, np.zeros(6 * len(begun) + 1), loss="soft_l1", f_scale=ROBUST_PX, x_scale="jac")
-    residual = found.fun[:-1]
-    spread = 1.4826 * float(np.median(np.abs(residual))) * np.sqrt(residual.size / (residual.size - found.x.size))
-    covariance = spread**2 * np.linalg.pinv(found.jac.T @ found.jac, hermitian=True)
-    places = at(found.x)[1]
-    sigma = []
-    for k in range(len(free)):
-        block = slice(6 * (len(views) + k), 6 * (len(views) + k) + 6)
-        lever = np.concatenate([-cross_matrix(square), np.tile(np.eye(3), (4, 1, 1))], axis=2)  # in the tag's frame
+    fit = least_squares(off, np.zeros(6 * len(begun) + 1), loss="soft_l1", f_scale=ROBUST_PX, x_scale="jac")
+    residual = fit.fun[:-1]
+    spread = 1.4826 * float(np.median(np.abs(residual))) * np.sqrt(residual.size / (residual.size - fit.x.size))
+    covariance = spread**2 * np.linalg.pinv(fit.jac.T @ fit.jac, hermitian=True)
+    places = at(fit.x)[1]
+    sigma, lever = (
+        [],
+        np.concatenate([np.tile(np.eye(3), (4, 1, 1)), -cross_matrix(square)], axis=2),
+    )  # in the tag's frame
+    for k in range(len(views), len(begun)):
+        block = slice(6 * k, 6 * k + 6)
         sigma.append(np.sqrt(np.einsum("cij,jk,cik->c", lever, covariance[block, block], lever)))
     return dict(zip(tags, places, strict=True)), spread, np.array(sigma)
-
-
-def _motions(x: Array) -> Array:
-    """[N, 4, 4] small motions: turn, radians, and shift, metres [N, 6]."""
-    moved = np.tile(np.eye(4), (len(x), 1, 1))
-    moved[:, :3, :3], moved[:, :3, 3] = Rotation.from_rotvec(x[:, :3]).as_matrix(), x[:, 3:]
-    return moved
 
 
 def _in_plane(corners: Array, first: int, views: Mapping[int, Pose]) -> Array:
@@ -215,7 +205,7 @@ def _in_plane(corners: Array, first: int, views: Mapping[int, Pose]) -> Array:
     for quad in corners:
         normal = np.cross(quad[1] - quad[0], quad[3] - quad[0])
         near = np.abs((corners - quad.mean(axis=0)) @ (normal / np.linalg.norm(normal))).max(axis=1) < FLAT_M
-        best = max(best, near, key=lambda one: int(one.sum()))
+        best = max(best, near, key=lambda near: int(near.sum()))
     flat = corners[best].reshape(-1, 3)
     middle = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
     z = np.linalg.svd(flat - flat.mean(axis=0))[2][2]
