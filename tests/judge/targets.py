@@ -84,7 +84,7 @@ def judge_scene(job_json: str, scene_id: int) -> Judged:
     for pair in pairs:
         pair.shapes.update(shapes)
         faults += check_pair(pair)
-        findings += pair.found
+        findings += pair.findings
     return Judged(scene_id, tuple(findings), tuple(faults), seconds=time.process_time() - began)
 
 
