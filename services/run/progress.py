@@ -19,7 +19,7 @@ from tqdm import tqdm
 from schemas.dataset.commit import CommitSummary
 from schemas.dataset.layout import LOG_FOLDER
 from schemas.dataset.shard import ShardReport
-from schemas.errors import MachineError, describe_seconds
+from schemas.errors import MachineError, describe_seconds, needs_making
 from services.run.supervisor import tell
 from workers.store.file_system import refuse_link_out
 
@@ -239,7 +239,8 @@ class Meter:
 
     def collect(self) -> Iterator["Metric"]:
         """The metrics of one scrape."""
-        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+        with needs_making("--metrics"):
+            from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         counts = {**self._counts, "phases": {phase: float(phase == self._phase) for phase in PHASES}}
         for kind, name, counted, label, what in METRICS:
@@ -259,7 +260,8 @@ def serve(meter: Meter, place: str | None) -> Iterator[None]:
     if place is None:
         yield
         return
-    from prometheus_client import CollectorRegistry, start_http_server  # those who read datasets may not have it
+    with needs_making("--metrics"):  # those who read datasets may not have it
+        from prometheus_client import CollectorRegistry, start_http_server
 
     host, _, port = place.rpartition(":")
     registry = CollectorRegistry()

@@ -29,7 +29,6 @@ MAY_READ_IT = {
     "workers/assets/library/making.py": "the same, for the list of a folder's files",
     "workers/store/local.py": "when a file was written, for the rate",
     "workers/store/objects.py": "when an object was put, for the rate",
-    "workers/store/file_system.py": "how long ago an unlocked folder was made, which a set clock only leaves longer",
 }
 """No work is lost or done twice by these, so a clock may be set while a run goes on."""
 

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Row = Mapping[str, Any]
-Array = NDArray[np.float64]
+from services.read.independent.rays import Array, Row
 
 ROUNDING = 1e-9
 """Largest difference of poses, distances and angles (metres, radians) between two orders of the same arithmetic."""

@@ -9,16 +9,19 @@ to a projected edge may therefore lie on either side of it, and what the face ha
 """
 
 import functools
+import io
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from services.read.independent.derive import Array, Row
+Row = Mapping[str, Any]
+Array = NDArray[np.float64]
 
 EDGE_PX = 1.0 / 128.0
 """Distance from a projected edge, pixels, within which a centre may lie on either side."""
@@ -110,12 +113,9 @@ def read_shape(data: bytes) -> Faces:
 
 
 def _linear_texture(data: bytes) -> Array:
-    # glTF has the pixels as they stand in the file, whatever orientation it tells of.
-    kind = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
-    if image is None:
-        raise ValueError("a texture is no image")
-    share = image[..., ::-1] / 255.0
+    """[H, W, 3] of an image as it stands in the file, whatever orientation it tells of. Raises OSError."""
+    with Image.open(io.BytesIO(data)) as image:
+        share = np.asarray(image.convert("RGB")) / 255.0
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 

@@ -86,10 +86,9 @@ def test_a_failed_scene_is_one_row():
     assert (row["detail"], row["attempts"]) == ("it rolled off", 2)
 
 
-def test_stages_and_effects_add_up_also_of_a_block_that_raises_and_a_row_has_their_seconds(monkeypatch):
+def test_stages_and_effects_add_up_also_of_a_block_that_raises_and_a_row_has_their_seconds():
     ticks = iter([0.0, 0.0, 1.0, 10.0, 12.0, 13.0, 20.0, 23.0])
-    monkeypatch.setattr("workers.scene.context.time.perf_counter", lambda: next(ticks))
-    watch = Stopwatch()
+    watch = Stopwatch(now=lambda: next(ticks))
     with watch.effect("mirror"):
         for _ in range(2):
             with watch.stage("render", "projection"):
