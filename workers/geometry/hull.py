@@ -5,12 +5,14 @@ Cutting ends on every mesh: a cut is a plane, one of a few, and so many parts ar
 
 import heapq
 import itertools
+import math
 from collections.abc import Iterator
 from weakref import WeakKeyDictionary
 
 import manifold3d
 import numpy as np
 from manifold3d import Manifold
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
@@ -66,10 +68,9 @@ def convex_hull(vertices: Array) -> Hull:
         if solid.num_vert() <= MOST_VERTICES:
             solid = solid.hull()
     mesh = mesh_of(solid)
-    points = np.ascontiguousarray(mesh.vertices)
+    points = mesh.vertices
     least = NO_AREA * float((np.ptp(bounds_of(points), axis=0) ** 2).sum())
-    sized = 2.0 * face_areas(points, mesh.faces) > least
-    return Hull(frozen_array(points), frozen_array(face_normals(points, mesh.faces)[sized]))
+    return Hull(frozen_array(points), frozen_array(_normals(points, mesh.faces, least)))
 
 
 def hull_of(shape: Shape) -> Hull:
@@ -94,6 +95,21 @@ def _scatter(points: Array) -> Array:
             for k in range(3):
                 scatter[j, k] += (point[j] - mean[j]) * (point[k] - mean[k])
     return scatter
+
+
+@compiled_for("f8[:,::1], i4[:,::1], f8")
+def _normals(points: Array, faces: NDArray[np.int32], least: float) -> Array:
+    """[N, 3]: unit normals of the triangles of which twice the area is more than `least`."""
+    normals, count = np.empty((len(faces), 3)), 0
+    for a, b, c in faces:
+        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        u, v, w = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        i, j, k = y * w - z * v, z * u - x * w, x * v - y * u
+        doubled = math.sqrt(i * i + j * j + k * k)
+        if doubled > least:
+            normals[count, 0], normals[count, 1], normals[count, 2] = i / doubled, j / doubled, k / doubled
+            count += 1
+    return normals[:count]
 
 
 def _thin_hull(vertices: Array) -> Hull:

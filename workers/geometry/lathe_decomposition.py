@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Loft
 from workers.geometry.hull import convex_hull, least_width_m
-from workers.geometry.jit import compiled_for
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import hold_to_one_thread, mesh_of, unique_rows
 
 Indices = NDArray[np.int64]
@@ -168,11 +168,36 @@ def stack_slabs(
 def _is_convex(rings: Sequence[Ring], outline: Array, tolerance: float) -> bool:
     """Whether no ring lies deeper than the tolerance below the hull of the body of revolution through all."""
     at = [outline[ring.corner, 0] * (1.0 - ring.share) + outline[ring.corner + 1, 0] * ring.share for ring in rings]
-    line = np.array([(float(radius) * ring.scale, ring.height) for radius, ring in zip(at, rings, strict=True)])
-    hull = shapely.convex_hull(shapely.multipoints(np.concatenate([line, line * [-1.0, 1.0]])))
-    if hull.geom_type != "Polygon":
-        return True
-    return bool(shapely.distance(hull.exterior, shapely.points(line)).max() <= tolerance)
+    line = [(float(radius) * ring.scale, ring.height) for radius, ring in zip(at, rings, strict=True)]
+    return _deepest(np.array(line)) <= tolerance
+
+
+@compiled_for("f8[:,::1]")
+def _deepest(line: Array) -> float:
+    """The most by which points [N, 2], radius and height, ascending, lie below the hull of them and their mirror images."""
+    hull, count = np.empty_like(line), 0
+    for n in range(len(line)):
+        # Andrew's monotone chain (1979), of the side away from the axis
+        while count > 1 and _distance_left_of(line[n], hull[count - 2], hull[count - 1]) <= 0.0:
+            count -= 1
+        hull[count, 0], hull[count, 1] = line[n, 0], line[n, 1]
+        count += 1
+    deepest = 0.0
+    for n in range(len(line)):
+        # The ends of the hull are level
+        depth = min(line[n, 1] - line[0, 1], line[-1, 1] - line[n, 1])
+        for k in range(count - 1):
+            depth = min(depth, _distance_left_of(line[n], hull[k], hull[k + 1]))
+        deepest = max(deepest, depth)
+    return deepest
+
+
+@compiled
+def _distance_left_of(point: Array, start: Array, stop: Array) -> float:
+    """Distance of a point [2] to the left of the line from start to stop, 0 where these are the same."""
+    x, y = stop[0] - start[0], stop[1] - start[1]
+    length = math.sqrt(x * x + y * y)
+    return (x * (point[1] - start[1]) - y * (point[0] - start[0])) / length if length > 0.0 else 0.0
 
 
 def _thicken(rings: list[Ring], visible: shapely.Polygon, tolerance: float, thin: float) -> list[Ring]:
@@ -260,10 +285,10 @@ def _decompose(loft: Loft, size: float, tolerance: float) -> list[Array]:
 
 def _join_rings(rings: Array) -> list[Array]:
     """Parts of a loft whose rings may lie askew: from ring to ring, or over several where that is as convex."""
-    parts, volume = [rings[:2]], _hull_of(rings[:2]).volume()
-    for link in (rings[number - 1 : number + 1] for number in range(2, len(rings))):
-        longer = np.concatenate([parts[-1], link[1:]])
-        separate, joined = _hull_of(link).volume(), _hull_of(longer).volume()
+    parts, volume = [rings[:2]], _hull_volume(rings[:2])
+    for number in range(2, len(rings)):
+        link, longer = rings[number - 1 : number + 1], np.concatenate([parts[-1], rings[number : number + 1]])
+        separate, joined = _hull_volume(link), _hull_volume(longer)
         if joined <= (volume + separate) * (1.0 + 1e-9):
             parts[-1], volume = longer, joined
         else:
@@ -274,6 +299,10 @@ def _join_rings(rings: Array) -> list[Array]:
 
 def _hull_of(points: Array) -> manifold3d.Manifold:
     return manifold3d.Manifold.hull_points(np.ascontiguousarray(points.reshape(-1, 3)))
+
+
+def _hull_volume(points: Array) -> float:
+    return float(_hull_of(points).volume())
 
 
 def _decompose_lathed(profiles: Array, columns: Array, size: float, tolerance: float) -> list[Array]:

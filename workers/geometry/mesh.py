@@ -18,10 +18,20 @@ from workers.geometry.jit import compiled, compiled_for
 def bounds_of(points: Array) -> Array:
     """[2, D] float64: lower and upper corner of the axis-aligned bounding box of points [N, D], N > 0.
 
-    By columns: numpy's minimum along the first axis takes several times as long.
+    numpy's minimum along the first axis takes ten times as long. Points must not hold nan.
     """
-    columns = np.ascontiguousarray(points.T, np.float64)
-    return np.stack([columns.min(axis=1), columns.max(axis=1)])
+    return _bounds_of(np.ascontiguousarray(points))
+
+
+@compiled_for("f8[:,::1]", "const(f8[:,::1])")
+def _bounds_of(points: Array) -> Array:
+    bounds = np.empty((2, points.shape[1]))
+    bounds[0], bounds[1] = np.inf, -np.inf
+    for n in range(len(points)):
+        for axis in range(points.shape[1]):
+            bounds[0, axis] = min(bounds[0, axis], points[n, axis])
+            bounds[1, axis] = max(bounds[1, axis], points[n, axis])
+    return bounds
 
 
 FRACTION_OF_2_64 = -0x61C8864680B583EB
@@ -97,29 +107,42 @@ def weld(mesh: Mesh) -> Mesh:
     """The mesh with one vertex at each place, without loose vertices, repeated triangles and triangles of two corners."""
     used = numbers_in(mesh.faces, len(mesh.vertices))
     points = np.ascontiguousarray(mesh.vertices[used])
-    order, new = _ranked(points)
-    place = np.empty(len(mesh.vertices), np.int32)
-    place[used[order]] = np.cumsum(new) - 1
-    faces = place[mesh.faces]
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    return Mesh(points[order[new]], faces[is_first(np.sort(faces, axis=1).astype(np.int64))])
+    places, faces = _welded(points, np.lexsort(points.T[::-1]), used, mesh.faces, len(mesh.vertices))
+    return Mesh(points[places], faces[is_first(np.sort(faces, axis=1).astype(np.int64))])
+
+
+@compiled_for("f8[:,::1], i8[::1], i8[::1], i4[:,::1], i8", "f8[:,::1], i8[::1], i8[::1], const(i4[:,::1]), i8")
+def _welded(
+    points: Array, order: NDArray[np.int64], used: NDArray[np.int64], faces: NDArray[np.integer], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """(the first point [V] at each place, faces [F, 3] of places), without triangles of two corners.
+
+    points [N, 3], with the numbers `used` [N] of `count` vertices that faces [F, 3] are into; order: the points' ascending order.
+    """
+    place, firsts, found = np.empty(count, np.int32), np.empty(len(points), np.int64), 0
+    for n in range(len(order)):
+        a, b = order[n], order[n - 1]
+        if n == 0 or points[a, 0] != points[b, 0] or points[a, 1] != points[b, 1] or points[a, 2] != points[b, 2]:
+            firsts[found] = a
+            found += 1
+        place[used[a]] = found - 1
+    kept, rows = np.empty((len(faces), 3), np.int32), 0
+    for f in range(len(faces)):
+        a, b, c = place[faces[f, 0]], place[faces[f, 1]], place[faces[f, 2]]
+        if a != b and b != c and c != a:
+            kept[rows, 0], kept[rows, 1], kept[rows, 2] = a, b, c
+            rows += 1
+    return firsts[:found].copy(), kept[:rows].copy()
 
 
 def unique_rows(rows: Array) -> Array:
-    """The rows [N, 3] without repetitions, in ascending order."""
-    order, new = _ranked(rows)
-    return rows[order[new]]
-
-
-def _ranked(rows: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """(ascending order [N] of rows [N, 3]; [N] whether a row differs from the one before it in that order).
+    """The rows [N, 3] without repetitions, in ascending order.
 
     By one column after the other: `np.unique` compares rows as records, which takes four times as long.
     """
-    order, new = np.lexsort(rows.T[::-1]), np.ones(len(rows), dtype=np.bool_)
-    ranked = rows[order]
+    ranked, new = rows[np.lexsort(rows.T[::-1])], np.ones(len(rows), dtype=np.bool_)
     new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
-    return order, new
+    return ranked[new]
 
 
 def numbers_in(numbers: NDArray[np.integer], count: int) -> NDArray[np.int64]:
@@ -283,20 +306,34 @@ def weigh_edges(point: Array, vertices: Array, corners: NDArray[np.int32], weigh
 
 def mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:
     """[N, C]: values [V, C] of vertices, interpolated with weights [N, 3] of corners [N, 3]."""
-    a, b, c = (weights[:, k, None] * values[corners[:, k]] for k in range(3))
-    return 0.0 + a + b + c
+    return _mix(np.ascontiguousarray(values, dtype=np.float64), corners, weights)
 
 
+@compiled_for("f8[:,::1], i4[:,::1], f8[:,::1]", "const(f8[:,::1]), i4[:,::1], f8[:,::1]")
+def _mix(values: Array, corners: NDArray[np.int32], weights: Array) -> Array:
+    mixed = np.zeros((len(corners), values.shape[1]))
+    for n in range(len(corners)):
+        for corner in range(3):
+            for channel in range(values.shape[1]):
+                mixed[n, channel] += weights[n, corner] * values[corners[n, corner], channel]
+    return mixed
+
+
+@compiled_for("const(u1[:,:,::1]), f8[:,::1], f8[::1]", "u1[:,:,::1], f8[:,::1], f8[::1]")
 def sample_texture(texture: NDArray[np.uint8], uv: Array, light: Array) -> Array:
     """[N, 3]: linear light of a texture [h, w, 3 or 4] at uv [N, 2], bilinear among four texels, repeated beyond its edges.
 
     uv (0, 0) is the lower left corner; light [256]: of each code.
     """
     height, width = texture.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
-    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     sampled = np.zeros((len(uv), 3))
-    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        share = (x - column if right else 1.0 - x + column) * (y - row if down else 1.0 - y + row)
-        sampled += share[:, None] * light[texture[(row + down) % height, (column + right) % width, :3]]
+    for n in range(len(uv)):
+        x, y = uv[n, 0] * width - 0.5, (1.0 - uv[n, 1]) * height - 0.5
+        left, top = np.floor(x), np.floor(y)
+        for corner in range(4):
+            right, down = corner % 2, corner // 2
+            share = (x - left if right else 1.0 - x + left) * (y - top if down else 1.0 - y + top)
+            texel = texture[(int(top) + down) % height, (int(left) + right) % width]
+            for channel in range(3):
+                sampled[n, channel] += share * light[texel[channel]]
     return sampled

@@ -6,7 +6,7 @@ so ties between coplanar faces of two things are found and go to the lower regio
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 
@@ -20,9 +20,114 @@ from schemas.base import Array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.geometry.camera import NEAR_M, project_bounds, unproject
+from workers.geometry.camera import NEAR_M, project
+from workers.geometry.distance import dot
 from workers.geometry.frames import invert, transform
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import face_planes
+
+
+@compiled_for("f8[::1], f8[::1], const(i4[:,::1]), i8, i8")
+def row_spans(
+    u: Array, v: Array, faces: NDArray[np.integer], width: int, height: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(first [H], end [H]): the columns of each row between the outermost edges of faces [F, 3], a pixel more on each side.
+
+    u, v [V]: image coordinates of corners, pixels. An edge counts in the rows above and below its own too; rows that no
+    edge comes near have end <= first.
+    """
+    first, end = np.full(height, width, np.int64), np.zeros(height, np.int64)
+    for f in range(len(faces)):
+        for corner in range(3):
+            a, b = faces[f, corner], faces[f, (corner + 1) % 3]
+            if v[a] > v[b]:
+                a, b = b, a
+            top, bottom = max(math.floor(v[a]) - 1.0, 0.0), min(math.ceil(v[b]) + 1.0, float(height))
+            for row in range(int(top), int(bottom)):
+                one, other = u[a], u[b]
+                if v[b] - v[a] > 1.0:  # the part of the edge in this row and the two beside it
+                    slope = (u[b] - u[a]) / (v[b] - v[a])
+                    one = u[a] + slope * (max(row - 1.0, v[a]) - v[a])
+                    other = u[a] + slope * (min(row + 2.0, v[b]) - v[a])
+                left, right = math.floor(min(one, other)) - 1.0, math.ceil(max(one, other)) + 1.0
+                first[row] = min(first[row], int(min(max(left, 0.0), float(width))))
+                end[row] = max(end[row], int(min(max(right, 0.0), float(width))))
+    return first, end
+
+
+@compiled_for("i8[::1], i8[::1], i8")
+def pixels_between(first: NDArray[np.int64], end: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+    """Flat numbers, ascending, of the pixels from column `first` [H] up to and without `end` [H] of each row."""
+    pixels = np.empty(np.maximum(end - first, 0).sum(), np.int64)
+    n = 0
+    for row in range(len(first)):
+        for column in range(first[row], end[row]):
+            pixels[n] = row * width + column
+            n += 1
+    return pixels
+
+
+@compiled_for("i8[::1], i8, UniTuple(f8, 4), f8")
+def pixel_rays(
+    pixels: NDArray[np.int64], width: int, k: tuple[float, float, float, float], near_m: float
+) -> tuple[Array, Array]:
+    """(origins, directions), each [N, 3]: rays with z = 1 through the centres of pixels, from the near plane on.
+
+    k: fx, fy, cx, cy. As `unproject` has them, in the camera's frame.
+    """
+    origins, directions = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
+    for n in range(len(pixels)):
+        row, column = pixels[n] // width, pixels[n] % width
+        x, y = (column + 0.5 - k[2]) / k[0], (row + 0.5 - k[3]) / k[1]
+        directions[n, 0], directions[n, 1], directions[n, 2] = x, y, 1.0
+        origins[n, 0], origins[n, 1], origins[n, 2] = near_m * x, near_m * y, near_m
+    return origins, directions
+
+
+@compiled_for("i4[::1], Tuple((f8[:,::1], f8[::1])), f8[:,::1], f8[:,::1], f8")
+def meet_planes(
+    face: NDArray[np.int32], planes: tuple[Array, Array], origins: Array, directions: Array, grazing: float
+) -> tuple[Array, Array, int]:
+    """(distance, cosine, n): where rays [N, 3] meet the planes of faces [N], and how many of them a plane does not fix.
+
+    planes: normals [F, 3] and offsets [F]. Distances, in lengths of the direction, are inf for face -1, and nan where the
+    cosine of incidence is at most `grazing`.
+    """
+    normals, offsets = planes
+    distance, cosine, open_ended = np.full(len(face), np.inf), np.zeros(len(face)), 0
+    for n in range(len(face)):
+        f = face[n]
+        if f < 0:
+            continue
+        towards = dot(normals[f], directions[n])
+        cosine[n] = abs(towards) / math.sqrt(dot(directions[n], directions[n]))
+        if cosine[n] > grazing:
+            distance[n] = (offsets[f] - dot(normals[f], origins[n])) / towards
+        else:
+            distance[n] = np.nan
+            open_ended += 1
+    return distance, cosine, open_ended
+
+
+@compiled_for("Tuple((f8[::1], u1[::1], f4[::1])), i8[::1], UniTuple(f8[::1], 2), i8, f8, f8")
+def keep_nearer(
+    best: tuple[Array, NDArray[np.uint8], NDArray[np.float32]],
+    rays: NDArray[np.int64],
+    found: tuple[Array, Array],
+    region_id: int,
+    apart_m: float,
+    grazing: float,
+) -> None:
+    """Writes hits that are nearer than the best by more than `apart_m` along the normal over these, in place.
+
+    best: distance, region and incidence_cos of all rays; found: distance and cosine [N] of the rays with the numbers `rays`.
+    """
+    distance, cosine = found
+    for n in range(len(rays)):
+        slant = grazing if cosine[n] < grazing else cosine[n]
+        if distance[n] + apart_m / slant < best[0][rays[n]]:
+            best[0][rays[n]], best[1][rays[n]], best[2][rays[n]] = distance[n], region_id, cosine[n]
+
 
 COPLANAR_M = 1e-6
 """Surfaces nearer than this along the normal count as one: ten times what float32 coordinates of a scene
@@ -30,6 +135,12 @@ a few metres across resolve, and a hundredth of the smallest gap that physics le
 
 GRAZING = 1e-6
 """Cosine of incidence below which the plane does not fix the distance, and Embree's is used."""
+
+RAYS_AT_ONCE = 8_192
+"""Rays of one call: a megabyte of intermediate arrays, which a processor's cache holds."""
+
+FEW_PIXELS = 16
+"""Up to so many, passes over all edges for each pixel cost less than a search tree of the edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +166,12 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
     best = _no_hits(k.height * k.width)
     for thing in sorted(things, key=attrgetter("region_id")):
         mesh = _in_camera(thing, camera)
-        rows, columns = _pixels_in_reach(mesh, camera)
-        rays = unproject(rows, columns, np.ones(len(rows)), k)
-        distance, cosine = _cast(mesh, NEAR_M * rays, rays)
-        _keep_nearer(best, rows * k.width + columns, distance + NEAR_M, cosine, thing.region_id)
+        pixels = _pixels_in_reach(mesh, camera)
+        caster = _Caster(mesh)
+        for some in (pixels[block] for block in _blocks(len(pixels))):
+            rays = pixel_rays(some, k.width, (k.fx, k.fy, k.cx, k.cy), NEAR_M)
+            distance, cosine = caster.cast(*rays)
+            _keep_nearer(best, some, distance + NEAR_M, cosine, thing.region_id)
     depth, shape = np.where(np.isinf(best.distance), 0.0, best.distance), (k.height, k.width)
     return depth.reshape(shape), best.region.reshape(shape), best.incidence_cos.reshape(shape)
 
@@ -71,8 +184,9 @@ def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hi
     best = _no_hits(len(origins))
     everything = np.arange(len(origins))
     for thing in sorted(things, key=attrgetter("region_id")):
-        mesh = Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
-        _keep_nearer(best, everything, *_cast(mesh, origins, directions), thing.region_id)
+        caster = _Caster(Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces))
+        for some in _blocks(len(origins)):
+            _keep_nearer(best, everything[some], *caster.cast(origins[some], directions[some]), thing.region_id)
     return best
 
 
@@ -83,16 +197,24 @@ def edge_distance_px(things: Sequence[Placed], camera: Camera, pixels: NDArray, 
     `outline_only`, only edges at which a mask can end count: those of a boundary, of a fold (more than two faces), and
     those between a front-facing and a back-facing triangle. Lines along which surfaces intersect one another are no edges.
     """
-    centres = shapely.points(np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5)
+    points = np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5
+    centres = shapely.points(points)
     nearest = np.full(len(centres), np.inf)
     for thing in things:
         mesh = _in_camera(thing, camera)
         edges = np.stack(_project_edges(mesh, _edges(mesh, outline_only), camera), axis=1)
-        (known, _), distance = shapely.STRtree(shapely.linestrings(edges)).query_nearest(
+        if len(points) <= FEW_PIXELS:
+            edges = edges[_may_be_nearest(edges, points)]
+        (own, _), distance = shapely.STRtree(shapely.linestrings(edges)).query_nearest(
             centres, return_distance=True, all_matches=False
         )
-        nearest[known] = np.minimum(nearest[known], distance)
+        nearest[own] = np.minimum(nearest[own], distance)
     return nearest
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """So many rays, `RAYS_AT_ONCE` at a time."""
+    return (slice(first, first + RAYS_AT_ONCE) for first in range(0, count, RAYS_AT_ONCE))
 
 
 def _in_camera(thing: Placed, camera: Camera) -> Mesh:
@@ -103,50 +225,49 @@ def _no_hits(count: int) -> Hits:
     return Hits(np.full(count, np.inf), np.zeros(count, np.uint8), np.zeros(count, np.float32))
 
 
-def _pixels_in_reach(mesh: Mesh, camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(rows, columns) of the pixels whose rays can meet a mesh in the camera's frame: those in its box, a pixel wider."""
+def _pixels_in_reach(mesh: Mesh, camera: Camera) -> NDArray[np.int64]:
+    """Flat numbers of the pixels whose rays can meet a mesh in the camera's frame, ascending.
+
+    In each row those between the outermost projected edges, a pixel wider on each side; all where a corner is not beyond
+    the near plane, because it has no place in the image then.
+    """
     k = camera.intrinsics
     if not len(mesh.faces):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    left, top, right, bottom = project_bounds(mesh.vertices, k, NEAR_M)
-    columns = np.arange(max(math.floor(left) - 1, 0), min(math.ceil(right) + 1, k.width))
-    rows = np.arange(max(math.floor(top) - 1, 0), min(math.ceil(bottom) + 1, k.height))
-    return np.repeat(rows, len(columns)), np.tile(columns, len(rows))
+        return np.empty(0, np.int64)
+    if (mesh.vertices[:, 2] <= NEAR_M).any():
+        return np.arange(k.height * k.width)
+    return pixels_between(*row_spans(*project(mesh.vertices, k), mesh.faces, k.width, k.height), k.width)
 
 
-def _cast(mesh: Mesh, origins: Array, directions: Array) -> tuple[Array, Array]:
-    """(distance, incidence_cos), each [N] float64: distance inf and cosine 0 where the ray meets nothing."""
-    distance, cosine = np.full(len(origins), np.inf), np.zeros(len(origins))
-    if not len(mesh.faces) or not len(origins):  # Embree does not take empty scenes
+class _Caster:
+    """A mesh in Embree's tree."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._empty = not len(mesh.faces)  # Embree does not take empty scenes
+        if self._empty:
+            return
+        self._scene = EmbreeScene(robust=True)
+        faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
+        self._geometry = TriangleMesh(self._scene, mesh.vertices.astype(np.float32), faces)
+        self._planes = face_planes(mesh)
+
+    def cast(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """(distance, incidence_cos), each [N] float64: distance inf and cosine 0 where the ray meets nothing."""
+        if self._empty or not len(origins):
+            return np.full(len(origins), np.inf), np.zeros(len(origins))
+        rays = origins.astype(np.float32), directions.astype(np.float32)
+        face = self._scene.run(*rays)  # without distances: embreex takes long to hand them over
+        distance, cosine, grazing = meet_planes(face, self._planes, origins, directions, GRAZING)
+        if grazing:
+            these = np.flatnonzero(np.isnan(distance))
+            distance[these] = self._scene.run(rays[0][these], rays[1][these], query="DISTANCE")
         return distance, cosine
-    scene = EmbreeScene(robust=True)
-    faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
-    geometry = TriangleMesh(scene, mesh.vertices.astype(np.float32), faces)  # noqa: F841 - Embree needs it as long as the scene
-    start, way = origins.astype(np.float32), directions.astype(np.float32)
-    face = scene.run(start, way)  # without distances: embreex takes long to hand them over
-    rays = np.flatnonzero(face >= 0)
-    normals, offsets = (each[face[rays]] for each in face_planes(mesh))
-    towards = _dot(normals, directions[rays])
-    cosine[rays] = np.abs(towards) / np.sqrt(_dot(directions[rays], directions[rays]))
-    grazes = cosine[rays] <= GRAZING
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance[rays] = (offsets - _dot(normals, origins[rays])) / towards
-    grazing = rays[grazes]
-    if len(grazing):
-        distance[grazing] = scene.run(start[grazing], way[grazing], query="DISTANCE")
-    return distance, cosine
-
-
-def _dot(a: Array, b: Array) -> Array:
-    """[N]: scalar products of vectors [N, 3]; x and z are added first, as in `distance.dot`."""
-    return (a[:, 0] * b[:, 0] + a[:, 2] * b[:, 2]) + a[:, 1] * b[:, 1]
 
 
 def _keep_nearer(best: Hits, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int) -> None:
-    """Writes into `best` the hits of these rays that are nearer than its own by more than `COPLANAR_M` along the normal."""
-    nearer = distance + COPLANAR_M / np.maximum(cosine, GRAZING) < best.distance[rays]
-    kept = rays[nearer]
-    best.distance[kept], best.region[kept], best.incidence_cos[kept] = distance[nearer], region_id, cosine[nearer]
+    """Writes into `best` the hits that are nearer than its own by more than `COPLANAR_M` along the normal."""
+    so_far = best.distance, best.region, best.incidence_cos
+    keep_nearer(so_far, rays, (distance, cosine), region_id, COPLANAR_M, GRAZING)
 
 
 def _edges(mesh: Mesh, outline_only: bool) -> NDArray[np.int64]:
@@ -179,3 +300,13 @@ def _project_edges(mesh: Mesh, edges: NDArray[np.int64], camera: Camera) -> tupl
         z = np.maximum(cut[:, 2], NEAR_M)
         ends.append(np.stack([k.fx * cut[:, 0] / z + k.cx, k.fy * cut[:, 1] / z + k.cy], axis=1))
     return ends[0], ends[1]
+
+
+def _may_be_nearest(edges: Array, points: Array) -> NDArray[np.bool_]:
+    """[E]: whether the box of an edge [E, 2, 2] is as near to one of the points [N, 2] as the nearest start of an edge."""
+    low, high, near = edges.min(axis=1), edges.max(axis=1), np.zeros(len(edges), dtype=np.bool_)
+    for point in points:
+        outside = np.maximum(np.maximum(low - point, point - high), 0.0)
+        to_start = np.hypot(*(edges[:, 0] - point).T).min(initial=np.inf)
+        near |= np.hypot(*outside.T) <= to_start + 1e-6  # what rounding may add
+    return near

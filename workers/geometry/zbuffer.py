@@ -71,25 +71,41 @@ def draw_depth(mesh: Mesh, camera: Camera, near_m: float = 0.05) -> Array:
     return draw_triangles(pixels, z, mesh.faces, (k.height, k.width), 0.0, True)[0].astype(np.float64)
 
 
-def _lift(depth_m: Array, rays: Array, T_color_depth: Pose) -> Array:
+@compiled
+def _lift(depth_m: Array, rays: Array, T_color_depth: Array) -> Array:
     """[h * w, 3] float64: the depth image's points in the colour camera's frame; (0, 0, -1), behind it, where there is none."""
-    z, at = depth_m.ravel(), rays.reshape(-1, 2)
-    known = (z > 0.0) & np.isfinite(z) & np.isfinite(at[:, 0])
-    points = np.tile([0.0, 0.0, -1.0], (depth_m.size, 1))
-    points[known] = transform(T_color_depth, np.column_stack([at[known] * z[known, None], z[known]]))
+    T = T_color_depth
+    points = np.empty((depth_m.size, 3))
+    for i in range(depth_m.shape[0]):
+        for j in range(depth_m.shape[1]):
+            n, z = i * depth_m.shape[1] + j, depth_m[i, j]
+            if z > 0.0 and math.isfinite(z) and math.isfinite(rays[i, j, 0]):
+                x, y = rays[i, j, 0] * z, rays[i, j, 1] * z
+                for axis in range(3):
+                    points[n, axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+            else:
+                points[n, 0], points[n, 1], points[n, 2] = 0.0, 0.0, -1.0
     return points
 
 
+@compiled
 def _squares(pixels: Array, depth_m: Array, max_step: float) -> NDArray[np.int32]:
     """[T, 3]: the two triangles of each square between four pixels of a depth image that lie on one surface, by number."""
-    known = np.isfinite(pixels[:, 0]).reshape(depth_m.shape)
-    depth = np.where(known, depth_m, np.nan)
-    corners = np.stack([depth[:-1, :-1], depth[:-1, 1:], depth[1:, 1:], depth[1:, :-1]])
-    nearest = corners.min(axis=0)
-    rows, columns = np.nonzero(corners.max(axis=0) - nearest <= max_step * nearest)
-    a = rows * depth_m.shape[1] + columns
-    d = a + depth_m.shape[1]
-    return np.stack([a, a + 1, d + 1, a, d + 1, d], axis=1).reshape(-1, 3).astype(np.int32)
+    height, columns = depth_m.shape
+    triangles, count = np.empty((2 * depth_m.size, 3), np.int32), 0
+    for i in range(height - 1):
+        for j in range(columns - 1):
+            a, d = i * columns + j, (i + 1) * columns + j
+            if math.isnan(pixels[a, 0] + pixels[a + 1, 0] + pixels[d, 0] + pixels[d + 1, 0]):
+                continue
+            z0, z1, z2, z3 = depth_m[i, j], depth_m[i, j + 1], depth_m[i + 1, j + 1], depth_m[i + 1, j]
+            nearest = min(min(z0, z1), min(z2, z3))
+            if max(max(z0, z1), max(z2, z3)) - nearest > max_step * nearest:
+                continue
+            triangles[count, 0], triangles[count, 1], triangles[count, 2] = a, a + 1, d + 1
+            triangles[count + 1, 0], triangles[count + 1, 1], triangles[count + 1, 2] = a, d + 1, d
+            count += 2
+    return triangles[:count]
 
 
 Drawn = tuple[NDArray[np.floating], NDArray[np.int32], Array]

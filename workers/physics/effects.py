@@ -11,6 +11,7 @@ from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import Hull
 from workers.geometry.frames import transform
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import fills_hull, is_first
 from workers.physics.support import inside_margin
 
@@ -48,15 +49,7 @@ def is_round(hull: Hull, com: Array, turn_rad: float = NEIGHBOUR_RAD, rise: floa
     round stretch lower than over some of them by at most the share `rise`.
     """
     normals = hull.normals[is_first(np.rint(hull.normals / CELL).astype(np.int64))]
-    blocks = np.array_split(normals, 1 + len(normals) // 256)  # so that no product takes much memory
-    heights = np.concatenate([(hull.vertices @ block.T).max(axis=0) for block in blocks]) - normals @ com
-    for block, here in zip(blocks, np.array_split(heights, len(blocks)), strict=True):
-        cosine = block @ normals.T
-        neighbours = (math.cos(turn_rad) < cosine) & (cosine < math.cos(SAME_PLANE_RAD))
-        lowest = np.where(neighbours, heights, np.inf).min(axis=1)
-        if ((here <= lowest) & (lowest <= here * (1.0 + rise))).any():
-            return True
-    return False
+    return _rests_on_round(hull.vertices, normals, com, math.cos(turn_rad), math.cos(SAME_PLANE_RAD), rise)
 
 
 def rolls(start: ObjectStart) -> bool:
@@ -66,6 +59,39 @@ def rolls(start: ObjectStart) -> bool:
         return True
     down = -start.T_world_obj[2, :3]
     return bool((hull.normals @ down).max() < math.cos(TILTED_RAD)) and is_round(hull, com, TURN_RAD, RISE_SHARE)
+
+
+@compiled_for("const(f8[:,::1]), f8[:,::1], const(f8[::1]), f8, f8, f8")
+def _rests_on_round(points: Array, normals: Array, com: Array, far: float, near: float, rise: float) -> bool:
+    """Whether com [3] is at most as high over a normal's plane as over its neighbours', and over one higher by `rise` at most.
+
+    points [V, 3] and normals [N, 3] of the hull. Most normals have a lower neighbour, and one that has none ends the search:
+    few heights are ever asked for.
+    """
+    heights = np.full(len(normals), np.nan)
+    for i in range(len(normals)):
+        here, lowest = _height(points, normals, com, i, heights), np.inf
+        for j in range(len(normals)):
+            cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            if far < cosine < near:
+                lowest = min(lowest, _height(points, normals, com, j, heights))
+                if lowest < here:
+                    break
+        if here <= lowest <= here * (1.0 + rise):
+            return True
+    return False
+
+
+@compiled
+def _height(points: Array, normals: Array, com: Array, i: int, heights: Array) -> float:
+    """How far points reach beyond com [3] along normal i; kept in heights [N], where nan is not known yet."""
+    if np.isnan(heights[i]):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        farthest = -np.inf
+        for n in range(len(points)):
+            farthest = max(farthest, points[n, 0] * x + points[n, 1] * y + points[n, 2] * z)
+        heights[i] = farthest - (com[0] * x + com[1] * y + com[2] * z)
+    return heights[i]
 
 
 def starts_over_top(start: ObjectStart, table: Table) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from schemas.base import Array, Pose
-from schemas.job.physics import Physics
+from schemas.job.physics import Physics, Rest
 from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import add_up, invert, translation
@@ -288,6 +288,24 @@ SPIN_KEPT = 0.8
 """Share of a spin that is left after the last window if nothing slows it: its contact is on its axis, or without friction."""
 
 
+@dataclass(frozen=True)
+class _Late:
+    """Where a body was as the last window began, and its spin about the vertical, rad/s."""
+
+    pose: BodyPose
+    spin_rad_s: float
+
+    def spins_on(self, at: BodyPose, moving: Velocity, rest: Rest, reach_m: float) -> bool:
+        """Whether the body has done nothing since but spin: it neither drifted nor leant further, and is calm but for that."""
+        (v, (p, q, r)), window_s = moving, rest.window_s
+        leant = math.dist(as_pose(self.pose)[2, :3], as_pose(at)[2, :3])
+        stays = (
+            math.dist(self.pose[0], at[0]) <= rest.speed_mm_s / 1e3 * window_s and leant <= rest.spin_rad_s * window_s
+        )
+        calm = math.hypot(*v) + math.hypot(p, q) * reach_m <= CALM_M_S
+        return stays and calm and abs(r) >= SPIN_KEPT * abs(self.spin_rad_s)
+
+
 class _Simulation:
     """Bodies in a world, stepped until they rest; the poses are those of the body frames.
 
@@ -309,9 +327,7 @@ class _Simulation:
         self.low_m, self.top_m = min(heights), max(heights) + slowest**2 / (2.0 * GRAVITY_M_S2)
         self.lost, self.thrown, self.thrown_m_s = list[int](), set[int](), 0.0
         self.asked_s = -1.0
-        self.late = list[
-            tuple[BodyPose, float]
-        ]()  # of the start of the last window, with spins about the vertical, rad/s
+        self.late = list[_Late]()
 
     def run(self, end_s: float) -> Outcome:
         """Step until all rest, `end_s` seconds are over or a stop condition holds."""
@@ -333,7 +349,7 @@ class _Simulation:
             if self.time >= end_s:
                 return self._out_of_time()
             if not self.late and self.time >= end_s - self.physics.rest.window_s:
-                self.late = [(pose, w[2]) for pose, (_, w) in zip(self.at, self.moving, strict=True)]
+                self.late = [_Late(pose, w[2]) for pose, (_, w) in zip(self.at, self.moving, strict=True)]
 
     def _read(self) -> None:
         numbers = range(len(self.bodies))
@@ -399,21 +415,13 @@ class _Simulation:
 
     def _out_of_time(self) -> Outcome:
         """The time is over and something moves: all of it may do nothing but spin, which counts as rest."""
-        moves = [k for k, still in enumerate(self.still) if not self._rests(still)]
-        if self.late and all(self._spins_on(k) for k in moves):
+        rest, moves = self.physics.rest, [k for k, still in enumerate(self.still) if not self._rests(still)]
+        reach_m = [body.reach_m for body in self.bodies]
+        if self.late and all(self.late[k].spins_on(self.at[k], self.moving[k], rest, reach_m[k]) for k in moves):
             return dataclasses.replace(self._outcome(max(self.speeds), True), spinning=tuple(moves))
         fastest = max(moves, key=lambda k: self.speeds[k])
         v, w = (math.hypot(*each) for each in self.moving[fastest])
         return dataclasses.replace(self._outcome(max(self.speeds), False), moves=(fastest, v, w))
-
-    def _spins_on(self, number: int) -> bool:
-        """Whether a body did nothing in the last window but spin: neither drifted nor leant further, and is calm but for that."""
-        rest, (before, spin_rad_s), at = self.physics.rest, self.late[number], self.at[number]
-        (v, (p, q, r)), reach_m = self.moving[number], self.bodies[number].reach_m
-        drifted_m, leant = math.dist(before[0], at[0]), math.dist(as_pose(before)[2, :3], as_pose(at)[2, :3])
-        stays = drifted_m <= rest.speed_mm_s / 1e3 * rest.window_s and leant <= rest.spin_rad_s * rest.window_s
-        calm = math.hypot(*v) + math.hypot(p, q) * reach_m <= CALM_M_S
-        return stays and calm and abs(r) >= SPIN_KEPT * abs(spin_rad_s)
 
     def _outcome(self, speed_m_s: float, rested: bool, name: str | None = None, face: Face | None = None) -> Outcome:
         # What others stop begins anew, or is let go again where it stops

@@ -46,7 +46,7 @@ from workers.physics.pour import (
     renumbered,
 )
 from workers.physics.release import LEFT_M, Drop, Pace, hold, moved_by, release, release_again
-from workers.physics.support import Face, inside_margin, snap_to_face, vertical_gap
+from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
 """Share of the weight, and of weight times size, that the contacts of what rests may leave unbalanced."""
@@ -189,12 +189,12 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
         outcome = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces)
         seconds += outcome.seconds
         _require_calm(drop, outcome, range(len(drop.starts)), moving=heaped and exact)
+        if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
+            return standing
         placement = placement or _place(drop, outcome.poses, forms)
         ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s, bool(outcome.spinning))
         if not exact:
             return ending
-        if flat and drop.single and (standing := _stand(ending, outcome.face)) is not None:
-            return standing
         rested = hold(drop, placement, outcome.poses)
         if rested.still:
             return dataclasses.replace(ending, poses=rested.poses)
@@ -275,16 +275,16 @@ def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placemen
     return place(drop.starts, poses, forms, drop.table, drop.physics.friction**2)
 
 
-def _stand(ending: _Ending, face: Face | None) -> _Ending | None:
+def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     """A single object turned onto the steady face of its hull that is below it, on the flat top; None where none is near."""
-    drop = ending.drop
     (start,), table = drop.starts, drop.table
-    known = None if drop.physics.collision == "box" else face  # a box has other faces than the object's hull
-    T = snap_to_face(ending.poses[0], start.hull, start.asset.mass.com, known)
+    known = None if drop.physics.collision == "box" else outcome.face  # a box has other faces than the object's hull
+    T = snap_to_face(outcome.poses[0], start.hull, start.asset.mass.com, known)
     if T is None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), table.mesh)) @ T
-    return dataclasses.replace(ending, placement=place_on_top(start, T, table, drop.physics.friction**2), poses=(T,))
+    placement = place_on_top(start, T, table, drop.physics.friction**2)
+    return _Ending(drop, placement, (T,), seconds, outcome.speed_m_s, bool(outcome.spinning))
 
 
 def _require_calm(drop: Drop, outcome: Outcome, fallen: Sequence[int], moving: bool) -> None:

@@ -25,6 +25,9 @@ VERTICAL_M2 = 1e-18
 SAME_HEIGHT_M = 1e-9
 """A vertex this near the highest crossing of its vertical line is the top of its mesh there."""
 
+FIRST_BAND_M = 1e-4
+"""Vertices this near the lowest one are compared with the ground first: they settle the gap of an object that stands."""
+
 
 def sample_elevation(points_xy: Array, ground: Mesh, highest: bool = True) -> Array:
     """[N] float64 metres: the highest, or the lowest, crossing of the mesh with vertical lines; nan where there is none.
@@ -72,9 +75,7 @@ def vertical_gap(upper: Mesh, lower: Mesh, band_m: float = 0.02) -> float:
     other; that is exact unless the nearest features are two crossing edges. Of the upper mesh only vertices within
     `band_m` of its lowest point are tried. inf where nothing is above anything.
     """
-    z = upper.vertices[:, 2]
-    lowest = upper.vertices[z <= z.min() + band_m]
-    gap = float(np.fmin.reduce(lowest[:, 2] - sample_elevation(lowest[:, :2], lower), initial=np.inf))
+    gap = _least_gap_below(upper.vertices, lower, band_m)
     bottom, top = bounds_of(upper.vertices)
     # The gap above a vertex of the lower mesh is at least its distance to the lowest point of the upper one.
     under = lower.vertices[bottom[2] - lower.vertices[:, 2] < gap]
@@ -83,6 +84,18 @@ def vertical_gap(upper: Mesh, lower: Mesh, band_m: float = 0.02) -> float:
         under = under[under[:, 2] >= sample_elevation(under[:, :2], lower) - SAME_HEIGHT_M]
         ceiling = sample_elevation(under[:, :2], upper, highest=False)
         gap = float(np.fmin.reduce(ceiling - under[:, 2], initial=gap))
+    return gap
+
+
+def _least_gap_below(vertices: Array, ground: Mesh, band_m: float) -> float:
+    """Least height of the lowest vertices [N, 3] above the ground; inf where there is none below any."""
+    z = vertices[:, 2]
+    points = vertices[z <= z.min() + band_m]
+    gap = np.inf
+    for part in (points[:, 2] <= z.min() + FIRST_BAND_M, points[:, 2] > z.min() + FIRST_BAND_M):
+        # A vertex at least the known gap above the ground's highest point cannot lessen the gap.
+        tried = points[part & (points[:, 2] - ground.vertices[:, 2].max() < gap)]
+        gap = float(np.fmin.reduce(tried[:, 2] - sample_elevation(tried[:, :2], ground), initial=gap))
     return gap
 
 

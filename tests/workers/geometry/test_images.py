@@ -9,9 +9,9 @@ from schemas.scene.view import Camera, Intrinsics
 from tests.kit.planes import HERE as PLANE_HERE
 from tests.kit.planes import IMAGES, plane_view
 from tests.kit.planes import THERE as PLANE_THERE
-from workers.geometry.camera import orbit_pose, unproject
+from workers.geometry.camera import orbit_pose, project, unproject
 from workers.geometry.colour import decode_codes, encode_codes, encode_srgb
-from workers.geometry.frames import invert
+from workers.geometry.frames import invert, pose, transform, uniform_rotation
 from workers.geometry.pixels import (
     count_filled,
     facing_cosine,
@@ -22,8 +22,11 @@ from workers.geometry.pixels import (
     round_depth,
 )
 from workers.geometry.projection import (
+    BLOCK,
     Bounds,
     Seen,
+    bound_view,
+    columns_in_sight,
     compare_covisible,
     forward_project,
     sample_inverse_depth,
@@ -38,15 +41,22 @@ def rays(k: Intrinsics) -> np.ndarray:
 
 
 def test_every_region_is_counted_and_boxed():
-    region = np.random.default_rng(1).integers(0, 6, (50, 70)).astype(np.uint8)
-    region[4:9, 3:30], region[20, 40:] = 255, 9
-    extents = measure_regions(region)
-    assert len(extents) == 256
-    for region_id, (pixels, box) in enumerate(extents):
-        rows, columns = np.nonzero(region == region_id)
-        assert pixels == len(rows)
-        where = columns.min(initial=999), rows.min(initial=999), np.ptp(columns) + 1 if pixels else 0
-        assert box == ((*where, np.ptp(rows) + 1) if pixels else (0, 0, 0, 0))
+    """Also where eight pixels make a word."""
+    for width in (70, 72):
+        region = np.random.default_rng(1).integers(0, 6, (50, width)).astype(np.uint8)
+        region[:, 40:] = 2
+        region[20, 40:] = 3
+        region[4:9, 3:30] = 255
+        region[30] = 4
+        region[31, 8:], region[31, :8] = 5, 4
+        region[32, :-1], region[32, -1] = 1, 0
+        extents = measure_regions(region)
+        assert len(extents) == 256
+        for region_id, (pixels, box) in enumerate(extents):
+            rows, columns = np.nonzero(region == region_id)
+            assert pixels == len(rows)
+            where = columns.min(initial=999), rows.min(initial=999), np.ptp(columns) + 1 if pixels else 0
+            assert box == ((*where, np.ptp(rows) + 1) if pixels else (0, 0, 0, 0))
 
 
 def test_depth_is_rounded_to_the_nearest_unit_and_is_zero_outside_the_open_range():
@@ -138,6 +148,49 @@ def test_a_plane_is_smooth_and_a_step_is_not():
 
 
 # ---------------------------------------------------------------------------------------------- two views
+
+HEIGHT, WIDTH, FOCAL_PX = BLOCK[0], 5 * BLOCK[1] + 7, 90.0
+WIDE = Intrinsics(width=WIDTH, height=HEIGHT, fx=FOCAL_PX, fy=FOCAL_PX, cx=WIDTH / 2, cy=HEIGHT / 2)
+RAY_X, RAY_Y = rays(WIDE)[0, :, 0].copy(), rays(WIDE)[:, 0, 1].copy()
+TARGET = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.0, cy=23.0)
+
+
+def in_sight(depth: np.ndarray, units: float, T: np.ndarray, reach: int) -> tuple[int, int]:
+    k = TARGET
+    return columns_in_sight(
+        depth, units, RAY_X, RAY_Y, bound_view(T, (k.cx, k.cy, k.fx, k.fy), reach, (k.height, k.width))
+    )
+
+
+def columns_seen(depth_m: np.ndarray, T: np.ndarray, reach: int) -> np.ndarray:
+    """Columns with a point in the target's image, which is wider by `reach` pixels on each side."""
+    points = transform(T, (rays(WIDE) * depth_m[..., None]).reshape(-1, 3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = project(points, TARGET)
+    inside = (u >= -reach) & (u < TARGET.width + reach) & (v >= -reach) & (v < TARGET.height + reach)
+    return np.flatnonzero(((inside & (points[:, 2] > 0)).reshape(depth_m.shape) & (depth_m > 0)).any(axis=0))
+
+
+def test_every_column_that_is_seen_is_in_sight_and_few_others():
+    for reach in (0, 2):
+        rng, seen_blocks, blocks_in_sight = np.random.default_rng(1), 0, 0
+        for _ in range(300):
+            depth = rng.integers(9000, 11000, (HEIGHT, WIDTH)).astype(np.uint16)
+            depth[rng.random(depth.shape) < 0.05] = 0
+            T = pose(uniform_rotation(rng), rng.normal(scale=2.0, size=3))
+            (start, stop), seen = in_sight(depth, 5000.0, T, reach), columns_seen(depth / 5000.0, T, reach)
+            assert len(seen) == 0 or start <= seen[0] <= seen[-1] < stop
+            seen_blocks += len(np.unique(seen // BLOCK[1]))
+            blocks_in_sight += -(-(stop - start) // BLOCK[1])
+        assert 100 < seen_blocks <= blocks_in_sight < 2 * seen_blocks
+
+
+def test_a_pixel_that_is_nan_hides_no_other_one():
+    depth = np.zeros((HEIGHT, WIDTH))
+    depth[3, WIDTH // 2], depth[0], depth[5] = 2.0, np.nan, np.nan
+    start, stop = in_sight(depth, 1.0, np.eye(4), 0)
+    assert start <= WIDTH // 2 < stop <= start + BLOCK[1]
+
 
 SMALL = Intrinsics(width=40, height=30, fx=33.0, fy=33.0, cx=20.0, cy=15.0)
 HERE = Camera(SMALL, orbit_pose(np.zeros(3), 0.8, 0.3, 2.5))

@@ -35,7 +35,7 @@ from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, Appearance
 from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_plane_depth
+from workers.geometry.pixels import fill_plane_depth, fourth_channel
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import ColourTarget, Framebuffer, choose, close_context, is_software, open_context
@@ -348,8 +348,7 @@ class Renderer:
         gl.glReadPixels(0, 0, k.width, k.height, gl.GL_RED, gl.GL_FLOAT, depth)
         # OpenCV splits channels 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.
         rgb: NDArray | None = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB) if view.color else None
-        region: NDArray = cv2.extractChannel(rgba, 3)
-        return rgb, depth, region
+        return rgb, depth, fourth_channel(rgba)
 
 
 def _is_lit(render: Render, effects: EffectPlan) -> bool:
