@@ -18,7 +18,6 @@ import contextlib
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, SCHEMAS
 from schemas.errors import RunError, VersoError
 from services.job.record import read_success
 from services.merge.reading import RangeRows, SharedRows, check_published, merge_folder, read_ranges, stored_sizes
-from services.merge.tables import MergedTable, PoseFiles
+from services.merge.tables import MergedTable, MergeResult, PoseFiles
 from workers.store.attempt import sweep
 from workers.store.canonical import dataset_digest
 from workers.store.commit import commits_digest
@@ -188,22 +187,6 @@ def _empty_table(folder: Path, key: str) -> Path:
     path = folder / f"empty-{table}.parquet"
     pq.write_table(SCHEMAS[table].empty_table().drop_columns("category"), path, **PARQUET_OPTIONS)
     return path
-
-
-@dataclass(frozen=True)
-class MergeResult:
-    """The contents of the merged dataset."""
-
-    digest: str
-    scenes: dict[str, int]
-    """How many were made, and how many failed by kind."""
-    rows: dict[str, int]
-    """By table."""
-
-    @property
-    def complete(self) -> bool:
-        """Whether `_SUCCESS` was written."""
-        return not self.scenes["environmental"]
 
 
 def merge(

@@ -6,6 +6,7 @@ Tables are written in files of about 100,000 rows, the text files in blocks of l
 import io
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,7 +40,6 @@ from workers.store.manifest import PARQUET_OPTIONS, row_keys
 from workers.store.store import Store
 
 if TYPE_CHECKING:
-    from services.merge.merge import MergeResult
     from workers.assets.catalogue import Catalogue
 
 ROWS_PER_FILE = 100_000
@@ -246,13 +246,29 @@ def is_card_sealed(data: bytes) -> bool:
     return is_sealed(data, *SEAL)
 
 
-def write_card(store: Store, record: JobRecord, catalogue: "Catalogue", merged: "MergeResult") -> None:
+@dataclass(frozen=True)
+class MergeResult:
+    """The contents of the merged dataset."""
+
+    digest: str
+    scenes: dict[str, int]
+    """How many were made, and how many failed by kind."""
+    rows: dict[str, int]
+    """By table."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether `_SUCCESS` was written."""
+        return not self.scenes["environmental"]
+
+
+def write_card(store: Store, record: JobRecord, catalogue: "Catalogue", merged: MergeResult) -> None:
     """Writes DATASET.md."""
     fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     store.put(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
 
 
-def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: "MergeResult", fingerprint: Fingerprint) -> str:
+def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: MergeResult, fingerprint: Fingerprint) -> str:
     """The text of DATASET.md."""
     job, objects = record.job, record.job.objects_per_scene
     libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))

@@ -15,8 +15,8 @@ from schemas.errors import FingerprintError, OutputError, describe_seconds, plur
 from schemas.job.job import Job
 from services.job.job_file import describe_idle
 from services.job.record import JobRecord, encode_job, record_job, refuse_foreign
-from services.merge.merge import MergeResult, merge
-from services.merge.tables import describe_sources, write_card
+from services.merge.merge import merge
+from services.merge.tables import MergeResult, describe_sources, write_card
 from services.run.coordinator import Coordinator, Limits
 from services.run.lock import Lock, explain_lost_folder, hold_lock, read_holder, shows_life
 from services.run.machine import usable_cores

@@ -8,7 +8,8 @@ from pathlib import Path
 from schemas.dataset.commit import CommitTerms
 from schemas.dataset.layout import STAGING
 from schemas.scene.scene import SceneOutput
-from services.merge.merge import MergeResult, merge
+from services.merge.merge import merge
+from services.merge.tables import MergeResult
 from services.run.lock import Lock
 from services.run.range_planner import plan_ranges, plan_retries
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene, terms

@@ -19,6 +19,7 @@ from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import (
     BUILT_IN,
+    MOST_TOLD,
     TABLE,
     VERSION,
     Assets,
@@ -219,10 +220,6 @@ def _check_offered(catalogue: Catalogue, category: str) -> None:
         f"no source in {where} offers {category!r}: {'; '.join(seen)}.{hint} Add `- source: procedural` there, "
         + (f"or leave {category!r} out of `categories`." if category != TABLE else "or a library that has tables.")
     )
-
-
-MOST_TOLD = 20
-"""Categories of a library that a message names."""
 
 
 def _describe(library: "Library") -> str:

@@ -105,7 +105,7 @@ def _check_shapes(library: Library) -> None:
     for row in library.rows:
         if not row.use or not row.category:
             continue
-        path = library.folder / (row.glb or f"shapes/{row.instance_id}.glb")
+        path = library.folder / (row.glb or row.glb_path)
         size = path.stat().st_size if path.is_file() else None
         if size is None or size != row.glb_bytes:
             what = "is missing" if size is None else "is not what library.parquet says"

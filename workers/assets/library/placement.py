@@ -29,9 +29,6 @@ TIPS_DEG = 3.0
 FLAT = 0.02
 """Least extent, by its diagonal, below which a shape is flat: how it stands tells nothing, because it lies."""
 
-THINNEST = 1e-5
-"""Least extent, by its diagonal, below which a shape has no thickness."""
-
 LIKELY_DEG = 10.0
 """A shape is likely to be upright where it stands by this much firmer than upside down, and so on no other axis."""
 

@@ -23,7 +23,7 @@ from workers.assets.library.reading import (
     environmental,
     refusal_of,
 )
-from workers.assets.library.table import SHAPES, Library, Row, write_whole
+from workers.assets.library.table import Library, Row, write_whole
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
 from workers.pool import Answers
@@ -34,7 +34,7 @@ REFUSED = ".refused"
 
 def shape_path(library: Library, row: Row) -> Path:
     """Where the GLB of a row lies."""
-    return library.folder / SHAPES / f"{row.instance_id}.glb"
+    return library.folder / row.glb_path
 
 
 def is_fit(library: Library, row: Row) -> bool:
@@ -189,7 +189,7 @@ def with_shape(library: Library, row: Row, made: bytes | MeshError) -> Row:
         scale=kept["scale"],
         mass_kg=kept["mass"][0],
         volume_m3=kept["mass"][0] / USUAL.density_kg_m3 if kept["mass"][3] else None,
-        glb=f"{SHAPES}/{row.instance_id}.glb",
+        glb=row.glb_path,
         glb_bytes=len(made),
         glb_sha256=hashlib.sha256(made).hexdigest(),
     )

@@ -93,6 +93,11 @@ class Row:
         word = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "-" for c in stem)[-MOST_LETTERS:]
         return f"{word}-{self.key[:8]}"
 
+    @property
+    def glb_path(self) -> str:
+        """Where its GLB lies below the library's folder, once it is made."""
+        return f"{SHAPES}/{self.instance_id}.glb"
+
 
 MOST_LETTERS = 150
 """Of a path in the name of an instance, which names a file."""
