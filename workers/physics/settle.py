@@ -312,8 +312,13 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Sequence[int], moving: b
 
 def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
     _, speed_m_s, spin_rad_s = outcome.moves
-    advice = "physics.max_settle_s or physics.rolling_friction"
-    if physics.friction == 0.0:
+    advice, reach_m = (
+        "physics.max_settle_s or physics.rolling_friction",
+        float(np.ptp(start.hull.vertices, axis=0).max()),
+    )
+    if physics.restitution > 0.0 and speed_m_s > spin_rad_s * reach_m:  # faster than it rolls
+        advice = f"physics.max_settle_s, or lower physics.restitution, which is {physics.restitution:g}"
+    elif physics.friction == 0.0:
         advice = "physics.friction, which is 0"
     elif physics.spinning_friction == 0.0 and speed_m_s < spin_rad_s * SPINS_M:
         advice = "physics.spinning_friction, which is 0"
