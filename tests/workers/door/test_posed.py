@@ -14,7 +14,8 @@ from tests.workers.door.test_statements import dae, geometry
 from workers.assets.library.reading import list_files
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.formats import load_shape
-from workers.door.meshes.urdf import find_named, list_named, list_seen, load_posed
+from workers.door.meshes.posed import Source
+from workers.door.meshes.urdf import list_named, list_seen, load_posed
 
 LIMITS = MeshLimits()
 
@@ -153,6 +154,30 @@ def test_an_sdf_is_read_as_its_poses_say_and_what_it_does_not_hold_is_named(tmp_
     assert named == {"cube.obj", "hull.obj"}, "collision shapes are parts too"
 
 
+def test_an_mjcf_is_read_with_what_it_includes_as_mujoco_has_it(tmp_path):
+    write(tmp_path / "m/cube.obj", CUBE)
+    write(
+        tmp_path / "parts/bodies.xml",
+        """<mujocoinclude><body pos="1 0 0"><geom type="mesh" mesh="c"/><include file="parts/tip.xml"/>
+    </body></mujocoinclude>""",
+    )
+    write(tmp_path / "parts/tip.xml", '<mujoco><body pos="0 2 0"><geom type="box" size="0.1 0.2 0.3"/></body></mujoco>')
+    write(
+        tmp_path / "assets.xml",
+        '<mujoco><compiler meshdir="m"/><asset><mesh name="c" file="cube.obj"/></asset></mujoco>',
+    )
+    path = write(
+        tmp_path / "a.xml",
+        """<mujoco><include file="assets.xml"/><worldbody><include file="parts/bodies.xml"/>
+    </worldbody></mujoco>""",
+    )
+    ours = boxes(load_posed(path, LIMITS, tmp_path).shape)
+    assert np.allclose(ours, seen_by_mujoco(path), atol=1e-6) and len(ours) == 2
+    files = {file.name for file in list_files(tmp_path, path, LIMITS)}
+    assert files == {"a.xml", "assets.xml", "bodies.xml", "tip.xml", "cube.obj"}
+    assert files - {"a.xml"} == {file.name for file in list_named(path, tmp_path, LIMITS)}, "parts, and no objects"
+
+
 WRONG = (
     ("a.sdf", "<sdf><world><model/></world></sdf>", "format", "is a world, and no object"),
     (
@@ -169,7 +194,9 @@ WRONG = (
     ),
     ("a.sdf", "<sdf/>", "no_faces", "no visual geometry"),
     ("a.xml", "<mujoco/>", "no_faces", "no visual geometry"),
-    ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "format", "has <include>"),
+    ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "missing", "names 'b.xml'"),
+    ("a.xml", '<mujoco><include file="a.xml"/></mujoco>', "unreadable", "includes a.xml twice"),
+    ("a.xml", '<mujoco><attach file="b.xml"/></mujoco>', "format", "has <attach>"),
     (
         "a.xml",
         '<mujoco><worldbody><geom type="mesh" mesh="m"/></worldbody></mujoco>',
@@ -207,7 +234,7 @@ def test_what_cannot_be_read_of_them_is_one_reason(tmp_path, name, text, reason,
 
 def test_names_are_found_by_every_tail_of_them_in_the_folders_above_and_never_outside(tmp_path):
     root, path = tmp_path / "in", tmp_path / "in/robot/urdf/r.urdf"
-    for name in ("robot/meshes/a.obj", "robot/urdf/b.obj", "c.obj", "textures/d.png"):
+    for name in ("robot/meshes/a.obj", "robot/urdf/b.obj", "c.obj", "textures/d.png", "my robot/e.stl", "100%20.obj"):
         write(root / name, "")
     write(tmp_path / "out.obj", "")
     for name, found in (
@@ -218,11 +245,13 @@ def test_names_are_found_by_every_tail_of_them_in_the_folders_above_and_never_ou
         ("b.obj", "robot/urdf/b.obj"),
         ("model://x/y/c.obj", "c.obj"),
         ("../../textures/d.png", "textures/d.png"),
+        ("package://pkg/my%20robot/e.stl", "my robot/e.stl"),
+        ("100%20.obj", "100%20.obj"),
     ):
-        assert find_named(name, path, root) == root / found
+        assert Source(path, root, LIMITS).find(name) == root / found
     for name in ("../../../out.obj", str(tmp_path / "out.obj"), "", "x" * 9999, "a" + "/x" * 500, "gone.obj"):
         with pytest.raises(MeshError, match="is not inside"):
-            find_named(name, path, root)
+            Source(path, root, LIMITS).find(name)
 
 
 def test_mujocos_own_meshes_are_read(tmp_path):

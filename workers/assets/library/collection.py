@@ -16,6 +16,7 @@ from workers.assets.library.reading import Question, ask, digest_of
 from workers.assets.library.table import UNKNOWN, SourceFile
 from workers.door.meshes.formats import FORMATS
 from workers.door.meshes.urdf import POSED
+from workers.door.opening import as_utf8
 from workers.pool import Answers
 
 SUFFIXES = (*POSED, *FORMATS)
@@ -75,7 +76,7 @@ def _is_mjcf(path: Path) -> bool:
     """Whether an XML file is one of MuJoCo's: others are of no concern."""
     try:
         with path.open("rb") as stream:
-            return b"<mujoco" in stream.read(1 << 16)
+            return b"<mujoco" in as_utf8(stream.read(1 << 16))[0]
     except OSError:
         return False
 

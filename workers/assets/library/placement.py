@@ -15,6 +15,7 @@ from schemas.scene.shape import MassProperties, Shape
 from workers.assets.samples import colors_at, draw_points
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.mesh import DEFAULT
+from workers.door.opening import as_utf8
 from workers.geometry.mesh import face_areas
 
 FLAT_SHARE, ROUGH_SHARE = 0.004, 0.016
@@ -237,4 +238,4 @@ def find_unit(path: Path) -> float | None:
 
 def _head(path: Path) -> bytes:
     with path.open("rb") as stream:
-        return stream.read(HEAD_BYTES)
+        return as_utf8(stream.read(HEAD_BYTES))[0]

@@ -1,9 +1,10 @@
 """Edge: files that pose meshes and simple bodies, parsed with the standard library: their XML, and what of them is seen."""
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,9 +14,9 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
-from workers.door.meshes.caps import check_nodes
+from workers.door.meshes.caps import LONGEST_NAME, check_nodes, find_inside
 from workers.door.meshes.mesh import DEFAULT
-from workers.door.opening import read_bytes
+from workers.door.opening import as_utf8, read_bytes
 from workers.geometry.frames import pose, rotation_about
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
@@ -47,32 +48,65 @@ class Visual:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a file poses: what is seen of it, the names of all its meshes, also of those that only collide, and notes."""
+    """What a file poses: what is seen of it, and the names of all its meshes, also of those that only collide."""
 
     visuals: tuple[Visual, ...]
     meshes: tuple[str, ...]
-    notes: tuple[str, ...] = ()
 
 
-def parse_xml(path: Path, limits: MeshLimits, tag: str, kind: str) -> ElementTree.Element:
-    """The root element of a file that poses others; MeshError `missing`, `too_large` or as `parse_tree`."""
-    data = read_bytes(path, MAX_XML_BYTES, MeshError)
-    root = parse_tree(path, data, tag, kind)
-    for what, many in (
-        ("link", "links"),
-        ("joint", "joints"),
-        ("visual", "visuals"),
-        ("body", "bodies"),
-        ("geom", "geoms"),
-    ):
-        check_nodes(path, sum(1 for _ in root.iter(what)), many, limits)
-    return root
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A file that poses others, and the folder below which all that it names must lie.
+
+    files, notes: what else it reads beside meshes and pictures, and what is to be said of it, filled while it is read.
+    """
+
+    path: Path
+    root: Path
+    limits: MeshLimits
+    files: dict[Path, None] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def parse(self, path: Path, tags: Sequence[str], kind: str) -> ElementTree.Element:
+        """The root element of this file, or of one that it includes; MeshError `missing`, `too_large` or as `parse_tree`."""
+        data, encoding = as_utf8(read_bytes(path, MAX_XML_BYTES, MeshError))
+        if encoding is not None:
+            self.notes.append(f"{path.name} {encoding}")
+        root = parse_tree(path, data, tags, kind)
+        for what, many in _COUNTED.items():
+            check_nodes(path, sum(1 for _ in root.iter(what)), many, self.limits)
+        return root
+
+    def find(self, name: str) -> Path:
+        """The file inside `root` that a name means; MeshError `missing`.
+
+        `package://`, `model://` and folders that are not there are passed over: every tail of the name is looked for, the
+        longest first, in the file's own folder and in those above it up to `root`; as it stands, and then with `%20` for a space.
+        """
+        plain = re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
+        above = [folder for folder in (self.path.parent, *self.path.parent.parents) if folder.is_relative_to(self.root)]
+        for parts in (PurePosixPath(word).parts for word in dict.fromkeys((plain, unquote(plain)))):
+            tails = [PurePosixPath(*parts[k:]) for k in range(min(len(parts), MOST_TAILS))]
+            if (
+                path := find_inside(self.root.resolve(), *(folder / tail for tail in tails for folder in above))
+            ) is not None:
+                return path
+        raise MeshError("missing", f"{self.path} names {name!r:.200}, which is not inside {self.root}")
 
 
-def parse_tree(path: Path, data: bytes, tag: str, kind: str) -> ElementTree.Element:
-    """The root element, its default namespace left out; MeshError `unreadable`, also for a DTD or entities."""
+_COUNTED = {"link": "links", "joint": "joints", "visual": "visuals", "body": "bodies", "geom": "geoms"}
+
+MOST_TAILS = 32
+"""Folders of a name that may be passed over."""
+
+
+def parse_tree(path: Path, data: bytes, tags: Sequence[str], kind: str) -> ElementTree.Element:
+    """The root element, its default namespace left out; MeshError `unreadable`, also for a DTD or entities.
+
+    data: as `as_utf8` has it; tags: those that the root may have.
+    """
     if b"<!" in data.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or b"\0" in data:
-        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
+        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is no text")
     # pybullet's own files declare XML version 0.0, which no parser accepts.
     data = _NAMESPACE.sub(b"", _DECLARATION.sub(b"", data, count=1), count=1)
     if b"xmlns:" not in data:
@@ -81,7 +115,7 @@ def parse_tree(path: Path, data: bytes, tag: str, kind: str) -> ElementTree.Elem
         root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
         raise MeshError("unreadable", f"{path} is not XML: {error}") from error
-    if root.tag != tag:
+    if root.tag not in tags:
         raise MeshError("unreadable", f"{path} is not {kind}: its root is <{root.tag:.40}>")
     return root
 

@@ -1,12 +1,11 @@
 """Edge: what is seen of a URDF, SDF or MJCF from outside as one shape; and the readers of URDF and SDF."""
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from os.path import relpath
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,85 +15,62 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.door.meshes.caps import (
-    LONGEST_NAME,
-    Budget,
-    FolderResolver,
-    check_counts,
-    check_nodes,
-    find_inside,
-)
+from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.formats import load_shape, with_jpeg
 from workers.door.meshes.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
 from workers.door.meshes.mjcf import read_mjcf
-from workers.door.meshes.posed import MOST_ABOVE, Model, Visual, numbers, parse_xml, read_body, scaled, turned
+from workers.door.meshes.posed import MOST_ABOVE, Model, Source, Visual, numbers, read_body, scaled, turned
 
 
-def find_named(name: str, path: Path, root: Path) -> Path:
-    """The file inside `root` that a posing file at `path` names; MeshError `missing`.
-
-    `package://`, `model://` and folders that are not there are passed over: every tail of the name is looked for, the longest
-    first, in the file's own folder and in those above it up to `root`.
-    """
-    parts = PurePosixPath(
-        re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
-    ).parts
-    above = [folder for folder in (path.parent, *path.parent.parents) if folder.is_relative_to(root)]
-    tails = [PurePosixPath(*parts[k:]) for k in range(min(len(parts), MOST_TAILS))]
-    found = find_inside(root.resolve(), *(folder / tail for tail in tails for folder in above))
-    if found is None:
-        raise MeshError("missing", f"{path} names the mesh {name!r:.200}, which is not inside {root}")
-    return found
-
-
-MOST_TAILS = 32
-"""Folders of a name that may be passed over."""
-
-
-def read_model(path: Path, limits: MeshLimits) -> Model:
-    """What a URDF, SDF or MJCF poses; MeshError as `parse_xml`, `no_faces` where nothing of it is seen."""
-    model = POSED[path.suffix.lower()](path, limits)
+def read_model(path: Path, root: Path, limits: MeshLimits) -> tuple[Source, Model]:
+    """What a URDF, SDF or MJCF poses; MeshError as `Source.parse`, `no_faces` where nothing of it is seen."""
+    source = Source(path, root, limits)
+    model = POSED[path.suffix.lower()](source)
     check_nodes(path, len(model.visuals), "visuals", limits)
     if not model.visuals:
         raise MeshError("no_faces", f"{path} has no visual geometry")
-    return model
+    return source, model
 
 
 def list_seen(path: Path, root: Path, limits: MeshLimits) -> tuple[list[Path], list[Path]]:
-    """The meshes of all that is seen, each once, and the pictures that are there; MeshError where a mesh is not inside `root`."""
-    visuals = read_model(path, limits).visuals
-    names = dict.fromkeys(visual.mesh for visual in visuals if visual.mesh is not None)
-    pictures = dict.fromkeys(visual.texture for visual in visuals if visual.texture is not None)
-    return list(dict.fromkeys(find_named(name, path, root) for name in names)), _found(pictures, path, root)
+    """The meshes of all that is seen, each once, and what else is read that is there, such as pictures.
+
+    MeshError where a mesh is not inside `root`.
+    """
+    source, model = read_model(path, root, limits)
+    names = dict.fromkeys(visual.mesh for visual in model.visuals if visual.mesh is not None)
+    pictures = dict.fromkeys(visual.texture for visual in model.visuals if visual.texture is not None)
+    return list(dict.fromkeys(map(source.find, names))), [*source.files, *_found(pictures, source)]
 
 
 def list_named(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
-    """The meshes of all that is seen or collides, of those inside `root`."""
-    return _found(POSED[path.suffix.lower()](path, limits).meshes, path, root)
+    """The meshes of all that is seen or collides, of those inside `root`, and the files that it includes."""
+    source = Source(path, root, limits)
+    return [*_found(POSED[path.suffix.lower()](source).meshes, source), *source.files]
 
 
-def _found(names: Iterable[str], path: Path, root: Path) -> list[Path]:
+def _found(names: Iterable[str], source: Source) -> list[Path]:
     found = []
     for name in names:
         with suppress(MeshError):
-            found.append(find_named(name, path, root))
+            found.append(source.find(name))
     return list(dict.fromkeys(found))
 
 
 def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     """All that is seen, joints at zero, in the frame of the first root, metres; MeshError as `load_shape`."""
-    model, budget = read_model(path, limits), Budget(limits)
+    (source, model), budget = read_model(path, root, limits), Budget(limits)
     resolver = FolderResolver(path, root, limits, budget)
-    parts, notes, vertices, faces = list[Part](), list(model.notes), 0, 0
+    parts, notes, vertices, faces = list[Part](), source.notes, 0, 0
 
     @cache
     def load(name: str) -> LoadedMesh:
-        return load_shape(find_named(name, path, root), limits, root, budget)
+        return load_shape(source.find(name), limits, root, budget)
 
     @cache
     def picture(name: str) -> NDArray[np.uint8] | None:
         try:
-            return resolver.picture(relpath(find_named(name, path, root), path.parent))
+            return resolver.picture(relpath(source.find(name), path.parent))
         except MeshError:
             resolver.note(name, "is missing")
             return None
@@ -127,9 +103,9 @@ def _dressed(part: Part, visual: Visual, picture: Callable[[str], NDArray[np.uin
     return replace(part, material=Material((red, green, blue, alpha or 1.0), texture=texture), colors=None)
 
 
-def read_urdf(path: Path, limits: MeshLimits) -> Model:
+def read_urdf(source: Source) -> Model:
     """The visuals of all links of a URDF, joints at zero; the frame of the first root link."""
-    robot = parse_xml(path, limits, "robot", "a URDF")
+    path, robot = source.path, source.parse(source.path, ["robot"], "a URDF")
     looks = {m.get("name", ""): _look(path, m) for m in robot.iterfind("material")}
     visuals = []
     for link, T_root_link in _link_poses(path, robot):
@@ -187,9 +163,9 @@ def _origin(path: Path, element: ElementTree.Element) -> Pose:
     return np.eye(4) if origin is None else turned(path, origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0"))
 
 
-def read_sdf(path: Path, limits: MeshLimits) -> Model:
+def read_sdf(source: Source) -> Model:
     """The visuals of all links of an SDF's model, joints at zero."""
-    root = parse_xml(path, limits, "sdf", "an SDF")
+    path, root = source.path, source.parse(source.path, ["sdf"], "an SDF")
     for tag in ("world", "include", "submesh", "heightmap", "polyline"):
         if root.find(f".//{tag}") is not None:
             what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
@@ -244,5 +220,5 @@ def _sdf_pose(path: Path, element: ElementTree.Element) -> Pose:
     )
 
 
-POSED: Mapping[str, Callable[[Path, MeshLimits], Model]] = {".urdf": read_urdf, ".xml": read_mjcf, ".sdf": read_sdf}
+POSED: Mapping[str, Callable[[Source], Model]] = {".urdf": read_urdf, ".xml": read_mjcf, ".sdf": read_sdf}
 """The formats of files that pose meshes, by suffix."""
