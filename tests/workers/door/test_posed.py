@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.door.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
-from tests.workers.door.test_statements import dae, geometry
+from tests.workers.door.test_statements import dae, geometry, seen
 from workers.assets.library.reading import list_files
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.formats import load_shape
@@ -129,6 +130,63 @@ def test_a_body_with_a_look_has_its_picture_or_colour_and_one_without_coordinate
         assert any(note in one for one in (*loaded.notes, "" if not note else "none")) == True  # noqa: E712
         meshes, pictures = list_seen(path, tmp_path, LIMITS)
         assert len(meshes) == 1 and len(pictures) == (name in ("a.xml", "c.xml", "e.urdf"))
+
+
+SCRIPTED = """<sdf><model><link><visual><geometry>{}</geometry><material><script><uri>model://m/materials/scripts</uri>
+<uri>model://m/materials/textures</uri><name>M/{}</name></script></material></visual></link></model></sdf>"""
+SCRIPTS = """material M/Blue // as M/Red
+{ technique { pass { ambient 1 0 0
+   diffuse 0 0 1.0 1
+} } }
+/* material M/Gone {
+ diffuse 1 0 0 } */
+material "M/Bands" : M/Blue
+{
+ technique { pass {
+   diffuse 1 1 1
+   texture_unit {
+     texture bands.png
+   } } }
+}
+material M/Lost { pass { texture_unit {
+ texture lost.png
+} } }
+material M/Shaded {
+}
+"""
+
+
+def test_an_ogre_script_gives_colour_and_picture_to_meshes_and_to_simple_bodies_or_is_named(tmp_path):
+    bands = Image.fromarray(np.repeat(np.array([[[200, 0, 0], [0, 200, 0]]], np.uint8), 2, axis=0).repeat(8, axis=1))
+    (tmp_path / "m/materials/textures").mkdir(parents=True)
+    bands.save(tmp_path / "m/materials/textures/bands.png")
+    write(tmp_path / "m/materials/scripts/a.material", SCRIPTS)
+    box, tube = "<box><size>1 2 3</size></box>", "<cylinder><radius>1</radius><length>2</length></cylinder>"
+    for name, body, colours, note in (
+        ("Blue", box, {(0, 0, 255)}, ""),
+        ("Bands", box, {(200, 0, 0), (0, 200, 0)}, ""),
+        ("Bands", tube, {(200, 0, 0), (0, 200, 0)}, ""),
+        ("Lost", box, {(178, 178, 178)}, "lost.png is missing"),
+        ("Gone", box, {(178, 178, 178)}, "the material script M/Gone is not had"),
+        ("Shaded", box, {(178, 178, 178)}, "the material script M/Shaded is not had"),
+    ):
+        path = write(tmp_path / "m/model.sdf", SCRIPTED.format(body, name))
+        loaded = load_posed(path, LIMITS, tmp_path)
+        (part,) = loaded.shape.parts
+        assert {tuple(c) for c in seen(loaded.shape)} == colours and note in "; ".join(loaded.notes), (
+            name,
+            loaded.notes,
+        )
+        assert ({file.name for file in list_files(tmp_path, path, LIMITS)} >= {"a.material"}) == (name != "Gone")
+        if name == "Bands":  # from outside the left half of each side is red, with z up
+            a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
+            level = np.abs(np.cross(b - a, c - a)[:, 2]) < 1e-9
+            right = np.cross([0.0, 0.0, 1.0], np.cross(b - a, c - a))
+            u = part.uv[part.faces][..., 0]
+            grows = ((b - a) * right).sum(axis=1) * (u[:, 1] - u[:, 0]) + ((c - a) * right).sum(axis=1) * (
+                u[:, 2] - u[:, 0]
+            )
+            assert level.sum() >= 8 and (grows[level] > 0.0).all() and np.ptp(u, axis=1).max() <= 1.0
 
 
 SDF = """<sdf version="1.6"><model name="m"><pose>0 0 1 0 0 0</pose><link name="l"><pose degrees="true">1 0 0 0 0 90</pose>

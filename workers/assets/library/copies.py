@@ -53,6 +53,8 @@ _NAMED_BEFORE = re.compile(r"(?:UCX|UBX|USP|UCP)_(.+?)(?:_\d+)?")
 """As Unreal has it."""
 _FOLDER = re.compile(rf"(?:{_COLLIDES})(?:[\s_.-]*mesh(?:es)?)?", re.IGNORECASE)
 _LEVEL = re.compile(r"(.+?)[\s_.-]*lod[\s_.-]*(\d+)", re.IGNORECASE)
+_EVALUATION = re.compile(r"(.*/|)models_[a-z]+/(obj_\d+\.ply)")
+"""BOP has an object's coarser meshes beside its `models`."""
 _SEEN = re.compile(r"[\s_.-]+(?:vis|visual)$", re.IGNORECASE)
 
 
@@ -74,6 +76,9 @@ def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, st
         by_folder.setdefault(_parent(path), []).append(path)
     found = {}
     for path in paths:
+        if (match := _EVALUATION.fullmatch(path)) and (model := f"{match[1]}models/{match[2]}") in split:
+            found[path] = f"made for evaluation, of {model}"
+            continue
         stem, level = split[path]
         if level is None or path in posed:
             continue

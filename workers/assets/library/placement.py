@@ -1,7 +1,9 @@
 """Pure but for a file's head: what a person asks about a mesh: its sizes, its unit, which axis points up (`find_upright`)."""
 
+import json
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -183,7 +185,7 @@ def measure_shape(
         volume=abs(float((a * np.cross(b, c)).sum())) / 6.0,
         thin=measure_thinness(hull_vertices),
         look=sample_look(shape),
-        unit_m=find_unit(path),
+        unit_m=find_unit(path, math.dist(lower, upper)),
         stated_up=find_up(_head(path)) if path.suffix.lower() == ".dae" else None,
     )
 
@@ -228,9 +230,23 @@ _UNITS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, 
 _UNITS |= {"millimeter": 0.001, "millimetre": 0.001, "inch": 0.0254, "inche": 0.0254, "in": 0.0254}
 _UNITS |= {"foot": 0.3048, "feet": 0.3048, "ft": 0.3048}
 
+INFO_FILE = "models_info.json"
+_INFO = re.compile(r"obj_0*(\d+)")
+INFO_SLACK = 0.02
+"""By how much a mesh may differ from the size that BOP tells of it, and still be in that unit."""
 
-def find_unit(path: Path) -> float | None:
-    """Metres in a unit of an OBJ file that states its unit in a remark at its start; else None."""
+
+def find_unit(path: Path, diagonal: float) -> float | None:
+    """Metres in a unit of a file of a diagonal, in its units; None where nothing says it.
+
+    An OBJ file may state its unit in a remark at its start; BOP's `models_info.json` tells the size of `obj_000001` in mm.
+    """
+    match, info = _INFO.fullmatch(path.stem), path.with_name(INFO_FILE)
+    if match is not None and info.is_file():
+        with suppress(OSError, ValueError, LookupError, TypeError, ArithmeticError):
+            sizes = json.loads(as_utf8(info.read_bytes())[0])[match[1]]
+            unit = 0.001 * math.hypot(*(float(sizes[f"size_{axis}"]) for axis in "xyz")) / diagonal
+            return next((known for known in _UNITS.values() if abs(unit / known - 1.0) < INFO_SLACK), None)
     found = _UNIT.search(_head(path)) if path.suffix.lower() == ".obj" else None
     word = found[1].decode().lower() if found else ""
     return _UNITS.get(word, _UNITS.get(word.removesuffix("s")))

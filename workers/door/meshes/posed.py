@@ -1,8 +1,8 @@
 """Edge: files that pose meshes and simple bodies, parsed with the standard library: their XML, and what of them is seen."""
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 from xml.etree import ElementTree
@@ -83,15 +83,17 @@ class Source:
         `package://`, `model://` and folders that are not there are passed over: every tail of the name is looked for, the
         longest first, in the file's own folder and in those above it up to `root`; as it stands, and then with `%20` for a space.
         """
+        if (path := find_inside(self.root.resolve(), *self.places(name))) is not None:
+            return path
+        raise MeshError("missing", f"{self.path} names {name!r:.200}, which is not inside {self.root}")
+
+    def places(self, name: str) -> Iterator[Path]:
+        """Where what a name means may lie, in that order."""
         plain = re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
         above = [folder for folder in (self.path.parent, *self.path.parent.parents) if folder.is_relative_to(self.root)]
         for parts in (PurePosixPath(word).parts for word in dict.fromkeys((plain, unquote(plain)))):
             tails = [PurePosixPath(*parts[k:]) for k in range(min(len(parts), MOST_TAILS))]
-            if (
-                path := find_inside(self.root.resolve(), *(folder / tail for tail in tails for folder in above))
-            ) is not None:
-                return path
-        raise MeshError("missing", f"{self.path} names {name!r:.200}, which is not inside {self.root}")
+            yield from (folder / tail for tail in tails for folder in above)
 
 
 _COUNTED = {"link": "links", "joint": "joints", "visual": "visuals", "body": "bodies", "geom": "geoms"}
@@ -138,6 +140,23 @@ def make_body(path: Path, kind: str, sizes: Array) -> Part:
     else:
         raise MeshError("unreadable", f"{path}: geometry <{kind:.40}> is not known")
     return Part(kind, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
+
+
+def wrap_body(part: Part) -> Part:
+    """The simple body with coordinates of a picture: once on each flat side, once around a round one; seen from outside, z up."""
+    corners, size = part.vertices[part.faces], np.ptp(part.vertices, axis=0)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.abs(normal).argmax(axis=1)
+    up = np.eye(3)[np.where(axis == 2, 1, 2)]
+    right = np.cross(up, np.eye(3)[axis] * np.sign(np.take_along_axis(normal, axis[:, None], axis=1)))
+    around = np.arctan2(corners[..., 1], corners[..., 0]) / (2.0 * np.pi) + 0.5
+    around += (around < 0.5) & (np.ptp(around, axis=1, keepdims=True) > 0.5)  # a face across the seam
+    uv = np.stack([around, corners[..., 2] / size[2] + 0.5], axis=-1)
+    flat = (part.name == "box") | (np.abs(normal[:, 2]) > 0.999 * np.linalg.norm(normal, axis=1))
+    uv[flat] = (np.einsum("fkc,afc->fka", corners / size, np.stack([right, up])) + 0.5)[flat]
+    faces = np.arange(corners.size // 3, dtype=np.int32).reshape(-1, 3)
+    vertices = frozen_array(corners.reshape(-1, 3))
+    return replace(part, vertices=vertices, faces=frozen_array(faces, np.int32), uv=frozen_array(uv.reshape(-1, 2)))
 
 
 def read_body(path: Path, element: ElementTree.Element, size_of: Callable[[str], str | None]) -> Part:

@@ -1,5 +1,6 @@
 """Edge: what is seen of a URDF, SDF or MJCF from outside as one shape; and the readers of URDF and SDF."""
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -15,11 +16,23 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
+from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes, find_inside
 from workers.door.meshes.formats import load_shape, with_jpeg
 from workers.door.meshes.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
 from workers.door.meshes.mjcf import read_mjcf
-from workers.door.meshes.posed import MOST_ABOVE, Model, Source, Visual, numbers, read_body, scaled, turned
+from workers.door.meshes.posed import (
+    MAX_XML_BYTES,
+    MOST_ABOVE,
+    Model,
+    Source,
+    Visual,
+    numbers,
+    read_body,
+    scaled,
+    turned,
+    wrap_body,
+)
+from workers.door.opening import as_utf8, read_bytes
 
 
 def read_model(path: Path, root: Path, limits: MeshLimits) -> tuple[Source, Model]:
@@ -76,7 +89,8 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
             return None
 
     for visual in model.visuals:
-        loaded = load(visual.mesh or "") if visual.body is None else LoadedMesh(Shape((visual.body,)), ())
+        body = wrap_body(visual.body) if visual.body is not None and visual.texture is not None else visual.body
+        loaded = load(visual.mesh or "") if body is None else LoadedMesh(Shape((body,)), ())
         notes += loaded.notes
         for part in transform_shape(loaded.shape, visual.T).parts:
             check_coordinates(path, part.vertices)
@@ -170,19 +184,23 @@ def read_sdf(source: Source) -> Model:
         if root.find(f".//{tag}") is not None:
             what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
             raise MeshError("format", f"{path} {what}: init its models' own files")
-    visuals = [visual for model in root.iterfind("model") for visual in _of_model(path, model, np.eye(4), 0)]
+    visuals = [visual for model in root.iterfind("model") for visual in _of_model(source, model, np.eye(4), 0)]
     names = dict.fromkeys((mesh.findtext("uri") or "").strip() for mesh in root.iterfind(".//geometry/mesh"))
     return Model(tuple(visuals), tuple(names))
 
 
-def _of_model(path: Path, model: ElementTree.Element, T_above: Pose, depth: int) -> Iterator[Visual]:
+def _of_model(source: Source, model: ElementTree.Element, T_above: Pose, depth: int) -> Iterator[Visual]:
+    path = source.path
     if depth > MOST_ABOVE:
         raise MeshError("unreadable", f"{path} has more than {MOST_ABOVE} models inside one another")
     T = T_above @ _sdf_pose(path, model)
     for link in model.iterfind("link"):
         for visual in link.iterfind("visual"):
             one = _sdf_geometry(path, visual, T @ _sdf_pose(path, link) @ _sdf_pose(path, visual))
-            if one is not None:
+            script = visual.find("material/script")
+            if one is not None and script is not None and (look := _read_script(source, script)) is not None:
+                yield replace(one, colour=look[0], texture=look[1], dresses=True)
+            elif one is not None:
                 diffuse, albedo = visual.findtext("material/diffuse"), visual.findtext("material/pbr/metal/albedo_map")
                 rgba = (
                     None
@@ -191,7 +209,41 @@ def _of_model(path: Path, model: ElementTree.Element, T_above: Pose, depth: int)
                 )
                 yield replace(one, colour=rgba, texture=albedo and albedo.strip())
     for inner in model.iterfind("model"):
-        yield from _of_model(path, inner, T, depth + 1)
+        yield from _of_model(source, inner, T, depth + 1)
+
+
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+_DIFFUSE = re.compile(r"^\s*diffuse((?:\s+(?:\d+\.?\d*|\.\d+)){3,4})\s*$", re.MULTILINE)
+_TEXTURE = re.compile(r"^\s*texture\s+(\S+)", re.MULTILINE)
+
+
+def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | None, str | None] | None:
+    """Colour and picture of the Ogre material that a visual names, first pass first; None, and a note, where it is not had.
+
+    After the manual of Ogre 1.9, "Material Scripts"; what a material has of another (`:`) is not read.
+    """
+    name, root = (script.findtext("name") or "").strip(), source.root.resolve()
+    places = [place for uri in script.iterfind("uri") for place in source.places(uri.text or "")]
+    listed = [file for place in places for file in (sorted(place.glob("*.material")) if place.is_dir() else [place])]
+    for file in dict.fromkeys(path for one in listed if (path := find_inside(root, one)) is not None):
+        text = _COMMENT.sub("", as_utf8(read_bytes(file, MAX_XML_BYTES, MeshError))[0].decode("utf-8", "replace"))
+        head = re.search(
+            rf"^\s*material\s+\"?{re.escape(name)}\"?\s*(?::[^{{]*)?{{(?P<rest>.*)", text, re.MULTILINE | re.DOTALL
+        )
+        if head is None:
+            continue
+        source.files[file] = None
+        inside = re.split(r"^\s*material\s", head["rest"], maxsplit=1, flags=re.MULTILINE)[0]
+        diffuse, picture = _DIFFUSE.search(inside), _TEXTURE.search(inside)
+        if diffuse is not None or picture is not None:
+            colour = None if diffuse is None else np.clip([*map(float, diffuse[1].split()), 1.0][:4], 0.0, 1.0)
+            if picture is None:
+                return colour, None
+            near = [folder / picture[1] for folder in (*places, file.parent, file.parent.with_name("textures"))]
+            there = find_inside(root, *near)
+            return colour, picture[1] if there is None else relpath(there, source.path.parent)
+    source.notes.append(f"the material script {name:.80} is not had, or has no colour: plain base colour used")
+    return None
 
 
 def _sdf_geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual | None:
