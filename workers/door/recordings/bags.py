@@ -178,7 +178,7 @@ PACKED = {
     **dict.fromkeys(("yuyv", "YUYV", "yuv422_yuy2"), cv2.COLOR_YUV2RGB_YUY2),
     **dict.fromkeys(("uyvy", "UYVY", "yuv422"), cv2.COLOR_YUV2RGB_UYVY),
 }
-"""OpenCV's conversions of encodings of colour, of 3 or 4 bytes a pixel and of 2. The SDK has capitals, and ROS's yuv422 for UYVY."""
+"""OpenCV's conversions of encodings of colour, of 3 or 4 bytes a pixel and of 2; the SDK has capitals, or yuv422 for UYVY."""
 
 DEPTHS = {"mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
 
