@@ -143,7 +143,7 @@ def open_folder(path: Path, board: Board | None = None) -> CaptureFolder:
     With a `board` there need be no board.json.
     """
     if not path.is_dir():
-        raise CaptureError("missing", f"{path} is no folder")
+        raise CaptureError("missing", f"{path}: there is no such folder")
     numbers, spec, about = _view_numbers(path), _read_json(path / CAMERA_FILE, CameraFile), path / CAPTURE_FILE
     described = _read_json(about, CaptureFile) if about.exists() else CaptureFile(name=derive_name(path.resolve().name))
     board = board or _read_json(path / BOARD_FILE, Board)
