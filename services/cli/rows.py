@@ -75,6 +75,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         ),
         NEW_DIR,
         number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
+        path("--camera", "camera.json", "the colour camera (docs/captures.md), in place of what the recording says"),
         BOARD,
         option("--name", "NAME", "of the object (default: the name of DIR)"),
         option("--category", "NAME", "folder that the capture has in a dataset (default: object)", default="object"),

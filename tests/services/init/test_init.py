@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from schemas.errors import AssetSourceError, MachineError
-from schemas.job.assets import ProceduralSource
+from schemas.job.assets import MeshLimits, ProceduralSource
 from services.cli.main import main
 from services.init import command, shown
 from services.init.shown import (
@@ -36,6 +36,9 @@ from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.assets.library import collection
 from workers.assets.library.collection import SUFFIXES, walk_folder
+from workers.assets.library.copies import find_copies
+from workers.assets.library.placement import find_unit
+from workers.assets.library.reading import list_files
 from workers.assets.library.table import Row, read_table
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
@@ -209,6 +212,48 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
     monkeypatch.setattr(collection.Path, "iterdir", deny)
     with pytest.raises(AssetSourceError, match="cannot be listed: Permission denied"):
         walk_folder(tmp_path / "in")
+
+
+def test_of_packages_each_object_is_offered_once_by_what_they_say_of_themselves(tmp_path):
+    root = tmp_path / "in"
+    for version, name in (("1.10", "model.sdf"), ("1.9", "model-1_9.sdf"), ("1.11", "gone.sdf")):
+        write(root / "sign" / name, "<sdf/>") if name != "gone.sdf" else None
+        config = root / "sign/model.config"
+        config.write_text((config.read_text() if config.exists() else "") + f"<sdf version='{version}'>{name}</sdf>\n")
+    write(root / "old/model.sdf", "<sdf/>")  # without a word of versions, as it was
+    write(root / "old/model-1_2.sdf", "<sdf/>")
+    write(root / "bop/models/obj_000001.ply", "")
+    write(root / "bop/models_eval/obj_000001.ply", "")
+    write(root / ".annex/77a9", "")
+    (root / "linked").mkdir()
+    (root / "linked/cup.obj").symlink_to(root / ".annex/77a9")
+    (root / "linked/cup2.obj").symlink_to(root / ".annex/77a9")
+    (root / "away").symlink_to(tmp_path / "out", target_is_directory=True)
+    (root / "again").symlink_to(root / "bop", target_is_directory=True)
+    (tmp_path / "out").mkdir()
+    paths, left_out = walk_folder(root)
+    told = {one.path: one.why for one in left_out}
+    assert paths == [
+        *("bop/models/obj_000001.ply", "bop/models_eval/obj_000001.ply", "linked/cup.obj"),
+        *("old/model-1_2.sdf", "old/model.sdf", "sign/model.sdf"),
+    ]
+    assert told.pop("sign/model-1_9.sdf") == "other version of model.sdf, by model.config"
+    assert "cp -rL" in told.pop("away") and not told
+    assert find_copies(paths, paths) == {paths[1]: f"made for evaluation, of {paths[0]}"}
+
+
+def test_bops_table_of_models_gives_their_unit(tmp_path):
+    info = {"1": {"diameter": 150.0, "size_x": 30.0, "size_y": 40.0, "size_z": 120.0}, "2": {"size_x": "?"}}
+    write(tmp_path / "models_info.json", json.dumps(info))
+    for name, diagonal, unit in (
+        *(("obj_000001.ply", 130.0, 0.001), ("obj_000001.ply", 0.1302, 1.0), ("obj_000001.ply", 99.0, None)),
+        *(("obj_000002.ply", 130.0, None), ("obj_000003.ply", 130.0, None), ("mug.ply", 130.0, None)),
+    ):
+        assert find_unit(tmp_path / name, diagonal) == unit, name
+    mesh = write_mesh(tmp_path / "obj_000001.ply", cup())
+    assert list_files(tmp_path, mesh, MeshLimits()) == (mesh, tmp_path / "models_info.json"), (
+        "so that a change is noticed"
+    )
 
 
 ROW = (

@@ -17,7 +17,8 @@ from PIL import Image
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
-from tests.workers.door.oracles import glb, welded, write_all
+from tests.workers.door.oracles import CUBE, glb, urdf, visual, welded, write_all
+from workers.assets.library.reading import list_files, load_file
 from workers.door.meshes.formats import load_shape
 
 CORNERS = np.array([[x, y, z] for z in (0, 0.2) for x, y in ((-0.1, -0.1), (0.1, -0.1), (0.1, 0.1), (-0.1, 0.1))])
@@ -678,6 +679,52 @@ def test_what_a_file_states_is_obeyed_or_named(tmp_path):
         elif told := list(faults(path, right)):
             found[name] = told
     assert not found, "\n".join(f"{name}: {told}" for name, told in found.items())
+
+
+DECLARED = '<?xml version="1.0" encoding="{}"?>'
+SPHERE = "<sphere><radius>0.1</radius></sphere>"
+TEXTS = {
+    "a.obj": obj("map_Kd ü.png\n", "mtllib ü.mtl"),
+    "a.dae": dae(image="ü.png"),
+    "a.ply": ply_by_vertex("s", "t"),
+    "a.urdf": {"a.urdf": urdf(visual('<mesh filename="ü.obj"/>')).encode()},
+    "a.sdf": {"a.sdf": f"<sdf><model><link>{visual(SPHERE)}</link></model><!-- ü --></sdf>".encode()},
+    "a.xml": {"a.xml": "<mujoco model='ü'><worldbody><geom type='mesh' mesh='ü'/></worldbody>"
+              "<asset><mesh file='ü.obj'/></asset></mujoco>".encode()},
+    "a.off": {"a.off": b"OFF # \xc3\xbc\n" + off()["a.off"].removeprefix(b"OFF")},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_text_is_read_by_its_mark_its_declaration_or_as_latin_1_with_a_note(tmp_path, name):
+    kind = name[2:]
+    for k, (encoding, declares) in enumerate(
+        (("utf-8", ""), ("utf-8-sig", ""), ("utf-16", ""), ("iso-8859-1", ""), ("iso-8859-1", "iso-8859-1"),
+         ("windows-1250", "windows-1250"), ("utf-8", "utf-16"), ("iso-8859-1", "utf-8"), ("utf-8", "no-such"))
+    ):  # fmt: skip
+        if (kind in ("obj", "ply", "off") and declares) or (kind == "ply" and encoding == "utf-16"):
+            continue
+        files = {
+            "ü.obj": CUBE.encode(),
+            "ü.mtl": b"newmtl a\nmap_Kd \xc3\xbc.png\n",
+            "ü.png": image(SKIN),
+            **TEXTS[name],
+        }
+        for text in (name, "ü.mtl"):
+            whole = (
+                files[text]
+                .decode()
+                .replace("TextureFile t.png", "TextureFile ü.png")
+                .replace('<?xml version="1.0"?>', "")
+            )
+            files[text] = (DECLARED.format(declares) * bool(declares) * (text == name) + whole).encode(encoding)
+        path = write_all(tmp_path / str(k), files).with_name(name)
+        list_files(path.parent, path, MeshLimits())
+        loaded = load_file(path.parent, path, MeshLimits())
+        if kind in ("obj", "dae", "ply"):
+            assert {tuple(colour) for colour in seen(loaded.shape)} == {SKIN}, (encoding, declares)
+        told = f"{name} is not in UTF-8: read as Latin-1" in loaded.notes
+        assert told == (encoding == "iso-8859-1" and declares != "iso-8859-1"), (encoding, declares, loaded.notes)
 
 
 def polygon(corners):

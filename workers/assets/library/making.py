@@ -125,7 +125,7 @@ def code_version() -> str:
     for folder in (here.parent, workers / "door" / "meshes", workers / "geometry"):
         for file in sorted(folder.glob("*.py")):
             whole.update(hashlib.sha256(file.read_bytes()).digest())
-    for file in (workers / "assets" / "mass.py", workers / "assets" / "glb.py"):
+    for file in (workers / "assets" / name for name in ("mass.py", "glb.py", "samples.py")):
         whole.update(hashlib.sha256(file.read_bytes()).digest())
     return whole.hexdigest()[:16]
 

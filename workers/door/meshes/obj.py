@@ -31,6 +31,7 @@ from workers.door.meshes.mesh import (
     make_material,
     roughness_of,
 )
+from workers.door.opening import as_utf8
 
 _LIBRARY = re.compile(r"^[ \t]*mtllib[ \t]+(.+?)[ \t]*$", re.MULTILINE)
 _DIGITS = str.maketrans("", "", "0123456789-+")
@@ -282,7 +283,10 @@ def _read_libraries(path: Path, lines: Iterable[str], resolver: FolderResolver) 
             if resolver.find(name) is None and resolver.find(beside) is not None:
                 resolver.notes.append(f"{name} is missing: {beside} was read in its place")
                 name = beside
-            materials = _read_mtl(_decode(resolver.read(name)), resolver) | materials
+            data, encoding = as_utf8(resolver.read(name))
+            if encoding is not None:
+                resolver.notes.append(f"{name} {encoding}")
+            materials = _read_mtl(_decode(data), resolver) | materials
     return materials
 
 
