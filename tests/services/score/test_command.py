@@ -73,7 +73,7 @@ def test_what_this_installation_cannot_score_is_told_before_anything_is_written(
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *a: None if name == "flip_evaluator" else find(name, *a)
     )
-    status, answer, told = score(capsys, files.root, truth, "--out", tmp_path / "new", "--flip")
+    status, _, told = score(capsys, files.root, truth, "--out", tmp_path / "new", "--flip")
     assert status == 1 and "`verso extra study` installs it" in told and not (tmp_path / "new").exists()
 
 
