@@ -20,6 +20,7 @@ from workers.geometry.frames import transform, translation
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
 from workers.physics.exact_rest import rest
 from workers.physics.fall import Outcome
+from workers.physics.landing import land
 from workers.physics.placement import (
     TOUCHING_M,
     Form,
@@ -29,7 +30,6 @@ from workers.physics.placement import (
     find_gaps_m,
     find_overlaps_m,
     forms_of,
-    land,
     measure_supports,
     place,
     place_on_top,
@@ -184,8 +184,8 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
     as they tip or slip, and released again where that takes them far. Raises LeftTopError, LeftRoomError and SettleError.
     """
     exact, heaped, seconds = drop.physics.exact_rest, bool(drop.lying), drop.seconds
-    if exact and (landed := _land(drop, flat, forms)) is not None:
-        return landed
+    if exact and (landed := land(drop, flat, forms)) is not None:
+        return _Ending(drop, *landed)
     placement, moved = None, 0
     most = POURED_RELEASES if heaped else MOST_RELEASES
     for _ in range(most):
@@ -272,24 +272,6 @@ def _rest_as_placed(drop: Drop, forms: Sequence[Form], poses: tuple[Pose, ...]) 
     rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
     stayed = rested.still and farthest_m(drop.starts, poses, rested.poses) <= STAYED_M
     return _Ending(drop, placement, rested.poses) if stayed else None
-
-
-def _land(drop: Drop, flat: bool, forms: Sequence[Form]) -> _Ending | None:
-    """Objects that stand where they first touch the table; None where they go on, and of a hull on the flat top alone.
-
-    This lands within 2 micrometres in the simulator too.
-    """
-    effects = drop.effects
-    if effects.runs("restitution") or (flat and drop.single and not effects.runs("decomposition")):
-        return None
-    landed = land(drop.starts, drop.table)
-    if landed is None or landed[1] > drop.physics.max_settle_s:
-        return None
-    poses, seconds = landed
-    placement = _place(drop, poses, forms)
-    rested = hold(drop, placement, poses)
-    stands = rested.still and farthest_m(drop.starts, poses, rested.poses) <= TOUCHING_M
-    return _Ending(drop, placement, rested.poses, seconds) if stands else None
 
 
 def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placement:
