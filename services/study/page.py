@@ -20,7 +20,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.cbook import pts_to_poststep
 from matplotlib.figure import Figure as Picture
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from pydantic import TypeAdapter
 
 from schemas.errors import describe_seconds, milliseconds, number, plural, size
@@ -273,7 +273,8 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str,
         axes.plot(*place[row.setting.name], ls="", **mark)
         if row.setting.kind == "preset" or (row in best and row.setting.kind == "single"):
             text = row.setting.parts[0][1][:26]
-            axes.annotate(text, place[row.setting.name], (6.0, 3.0), textcoords="offset points", zorder=6)
+            beside = (6.0, 3.0 if row.setting.kind == "preset" else -11.0)  # those of one place stay apart
+            axes.annotate(text, place[row.setting.name], beside, textcoords="offset points", zorder=6)
     if best:
         corners = pts_to_poststep(*zip(*(place[row.setting.name] for row in best), strict=True))
         axes.plot(*corners, color="#222222", lw=1.3, zorder=2, label="front: none is cheaper and better")
@@ -286,10 +287,8 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str,
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
             low, high = axis.get_view_interval()
-            subs = (
-                (1.0,) if high > 1e2 * low else (1.0, 2.0, 5.0) if high > 4.0 * low else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-            )
-            axis.set_major_locator(LogLocator(subs=subs, numticks=6))
+            subs = (1.0,) if high > 1e2 * low else (1.0, 2.0, 5.0)
+            axis.set_major_locator(LogLocator(subs=subs, numticks=6) if high > 4.0 * low else MaxNLocator(4))
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
     axes.set(xlabel="ms of processor a scene", ylabel=", ".join(filter(None, [short(error), unit(error)])))
