@@ -83,26 +83,25 @@ def worst_first(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 def scene_table_html(table: SceneTable, place: str) -> str:
     """The table with a field that filters and headings that sort. `place`: the dataset, of which SQL tells the rest."""
+    if not table.rows:
+        return ""
     shown = [name for name in COLUMNS if any(row[name] is not None for row in table.rows)]
-    head = ("scene", "category", "split", *shown)
     rows = [
         (
             str(row["scene_id"]),
-            escape(" ".join(filter(None, (row["category"], row["name"])))),
+            escape(f"{row['category']} {row['name']}".strip()),
             row["split"],
-            *(f"<strong>{_cell(row[name])}</strong>" if name == row["worst"] else _cell(row[name]) for name in shown),
+            *(_cell(row[name], name == row["worst"]) for name in shown),
         )
         for row in table.rows
     ]
-    if not rows:
-        return ""
     all_of_them = f"All: {command_line('query', place, 'select * from scenes')}"
     note = f"{plural(len(rows), 'scene')}, first the worst in some figure (bold). A heading sorts. {all_of_them}"
-    return (
-        '<div class="tools"><label>Only with <input id="scenes-filter" type="search" placeholder="mug test"></label></div>'
-        f'<div class="wide" id="scenes-table">{table_html(head, rows)}</div><p class="note">{escape(note)}</p>'
-    )
+    field = '<label>Only with <input id="scenes-filter" type="search" placeholder="mug test"></label>'
+    html = table_html(("scene", "category", "split", *shown), rows)
+    return f'<div class="tools">{field}</div><div id="scenes-table">{html}</div><p class="note">{escape(note)}</p>'
 
 
-def _cell(value: float | None) -> str:
-    return "–" if value is None else number(value)
+def _cell(value: float | None, is_worst: bool) -> str:
+    words = "–" if value is None else number(value)
+    return f"<strong>{words}</strong>" if is_worst else words
