@@ -180,7 +180,7 @@ def simulate(options: argparse.Namespace) -> int:
 
 
 def import_recording(options: argparse.Namespace) -> int:
-    """Reads options.recording, `out`, `frames`, `board` (a path or None), `name`, `category` and `json`. Returns 0.
+    """Reads options.recording, `out`, `frames`, `board` and `camera` (paths or None), `name`, `category`, `json`. Returns 0.
 
     Raises InputError and OutputError for what cannot be, CaptureError for a recording that cannot be used.
     """
@@ -197,11 +197,11 @@ def import_recording(options: argparse.Namespace) -> int:
     board = read_board(Path(options.board)) if options.board else Board()
     if not recording.exists():
         raise InputError(f"{recording}: no such file or folder")
-    made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
-    notes = work.describe_losses(made.losses)
+    made = work.import_recording(recording, _make_empty(out), about, board, options.frames, options.camera)
     views = f"{plural(len(made.views), 'view')} of {plural(made.frames, 'frame')}"
-    print(f"{out}: {views}, depth registered by the recording's own calibration")
-    print("\n".join(f"  {note}" for note in notes), end="\n" if notes else "")
+    print(f"{out}: {views}, depth registered by {made.calibration}")
+    for note in made.notes:
+        print(f"  {note}")
     if not options.board:
         print(f"  no --board: board.json is the default board ({board.words}, {board.dictionary})")
     if options.json:
@@ -209,7 +209,6 @@ def import_recording(options: argparse.Namespace) -> int:
             "ok": True,
             "out": str(out),
             "frames": made.frames,
-            "notes": notes,
             "default_board": not options.board,
         }
         print(json.dumps({**answer, **asdict(made)}))

@@ -10,10 +10,10 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from schemas.errors import VersoError, needs_making
+from schemas.errors import VersoError, command_line, needs_making
 from services.cli.arguments import Command, Parser
 from services.cli.environment import enter_stack_environment, speak_as_typed, typed_program
-from services.cli.rows import COMMANDS, JSON, KEPT
+from services.cli.rows import COMMANDS, JSON, KEPT, THERE
 from services.run.supervisor import supervise
 
 if TYPE_CHECKING:
@@ -44,13 +44,17 @@ def _run(options: argparse.Namespace) -> int:
     """The exit code of a command; errors are told in one line. KeyboardInterrupt passes."""
     speak_as_typed()  # once more: a child of the supervisor has another standard error
     try:
+        _require_there(options)
         module, _, function = options.handler.partition(":")
         with needs_making(f"`{options.command}`"):
             return int(getattr(importlib.import_module(f"..{module}", __package__), function)(options) or 0)
     except VersoError as error:
-        print(f"verso: {error}", file=sys.stderr)
+        message, out = str(error), getattr(options, "out", None)
+        if out is not None:  # what reads a file does not know in whose dataset it lies
+            message = message.replace("verso verify OUT", command_line("verify", out))
+        print(f"verso: {message}", file=sys.stderr)
         if getattr(options, "json", False):
-            print(json.dumps({"ok": False, "error": str(error), "kind": type(error).__name__}))
+            print(json.dumps({"ok": False, "error": message, "kind": type(error).__name__}))
         return error.exit_code
     except BrokenPipeError:
         return 1
@@ -61,6 +65,17 @@ def _run(options: argparse.Namespace) -> int:
             raise
         print(f"verso: {error.filename or 'a file'}: {remedy}", file=sys.stderr)
         return 1
+
+
+def _require_there(options: argparse.Namespace) -> None:
+    """Raises OutputError where a folder that the command reads is not there: before anything is loaded or written."""
+    from services.job.record import require_folder
+
+    for name in options.there:
+        value = getattr(options, name)
+        for place in value if isinstance(value, list) else [value]:
+            if place is not None:
+                require_folder(place)
 
 
 def build_parser(program: str = "verso") -> argparse.ArgumentParser:
@@ -107,6 +122,7 @@ def _add_commands(parsers: "Commands", commands: Mapping[str, Command], above: s
             starts_ray=entry.starts_ray,
             kept=entry.kept,
             quiet=entry.quiet,
+            there=[names[0].lstrip("-") for names, settings in entry.options if (names, settings) in THERE],
         )
 
 

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, MachineError, RunError, plural
+from schemas.errors import InputError, MachineError, RunError, command_line, plural
 from schemas.queue import JobRequest
 from services.cli import rows
 from services.cli.commands import finish, tell_result
@@ -185,7 +185,7 @@ def _describe_supervisor(queue: Queue) -> str:
 
     holder = read_holder(queue.store)
     if holder is None or (is_here(holder) and not shows_life(queue.store, holder)):
-        return f"no supervisor is running: `verso supervise --queue {queue.name}` starts the jobs"
+        return f"no supervisor is running: `{command_line('supervise', '--queue', queue.name)}` starts the jobs"
     return f"supervised by process {holder.pid} on {holder.host}"
 
 

@@ -19,7 +19,7 @@ import pyarrow.dataset as ds
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import SCHEMAS, TABLES
-from schemas.errors import InputError, did_you_mean
+from schemas.errors import InputError, command_line, did_you_mean
 from schemas.job.assets import SplitShares
 from schemas.job.job import Job
 from schemas.scene.view import ROLES
@@ -200,7 +200,7 @@ class Dataset:
         pairs = [pair for pair in self.scene(scene_id) if pair.pose_id == pose_id - pose_id % 2]
         if not pairs:
             raise InputError(
-                f"{self.place} has no pair {pose_id}: `verso status {self.place}` tells which scenes are there"
+                f"{self.place} has no pair {pose_id}: `{command_line('status', self.place)}` tells which scenes are there"
             )
         return pairs[0]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import PixelKind, patch_index
-from schemas.errors import CorruptError, InputError
+from schemas.errors import CorruptError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import DRAWN_ROLES, Role
@@ -164,13 +164,11 @@ def iter_records(store: Store, codes: NDArray[np.int64]) -> Iterator[list[Commit
 def splits_of(
     store: Store, codes: NDArray[np.int64], shares: SplitShares, held_out: Collection[str], by_category: bool
 ) -> Splits:
-    """The splits of the instances in the ranges that `codes` name. Raises InputError for a category that none has."""
+    """The splits of the instances in the ranges that `codes` name."""
     if not by_category and not held_out:
         return Splits({})
     tables = (range_rows(store, records, "assets") for records in iter_records(store, codes))
     ids = collect_ids(table.select(["instance_id", "category"]).to_pylist() for table in tables)
-    if unknown := sorted(set(held_out) - ids.keys()):
-        raise InputError(f"--held-out {unknown[0]}: the dataset has no such object; its are {', '.join(sorted(ids))}")
     return Splits(split_by_category(ids, shares) if by_category else {}, frozenset(held_out))
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from schemas.errors import AssetSourceError, InputError, MachineError, MeshError, OutputError, plain_line
+from schemas.errors import AssetSourceError, InputError, MachineError, MeshError, OutputError, command_line, plain_line
 from schemas.job.assets import TABLE, Assets, LibrarySource, MeshLimits, is_usable
 from schemas.job.physics import Physics
 from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_table, plural
@@ -120,7 +120,7 @@ def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) 
     print(f"{out}: {plural(len(used), 'object')} in {plural(len(categories), 'category')}")
     print("\n".join(f"  {line}" for line in (*describe_decisions(used), *ask_about_large(used))))
     look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
-    print(look, f"verso run {out / JOB_FILE} --scenes 8")
+    print(look, command_line("run", out / JOB_FILE, "--scenes", 8))
     if options.json:
         tree = {
             "library": str(out),

@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,7 +67,7 @@ class MergedTable:
             if before >= after:
                 raise CorruptError(
                     f"{self._table}: the key {after} comes after {before}: the ranges do not join; "
-                    "`verso verify` lists what is damaged"
+                    "`verso verify OUT` lists what is damaged"
                 )
         self._last_key = keys[-1:] or self._last_key
         self.digest.update(rows)
@@ -225,13 +225,10 @@ def _poses(rows: pa.Table) -> pa.Table:
 
 def _lines(rows: pa.Table, columns: Sequence[str], separator: str) -> bytes:
     """The rows as lines of UTF-8: a matrix is sixteen words, a double the shortest digits that give it back."""
-    words = [rows.column(name).to_pylist() for name in columns[:-1]]
-    lines = zip(*words, rows.column(columns[-1]).to_pylist(), strict=True)
-    return "".join(separator.join(map(_word, chain(line[:-1], line[-1]))) + "\n" for line in lines).encode()
-
-
-def _word(value: float | str) -> str:
-    return escaped(value) if isinstance(value, str) else repr(value)
+    *plain, matrices = (rows.column(name).to_pylist() for name in columns)
+    words = [[escaped(value) if isinstance(value, str) else repr(value) for value in column] for column in plain]
+    words.append([separator.join(map(repr, T)) for T in matrices])
+    return "".join(separator.join(line) + "\n" for line in zip(*words, strict=True)).encode()
 
 
 SHAPES_OF_CAPTURES = """\

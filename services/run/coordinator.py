@@ -20,7 +20,7 @@ from ray.exceptions import NodeDiedError, OutOfMemoryError, RayError, RayTaskErr
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardReport
-from schemas.errors import CommitConflict, RunError, VersoError
+from schemas.errors import CommitConflict, RunError, VersoError, command_line
 from services.run.machine import Process, send
 from services.run.progress import Tally, log_event, say
 from services.run.ray_cluster import LOOK_EVERY_S, Slots, alive_nodes, on_node
@@ -230,7 +230,7 @@ class Coordinator:
             reasons = ", ".join(f"{count} x {reason}" for reason, count in self._tally.failed.most_common(3))
             raise RunError(
                 f"{self._tally.failed.total()} of {self._tally.asked} scenes have failed ({reasons}), which is more than "
-                'run.max_failure_share allows: see `verso query OUT "select * from failures"`'
+                f"run.max_failure_share allows: see `{command_line('query', self._store.name, 'select * from failures')}`"
             )
 
     def _take_lost_hosts(self) -> set[str]:

@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.errors import InputError, number, plural
+from schemas.errors import InputError, command_line, number, plural
 from services.job.record import read_success, require_dataset
 from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.report import POLICY, Page, Section, fill_page, read_web
@@ -82,7 +82,7 @@ def _print_metrics(metrics: dict[str, Any]) -> None:
 
 def _compare(options: argparse.Namespace) -> int:
     """Prints which of two scores is better by each metric, with a paired interval."""
-    (a, one), (b, other) = (_read_score(path) for path in options.compare)
+    (a, one), (b, other) = (_read_score(options.out, path) for path in options.compare)
     if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != options.out:
         raise InputError(f"{options.compare[0]} and {options.compare[1]} are scores of different datasets")
     if one["align"] != other["align"]:
@@ -100,12 +100,12 @@ def _compare(options: argparse.Namespace) -> int:
     return _finish(options, True, {"a": str(options.compare[0]), "b": str(options.compare[1]), "metrics": metrics})
 
 
-def _read_score(path: Path) -> tuple[pa.Table, dict[str, Any]]:
+def _read_score(out: str, path: Path) -> tuple[pa.Table, dict[str, Any]]:
     """The items and the summary of a folder of predictions or of its score. Raises InputError where it is not scored."""
     for folder in (path, path / "score"):
         if (folder / ITEMS_FILE).is_file() and (folder / SUMMARY_FILE).is_file():
             return pq.read_table(folder / ITEMS_FILE), json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
-    raise InputError(f"{path} has no score: make one with verso score OUT {path}")
+    raise InputError(f"{path} has no score: make one with {command_line('score', out, path)}")
 
 
 def _write(path: Path, text: str) -> None:

@@ -1,7 +1,7 @@
 """From a recording of any format to the folder of a capture: frames paired, chosen and registered."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,24 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import shortest_path
 
 from schemas.base import Array
-from schemas.capture import CapturedView, DepthCamera, Recorded, RecordedFrame
+from schemas.capture import CaptureCamera, CapturedView, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
 from schemas.scene.view import Intrinsics
-from workers.capture.folder import CaptureFile, stored_depth, write_description, write_view
+from workers.capture.folder import (
+    CAMERA_FILE,
+    CameraFile,
+    CaptureFile,
+    camera_of,
+    describe_camera,
+    is_taken_out,
+    read_camera_file,
+    stored_depth,
+    write_description,
+    write_view,
+)
 from workers.door.opening import as_refusal
+from workers.door.recordings.folders import scaled_camera
 from workers.door.recordings.formats import open_any
 from workers.door.recordings.pictures import change_camera
 from workers.geometry.zbuffer import register_depth
@@ -173,15 +185,66 @@ class Imported:
     frames: int
     """Colour frames with depth, of which the views were chosen."""
     losses: Losses
+    calibration: str
+    """Whose the camera is, in words."""
+    notes: tuple[str, ...]
+    """What is missing or was taken for granted, sentences."""
 
 
-def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, views: int) -> Imported:
-    """Writes a capture folder into `out`, which must exist: `views` chosen frames with depth in the colour camera.
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A recording, its colour camera and that camera as camera.json has it; `given` where it is not the recording's own."""
 
-    The images keep the lens of the colour camera, which camera.json has. What describes the folder is written last, so that a
-    folder that was left half-made is not taken for a capture. Raises CaptureError for a recording that cannot be used.
+    recording: Recorded
+    camera: CaptureCamera
+    stored: CameraFile
+    given: Path | None = None
+    note: str = ""
+
+
+def _open(path: Path, file: Path | None) -> _Source:
+    """The recording with the camera of a file in camera.json's form, or of such a file beside pictures that have no other.
+
+    Raises CaptureError where there is none, or one of pictures of another size.
     """
     recording = open_any(path)
+    if file is None and recording.color is None:
+        file = path / CAMERA_FILE
+        if not file.is_file():
+            how = f"describe it in a {CAMERA_FILE} (docs/captures.md has its keys) and name that by --camera"
+            raise CaptureError("calibration", f"{path}: {recording.missing}: {how}, or put it into the folder")
+    if file is None:
+        assert recording.color is not None
+        return _Source(recording, recording.color, describe_camera(recording.color))
+    spec = read_camera_file(file)
+    note = ""
+    if "depth_units_per_m" not in spec.model_fields_set:
+        units = recording.units_per_m
+        spec = spec.model_copy(update={"depth_units_per_m": units})
+        note = f"depth is taken for {units:g} units a metre: {file} can say depth_units_per_m" * bool(
+            recording.with_units
+        )
+    elif recording.with_units:
+        recording = recording.with_units(spec.depth_units_per_m)
+    frames = (frame for frame in recording.frames() if not frame.is_depth)
+    image = next((image for frame in frames if (image := _load(recording, frame, False)) is not None), None)
+    if image is not None and image.shape[1::-1] != (spec.width, spec.height):
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise CaptureError("size", f"{path}: its pictures are {size}, and {file} says {spec.width} x {spec.height}")
+    return _Source(recording, camera_of(spec), spec, file, note)
+
+
+def import_recording(
+    path: Path, out: Path, about: CaptureFile, board: Board, views: int, camera: Path | None = None
+) -> Imported:
+    """Writes a capture folder into `out`, which must exist: `views` chosen frames with depth in the colour camera.
+
+    The images keep the lens of the colour camera, which camera.json has: the recording's, or that of the file `camera` in its
+    place. What describes the folder is written last, so that a folder that was left half-made is not taken for a capture.
+    Raises CaptureError for a recording that cannot be used.
+    """
+    source = _open(path, camera)
+    recording = source.recording
     color_us, measures, depth_us, damaged = _measure(recording)
     pairs = pair_frames(color_us, depth_us, recording.period_us, recording.depth_delay_us)
     if not pairs:
@@ -196,12 +259,14 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
     made = tuple(
         ImportedView(n, int(color_us[i]), int(depth_us[pairs[i]]), measures[i].sharpness) for n, i in enumerate(chosen)
     )
-    _write_views(recording, made, out)
-    origin: dict[str, Any] = {"recording": path.name, **recording.told}
+    _write_views(source, made, out)
+    calibration = str(source.given or recording.told.get("calibration", "the recording's own calibration"))
+    origin: dict[str, Any] = {"recording": path.name, **recording.told, "calibration": calibration}
     origin |= {"losses": asdict(losses), "views": [asdict(view) for view in made]}
     (out / RECORDING_FILE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
-    write_description(out, about, recording.color, board)
-    return Imported(made, len(pairs), losses)
+    write_description(out, about, source.stored, board)
+    notes = (*describe_losses(losses), *([source.note] if source.note else ()))
+    return Imported(made, len(pairs), losses, calibration, notes)
 
 
 def _measure(recording: Recorded) -> tuple[Stamps, list[FrameMeasure], Stamps, int]:
@@ -227,30 +292,37 @@ def _load(recording: Recorded, frame: RecordedFrame, small: bool) -> NDArray | N
         return frame.load(small)
 
 
-def _write_views(recording: Recorded, views: tuple[ImportedView, ...], out: Path) -> None:
+def _write_views(source: _Source, views: tuple[ImportedView, ...], out: Path) -> None:
     """Reads the recording again and writes the chosen frames; a view is written as soon as both its frames are there."""
     color = {view.color_us: [view] for view in views}
     depth: dict[int, list[ImportedView]] = {}
     for view in views:
         depth.setdefault(view.depth_us, []).append(view)
     half: dict[int, RecordedFrame] = {}
-    for frame in recording.frames():
+    for frame in source.recording.frames():
         for view in (depth if frame.is_depth else color).get(frame.stamp_us, []):
             other = half.setdefault(view.number, frame)
             if other.is_depth != frame.is_depth:
                 pair = (other, frame) if frame.is_depth else (frame, other)
-                write_view(out, _view(recording, view.number, *pair))
+                write_view(out, _view(source, view.number, *pair))
                 del half[view.number]
 
 
-def _view(recording: Recorded, number: int, color: RecordedFrame, depth: RecordedFrame) -> CapturedView:
-    """Both images in the recording's colour camera."""
+def _view(source: _Source, number: int, color: RecordedFrame, depth: RecordedFrame) -> CapturedView:
+    """Both images in the colour camera; depth as it is where camera.json describes its camera."""
+    recording, common = source.recording, source.camera
     rgb, depth_m = _load(recording, color, False), _load(recording, depth, False)
     if rgb is None or depth_m is None:
         raise CaptureError("unreadable", f"{recording.path}: the colour frame of view {number} cannot be decoded")
-    common = recording.color
-    k = color.camera if isinstance(color.camera, Intrinsics) else common.intrinsics
+    k = color.camera if isinstance(color.camera, Intrinsics) and source.given is None else common.intrinsics
     camera = depth.camera if isinstance(depth.camera, DepthCamera) else recording.depth
+    if source.stored.depth_camera is not None:
+        return CapturedView(number, rgb, stored_depth(depth_m, common), None)
+    if camera is not None and source.given is not None and (common.depth == "ray" or is_taken_out(source.stored)):
+        how = "depth of another camera is registered as z, and with a lens of at most eight numbers: describe depth_camera"
+        raise CaptureError("calibration", f"{source.given}: {how}")
+    if source.given is not None and isinstance(depth.camera, DepthCamera):
+        camera = replace(scaled_camera(k, depth_m.shape[::-1]), lens=common.lens)
     if camera is None:
         depth_m = change_camera(depth_m, k, common.intrinsics, between=False)
     else:

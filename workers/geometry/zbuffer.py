@@ -108,8 +108,8 @@ def _squares(pixels: Array, depth_m: Array, max_step: float) -> NDArray[np.int32
     return triangles[:count]
 
 
-Drawn = tuple[NDArray[np.floating], NDArray[np.int32], Array]
-"""(z [H, W], metres, 0 where there is nothing; number of the triangle [H, W], -1 there; its corners' weights [H, W, 3])."""
+Drawn = tuple[NDArray[np.floating], NDArray[np.int32]]
+"""(z [H, W], metres, 0 where there is nothing; number of the triangle [H, W], -1 there)."""
 
 
 @compiled
@@ -130,7 +130,6 @@ def draw_triangles(
     """
     height, width = shape
     depth, nearest = np.zeros(shape, z.dtype), np.full(shape, -1, np.int32)
-    weights = np.zeros((height, width, 3))
     for t in range(len(triangles)):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ua, va, ub, vb, uc, vc = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
@@ -151,8 +150,31 @@ def draw_triangles(
                 at = 1.0 / (wa / z[a] + wb / z[b] + wc / z[c])
                 if nearest[y, x] < 0 or depth[y, x] > at:
                     depth[y, x], nearest[y, x] = at, t
-                    weights[y, x, 0], weights[y, x, 1], weights[y, x, 2] = wa, wb, wc
-    return depth, nearest, weights
+    return depth, nearest
+
+
+@compiled
+def corner_weights(pixels: NDArray[np.floating], triangles: NDArray[np.int32], nearest: NDArray[np.int32]) -> Array:
+    """[H, W, 3] float64: the weights, sum 1, of the corners of the triangles [H, W] that `draw_triangles` found; 0 at none."""
+    weights = np.zeros((*nearest.shape, 3))
+    for y in range(nearest.shape[0]):
+        for x in range(nearest.shape[1]):
+            t = nearest[y, x]
+            if t >= 0:
+                a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+                ua, va, ub, vb, uc, vc = (
+                    pixels[a, 0],
+                    pixels[a, 1],
+                    pixels[b, 0],
+                    pixels[b, 1],
+                    pixels[c, 0],
+                    pixels[c, 1],
+                )
+                area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
+                weights[y, x, 1] = ((x - ua) * (vc - va) - (uc - ua) * (y - va)) / area
+                weights[y, x, 2] = ((ub - ua) * (y - va) - (x - ua) * (vb - va)) / area
+                weights[y, x, 0] = 1.0 - weights[y, x, 1] - weights[y, x, 2]
+    return weights
 
 
 NEAREST_M = 0.1

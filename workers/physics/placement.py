@@ -1,6 +1,7 @@
 """Objects at poses on a table: distances and overlaps between true meshes, and how contacts hold them up. Pure."""
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,14 +12,14 @@ import numpy as np
 from schemas.base import Pose, frozen_array
 from schemas.scene.scene import ContactForce, ObjectStart, Table
 from schemas.scene.shape import REGION_TABLE, Mesh
-from workers.geometry.frames import DOWN, motion_between, transform
+from workers.geometry.frames import DOWN, motion_between, transform, translation
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.mesh import bounds_of, hold_to_one_thread, mesh_of, solid_of, weld
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.contact_surface import Surface, crop, is_closed, surface_of
 from workers.physics.contacts import Contacts, contacts_within
 from workers.physics.exact_rest import FALL_M, Inertia, Motion, Thing, step
-from workers.physics.support import support_margin
+from workers.physics.support import columns_apart, stands_on_face, support_margin, vertical_gap
 
 FARTHEST_M = 0.01
 """Farthest distance that is measured: convex parts stand out of a surface by less."""
@@ -149,6 +150,25 @@ class Placement:
         """Some of the objects, by their numbers, with the same table."""
         starts, things = tuple(self.starts[k] for k in numbers), tuple(self.things[k] for k in numbers)
         return Placement(starts, things, tuple(self.forms[k] for k in (*numbers, -1)), self.friction)
+
+
+def land(starts: Sequence[ObjectStart], table: Table) -> tuple[tuple[Pose, ...], float] | None:
+    """(`T_world_obj` [4, 4] where objects first touch the table, seconds that the longest fall takes), all straight down.
+
+    None where one does not come down on a face of its hull, or not in a column of its own. What then stands has come to rest: an
+    impact without a rebound takes all speed where contacts all about the centre of mass take it at once, on a face (Stronge 2000,
+    "Impact Mechanics"). A simulator, which finds them one by one, would turn and push it by millimetres.
+    """
+    if not all(stands_on_face(start.hull.vertices, -start.T_world_obj[2, :3]) for start in starts):
+        return None
+    columns = [transform(start.T_world_obj, start.hull.vertices) for start in starts]
+    if not all(columns_apart(a, b) for a, b in itertools.combinations(columns, 2)):
+        return None
+    falls_m = [vertical_gap(placed_mesh(start, start.T_world_obj), table.mesh) for start in starts]
+    if not 0.0 <= min(falls_m) <= max(falls_m) < math.inf:
+        return None
+    poses = tuple(translation(0.0, 0.0, -m) @ start.T_world_obj for start, m in zip(starts, falls_m, strict=True))
+    return poses, math.sqrt(2.0 * max(falls_m) / GRAVITY_M_S2)
 
 
 @dataclass(frozen=True)

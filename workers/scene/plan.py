@@ -24,29 +24,9 @@ from workers.geometry.frames import UP, invert, pose, rotation_about, transform,
 from workers.geometry.hull import hull_of
 from workers.geometry.zbuffer import count_covered
 from workers.physics.pour import Pouring, points_of
-from workers.physics.support import place_table, sample_elevation, support_height, support_margin
+from workers.physics.support import columns_apart, place_table, sample_elevation, support_height, support_margin
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.pairs import place_beside
-
-APART_M = 0.001
-"""Columns nearer to each other than this count as touching."""
-
-_ANGLES = math.pi * np.arange(90) / 90
-AXES = frozen_array(np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1))
-"""[90, 2] the horizontal axes that are tried for a separating plane. None is further than 1 degree from the best one, so
-that two footprints of 0.2 m that are more than 4 mm apart are found to be so."""
-
-
-def columns_apart(points: Array, others: Array) -> bool:
-    """Whether a vertical plane separates two clouds [N, 3] by at least `APART_M` of air.
-
-    Two bodies that fall straight down then do not meet. The theorem of the separating axis, applied to `AXES` alone:
-    clouds that almost touch may count as touching.
-    """
-    mine, theirs = points[:, :2] @ AXES.T, others[:, :2] @ AXES.T
-    gap = np.maximum(theirs.min(axis=0) - mine.max(axis=0), mine.min(axis=0) - theirs.max(axis=0))
-    return bool(gap.max() >= APART_M)
-
 
 MOST_REDRAWS = 20
 """Of a position that is not over the table or has no room, and of an object that was lost: hardly a scene needs five."""

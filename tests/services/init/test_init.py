@@ -108,7 +108,7 @@ def test_a_mixed_folder_becomes_a_library_and_a_job_that_offers_exactly_what_was
 
 
 WRONG = (
-    (("none",), "none is not there"),
+    (("none",), "none: there is no such folder"),
     (("file",), "file is a file"),
     (("empty",), "empty is empty"),
     (("other",), "other has no mesh"),
@@ -220,7 +220,7 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
     assert paths == ["a/b/c.GLB", "a/robot.xml", "a/x.urdf", "b.obj"]
     reasons = {"bad\\nname.obj": "name", "bad\\udcff.obj": "name", "dead.obj": "missing", "link.obj": "link"}
     assert {one.path: one.reason for one in left_out} == {**reasons, "locked.obj": "permission"}
-    with pytest.raises(AssetSourceError, match=r"bad\\nname is not there"):
+    with pytest.raises(AssetSourceError, match=r"bad\\nname: there is no such folder"):
         walk_folder(tmp_path / "bad\nname")
 
     def deny(self):

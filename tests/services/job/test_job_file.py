@@ -299,7 +299,8 @@ def peak_mb() -> float:
 
 @pytest.mark.parametrize("numbers", [range(40), pytest.param(range(100, 2100), marks=pytest.mark.slow)], ids=len)
 def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(run_job, "measure_scene", lambda job, catalogue: None)  # this is about reading jobs
+    for name in ("measure_scene", "require_framed"):  # this is about reading jobs
+        monkeypatch.setattr(run_job, name, lambda job, catalogue: None)
     path, out, outcomes = tmp_path / "job.yaml", str(tmp_path / "out"), Counter()
     main(["run", str(EXAMPLES[-1]), "--dry-run", "--out", out])  # loads what reading a job loads
     before = peak_mb()

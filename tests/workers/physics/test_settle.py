@@ -57,6 +57,8 @@ TOP = TABLE.top.height_m
 ALL = ("dynamics", "fine_step", "object_contacts", "rolling_friction")
 CUBE = cube(0.06)
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+LEANS = turn(X, 1.0)
+"""So that it does not stand where it lands, and falls in the simulator."""
 
 
 def group_of(starts: Sequence[ObjectStart], physics=PHYSICS) -> tuple[Settled, ...]:
@@ -127,7 +129,7 @@ def test_what_does_not_rest_is_refused_with_what_was_measured(monkeypatch):
         (at(ball(0.05, 2), TABLE, (0, 0, 0.2)), TABLE, hurried, "not_at_rest", r"rad/s after 0\.1 s"),
         (beyond, TABLE, PHYSICS, "left_table", r"off the table's top: narrow start.offset_m"),
         # PyBullet itself stops with `createCollisionShape failed`, which would end the worker
-        (at(CUBE, TABLE, (0, 0, 0.1)), fine, PHYSICS, "table_too_fine", "takes 131072 and 174762"),
+        (at(CUBE, TABLE, (0, 0, 0.1), LEANS), fine, PHYSICS, "table_too_fine", "takes 131072 and 174762"),
         (hover, TABLE, PHYSICS, "unsupported", r"it came to rest 0.020 mm from anything, with 100.0% of its weight"),
     ):
         if start is hover:
@@ -176,7 +178,9 @@ def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(monke
     for height_m, side_m, travel_m in ((0.02, 0.06, 2e-3), (1.5, 0.06, 3e-3), (0.3, 0.006, 3e-4)):
         with monkeypatch.context() as patch:
             seen = told_by(patch)
-            group_of([at(CUBE, TABLE, (0, 0, 0.031)), at(cube(side_m), TABLE, (0.2, 0.0, height_m + side_m / 2))])
+            group_of(
+                [at(CUBE, TABLE, (0, 0, 0.031), LEANS), at(cube(side_m), TABLE, (0.2, 0.0, height_m + side_m / 2))]
+            )
         told = [(steps.base_hz, pytest.approx(steps.max_travel_m)) for steps, _ in seen]
         assert told == [(PHYSICS.step_hz, travel_m)]
 
@@ -340,7 +344,7 @@ def test_what_finds_no_balance_is_removed_where_what_leaves_is(monkeypatch):
 @pytest.mark.parametrize("push_m_s", [(40.0, 0.0, 0.0), (0.0, 0.0, 10.0)])
 def test_what_was_thrown_is_told_so_and_never_rests_nor_counts_as_lost(push_m_s, pouring, monkeypatch):
     """Whatever throws the second of two, here a push as its fall begins; upwards it comes down on the table again."""
-    starts = together(TABLE, [at(CUBE, TABLE, (0.0, 0.0, 0.031)), at(CUBE, TABLE, (0.2, 0, 0.04))]).starts
+    starts = together(TABLE, [at(CUBE, TABLE, (0.0, 0.0, 0.031), LEANS), at(CUBE, TABLE, (0.2, 0, 0.04))]).starts
     set_velocity = World.set_velocity
 
     def pushed(world, velocity, spin=(0.0, 0.0, 0.0), body=0):

@@ -19,18 +19,10 @@ from tests.kit.shapes import asset_of, box, table
 from workers.geometry.camera import inclination, project, yaw
 from workers.geometry.frames import invert, pose, rotation_about, transform, translation
 from workers.geometry.hull import hull_of
-from workers.physics.support import place_table
+from workers.physics.support import APART_M, columns_apart, place_table
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import is_raycast_scene
-from workers.scene.plan import (
-    APART_M,
-    choose_category,
-    columns_apart,
-    count_objects,
-    draw_scene,
-    frame_cameras,
-    stands_on,
-)
+from workers.scene.plan import choose_category, count_objects, draw_scene, frame_cameras, stands_on
 
 BOX = asset_of(box(0.1, 0.08, 0.2))
 TABLE = table()

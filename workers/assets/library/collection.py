@@ -45,8 +45,8 @@ def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
     """
     name = plain_line(str(folder), 300)
     if not folder.is_dir():
-        what = "is a file: name the folder that it lies in" if folder.exists() else "is not there"
-        raise AssetSourceError(f"{name} {what}")
+        what = "is a file: name the folder that it lies in" if folder.exists() else "there is no such folder"
+        raise AssetSourceError(f"{name}: {what}")
     try:
         empty = not any(folder.iterdir())
     except OSError as error:

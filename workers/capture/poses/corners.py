@@ -102,10 +102,15 @@ class CornerTerm:
         """[K, 2]: how corners move, pixels, where each side of their marker looks longer by a pixel."""
         return outward_motion(self.focal * self.rays, self.square)
 
+    @cached_property
+    def outwards(self) -> Array:
+        """[K, 3]: the same on the board, metres for a metre."""
+        return outward_motion(self.board, self.square)
+
     def rows(self, poses: Array, shared: Shared) -> Rows:
         """Two rows a corner: each mode of a marker over its sigma, as one symmetric matrix, so that a row stays a corner's."""
         R, t = poses[self.view, :3, :3], poses[self.view, :3, 3]
-        outwards = outward_motion(self.board, self.square)
+        outwards = self.outwards
         p = np.einsum("kji,kj->ki", R, shared.print_scale * self.board + shared.growth_m * outwards - t)
         z = np.maximum(p[:, 2], 1e-3)
         at = p[:, :2] / z[:, None]

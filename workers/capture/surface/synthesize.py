@@ -20,7 +20,7 @@ from workers.capture.surface.posed_view import PosedView, project_pixels, sample
 from workers.capture.surface.tsdf import FittedDepth
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
-from workers.geometry.zbuffer import draw_triangles
+from workers.geometry.zbuffer import corner_weights, draw_triangles
 
 Images = tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]
 """(rgb [H, W, 3], depth_m [H, W] float64, mask [H, W] of the object)."""
@@ -94,7 +94,8 @@ def warp(source: Source, camera: Camera, factor: float = 1.0) -> Layer:
     k, inverse = camera.intrinsics, source.fitted.inverse
     pixels, z = _carry(inverse, source.camera, camera)
     triangles = _join(inverse, z)
-    depth, drawn, shares = draw_triangles(pixels, z, triangles, (k.height, k.width), EDGE_SLACK, True)
+    depth, drawn = draw_triangles(pixels, z, triangles, (k.height, k.width), EDGE_SLACK, True)
+    shares = corner_weights(pixels, triangles, drawn)
     weight = source.weight * np.float32(factor)
     painted = _paint(drawn, shares, triangles, pixels, weight, source.rgb, source.mask)
     return Layer(depth.astype(np.float32), *painted)
