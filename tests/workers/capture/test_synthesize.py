@@ -182,12 +182,13 @@ def test_colours_and_depth_follow_a_depth_camera_that_stands_elsewhere():
 
 
 def body(*open_at):
-    """The thing as a mesh, without the upper faces of the box whose middle is within 25 mm of (x, y)."""
+    """The thing as a mesh, without the box's bottom and its upper faces within 25 mm of (x, y) where that is given."""
     ball, box = trimesh.creation.icosphere(5, RADIUS), trimesh.creation.box(bounds=np.stack([LOW, HIGH]))
     box = box.subdivide().subdivide().subdivide().subdivide()
     for place in open_at:
         middle = box.triangles_center
-        box.update_faces((middle[:, 2] < HIGH[2] - 1e-6) | (np.hypot(*(middle[:, :2] - place).T) > 0.025))
+        top, bottom = middle[:, 2] > HIGH[2] - 1e-6, middle[:, 2] < 1e-6
+        box.update_faces(~bottom & ~(top & (np.hypot(*(middle[:, :2] - place).T) < 0.025)))
     mesh = trimesh.util.concatenate([ball.apply_translation(SPHERE), box])
     return Mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int32))
 
