@@ -361,7 +361,15 @@ def _intrinsics(path: Path, info: _Info) -> Intrinsics:
     return Intrinsics(**size, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + 0.5, cy=K[1, 2] + 0.5)
 
 
-FORWARD = "plumb_bob|rational_polynomial|brown conrady|modified brown conrady|inverse brown conrady|none|".split("|")
+FORWARD = [
+    "plumb_bob",
+    "rational_polynomial",
+    "brown conrady",
+    "modified brown conrady",
+    "inverse brown conrady",
+    "none",
+    "",
+]
 """Models whose numbers are OpenCV's. So the SDK uses its inverse model as well, which a D455's colour has: it projects with it
 as with the modified one, whose tangential part differs from OpenCV's by less than 0.1 pixels."""
 
