@@ -252,9 +252,9 @@ class Reconstruction:
 class SynthesizedView:
     """A view from a pose that was not captured.
 
-    rgb [H, W, 3] uint8; depth_m [H, W] float64, 0 where there is nothing; mask [H, W] bool of the object; measured [H, W]
-    bool: pixels that hold a measurement and were not filled; measured_share of the filled pixels; `sources`: numbers of the
-    captured views that were merged.
+    rgb [H, W, 3] uint8; depth_m [H, W] float64, 0 where there is nothing; mask [H, W] bool of the object, also where no view
+    saw it; measured [H, W] bool: pixels that hold a measurement, which were not filled and, of the object, lie on its merged
+    surface; measured_share of those with depth or of the object; `sources`: numbers of the captured views that were merged.
     """
 
     rgb: np.ndarray

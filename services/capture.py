@@ -154,7 +154,9 @@ def simulate(options: argparse.Namespace) -> int:
     assert job.captures is not None
     path, begun = Path(options.out), time.perf_counter()
     from workers.assets.catalogue import open_catalogue
+    from workers.capture.folder import open_folder
     from workers.capture.make_capture import load_object
+    from workers.capture.score import describe_true_grazing
     from workers.capture.simulate.simulate import simulate_capture
     from workers.render.tiers import require_tier
     from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
@@ -172,9 +174,11 @@ def simulate(options: argparse.Namespace) -> int:
         f"{path}: {plural(views, 'view')} of {asset.instance_id} in {seconds:.1f} s; effects: {', '.join(ran) or 'none'}"
     )
     print(f"{path / 'truth'}: poses and the true mesh, which only `verso capture evaluate` reads")
+    if (note := describe_true_grazing(open_folder(path))) is not None:
+        print(f"note: {note}")
     if options.json:
         answer = {"ok": True, "out": str(path), "views": views, "category": asset.category}
-        answer |= {"instance_id": asset.instance_id, "seed": job.seed, "effects": ran, "seconds": seconds}
+        answer |= {"instance_id": asset.instance_id, "seed": job.seed, "effects": ran, "seconds": seconds, "note": note}
         print(json.dumps(answer))
     return 0
 

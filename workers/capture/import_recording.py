@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import shortest_path
 
 from schemas.base import Array
-from schemas.capture import CaptureCamera, CapturedView, DepthCamera, Recorded, RecordedFrame
+from schemas.capture import CapturedView, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
 from schemas.scene.view import Intrinsics
@@ -191,47 +191,52 @@ class Imported:
     """What is missing or was taken for granted, sentences."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """A recording, its colour camera and that camera as camera.json has it; `given` where it is not the recording's own."""
-
-    recording: Recorded
-    camera: CaptureCamera
-    stored: CameraFile
-    given: Path | None = None
-    note: str = ""
-
-
-def _open(path: Path, file: Path | None) -> _Source:
-    """The recording with the camera of a file in camera.json's form, or of such a file beside pictures that have no other.
+def _open(path: Path, file: Path | None) -> tuple[Recorded, CameraFile, list[str]]:
+    """(recording, its camera.json, notes): with the camera of a file, or of such a file beside pictures that have no other.
 
     Raises CaptureError where there is none, or one of pictures of another size.
     """
-    recording = open_any(path)
-    if file is None and recording.color is None:
-        file = path / CAMERA_FILE
-        if not file.is_file():
-            how = f"describe it in a {CAMERA_FILE} (docs/captures.md has its keys) and name that by --camera"
-            raise CaptureError("calibration", f"{path}: {recording.missing}: {how}, or put it into the folder")
-    if file is None:
-        assert recording.color is not None
-        return _Source(recording, recording.color, describe_camera(recording.color))
-    spec = read_camera_file(file)
-    note = ""
+    opened = open_any(path)
+    if file is None and opened.color is not None:
+        return opened, describe_camera(opened.color), []
+    file = file or path / CAMERA_FILE
+    if opened.color is None and not file.is_file():
+        how = f"describe it in a {CAMERA_FILE} (docs/captures.md has its keys) and name that by --camera"
+        raise CaptureError("calibration", f"{path}: {opened.missing}: {how}, or put it into the folder")
+    spec, notes = read_camera_file(file), []
     if "depth_units_per_m" not in spec.model_fields_set:
-        units = recording.units_per_m
+        units = opened.color.depth_units_per_m if opened.color else opened.units_per_m
         spec = spec.model_copy(update={"depth_units_per_m": units})
-        note = f"depth is taken for {units:g} units a metre: {file} can say depth_units_per_m" * bool(
-            recording.with_units
-        )
-    elif recording.with_units:
-        recording = recording.with_units(spec.depth_units_per_m)
-    frames = (frame for frame in recording.frames() if not frame.is_depth)
-    image = next((image for frame in frames if (image := _load(recording, frame, False)) is not None), None)
+        if opened.with_units:
+            notes = [f"depth is taken for {units:g} units a metre: {file} can say depth_units_per_m"]
+    elif opened.with_units:
+        opened = opened.with_units(spec.depth_units_per_m)
+    colors = (frame for frame in opened.frames() if not frame.is_depth)
+    image = next((image for frame in colors if (image := _load(opened, frame, False)) is not None), None)
     if image is not None and image.shape[1::-1] != (spec.width, spec.height):
         size = f"{image.shape[1]} x {image.shape[0]}"
         raise CaptureError("size", f"{path}: its pictures are {size}, and {file} says {spec.width} x {spec.height}")
-    return _Source(recording, camera_of(spec), spec, file, note)
+    told = {**opened.told, "calibration": str(file)}
+    return replace(_with_camera(opened, spec, file), told=told), spec, notes
+
+
+def _with_camera(opened: Recorded, spec: CameraFile, file: Path) -> Recorded:
+    """The recording as a camera.json has it: depth stays where its camera is described, and else is registered as it was."""
+    camera, depth = camera_of(spec), None if spec.depth_camera else opened.depth
+
+    def seen_by(frame: RecordedFrame) -> RecordedFrame:
+        if spec.depth_camera is not None or not isinstance(frame.camera, DepthCamera):
+            return replace(frame, camera=None)
+        k = frame.camera.intrinsics
+        scaled = scaled_camera(camera.intrinsics, (k.width, k.height))
+        return replace(frame, camera=replace(scaled, lens=camera.lens))
+
+    first = next((each for frame in opened.frames() if (each := seen_by(frame)).is_depth), None)
+    registers = depth is not None or (first is not None and first.camera is not None)
+    if registers and (spec.depth == "ray" or is_taken_out(spec)):
+        how = "depth of another camera is registered as z, and with a lens of at most eight numbers: describe depth_camera"
+        raise CaptureError("calibration", f"{file}: {how}")
+    return replace(opened, color=camera, depth=depth, frames=lambda: map(seen_by, opened.frames()))
 
 
 def import_recording(
@@ -243,8 +248,7 @@ def import_recording(
     place. What describes the folder is written last, so that a folder that was left half-made is not taken for a capture.
     Raises CaptureError for a recording that cannot be used.
     """
-    source = _open(path, camera)
-    recording = source.recording
+    recording, stored, notes = _open(path, camera)
     color_us, measures, depth_us, damaged = _measure(recording)
     pairs = pair_frames(color_us, depth_us, recording.period_us, recording.depth_delay_us)
     if not pairs:
@@ -259,14 +263,16 @@ def import_recording(
     made = tuple(
         ImportedView(n, int(color_us[i]), int(depth_us[pairs[i]]), measures[i].sharpness) for n, i in enumerate(chosen)
     )
-    _write_views(source, made, out)
-    calibration = str(source.given or recording.told.get("calibration", "the recording's own calibration"))
-    origin: dict[str, Any] = {"recording": path.name, **recording.told, "calibration": calibration}
+    _write_views(recording, made, out)
+    origin: dict[str, Any] = {
+        "recording": path.name,
+        "calibration": "the recording's own calibration",
+        **recording.told,
+    }
     origin |= {"losses": asdict(losses), "views": [asdict(view) for view in made]}
     (out / RECORDING_FILE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
-    write_description(out, about, source.stored, board)
-    notes = (*describe_losses(losses), *([source.note] if source.note else ()))
-    return Imported(made, len(pairs), losses, calibration, notes)
+    write_description(out, about, stored, board)
+    return Imported(made, len(pairs), losses, origin["calibration"], (*describe_losses(losses), *notes))
 
 
 def _measure(recording: Recorded) -> tuple[Stamps, list[FrameMeasure], Stamps, int]:
@@ -292,37 +298,31 @@ def _load(recording: Recorded, frame: RecordedFrame, small: bool) -> NDArray | N
         return frame.load(small)
 
 
-def _write_views(source: _Source, views: tuple[ImportedView, ...], out: Path) -> None:
+def _write_views(recording: Recorded, views: tuple[ImportedView, ...], out: Path) -> None:
     """Reads the recording again and writes the chosen frames; a view is written as soon as both its frames are there."""
     color = {view.color_us: [view] for view in views}
     depth: dict[int, list[ImportedView]] = {}
     for view in views:
         depth.setdefault(view.depth_us, []).append(view)
     half: dict[int, RecordedFrame] = {}
-    for frame in source.recording.frames():
+    for frame in recording.frames():
         for view in (depth if frame.is_depth else color).get(frame.stamp_us, []):
             other = half.setdefault(view.number, frame)
             if other.is_depth != frame.is_depth:
                 pair = (other, frame) if frame.is_depth else (frame, other)
-                write_view(out, _view(source, view.number, *pair))
+                write_view(out, _view(recording, view.number, *pair))
                 del half[view.number]
 
 
-def _view(source: _Source, number: int, color: RecordedFrame, depth: RecordedFrame) -> CapturedView:
-    """Both images in the colour camera; depth as it is where camera.json describes its camera."""
-    recording, common = source.recording, source.camera
+def _view(recording: Recorded, number: int, color: RecordedFrame, depth: RecordedFrame) -> CapturedView:
+    """Both images in the recording's colour camera."""
     rgb, depth_m = _load(recording, color, False), _load(recording, depth, False)
     if rgb is None or depth_m is None:
         raise CaptureError("unreadable", f"{recording.path}: the colour frame of view {number} cannot be decoded")
-    k = color.camera if isinstance(color.camera, Intrinsics) and source.given is None else common.intrinsics
+    common = recording.color
+    assert common is not None
+    k = color.camera if isinstance(color.camera, Intrinsics) else common.intrinsics
     camera = depth.camera if isinstance(depth.camera, DepthCamera) else recording.depth
-    if source.stored.depth_camera is not None:
-        return CapturedView(number, rgb, stored_depth(depth_m, common), None)
-    if camera is not None and source.given is not None and (common.depth == "ray" or is_taken_out(source.stored)):
-        how = "depth of another camera is registered as z, and with a lens of at most eight numbers: describe depth_camera"
-        raise CaptureError("calibration", f"{source.given}: {how}")
-    if source.given is not None and isinstance(depth.camera, DepthCamera):
-        camera = replace(scaled_camera(k, depth_m.shape[::-1]), lens=common.lens)
     if camera is None:
         depth_m = change_camera(depth_m, k, common.intrinsics, between=False)
     else:

@@ -1,6 +1,7 @@
 """Views as pinholes see them, from elsewhere too, against exact ones; and the measures of what is off."""
 
 import functools
+import re
 
 import cv2
 import numpy as np
@@ -17,9 +18,9 @@ from tests.workers.capture.analytic_capture import HIGH, LOW, RADIUS, SPHERE, Th
 from workers.capture.score import (
     align_mesh,
     measured_points,
-    sample_surface,
     score_surface,
 )
+from workers.capture.surface.coverage import describe_grazing, sample_surface
 from workers.capture.surface.posed_view import (
     UNSEEN,
     PosedView,
@@ -323,6 +324,32 @@ def test_samples_are_even_over_the_area_and_surface_errors_are_the_distances_tha
     assert errors.surface_median_mm == pytest.approx(0.0, abs=1e-6) and errors.completeness > 0.97
     seen = visible_points(MESH, samples, normals, [ABOVE]).mean()
     assert errors.visible_share == pytest.approx(seen, abs=0.01) and 0.3 < seen < 0.7
+
+
+def ring(elevation_deg, turns_deg):
+    """Distant cameras about the origin at an elevation and angles about the vertical, by number."""
+    wide, found = Intrinsics(width=200, height=200, fx=900.0, fy=900.0, cx=100.0, cy=100.0), {}
+    for number, turn in enumerate(np.radians(turns_deg)):
+        e = np.radians(elevation_deg)
+        position = 5.0 * np.array([np.cos(e) * np.cos(turn), np.cos(e) * np.sin(turn), np.sin(e)])
+        found[number] = Camera(wide, frozen_array(look_at(position, np.zeros(3))))
+    return found
+
+
+def test_what_is_seen_only_at_grazing_angles_is_a_share_and_a_place_from_where_it_is_seen_well():
+    made = trimesh.creation.icosphere(4, 0.1)
+    ball, all_around = Mesh(np.array(made.vertices), np.array(made.faces, np.int32)), np.arange(0, 360, 10)
+    note = describe_grazing(ball, ring(50.0, all_around))
+    # A belt of a sphere has an area as its height: seen down to 40 degrees below the middle, at 70 down to 20 below.
+    share = (np.sin(np.radians(40)) - np.sin(np.radians(20))) / (1 + np.sin(np.radians(40)))
+    assert abs(int(note.split("%")[0]) - 100 * share) < 2 and "about 10 degrees above the board all around" in note
+    lower = {number + 36: camera for number, camera in ring(10.0, all_around).items()}
+    assert describe_grazing(ball, {**ring(50.0, all_around), **lower}) is None
+    views = ring(45.0, [92, 100, 180, 268, 20])  # the box's face towards +x is seen by the last alone
+    assert describe_grazing(MESH, views) is None
+    views[4] = ring(45.0, [72])[0]  # 77 degrees from that face's normal
+    told = describe_grazing(MESH, views)
+    assert re.search("about (10|25|40) degrees above the board on the side of view 4", told)
 
 
 def test_points_are_measured_where_a_pixel_has_their_depth():

@@ -369,8 +369,14 @@ def test_the_camera_of_a_file_takes_the_place_of_what_any_recording_says(kind, t
 def test_depth_of_a_phone_is_seen_by_the_camera_of_the_file(kind, tmp_path):
     """The recording's own numbers in a file give what the recording gives."""
     path = WRITTEN[kind](tmp_path / "from" if kind != "record3d" else tmp_path)
-    given = imported(path, tmp_path / "a", fx=FX + 1, fy=FY + 1, pixel_centre="0.5")[1]
-    assert np.array_equal(read_view(given, 1).depth, read_view(imported(path, tmp_path / "b")[1], 1).depth)
+    keys, expected = (
+        {"fx": FX + 1, "fy": FY + 1, "pixel_centre": "0.5"},
+        read_view(imported(path, tmp_path / "a")[1], 1),
+    )
+    assert np.array_equal(read_view(imported(path, tmp_path / "b", **keys)[1], 1).depth, expected.depth)
+    small = {"width": DW, "height": DH, "fx": (FX + 1) / 4, "fy": (FY + 1) / 4, "cx": CX / 4, "cy": CY / 4}
+    described = imported(path, tmp_path / "c", **keys, depth_camera={**small, "T_color_depth": np.eye(4).tolist()})[1]
+    assert np.abs(read_view(described, 1).depth.astype(int) - expected.depth).max() <= 1  # rounded before, not after
 
 
 def test_a_folder_without_a_camera_asks_for_one_and_takes_no_one_elses(tmp_path):
@@ -414,9 +420,6 @@ def test_folders_of_other_names_and_grey_pictures_are_read(tmp_path):
     with pytest.raises(CaptureError, match="is of 32 x 48, its images are 64 x 48: describe it in"):
         imported(path, tmp_path / "wrong")
     assert imported(path, tmp_path / "right", fx=66.0)[1].camera.intrinsics.fx == 66.0
-    path = write_arkit(tmp_path / "a")
-    put(next(path.glob("*/*.pincam")), f"32 48 {FX} {FY} {CX} {CY}")
-    refused(path, "of 32 x 48, and the image is 64 x 48")
     path = write_bop(tmp_path / "b")
     for file in sorted(path.glob("*/*.png")):
         folder, pixels = file.parent.name, cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
@@ -558,6 +561,12 @@ def test_a_drivers_bag_needs_depth_registered_to_colour(tmp_path):
     assert np.array_equal(color[1].load(False), SMOOTH[1]) and depth[1].load(False) == pytest.approx(DEPTH_MM[1] / 1000)
     with pytest.raises(CaptureError, match="record the topic aligned_depth_to_color"):
         open_any(write_bag(tmp_path, published("depth")))
+    bare = write_bag(
+        tmp_path, [said for said in published("aligned_depth_to_color") if "color/camera_info" not in said[0]]
+    )
+    with pytest.raises(CaptureError, match="no camera_info for /camera/color/image_raw: describe it in a camera"):
+        imported(bare, tmp_path / "no")
+    assert np.array_equal(read_view(imported(bare, tmp_path / "given", fx=70.0)[1], 2).rgb, SMOOTH[2])
 
 
 # ---------------------------------------------------------------------------------------------- what is refused

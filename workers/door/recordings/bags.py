@@ -307,8 +307,8 @@ def open_bag(path: Path) -> Recorded:
                 is_depth = message.topic == contents.depth.topic
                 yield RecordedFrame(is_depth, message.stamp_us, partial(_load, message, is_depth, contents))
 
-    told = {"topic": contents.color.topic}
-    return Recorded(path, color, depth, max(period, 1.0), frames, float(stamps[-1]), told=told)
+    clock, topic = (max(period, 1.0), frames, float(stamps[-1])), contents.color.topic
+    return Recorded(path, color, depth, *clock, told={"topic": topic}, missing=f"it has no camera_info for {topic}")
 
 
 def _base(topic: str) -> str:
@@ -331,16 +331,17 @@ def _check(path: Path, contents: _Contents) -> None:
         if stream.encoding not in usable:
             wanted = f"not one of {', '.join(usable)}: record it as one of those"
             raise CaptureError("format", f"{path}: {name} is {stream.encoding!r:.60}, {wanted}")
-        if stream.info is None:
+        if stream.info is None and not contents.depth.is_registered:
             raise CaptureError("calibration", f"{path} has no camera_info for {stream.topic}: record it as well")
 
 
-def _cameras(path: Path, contents: _Contents) -> tuple[CaptureCamera, DepthCamera | None]:
+def _cameras(path: Path, contents: _Contents) -> tuple[CaptureCamera | None, DepthCamera | None]:
     color, depth = contents.color, contents.depth
-    assert color.info is not None and depth.info is not None
+    if color.info is None:
+        return None, None
     units_per_m = contents.units_per_m if contents.units_per_m <= 10_000 else 1000.0
     camera = CaptureCamera(_intrinsics(path, color.info), _lens(path, color.info), units_per_m)
-    if depth.is_registered:
+    if depth.is_registered or depth.info is None:
         return camera, None
     if color.T_stream_ref is None or depth.T_stream_ref is None or color.reference != depth.reference:
         raise CaptureError(
@@ -360,17 +361,15 @@ def _intrinsics(path: Path, info: _Info) -> Intrinsics:
     return Intrinsics(**size, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + 0.5, cy=K[1, 2] + 0.5)
 
 
-FORWARD = (
-    *("plumb_bob", "rational_polynomial", "brown conrady", "modified brown conrady", "inverse brown conrady"),
-    *("none", ""),
-)
-"""Models whose numbers are OpenCV's. So the SDK uses its inverse model as well, which a D455's colour has: it projects with it
-as with the modified one, whose tangential part differs from OpenCV's by less than 0.1 pixels."""
+FORWARD = ("plumb_bob", "rational_polynomial", "brown conrady", "none", "")
+"""Models whose numbers are OpenCV's; the SDK's modified and inverse one, which a D455's colour has, differ by 0.03 pixels there:
+its rs2_project_point_to_pixel uses both forwards."""
 
 
 def _lens(path: Path, info: _Info) -> Array:
     """[8]; raises CaptureError for a lens of another kind whose numbers are not all 0."""
-    if not np.isfinite(info.D).all() or (np.any(info.D) and (info.model.lower() not in FORWARD or len(info.D) > 8)):
+    model = info.model.lower().removeprefix("modified ").removeprefix("inverse ")
+    if not np.isfinite(info.D).all() or (np.any(info.D) and (model not in FORWARD or len(info.D) > 8)):
         told = f"the lens {info.model!r:.60} with {info.D[:16].tolist()} is not read: export frames"
         raise CaptureError("calibration", f"{path}: {told}")
     return frozen_array(np.append(info.D[:8], np.zeros(8))[:8])
@@ -383,9 +382,9 @@ def _load(message: _Message, is_depth: bool, contents: _Contents, small: bool) -
     with suppress(CaptureError), as_refusal(message.topic, CaptureError):
         image = message.content()
         pixels = _pixels(image)
-    if image is None or pixels is None or stream.info is None:
+    if image is None or pixels is None or image.encoding != stream.encoding:
         return None
-    if image.encoding != stream.encoding or pixels.shape[1::-1] != stream.info.size:
+    if stream.info is not None and pixels.shape[1::-1] != stream.info.size:
         return None
     if is_depth:
         scale = contents.units_per_m if image.encoding != "32FC1" else 1.0

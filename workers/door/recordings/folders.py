@@ -62,13 +62,9 @@ def _size_of(path: Path) -> Size:
         return head_size(_bytes_of(path))
 
 
-def _intrinsics(
-    path: Path, size: Size, numbers: Iterable[Any], centre: float, stated: Iterable[Any] | None = None
-) -> Intrinsics:
-    """Of fx, fy, cx, cy, whose first pixel's centre is at `centre`, of images of the `stated` size. Raises CaptureError."""
+def _intrinsics(path: Path, size: Size, numbers: Iterable[Any], centre: float) -> Intrinsics:
+    """Of fx, fy, cx, cy, whose first pixel's centre is at `centre`. Raises CaptureError."""
     with as_refusal(f"{path}: its intrinsics", CaptureError):
-        if stated is not None and (of := tuple(int(side) for side in stated)) != size:
-            raise ValueError(f"of {of[0]} x {of[1]}, and the image is {size[0]} x {size[1]}")
         fx, fy, cx, cy = (float(x) for x in numbers)
         if not np.isfinite([fx, fy, cx, cy]).all() or min(fx, fy) <= 0 or max(abs(cx), abs(cy)) > 1e6:
             raise ValueError(f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}")
@@ -346,8 +342,7 @@ def _open_polycam(path: Path) -> Recorded:
         if not described.stem.isdecimal() or not isinstance(tree, dict) or not {"fx", "fy", "cx", "cy"} <= set(tree):
             raise _wrong(described, "must be named by its time and have fx, fy, cx and cy")
         color, depth = root / "images" / f"{described.stem}.jpg", root / "depth" / f"{described.stem}.png"
-        stated = [tree[name] for name in ("width", "height") if name in tree] or None
-        k = _intrinsics(described, _size_of(color), (tree[name] for name in ("fx", "fy", "cx", "cy")), 0.5, stated)
+        k = _intrinsics(described, _size_of(color), (tree[name] for name in ("fx", "fy", "cx", "cy")), 0.5)
         frames.append(_color(int(described.stem), _reader(color), k))
         if depth.is_file():
             seen = _depth(int(described.stem), _reader(depth), k, 1000.0, _size_of(depth))
@@ -372,7 +367,7 @@ def _open_arkit(path: Path) -> Recorded:
         if camera is None:
             raise CaptureError("missing", f"{described} has no camera for {file.name}")
         numbers = _bytes_of(camera).decode("utf-8", "replace").split()
-        k = _intrinsics(camera, _size_of(file), numbers[2:], 0.5, numbers[:2])
+        k = _intrinsics(camera, _size_of(file), numbers[2:], 0.5)
         frames.append(_color(1000 * at, _reader(file), k))
         if (seen := depth / file.name).is_file():
             image = _depth(1000 * at, _reader(seen), k, 1000.0, _size_of(seen))
