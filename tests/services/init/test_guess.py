@@ -92,6 +92,12 @@ UNITS = (
         {1.0: 4, 0.001: 3},
         "millimetres",
     ),  # 58.8 alone might be centimetres
+    (cubes(1.0, 1.6, 0.9, 4.4, 5.2, 2.6, 2.2, 389.0, 638.0), {1.0: 7, 0.001: 2}, "millimetres, 51.3 cm"),
+    (
+        cubes(20.0, 15.0, 30.0, 12.0, 25.0, 0.25, 2500.0),
+        {0.01: 5, 1.0: 1, 0.001: 1},
+        "metres, 25 cm",
+    ),  # apart, each its own
     (cubes(250.0, 90.0, 4.0), {0.001: 3}, "millimetres"),  # a screw among millimetres is small
     # A remark in the file.
     ([item("a.obj", (8.0, 8.0, 12.0), unit_m=0.0254)], {0.0254: 1}, "inches, as the files say"),
