@@ -7,7 +7,7 @@ import trimesh
 
 from schemas.job.assets import is_usable
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.library.categories import name_categories
+from workers.assets.library.categories import find_joined, name_categories
 from workers.assets.library.collection import SUFFIXES
 from workers.assets.library.copies import Item, find_copies, find_doubles
 from workers.assets.library.guess import guess_groups, guess_ups
@@ -50,6 +50,12 @@ def test_categories_follow_from_where_files_lie_and_what_they_and_their_folders_
     for source, categories in CATEGORIES:
         assert name_categories(categories, source) == categories
         assert all(is_usable(name) for name in categories.values())
+
+
+def test_different_names_that_become_one_are_told():
+    paths = ["a: b/x.obj", "a: b/y.obj", "a #b/x.obj", "a #b/y.obj", "c/x.obj", "c/y.obj"]
+    assert set(name_categories(paths, None).values()) == {"a-b", "c"}
+    assert find_joined(paths, None) == {"a-b": "category a-b is of 'a #b', 'a: b'"}
 
 
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure", **more):

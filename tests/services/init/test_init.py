@@ -211,11 +211,20 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
     # The system is asked through `os`, because root may read everything.
     monkeypatch.setattr(collection.os, "access", lambda path, how: "locked" not in str(path))
     write(tmp_path / "in/a/robot.xml", "<!-- x --><mujoco/>")
-    for name, text in (("package.xml", "<package/>"), ("a/r.urdf.xacro", ""), ("a/all.tar.gz", ""), ("a/scan.FBX", "")):
+    for name, text in (
+        ("package.xml", "<package/>"),
+        ("a/r.urdf.xacro", ""),
+        ("a/all.tar.gz", ""),
+        ("a/scan.FBX", ""),
+        ("a/b.vrm", ""),
+    ):
         write(tmp_path / "in" / name, text)
     paths, left_out = walk_folder(tmp_path / "in")
     told = {one.path: one.why for one in left_out if one.reason == "format"}
-    assert set(told) == {"a/r.urdf.xacro", "a/all.tar.gz", "a/scan.FBX"} and "`xacro FILE" in told["a/r.urdf.xacro"]
+    assert (
+        set(told) == {"a/r.urdf.xacro", "a/all.tar.gz", "a/scan.FBX", "a/b.vrm"}
+        and "`xacro FILE" in told["a/r.urdf.xacro"]
+    )
     left_out = [one for one in left_out if one.path not in told]
     assert paths == ["a/b/c.GLB", "a/robot.xml", "a/x.urdf", "b.obj"]
     reasons = {"bad\\nname.obj": "name", "bad\\udcff.obj": "name", "dead.obj": "missing", "link.obj": "link"}
