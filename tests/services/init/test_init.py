@@ -199,6 +199,29 @@ def test_scanned_meshes_offer_their_urdfs_and_a_bottle_that_lies_is_stood_up(tmp
     assert "plain base colour used" in str(objects["mug"]["mended"]) and objects["blue_cup"]["pictures"] == 1
 
 
+CASES = {
+    "palette_twins": lambda rows: len(rows) == 2 and {row["pictures"] for row in rows} == {1},
+    "sdf_two_versions": lambda rows: [row["path"] for row in rows] == ["model.sdf"],
+    "sdf_ogre_script": lambda rows: rows[0]["pictures"] == 1,
+    "unit_of_second_group": lambda rows: (
+        {row["path"]: row["unit"] for row in rows if row["path"] > "b"}
+        == {"b0.obj": 0.001, "b1.obj": 0.001, "bunny.obj": 1.0}
+    ),
+    "dae_latin1": lambda rows: rows[0]["extents_m"] == pytest.approx([0.1, 0.16, 0.24]),
+    "obj_mtl_bom": lambda rows: [row["pictures"] for row in rows] == [1, 1],
+}
+"""What is right of folders in `../shared/data/mesh_cases`."""
+
+
+@pytest.mark.minute
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", CASES)
+def test_folders_that_were_read_wrong_are_read_right(tmp_path, capsys, name):
+    folder = ROOT.parent / "shared/data/mesh_cases" / name
+    code, told, _ = init(folder, "--out", tmp_path / "lib", "--json", capsys=capsys)
+    assert code == 0 and CASES[name](json.loads(told.splitlines()[-1])["objects"]), told
+
+
 # ------------------------------------------------------------------------------------------------ what is found and shown
 
 
