@@ -83,8 +83,8 @@ class DepthCamera(Frozen):
     """Translation in the RGB camera's optical axes."""
 
 
-MIRROR_FIT = 1.3
-"""T_z by d_z where it is `fit`: what is a quarter of its distance wide has its front at 0.87 of it, and its back as far away."""
+MIRROR_FIT = 1.5
+"""T_z by d_z where it is `fit`: what is beyond the pivot lies lower in the mirror view, and tall things are still seen whole."""
 
 
 class Mirror(Frozen):
@@ -93,8 +93,8 @@ class Mirror(Frozen):
     enabled: bool = True
     """Whether there are mirror views; without them camPoses.csv has one row a pair, with an even id."""
     T_z_m: Behind = 1.3
-    """Distance of the mirror camera from its pivot, the point it looks at. `fit`: 1.3 d_z, from where a framed object looks about
-    as large."""
+    """Distance of the mirror camera from its pivot, the point it looks at. `fit`: 1.5 d_z, from where a framed object looks
+    a little smaller."""
     percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
     """d_z, the distance to the object's front surface, is this percentile of the object's stored input depth; 0: the nearest."""
 

@@ -25,7 +25,7 @@ from services.read.independent.derive import (
 )
 from services.read.independent.targets import check_targets
 
-FIT, FIT_SLACK, MIRROR_FIT = 0.06, 1.05, 1.3
+FIT, FIT_SLACK, MIRROR_FIT = 0.06, 1.05, 1.5
 """What `fit` stands for: the share of the picture that objects cover, at most but for the last step of the search; T_z by d_z."""
 
 BOARD_M = 0.05

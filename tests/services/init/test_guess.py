@@ -7,7 +7,7 @@ import trimesh
 
 from schemas.job.assets import is_usable
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.library.categories import name_categories
+from workers.assets.library.categories import find_joined, name_categories
 from workers.assets.library.collection import SUFFIXES
 from workers.assets.library.copies import Item, find_copies, find_doubles
 from workers.assets.library.guess import guess_groups, guess_ups
@@ -52,6 +52,12 @@ def test_categories_follow_from_where_files_lie_and_what_they_and_their_folders_
         assert all(is_usable(name) for name in categories.values())
 
 
+def test_different_names_that_become_one_are_told():
+    paths = ["a: b/x.obj", "a: b/y.obj", "a #b/x.obj", "a #b/y.obj", "c/x.obj", "c/y.obj"]
+    assert set(name_categories(paths, None).values()) == {"a-b", "c"}
+    assert find_joined(paths, None) == {"a-b": "category a-b is of 'a #b', 'a: b'"}
+
+
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure", **more):
     return Item(path, Measured(extents, 8, 12, True, 0, (), up, confidence if up else None, **more), path)
 
@@ -92,6 +98,12 @@ UNITS = (
         {1.0: 4, 0.001: 3},
         "millimetres",
     ),  # 58.8 alone might be centimetres
+    (cubes(1.0, 1.6, 0.9, 4.4, 5.2, 2.6, 2.2, 389.0, 638.0), {1.0: 7, 0.001: 2}, "millimetres, 51.3 cm"),
+    (
+        cubes(20.0, 15.0, 30.0, 12.0, 25.0, 0.25, 2500.0),
+        {0.01: 5, 1.0: 1, 0.001: 1},
+        "metres, 25 cm",
+    ),  # apart, each its own
     (cubes(250.0, 90.0, 4.0), {0.001: 3}, "millimetres"),  # a screw among millimetres is small
     # A remark in the file.
     ([item("a.obj", (8.0, 8.0, 12.0), unit_m=0.0254)], {0.0254: 1}, "inches, as the files say"),

@@ -199,6 +199,29 @@ def test_scanned_meshes_offer_their_urdfs_and_a_bottle_that_lies_is_stood_up(tmp
     assert "plain base colour used" in str(objects["mug"]["mended"]) and objects["blue_cup"]["pictures"] == 1
 
 
+CASES = {
+    "palette_twins": lambda rows: len(rows) == 2 and {row["pictures"] for row in rows} == {1},
+    "sdf_two_versions": lambda rows: [row["path"] for row in rows] == ["model.sdf"],
+    "sdf_ogre_script": lambda rows: rows[0]["pictures"] == 1,
+    "unit_of_second_group": lambda rows: (
+        {row["path"]: row["unit"] for row in rows if row["path"] > "b"}
+        == {"b0.obj": 0.001, "b1.obj": 0.001, "bunny.obj": 1.0}
+    ),
+    "dae_latin1": lambda rows: rows[0]["extents_m"] == pytest.approx([0.1, 0.16, 0.24]),
+    "obj_mtl_bom": lambda rows: [row["pictures"] for row in rows] == [1, 1],
+}
+"""What is right of folders in `../shared/data/mesh_cases`."""
+
+
+@pytest.mark.minute
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", CASES)
+def test_folders_that_were_read_wrong_are_read_right(tmp_path, capsys, name):
+    folder = ROOT.parent / "shared/data/mesh_cases" / name
+    code, told, _ = init(folder, "--out", tmp_path / "lib", "--json", capsys=capsys)
+    assert code == 0 and CASES[name](json.loads(told.splitlines()[-1])["objects"]), told
+
+
 # ------------------------------------------------------------------------------------------------ what is found and shown
 
 
@@ -211,11 +234,20 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
     # The system is asked through `os`, because root may read everything.
     monkeypatch.setattr(collection.os, "access", lambda path, how: "locked" not in str(path))
     write(tmp_path / "in/a/robot.xml", "<!-- x --><mujoco/>")
-    for name, text in (("package.xml", "<package/>"), ("a/r.urdf.xacro", ""), ("a/all.tar.gz", ""), ("a/scan.FBX", "")):
+    for name, text in (
+        ("package.xml", "<package/>"),
+        ("a/r.urdf.xacro", ""),
+        ("a/all.tar.gz", ""),
+        ("a/scan.FBX", ""),
+        ("a/b.vrm", ""),
+    ):
         write(tmp_path / "in" / name, text)
     paths, left_out = walk_folder(tmp_path / "in")
     told = {one.path: one.why for one in left_out if one.reason == "format"}
-    assert set(told) == {"a/r.urdf.xacro", "a/all.tar.gz", "a/scan.FBX"} and "`xacro FILE" in told["a/r.urdf.xacro"]
+    assert (
+        set(told) == {"a/r.urdf.xacro", "a/all.tar.gz", "a/scan.FBX", "a/b.vrm"}
+        and "`xacro FILE" in told["a/r.urdf.xacro"]
+    )
     left_out = [one for one in left_out if one.path not in told]
     assert paths == ["a/b/c.GLB", "a/robot.xml", "a/x.urdf", "b.obj"]
     reasons = {"bad\\nname.obj": "name", "bad\\udcff.obj": "name", "dead.obj": "missing", "link.obj": "link"}

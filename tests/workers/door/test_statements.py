@@ -282,6 +282,13 @@ INPUTS = '<input semantic="VERTEX" source="#v" offset="0"/><input semantic="TEXC
 RING = [f"{c} {k}" for side in SIDES for k, c in enumerate(side)]
 
 
+def wrong_count(count, cut=0):
+    """The cube as a binary STL whose head tells another count, and that misses its last bytes."""
+    (data,) = stl().values()
+    data = data[:80] + struct.pack("<I", count) + data[84:]
+    return {"a.stl": data[: len(data) - cut]}
+
+
 def part(kind, *orders, more=""):
     """A primitive of the six sides, each once for every order of its corners."""
     runs = [" ".join(RING[4 * k + i] for i in order) for k in range(6) for order in orders]
@@ -427,7 +434,7 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "black Kd": (obj("Kd 0 0 0\nmap_Kd t.png\n"), Right(note="grey Kd")),
     "grey Kd": (obj("Kd 0.588 0.588 0.588\nmap_Kd t.png\n"), Right(note="a grey Kd of 0.588")),
     "red Kd": (obj("Kd 1 0 0\nmap_Kd t.png\n"), Right(((200, 0, 0),))),
-    "no material file": (obj(first="", use=""), Right((GREY,))),
+    "no material file": (obj(first="", use=""), Right((GREY,), note="t.png beside it was not used")),
     "a material file that is missing": (
         obj(first="mtllib n.mtl", files={"a.mtl": b""}),
         Right((GREY,), note="a.mtl was read"),
@@ -618,6 +625,17 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "off in binary": (off("OFF BINARY"), "three dimensions"),
     "stl": (stl(), Right((GREY,))),
     "stl with bytes behind": (stl(b"\0\0"), Right((GREY,))),
+    "stl with a count too small": (wrong_count(7), Right((GREY,), note="its head tells 7 faces, and 12 are there")),
+    "stl with a count too large": (
+        wrong_count(4711),
+        Right((GREY,), note="its head tells 4711 faces, and 12 are there"),
+    ),
+    "stl without a count": (wrong_count(0), Right((GREY,), note="its head tells 0 faces, and 12 are there")),
+    "stl that ends early": (wrong_count(12, cut=20), "ends early: 11 of 12 faces are there"),
+    "clear vertices": (
+        ply(f"{RGB}property uchar alpha\n", row=lambda k, c: "220 30 30 0"),
+        Right((RED,), note="an alpha of 0 of vertices"),
+    ),
     "stl with a colour in its head": (stl(colour=b"COLOR=\xff\0\0\xff"), Right((GREY,))),
 }
 

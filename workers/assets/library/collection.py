@@ -30,6 +30,10 @@ _REMEDIES = {
     "export it as .glb by the program that wrote it": ".max .mb .ma .c4d .skp",
     "export it as .stl by a CAD program": ".step .stp .iges .igs .fcstd .sldprt",
     "it has points and no faces, so make a mesh of it": ".pcd .las .laz .xyz .e57 .splat .spz",
+    "run `draco_decoder -i FILE -o FILE.ply`": ".drc",
+    "run `ctmconv FILE FILE.ply`": ".ctm",
+    "it is a GLB, so copy it under a name that ends in .glb": ".vrm",
+    "arrays say not which are a mesh, so write it as .ply": ".npz",
     "unpack it": ".zip .tar .gz .tgz .bz2 .xz .7z .rar",
     "run `xacro FILE > FILE.urdf`": ".xacro",
 }

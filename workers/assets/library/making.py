@@ -20,7 +20,7 @@ from pathlib import Path
 from schemas.environment import cache_folder
 from schemas.errors import AssetSourceError, InUseError, OutputError, plain_line
 from schemas.job.assets import BUILT_IN, TABLE, MeshLimits, UpAxis
-from workers.assets.library.categories import name_categories
+from workers.assets.library.categories import find_joined, name_categories
 from workers.assets.library.collection import (
     SUFFIXES,
     Survey,
@@ -298,7 +298,7 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
     of = {path: group for group in guess_groups(different) for path in group.paths}
     ups = guess_ups(different)
     objects = [survey.path for survey in known if survey.path not in doubles]
-    categories = name_categories(objects, making.category_from)
+    categories, joined = name_categories(objects, making.category_from), find_joined(objects, making.category_from)
     by_path, rows = {item.path: item for item in items}, []
     for survey in known:
         row = Row(path=survey.path, files=survey.files, sha256=survey.files[0].sha256 if survey.files else "")
@@ -312,6 +312,8 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
         item = by_path[survey.path]
         unit, (up, why) = making.unit_of(item.path) or of[item.path].unit(item), ups[item.path]
         row = _measured(replace(row, unit=unit, up=making.up or up), survey, why, of[item.path].why)
+        if row.category in joined:
+            row = replace(row, why=f"{row.why}; {joined[row.category]}")
         rows.append(_sized(row, item))
     return rows
 

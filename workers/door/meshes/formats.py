@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
@@ -75,9 +78,24 @@ def load_shape(path: Path, limits: MeshLimits, root: Path | None = None, budget:
     check_counts(path, sum(len(m.vertices) for m in meshes), sum(len(m.faces) for m in meshes), limits)
     if not meshes:
         raise MeshError("no_faces", f"{path} has no triangles")
-    shape, mended = clean_shape(path, [place_mesh(path, mesh) for mesh in meshes])
+    shape, mended = clean_shape(path, [place_mesh(path, _opaque(mesh, resolver.notes)) for mesh in meshes])
     parts = tuple(with_jpeg(part, resolver) for part in shape.parts)
     return LoadedMesh(replace(shape, parts=parts), tuple(dict.fromkeys([*resolver.notes, *mended])))
+
+
+def _opaque(mesh: RawMesh, notes: list[str]) -> RawMesh:
+    """The mesh with colours of vertices or faces whose alpha of 0 is 1: some exporters leave it out, and none is drawn."""
+    colors, face_colors = (_filled(values) for values in (mesh.visual.colors, mesh.visual.face_colors))
+    if colors is mesh.visual.colors and face_colors is mesh.visual.face_colors:
+        return mesh
+    notes.append("an alpha of 0 of vertices or faces was read as 1")
+    return replace(mesh, visual=replace(mesh.visual, colors=colors, face_colors=face_colors))
+
+
+def _filled(colors: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+    if colors is None or colors[:, 3].all():
+        return colors
+    return np.where((colors[:, 3:] == 0) & (np.arange(4) == 3), np.uint8(255), colors)
 
 
 def with_jpeg(part: Part, resolver: FolderResolver) -> Part:

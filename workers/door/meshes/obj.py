@@ -84,6 +84,10 @@ def read_obj(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     points, colors = lines.points(resolver)
     uv, normals = lines.columns("vt", 2), lines.columns("vn", 3)
     materials = _read_libraries(path, lines.libraries, resolver)
+    if not lines.libraries and len(uv) and (picture := resolver.picture_beside()) is not None:
+        resolver.notes.append(
+            f"no material file is named: {picture} beside it was not used; write `mtllib` and an .mtl"
+        )
     by_material: dict[str | None, list[_Run]] = {}
     for run in lines.runs:
         if run.faces:
