@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 import shutil
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from services.cli.environment import host_place
 from services.job.job_file import load_job, pack_job
 from services.job.record import read_job, require_dataset, require_job
 from services.read.verdict import explain_damage
-from services.run.progress import ProgressLine
+from services.run.progress import ProgressLine, finish
 from workers.store.local import open_store
 from workers.store.store import Store
 
@@ -95,13 +94,6 @@ def tell_result(out: str, job: Job, result: "RunResult") -> tuple[bool, dict[str
         asks = command_line("query", out, "select reason, count(*) from failures group by reason")
         print(f"verso: {why}: `{asks}` says why", file=sys.stderr)
     return complete, {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
-
-
-def finish(options: argparse.Namespace, ok: bool, /, **answer: Any) -> int:
-    """The exit code of a command; prints what `--json` asks for: one object in the last line."""
-    if options.json:
-        print(json.dumps({"ok": ok, **answer}))
-    return 0 if ok else 1
 
 
 def pack(options: argparse.Namespace) -> int:

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 from schemas.errors import InputError, MachineError, RunError, command_line, plural
 from schemas.queue import JobRequest
 from services.cli import rows
-from services.cli.commands import finish, tell_result
+from services.cli.commands import tell_result
 from services.cli.environment import default_queue
 from services.job.job_file import load_job, name_of, read_text, refuse_folders
 from services.queue.queue import Queue, make_queue, new_id, open_queue
+from services.run.progress import finish
 
 if TYPE_CHECKING:
     from services.queue.drivers import Ending

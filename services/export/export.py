@@ -1,7 +1,6 @@
 """`verso export`: a dataset in another layout, scene by scene in constant memory, gone on with after a kill."""
 
 import argparse
-import json
 import sys
 import time
 from collections import Counter
@@ -23,7 +22,7 @@ from services.job.record import JobRecord, read_success, require_dataset, requir
 from services.read.dataset_reader import read_stored
 from services.read.query import query
 from services.read.verdict import explain_damage
-from services.run.progress import ProgressLine
+from services.run.progress import ProgressLine, finish
 from workers.store.commit import list_codes
 from workers.store.local import open_store
 
@@ -195,7 +194,8 @@ def main(options: argparse.Namespace) -> int:
 
         result = export(request, report)
     _print_result(options, result, time.monotonic() - begun)
-    return 0 if result.manifest["pairs"] else 1
+    pairs = result.manifest["pairs"] > 0
+    return finish(options, pairs, dir=options.dir, pairs_now=result.pairs_now, **result.manifest)
 
 
 def _print_result(options: argparse.Namespace, result: ExportResult, seconds: float) -> None:
@@ -212,6 +212,3 @@ def _print_result(options: argparse.Namespace, result: ExportResult, seconds: fl
         print(f"  not exported: {line}")
     if not manifest["pairs"]:
         print(f"verso: {options.dir} holds no pair: every pair was left out", file=sys.stderr)
-    if options.json:
-        answer = {"ok": manifest["pairs"] > 0, "dir": options.dir, "pairs_now": result.pairs_now}
-        print(json.dumps({**answer, **manifest}))

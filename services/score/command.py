@@ -25,6 +25,7 @@ from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.report import POLICY, Page, Section, fill_page, read_web
 from services.look.sections import table_html
 from services.read.verdict import explain_damage
+from services.run.progress import finish
 from services.score.items import Asked
 from services.score.predictions import find_predictions
 from services.score.run import ITEMS_FILE, describe_refused, score_dataset
@@ -69,7 +70,7 @@ def main(options: argparse.Namespace) -> int:
     print(answer_of(summary))
     print(f"page: {target / PAGE_FILE}")
     answer = {name: summary[name] for name in ("items", "missing", "refused", "metrics")}
-    return _finish(options, not summary["refused"], answer | {"page": str(target / PAGE_FILE)})
+    return finish(options, not summary["refused"], **answer, page=str(target / PAGE_FILE))
 
 
 def _print_metrics(metrics: dict[str, Any]) -> None:
@@ -97,7 +98,7 @@ def _compare(options: argparse.Namespace) -> int:
         print(
             f"{name:28}{in_words(name, row['a']):>12}{in_words(name, row['b']):>12}  b - a: {interval(name, row):28}{verdict}"
         )
-    return _finish(options, True, {"a": str(options.compare[0]), "b": str(options.compare[1]), "metrics": metrics})
+    return finish(options, True, a=str(options.compare[0]), b=str(options.compare[1]), metrics=metrics)
 
 
 def _read_score(out: str, path: Path) -> tuple[pa.Table, dict[str, Any]]:
@@ -113,12 +114,6 @@ def _write(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)
-
-
-def _finish(options: argparse.Namespace, ok: bool, answer: dict[str, Any]) -> int:
-    if options.json:
-        print(json.dumps({"ok": ok, **answer}))
-    return 0 if ok else 1
 
 
 _SHOWN: Final = ("depth_mae_m", "rgb_psnr_db", "shape_chamfer_l1_m", "volume_iou", "pose_add_m")

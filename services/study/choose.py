@@ -176,7 +176,8 @@ def describe_answer(
     asked = default_targets(rows)[0] if targets is None else targets
     own, others = own_row(rows), [row for row in rows if row.setting.parts]
     few = [row for row in others if not all(tells(row, name) for name in row.errors)]
-    if not all(tells(own, name) for name in asked if name in own.errors) or (others and len(few) == len(others)):
+    judged = len(few) < len(others) or any(proof.setting != own.setting.name for proof in proofs)
+    if not judged or not all(tells(own, name) for name in asked if name in own.errors):
         words = f"fewer than {FEWEST_SCENES} scenes of the job, or of every other setting, were measured"
         return f"No verdict: {words}, which promise nothing of others. Give a longer --budget.", ""
     limits = listed([f"{amount(name, most)} of {short(name)}" for name, most in asked.items()])

@@ -113,7 +113,7 @@ def test_a_setting_that_few_scenes_measured_is_not_recommended():
         choose([unknown], {"depth_mm": 0.2})
     assert recommend([unknown], None) is unknown  # who asks for nothing keeps the job
     four, three = row(scenes=4, depth_mm=0.1), row("step=60", 0.5, scenes=3, depth_mm=0.01)
-    for rows in ([unknown], [unknown, row("step=60", 0.5, depth_mm=0.01)], [four, three]):
+    for rows in ([unknown], [four], [unknown, row("step=60", 0.5, depth_mm=0.01)], [four, three]):
         words, chosen = describe_answer(rows, None, (), 64)
         assert chosen == "" and words.startswith("No verdict: fewer than 4 scenes") and "--budget" in words
     words, chosen = describe_answer([four, three, row("size=small", 0.5, scenes=4, depth_mm=0.1)], None, (), 64)
