@@ -45,7 +45,7 @@ from workers.physics.pour import (
     points_of,
     renumbered,
 )
-from workers.physics.release import LEFT_M, Drop, Pace, hold, moved_by, release, release_again
+from workers.physics.release import LEFT_M, RELEASE_RATE, Drop, Pace, hold, moved_by, release, release_again
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
@@ -464,17 +464,13 @@ def _settle_alone(
 RECHECK_S = 1.0
 """Simulated time of the second release."""
 
-RECHECK_RATE = 4.0
-"""Steps a second of the second release, in the settings', of a single object on level ground: a quarter of the finest. Nothing
-slips slowly there. At rest, tilted and lifted, both rates refuse the same (docs/rest.md), this one in 0.31 of the time."""
-
 
 def recheck_scene(
-    plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan, level_rate: float = RECHECK_RATE
+    plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan, rate: float = RELEASE_RATE
 ) -> Rest:
-    """The same rest, with the motion of every object after a second release of all. level_rate: as of `release_again`."""
+    """The same rest, with the motion of every object after a second release of all. rate: as of `release_again`."""
     effects, plan = add_effects(effects, rest.called), dataclasses.replace(plan, objects=rest.starts)
-    poses = release_again(plan, rest.settled, physics, effects, RECHECK_S, level_rate)
+    poses = release_again(plan, rest.settled, physics, effects, RECHECK_S, rate)
     settled = []
     for start, before, after in zip(rest.starts, rest.settled, poses, strict=True):
         moved_mm, turned_deg = moved_by(start, before.T_world_obj, after)

@@ -45,12 +45,13 @@ from workers.physics.release import (
     PACES,
     PACES_MANY,
     PACES_TOGETHER,
+    RELEASE_RATE,
     Drop,
     hold,
     release,
     release_again,
 )
-from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_RATE, RECHECK_S, Rest, settle_scene
+from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_S, Rest, settle_scene
 
 TABLE = level()
 TOP = TABLE.top.height_m
@@ -256,7 +257,7 @@ def test_what_is_let_go_again_shows_whether_it_rested():
         (0.701, 0.0, 0.2, 0.5),  # 1 mm outside
     ):
         start = at(CUBE, TABLE, (x_m, 0.0, 0.03 + up_m))
-        for rate in (RECHECK_RATE, FINEST):
+        for rate in (RELEASE_RATE, FINEST):
             moved = dataclasses.replace(rest, T_world_obj=start.T_world_obj)
             moved_mm, _ = recheck(start, moved, TABLE, PHYSICS, rate)
             assert least_mm <= moved_mm <= most_mm, (x_m, up_m, rate)
@@ -276,11 +277,11 @@ def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatc
     starts = together(TABLE, [put(cube(0.05), TABLE, 0.0), put(cube(0.04), TABLE, 0.05)]).starts
     left, seen = [slips], []
 
-    def slip(_drop, _placement, poses, _far_m, _groups):
+    def slip(_drop, _placement, poses, *_):
         seen.append(poses[1][0, 3])
         left[0] -= 1
         by_m = 2.0 * HELD_M if left[0] >= 0 else 0.5 * HELD_M
-        return poses[0], translation(by_m, 0.0, 0.0) @ poses[1]
+        return (poses[0], translation(by_m, 0.0, 0.0) @ poses[1]), False
 
     monkeypatch.setattr(module, "let_go", slip)
     held = hold(*released(starts, TABLE), [one.T_world_obj for one in starts])
