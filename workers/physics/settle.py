@@ -45,7 +45,18 @@ from workers.physics.pour import (
     points_of,
     renumbered,
 )
-from workers.physics.release import LEFT_M, RELEASE_RATE, Drop, Pace, hold, moved_by, release, release_again
+from workers.physics.release import (
+    LEFT_M,
+    LET_GO_COST,
+    RELEASE_RATE,
+    Budget,
+    Drop,
+    Pace,
+    hold,
+    moved_by,
+    release,
+    release_again,
+)
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
@@ -60,6 +71,9 @@ SPINS_M = 1e-3
 
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
+
+ROUNDED_M = 1e-8
+"""Greatest rounding of an object's coordinates: a thousandth of the bound on its overlap."""
 
 MOST_RELEASES, POURED_RELEASES = 3, 6
 """Times that objects are released, each from where exact rest gave up the time before; and those of a pile that fell in waves."""
@@ -101,7 +115,10 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
     Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`, and LeftRoomError
     where a single object leaves its room.
     """
+    drop = dataclasses.replace(drop, budget=Budget(LET_GO_COST))
     forms, again = forms_of(drop.starts), dict[int, int]()
+    for start in drop.starts:
+        _require_near_origin(start)
     poses = tuple(start.T_world_obj for start in drop.starts)
     if not drop.effects.runs("dynamics"):
         return drop.starts, _describe(_Ending(drop, _place(drop, poses, forms), poses))
@@ -122,6 +139,17 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
         except LostError as lost:
             drop = _without_lost(drop, lost, again)
             forms = forms_of(drop.starts)
+
+
+def _require_near_origin(start: ObjectStart) -> None:
+    """Raises SettleError where a mesh is so far from its own origin that its coordinates are rounded to what contacts leave."""
+    far_m = float(np.abs(start.hull.vertices).max())
+    if far_m * np.finfo(np.float64).eps > ROUNDED_M:
+        raise SettleError(
+            "unsupported",
+            f"the mesh of region {start.region_id} ({start.asset.category}) lies {far_m:.3g} m from its origin, where "
+            f"coordinates are rounded to {far_m * np.finfo(np.float64).eps:.1g} m: move the mesh to its origin",
+        )
 
 
 def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
@@ -203,8 +231,9 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
         drop = dataclasses.replace(drop, starts=moved_to(drop.starts, rested.poses))
     raise UnsupportedError(
         "unsupported",
-        f"{'it tips or slips' if drop.single else 'something tips or slips'} on without end: released {most} times, "
-        f"for {seconds:.1f} s in all, it never came into balance: lower physics.rest.speed_mm_s, or raise physics.friction",
+        f"{'it' if drop.single else f'region {drop.starts[moved].region_id} ({drop.starts[moved].asset.category})'} tips or "
+        f"slips on without end: released {most} times, for {seconds:.1f} s in all, it never came into balance"
+        f"{': let it fall elsewhere, or in another size' if rested.balanced or not drop.single else ': raise physics.friction'}",
         [moved],
         rested.poses,
         range(len(drop.starts)),
