@@ -33,6 +33,7 @@ from workers.physics.placement import (
     place,
     place_on_top,
     placed_mesh,
+    require_near_origin,
 )
 from workers.physics.pour import (
     NOTHING_MORE,
@@ -71,9 +72,6 @@ SPINS_M = 1e-3
 
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
-
-ROUNDED_M = 1e-8
-"""Greatest rounding of an object's coordinates: a thousandth of the bound on its overlap."""
 
 MOST_RELEASES, POURED_RELEASES = 3, 6
 """Times that objects are released, each from where exact rest gave up the time before; and those of a pile that fell in waves."""
@@ -118,7 +116,7 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
     drop = dataclasses.replace(drop, budget=Budget(LET_GO_COST))
     forms, again = forms_of(drop.starts), dict[int, int]()
     for start in drop.starts:
-        _require_near_origin(start)
+        require_near_origin(start)
     poses = tuple(start.T_world_obj for start in drop.starts)
     if not drop.effects.runs("dynamics"):
         return drop.starts, _describe(_Ending(drop, _place(drop, poses, forms), poses))
@@ -139,17 +137,6 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
         except LostError as lost:
             drop = _without_lost(drop, lost, again)
             forms = forms_of(drop.starts)
-
-
-def _require_near_origin(start: ObjectStart) -> None:
-    """Raises SettleError where a mesh is so far from its own origin that its coordinates are rounded to what contacts leave."""
-    far_m = float(np.abs(start.hull.vertices).max())
-    if far_m * np.finfo(np.float64).eps > ROUNDED_M:
-        raise SettleError(
-            "unsupported",
-            f"the mesh of region {start.region_id} ({start.asset.category}) lies {far_m:.3g} m from its origin, where "
-            f"coordinates are rounded to {far_m * np.finfo(np.float64).eps:.1g} m: move the mesh to its origin",
-        )
 
 
 def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
