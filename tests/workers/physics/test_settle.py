@@ -13,9 +13,10 @@ from schemas.errors import SettleError
 from schemas.scene.scene import EffectPlan, ObjectStart, Settled, Table
 from schemas.scene.shape import Mesh
 from tests.hard_cases.bodies import ball, built_in, cube, over_edge
-from tests.hard_cases.drops import Y, level, turn
+from tests.hard_cases.drops import Y, drop, level, turn
 from tests.hard_cases.groups import place as at
 from tests.hard_cases.groups import put, together, tray
+from tests.hard_cases.hollow_cases import cups
 from tests.kit.shapes import asset_of, box
 from tests.physics.settling import (
     PHYSICS,
@@ -45,12 +46,13 @@ from workers.physics.release import (
     PACES,
     PACES_MANY,
     PACES_TOGETHER,
+    RELEASE_RATE,
     Drop,
     hold,
     release,
     release_again,
 )
-from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_RATE, RECHECK_S, Rest, settle_scene
+from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_S, Rest, settle_scene
 
 TABLE = level()
 TOP = TABLE.top.height_m
@@ -246,7 +248,7 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
     rest = settle_single(start, TABLE, PHYSICS)
     seen = told_by(monkeypatch)
     recheck(start, rest, TABLE, PHYSICS)
-    release_again(scene_of([start], TABLE), [rest], PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), 0.5)
+    release_again(scene_of([start], TABLE), [rest], PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), 0.5, FINEST)
     assert [outcome.seconds for _, outcome in seen] == pytest.approx([RECHECK_S, 0.5], abs=1e-3)
 
 
@@ -260,7 +262,7 @@ def test_what_is_let_go_again_shows_whether_it_rested():
         (0.701, 0.0, 0.2, 0.5),  # 1 mm outside
     ):
         start = at(CUBE, TABLE, (x_m, 0.0, 0.03 + up_m))
-        for rate in (RECHECK_RATE, FINEST):
+        for rate in (RELEASE_RATE, FINEST):
             moved = dataclasses.replace(rest, T_world_obj=start.T_world_obj)
             moved_mm, _ = recheck(start, moved, TABLE, PHYSICS, rate)
             assert least_mm <= moved_mm <= most_mm, (x_m, up_m, rate)
@@ -280,11 +282,11 @@ def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatc
     starts = together(TABLE, [put(cube(0.05), TABLE, 0.0), put(cube(0.04), TABLE, 0.05)]).starts
     left, seen = [slips], []
 
-    def slip(_drop, _placement, poses, _far_m, _groups):
+    def slip(_drop, _placement, poses, *_):
         seen.append(poses[1][0, 3])
         left[0] -= 1
         by_m = 2.0 * HELD_M if left[0] >= 0 else 0.5 * HELD_M
-        return poses[0], translation(by_m, 0.0, 0.0) @ poses[1]
+        return (poses[0], translation(by_m, 0.0, 0.0) @ poses[1]), False
 
     monkeypatch.setattr(module, "let_go", slip)
     held = hold(*released(starts, TABLE), [one.T_world_obj for one in starts])
@@ -371,3 +373,17 @@ def test_a_pile_of_more_than_eight_falls_in_waves_above_what_lies(monkeypatch):
     for wave, lying in zip(waves[:2], (0, 5), strict=True):
         tops = np.maximum.accumulate([TOP, *(heights.max() for heights in wave)])[lying:]
         assert [heights.min() for heights in wave[lying:]] == pytest.approx(tops[:-1] + 0.04, abs=1e-9)
+
+
+def test_letting_go_ends_at_its_budget_and_names_the_objects(monkeypatch):
+    monkeypatch.setattr(settle, "LET_GO_COST", 0.0)
+    group = cups(2)
+    with pytest.raises(SettleError, match=r"regions 3 \(\w+\), 4 \(\w+\) touch with \d+ faces.*coarser meshes"):
+        settle_group(group.starts, group.table, PHYSICS)
+
+
+def test_a_mesh_far_from_its_origin_is_refused_by_name_and_not_as_off_the_table():
+    far = box(0.05, 0.05, 0.05)
+    far.apply_translation([1e9, 0.0, 0.0])
+    with pytest.raises(SettleError, match=r"region 3 .* lies 1e\+09 m from its origin, .*: move the mesh"):
+        settle_group([drop(asset_of(far), TABLE, 0.01).start], TABLE, PHYSICS)
