@@ -107,15 +107,16 @@ def supervise(options: argparse.Namespace) -> int:
 
     queue = make_queue(_place(options))
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    rules = Rules(options.at_once, _driver_command(options))
+    rules, failed = Rules(options.at_once, _driver_command(options), options.until_empty), []
     on_own = options.address == rows.OWN_RAY or (options.address is None and not answers(rows.DASHBOARD))
     try:
         place = own_ray(queue.name, _say) if on_own else contextlib.nullcontext(_cluster_drivers(options))
-        supervise(queue, place, rules, _say)
+        failed = supervise(queue, place, rules, _say)
+        _say("the queue is empty" + (f"; failed: {', '.join(failed)}: `verso logs ID` says why" if failed else ""))
     except KeyboardInterrupt:
         then = "its jobs wait" if on_own else "jobs that run go on, the others wait"
         _say(f"supervision ends; {then} for the next `verso supervise`")
-    return finish(options, True, queue=queue.name)
+    return finish(options, not failed, queue=queue.name, failed=failed)
 
 
 def drive(options: argparse.Namespace) -> int:

@@ -228,6 +228,7 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
         "--queue /shared/queue --at-once 2",
         QUEUE,
         SUPERVISED,
+        flag("--until-empty", "end when every job has; exit code 1 where one failed"),
         number("--at-once", "jobs that run at once, and share the cluster evenly (default: 2)", 2),
         path(
             "--driver",

@@ -16,10 +16,10 @@ from schemas.job.job import Job
 from services.run.progress import ProgressLine
 from services.study import choose
 from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, recommend
-from services.study.measure import Unit, answer_unit
 from services.study.model import OWN, Proof, Row, Setting, Study, Targets, joined
 from services.study.rounds import LEAST, Wanted, missing, next_round, promising, seconds, undecided
 from services.study.table import AT_REST, PARTS, Part, Table, figures_of, part_of, split_settings, unit_name
+from services.study.unit import Unit, answer_unit
 from workers.pool import Answers, Ended, Pool
 
 

@@ -12,6 +12,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -67,9 +68,7 @@ def _intrinsics(
     """Of fx, fy, cx, cy, whose first pixel's centre is at `centre`, of images of the `stated` size. Raises CaptureError."""
     with as_refusal(f"{path}: its intrinsics", CaptureError):
         if stated is not None and (of := tuple(int(side) for side in stated)) != size:
-            raise ValueError(
-                f"of {of[0]} x {of[1]}, and the image is {size[0]} x {size[1]}: give its camera by --camera"
-            )
+            raise ValueError(f"of {of[0]} x {of[1]}, and the image is {size[0]} x {size[1]}")
         fx, fy, cx, cy = (float(x) for x in numbers)
         if not np.isfinite([fx, fy, cx, cy]).all() or min(fx, fy) <= 0 or max(abs(cx), abs(cy)) > 1e6:
             raise ValueError(f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}")
@@ -84,32 +83,41 @@ def scaled_camera(k: Intrinsics, size: Size) -> DepthCamera:
     return DepthCamera(small, frozen_array(np.zeros(8)), frozen_array(np.eye(4)))
 
 
-def _color(stamp_us: int, read: Read, k: Intrinsics | Size) -> RecordedFrame:
-    """Of a camera, or of one that is not known but for the size of its images."""
-    size = (k.width, k.height) if isinstance(k, Intrinsics) else k
-    load = lambda small: (decode_small if small else decode_rgb)(read(), size)  # noqa: E731
+Seen = Intrinsics | Size
+"""A colour camera, or the size of its images where nothing else is known of it."""
+
+
+def _of_size(k: Seen) -> Size:
+    return (k.width, k.height) if isinstance(k, Intrinsics) else k
+
+
+def _color(stamp_us: int, read: Read, k: Seen) -> RecordedFrame:
+    def load(small: bool) -> np.ndarray:
+        return (decode_small if small else decode_rgb)(read(), _of_size(k))
+
     return RecordedFrame(False, stamp_us, load, k if isinstance(k, Intrinsics) else None)
 
 
-def _depth(
-    stamp_us: int,
-    read: Read,
-    k: Intrinsics | Size,
-    units_per_m: float,
-    size: Size | None = None,
-    sure: Read | None = None,
-) -> RecordedFrame:
-    """Of the colour camera `k`, registered to it or, with a `size`, seen by it in an image of that size; `sure`: confidence."""
-    whole = (k.width, k.height) if isinstance(k, Intrinsics) else k
-    own, camera = size or whole, k if isinstance(k, Intrinsics) else None
+def _depth(stamp_us: int, read: Read, k: Seen, units_per_m: float, size: Size | None = None) -> RecordedFrame:
+    """Of the colour camera `k`, registered to it or, with a `size`, seen by it in an image of that size."""
+    own, camera = size or _of_size(k), k if isinstance(k, Intrinsics) else None
 
     def load(small: bool) -> np.ndarray | None:
-        if small:
-            return np.zeros(0)
-        depth = decode_depth(read(), own, units_per_m)
-        return depth if sure is None else np.where(decode_confidence(sure(), own) > 0, depth, 0.0)
+        return np.zeros(0) if small else decode_depth(read(), own, units_per_m)
 
-    return RecordedFrame(True, stamp_us, load, scaled_camera(camera, own) if camera and own != whole else camera)
+    return RecordedFrame(True, stamp_us, load, scaled_camera(camera, own) if camera and own != _of_size(k) else camera)
+
+
+def _trusted(frame: RecordedFrame, sure: Read | None) -> RecordedFrame:
+    """The frame without depth of the lowest confidence, 0, where the phone wrote how sure it is of each pixel."""
+
+    def load(small: bool) -> np.ndarray | None:
+        depth = frame.load(small)
+        if small or depth is None or sure is None:
+            return depth
+        return np.where(decode_confidence(sure(), depth.shape[::-1]) > 0, depth, 0.0)
+
+    return replace(frame, load=load)
 
 
 def _recorded(
@@ -132,9 +140,8 @@ def _recorded(
     if cameras:
         k = sorted(cameras, key=lambda each: each.fx)[len(cameras) // 2]
         camera = CaptureCamera(k, frozen_array(whole), units_per_m)
-    return Recorded(
-        path, camera, None, max(period, 1.0), lambda: iter(frames), float(stamps[-1]), units_per_m=units_per_m, **more
-    )
+    clock = max(period, 1.0), lambda: iter(frames), float(stamps[-1])
+    return Recorded(path, camera, None, *clock, units_per_m=units_per_m, **more)
 
 
 def _below(folder: Path, name: str) -> Path:
@@ -167,20 +174,15 @@ def _open_tum(path: Path, units_per_m: float = TUM_UNITS_PER_M) -> Recorded:
     color, depth = (list(_tum_list(path, name)) for name in ("rgb.txt", "depth.txt"))
     if not color:
         raise CaptureError("empty", f"{path}/rgb.txt names no image")
-    size, word = (
-        _size_of(color[0][1]),
-        next((word for word in TUM_CAMERAS if word in path.resolve().name.lower()), None),
-    )
-    k: Intrinsics | Size = size
-    lens: tuple[float, ...] = ()
-    told, missing = {}, "no file in it has its camera"
-    if word is not None and size == TUM_SIZE:
-        numbers, lens = TUM_CAMERAS[word]
-        k, told = _intrinsics(path, size, numbers, 0.0), {"calibration": f"that of TUM's {word}"}
-    elif word is not None:
+    word = next((word for word in TUM_CAMERAS if word in path.resolve().name.lower()), None)
+    numbers, lens = TUM_CAMERAS.get(word or "", ((), ()))
+    size, missing = _size_of(color[0][1]), "no file in it has its camera"
+    k: Seen = _intrinsics(path, size, numbers, 0.0) if word and size == TUM_SIZE else size
+    if word and size != TUM_SIZE:
         missing += f", and the camera of TUM's {word} has images of 640 x 480, not of {size[0]} x {size[1]}"
     frames = [_color(stamp, _reader(file), k) for stamp, file in color]
     frames += [_depth(stamp, _reader(file), k, units_per_m) for stamp, file in depth]
+    told = {"calibration": f"that of TUM's {word}"} if isinstance(k, Intrinsics) else {}
     more = {"told": told, "missing": missing, "with_units": partial(_open_tum, path)}
     return _recorded(path, frames, lens, units_per_m, **more)
 
@@ -234,7 +236,8 @@ def _bop_file(path: Path, folders: tuple[str, ...], number: int) -> Path:
     return file
 
 
-OPEN3D_FILES = ("intrinsic.json", "camera_intrinsic.json", "camera.json")
+CAMERA_JSON = "camera.json"
+OPEN3D_FILES = ("intrinsic.json", "camera_intrinsic.json", CAMERA_JSON)
 
 
 def _open3d_folder(path: Path) -> Path | None:
@@ -243,41 +246,33 @@ def _open3d_folder(path: Path) -> Path | None:
     return color if (path / "depth").is_dir() else None
 
 
-def _open3d_matrix(path: Path) -> tuple[Path, dict[str, Any]] | None:
-    """The file with Open3D's intrinsics, and what it says; None without any. A camera.json may be ours."""
+def _open3d_camera(path: Path, size: Size) -> tuple[Seen, str]:
+    """The camera of images of a size by Open3D's file, or what is missing. A camera.json may be one of ours."""
     for described in (path / name for name in OPEN3D_FILES if (path / name).is_file()):
         tree = _tree_of(described, _bytes_of(described))
         matrix = tree.get("intrinsic_matrix") if isinstance(tree, dict) else None
         if isinstance(matrix, list) and len(matrix) == 9:
-            return described, tree
-        if described.name != "camera.json":
+            stated = tuple(tree.get(name, side) for name, side in zip(("width", "height"), size, strict=True))
+            if stated != size:
+                return size, f"{described.name} is of {stated[0]} x {stated[1]}, its images are {size[0]} x {size[1]}"
+            return _intrinsics(described, size, (matrix[i] for i in (0, 4, 6, 7)), 0.0), ""
+        if described.name != CAMERA_JSON:
             raise _wrong(described, "has no intrinsic_matrix of nine numbers, column by column")
-    return None
+    return size, f"it has no {OPEN3D_FILES[0]}"
 
 
 def _open_open3d(path: Path, units_per_m: float = UNITS_PER_M) -> Recorded:
-    folder, described = _open3d_folder(path), _open3d_matrix(path)
+    folder = _open3d_folder(path)
     assert folder is not None
     color, depth = (sorted(f for f in each.iterdir() if f.is_file()) for each in (folder, path / "depth"))
-    if [file.stem for file in color] != [file.stem for file in depth]:
+    if not color or [file.stem for file in color] != [file.stem for file in depth]:
         counts = f"{len(color)} images in {folder.name}/ and {len(depth)} in depth/"
         raise CaptureError("counts", f"{path} has {counts}, or of other names")
-    frames: list[RecordedFrame] = []
+    (k, missing), frames = _open3d_camera(path, _size_of(color[0])), []
     for number, (rgb, z) in enumerate(zip(color, depth, strict=True)):
-        k: Intrinsics | Size = _size_of(rgb)
-        if described is not None:
-            file, tree = described
-            numbers, stated = (
-                [tree["intrinsic_matrix"][i] for i in (0, 4, 6, 7)],
-                [tree.get("width"), tree.get("height")],
-            )
-            k = _intrinsics(file, _size_of(rgb), numbers, 0.0, stated if all(stated) else None)
-        frames += [
-            _color(number * NO_TIME_US, _reader(rgb), k),
-            _depth(number * NO_TIME_US, _reader(z), k, units_per_m),
-        ]
-    more = {"missing": "it has no intrinsic.json", "with_units": partial(_open_open3d, path)}
-    return _recorded(path, frames, (), units_per_m, **more)
+        frames.append(_color(number * NO_TIME_US, _reader(rgb), k))
+        frames.append(_depth(number * NO_TIME_US, _reader(z), k, units_per_m))
+    return _recorded(path, frames, (), units_per_m, missing=missing, with_units=partial(_open_open3d, path))
 
 
 # ---------------------------------------------------------------------------------------------- Apple's
@@ -313,7 +308,8 @@ def _open_record3d(path: Path) -> Recorded:
         frames.append(_color(stamp, _member(path, f"rgbd/{number}.jpg"), k))
         if f"rgbd/{number}.depth" in names:
             sure = _member(path, name) if (name := f"rgbd/{number}.conf") in names else None
-            frames.append(_depth(stamp, _member(path, f"rgbd/{number}.depth"), k, 1000.0, depth_size, sure))
+            seen = _depth(stamp, _member(path, f"rgbd/{number}.depth"), k, 1000.0, depth_size)
+            frames.append(_trusted(seen, sure))
     return _recorded(path, frames)
 
 
@@ -329,6 +325,10 @@ def _member(path: Path, name: str) -> Read:
             return data
 
     return read
+
+
+def _confidence(file: Path) -> Read | None:
+    return _reader(file) if file.is_file() else None
 
 
 def _keyframes(path: Path) -> Path:
@@ -350,8 +350,8 @@ def _open_polycam(path: Path) -> Recorded:
         k = _intrinsics(described, _size_of(color), (tree[name] for name in ("fx", "fy", "cx", "cy")), 0.5, stated)
         frames.append(_color(int(described.stem), _reader(color), k))
         if depth.is_file():
-            sure = _reader(file) if (file := root / "confidence" / depth.name).is_file() else None
-            frames.append(_depth(int(described.stem), _reader(depth), k, 1000.0, _size_of(depth), sure))
+            seen = _depth(int(described.stem), _reader(depth), k, 1000.0, _size_of(depth))
+            frames.append(_trusted(seen, _confidence(root / "confidence" / depth.name)))
     return _recorded(path, frames)
 
 
@@ -375,8 +375,8 @@ def _open_arkit(path: Path) -> Recorded:
         k = _intrinsics(camera, _size_of(file), numbers[2:], 0.5, numbers[:2])
         frames.append(_color(1000 * at, _reader(file), k))
         if (seen := depth / file.name).is_file():
-            sure = _reader(path / "confidence" / file.name) if (path / "confidence" / file.name).is_file() else None
-            frames.append(_depth(1000 * at, _reader(seen), k, 1000.0, _size_of(seen), sure))
+            image = _depth(1000 * at, _reader(seen), k, 1000.0, _size_of(seen))
+            frames.append(_trusted(image, _confidence(path / "confidence" / file.name)))
     return _recorded(path, frames)
 
 
@@ -391,10 +391,7 @@ def _milliseconds(path: Path) -> int:
 FOLDERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Recorded]]] = {
     "a TUM RGB-D folder (rgb.txt, depth.txt)": (_is_tum, _open_tum),
     "a BOP scene (scene_camera.json, rgb/ or gray/, depth/)": (_is_bop, _open_bop),
-    "an Open3D folder (color/ or rgb/, depth/, intrinsic.json)": (
-        lambda path: bool(_open3d_folder(path)),
-        _open_open3d,
-    ),
+    "an Open3D folder (color/ or rgb/, depth/)": (lambda path: bool(_open3d_folder(path)), _open_open3d),
     "a Record3D file (.r3d)": (_is_record3d, _open_record3d),
     "Polycam's raw data (keyframes/)": (_is_polycam, _open_polycam),
     "an ARKitScenes folder (lowres_wide/, lowres_depth/)": (_is_arkit, _open_arkit),
