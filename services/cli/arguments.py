@@ -89,9 +89,9 @@ read_job_id = reader(
     JOB_ID, ": an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
 )
 read_unit = reader(
-    r"\d{1,9}(?:\.\d{1,12})?(?:e-?\d)?",
-    " is no unit: write metres, such as 0.001 for millimetres",
-    lambda match: float(match[0]) or None,
+    r"(?:([^=]{1,500})=)?(\d{1,9}(?:\.\d{1,12})?(?:e-?\d)?)",
+    " is no unit: write metres, such as 0.001 for millimetres, or PATTERN=METRES, such as 'scans/*=0.001'",
+    lambda match: (match[1] or "*", float(match[2])) if float(match[2]) else None,
 )
 read_host = reader(
     rf"{HOST}|[0-9a-fA-F:.]{{2,45}}",

@@ -44,7 +44,12 @@ def _run(options: argparse.Namespace) -> int:
     """The exit code of a command; errors are told in one line. KeyboardInterrupt passes."""
     speak_as_typed()  # once more: a child of the supervisor has another standard error
     try:
-        _require_there(options)
+        from services.job.record import require_folder
+
+        for name in options.there:  # before anything is loaded or written
+            value = getattr(options, name)
+            for place in value if isinstance(value, list) else [value] if value else []:
+                require_folder(place)
         module, _, function = options.handler.partition(":")
         with needs_making(f"`{options.command}`"):
             return int(getattr(importlib.import_module(f"..{module}", __package__), function)(options) or 0)
@@ -65,17 +70,6 @@ def _run(options: argparse.Namespace) -> int:
             raise
         print(f"verso: {error.filename or 'a file'}: {remedy}", file=sys.stderr)
         return 1
-
-
-def _require_there(options: argparse.Namespace) -> None:
-    """Raises OutputError where a folder that the command reads is not there: before anything is loaded or written."""
-    from services.job.record import require_folder
-
-    for name in options.there:
-        value = getattr(options, name)
-        for place in value if isinstance(value, list) else [value]:
-            if place is not None:
-                require_folder(place)
 
 
 def build_parser(program: str = "verso") -> argparse.ArgumentParser:

@@ -269,9 +269,11 @@ COMMANDS: Final[dict[str, Command]] = {
         ),
         option(
             "--unit",
-            "METRES",
-            "of all files, such as 0.001 for millimetres (default: a guess)",
+            "[PATTERN=]METRES",
+            "of all files, or of those whose path fits, such as 0.001 for millimetres; the last counts (default: a guess)",
             read.read_unit,
+            action="append",
+            default=[],
         ),
         choice("--up", ("x", "y", "z"), "the axis that points up in all files (default: a guess)"),
         option("--licence", "TEXT", "of the shapes (default: the nearest licence file)"),

@@ -52,6 +52,11 @@ class Splits:
         return self.by_id.get(asset["instance_id"], asset["split"])
 
 
+def strictest(splits: Iterable[str]) -> str:
+    """The split of a scene whose objects are of these, so that no scene of `train` shows an object of `test`."""
+    return max(splits, key=("train", "val", "test").index)
+
+
 def collect_ids(batches: Iterable[Iterable[Row]]) -> dict[str, set[str] | None]:
     """The instance ids of each category in rows of `assets`; None where there are more than `MOST_INSTANCES`."""
     by_category: dict[str, set[str] | None] = {}

@@ -18,7 +18,7 @@ from schemas.errors import CorruptError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import DRAWN_ROLES, Role
-from services.dataset.dataset import Splits, collect_ids, split_by_category
+from services.dataset.dataset import Splits, collect_ids, split_by_category, strictest
 from services.read.dataset_reader import (
     ReadFile,
     StoredRange,
@@ -36,8 +36,6 @@ from workers.store.store import Store
 SIDES: tuple[Role, ...] = ("input", "mirror")
 """Views from two sides; that of the depth camera beside the input camera shows what the input view does."""
 MM_PER_M = 1000.0
-
-_STRICTNESS = ("train", "val", "test")
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +140,8 @@ class ExportScene:
 
     @property
     def split(self) -> str:
-        """train, val or test: the strictest of its objects, so that no scene of `train` shows an object of `test`."""
-        places = [_STRICTNESS.index(self.assets[name]["split"]) for _, name in self.instances.values()]
-        return _STRICTNESS[max(places)]
+        """train, val or test: the strictest of its objects."""
+        return strictest(self.assets[name]["split"] for _, name in self.instances.values())
 
 
 def in_units(data: bytes, units_per_m: float, wanted_per_m: float) -> bytes:

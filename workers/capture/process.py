@@ -272,7 +272,7 @@ class CaptureViews:
         """What `camera` sees, poses in the board frame; `without` names a view that must not be a source."""
         axes = {number: T[:3, 2] for number, T in self.cameras.items() if number != without}
         chosen = choose_sources(axes, camera, self.captures.synthesis)
-        return synthesize_view([self._source(number) for number in chosen], camera)
+        return synthesize_view([self._source(number) for number in chosen], camera, self.body)
 
     def mirror(self, number: int) -> tuple[Camera, float, SynthesizedView]:
         """(camera, d_z in metres, view) from the other side of the object, half a turn about the board's normal.
@@ -288,7 +288,7 @@ class CaptureViews:
         if number not in self._sources:
             view = self.posed(number)
             fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics)
-            self._sources[number] = prepare_source(view, fitted, silhouette(self.body, view.depth_camera))
+            self._sources[number] = prepare_source(view, fitted)
             while len(self._sources) > max(KEPT, 2 * self.captures.synthesis.views):
                 self._sources.popitem(last=False)
         self._sources.move_to_end(number)

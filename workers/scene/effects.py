@@ -183,6 +183,8 @@ def _table(facts: Facts) -> str | None:
 
 def _outside(facts: Facts, points: Array) -> str | None:
     """Whether no view sees anything of the convex hull of points [N, 3], world."""
+    if facts.job.cameras.orbit.share is not None:
+        return None  # where the cameras stand follows from where the objects come to rest
     unseen = all(is_outside_views(points, cameras) for cameras in _views(facts))
     return "outside of every view" if unseen else None
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
+import trimesh
 from PIL import Image
 
 from schemas.errors import AssetSourceError, MachineError
@@ -35,7 +36,7 @@ from tests.workers.door.oracles import write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.assets.library import collection
-from workers.assets.library.collection import SUFFIXES, walk_folder
+from workers.assets.library.collection import OUTSIDE, SUFFIXES, walk_folder
 from workers.assets.library.copies import find_copies
 from workers.assets.library.placement import find_unit
 from workers.assets.library.reading import list_files
@@ -93,7 +94,7 @@ def test_a_mixed_folder_becomes_a_library_and_a_job_that_offers_exactly_what_was
     assert left_out == {
         "002_can/google_16k/nontextured.ply": ("copy", "double of 002_can/copy/textured.obj"),
         "002_can/google_16k/textured.obj": ("copy", "double of 002_can/copy/textured.obj"),
-        "mugs/out.glb": ("link", "leads out of the folder: copy it there"),
+        "mugs/out.glb": ("link", OUTSIDE),
         "robot/collision.obj": ("part", "part of robot/model.urdf"),
         "robot/textured.obj": ("part", "part of robot/model.urdf"),
         "scene.fbx": ("format", ".fbx is not read: run `assimp export FILE FILE.glb`, or use Blender"),
@@ -135,6 +136,22 @@ def test_wrong_input_is_one_clear_line_and_leaves_and_overwrites_nothing(tmp_pat
         assert before == {path: path.is_file() and path.read_bytes() for path in sorted(tmp_path.rglob("*"))}, words
     code, _, err = init("broken", capsys=capsys)
     assert code == 2 and "none of its meshes can be used: 1 left out" in err
+
+
+def test_what_no_table_carries_is_asked_about_and_is_scaled_or_left_out_where_one_says_so(tmp_path, capsys):
+    for name, side in (("crate", 3.0), ("barrel", 1.5), ("cup", 0.1)):
+        write_mesh(tmp_path / f"m/{name}.glb", trimesh.creation.box((side, side, side)))
+    for k, (words, asked, used) in enumerate((
+        ((), "2 objects of 2.6 m to 5.2 m (crate.glb) are too large", {"crate": 5.196, "barrel": 2.598, "cup": 0.173}),
+        (("--unit", "crate*=0.1", "--unit", "barrel*=0.5"), "1 object of 1.3 m", {"crate": 0.52, "barrel": 1.299, "cup": 0.173}),
+        (("--unit", "0.1"), None, {"crate": 0.52, "barrel": 0.26, "cup": 0.017}),
+        (("--limit", "max_size_m=1"), None, {"cup": 0.173}),
+    )):  # fmt: skip
+        code, told, _ = init(tmp_path / "m", "--out", tmp_path / f"lib{k}", "--json", *words, capsys=capsys)
+        objects = json.loads(told.splitlines()[-1])["objects"]
+        sizes = {one["category"]: round(float(np.linalg.norm(one["extents_m"])), 3) for one in objects}
+        assert (code, sizes) == (0, used), words
+        assert ("? " in told) == (asked is not None) and (asked or "") in told, told
 
 
 def test_a_disk_that_is_full_at_any_file_is_told_in_a_line_and_the_next_init_goes_on(tmp_path, capsys, monkeypatch):
@@ -353,6 +370,9 @@ def test_its_commands_run_as_printed_and_make_a_dataset_in_which_everything_stan
     ]
     scenes, assets = (table.to_table().to_pylist() for table in tables)
     assert len(scenes) == 8 and len({row["category"] for row in scenes}) > 2
+    views = ds.dataset(tmp_path / "data/meshes/manifest/views", partitioning="hive").to_table().to_pylist()
+    shares = [row["object_pixels"] / (640 * 480) for row in views if row["role"] == "input"]
+    assert len(shares) == 8 and min(shares) > 0.03 and max(shares) < 0.1, "objects of any size are framed"
     heights = {row["path"]: row["extents_m"][2] for row in assets if row["source"] == "library"}
     true = {"mugs/mug_0.glb": 0.08, "mugs/mug_1.glb": 0.1, "mugs/mug_2.glb": 0.12, "gltf cup/model.gltf": 0.1}
     drawn = {path: height for path, height in heights.items() if path in true}

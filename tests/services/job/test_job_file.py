@@ -74,6 +74,14 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("start: {offset_m: [1, 2, 3]}", ["start.offset_m: [1, 2, 3]: must have at most 2 of them"]),
     ("start: {pose: uprigth}", ["start.pose: 'uprigth': did you mean 'upright'? must be 'upright', 'tumbled' or"]),
     ("cameras: {depth: {offset_m: [0, 0, x]}}", ["cameras.depth.offset_m.2: 'x'"]),
+    *(
+        (
+            f"cameras: {{orbit: {{radius_m: {text}}}}}",
+            [f"cameras.orbit.radius_m: '{text}': write metres, fit, or a share"],
+        )
+        for text in ("fitt", "60%", "0%", "6 cm")
+    ),
+    ("cameras: {mirror: {T_z_m: 6%}}", ["cameras.mirror.T_z_m: '6%': must be 'fit'"]),
     ("cameras: {orbit: {radius_m: -1}}", ["cameras.orbit.radius_m: -1: must be greater than 0"]),
     ("categories: [mug, sofa]", ["categories.sofa", "no source offers it", "bottle, camera"]),
     ("categories: [mug, mug]", ["categories", "twice"]),
