@@ -326,7 +326,7 @@ def test_what_leaves_the_table_is_drawn_again_above_the_others_or_removed_or_the
 
 def test_what_finds_no_balance_is_removed_where_what_leaves_is(monkeypatch):
     """Of three the second is said to slip by 1 mm as often as it is let go among them."""
-    starts = together(TABLE, [at(CUBE, TABLE, (x, 0.0, 0.031)) for x in (0.0, 0.08, 0.16)]).starts
+    starts = together(TABLE, [at(CUBE, TABLE, (x, 0.0, 0.031), LEANS) for x in (0.0, 0.08, 0.16)]).starts
     usual = settle.hold
 
     def slips(drop, placement, poses):
