@@ -38,7 +38,7 @@ from workers.capture.simulate.simulate import simulate_capture
 from workers.scene.chance import SceneChance
 
 ROOT = Path(__file__).resolve().parents[2]
-DIGEST = "b303d85c6dfab8bd410e5279ff917e5084a55b4b35abd3c06585001e9a88c3d0"
+DIGEST = "2eb89837f52c05a7ee1aba49a460050c4b61ae4518b068e70c1119ebc72705b2"
 FIRST = "./verso run deploy/jobs/tabletop.yaml"
 
 ELSEWHERE = {

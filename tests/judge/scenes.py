@@ -17,6 +17,7 @@ from tests.judge.referee import hold_scene
 from workers.geometry.frames import transform
 from workers.physics import settle
 from workers.physics.effects import called_for
+from workers.physics.fall import FINEST
 from workers.physics.pour import NOTHING_MORE, Pouring
 from workers.physics.settle import recheck_scene, settle_scene
 
@@ -95,7 +96,7 @@ def try_scene(
     judge_s = time.process_time() - began
     moved: tuple[float | None, float | None] = (None, None)
     if asked.recheck:
-        again = recheck_scene(plan, rest, physics, effects).settled
+        again = recheck_scene(plan, rest, physics, effects, FINEST).settled
         moved = max(one.recheck_move_mm or 0.0 for one in again), max(one.recheck_turn_deg or 0.0 for one in again)
     poses = [one.T_world_obj for one in rest.settled]
     held = (hold_scene(plan, poses, physics) if asked.mujoco else None) or (None, None)
