@@ -257,21 +257,31 @@ FITS_NOT = (
     "camera.json does not fit: the markers say {numbers}, which moves the poses by {by}. Calibrate the camera at this size of "
     "image, or use --calibrate (estimation.calibrate), which takes what the markers say"
 )
+FITS_NO_MODEL = (
+    "camera.json does not fit the markers, and no other focal length, principal point or k1 does: see that `distortion` has all "
+    "numbers of the calibration (k4, k5, k6 too), or calibrate the camera at this size of image with a lens of eight numbers"
+)
 FITS_NONE = (
     "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is wrong: "
     "calibrate the camera at this size of image, or take views from more sides"
 )
 
 
+UNEXPLAINED = 2.0
+"""Where markers are off their place by more than so many times the noise of their shape, this camera does not explain it."""
+
+
 @dataclass(frozen=True, eq=False)
 class CameraFit(Doubt):
     """The camera by the markers of all views; significant: they ask for another than camera.json's.
 
-    is_known: the poses are nearer to the truth with this camera, by its own uncertainty.
+    explains: markers then lie where they should but for the noise of corners. is_known: it does, and the poses are nearer to the
+    truth with this camera, by its own uncertainty.
     """
 
     camera: CaptureCamera
     significant: bool
+    explains: bool
     is_known: bool
 
 
@@ -318,13 +328,17 @@ def fit_camera(
     of_poses = np.einsum("vij,jk,vlk->vil", by_camera, np.linalg.inv(of_camera), by_camera)
     shift_m, unsure_m = np.linalg.norm(motion[:, :3], axis=1), np.sqrt(np.trace(of_poses[:, :3, :3], axis1=1, axis2=2))
     camera, note = corrected_camera(seen[1], free.shared.camera), ""
-    if significant and float(np.max(shift_m / np.linalg.norm(begun.poses[:, :3, 3], axis=1))) >= MATERIAL:
-        sure = np.abs(free.shared.camera) > SIGNIFICANT * np.sqrt(np.diag(of_camera))
-        numbers = compare_cameras(camera, seen[1], sure)
+    explains = bool(corners.sigma_px[0] <= UNEXPLAINED * corners.sigma_px[2])
+    sure = np.abs(free.shared.camera) > SIGNIFICANT * np.sqrt(np.diag(of_camera))
+    numbers = compare_cameras(camera, seen[1], sure)
+    material = float(np.max(shift_m / np.linalg.norm(begun.poses[:, :3, 3], axis=1))) >= MATERIAL
+    if significant and not explains:
+        note = FITS_NO_MODEL * material
+    elif significant and (material or (numbers and explains)):
         by = f"{1000 * float(np.median(shift_m)):.1f} mm"
         note = FITS_NOT.format(numbers=numbers, by=by) if numbers else FITS_NONE
-    is_known = significant and bool(np.median(shift_m) > np.median(unsure_m))
-    return CameraFit(motion, of_poses, note, camera, significant, is_known)
+    is_known = significant and explains and bool(np.median(shift_m) > np.median(unsure_m))
+    return CameraFit(motion, of_poses, note, camera, significant, explains, is_known)
 
 
 def _scatter(rows: Rows, views: int, variance: float) -> float:
