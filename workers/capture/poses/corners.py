@@ -275,13 +275,12 @@ UNEXPLAINED = 2.0
 class CameraFit(Doubt):
     """The camera by the markers of all views; significant: they ask for another than camera.json's.
 
-    explains: markers then lie where they should but for the noise of corners. is_known: it does, and the poses are nearer to the
-    truth with this camera, by its own uncertainty.
+    is_known: markers then lie where they should but for the noise of corners, and the poses are nearer to the truth with this
+    camera, by its own uncertainty.
     """
 
     camera: CaptureCamera
     significant: bool
-    explains: bool
     is_known: bool
 
 
@@ -338,7 +337,7 @@ def fit_camera(
         by = f"{1000 * float(np.median(shift_m)):.1f} mm"
         note = FITS_NOT.format(numbers=numbers, by=by) if numbers else FITS_NONE
     is_known = significant and explains and bool(np.median(shift_m) > np.median(unsure_m))
-    return CameraFit(motion, of_poses, note, camera, significant, explains, is_known)
+    return CameraFit(motion, of_poses, note, camera, significant, is_known)
 
 
 def _scatter(rows: Rows, views: int, variance: float) -> float:

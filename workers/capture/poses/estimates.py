@@ -206,8 +206,7 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     pixels = np.concatenate([o.corners.pixels for o in problem.observations])
     camera = fit_camera(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
     doubt: Doubt | None = camera if camera is not None and camera.note else None
-    if camera is None or not (camera.significant and camera.explains):  # what a camera explains is no rolling shutter
-        doubt = doubt or find_rolling(problem.corner_term(), joint.solution, problem.camera.intrinsics.height)
+    doubt = doubt or find_rolling(problem.corner_term(), joint.solution, problem.camera.intrinsics.height)
     everyone = list(range(len(problem.index)))
     # Poses that are off by more than an object is said to have moved see it elsewhere although it rests.
     off_m = 0.0 if doubt is None else float(np.linalg.norm(doubt.motion[:, :3], axis=1).max())
