@@ -113,12 +113,13 @@ def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) 
         )
     print("\n".join([*draw_table([cells_of(row) for row in used], width), *draw_left_out(left_out, width)]))
     title = f"{folder}: {plural(len(used), 'object')}"
-    notes = [*ask_about_large(used), *draw_left_out(left_out, None)]
+    asked = ask_about_large(used)
+    notes = [*asked, *draw_left_out(left_out, None)]
     sheet = out / SHEET_FILE if _draw(out / SHEET_FILE, title, library, used, notes) else None
     categories = sorted({row.category for row in used} - {TABLE})
     _write_job(out, folder, used)
     print(f"{out}: {plural(len(used), 'object')} in {plural(len(categories), 'category')}")
-    print("\n".join(f"  {line}" for line in (*describe_decisions(used), *ask_about_large(used))))
+    print("\n".join(f"  {line}" for line in (*describe_decisions(used), *asked)))
     look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
     print(look, command_line("run", out / JOB_FILE, "--scenes", 8))
     if options.json:
