@@ -71,7 +71,7 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
     if effects.runs("release_again"):
         with stopwatch.stage("recheck", "release_again"):
             rest = recheck_scene(plan, rest, job.physics, effects)
-    return Laid(frame_cameras(job, plan, rest.settled), effects, rest)
+    return Laid(frame_cameras(job, plan, [each.T_world_obj for each in rest.settled]), effects, rest)
 
 
 def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Scene:

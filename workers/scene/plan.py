@@ -14,7 +14,7 @@ from schemas.errors import StartError, ViewError
 from schemas.job.job import Job
 from schemas.job.physics import Start
 from schemas.job.views import Cameras
-from schemas.scene.scene import ObjectStart, ScenePlan, Settled, Table
+from schemas.scene.scene import ObjectStart, ScenePlan, Table
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
@@ -204,13 +204,14 @@ SEARCHED, STEPS = 40, 4
 """Doublings, and then halvings, of a distance; corrections of one by the pixels that objects cover."""
 
 
-def frame_cameras(job: Job, plan: ScenePlan, settled: Sequence[Settled]) -> ScenePlan:
-    """The plan with input cameras that frame its objects at rest, where the orbit says so, in the directions that were drawn.
+def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan:
+    """The plan with input cameras that frame its objects, where the orbit says so, in the directions that were drawn.
 
+    poses: `T_world_obj` [4, 4] of each object.
     Raises ViewError `not_framed` where a camera stands nearer to an object than the object is large, or where the objects do
     not fit into the picture and the range of depth.
     """
-    placed = [(start, rest.T_world_obj) for start, rest in zip(plan.objects, settled, strict=True)]
+    placed = list(zip(plan.objects, poses, strict=True))
     cameras = plan.input_cameras
     if job.cameras.orbit.share is not None:
         cameras = tuple(_frame(job, camera, placed, job.cameras.orbit.share) for camera in cameras)

@@ -64,6 +64,10 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
         ),
         ({"cameras.mirror.T_z_m": 60}, r"mirror camera has the object (59\.\d|60) to .* change cameras\.mirror\.T_z_m"),
         ({"cameras.sensor.cx": -5000}, r"beside its picture or smaller than a pixel: see cameras\.sensor"),
+        (
+            {"cameras.orbit.radius_m": "fit", "cameras.mirror.T_z_m": "fit", "images.depth_range_m": [3.0, 3.05]},
+            r"m across together: the camera that frames them .* 3 to 3\.05 m",
+        ),
         ({"start.offset_m": [3, 4]}, r"none of 21 positions .* narrow start\.offset_m"),
     ],
 )
@@ -80,6 +84,13 @@ def test_a_job_whose_scenes_cannot_be_framed_is_refused_before_anything_is_writt
         )
     assert main(["run", str(job), "--out", str(out), "--address", "127.0.0.1:1"]) == 1  # nobody answers there
     assert not out.exists()
+
+
+def test_cameras_that_frame_their_objects_are_asked_where_they_will_stand(tmp_path):
+    """Before a scene is at rest they stand at a distance that stands for one."""
+    framed = {"orbit": {"radius_m": "fit"}, "mirror": {"T_z_m": "fit"}}
+    asked = request(tmp_path / "new", cameras=framed, images={"depth_range_m": [1.3, 3.0]})
+    assert open_inputs(asked.job, asked.job_folder, asked.out)
 
 
 def test_a_dry_run_says_why_scenes_cannot_be_made_that_can_be_framed(tmp_path, monkeypatch):

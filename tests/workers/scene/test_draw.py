@@ -134,7 +134,9 @@ def framed(*objects, radius_m="fit", at=(0.3, -0.2), **changes):
     starts = [replace(planned.objects[0], asset=asset, hull=hull_of(asset.shape)) for asset in objects]
     poses = [translation(at[0] + 0.1 * k, at[1], 0.9) for k in range(len(objects))]
     rests = [SimpleNamespace(T_world_obj=T) for T in poses]
-    (camera,) = frame_cameras(drawn, replace(planned, objects=tuple(starts)), rests).input_cameras
+    (camera,) = frame_cameras(
+        drawn, replace(planned, objects=tuple(starts)), [rest.T_world_obj for rest in rests]
+    ).input_cameras
     before = planned.input_cameras[0]
     assert np.array_equal(camera.T_world_cam[:3, :3], before.T_world_cam[:3, :3]), "the direction that was drawn"
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
