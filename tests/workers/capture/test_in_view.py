@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
+from schemas.base import frozen_array
 from schemas.capture import CaptureCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Captures, Estimation, Simulate
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Material, Part, Shape
 from services.cli.main import main
 from tests.workers.capture.drawn import errors
 from tests.workers.capture.simulated import asset_of
@@ -121,3 +123,37 @@ def test_a_view_of_the_second_print_alone_has_no_pose(tmp_path):
         assert [v.number for v in estimate.used] == [0, 1, 2]
         assert max(errors(v.T_board_cam, poses[v.number])[0] for v in estimate.used) < 0.3
         assert estimate.views[3].markers > 10 and "nothing stands on the one it shows" in estimate.views[3].reasons[0]
+
+
+# ---------------------------------------------------------------------------------------------- a hand
+
+
+def arm(start_m, tip_m, radius_m=0.025):
+    """A forearm with a fist, board frame: from outside of the board to over it."""
+    along = np.array(tip_m) - start_m
+    length = np.linalg.norm(along)
+    forearm = trimesh.creation.capsule(length, radius_m, count=[12, 12])
+    forearm.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], along / length))
+    fist = trimesh.creation.icosphere(2, 1.6 * radius_m)
+    middle = 0.5 * (np.array(start_m) + tip_m) - forearm.bounds.mean(axis=0)
+    mesh = trimesh.util.concatenate([forearm.apply_translation(middle), fist.apply_translation(tip_m)])
+    part = Part("arm", frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), Material((0.8, 0.6, 0.5, 1.0)))
+    return Placed(REGION_TABLE, Shape((part,)), np.eye(4))
+
+
+def arms(where):
+    """By number of a view: an arm that ends at a place [3], beginning on its side of the board."""
+    return lambda n: [arm(0.55 * np.array([np.cos(a), np.sin(a), 0.5]), tip) for a, tip in where.get(n, ())]
+
+
+HANDS = {
+    "over the edge of the board, elsewhere each time": {
+        1: [(0.5, (0.2, 0.1, 0.05))],
+        4: [(2.5, (-0.19, 0.1, 0.06))],
+        6: [(-1.5, (0.03, -0.17, 0.05))],
+    },
+    "twice in one place": {2: [(0.4, (0.2, 0.1, 0.05))], 3: [(0.4, (0.2, 0.1, 0.05))]},
+    "between camera and object": {n: [(0.4, (0.1, 0.02, 0.12))] for n in (0, 3)},
+    "two hands about the object": {5: [(0.2, (0.11, 0.0, 0.06)), (3.3, (-0.11, 0.0, 0.06))]},
+    "large, in one view": {5: [(1.0, (0.12, 0.1, 0.09)), (1.5, (0.0, 0.13, 0.09)), (2.0, (-0.12, 0.13, 0.09))]},
+}
