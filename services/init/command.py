@@ -23,7 +23,7 @@ from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import MOST_KEYS, validate_job
 from services.run.parts import Cut, cut_shapes
-from services.run.progress import show_counts
+from services.run.progress import finish, show_counts
 from workers.assets.catalogue import Watch
 from workers.assets.library.categories import BY_FILE, BY_FOLDER, BY_PARENT
 from workers.assets.library.copies import COPY, PART
@@ -122,16 +122,8 @@ def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) 
     print("\n".join(f"  {line}" for line in (*describe_decisions(used), *asked)))
     look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
     print(look, command_line("run", out / JOB_FILE, "--scenes", 8))
-    if options.json:
-        tree = {
-            "library": str(out),
-            "job": str(out / JOB_FILE),
-            "sheet": sheet and str(sheet),
-            "categories": categories,
-        }
-        objects, others = [_plain(row) for row in used], [_plain(row) for row in left_out]
-        print(json.dumps({"ok": True, **tree, "objects": objects, "left_out": others}))
-    return 0
+    tree = {"library": str(out), "job": str(out / JOB_FILE), "sheet": sheet and str(sheet), "categories": categories}
+    return finish(options, True, **tree, objects=list(map(_plain, used)), left_out=list(map(_plain, left_out)))
 
 
 def _plain(row: Row) -> dict[str, object]:

@@ -18,11 +18,22 @@ from schemas.errors import OutputError, RunError, describe_seconds, plural
 from schemas.job.job import Job
 from services.run.progress import ProgressLine
 from services.study import choose
-from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, recommend
+from services.study.choose import (
+    DEFAULT_TARGETS,
+    FEWEST_SCENES,
+    LEAST,
+    TargetError,
+    Wanted,
+    missing,
+    next_round,
+    promising,
+    recommend,
+    seconds,
+    undecided,
+)
 from services.study.images import measure_colour, measure_drawn
 from services.study.measure import LIMIT, RESTS, measure_capture, measure_rest
 from services.study.model import OWN, Proof, Row, Setting, Study, Targets, apply, joined
-from services.study.rounds import LEAST, Wanted, missing, next_round, promising, seconds, undecided
 from services.study.table import AT_REST, PARTS, Part, Table, figures_of, part_of, split_settings, unit_name
 from workers.assets.catalogue import open_catalogue
 from workers.pool import Answers, Ended, Pool

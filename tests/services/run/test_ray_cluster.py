@@ -21,12 +21,11 @@ from schemas.errors import MachineError
 from services.run import machine as module
 from services.run.machine import (
     MAX_BASE_BYTES,
-    OWNER,
     PREFIX,
     SESSION_BYTES,
     SOCKET_BYTES,
+    living_folders,
     private_folder,
-    remove_dead,
 )
 from services.run.ray_cluster import (
     LOOK_EVERY_S,
@@ -49,6 +48,7 @@ from tests.kit.network import (
     tree_of,
     unix_sockets_of,
 )
+from workers.store.file_system import OWNER
 
 ROOT = Path(__file__).resolve().parents[3]
 NOBODY = 65534
@@ -180,7 +180,7 @@ def test_the_folder_of_a_dead_owner_goes_at_the_next_start_and_that_of_a_living_
         dead = killed_owner(short)
         with monkeypatch.context() as busy:
             busy.setattr(shutil, "rmtree", lambda folder, **_: None)  # a process that is just ending still writes there
-            remove_dead(short)
+            living_folders()
         assert (dead / OWNER).exists(), "half removed, it is found again"
         with private_folder():
             assert not dead.exists()
@@ -196,7 +196,7 @@ def test_what_only_looks_like_one_or_is_another_users_stays(short):
     if os.geteuid() == 0:
         os.chown(killed_owner(short), NOBODY, NOBODY)
     before = sorted(short.rglob("*"))
-    remove_dead(short)
+    living_folders()
     assert sorted(short.rglob("*")) == before
 
 
