@@ -91,7 +91,9 @@ def main(options: argparse.Namespace) -> int:
     folder: Path = options.folder
     out: Path = options.out or Path(f"{dataset_name(folder)}_library")
     making = read_making(options)
-    _check_target(out)
+    holds = [path.name for path in out.iterdir()] if out.is_dir() else []
+    if out.exists() and TABLE_FILE not in holds and (not out.is_dir() or set(holds) - {".lock"}):
+        raise OutputError(f"{out} is there already, and no library: remove it, or choose another --out")
     with locked(out, wait=False):
         return _init(options, folder, out, making)
 
@@ -147,13 +149,6 @@ def read_making(options: argparse.Namespace) -> Making:
     if options.licence is not None and not (options.licence.strip() and options.licence.isprintable()):
         raise InputError("--licence: write some words")
     return Making(by, tuple(options.unit), options.up, options.licence, limits)
-
-
-def _check_target(out: Path) -> None:
-    if not out.exists() or (out / TABLE_FILE).is_file():
-        return
-    if not out.is_dir() or any(path.name != ".lock" for path in out.iterdir()):
-        raise OutputError(f"{out} is there already, and no library: remove it, or choose another --out")
 
 
 def fill_library(library: Library, watch: Watch) -> Library:

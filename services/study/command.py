@@ -60,8 +60,8 @@ def main(options: argparse.Namespace) -> int:
     print(f"measures for at most {describe_seconds(plan.budget_s)} (--budget), {plan.processes} scenes at a time")
     journal = Journal(options.out, {"job": context.settings_digest, "code": code_digest()})
     about = {"command": shlex.join(["verso", *sys.argv[1:]]), "machine": describe_machine(context.renderer.name)}
-    with closing(ProgressLine(round(plan.budget_s), "tradeoff", unit="second")) as line:
-        study = run_study(plan, journal, line, began, notes=notes, **about)
+    with closing(ProgressLine(round(plan.budget_s), "tradeoff", unit="second")) as bar:
+        study = run_study(plan, journal, bar, began, notes=notes, **about)
     write_study(study, options.out)
     said = {"note": study.notes, "not decided": study.doubts, "proof": map(describe_proof, study.proofs)}
     for line in (f"{word:12} {line}" for word, lines in said.items() for line in lines):

@@ -1,6 +1,8 @@
 """What is refused before Ray is asked, who can reach a private Ray and what it sends, its folder, and a cluster's slots."""
 
+import itertools
 import json
+import math
 import os
 import shutil
 import signal
@@ -129,6 +131,8 @@ def test_slots_follow_the_cores_of_the_cluster_which_is_asked_now_and_then(monke
         (2, 6, Slots(2, 2 * PREFETCH)),
     ):
         assert slots_of(cores, workers) == slots
+    for cores, jobs in itertools.product(range(1, 20), range(2, 6)):  # even shares: no core is idle, no job without
+        assert slots_of(cores, None, jobs) == Slots(share := math.ceil(cores / jobs), share)
     cores, now, asked = [2], [100.0], []
 
     def count() -> int:
