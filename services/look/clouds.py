@@ -14,11 +14,10 @@ from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_world_poses
 from schemas.errors import VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
-from services.look.collect import choose_spread
 from services.look.pictures import PLAIN, SHOWN_ROLES, PairImages, metres_of, read_pair
 from services.read.dataset_reader import file_reader, find_scene
 from services.read.scene_geometry import posed_scene
-from workers.geometry.camera import unproject
+from workers.geometry.camera import spread_evenly, unproject
 from workers.store.store import Store
 
 MOST_POINTS = 90_000
@@ -81,7 +80,7 @@ class Space:
 
 def read_spaces(store: Store, scene_ids: Sequence[int]) -> tuple[Space, ...]:
     """At most `MOST_SPACES` of these scenes, evenly. Raises CorruptError for damaged images."""
-    chosen = choose_spread(scene_ids, MOST_SPACES)
+    chosen = [scene_ids[place] for place in spread_evenly(len(scene_ids), MOST_SPACES)]
     most = MOST_POINTS if len(chosen) == 1 else FEWER_POINTS
     return tuple(filter(None, (read_space(store, scene_id, most) for scene_id in chosen)))
 

@@ -13,8 +13,8 @@ from cachetools import LRUCache
 from schemas.dataset.layout import commit_path
 from schemas.errors import OutputError, VersoError, describe_seconds, number, plural
 from services.job.record import read_job
-from services.look.charts import Histogram
-from services.look.pictures import DEPTH_M, PLAIN, Picture, ShownScene, show_scene
+from services.look.charts import DEPTH_M, Histogram
+from services.look.pictures import PLAIN, Picture, ShownScene, show_scene
 from services.look.report import Section, View, page_of, read_report
 from services.look.sheets import Address, strip_html
 from services.read.dataset_reader import file_reader, read_stored

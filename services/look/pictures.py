@@ -19,17 +19,19 @@ from schemas.dataset.codec import Row
 from schemas.dataset.layout import patch_index
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import MODALITIES, PixelKind
-from services.look.charts import Histogram
-from services.look.collect import Tables, choose_spread
+from services.look.charts import DEPTH_M, Histogram
 from services.read.dataset_reader import (
     ReadFile,
     StoredRange,
+    StoredTables,
     file_reader,
     find_scene,
     patch_paths,
     read_image,
     view_paths,
 )
+from services.read.query import query
+from workers.geometry.camera import spread_evenly
 from workers.store.store import Store
 
 MOST_WIDTH = 480
@@ -201,10 +203,6 @@ def metres_of(depth: NDArray, view: Row) -> NDArray:
     return metres
 
 
-DEPTH_M = (0.0, 9.6)
-"""Range of counted depth, metres: stored depth ends at 8 m by default."""
-
-
 @dataclass(frozen=True)
 class ShownScene:
     """One scene of the page: its pictures by name (`input rgb`, `mirror normals patch`, `over`), and what is told beside them."""
@@ -219,15 +217,12 @@ class ShownScene:
     d_z_m: float | None
 
 
-def choose_scenes(tables: Tables, scenes: int) -> list[int]:
+def choose_scenes(tables: StoredTables, scenes: int) -> list[int]:
     """At most `scenes` scene ids, equally many of each category, evenly over its ids; at least one of each."""
-    by_category: dict[str, list[int]] = {}
-    for rows in tables.batches("scenes", ("scene_id", "category")):
-        ids, names = rows.column("scene_id").to_numpy(), np.asarray(rows.column("category").to_pylist())
-        for category in np.unique(names).tolist():
-            by_category.setdefault(category, []).extend(ids[names == category].tolist())
+    sql = "select list(scene_id order by scene_id) as ids from scenes group by category order by category"
+    by_category = query(tables, sql)["ids"].to_pylist()
     each = max(1, scenes // max(len(by_category), 1))
-    return [scene_id for name in sorted(by_category) for scene_id in choose_spread(by_category[name], each)]
+    return [ids[place] for ids in by_category for place in spread_evenly(len(ids), each)]
 
 
 def show_scenes(store: Store, scene_ids: Iterable[int]) -> tuple[list[ShownScene], Mapping[str, Histogram]]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, NoReturn, TypeAlias
 
@@ -39,6 +40,7 @@ from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError, command_line
 from schemas.scene.view import MODALITIES
 from services.job.record import read_success
+from workers.geometry.camera import spread_evenly
 from workers.store.commit import code_of, commit_names, list_codes, read_record, split_code
 from workers.store.images import decode_png
 from workers.store.ledger import list_commits, range_rows, read_range
@@ -287,30 +289,35 @@ class StoredTables:
     the first try's. Raises OutputError where there is no dataset, CorruptError where `_SUCCESS` or a commit is damaged.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, most_ranges: int | None = None) -> None:
+        """`most_ranges`: so many of an unfinished dataset are read, evenly chosen; then there may be none yet."""
+        self.store = store
+        self.sampled = False
+        """Whether rows of some ranges only are read."""
         self._done = read_success(store)
         self._plain: list[int] = []
         """Of an unfinished dataset, the ranges whose tables are in place, as they were made first."""
         self._other: list[list[CommitRecord]] = []
         """The ranges that are not published or have retries: their rows go through memory."""
         if self._done is None:
-            self._find_ranges()
+            self._find_ranges(most_ranges)
 
-    def _find_ranges(self) -> None:
-        names = commit_names(self._store)
-        if not names:
+    def _find_ranges(self, most_ranges: int | None) -> None:
+        groups = groupby(commit_names(self.store), key=itemgetter(0))
+        ranges = [(start, [retry for _, retry, _ in group]) for start, group in groups]
+        if not ranges and most_ranges is None:
             raise OutputError(
-                f"{self._store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet"
+                f"{self.store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet"
             )
         # Listed after the commits: a committed range without staging is published.
-        staged = set(self._store.children(STAGING))
-        for start, group in groupby(names, key=lambda name: name[0]):
-            retries = [retry for _, retry, _ in group]
+        staged = set(self.store.children(STAGING))
+        self.sampled = most_ranges is not None and len(ranges) > most_ranges
+        for place in spread_evenly(len(ranges), most_ranges or len(ranges)):
+            start, retries = ranges[place]
             if retries == [0] and range_name(start) not in staged:
                 self._plain.append(start)
             else:
-                records = (read_record(self._store, start, retry) for retry in retries)
+                records = (read_record(self.store, start, retry) for retry in retries)
                 self._other.append([record for record in records if record is not None])
 
     @cached_property
@@ -321,19 +328,19 @@ class StoredTables:
             any(key.startswith(f"{MANIFEST}/{table}/") for key in files) for table in TABLES
         ):
             return list(files)
-        fault = f"{SUCCESS_FILE} in {self._store.name} does not name its merged files"
+        fault = f"{SUCCESS_FILE} in {self.store.name} does not name its merged files"
         raise CorruptError(f"{fault}: remove it, and run the job again")
 
     def parts(self, table: str) -> list[Rows]:
         """The rows of one table in one or two pieces. In `assets` of an unfinished dataset an instance may be repeated."""
-        schema, files = SCHEMAS[table], file_system_of(self._store)
+        schema, files = SCHEMAS[table], file_system_of(self.store)
         if self._done is not None:
             folder = f"{MANIFEST}/{table}"
             keys = [key for key in self._merged_files if key.startswith(f"{folder}/")]
             hive: Any = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
             options = {"filesystem": files, "partition_base_dir": folder, "partitioning": hive}
             return [ds.dataset(keys, schema, _FORMAT, **options)]
-        rows = [range_rows(self._store, records, table) for records in self._other]
+        rows = [range_rows(self.store, records, table) for records in self._other]
         parts: list[Rows] = [join_rows(table, [schema.empty_table(), *rows])]
         if self._plain:
             paths = [range_table_path(start, table) for start in self._plain]
