@@ -290,7 +290,7 @@ class _MadeFiles:
             raise FileNotFoundError(path)
         return self._data[path]
 
-    def image(self, scene_id: int, path: str) -> bytes:
+    def image(self, path: str) -> bytes:
         """The bytes of an image."""
         if path not in self._data:
             raise CorruptError(f"{path} was not made")

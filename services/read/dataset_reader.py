@@ -6,7 +6,8 @@ Range by range or scene by scene, and as tables: pyarrow datasets.
 import io
 import itertools
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -41,8 +42,7 @@ from schemas.errors import CorruptError, InputError, OutputError, command_line
 from schemas.scene.view import MODALITIES
 from services.job.record import read_success
 from workers.geometry.camera import spread_evenly
-from workers.store.commit import code_of, commit_names, list_codes, read_record, split_code
-from workers.store.images import decode_png
+from workers.store.commit import code_of, commit_names, list_codes, read_committed, read_record, split_code
 from workers.store.ledger import list_commits, range_rows, read_range
 from workers.store.manifest import join_rows
 from workers.store.store import Store
@@ -122,40 +122,51 @@ def find_records(store: Store, scene_id: int) -> list[CommitRecord]:
     )
 
 
-def file_reader(read: ReadFile, stored: StoredRange) -> ReadFile:
-    """Reads images and shapes of a range by path, from their own place or from a tar (each tar is read once).
+def committed_reader(store: Store, records: Sequence[CommitRecord]) -> ReadFile:
+    """Reads the files of a range, published or, where a run is at work, not yet. Raises CorruptError for one that is missing."""
 
-    `read` is the store's. What comes back raises CorruptError where a file is missing.
+    def read(path: str) -> bytes:
+        for record in records[:-1]:
+            with suppress(CorruptError):
+                return read_committed(store, record, path)
+        return read_committed(store, records[-1], path)
+
+    return read
+
+
+Members = Mapping[str, bytes]
+"""Images of a tar by path."""
+
+
+def file_reader(
+    read: ReadFile, records: Sequence[CommitRecord], tars: MutableMapping[str, Members] | None = None
+) -> ReadFile:
+    """Reads images and shapes of a range by path, from their own place or from a tar, of a retry's first.
+
+    `read` gives the bytes of files and tars. A tar is read when it is first needed, and kept in `tars` by its path. What comes
+    back raises CorruptError for an image that is in no tar.
     """
+    kept = {} if tars is None else tars
+    packed = [entry.path for record in reversed(records) for entry in record.files if entry.path.endswith(".tar")]
 
-    def read_committed(path: str) -> bytes:
-        try:
+    def members_of(tar: str) -> Members:
+        if (known := kept.get(tar)) is not None:
+            return known
+        members = dict(read_tar(tar.partition("/")[0], read(tar), tar))
+        with suppress(ValueError):  # it is larger than all that is kept
+            kept[tar] = members
+        return members
+
+    def read_file(path: str) -> bytes:
+        if records[0].terms.layout == "files" or is_shape(path):
             return read(path)
-        except FileNotFoundError as error:
-            raise CorruptError(f"{path} is committed and missing: restore it from a copy") from error
+        folder = f"{path.partition('/')[0]}/"
+        for members in (members_of(tar) for tar in packed if tar.startswith(folder)):
+            if path in members:
+                return members[path]
+        raise CorruptError(f"{path} is committed and in no tar: `verso verify OUT` tells more")
 
-    if stored.records[0].terms.layout == "files":
-        return read_committed
-    members: dict[str, bytes] = {}
-    for path in (entry.path for record in stored.records for entry in record.files if entry.path.endswith(".tar")):
-        members.update(read_tar(path.partition("/")[0], read_committed(path), path))
-
-    def read_packed(path: str) -> bytes:
-        if is_shape(path):
-            return read_committed(path)
-        if path not in members:
-            raise CorruptError(f"{path} is committed and in no tar")
-        return members[path]
-
-    return read_packed
-
-
-def read_image(read: ReadFile, path: str) -> NDArray:
-    """An image by its path. Raises CorruptError where it is missing or no PNG."""
-    try:
-        return decode_png(read(path), path)
-    except ValueError as error:
-        raise CorruptError(f"{path} is not a whole PNG: {error}") from error
+    return read_file
 
 
 _SAMPLES: Mapping[str, tuple[str, tuple[int, ...]]] = {
