@@ -20,7 +20,7 @@ from schemas.errors import MachineError, MeshError, plain_line
 from schemas.job.assets import TABLE, Assets, MeshLimits
 from schemas.scene.shape import Asset, Shape
 from workers.assets.glb import asset_glb
-from workers.assets.library.placement import INFO_FILE, find_upright, measure_shape, measure_thinness
+from workers.assets.library.placement import INFO_FILE, measure_shape, measure_thinness
 from workers.assets.library.table import Row, SourceFile
 from workers.assets.mass import weigh
 from workers.door.meshes.caps import LONGEST_NOTE, MOST_NOTES, find_inside
@@ -158,16 +158,10 @@ def make_glb(question: Question, row: Row) -> bytes:
     loaded = load_file(folder, path, question.limits)
     asset = place_asset(loaded, row, question.limits)
     if row.category != TABLE:
-        hull_vertices = check_body(asset.shape, path)
-        fits = find_upright(
-            hull_vertices @ asset.T_source_to_object[:3, :3], asset.mass.com @ asset.T_source_to_object[:3, :3]
-        )
-    else:
-        fits = None
+        check_body(asset.shape, path)
     mass = asset.mass
     more = {
         "key": row.key,
-        "path": row.path,
         "sha256": files[0].sha256,
         "closed": asset.shape.closed,
         "watertight": asset.watertight,
@@ -178,8 +172,6 @@ def make_glb(question: Question, row: Row) -> bytes:
         "faces": len(asset.shape.faces),
         "extents_m": asset.extents_m.tolist(),
         "pictures": len({id(p.material.texture) for p in asset.shape.parts if p.material.texture is not None}),
-        "shape_up": None if fits is None else fits.axis,
-        "sure": None if fits is None else fits.confidence == "sure",
     }
     return asset_glb(replace(asset, sha256=files[0].sha256), library=more)
 

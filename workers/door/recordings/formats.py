@@ -304,17 +304,8 @@ def _of_phone(
     k = read_intrinsics(described, _size_of(color), numbers, 0.5)
     yield _color(stamp_us, partial(_bytes_of, color), k)
     if depth.is_file():
-        yield _depth(
-            stamp_us,
-            partial(_bytes_of, depth),
-            k,
-            1000.0,
-            _size_of(depth),
-            partial(_bytes_of, sure) if sure.is_file() else None,
-        )
-
-
-POLYCAM_FOLDERS = ("images", "depth", "cameras")
+        confidence = partial(_bytes_of, sure) if sure.is_file() else None
+        yield _depth(stamp_us, partial(_bytes_of, depth), k, 1000.0, _size_of(depth), confidence)
 
 
 def _keyframes(path: Path) -> Path:
@@ -380,7 +371,11 @@ READERS = (
     Reader("a BOP scene (scene_camera.json, rgb/ or gray/, depth/)", lambda path: _has(path, BOP_FILE), _open_bop),
     Reader("an Open3D folder (color/ or rgb/, depth/)", lambda path: bool(_open3d_folder(path)), _open_open3d),
     Reader("a Record3D file (.r3d)", _is_record3d, _open_record3d),
-    Reader("Polycam's raw data (keyframes/)", lambda path: _has(_keyframes(path), *POLYCAM_FOLDERS), _open_polycam),
+    Reader(
+        "Polycam's raw data (keyframes/)",
+        lambda path: _has(_keyframes(path), "images", "depth", "cameras"),
+        _open_polycam,
+    ),
     Reader("an ARKitScenes folder (lowres_wide/, lowres_depth/)", lambda path: _has(path, *ARKIT_FOLDERS), _open_arkit),
 )
 """Formats that are read, in the order in which they are tried."""
