@@ -33,15 +33,21 @@ ROOT = Path(__file__).resolve().parents[3]
 TABLETOP = str(ROOT / "deploy" / "jobs" / "tabletop.yaml")
 
 
-def told(capsys, *arguments: str) -> tuple[int, str]:
-    """Exit code and everything that was written."""
+def ended(capsys, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, and what was written to standard output and to standard error."""
     try:
         code = main(list(arguments))
     except SystemExit as exit_:  # argparse's own
         code = int(exit_.code or 0)
     captured = capsys.readouterr()
     assert "Traceback" not in captured.out + captured.err
-    return code, captured.out + captured.err
+    return code, captured.out, captured.err
+
+
+def told(capsys, *arguments: str) -> tuple[int, str]:
+    """Exit code and everything that was written."""
+    code, out, err = ended(capsys, *arguments)
+    return code, out + err
 
 
 def answer(capsys, *arguments: str) -> tuple[int, list[str], dict]:
