@@ -297,9 +297,9 @@ class SensedFiles:
         self._files, self._images = files, images
         self.patch, self.mesh, self.samples = files.patch, files.mesh, files.samples
 
-    def image(self, scene_id: int, path: str) -> bytes:
+    def image(self, path: str) -> bytes:
         """The bytes of an image."""
-        return self._images[path] if path in self._images else self._files.image(scene_id, path)
+        return self._images[path] if path in self._images else self._files.image(path)
 
 
 def sense_input(pair: Pair, job: Job) -> Pair:

@@ -34,9 +34,8 @@ from services.job.job_file import MOST_KEYS, validate_job
 from services.run.parts import Cut, cut_shapes
 from services.run.progress import finish, show_counts
 from workers.assets.catalogue import Watch
-from workers.assets.library.categories import BY_FILE, BY_FOLDER, BY_PARENT
 from workers.assets.library.copies import COPY, PART
-from workers.assets.library.guess import ON_TABLE_M, length
+from workers.assets.library.guess import BY_FILE, BY_FOLDER, BY_PARENT, ON_TABLE_M, length
 from workers.assets.library.making import Making, locked, remake_library
 from workers.assets.library.shapes import load_shape, make_shapes, with_shape
 from workers.assets.library.table import TABLE_FILE, Library, Row, write_table, write_whole
