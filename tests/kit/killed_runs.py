@@ -113,6 +113,29 @@ def disturb_at_first_commit(
     return EndedRun(run.returncode, b"".join(said).decode(errors="replace"), [process.name for process in left])
 
 
+HOLD = """
+import sys, time
+from services.run.lock import hold_lock
+from workers.store.local import LocalStore
+with hold_lock(LocalStore(sys.argv[1])):
+    print(flush=True)
+    time.sleep(600)
+"""
+
+
+@contextlib.contextmanager
+def holding(folder: Path) -> Iterator[subprocess.Popen]:
+    """A process that holds the lock of an output folder; killed in the end."""
+    command = [sys.executable, "-c", HOLD, str(folder)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 PATIENCE_S = 180.0
 
 
