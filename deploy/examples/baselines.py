@@ -25,9 +25,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import trimesh
+from mirror_depth import pairs_of_split
 from numpy.typing import NDArray
 from scipy import ndimage
-from splits import pairs_of_split
 
 from schemas.dataset.codec import read_matrix
 from schemas.dataset.layout import PixelKind
