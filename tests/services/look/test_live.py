@@ -204,8 +204,8 @@ ASKED = (
 
 def test_reading_alone_is_answered_under_the_servers_own_names_and_with_its_token(monkeypatch):
     for gate, method, target, headers, status in ASKED:
-        assert judge(gate, method, target, {**HERE, **headers}).status == status, (method, target, headers)
-    assert judge(OPEN, "GET", "/live.json?x=1", HERE).path == "/live.json"
+        assert judge(gate, method, target, {**HERE, **headers})[0] == status, (method, target, headers)
+    assert judge(OPEN, "GET", "/live.json?x=1", HERE) == (200, "/live.json")
     assert all(is_host_known(host, OPEN.names) for host in OURS)
     assert not any(is_host_known(host, OPEN.names) for host in FOREIGN)
     compared = []
