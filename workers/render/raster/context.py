@@ -40,7 +40,6 @@ SIGNATURES: dict[str, tuple[Any, ...]] = {
     "glEnableVertexAttribArray": (c_uint,),
     "glPixelStorei": (c_uint, c_int),
     "glReadBuffer": (c_uint,),
-    "glScissor": (c_int, c_int, c_int, c_int),
     "glStencilFunc": (c_uint, c_int, c_uint),
     "glStencilOp": (c_uint, c_uint, c_uint),
     "glUniform1f": (c_int, c_float),
@@ -218,38 +217,15 @@ class Framebuffer:
             raise RuntimeError(f"a framebuffer of {width} x {height} is not complete: status {status:#x}")
         self.size = (width, height)
 
-    def clear(self, appearance: Appearance) -> None:
-        """Set every pixel to the background, at no depth and infinitely far away."""
+    def clear(self, appearance: Appearance, colors: bool = True) -> None:
+        """Set every pixel infinitely far away, and without `colors` leave the background and no depth to what is drawn."""
         gl = self._gl
-        self.clear_depth()
-        self.clear_color(np.append(encode_srgb(np.array(appearance.background)), 0.0))
+        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.zeros(1, np.float32))  # what the depth test compares falls with distance
+        if not colors:
+            return
+        gl.glClearBufferfv(gl.GL_COLOR, 0, np.append(encode_srgb(np.array(appearance.background)), 0.0))
         if gl.GL_COLOR_ATTACHMENT1 in self._formats:
             gl.glClearBufferfv(gl.GL_COLOR, 1, np.zeros(4, np.float32))
-
-    def clear_depth(self) -> None:
-        """Set every pixel infinitely far away: what the depth test compares falls with distance."""
-        self._gl.glClearBufferfv(self._gl.GL_DEPTH, 0, np.zeros(1, np.float32))
-
-    def clear_color(self, rgba: NDArray[np.floating]) -> None:
-        """Set every pixel of the first colour attachment to [4] sRGB and region id / 255."""
-        self._gl.glClearBufferfv(self._gl.GL_COLOR, 0, rgba)
-
-    def limit_to(self, window: tuple[int, int, int, int] | None) -> bool:
-        """Draw into the first colour attachment alone, and within a window, until called with None.
-
-        The window is (left, top, right, bottom), right and bottom excluded. False, without a change, where it is empty.
-        """
-        gl = self._gl
-        if window is None:
-            gl.glDisable(gl.GL_SCISSOR_TEST)
-        else:
-            left, top, right, bottom = window
-            if left >= right or top >= bottom:
-                return False
-            gl.glEnable(gl.GL_SCISSOR_TEST)
-            gl.glScissor(left, top, right - left, bottom - top)
-        gl.glColorMaski(1, *([window is None] * 4))
-        return True
 
     def read(self, rgba: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Read the first colour attachment into `rgba` [H, W, 4], and return it."""
