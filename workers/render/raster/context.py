@@ -11,7 +11,7 @@ function that PyOpenGL checks: the read-back of the image at the latest.
 import importlib
 import socket
 from collections.abc import Callable, Mapping
-from ctypes import CFUNCTYPE, c_float, c_int, c_ssize_t, c_ubyte, c_uint, c_void_p
+from ctypes import CFUNCTYPE, c_void_p
 from types import ModuleType
 from typing import Any, Literal
 
@@ -26,47 +26,20 @@ from workers.render.raster.devices import NO_GPU, Choice, choose_device, list_de
 from workers.render.raster.draw_calls import Program
 from workers.render.raster.lit_shaders import MASK_FRAGMENT, MASK_VERTEX
 
-SIGNATURES: dict[str, tuple[Any, ...]] = {
-    "glActiveTexture": (c_uint,),
-    "glBindBuffer": (c_uint, c_uint),
-    "glBindFramebuffer": (c_uint, c_uint),
-    "glBindTexture": (c_uint, c_uint),
-    "glBindVertexArray": (c_uint,),
-    "glColorMaski": (c_uint, c_ubyte, c_ubyte, c_ubyte, c_ubyte),
-    "glDepthFunc": (c_uint,),
-    "glDisable": (c_uint,),
-    "glDrawElements": (c_uint, c_int, c_uint, c_void_p),
-    "glEnable": (c_uint,),
-    "glEnableVertexAttribArray": (c_uint,),
-    "glPixelStorei": (c_uint, c_int),
-    "glReadBuffer": (c_uint,),
-    "glStencilFunc": (c_uint, c_int, c_uint),
-    "glStencilOp": (c_uint, c_uint, c_uint),
-    "glUniform1f": (c_int, c_float),
-    "glUniform1i": (c_int, c_int),
-    "glUniform2f": (c_int, c_float, c_float),
-    "glUniform3f": (c_int, c_float, c_float, c_float),
-    "glUniform4f": (c_int, c_float, c_float, c_float, c_float),
-    "glUseProgram": (c_uint,),
-    "glVertexAttribPointer": (c_uint, c_int, c_uint, c_ubyte, c_int, c_void_p),
-    "glViewport": (c_int, c_int, c_int, c_int),
-}
-"""The types of the arguments of functions that return nothing and take no array."""
-
-ARRAYS: dict[str, tuple[Any, tuple[Any, ...]]] = {
-    "glBufferData": (None, (c_uint, c_ssize_t, c_void_p, c_uint)),
-    "glClearBufferfv": (np.float32, (c_uint, c_int, c_void_p)),
-    "glDeleteBuffers": (np.uint32, (c_int, c_void_p)),
-    "glDeleteTextures": (np.uint32, (c_int, c_void_p)),
-    "glDeleteVertexArrays": (np.uint32, (c_int, c_void_p)),
-    "glTexImage2D": (None, (c_uint, c_int, c_int, c_int, c_int, c_int, c_uint, c_uint, c_void_p)),
-    "glUniform3fv": (np.float32, (c_int, c_int, c_void_p)),
-    "glUniformMatrix3fv": (np.float32, (c_int, c_int, c_ubyte, c_void_p)),
-    "glUniformMatrix4fv": (np.float32, (c_int, c_int, c_ubyte, c_void_p)),
-}
-"""Functions that take an array: its type, where it is always the same, and the types of the arguments."""
+PLAIN = (
+    *("glActiveTexture", "glBindBuffer", "glBindFramebuffer", "glBindTexture", "glBindVertexArray", "glBufferData"),
+    *("glClearBufferfv", "glColorMaski", "glDeleteBuffers", "glDeleteTextures", "glDeleteVertexArrays", "glDepthFunc"),
+    *("glDisable", "glDrawElements", "glEnable", "glEnableVertexAttribArray", "glPixelStorei", "glReadBuffer"),
+    *("glStencilFunc", "glStencilOp", "glTexImage2D", "glUniform1f", "glUniform1i", "glUniform2f", "glUniform3f"),
+    *("glUniform3fv", "glUniform4f", "glUniformMatrix3fv", "glUniformMatrix4fv", "glUseProgram"),
+    *("glVertexAttribPointer", "glViewport"),
+)
+"""Functions that return nothing, and take one array, or None, if any. PyOpenGL knows the types of their arguments."""
 
 GENERATORS = ("glGenBuffers", "glGenTextures", "glGenVertexArrays")
+
+ARRAY_TYPES = {"GLfloatArray": np.float32, "GLuintArray": np.uint32}
+"""By the name of PyOpenGL's type, that of an array which is always the same; others are passed on as they are."""
 
 
 class DirectCalls(ModuleType):
@@ -75,10 +48,8 @@ class DirectCalls(ModuleType):
     def __init__(self, gl: ModuleType) -> None:
         super().__init__(gl.__name__, gl.__doc__)
         self._gl = gl
-        calls = {name: _plain(name, *types) for name, types in SIGNATURES.items()}
-        calls |= {name: _with_array(name, *form) for name, form in ARRAYS.items()}
-        calls |= {name: _generator(name) for name in GENERATORS}
-        vars(self).update(calls)
+        vars(self).update({name: _plain(getattr(gl, name)) for name in PLAIN})
+        vars(self).update({name: _generator(getattr(gl, name)) for name in GENERATORS})
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._gl, name)
@@ -86,18 +57,21 @@ class DirectCalls(ModuleType):
         return value
 
 
-def _plain(name: str, *types: Any) -> Any:
-    """The library's function called `name`, which returns nothing."""
+def _plain(checked: Any) -> Callable[..., None]:
+    """The library's function behind one of PyOpenGL's."""
+    declared, arrays = getattr(checked, "wrappedOperation", checked), {}
+    for place, kind in enumerate(declared.argtypes):
+        if kind is c_void_p or kind.__name__ in ARRAY_TYPES:
+            arrays[place] = ARRAY_TYPES.get(kind.__name__)
+    name, types = declared.__name__, (c_void_p if n in arrays else kind for n, kind in enumerate(declared.argtypes))
     platform, kind = importlib.import_module("OpenGL.platform").PLATFORM, CFUNCTYPE(None, *types)
     try:
-        return kind((name, platform.GL))
+        call: Callable[..., None] = kind((name, platform.GL))
     except AttributeError:  # a library need not export what is newer than OpenGL 1.1
-        return kind(platform.getExtensionProcedure(name.encode()))
-
-
-def _with_array(name: str, dtype: Any, types: tuple[Any, ...]) -> Callable[..., None]:
-    """The same for a function whose only pointer is an array, or None."""
-    call, place = _plain(name, *types), types.index(c_void_p)
+        call = kind(platform.getExtensionProcedure(name.encode()))
+    if not arrays or name in ("glDrawElements", "glVertexAttribPointer"):  # these take a place in a buffer
+        return call
+    ((place, dtype),) = arrays.items()
 
     def with_array(*arguments: Any) -> None:
         if arguments[place] is None:
@@ -109,13 +83,13 @@ def _with_array(name: str, dtype: Any, types: tuple[Any, ...]) -> Callable[..., 
     return with_array
 
 
-def _generator(name: str) -> Callable[[int], NDArray[np.uint32] | int]:
+def _generator(checked: Any) -> Callable[[int], NDArray[np.uint32] | int]:
     """The same for a function that makes names: one of them, or an array of several."""
-    call = _plain(name, c_int, c_void_p)
+    call = _plain(checked)
 
     def generate(count: int) -> NDArray[np.uint32] | int:
         names = np.zeros(count, np.uint32)
-        call(count, names.ctypes.data)
+        call(count, names)
         return names if count > 1 else int(names[0])
 
     return generate
