@@ -38,8 +38,15 @@ from workers.geometry.frames import invert
 from workers.geometry.pixels import fill_plane_depth, fourth_channel
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
-from workers.render.raster.context import ColourTarget, Framebuffer, choose, close_context, is_software, open_context
-from workers.render.raster.devices import Choice
+from workers.render.raster.context import (
+    Choice,
+    ColourTarget,
+    Framebuffer,
+    choose,
+    close_context,
+    is_software,
+    open_context,
+)
 from workers.render.raster.draw_calls import (
     DEPTH_BIAS,
     FLOOR_BIAS,
