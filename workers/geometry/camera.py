@@ -97,7 +97,7 @@ def is_outside_views(points: Array, cameras: Sequence[Camera]) -> bool:
     beyond one of them, or below every camera while the whole image looks up. False leaves it open.
     """
     k, rotation = cameras[0].intrinsics, cameras[0].T_world_cam[:3, :3]
-    if (_corner_rays(k) @ rotation[2] > 0.0).all():
+    if (corner_rays(k) @ rotation[2] > 0.0).all():
         lowest = min(float(camera.T_world_cam[2, 3]) for camera in cameras)
         if float(points[:, 2].max()) < lowest:
             return True
@@ -115,7 +115,7 @@ def _side_normals(k: Intrinsics) -> Array:
     return np.array([[k.fx, 0.0, left], [-k.fx, 0.0, right], [0.0, k.fy, top], [0.0, -k.fy, bottom], [0.0, 0.0, 1.0]])
 
 
-def _corner_rays(k: Intrinsics) -> Array:
+def corner_rays(k: Intrinsics) -> Array:
     """[4, 3]: the rays through the image's corners, in the optical frame; every other is between them."""
     columns, rows = (-MARGIN_PX, k.width + MARGIN_PX), (-MARGIN_PX, k.height + MARGIN_PX)
     return np.array([[(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0] for v in rows for u in columns])
