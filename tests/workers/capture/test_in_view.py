@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from schemas.job.captures import Board, Captures, Estimation, Simulate
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Material, Part, Shape
 from services.cli.main import main
+from tests.conftest import SHARED_DATA
 from tests.workers.capture.drawn import errors
 from tests.workers.capture.simulated import asset_of
 from workers.capture.board_kinds import KINDS, BoardSizes
@@ -183,3 +185,20 @@ def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(n
         seen = mark_object(with_things(studio, beside(n)), studio.T_world_board @ poses[n])
         mask = read_view(open_folder(tmp_path), n).mask
         assert (mask & seen).sum() > 0.96 * (mask | seen).sum()
+
+
+# ---------------------------------------------------------------------------------------------- by a ray caster not ours
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", ["hand", "spare_board"])
+def test_all_views_of_an_independent_capture_are_used_whatever_lies_beside_the_object(name, tmp_path):
+    captures = SHARED_DATA / "captures"
+    if name == "spare_board":  # it holds the views that differ
+        shutil.copytree(captures / "m_ref", tmp_path, dirs_exist_ok=True)
+    shutil.copytree(captures / "turn4" / name, tmp_path, dirs_exist_ok=True)
+    truth = np.load(captures / "mug.truth.npy" if name == "spare_board" else tmp_path / "truth.npy")
+    estimates = process_folder(tmp_path, Captures(estimation=Estimation(compare=True))).estimates
+    for estimate, most_mm in (("joint", 0.06), ("markers", 0.8)):  # one view alone does not know what sharpening does
+        off = [errors(v.T_board_cam, truth[v.number])[0] for v in estimates.by_name[estimate].used]
+        assert len(off) == {"hand": 11, "spare_board": 10}[name] and max(off) < most_mm
