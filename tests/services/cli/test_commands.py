@@ -24,8 +24,8 @@ from services.job.record import encode_job, record_job
 from services.run.lock import read_holder
 from tests.datasets import make_dataset
 from tests.kit.killed_runs import holding
-from workers.render.raster import context, devices
-from workers.render.raster.devices import GraphicsDevice
+from workers.render.raster import context
+from workers.render.raster.context import GraphicsDevice
 from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 
@@ -281,10 +281,9 @@ def test_every_gpu_is_listed_with_its_device_and_the_one_that_would_be_drawn_on(
         (gpus, "9", "none that may be drawn on"),
         ((), "0", "EGL lists none"),
     ):
-        for module in (devices, context):
-            monkeypatch.setattr(module, "list_devices", lambda listed=listed: listed)
+        monkeypatch.setattr(context, "list_devices", lambda listed=listed: listed)
         monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
-        monkeypatch.setattr(devices, "visible_gpus", lambda visible=visible: visible)
+        monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
         finding = doctor._gpus()
         assert words in finding.found and finding.ok == (words != "none that may be drawn on"), finding
         if software in listed:
