@@ -23,6 +23,7 @@ from workers.geometry.mesh import corner_weights, mix
 from workers.geometry.pixels import quantise_depth
 from workers.scene.context import Stopwatch
 from workers.scene.painting import (
+    CODES,
     Skin,
     paint_albedo,
     paint_faces,
@@ -144,7 +145,7 @@ def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     base = decode_srgb(np.array([part.material.base_color[:3] for part in parts]))
     values = np.concatenate([_values_of(part) for part in parts])
     skin = Skin(np.concatenate(points), values, corners, part_of, base, *_textures_of(parts))
-    paint_albedo((seen.face, seen.z), skin, triangles.k, image)
+    paint_albedo((seen.face, seen.z), skin, triangles.k, CODES, image)
     return image
 
 

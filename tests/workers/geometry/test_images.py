@@ -2,6 +2,8 @@
 OpenCV, which puts pixel centres on integers.
 """
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -12,9 +14,9 @@ from tests.kit.planes import HERE as PLANE_HERE
 from tests.kit.planes import IMAGES, plane_view
 from tests.kit.planes import THERE as PLANE_THERE
 from tests.workers.geometry.made_up_kinect import COLOR, COLOR_LENS, DEPTH, DEPTH_LENS, opencv_rays, smaller
-from workers.geometry.camera import project, unproject
+from workers.geometry.camera import orbit_pose, project, unproject
 from workers.geometry.colour import decode_codes, encode_codes, encode_srgb
-from workers.geometry.frames import pose, transform, uniform_rotation
+from workers.geometry.frames import invert, pose, transform, uniform_rotation
 from workers.geometry.pixels import (
     WIDEST,
     count_filled,
@@ -38,8 +40,10 @@ from workers.geometry.projection import (
     bound_view,
     columns_in_sight,
     compare_covisible,
+    forward_project,
     sample_inverse_depth,
 )
+from workers.scene.pairs import mirror_pose
 
 
 def rays(k: Intrinsics) -> np.ndarray:
@@ -195,6 +199,35 @@ def test_a_pixel_that_is_nan_hides_no_other_one():
 
 
 SMALL = Intrinsics(width=40, height=30, fx=33.0, fy=33.0, cx=20.0, cy=15.0)
+HERE = Camera(SMALL, orbit_pose(np.zeros(3), 0.8, 0.3, 2.5))
+THERE = Camera(SMALL, mirror_pose(HERE.T_world_cam, 2.3))
+
+
+def plain_projection(depth: np.ndarray, splat: int) -> tuple[np.ndarray, np.ndarray]:
+    """The definition, pixel by pixel."""
+    out, source, k = np.zeros(depth.shape), np.full(depth.shape, -1), SMALL
+    T = invert(THERE.T_world_cam) @ HERE.T_world_cam
+    for i, j in np.argwhere(depth > 0).tolist():
+        x, y, z, _ = T @ [(j + 0.5 - k.cx) / k.fx * depth[i, j], (i + 0.5 - k.cy) / k.fy * depth[i, j], depth[i, j], 1]
+        if z <= 0:
+            continue
+        u, v = math.floor(k.fx * x / z + k.cx), math.floor(k.fy * y / z + k.cy)
+        for row in range(max(v - splat // 2, 0), min(v + splat // 2 + 1, k.height)):
+            for column in range(max(u - splat // 2, 0), min(u + splat // 2 + 1, k.width)):
+                if source[row, column] < 0 or z < out[row, column]:
+                    out[row, column], source[row, column] = z, i * k.width + j
+    return out, source
+
+
+def test_forward_projection_is_its_definition():
+    depth = np.random.default_rng(4).uniform(1.5, 3.0, (30, 40))
+    depth[::7] = 0.0
+    for splat in (1, 3, 5):
+        expected, source = plain_projection(depth, splat)
+        projected = forward_project(depth, HERE, THERE, splat)
+        assert (source >= 0).sum() > 50
+        assert np.array_equal(projected.source, source)
+        assert projected.depth_m == pytest.approx(expected, abs=1e-12)
 
 
 def test_interpolation_in_inverse_depth_is_exact_on_a_plane():
