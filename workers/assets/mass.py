@@ -107,18 +107,12 @@ def shell_mass(vertices: Array, faces: np.ndarray, shell_kg_m2: float) -> MassPr
     A/12 (a a^T + b b^T + c c^T + s s^T), from the barycentric integrals of 1, u, u^2 and u v
     (A, A/3, A/6 and A/12; Eisenberg and Malvern, "On finite element integration in natural co-ordinates", 1973).
     """
-    middle, corners = _corners(vertices, faces)
+    middle = bounds_of(vertices).sum(axis=0) * 0.5
+    corners, _ = _tetrahedra(vertices, faces, middle)
     a, b, c = corners
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0)
     mass = shell_kg_m2 * float(area.sum())
     return _assemble(middle, corners, shell_kg_m2 * area / 3.0, shell_kg_m2 * area / 12.0, mass, solid=False)
-
-
-def _corners(vertices: Array, faces: np.ndarray) -> tuple[Array, Array]:
-    """The bounding box's middle [3], and the faces' corners measured from it: [corner, axis, F]."""
-    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    local = np.ascontiguousarray((vertices - middle).T)
-    return middle, np.stack([np.take(local, faces[:, k], axis=1) for k in range(3)])
 
 
 @compiled_for("f8[:,::1], i8[:,::1], f8[::1]", "f8[:,::1], const(i8[:,::1]), f8[::1]")

@@ -44,6 +44,7 @@ from workers.assets.library.table import (
     write_table,
 )
 from workers.pool import Answers
+from workers.source import code_digest
 
 MOST_READ = 5000
 """Candidates up to which all are read before anything is decided; of more, so many are, evenly spaced."""
@@ -126,15 +127,7 @@ def _check_shapes(library: Library) -> None:
 def code_version() -> str:
     """Digest of the code that decisions and shapes depend on, and of the versions of libraries."""
     names = ("manifold3d", "numpy", "pillow", "scipy", "trimesh")
-    whole = hashlib.sha256(repr([version(name) for name in names]).encode())
-    here = Path(__file__).resolve()
-    workers = here.parents[2]
-    for folder in (here.parent, workers / "door" / "meshes", workers / "geometry"):
-        for file in sorted(folder.glob("*.py")):
-            whole.update(hashlib.sha256(file.read_bytes()).digest())
-    for file in (workers / "assets" / name for name in ("mass.py", "glb.py", "samples.py")):
-        whole.update(hashlib.sha256(file.read_bytes()).digest())
-    return whole.hexdigest()[:16]
+    return hashlib.sha256(repr([code_digest(), *map(version, names)]).encode()).hexdigest()[:16]
 
 
 def locate_folder(name: str, job_folder: Path) -> Path:

@@ -41,6 +41,7 @@ from workers.geometry.frames import pose, rotation_about
 
 _UP = re.compile(rb"<up_axis>\s*([XYZ])_UP")
 _AXES: Mapping[bytes, UpAxis] = {b"X": "x", b"Y": "y", b"Z": "z"}
+_READ = ("POSITION", "TEXCOORD", "NORMAL", "COLOR")
 _NO_FACES = ("lines", "linestrips")
 _NOT_SHAPE = ("instance_camera", "instance_light", "asset", "evaluate_scene", "extra")
 
@@ -142,8 +143,10 @@ class _File:
     def _mesh(self, primitive: Element, bound: Mapping[str | None, Element], matrix: Pose) -> Iterator[RawMesh]:
         inputs = self._inputs(primitive)
         width = 1 + max(offset for _, _, offset, _ in inputs)
-        offset, points = next((at, values) for kind, _, at, values in inputs if kind == "POSITION")
-        corners = _corners(self.path, primitive, width, offset, points[:, :3])
+        given = {kind: (at, values) for kind, _, at, values in reversed(inputs)}
+        offset, points = given["POSITION"]
+        given["POSITION"] = offset, points[:, :3]
+        corners = _corners(self.path, primitive, width, *given["POSITION"])
         if not len(corners):
             return
         symbol = primitive.get("material")
@@ -152,23 +155,22 @@ class _File:
         at = None if binding is None else binding.find(f"bind_vertex_input[@semantic='{coordinates}']")
         sets = {number: (at, values) for kind, number, at, values in inputs if kind == "TEXCOORD"}
         wanted = int("0" if at is None else at.get("input_set", "0"))
-        uv = sets.get(wanted, next(iter(sets.values()), None)) if sets else None
-        normals = next(((at, values) for kind, _, at, values in inputs if kind == "NORMAL"), None)
-        colors = next(((at, values) for kind, _, at, values in inputs if kind == "COLOR"), None)
-        used = [(offset, points[:, :3]), *(one for one in (uv, normals, colors) if one is not None)]
-        columns = corners[:, :, [at for at, _ in used]]
-        for k, (_, values) in enumerate(used):
-            check_indices(self.path, columns[..., k], len(values))
-        own, faces = index_corners(columns, [len(values) for _, values in used])
-        rows = {id(values): values[own[:, k]] for k, (_, values) in enumerate(used)}
-        flat = None if uv is None else rows[id(uv[1])][:, :2]
+        if wanted in sets:
+            given["TEXCOORD"] = sets[wanted]
+        kinds = [kind for kind in _READ if kind in given]
+        columns = corners[:, :, [given[kind][0] for kind in kinds]]
+        for k, kind in enumerate(kinds):
+            check_indices(self.path, columns[..., k], len(given[kind][1]))
+        vertices, faces = index_corners(columns, [len(given[kind][1]) for kind in kinds])
+        rows = {kind: given[kind][1][vertices[:, k]] for k, kind in enumerate(kinds)}
+        flat = rows["TEXCOORD"][:, :2] if "TEXCOORD" in rows else None
         if material.texture is not None and (flat is None or not np.isfinite(flat).all()):
             material = replace(material, texture=None)
         visual = MeshVisual(material, flat if material.texture is not None else None)
-        if colors is not None and material.texture is None:
-            visual = MeshVisual(replace(WHITE, roughness=material.roughness), None, _bytes(rows[id(colors[1])]))
-        shaded = None if normals is None else rows[id(normals[1])][:, :3]
-        yield RawMesh(rows[id(used[0][1])], faces, shaded, visual, matrix)
+        if "COLOR" in rows and material.texture is None:
+            visual = MeshVisual(replace(WHITE, roughness=material.roughness), None, _bytes(rows["COLOR"]))
+        shaded = rows["NORMAL"][:, :3] if "NORMAL" in rows else None
+        yield RawMesh(rows["POSITION"], faces, shaded, visual, matrix)
 
     def _inputs(self, primitive: Element) -> list[tuple[str, int, int, Array]]:
         """(what, number of its set, place in a corner, values [N, stride]) of each array that a primitive reads."""
@@ -181,8 +183,7 @@ class _File:
                 found += [(str(inner.get("semantic")), number, offset, inner) for inner in source.iterfind("input")]
             else:
                 found.append((str(one.get("semantic")), number, offset, one))
-        read = ("POSITION", "NORMAL", "TEXCOORD", "COLOR")
-        return [(kind, number, at, self._values(one)) for kind, number, at, one in found if kind in read]
+        return [(kind, number, at, self._values(one)) for kind, number, at, one in found if kind in _READ]
 
     def _values(self, given: Element) -> Array:
         source = self.find(given.get("source"))
