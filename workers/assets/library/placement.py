@@ -16,7 +16,7 @@ from schemas.job.assets import UpAxis
 from schemas.scene.shape import MassProperties, Shape
 from workers.assets.samples import colors_at, draw_points
 from workers.door.meshes.dae import find_up
-from workers.door.meshes.mesh import DEFAULT
+from workers.door.meshes.raw import DEFAULT
 from workers.door.opening import as_utf8
 from workers.geometry.mesh import face_areas
 

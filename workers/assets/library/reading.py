@@ -23,9 +23,9 @@ from workers.assets.glb import asset_glb
 from workers.assets.library.placement import INFO_FILE, measure_shape, measure_thinness
 from workers.assets.library.table import Row, SourceFile
 from workers.assets.mass import weigh
-from workers.door.meshes.caps import LONGEST_NOTE, MOST_NOTES, find_inside
 from workers.door.meshes.formats import FORMATS, list_mesh_files, load_shape
 from workers.door.meshes.mesh import LoadedMesh, transform_shape
+from workers.door.meshes.raw import LONGEST_NOTE, MOST_NOTES, find_inside
 from workers.door.meshes.urdf import POSED, list_named, list_seen, load_posed
 from workers.door.opening import describe_error
 from workers.geometry.frames import pose

@@ -22,21 +22,23 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import UpAxis
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver, check_counts, check_nodes
-from workers.door.meshes.mesh import (
+from workers.door.meshes.posed import MOST_ABOVE, parse_tree
+from workers.door.meshes.raw import (
     DEFAULT,
     WHITE,
+    FolderResolver,
     Indices,
     MeshVisual,
     RawMesh,
+    check_counts,
     check_indices,
+    check_nodes,
     cut_faces,
     cut_strip,
     index_corners,
     make_material,
     roughness_of,
 )
-from workers.door.meshes.posed import MOST_ABOVE, parse_tree
 from workers.geometry.frames import pose, rotation_about
 
 _UP = re.compile(rb"<up_axis>\s*([XYZ])_UP")

@@ -22,22 +22,23 @@ from schemas.errors import MeshError, VersoError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
 from workers.door import opening
-from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.dae import named_by_dae, read_dae
 from workers.door.meshes.gltf import named_by_gltf, read_gltf
-from workers.door.meshes.mesh import (
-    DEFAULT,
-    WHITE,
-    LoadedMesh,
-    MeshVisual,
-    RawMesh,
-    clean_shape,
-    cut_faces,
-    place_mesh,
-)
+from workers.door.meshes.mesh import LoadedMesh, clean_shape, place_mesh
 from workers.door.meshes.mjcf import count_msh, read_msh
 from workers.door.meshes.obj import count_obj, named_by_mtl, named_by_obj, read_obj
 from workers.door.meshes.ply import count_ply, decode_head, named_by_ply, read_ply
+from workers.door.meshes.raw import (
+    DEFAULT,
+    WHITE,
+    Budget,
+    FolderResolver,
+    MeshVisual,
+    RawMesh,
+    check_counts,
+    check_nodes,
+    cut_faces,
+)
 from workers.door.opening import as_utf8, describe_error
 
 _OFF = re.compile(r"\s*(ST)?(C)?(N)?(4)?(n)?OFF(?!\s+BINARY)")

@@ -22,9 +22,18 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
-from workers.door.meshes.caps import LONGEST_NAME, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.gltf_materials import Materials, image_of, read_references
-from workers.door.meshes.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, cut_strip
+from workers.door.meshes.raw import (
+    DEFAULT,
+    LONGEST_NAME,
+    WHITE,
+    FolderResolver,
+    MeshVisual,
+    RawMesh,
+    check_counts,
+    check_nodes,
+    cut_strip,
+)
 from workers.door.opening import split_glb
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import rotation_from_quaternion

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver
-from workers.door.meshes.mesh import MIN_TINT, MeshVisual, make_material
+from workers.door.meshes.raw import MIN_TINT, FolderResolver, MeshVisual, make_material
 from workers.geometry.colour import encode_srgb
 
 Tree = dict[str, Any]

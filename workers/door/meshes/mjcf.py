@@ -14,9 +14,8 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
-from workers.door.meshes.caps import FolderResolver, check_nodes
-from workers.door.meshes.mesh import DEFAULT, MeshVisual, RawMesh
 from workers.door.meshes.posed import MOST_ABOVE, Model, Source, Visual, make_body, numbers, scaled
+from workers.door.meshes.raw import DEFAULT, FolderResolver, MeshVisual, RawMesh, check_nodes
 from workers.geometry.frames import half_turn, pose, rotation_about, rotation_between, rotation_from_quaternion
 
 Attributes = Mapping[str, str]

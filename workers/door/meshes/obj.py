@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver
-from workers.door.meshes.mesh import (
+from workers.door.meshes.raw import (
     DEFAULT,
     WHITE,
+    FolderResolver,
     Indices,
     MeshVisual,
     RawMesh,

@@ -14,9 +14,8 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.door.meshes.caps import check_counts, check_nodes, find_inside
 from workers.door.meshes.formats import load_shape, with_jpeg
-from workers.door.meshes.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
+from workers.door.meshes.mesh import LoadedMesh, check_coordinates, transform_shape
 from workers.door.meshes.mjcf import read_mjcf
 from workers.door.meshes.posed import (
     MAX_XML_BYTES,
@@ -29,6 +28,7 @@ from workers.door.meshes.posed import (
     turned,
     wrap_body,
 )
+from workers.door.meshes.raw import DEFAULT, check_counts, check_nodes, find_inside
 from workers.door.opening import as_utf8, read_bytes
 
 
