@@ -255,7 +255,7 @@ def _pybullet(source: Path) -> Iterator[Row]:
 
 def _guess_rows(source: Path, making: Making, watch: Watch) -> list[Row]:
     paths, unusable = walk_folder(source)
-    beside = [one.path for one in unusable]
+    beside = [left.path for left in unusable]
     copies = find_copies(paths, [*paths, *beside])
     left_out = {path: LeftOut(path, COPY, why) for path, why in copies.items()}
     asked = [path for path in paths if path not in left_out]
@@ -271,8 +271,8 @@ def _guess_rows(source: Path, making: Making, watch: Watch) -> list[Row]:
     rows = _apply_sample(source, asked, surveys, making) if is_large else _decide(surveys, left_out, making)
     rows = [replace(row, licence=find_licence(source / row.path, source, licences)) for row in rows]
     listed = {row.path for row in rows}
-    aside = [one for one in (*unusable, *left_out.values()) if one.path not in listed]
-    return rows + [Row(path=one.path, use=False, reason=one.reason, why=one.why) for one in aside]
+    aside = [left for left in (*unusable, *left_out.values()) if left.path not in listed]
+    return rows + [Row(path=left.path, use=False, reason=left.reason, why=left.why) for left in aside]
 
 
 def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: Making) -> list[Row]:
@@ -285,7 +285,7 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
         return (making.unit_of(item.path) or of[item.path].unit(item)) * item.diagonal
 
     fit = [item for item in items if SMALLEST_M <= size_m(item) <= LARGEST_M]
-    doubles = {one.path: one for one in find_doubles(fit, size_m, SUFFIXES)}
+    doubles = {double.path: double for double in find_doubles(fit, size_m, SUFFIXES)}
     different = [item for item in items if item.path not in doubles]
     of = {path: group for group in guess_groups(different) for path in group.paths}
     ups = guess_ups(different)

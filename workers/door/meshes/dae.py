@@ -50,8 +50,8 @@ _NOT_SHAPE = ("instance_camera", "instance_light", "asset", "evaluate_scene", "e
 
 def find_up(head: bytes) -> UpAxis:
     """The axis that is up in a file that begins so; y where it states none, as the format has it."""
-    found = _UP.search(head)
-    return _AXES[found[1]] if found else "y"
+    stated = _UP.search(head)
+    return _AXES[stated[1]] if stated else "y"
 
 
 def named_by_dae(path: Path, data: bytes) -> list[str]:
@@ -135,7 +135,8 @@ class _File:
         if mesh is None:
             raise MeshError("format", f"{self.path} has a shape that is no mesh: export it as triangles")
         bound = {
-            one.get("symbol"): one for one in instance.iterfind("bind_material/technique_common/instance_material")
+            material.get("symbol"): material
+            for material in instance.iterfind("bind_material/technique_common/instance_material")
         }
         for primitive in mesh:
             filled = primitive.find("p") is not None or primitive.find("ph") is not None
@@ -176,16 +177,20 @@ class _File:
 
     def _inputs(self, primitive: Element) -> list[tuple[str, int, int, Array]]:
         """(what, number of its set, place in a corner, values [N, stride]) of each array that a primitive reads."""
-        found = []
-        for one in primitive.iterfind("input"):
-            offset, number, source = int(one.get("offset", "0")), int(one.get("set", "0")), self.find(one.get("source"))
+        inputs = []
+        for item in primitive.iterfind("input"):
+            offset, number, source = (
+                int(item.get("offset", "0")),
+                int(item.get("set", "0")),
+                self.find(item.get("source")),
+            )
             if offset < 0:
                 raise ValueError(f"an input at {offset}")
             if source.tag == "vertices":
-                found += [(str(inner.get("semantic")), number, offset, inner) for inner in source.iterfind("input")]
+                inputs += [(str(inner.get("semantic")), number, offset, inner) for inner in source.iterfind("input")]
             else:
-                found.append((str(one.get("semantic")), number, offset, one))
-        return [(kind, number, at, self._values(one)) for kind, number, at, one in found if kind in _READ]
+                inputs.append((str(item.get("semantic")), number, offset, item))
+        return [(kind, number, at, self._values(item)) for kind, number, at, item in inputs if kind in _READ]
 
     def _values(self, given: Element) -> Array:
         source = self.find(given.get("source"))
@@ -268,13 +273,13 @@ class _Effect:
 
     def color(self, name: str) -> Array | None:
         """A property's colour [4]."""
-        found = self._value(name, "color", "float3", "float4")
-        return None if found is None else np.append(_floats(found.text)[:4], np.ones(4))[:4]
+        value = self._value(name, "color", "float3", "float4")
+        return None if value is None else np.append(_floats(value.text)[:4], np.ones(4))[:4]
 
     def number(self, name: str) -> float | None:
         """A property's number."""
-        found = self._value(name, "float")
-        return None if found is None else float(found.text or "")
+        value = self._value(name, "float")
+        return None if value is None else float(value.text or "")
 
     def has_picture(self, name: str) -> bool:
         """Whether a property has a picture."""
@@ -348,10 +353,10 @@ def _bytes(colors: Array) -> NDArray[np.uint8]:
 
 def _image_name(image: Element) -> str | None:
     """The name of a picture's file: of version 1.4 the text, of 1.5 the element in it."""
-    found = next((one for one in image.iter() if one.tag in ("init_from", "ref") and (one.text or "").strip()), None)
-    if found is None:
+    named = next((e for e in image.iter() if e.tag in ("init_from", "ref") and (e.text or "").strip()), None)
+    if named is None:
         return None
-    return unquote(re.sub(r"^file:/*(?=\w:|/)", "", (found.text or "").strip()).removeprefix("file:"))
+    return unquote(re.sub(r"^file:/*(?=\w:|/)", "", (named.text or "").strip()).removeprefix("file:"))
 
 
 def _corners(path: Path, primitive: Element, width: int, offset: int, points: Array) -> Indices:

@@ -57,17 +57,17 @@ def read_off(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     lines = [line.split() for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
     vertices, faces = int(lines[0][0]), int(lines[0][1])
     rows = np.array(lines[1 : 1 + vertices], dtype=np.float64).reshape(vertices, -1)
-    told = lines[1 + vertices : 1 + vertices + faces]
-    counts = np.array([int(line[0]) for line in told])
-    corners = np.array([word for line in told for word in line[1 : 1 + int(line[0])]], dtype=np.int64)
-    if len(told) < faces or len(corners) != counts.sum():
-        raise ValueError(f"{len(told)} of {faces} faces")
+    listed = lines[1 + vertices : 1 + vertices + faces]
+    counts = np.array([int(line[0]) for line in listed])
+    corners = np.array([word for line in listed for word in line[1 : 1 + int(line[0])]], dtype=np.int64)
+    if len(listed) < faces or len(corners) != counts.sum():
+        raise ValueError(f"{len(listed)} of {faces} faces")
     places, face = cut_faces(path, corners, counts, rows[:, :3])
     first = 6 if head is not None and head[3] else 3
     colors = _off_colors(lines[1 : 1 + vertices], first) if head is not None and head[2] else None
-    shown = None if colors is not None else _off_colors([line[int(line[0]) :] for line in told], 1)
+    shown = None if colors is not None else _off_colors([line[int(line[0]) :] for line in listed], 1)
     normals = rows[:, 3:6] if first == 6 else None
-    if any(len(line) == 2 + int(line[0]) for line in told):
+    if any(len(line) == 2 + int(line[0]) for line in listed):
         resolver.notes.append("not drawn: colours of a map by their numbers")
     visual = MeshVisual(DEFAULT if colors is None and shown is None else WHITE, None, colors)
     visual = visual if shown is None else replace(visual, face_colors=shown[face])

@@ -210,10 +210,10 @@ _FOLDERS = ("textures", "../textures", "../materials/textures")
 def _other_case(path: Path) -> Path:
     """The only file whose name is this one but for upper and lower case; the path itself where there is not one."""
     try:
-        found = [entry.name for entry in os.scandir(path.parent) if entry.name.lower() == path.name.lower()]
+        names = [entry.name for entry in os.scandir(path.parent) if entry.name.lower() == path.name.lower()]
     except (OSError, ValueError):
         return path
-    return path.parent / found[0] if len(found) == 1 else path
+    return path.parent / names[0] if len(names) == 1 else path
 
 
 def find_inside(root: Path, *candidates: Path) -> Path | None:
