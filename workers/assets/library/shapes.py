@@ -20,7 +20,6 @@ from workers.assets.library.reading import (
     Question,
     ask,
     describe_refusal,
-    environmental,
     refusal_of,
 )
 from workers.assets.library.table import Library, Row, write_whole
@@ -60,17 +59,14 @@ def open_shape(library: Library, row: Row) -> tuple[Shape, dict[str, Any]]:
     if (kept := _read_kept(library, row)) is not None:
         return kept[1]
     if not library.source.is_dir():
-        raise environmental("missing", _describe_lost(library, row))
+        path = shape_path(library, row)
+        how = "is not what library.parquet says" if path.exists() else "is missing"
+        more = f"and {library.source}, of which it was made, is not here: `verso init` again where it is"
+        raise MeshError("missing", f"{path} {how}, {more}", "environmental")
     ((_, answer),) = make_shapes(library, [row])
     if isinstance(answer, MeshError):
         raise answer
     return _open(answer, row)
-
-
-def _describe_lost(library: Library, row: Row) -> str:
-    path = shape_path(library, row)
-    how = "is not what library.parquet says" if path.exists() else "is missing"
-    return f"{path} {how}, and {library.source}, of which it was made, is not here: `verso init` again where it is"
 
 
 def _read_kept(library: Library, row: Row) -> tuple[bytes, tuple[Shape, dict[str, Any]]] | None:
@@ -121,7 +117,7 @@ def make_shapes(
         else:
             if row.glb_sha256 is not None and hashlib.sha256(answer).hexdigest() != row.glb_sha256:
                 more = "came out otherwise than library.parquet says: `verso init` again"
-                answer = environmental("changed", f"{shape_path(library, row)} {more}")
+                answer = MeshError("changed", f"{shape_path(library, row)} {more}", "environmental")
             else:
                 with suppress(*(() if must_keep else (OutputError,))):
                     write_whole(shape_path(library, row), answer)
