@@ -38,7 +38,7 @@ def wrong_with(case: Chaotic, seed: int) -> str:
     physics = PHYSICS.model_copy(update=case.physics)
     if isinstance(end, SceneError):
         slips = len(made.starts) >= HELD[0][0] and "slips" in str(end)
-        return "" if slips or end.reason in MAY_HAPPEN else str(end)
+        return "" if slips or end.reason in (*MAY_HAPPEN, case.refused) else str(end)
     found = what_is_wrong(verdicts(made, end, physics))
     if (figure := case.measure.of(made, end)) > case.measure.bound:
         found = f"{case.measure.what}: {figure:.4g} of {case.measure.bound:g}; {found}"
