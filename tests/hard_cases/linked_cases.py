@@ -1,5 +1,6 @@
 """Rows of the table of chaotic cases: what is linked or threaded, and may not come apart; a seed turns and leans it."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -54,13 +55,13 @@ def rod_line() -> Array:
 def stay_linked(*lines: Array) -> Measure:
     """How far the linking numbers of neighbours are from those at release: the worst."""
 
+    def links(poses: Sequence[Array]) -> Array:
+        at = [transform(T, line) for T, line in zip(poses, lines, strict=True)]
+        return np.array([linking(one, other) for one, other in itertools.pairwise(at)])
+
     def worst(made: Made, rest: Rest) -> float:
-        before, after = (
-            [transform(one.T_world_obj, line) for one, line in zip(placed, lines, strict=True)]
-            for placed in (made.starts, rest)
-        )
-        pairs = range(len(lines) - 1)
-        return max(abs(linking(*after[k : k + 2]) - round(linking(*before[k : k + 2]))) for k in pairs)
+        before = links([one.T_world_obj for one in made.starts])
+        return float(np.abs(links([one.T_world_obj for one in rest]) - np.rint(before)).max())
 
     return Measure("linking number off what it was", 0.5, worst)
 

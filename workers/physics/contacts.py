@@ -29,8 +29,8 @@ BORDER_M = 1e-7
 """Distance from a face up to which a corner above its border is above it, and from the end of an edge of what is beside that."""
 
 SLIGHT_M = 1e-5
-"""Overlap that a step leaves at most, and up to which edges count as crossing beyond their ends by as much: in the inner corner of
-a hole what is a little too deep is beyond the ends of both edges."""
+"""Overlap that a step leaves at most, and up to which edges count as crossing beyond their ends by as much: in the inner corner
+of a hole what is a little too deep is beyond the ends of both edges."""
 
 
 @dataclass(frozen=True, eq=False)
