@@ -15,7 +15,7 @@ from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
 from tests.hard_cases.test_hard_cases import MOVED_MM, TURNED_DEG
 from tests.physics.settling import recheck_group, settle_group
-from workers.physics.release import HELD
+from workers.physics.hold import HELD
 
 PHYSICS = Job(name="t").physics
 MAY_HAPPEN = ("left_table", "not_at_rest")
