@@ -1,20 +1,49 @@
-"""What a network may know of a pair before it sees the mirror view, the baseline made of that, and the scores.
+"""The pairs of a split, what a network may know of one before it sees the mirror view, the baseline made of that, and the scores.
 
 Everything lies in a crop of the mirror image about the place where the object's seen points fall. Nothing but the input
 view, the two cameras and the planes of table top and floor goes into it: the mirror view is the answer alone.
 """
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
+from services.dataset.dataset import Dataset
 from services.dataset.pair import Pair
 from services.dataset.view import Pixels, View
 from workers.geometry import camera
+
+Split = Literal["train", "val", "test"]
+
+
+def pairs_of_split(dataset: Dataset, split: Split, splits: Mapping[str, str] | None = None) -> Iterator[Pair]:
+    """Every pair whose objects are all of instances of this split.
+
+    `splits`: by instance; by default the column of `assets`, which follows from the instance's id and is the same in every
+    dataset. `dataset.splits()` has the shares in each category. A scene of several objects of different splits is in none.
+    """
+    if splits is None:
+        rows = dataset.table("assets").to_table(columns=["instance_id", "split"]).to_pylist()
+        splits = {row["instance_id"]: row["split"] for row in rows}
+    for pair in dataset.pairs(
+        pc.field("instance_id").isin(pa.array([name for name in splits if splits[name] == split], pa.string()))
+    ):
+        if all(splits[name] == split for name in instances_of(pair)):
+            yield pair
+
+
+def instances_of(pair: Pair) -> set[str]:
+    """The ids of all objects of a pair's scene."""
+    return {pair.instance_id, *(body["instance_id"] for body in pair.scene["bodies"] or ())}
+
 
 CROP = (96, 128)
 """Rows and columns, as the article's patches."""
@@ -55,19 +84,19 @@ def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT) -> Example | Non
     depth, rgb = view.depth_m(), view.rgb()
     here = view.segment() == region
     T = np.linalg.inv(mirror.T_world_cam) @ view.T_world_cam
-    own = transform(T, unproject(view, depth, here))
-    if len(own) < 20:
+    cloud = transform(T, unproject(view, depth, here))
+    if len(cloud) < 20:
         return None
-    corner = crop_corner(mirror, own)
+    corner = crop_corner(mirror, cloud)
     if corner is None:
         return None
     up = mirror.T_world_cam[2, :3]
-    turned = half_turn(own, up)
-    middle = float(np.median(own[:, 2]))
+    turned = half_turn(cloud, up)
+    middle = float(np.median(cloud[:, 2]))
     background, gap = put_planes(pair, mirror, corner)
-    seen, other = (close_holes(splat(mirror, cloud, corner)) for cloud in (own, turned))
+    seen, other = (close_holes(splat(mirror, points, corner)) for points in (cloud, turned))
     baseline = nearest(seen, background)
-    color = splat_values(mirror, own, rgb[here & (depth > 0)], corner)
+    color = splat_values(mirror, cloud, rgb[here & (depth > 0)], corner)
     features = stack_features(seen, other, background, color, gap, middle)
     window = np.s_[corner[0] : corner[0] + CROP[0], corner[1] : corner[1] + CROP[1]]
     truth, mask = mirror.depth_m()[window], mirror.segment()[window] == region
@@ -192,7 +221,7 @@ def half_turn(points: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[n
 
 def stack_features(seen: Image, other: Image, background: Image, color: Image, gap: Image, middle: float) -> Image:
     """[CHANNELS, H, W]: depths relative to `middle`, which pixels have them, colour, and the place in the crop."""
-    relative = [np.where(one > 0, (one - middle) / SCALE_M, 0) for one in (seen, other)]
+    relative = [np.where(depth > 0, (depth - middle) / SCALE_M, 0) for depth in (seen, other)]
     plane = np.clip((background - middle) / SCALE_M, -5, 5)
     rows, columns = np.meshgrid(np.linspace(-1, 1, CROP[0]), np.linspace(-1, 1, CROP[1]), indexing="ij")
     maps = [*relative, seen > 0, other > 0, plane, gap - 1, rows, columns, *np.moveaxis(color, -1, 0)]

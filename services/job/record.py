@@ -32,9 +32,6 @@ HEADER = """\
 SEAL = "seal: "
 """Begins the last line of job.yaml."""
 
-MAX_BYTES = 1 << 20
-"""Larger than any job: what is larger was not written by a run."""
-
 REMEDY = "restore it from a copy"
 
 
@@ -105,8 +102,6 @@ def read_job(store: Store) -> JobRecord | None:
 
 def decode_job(data: bytes, name: str) -> JobRecord:
     """The job in the bytes of a job.yaml, whatever its seal says. Raises CorruptError naming the file, with one line."""
-    if len(data) > MAX_BYTES:
-        raise CorruptError(f"{name} has {len(data)} bytes, and a job has less than {MAX_BYTES}: {REMEDY}")
     try:
         tree = parse_yaml(data.decode())
         job, inputs = validate_job(tree["job"], name), tuple(tree.get("inputs", ()))
@@ -118,11 +113,10 @@ def decode_job(data: bytes, name: str) -> JobRecord:
         if not folder.startswith("/") or any(unicodedata.category(letter) == "Cc" for letter in folder):
             raise TypeError(f"folder: {folder!r} is not an absolute path")
         return JobRecord(job, **texts, inputs=inputs)
-    except JobError as error:
-        problem = str(error).splitlines()[0].removeprefix(f"{name}: ")
-        raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (JobError, ValueError, TypeError, KeyError, AttributeError) as error:
         problem = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        if isinstance(error, JobError):
+            problem = str(error).splitlines()[0].removeprefix(f"{name}: ")
         raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
 
 

@@ -15,17 +15,18 @@ from schemas.errors import MachineError, OutputError, command_line, plural
 from services.job.record import JobRecord, read_success, require_job
 from services.look.charts import Histogram
 from services.look.clouds import Space, pack_spaces, read_spaces
-from services.look.collect import Figures, collect, open_tables
+from services.look.collect import MOST_RANGES, Figures, SceneTable, collect, read_scene_table
 from services.look.pictures import ShownScene, choose_scenes, show_scenes
-from services.look.scene_table import SceneTable, read_scene_table, scene_table_html
 from services.look.sections import (
     charts_html,
     effects_html,
     failures_html,
     overview_html,
+    scene_table_html,
     space_html,
 )
 from services.look.sheets import Address, compare_html, sheets_html
+from services.read.dataset_reader import StoredTables
 from workers.store.store import Store
 
 WEB = Path(__file__).with_name("web")
@@ -168,7 +169,7 @@ def read_report(store: Store, scenes: int) -> Report:
     Raises OutputError where there is no dataset, CorruptError where a file is damaged.
     """
     record = require_job(store)
-    tables = open_tables(store)
+    tables = StoredTables(store, MOST_RANGES)
     shown, depth = show_scenes(store, choose_scenes(tables, scenes))
     spaces = read_spaces(store, [scene.scene_id for scene in shown])
     figures = collect(tables)
@@ -179,11 +180,13 @@ def read_report(store: Store, scenes: int) -> Report:
 def page_of(report: Report, address: Address) -> Page:
     """The page of a report, with its pictures at these addresses."""
     figures, scenes, job = report.figures, report.scenes, report.record.job
-    failed = sum(failure.scenes for failure in figures.failures)
+    failed, shown, there = sum(failure.scenes for failure in figures.failures), len(scenes), figures.scenes
+    more = f" More: {command_line('report', report.place, '--scenes', there)}" if shown < there else ""
+    chosen = f'<p class="note">{shown} of {plural(there, "scene")}, chosen evenly from each category.{escape(more)}</p>'
     sections = (
         Section("overview", "Overview", overview_html(figures, job, failed, report.table.splits)),
         Section("scenes", "All scenes", scene_table_html(report.table, report.place)),
-        Section("pictures", "Pictures", sheets_html(scenes, address) + _of_all(report)),
+        Section("pictures", "Pictures", sheets_html(scenes, address) + chosen),
         Section("compare", "Compare", compare_html(scenes)),
         Section("space", "In space", space_html(report.spaces, pack_spaces(report.spaces))),
         Section("figures", "Figures", charts_html(figures, report.depth)),
@@ -194,13 +197,6 @@ def page_of(report: Report, address: Address) -> Page:
     state = f"finished, digest {report.digest[:12]}" if report.digest else "not finished"
     footer = f"Job {report.record.digest[:12]}. Made by verso report; this page fetches nothing."
     return Page(job.name, f"{job.scenes:,} {what} asked, seed {job.seed}, {state}", sections, footer)
-
-
-def _of_all(report: Report) -> str:
-    """Of how many scenes there are pictures, and how to see more."""
-    shown, there = len(report.scenes), report.figures.scenes
-    more = f" More: {command_line('report', report.place, '--scenes', there)}" if shown < there else ""
-    return f'<p class="note">{shown} of {plural(there, "scene")}, chosen evenly from each category.{escape(more)}</p>'
 
 
 def write_report(store: Store, scenes: int, target: Path) -> tuple[int, Report]:

@@ -17,7 +17,7 @@ from schemas.errors import CorruptError, MachineError
 from schemas.job.job import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
-from services.read.dataset_reader import StoredRange, decode_samples, file_reader, find_scene
+from services.read.dataset_reader import StoredRange, committed_reader, decode_samples, file_reader, find_scene
 from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
@@ -60,8 +60,7 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
             f"{store.name}/{JOB_FILE} is not the job that scene {scene_id} was made from: restore it from a copy"
         )
     context = open_context(record)
-    theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    same_stack = take_fingerprint(context.renderer, context.job.drawn.tier) == theirs
+    same_stack = is_same_stack(store, context)
     output = run_scene(context, scene_id, Stopwatch())
     differences = compare_files(store, stored, output, same_stack)
     if same_stack:
@@ -78,6 +77,12 @@ def open_context(record: JobRecord) -> WorkerContext:
     return open_worker(record.job, catalogue)
 
 
+def is_same_stack(store: Store, context: WorkerContext) -> bool:
+    """Whether the stack of a dataset's first worker is this one."""
+    theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
+    return take_fingerprint(context.renderer, context.job.drawn.tier) == theirs
+
+
 def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:
     """Differences of a scene's new images and samples from the stored ones, a sentence each."""
     used = {row["instance_id"] for row in output.rows.get("assets", [])}
@@ -89,7 +94,7 @@ def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_s
     made = {file.path: file for file in output.files if not is_glb(file.path)}
     only = sorted(made.keys() ^ scene_files.keys())
     differences = [f"{path}: only {'stored' if path in scene_files else 'made now'}" for path in only]
-    read = file_reader(store.read, stored)
+    read = file_reader(committed_reader(store, stored.records), stored.records)
     for path in sorted(made.keys() & scene_files.keys()):
         if made[path].sha256 == scene_files[path]:
             continue

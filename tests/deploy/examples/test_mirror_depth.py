@@ -5,8 +5,7 @@ import dataclasses
 import mirror_depth
 import numpy as np
 import pytest
-from mirror_depth import CHANNELS, CROP, is_unseen, make_example, score
-from splits import instances_of, pairs_of_split
+from mirror_depth import CHANNELS, CROP, instances_of, is_unseen, make_example, pairs_of_split, score
 
 from services.dataset.dataset import open_dataset
 from services.dataset.view import View
@@ -34,11 +33,6 @@ def test_no_instance_is_in_two_splits_also_where_a_scene_has_several_objects(few
         ids = [pair.pose_id for split in ("train", "val", "test") for pair in pairs_of_split(single, split, splits)]
         assert sorted(ids) == [pair.pose_id for pair in single.pairs()]
     assert all(held[pair.instance_id] == "test" for pair in single.pairs() if pair.category == "box")
-
-
-@pytest.fixture(scope="module")
-def pairs(few):
-    return list(open_dataset(few.root).pairs())
 
 
 @pytest.fixture(scope="module")
