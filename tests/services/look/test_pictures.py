@@ -85,7 +85,7 @@ def test_a_large_picture_is_shrunk_and_its_address_holds_its_bytes():
 def test_each_category_has_as_many_scenes_evenly_over_its_ids_and_at_least_one():
     def chosen(categories: list[str], scenes: int) -> list[int]:
         rows = [{"scene_id": 10 + i, "category": name} for i, name in enumerate(categories)]
-        return choose_scenes(Handmade(scenes=rows), scenes)  # type: ignore[arg-type]
+        return choose_scenes(Handmade(scenes=rows), scenes)
 
     assert chosen(["mug", "box"] * 50, 6) == [11, 59, 109, 10, 58, 108]
     rare = ["mug"] * 30 + ["box"]
