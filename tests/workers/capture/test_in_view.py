@@ -174,7 +174,9 @@ def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(n
     off = [errors(v.T_board_cam, poses[v.number])[0] for v in estimate.used]
     assert len(off) == len(poses) and max(off) < 0.4 and not any("moved" in note for note in estimate.notes)
     cluttered = {n for n in range(8) if estimate.is_cluttered(n)}
-    assert cluttered and cluttered <= set(HANDS[name]) and "alone has on the board" in estimate.notes[0]
+    assert (
+        cluttered and cluttered <= set(HANDS[name]) and any("alone has on the board" in note for note in estimate.notes)
+    )
     studio, mesh, _ = studio_of(Board(), 8)
     true = mesh.sample(50_000, seed=0)
     assert (
