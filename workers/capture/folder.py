@@ -191,13 +191,13 @@ def read_camera_file(path: Path) -> CameraFile:
     return _read_json(path, CameraFile)
 
 
-def read_view(folder: CaptureFolder, number: int) -> CapturedView:
-    """One view's images. Raises CaptureError where one cannot be read or has the wrong size."""
+def read_view(folder: CaptureFolder, number: int, masked: bool = True) -> CapturedView:
+    """One view's images, with its mask if wanted. Raises CaptureError where one cannot be read or has the wrong size."""
     common, path = folder.camera.intrinsics, folder.file("camera", number)
     k = common if path is None else _intrinsics(folder.stored, _read_json(path, ViewFile))
     images = {}
     for kind, flags, ndim in (("rgb", cv2.IMREAD_COLOR_RGB, 3), ("mask", cv2.IMREAD_GRAYSCALE, 2)):
-        if path := folder.file(kind, number):
+        if (path := folder.file(kind, number)) and (masked or kind != "mask"):
             image = _decoded(folder, path, flags | cv2.IMREAD_IGNORE_ORIENTATION, np.uint8, ndim)
             images[kind] = _as_read(folder, image, k, between=kind == "rgb")
     if "rgb" not in images:
@@ -224,7 +224,10 @@ def _read_depth(folder: CaptureFolder, number: int, k: Intrinsics) -> NDArray[np
         return None
     size = (folder.stored.width, folder.stored.height) if spec is None else (spec.width, spec.height)
     if path.suffix == ".png" and spec is None:
-        depth_m = _decoded(folder, path, cv2.IMREAD_UNCHANGED, np.uint16, 2) / folder.stored.depth_units_per_m
+        units, per_m = _decoded(folder, path, cv2.IMREAD_UNCHANGED, np.uint16, 2), folder.stored.depth_units_per_m
+        if to.depth == "z" and to.depth_units_per_m == per_m:  # as it is: all others make metres of millions of pixels
+            return _as_read(folder, units, k, between=False)
+        depth_m = units / per_m
     else:
         try:
             depth_m = decode_depth(path.read_bytes(), size, folder.stored.depth_units_per_m)

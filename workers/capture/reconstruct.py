@@ -116,9 +116,7 @@ def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedVie
     view = next(view for view in estimate.views if view.number == number)
     if view.T_board_cam is None:
         raise CaptureError("no_pose", f"view {number} has no pose: {'; '.join(view.reasons)}")
-    stored = read_view(given.folder, number)
-    if not given.has_mask(number):
-        stored = replace(stored, mask=None)
+    stored = read_view(given.folder, number, given.has_mask(number))
     return pose_view(stored, given.folder.camera, view.T_board_cam, estimate.depth)
 
 
@@ -226,7 +224,7 @@ def _observe(given: Given, spec: Estimation, clock: Stopwatch) -> Evidence:
     views = []
     for number in folder.numbers:
         with clock.stage("read"):
-            view = read_view(folder, number)
+            view = read_view(folder, number, masked=False)
         with clock.stage("detect"):
             detection = detect_markers(view.rgb, folder.board, dictionary, folder.camera, number)
         with clock.stage("sample"):

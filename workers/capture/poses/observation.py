@@ -186,7 +186,7 @@ def fit_patches(rays: Array, z: Array) -> Patches:
             chosen.transpose(0, 2, 1) @ chosen + ALONE * np.eye(3), chosen.transpose(0, 2, 1) @ inverse[..., None]
         )[..., 0]
         off = (inverse - np.einsum("psk,pk->ps", basis, plane)) * z**2  # metres along z, to first order
-        sigma = 1.4826 * np.nanmedian(np.where(used, np.abs(off), np.nan), axis=1)
+        sigma = 1.4826 * _medians(np.abs(off), used)
         used = (z > 0) & (np.abs(off) <= OUTLIER * np.maximum(sigma, 1e-4)[:, None])
     total = np.maximum(used.sum(axis=1), 1)
     ray = (basis * used[..., None]).sum(axis=1) / total[:, None]
@@ -204,9 +204,16 @@ def depth_at(depth: NDArray[np.uint16], pixels: Array, units_per_m: float) -> Ar
     row = np.clip(np.floor(pixels[:, 1]).astype(np.int64)[:, None] + reach, 0, height - 1)
     window = depth[row[:, :, None], column[:, None, :]].reshape(len(pixels), len(reach) ** 2)
     many = (window > 0).mean(axis=1) >= 1 / 3
-    median = np.zeros(len(pixels))
-    median[many] = np.nanmedian(np.where(window > 0, window, np.nan)[many], axis=1)
-    return median / units_per_m
+    return np.where(many, _medians(window, window > 0), 0.0) / units_per_m
+
+
+def _medians(values: Array, used: NDArray[np.bool_]) -> Array:
+    """[N]: medians of the used of values [N, S], inf where none is; numpy's for nan takes ten times as long."""
+    ordered, count = np.sort(np.where(used, values, np.inf), axis=1), used.sum(axis=1)
+    row = np.arange(len(values))
+    return 0.5 * (
+        ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, np.minimum(count // 2, values.shape[1] - 1)]
+    )
 
 
 SIDE_RAD = 0.012
