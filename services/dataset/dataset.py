@@ -21,8 +21,8 @@ import pyarrow.dataset as ds
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.tables import SCHEMAS, TABLES
-from schemas.errors import CorruptError, InputError, SceneError, command_line, did_you_mean, needs_making
+from schemas.dataset.tables import SCHEMAS
+from schemas.errors import CorruptError, InputError, SceneError, command_line, needs_making
 from schemas.job.assets import SplitShares
 from schemas.job.job import Job
 from schemas.job.views import Patch
@@ -32,6 +32,7 @@ from services.dataset.pair import Pair, read_pair
 from services.dataset.shapes import RangeFiles, Shapes, StoredFiles
 from services.dataset.view import Files
 from services.job.record import JobRecord, read_success, record_job, require_job
+from services.read.columns_page import require_table
 from services.read.dataset_reader import StoredTables, find_records
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
@@ -173,8 +174,7 @@ class Dataset:
         Rows are read when it is scanned. In `assets` of an unfinished dataset an instance may stand several times. Raises
         InputError for another name.
         """
-        if name not in TABLES:
-            raise InputError(f"there is no table {name!r}; {did_you_mean(name, TABLES)}Tables are {', '.join(TABLES)}")
+        require_table(name)
         return StoredTables(self._store).dataset(name)
 
     def splits(self, held_out: Sequence[str] = ()) -> dict[str, str]:

@@ -43,21 +43,6 @@ class Correspondence:
         return self.uv - np.stack([columns + 0.5, rows + 0.5], axis=2)
 
 
-def correspond(source: Pixels, target: Pixels, tolerance_m: float) -> Correspondence:
-    """The source's stored depth carried into the target, and compared there with the target's.
-
-    A point is seen where the pixel that it falls in shows its region, and where it lies no more than `tolerance_m` behind
-    what `farthest_surface` expects there.
-    """
-    units, region = source.depth(), source.segment()
-    rows, columns = np.nonzero(units)
-    z = units[rows, columns] / source.depth_units_per_m
-    uv_seen, seen = carry(source, target, rows, columns, z, region[rows, columns], tolerance_m)
-    uv, visible = np.full((*units.shape, 2), np.nan), np.zeros(units.shape, np.bool_)
-    uv[rows, columns], visible[rows, columns] = uv_seen, seen
-    return Correspondence(uv, visible)
-
-
 def carry(
     source: Pixels,
     target: Pixels,
@@ -67,7 +52,11 @@ def carry(
     region: NDArray[np.uint8],
     tolerance_m: float,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(uv [N, 2], visible [N]) as in `Correspondence`, of N pixels of the source with depth z_m [N] and these regions [N]."""
+    """(uv [N, 2], visible [N]) as in `Correspondence`, of N pixels of the source with depth z_m [N] and these regions [N].
+
+    A point is seen where the pixel that it falls in shows its region, and where it lies no more than `tolerance_m` behind
+    what `farthest_surface` expects there.
+    """
     T_target_source = invert(target.T_world_cam) @ source.T_world_cam
     points = transform(T_target_source, unproject(rows, columns, z_m, source.camera.intrinsics))
     uv, visible = np.full((len(points), 2), np.nan), np.zeros(len(points), np.bool_)
@@ -199,7 +188,14 @@ class Pair:
         if self.mirror is None:
             raise InputError(f"pair {self.pose_id} has no mirror view: the job's cameras.mirror.enabled is false")
         source, target = (self.mirror, self.input) if back else (self.input, self.mirror)
-        return correspond(source, target, tolerance_m)
+        units, region = source.depth(), source.segment()
+        rows, columns = np.nonzero(units)
+        z_m = units[rows, columns] / source.depth_units_per_m
+        uv, visible = np.full((*units.shape, 2), np.nan), np.zeros(units.shape, np.bool_)
+        uv[rows, columns], visible[rows, columns] = carry(
+            source, target, rows, columns, z_m, region[rows, columns], tolerance_m
+        )
+        return Correspondence(uv, visible)
 
     def flow(self, back: bool = False) -> Array:
         """[H, W, 2] float64: how far, pixels, each pixel of the input view moves to the mirror view; nan where not known.

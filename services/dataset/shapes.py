@@ -11,7 +11,7 @@ from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import samples_path
 from schemas.job.views import Patch
 from services.job.record import JobRecord
-from services.read.dataset_reader import Members, committed_reader, decode_samples, file_reader
+from services.read.dataset_reader import Members, committed_reader, decode_samples, file_reader, region_names
 from workers.store.store import Store
 
 if TYPE_CHECKING:
@@ -32,8 +32,6 @@ class Shapes:
 
         Raises InputError where it is neither stored nor to be had from the job's sources, CorruptError where it is damaged.
         """
-        from services.read.scene_geometry import region_names
-
         return self._kept(region_names(scene)[region], scene["scene_id"]).copy()
 
     def samples(self, scene: Mapping[str, Any], region: int) -> Mapping[str, NDArray]:
@@ -41,8 +39,6 @@ class Shapes:
 
         Raises CorruptError where they are damaged.
         """
-        from services.read.scene_geometry import region_names
-
         path = samples_path(*region_names(scene)[region])
         try:
             return decode_samples(self._read(path), path)

@@ -70,15 +70,12 @@ def with_cameras(glb: bytes, views: list[Row]) -> bytes:
         name = f"{view['role']} {view['pose_id']}"
         roots.append(len(nodes))
         nodes.append({"name": name, "camera": len(cameras), "matrix": matrix.T.ravel().tolist()})
-        cameras.append({"name": name, "type": "perspective", "perspective": _perspective(view)})
+        width, height = view["width"] / view["fx"], view["height"] / view["fy"]
+        lens = {"yfov": 2.0 * math.atan(0.5 * height), "aspectRatio": width / height, "znear": _NEAR_M}
+        cameras.append({"name": name, "type": "perspective", "perspective": lens})
     tree["scenes"][0]["nodes"] = [len(nodes)]
     nodes.append({"name": "z up", "rotation": _Y_UP, "children": roots})
     return join_glb(tree, binary)
-
-
-def _perspective(view: Row) -> dict[str, float]:
-    width, height = view["width"] / view["fx"], view["height"] / view["fy"]
-    return {"yfov": 2.0 * math.atan(0.5 * height), "aspectRatio": width / height, "znear": _NEAR_M}
 
 
 _SIZES: Final = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}

@@ -173,7 +173,9 @@ def schema_of_pairs(job: Job) -> pa.Schema:
     absent = () if job.targets.views else OF_TARGETS["objects"]
     objects = pa.struct([field for field in SCHEMAS["objects"] if field.name not in (*_NOT_OF_OBJECTS, *absent)])
     schema = pa.schema([*fields, pa.field("objects", pa.list_(objects))])
-    return schema.with_metadata(features_metadata(schema))
+    # So that `datasets` knows which columns are images.
+    features = {field.name: _feature(field.type) for field in schema}
+    return schema.with_metadata({b"huggingface": json.dumps({"info": {"features": features}}).encode()})
 
 
 def _type_of(kind: PixelKind) -> pa.DataType:
@@ -241,12 +243,6 @@ def _bytes_in(cell: object) -> int:
     if isinstance(cell, list):
         return sum(map(_bytes_in, cell))
     return len(cell["bytes"]) if isinstance(cell, dict) and "bytes" in cell else 0
-
-
-def features_metadata(schema: pa.Schema) -> dict[bytes, bytes]:
-    """Schema metadata that tells `datasets` which columns are images."""
-    features = {field.name: _feature(field.type) for field in schema}
-    return {b"huggingface": json.dumps({"info": {"features": features}}).encode()}
 
 
 def _feature(kind: pa.DataType) -> dict[str, Any]:

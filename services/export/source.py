@@ -24,6 +24,7 @@ from services.read.dataset_reader import (
     decode_samples,
     file_reader,
     patch_paths,
+    region_names,
     view_paths,
 )
 from workers.store.commit import split_code
@@ -128,8 +129,7 @@ class ExportScene:
     @cached_property
     def instances(self) -> dict[int, tuple[str, str]]:
         """(category, instance id) of every object, by region id."""
-        bodies = self.row["bodies"] or [{**self.row, "region_id": REGION_FIRST_OBJECT}]
-        return {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
+        return {region: name for region, name in region_names(self.row).items() if region >= REGION_FIRST_OBJECT}
 
     def samples(self, instance_id: str) -> Mapping[str, NDArray]:
         """The shape targets of an instance by key; none where it has none. Raises CorruptError for a damaged or missing file."""

@@ -144,7 +144,7 @@ def coarsen(body: Body) -> Body:
 
 def pack_spaces(spaces: Sequence[Space]) -> str:
     """JSON for the page; arrays are base64 of little-endian numbers, points relative to the target."""
-    return json.dumps([_packed(space) for space in spaces], separators=(",", ":"))
+    return json.dumps(list(map(_packed, spaces)), separators=(",", ":"))
 
 
 def _packed(space: Space) -> dict[str, Any]:

@@ -59,11 +59,11 @@ class Page:
     footer: str
 
 
-def whole_page(page: Page) -> str:
-    """The page with everything that it needs inside."""
-    style = f"<style>{read_web('page.css')}</style>"
+def whole_page(page: Page, names: Sequence[str] = SCRIPTS, style: str = "") -> str:
+    """The page with everything that it needs inside: these scripts, and more rules of style."""
+    style = f"<style>{read_web('page.css')}{style}</style>"
     icon = f"data:image/svg+xml,{quote(read_web('icon.svg').strip())}"
-    scripts = "".join(f"<script>{read_web(name)}</script>\n" for name in SCRIPTS)
+    scripts = "".join(f"<script>{read_web(name)}</script>\n" for name in names)
     return fill_page(page, policy=POLICY, style=style, icon=icon, scripts=scripts, data="")
 
 

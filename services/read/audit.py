@@ -18,7 +18,7 @@ from schemas.dataset.codec import Row
 from schemas.dataset.layout import is_shape, stored_images, stored_roles
 from schemas.errors import CorruptError, InputError, SceneError, command_line, plural
 from schemas.job.job import Job
-from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
+from schemas.scene.scene import EffectPlan, ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import MODALITIES, Camera, View
 from services.job.record import read_success, require_job
@@ -29,7 +29,7 @@ from services.read.replay import compare_files, compare_rows, is_same_stack, ope
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import edge_distance_px
-from workers.physics.release import release_again
+from workers.physics.hold import release_again
 from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import Stopwatch, WorkerContext
@@ -82,10 +82,8 @@ class Motion:
         return phrases
 
 
-def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
-    """Release the scene for `RELEASE_S` and draw its masks again."""
-    facts = Facts(context.job, scene.plan, scene.raycast_checked)
-    effects = plan_effects(facts, names_of_kind("approximation"))
+def measure_motion(context: WorkerContext, scene: Scene, effects: EffectPlan) -> Motion:
+    """Release the scene for `RELEASE_S` with these effects and draw its masks again."""
     poses = release_again(scene.plan, scene.settled, context.job.physics, effects, RELEASE_S)
     largest = Motion()
     for start, rest, pose in zip(scene.plan.objects, scene.settled, poses, strict=True):
@@ -172,11 +170,10 @@ class Drops:
         )
 
 
-def drop_again(context: WorkerContext, scene: Scene, drops: Drops) -> None:
-    """Drops the objects of a scene from their starts with every effect of physics, and counts where they end."""
-    facts = Facts(context.job, scene.plan, scene.raycast_checked)
+def drop_again(context: WorkerContext, scene: Scene, effects: EffectPlan, drops: Drops) -> None:
+    """Drops the objects of a scene from their starts with these effects, and counts where they end."""
     try:
-        rest = settle_scene(scene.plan, context.job.physics, plan_effects(facts, names_of_kind("approximation")))
+        rest = settle_scene(scene.plan, context.job.physics, effects)
     except SceneError:
         drops.lost += len(scene.plan.objects)
         return
@@ -323,8 +320,10 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, audited: A
     plain = None if audited.same_stack else make_forced(context, scene_id)[1]
     proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, audited)
     if approximations:
-        motion = measure_motion(context, scene)
-        drop_again(context, scene, audited.drops)
+        facts = Facts(context.job, scene.plan, scene.raycast_checked)
+        effects = plan_effects(facts, names_of_kind("approximation"))
+        motion = measure_motion(context, scene, effects)
+        drop_again(context, scene, effects, audited.drops)
         audited.released += 1
         audited.motion = audited.motion.join(motion)
         released = f"scene {scene_id}, {', '.join(approximations)}: released with every effect"

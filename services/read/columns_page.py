@@ -36,9 +36,15 @@ def list_columns(table: str | None) -> list[dict[str, Any]]:
     ]
 
 
+def require_table(name: str) -> None:
+    """Raises InputError where a dataset has no table of this name."""
+    if name not in TABLES:
+        raise InputError(f"there is no table {name!r}; {did_you_mean(name, TABLES)}Tables are {', '.join(TABLES)}")
+
+
 def _chosen(table: str | None) -> tuple[str, ...]:
-    if table is not None and table not in TABLES:
-        raise InputError(f"there is no table {table!r}; {did_you_mean(table, TABLES)}Tables are {', '.join(TABLES)}")
+    if table is not None:
+        require_table(table)
     return (table,) if table else tuple(TABLES)
 
 

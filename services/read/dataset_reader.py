@@ -39,6 +39,8 @@ from schemas.dataset.layout import (
 )
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError, command_line
+from schemas.job.assets import TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import MODALITIES
 from services.job.record import read_success
 from workers.geometry.camera import spread_evenly
@@ -207,6 +209,13 @@ def _check_samples(arrays: Mapping[str, NDArray]) -> None:
             raise ValueError(f"{key} is {array.dtype.str} {array.shape}, not {dtype} {shape}")
         if not np.isfinite(array).all():
             raise ValueError(f"{key} has a number that is not finite")
+
+
+def region_names(scene: Mapping[str, Any]) -> dict[int, tuple[str, str]]:
+    """(category, instance id) of the table and of every object, by region id, of a row of `scenes`."""
+    bodies = scene["bodies"] or [{**scene, "region_id": REGION_FIRST_OBJECT}]
+    objects = {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
+    return {REGION_TABLE: (TABLE, scene["table_id"]), **objects}
 
 
 def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:

@@ -4,7 +4,7 @@ import io
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
@@ -13,10 +13,9 @@ from trimesh.visual import ColorVisuals
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import asset_path
 from schemas.errors import CorruptError, InputError, MachineError, VersoError, needs_making
-from schemas.job.assets import TABLE
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Asset
 from services.job.record import JobRecord, require_job
-from services.read.dataset_reader import StoredRange, find_scene
+from services.read.dataset_reader import StoredRange, find_scene, region_names
 from workers.assets.glb import linear_bytes, mesh_of_part, show_colors
 from workers.store.store import Store
 
@@ -91,13 +90,6 @@ def load_glb(data: bytes, path: str) -> Mapping[str, trimesh.Trimesh]:
         return meshes
     except Exception as error:  # trimesh raises errors of many kinds for a damaged file
         raise CorruptError(f"{path} cannot be read: {error}; `verso verify OUT` says what to do") from error
-
-
-def region_names(scene: Mapping[str, Any]) -> dict[int, tuple[str, str]]:
-    """(category, instance id) of the table and of every object, by region id, of a row of `scenes`."""
-    bodies = scene["bodies"] or [{**scene, "region_id": REGION_FIRST_OBJECT}]
-    objects = {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
-    return {REGION_TABLE: (TABLE, scene["table_id"]), **objects}
 
 
 def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[str, str]) -> list[Named]:

@@ -58,8 +58,10 @@ class Known:
     """Scenes [start, stop), in order, whose commit is missing or damaged, which is told: their files are not told again."""
     poses_per_scene: int
 
-    def has_lost(self, key: str) -> bool:
-        """Whether a file may belong to a commit that cannot be read."""
+    def has(self, key: str) -> bool:
+        """Whether a file is the dataset's, or may be, because it may belong to a commit that cannot be read."""
+        if key in self.index or (self.merging and is_merged_path(key)) or key.startswith(f"{COMMITS}/{PROBE_PREFIX}"):
+            return True
         if not self.lost:
             return False
         if is_shape(key):
@@ -73,43 +75,29 @@ class Known:
 
 
 ODD: dict[Kind, tuple[str, str]] = {
+    "file": ("is in no commit", MOVE),
     "link": ("is a symbolic link", "put a copy of what it leads to in its place, or move it away"),
     "unreadable": ("cannot be listed", "check its permissions and the disk"),
     "special": ("is neither a file nor a folder", MOVE),
     "empty folder": ("is an empty folder", "remove it"),
 }
-"""What is never part of a dataset, and what to do about it."""
+"""What is told of what is no part of a dataset, and what to do about it."""
 
 
 def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
     """Tells of everything that no commit names."""
     for kind, key in _walk(store):
+        what, remedy = ODD[kind]
         if kind == "file":
-            if not _belongs(key, known):
-                _tell_file(store, key, verdict)
-        elif kind != "empty folder" or not (known.merging or key in FRAME or key in known.index):
-            what, remedy = ODD[kind]
-            verdict.tell(f"{key}: {what}", remedy, "stray")
-
-
-def _tell_file(store: Store, key: str, verdict: Verdict) -> None:
-    """Tells of a file that no commit names, and of the commit that would name it, where that is gone."""
-    range_of = _RANGE.match(key)
-    if range_of and store.size(commit := commit_path(int(range_of[1]), int(range_of[2] or 0))) is None:
-        what = f"{key}: is in no commit, and {commit} is missing"
-        verdict.tell(what, f"restore that from a copy, or {verdict.run_again} --retry-failed", "stray")
-    else:
-        verdict.tell(f"{key}: is in no commit", MOVE, "stray")
-
-
-def _belongs(key: str, known: Known) -> bool:
-    """Whether a file is the dataset's, or may be."""
-    name = key.rpartition("/")[2]
-    if key in known.index or (known.merging and is_merged_path(key)):
-        return True
-    if key.startswith(f"{COMMITS}/{PROBE_PREFIX}") and "/" not in name:
-        return True
-    return known.has_lost(key)
+            if known.has(key):
+                continue
+            range_of = _RANGE.match(key)
+            if range_of and store.size(commit := commit_path(int(range_of[1]), int(range_of[2] or 0))) is None:
+                what += f", and {commit} is missing"
+                remedy = f"restore that from a copy, or {verdict.run_again} --retry-failed"
+        elif kind == "empty folder" and (known.merging or key in FRAME or key in known.index):
+            continue
+        verdict.tell(f"{key}: {what}", remedy, "stray")
 
 
 def _walk(store: Store) -> Iterator[tuple[Kind, str]]:

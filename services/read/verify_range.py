@@ -1,6 +1,5 @@
 """Committed ranges read back: which there must be, and of each its record, tables, files and labels."""
 
-import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,9 +13,9 @@ from schemas.dataset.layout import COMMITS, RANGES, commit_path, is_shape, parse
 from schemas.dataset.tables import DETERMINISTIC_TABLES, TABLES
 from schemas.errors import CorruptError, command_line, needs_making
 from schemas.job.job import Job
-from services.read.dataset_reader import Members, ReadFile, StoredRange, file_reader
+from services.read.dataset_reader import Members, ReadFile, StoredRange, committed_reader, file_reader
 from services.read.verdict import COPY, MOST_FAULTS, PathIndex, Verdict, describe_os_error
-from workers.store.commit import committed_files, read_committed, read_record
+from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png
 from workers.store.ledger import range_rows
 from workers.store.store import Store
@@ -182,19 +181,15 @@ class ReadRange:
         try:
             data = self._reading.store.read(path)
         except FileNotFoundError:
-            data = self._read_staged(path)
+            try:
+                data = committed_reader(self._reading.store, self.records)(path)
+            except CorruptError as error:
+                raise FileNotFoundError(path) from error
+            self.staged += 1
         self._digests[path] = hashlib.sha256(data).hexdigest()
         self.verdict.files += 1
         self.verdict.bytes += len(data)
         return data
-
-    def _read_staged(self, path: str) -> bytes:
-        for record in self.records:
-            with contextlib.suppress(CorruptError):
-                data = read_committed(self._reading.store, record, path)
-                self.staged += 1
-                return data
-        raise FileNotFoundError(path)
 
     def _read_rows(self) -> dict[str, pa.Table] | None:
         """The rows by table. None, which is told, where they cannot be read although their bytes are as committed."""

@@ -13,7 +13,6 @@ from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import quote
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +21,7 @@ import pyarrow.parquet as pq
 from schemas.errors import InputError, command_line, number, plural
 from services.job.record import read_success, require_dataset
 from services.look.charts import Chart, Histogram, amount, chart_html
-from services.look.report import POLICY, Page, Section, fill_page, read_web
+from services.look.report import Page, Section, whole_page
 from services.look.sections import table_html
 from services.read.verdict import explain_damage
 from services.run.progress import finish
@@ -66,19 +65,14 @@ def main(options: argparse.Namespace) -> int:
         _write(target / PAGE_FILE, page_of(summary, table, troubles))
     for line in troubles:
         print(f"verso: {line}", file=sys.stderr)
-    _print_metrics(summary["metrics"])
+    for name, figure in summary["metrics"].items():
+        if name in HEADLINES and figure["items"]:
+            ends, items = interval(name, figure), plural(figure["items"], "item")
+            print(f"{name:28}{in_words(name, figure['value']):>12}  {ends:28}{items}")
     print(answer_of(summary))
     print(f"page: {target / PAGE_FILE}")
     answer = {name: summary[name] for name in ("items", "missing", "refused", "metrics")}
     return finish(options, not summary["refused"], **answer, page=str(target / PAGE_FILE))
-
-
-def _print_metrics(metrics: dict[str, Any]) -> None:
-    for name, one in metrics.items():
-        if name in HEADLINES and one["items"]:
-            print(
-                f"{name:28}{in_words(name, one['value']):>12}  {interval(name, one):28}{plural(one['items'], 'item')}"
-            )
 
 
 def _compare(options: argparse.Namespace) -> int:
@@ -186,11 +180,7 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
         sections,
         "",
     )
-    icon = f"data:image/svg+xml,{quote(read_web('icon.svg').strip())}"
-    style = f"<style>{read_web('page.css')}{_STYLE}</style>"
-    return fill_page(
-        page, policy=POLICY, style=style, icon=icon, scripts=f"<script>{read_web('page.js')}</script>", data=""
-    )
+    return whole_page(page, ("page.js",), _STYLE)
 
 
 def _metrics(metrics: Mapping[str, Figure]) -> str:

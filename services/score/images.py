@@ -51,7 +51,7 @@ def score_colour(predicted: NDArray[np.uint8], true: NDArray[np.uint8], flip: bo
         "psnr_db": math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error),
         "ssim": ssim,
         "ms_ssim": ms_ssim,
-        "flip": _flip(predicted, true) if flip else None,
+        "flip": None if not flip else _flip(predicted, true) if true.size else math.nan,
     }
 
 
@@ -91,7 +91,7 @@ def _halve(image: Array) -> Array:
 def _flip(predicted: NDArray[np.uint8], true: NDArray[np.uint8]) -> float:
     from services.study.truths import flip_between
 
-    return flip_between(true, predicted) if true.size else math.nan
+    return flip_between(true, predicted)
 
 
 def require_flip() -> None:

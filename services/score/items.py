@@ -28,7 +28,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.dataset.pair import Pair, carry
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
-from services.score.pose import INVERTED, box_of, check_distance, score_pose, score_volume, symmetries_of
+from services.score.pose import INVERTED, box_of, check_distance, correlation, score_pose, score_volume, symmetries_of
 from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
@@ -239,10 +239,8 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) ->
     if np.count_nonzero(both) < LEAST_PIXELS:
         return
     predicted, true = predicted[both], true[both]
-    a, b = predicted - predicted.mean(), true - true.mean()
-    norm = float(np.sqrt((a @ a) * (b @ b)))
-    if norm > 0.0 and float(a @ b) / norm < INVERTED:  # before the unit: disparity may look like another one
-        raise InputError(f"depth is inverted: its correlation with the truth is {float(a @ b) / norm:.2f}")
+    if (likeness := correlation(predicted, true)) < INVERTED:  # before the unit: disparity may look like another one
+        raise InputError(f"depth is inverted: its correlation with the truth is {likeness:.2f}")
     if units_per_m is None:
         return
     ratio = float(np.median(predicted / true))

@@ -170,10 +170,15 @@ def check_distance(predicted: Array, true: Array) -> None:
             f"values reach {np.abs(predicted).max():.3g}, {times:.3g} times the largest distance: they seem to be logits; write "
             "occupancy from 0 to 1, or distance in metres"
         )
-    a, b = predicted - predicted.mean(), true - true.mean()
-    norm = float(np.sqrt((a @ a) * (b @ b)))
-    if norm > 0.0 and float(a @ b) / norm < INVERTED:
+    if correlation(predicted, true) < INVERTED:
         raise InputError("the distances have the other sign: they are negative inside, positive outside")
+
+
+def correlation(a: Array, b: Array) -> float:
+    """Pearson's, of values [N]; nan where one does not vary."""
+    a, b = a - a.mean(), b - b.mean()
+    norm = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / norm if norm > 0.0 else math.nan
 
 
 def box_of(points: Array) -> tuple[Array, float]:

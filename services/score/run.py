@@ -192,9 +192,7 @@ def _rows(item: _Range) -> list[Row]:
 
 
 def _table(rows: Sequence[Row]) -> pa.Table:
-    metrics = {name for row in rows for name in row} - set(FACTS.names)
-    schema = _schema(metrics)
-    return pa.Table.from_pylist([{name: row.get(name) for name in schema.names} for row in rows], schema)
+    return pa.Table.from_pylist(rows, _schema({name for row in rows for name in row} - set(FACTS.names)))
 
 
 def _schema(metrics: Collection[str]) -> pa.Schema:
@@ -206,9 +204,7 @@ def _write_items(tables: Iterable[pa.Table], metrics: Collection[str], target: P
     schema, partial = _schema(metrics), target.with_name(f".{target.name}.{os.getpid()}")
     with pq.ParquetWriter(partial, schema) as file:
         for table in tables:
-            there = set(table.column_names)
-            columns = [table[name] if name in there else pa.nulls(len(table), pa.float64()) for name in schema.names]
-            file.write_table(pa.table(columns, schema))
+            file.write_table(pa.concat_tables([schema.empty_table(), table], promote_options="default"))
     os.replace(partial, target)
 
 

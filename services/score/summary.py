@@ -100,7 +100,11 @@ def summarise(table: pa.Table) -> dict[str, Any]:
     names = metrics_of(table)
     shown = [place for place, name in enumerate(names) if name in HEADLINES]
     values = np.stack([values_of(table, name) for name in names], axis=1) if names else np.zeros((table.num_rows, 0))
-    scenes, groups = _scenes(table), {"category": _categories(table), "visible_fraction": _quarters(table)}
+    categories = {
+        name: np.asarray(pc.equal(table["category"], name).fill_null(False).to_numpy(), np.bool_)
+        for name in sorted(filter(None, pc.unique(table["category"]).to_pylist()))
+    }
+    scenes, groups = _scenes(table), {"category": categories, "visible_fraction": _quarters(table)}
     statuses = [_equal(table, "status", word) for word in ("ok", "missing", "refused")]
     return {
         "items": table.num_rows,
@@ -197,11 +201,6 @@ def _equal(table: pa.Table, name: str, word: str) -> NDArray[np.bool_]:
 def _scenes(table: pa.Table) -> NDArray[np.int64]:
     """[N] numbers of scenes from 0 up; items without a scene are one together."""
     return np.unique(_numbers(table, "scene_id"), return_inverse=True)[1].reshape(-1)
-
-
-def _categories(table: pa.Table) -> dict[str, NDArray[np.bool_]]:
-    names = sorted(name for name in pc.unique(table["category"]).to_pylist() if name is not None)
-    return {name: np.asarray(pc.equal(table["category"], name).fill_null(False).to_numpy(), np.bool_) for name in names}
 
 
 def _quarters(table: pa.Table) -> dict[str, NDArray[np.bool_]]:

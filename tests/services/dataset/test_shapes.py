@@ -3,7 +3,6 @@
 import shutil
 
 import numpy as np
-import pyarrow.compute as pc
 import pytest
 import trimesh
 import yaml
@@ -27,18 +26,6 @@ def test_a_mesh_is_the_same_in_every_form_and_may_be_changed(dataset, files):
         before = pair.mesh().bounds
         pair.mesh().apply_scale(9.0)
         assert np.array_equal(pair.mesh().bounds, before) and np.array_equal(before, plain.mesh().bounds)
-
-
-def test_a_mesh_in_the_world_is_the_glb_at_the_pose_of_objects_dat(files):
-    (pair, *_) = open_dataset(files.root).pairs()
-    lines = map(str.split, (files.root / "objects.dat").read_text().splitlines())
-    line = next(words for words in lines if words[0] == str(pair.pose_id) and words[3] == "3")
-    T_cam_obj = np.array(line[6:], float).reshape(4, 4)
-    glb = trimesh.load_mesh(files.root / "assets" / line[1] / f"{line[2]}.glb", process=False)
-    seen = trimesh.transform_points(glb.vertices, T_cam_obj)
-    world = trimesh.transform_points(seen, pair.input.T_world_cam)
-    for mesh, points in ((pair.mesh(3, pair.input), seen), (pair.mesh(), world)):
-        assert mesh.bounds == pytest.approx(np.stack([points.min(axis=0), points.max(axis=0)]), abs=1e-6)
 
 
 def test_a_welded_mesh_is_watertight_where_the_asset_is_and_is_the_same_surface(tmp_path):
@@ -82,17 +69,6 @@ def test_colours_of_vertices_are_shown_by_a_mesh_and_by_a_stored_file_read_as_th
     for mesh in (posed, trimesh.load_mesh(path, process=False, skip_materials=True)):
         wanted = np.where(mesh.vertices[:, 2:] < -1e-6, [level, 0, 0, 255], [0, level, 0, 255])
         assert np.abs(mesh.visual.vertex_colors.astype(int) - wanted).max() <= 1
-
-
-def test_each_of_several_objects_has_its_own_shape(tmp_path):
-    make_dataset(tmp_path, scenes=1, objects_per_scene=3, categories=["box", "camera", "bottle"])
-    (pair,) = open_dataset(tmp_path).pairs()
-    assets = open_dataset(tmp_path).table("assets")
-    for number in (3, 4, 5):
-        (instance,) = [body["instance_id"] for body in pair.scene["bodies"] if body["region_id"] == number]
-        (row,) = assets.to_table(filter=pc.field("instance_id") == instance).to_pylist()
-        own = trimesh.transform_points(pair.mesh(number).vertices, np.linalg.inv(pair.T_world[number]))
-        assert np.ptp(own, axis=0) == pytest.approx(row["extents_m"], abs=1e-6)
 
 
 def test_a_shape_that_is_not_stored_comes_from_the_source_and_one_that_is_gone_is_told(files, copy):

@@ -237,14 +237,6 @@ def first_scene(store):
     return scene
 
 
-def test_the_split_of_a_scene_is_the_strictest_of_its_objects(pile):
-    scene = first_scene(pile)
-    assert set(scene.instances) == {3, 4, 5}
-    for position, (_, name) in enumerate(scene.instances.values()):
-        scene.assets[name] = {**scene.assets[name], "split": ("val", "test", "train")[position]}
-    assert scene.split == "test"
-
-
 def test_each_split_has_its_share_of_every_category_and_what_is_held_out_is_test_alone(files, tmp_path, monkeypatch):
     ids = {
         "laptop": [f"laptop-{k}" for k in range(30)],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.dataset.tables import SCHEMAS, TABLES
-from schemas.errors import CorruptError, InputError, OutputError
+from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.cli.main import main
 from services.job.record import encode_job, record_job
@@ -16,17 +16,10 @@ from services.merge.merge import merge
 from services.read.columns_page import describe_columns, list_columns, write_page
 from services.read.dataset_reader import (
     choose_scenes,
-    committed_reader,
-    file_reader,
-    find_scene,
-    patch_paths,
-    view_paths,
 )
 from services.read.status import read_status
 from services.run.lock import hold_lock
-from tests.datasets import make_dataset
 from tests.made_up_scenes import attempt_at, failed_scene, scene
-from workers.store.images import decode_png
 from workers.store.ledger import list_commits, save_rows
 from workers.store.local import LocalStore
 
@@ -42,40 +35,6 @@ def test_scenes_are_chosen_evenly_by_seed_and_failed_ones_never(tmp_path, unflus
     places = [choose_scenes(store, 99, 0).index(scene) for scene in choose_scenes(store, 7, 1)]
     assert set(np.diff(places)) == {2} and places[0] < 2
     assert len({tuple(choose_scenes(store, 4, seed)) for seed in range(9)}) > 1
-
-
-@pytest.mark.parametrize("layout", ["files", "tar"])
-def test_a_scene_is_found_with_its_pairs_and_every_image_is_read_from_either_layout(layout, tmp_path):
-    store, _ = make_dataset(tmp_path, output={"layout": layout}, pairs_per_scene=2)
-    assert choose_scenes(store, 9, 0) == [0, 1]
-    stored = find_scene(store, 1)
-    assert stored.scene(1)["scene_id"] == 1 and stored.scene(7) is None
-    pairs = list(stored.pairs(1))
-    assert [views["input"]["pose_id"] for views, _ in pairs] == [4, 6]
-    for views, objects in pairs:
-        assert set(views) == {"input", "aligned", "mirror", "projected"}
-        assert {row["pose_id"] for row in objects} == {views["input"]["pose_id"], views["mirror"]["pose_id"]}
-        assert {row["region_id"] for row in objects} == {2, 3}
-    with pytest.raises(InputError, match="scene 2 is not in"):
-        find_scene(store, 2)
-    read = file_reader(committed_reader(store, stored.records), stored.records)
-    paths = [file["path"] for row in stored.rows["views"] for file in row["files"]]
-    assert len(paths) >= 4 * 11 and all(decode_png(read(path)).size for path in paths)
-    with pytest.raises(CorruptError, match="mug/RGB99999"):
-        read("mug/RGB99999.png")
-
-
-def test_only_images_that_are_stored_have_a_path():
-    def named(*paths: str) -> dict:
-        files = [{"path": f"mug/{path}.png"} for path in paths]
-        return {"category": "mug", "role": "aligned", "pose_id": 12, "files": files}
-
-    both = named("depthAligned00012", "patches/depthAligned00012", "RGB00012")
-    assert view_paths(both) == {"depth": "mug/depthAligned00012.png"}
-    assert patch_paths(both, None) == {"depth": "mug/patches/depthAligned00012.png"}
-    assert patch_paths(both, 1) == {}
-    of_second = "patches/depthAligned00012obj1"
-    assert patch_paths(named(of_second), 1) == {"depth": f"mug/{of_second}.png"}
 
 
 # ---------------------------------------------------------------------------------------------- status
