@@ -163,6 +163,10 @@ class DepthCorrection:
     identified: tuple[str, ...] = ()
 
 
+CLUTTERED = "what it alone has on the board is left out"
+"""The reason that a view which is used has where things such as a hand are on the board."""
+
+
 @dataclass(frozen=True, eq=False)
 class ViewEstimate:
     """One view's pose in one estimate.
@@ -170,7 +174,7 @@ class ViewEstimate:
     T_board_cam [4, 4] takes camera coordinates to board coordinates, None where refused; covariance [6, 6] of a small motion
     (metres, then radians, camera axes) or None; reprojection_px: median over corners, of all that were found;
     depth_mm: median distance of board points measured by depth from the board's plane, after the correction, or None.
-    `reasons` says why a view is flagged or refused, with the number measured.
+    `reasons` says why a view is flagged or refused, with the number measured, or what is left out of one that is used.
     """
 
     number: int
@@ -206,6 +210,10 @@ class CaptureEstimate:
     def used(self) -> tuple[ViewEstimate, ...]:
         """The views that take part in the result."""
         return tuple(view for view in self.views if view.status == "used")
+
+    def is_cluttered(self, number: int) -> bool:
+        """Whether a view shows things on the board, such as a hand, that other views do not."""
+        return any(view.number == number and CLUTTERED in view.reasons for view in self.views)
 
 
 @dataclass(frozen=True, eq=False)

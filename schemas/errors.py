@@ -89,15 +89,19 @@ class FingerprintError(RunError):
 
 
 class SceneError(VersoError):
-    """A scene that cannot be made: a row in `failures`; `reason` is a short stable word, `detail` a sentence."""
+    """A scene that cannot be made: a row in `failures`; `reason` is a short stable word, `detail` a sentence.
+
+    kind: `environmental` where neither job nor seed is to blame: the scene may be tried again.
+    """
 
     stage = "scene"
     kind: FailureKind = "intrinsic"
 
-    def __init__(self, reason: str, detail: str) -> None:
+    def __init__(self, reason: str, detail: str, kind: FailureKind | None = None) -> None:
         super().__init__(reason, detail)
         self.reason = reason
         self.detail = detail
+        self.kind = kind or self.kind
 
     def __str__(self) -> str:
         return f"{self.stage}: {self.reason}: {self.detail}"

@@ -5,7 +5,7 @@ A job with this branch makes captures in place of scenes: capture number n is th
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, model_validator
 
@@ -31,7 +31,7 @@ y down, z into the board; OpenCV's before, and Kalibr's, at the bottom left, y u
 UNNAMED = "object"
 """The category of a capture whose capture.json names none."""
 
-ESTIMATES: tuple[Estimate, ...] = ("markers", "article", "joint")
+ESTIMATES: tuple[Estimate, ...] = get_args(Estimate)
 
 
 Point = tuple[float, float, float]

@@ -303,26 +303,17 @@ def settings_digest(job: Job, catalogue_digest: str) -> str:
 
 def compare_jobs(before: Job, now: Job) -> list[tuple[str, Any, Any]]:
     """(dotted key, value before, value now) of every key that must stay the same and does not."""
-    there, here = (_keys_of(job, NOT_OF_A_DATASET, all_keys=True) for job in (before, now))
+    there, here = (differing_keys(job, NOT_OF_A_DATASET, all_keys=True) for job in (before, now))
     return _differences(there, here)
 
 
-def differing_keys(model: BaseModel, without: Collection[str] = ()) -> dict[str, Any]:
+def differing_keys(model: BaseModel, without: Collection[str] = (), all_keys: bool = False) -> dict[str, Any]:
     """The keys of a model, as JSON holds them, whose values differ from their fields' defaults.
 
     Inside a branch or an item of a list too; keys without a default, such as the kind of a source, are always there. `without`:
-    dotted keys that are left out; items of a list have no position in them.
+    dotted keys that are left out; items of a list have no position in them. `all_keys`: also those that do not differ.
     """
-    return _keys_of(model, without)
 
-
-def _digest(job: Job, without: Collection[str], catalogue_digest: str) -> str:
-    keys = {"verso": job.verso, **differing_keys(job, without)}
-    text = json.dumps([keys, catalogue_digest], sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _keys_of(model: BaseModel, without: Collection[str], all_keys: bool = False) -> dict[str, Any]:
     def walk(value: Any, plain: Any, path: str) -> Any:
         """What stays of `plain`, which is `value` as JSON holds it."""
         if isinstance(plain, list):
@@ -338,6 +329,12 @@ def _keys_of(model: BaseModel, without: Collection[str], all_keys: bool = False)
         return kept
 
     return dict(walk(model, model.model_dump(mode="json"), ""))
+
+
+def _digest(job: Job, without: Collection[str], catalogue_digest: str) -> str:
+    keys = {"verso": job.verso, **differing_keys(job, without)}
+    text = json.dumps([keys, catalogue_digest], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:

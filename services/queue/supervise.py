@@ -194,7 +194,10 @@ class Supervisor:
         self._keep_logs(views, known)
         left = [view.request.id for view in views if not view.ended]
         self._do_all(choose_starts(self._queue.read_all(left)[0], self._rules.at_once, self._is_due))
-        self._tell_share(left)
+        running = max(1, sum(view.held for view in self._queue.read_all(left)[0]))
+        if running != self._share:  # among so many jobs the cluster is shared
+            self._queue.put_share(running)
+            self._share = running
         self._waited_for |= {*left}
         self.is_empty = self._settled >= {view.request.id for view in views}
 
@@ -274,13 +277,6 @@ class Supervisor:
             since = self._clock()
             self._seen[view.request.id] = (view.events, since)
         return self._clock() - since >= pause_of(view)
-
-    def _tell_share(self, ids: Sequence[str]) -> None:
-        """Tells the drivers among how many the cluster is shared, where that has changed."""
-        running = max(1, sum(view.held for view in self._queue.read_all(ids)[0]))
-        if running != self._share:
-            self._queue.put_share(running)
-            self._share = running
 
 
 def supervise(

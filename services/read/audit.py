@@ -29,7 +29,7 @@ from services.read.replay import compare_files, compare_rows, is_same_stack, ope
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import edge_distance_px
-from workers.physics.release import release_again
+from workers.physics.hold import release_again
 from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import Stopwatch, WorkerContext

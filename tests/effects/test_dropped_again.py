@@ -22,7 +22,7 @@ from tests.hard_cases.drops import drop, level
 from tests.kit.shapes import asset_of
 from workers.geometry.frames import transform
 from workers.physics.effects import PREDICATES
-from workers.physics.release import moved_by
+from workers.physics.hold import moved_by
 from workers.scene.effects import plan_effects
 
 MOST_FACES = 0.1

@@ -18,6 +18,7 @@ from tests.hard_cases.case import Made, nudged
 from tests.hard_cases.drops import Drop, X, Y, drop, level, ring, turn
 from tests.hard_cases.groups import Group, dominoes, heavy, pile, put, together, tray
 from tests.hard_cases.hollow_cases import BALL_M, at_the_bottom
+from tests.hard_cases.linked_cases import chain, circle, rod_line, stay_linked, threaded
 from tests.hard_cases.measures import Made as Objects
 from tests.hard_cases.measures import Measure, Rest, Z, apart, both, coms, height, on_a_face, shift, tilt
 from tests.hard_cases.slope_cases import on_wedge, slid_down
@@ -34,8 +35,8 @@ class Chaotic:
     """One row: at least the share `rests` of the seeds must settle, and all that settle within the measure's bound.
 
     `share` (least, most): of those that settle, how many must pass `counted`, where that is given. The others of the seeds
-    must leave the table or be refused as not at rest. `again`: what rests must stay when it is let go again. `tier` is the
-    marker of the whole row of seeds, `first` that of the first ones.
+    must leave the table or be refused as not at rest, or for the reason `refused`. `again`: what rests must stay when it is
+    let go again. `tier` is the marker of the whole row of seeds, `first` that of the first ones.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Chaotic:
     again: bool = True
     tier: str = "minute"
     first: str = ""
+    refused: str = ""
 
 
 def chance(seed: int) -> np.random.Generator:
@@ -239,6 +241,35 @@ CHAOTIC = (
     ),
     Chaotic(
         "ball let go anywhere into a bowl", NOTHING_LESS, at_the_bottom(), ball_into_bowl, tier="slow", first="slow"
+    ),
+    # What is thin touches with many faces, and what is thick rocks for long: such seeds may be refused, but none comes apart.
+    *(
+        Chaotic(
+            f"{name} linked rings of {wire_mm:g} mm wire",
+            rests,
+            stay_linked(*[circle()] * count),
+            functools.partial(chain, wire_mm / 1e3, count),
+            again=False,
+            tier="slow",
+            first=first,
+            refused="unsupported",
+        )
+        for name, count, wire_mm, rests, first in (
+            ("two", 2, 0.5, 0.0, "slow"),
+            ("two", 2, 1.0, 0.5, "minute"),
+            ("two", 2, 4.0, 0.8, "minute"),
+            ("two", 2, 10.0, 0.5, "minute"),
+            ("three", 3, 4.0, 0.8, "minute"),
+        )
+    ),
+    Chaotic(
+        "ring of 4 mm wire threaded on a rod",
+        0.8,
+        stay_linked(circle(), rod_line()),
+        threaded,
+        again=False,
+        tier="slow",
+        refused="unsupported",
     ),
     # Moved by at most 10 micrometres and 0.002 degrees, as the table of margins does: these alone end in several ways.
     Chaotic(

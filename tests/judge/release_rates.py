@@ -25,7 +25,7 @@ from tests.judge.table import STILL_DEG, STILL_MM
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.physics.fall import FINEST
-from workers.physics.release import RELEASE_RATE, moved_by, release_again
+from workers.physics.hold import RELEASE_RATE, moved_by, release_again
 from workers.physics.settle import RECHECK_S, settle_scene
 from workers.scene.chance import SceneChance
 from workers.scene.effects import Facts, plan_effects

@@ -15,7 +15,7 @@ from tests.kit.shapes import asset_of, box, table
 from workers.geometry.hull import convex_hull
 from workers.physics.effects import called_for, called_for_with
 from workers.physics.fall import FINEST
-from workers.physics.release import moved_by, release_again
+from workers.physics.hold import moved_by, release_again
 from workers.physics.settle import RECHECK_S, settle_scene
 from workers.scene.chance import SceneChance
 from workers.scene.plan import draw_scene

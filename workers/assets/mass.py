@@ -49,20 +49,20 @@ def unite_bodies(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array
     """
     as_they_are = (vertices, faces)
     corners = merge_points(vertices)[faces]
-    found = find_bodies(vertices, faces, corners, apart=True)
-    all_m3, once = float(found.volume.sum()), corners
+    bodies = find_bodies(vertices, faces, corners, apart=True)
+    all_m3, once = float(bodies.volume.sum()), corners
     repeated = find_repeated(corners, oriented=True)
     if repeated.any():  # a body that a file shows more than once
         single = find_bodies(vertices, faces[~repeated], corners[~repeated], apart=True)
-        found, once = (single, corners[~repeated]) if single.closed.all() else (found, corners)
-    if len(found.volume) > MOST_UNITED:
+        bodies, once = (single, corners[~repeated]) if single.closed.all() else (bodies, corners)
+    if len(bodies.volume) > MOST_UNITED:
         return as_they_are, None
     places = np.zeros((int(corners.max()) + 1, 3))
     places[corners] = vertices[faces]
     whole = Mesh(places, once.astype(np.int32))
-    pieces = [piece_of(whole, once[found.body == k]) for k in range(len(found.volume))]
+    pieces = [piece_of(whole, once[bodies.body == k]) for k in range(len(bodies.volume))]
     low, high = np.stack([bounds_of(piece.vertices) for piece in pieces], axis=1)
-    outer = np.flatnonzero(found.volume > 0.0)
+    outer = np.flatnonzero(bodies.volume > 0.0)
     below = (low[outer, None] < high[None, outer]).all(axis=2)
     a, b = np.nonzero(np.triu(below & below.T, k=1))
     if not len(a) and len(once) == len(corners):
@@ -73,7 +73,7 @@ def unite_bodies(vertices: Array, faces: NDArray[np.int64]) -> tuple[tuple[Array
     solids = {k: solid for k, piece in enumerate(pieces) if (solid := solid_of(piece)) is not None}
     for void in solids.keys() - set(outer.tolist()):
         around = [k for k in outer.tolist() if (low[k] < low[void]).all() and (high[void] < high[k]).all()]
-        inmost = min(around, key=lambda k: float(found.volume[k]), default=None)
+        inmost = min(around, key=lambda k: float(bodies.volume[k]), default=None)
         if inmost not in solids:
             return as_they_are, 0.0
         solids[inmost] = solids[inmost] - solids[void]
@@ -107,18 +107,12 @@ def shell_mass(vertices: Array, faces: np.ndarray, shell_kg_m2: float) -> MassPr
     A/12 (a a^T + b b^T + c c^T + s s^T), from the barycentric integrals of 1, u, u^2 and u v
     (A, A/3, A/6 and A/12; Eisenberg and Malvern, "On finite element integration in natural co-ordinates", 1973).
     """
-    middle, corners = _corners(vertices, faces)
+    middle = bounds_of(vertices).sum(axis=0) * 0.5
+    corners, _ = _tetrahedra(vertices, faces, middle)
     a, b, c = corners
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0)
     mass = shell_kg_m2 * float(area.sum())
     return _assemble(middle, corners, shell_kg_m2 * area / 3.0, shell_kg_m2 * area / 12.0, mass, solid=False)
-
-
-def _corners(vertices: Array, faces: np.ndarray) -> tuple[Array, Array]:
-    """The bounding box's middle [3], and the faces' corners measured from it: [corner, axis, F]."""
-    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    local = np.ascontiguousarray((vertices - middle).T)
-    return middle, np.stack([np.take(local, faces[:, k], axis=1) for k in range(3)])
 
 
 @compiled_for("f8[:,::1], i8[:,::1], f8[::1]", "f8[:,::1], const(i8[:,::1]), f8[::1]")

@@ -104,21 +104,21 @@ def _expand(corners: Array, tree: Tree) -> Array:
         area[face] = np.sqrt(normal[face, 0] ** 2 + normal[face, 1] ** 2 + normal[face, 2] ** 2)
     terms = np.zeros((len(first), 7))
     for node in range(len(first)):
-        mine, own, whole = order[first[node] : first[node] + count[node]], terms[node], 0.0
+        mine, term, whole = order[first[node] : first[node] + count[node]], terms[node], 0.0
         for face in mine:
             whole += area[face]
             for k in range(3):
-                own[k] += area[face] * mean[face, k]
+                term[k] += area[face] * mean[face, k]
         for k in range(3):
-            own[k] = own[k] / whole if whole > 0.0 else mean[mine[0], k] if len(mine) else 0.0
+            term[k] = term[k] / whole if whole > 0.0 else mean[mine[0], k] if len(mine) else 0.0
         for face in mine:
             for corner in range(3):
                 away = 0.0
                 for k in range(3):
-                    away += (corners[face, corner, k] - own[k]) ** 2
-                own[3] = max(own[3], away)
+                    away += (corners[face, corner, k] - term[k]) ** 2
+                term[3] = max(term[3], away)
             for k in range(3):
-                own[4 + k] += normal[face, k]
+                term[4 + k] += normal[face, k]
     return terms
 
 

@@ -108,12 +108,6 @@ KINDS: dict[str, Callable[[BoardSizes], Board]] = {
     "aprilgrid": make_aprilgrid,
 }
 """Kinds of boards that can be printed."""
-KIND_WORDS = {
-    "grid": "a grid of {} markers",
-    "charuco": "a ChArUco board of {} squares",
-    "charuco_old": "a ChArUco board of {} squares, as OpenCV had it before 4.6,",
-    "aprilgrid": "an aprilgrid of {} tags",
-}
 
 
 MOST_ACROSS = 25
@@ -159,7 +153,8 @@ def recognise_board(
     name = max(names, key=lambda name: (len(name), name))  # the larger
     marker_m = float(_sides(board_geometry(board).corners)[0])
     squares = _sides(board_geometry(board).squares)[:1]
-    lengths = [marker_m / share, *squares, *(squares + marker_m), marker_m + board.scale * board.gap_m]
+    lengths = [marker_m / share, *squares, *(squares + marker_m)]
+    lengths += [marker_m + board.scale * board.gap_m] * (not board.markers)
     pitch_m = next((m for m in lengths[1:] if abs(m / lengths[0] - 1) < SAME_PITCH), lengths[0])
     return best[0], replace(best[1], marker_m=round(marker_m, 5), pitch_m=round(float(pitch_m), 4), dictionary=name)
 

@@ -190,7 +190,9 @@ def _view_files(given: Given, estimates: Estimates, body: Mesh) -> dict[str, byt
         files[f"board_{number:05d}.txt"] = pose_text(board).encode()
         files[f"correction_{number:05d}.txt"] = pose_text(correction).encode()
         if not given.has_mask(number):
-            mask = silhouette(body, Camera(camera.intrinsics, correction @ board))
+            cluttered = estimates.estimate.is_cluttered(number) and given.folder.file("depth", number) is not None
+            depth_m = read_posed(given, estimates.estimate, number).depth_m if cluttered else None
+            mask = silhouette(body, Camera(camera.intrinsics, correction @ board), depth_m)
             files[f"mask_{number:05d}.png"] = encode_mask(distort_mask(mask, camera))
     return files
 
@@ -262,8 +264,8 @@ class CaptureViews:
         Depth is what was measured, corrected. Where the correction moves the depth camera, depth is drawn anew from there.
         """
         view = self.posed(number)
-        mask = silhouette(self.body, view.camera) if view.mask is None else view.mask
-        depth_m = view.depth_m
+        depth_m, hides = view.depth_m, self.estimate.is_cluttered(number)
+        mask = silhouette(self.body, view.camera, depth_m if hides else None) if view.mask is None else view.mask
         if not np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
             depth_m = move_depth(depth_m, view.depth_camera, view.camera)
         return PosedImages(number, view.camera, view.rgb, depth_m.astype(np.float64), mask)

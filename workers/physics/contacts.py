@@ -26,7 +26,11 @@ PARALLEL = 1e-3
 """Sine of the angle between edges below which they count as parallel: their ends lie on faces then."""
 
 BORDER_M = 1e-7
-"""Distance from a face up to which a corner above its border is above it."""
+"""Distance from a face up to which a corner above its border is above it, and from the end of an edge of what is beside that."""
+
+SLIGHT_M = 1e-5
+"""Overlap that a step leaves at most, and up to which edges count as crossing beyond their ends by as much: in the inner corner
+of a hole what is a little too deep is beyond the ends of both edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +238,8 @@ def edges_across_edges(
 ) -> Array:
     """[N, 7]: point, normal and gap, from -`deepest` to `within`, where edges of one surface cross those of another.
 
-    Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges. An edge crosses another where the faces about
-    the one lie above the plane between them and those about the other below, to within `SLOPE`.
+    Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges, but for `SLIGHT_M`. An edge crosses another where
+    the faces about the one lie above the plane between them and those about the other below, to within `SLOPE`.
     """
     contacts, count = np.empty((64, 7)), 0
     n, u, v, r = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -253,9 +257,10 @@ def edges_across_edges(
         if nn <= PARALLEL * PARALLEL * uu * vv or nr * nr > max(within, deepest) ** 2 * nn:
             continue
         s, t = (uv * vr - ur * vv) / nn, (uu * vr - uv * ur) / nn
-        if s < 0.0 or s > 1.0 or t < 0.0 or t > 1.0:
-            continue
         length = np.sqrt(nn)
+        beyond = max(max(-s, s - 1.0) * np.sqrt(uu), max(-t, t - 1.0) * np.sqrt(vv))
+        if beyond > BORDER_M + SLIGHT_M:
+            continue
         positive, negative = True, True
         for m in range(2):
             up = down = far_up = far_down = along_up = along_down = 0.0
@@ -271,6 +276,8 @@ def edges_across_edges(
         sign = 1.0 if positive else -1.0
         gap = sign * nr / length
         if not (positive or negative) or gap > within or gap < -deepest:
+            continue
+        if beyond > BORDER_M + (-gap if -SLIGHT_M <= gap < 0.0 else 0.0):
             continue
         if count == len(contacts):
             contacts = np.concatenate((contacts, contacts))

@@ -12,25 +12,23 @@ from typing import TypeVar
 
 import numpy as np
 
-from schemas.base import Pose, frozen_array
+from schemas.base import Pose
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
-from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, SupportedBy
-from workers.geometry.frames import transform, translation
+from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
+from workers.geometry.frames import translation
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
+from workers.physics.ending import Ending, UnsupportedError, describe, require_calm
 from workers.physics.exact_rest import rest
 from workers.physics.fall import Outcome
-from workers.physics.landing import land
+from workers.physics.hold import RELEASE_RATE, hold, land, moved_by, release_again
 from workers.physics.placement import (
-    TOUCHING_M,
     Form,
     Placement,
-    Support,
     farthest_m,
     find_gaps_m,
     find_overlaps_m,
     forms_of,
-    measure_supports,
     place,
     place_on_top,
     placed_mesh,
@@ -48,28 +46,17 @@ from workers.physics.pour import (
     renumbered,
 )
 from workers.physics.release import (
-    LEFT_M,
     LET_GO_COST,
-    RELEASE_RATE,
     Budget,
     Drop,
     Pace,
-    hold,
-    moved_by,
     release,
-    release_again,
 )
-from workers.physics.support import inside_margin, snap_to_face, vertical_gap
-
-UNBALANCED = 1e-3
-"""Share of the weight, and of weight times size, that the contacts of what rests may leave unbalanced."""
+from workers.physics.support import snap_to_face, vertical_gap
 
 PLACED_M = 1e-4
 """Height up to which an object was set down and not dropped, where it lands at 44 mm/s, and greatest overlap of objects at
 release: correcting centimetres by a share per step gives tens of metres per second."""
-
-SPINS_M = 1e-3
-"""Radius inside of which what turns spins in place, and does not roll."""
 
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
@@ -81,31 +68,12 @@ WAVE_S, POURED_S = 0.7, 4.0
 """Time that a wave has before the next one falls on it, and the last before exact rest, whether it has come to rest or not."""
 
 
-class UnsupportedError(LostError):
-    """No balance was found, or none that holds, for these objects."""
-
-
 class LeftRoomError(Exception):
     """An object settled as if alone came where it may meet another."""
 
 
 class LeftTopError(Exception):
     """A footprint left the flat top, so that the table's edges may matter."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Ending:
-    """The objects of a drop at the poses [4, 4] of their rest, after `seconds` in all, with the speed that was left.
-
-    spun: whether some spun on at the end.
-    """
-
-    drop: Drop
-    placement: Placement
-    poses: tuple[Pose, ...]
-    seconds: float = 0.0
-    speed_m_s: float = 0.0
-    spun: bool = False
 
 
 def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
@@ -120,7 +88,7 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
         require_near_origin(start)
     poses = tuple(start.T_world_obj for start in drop.starts)
     if not drop.effects.runs("dynamics"):
-        return drop.starts, _describe(_Ending(drop, _place(drop, poses, forms), poses))
+        return drop.starts, describe(Ending(drop, _place(drop, poses, forms), poses))
     for i, j, depth_m in find_overlaps_m(forms, poses):
         if depth_m > PLACED_M:
             raise SettleError(
@@ -129,7 +97,7 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
                 "another: let them go apart, or one above the other",
             )
     if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms, poses)) is not None:
-        return drop.starts, _describe(placed)
+        return drop.starts, describe(placed)
     if drop.pouring.waves:
         drop = dataclasses.replace(drop, clearances_m=clearances_m(drop.starts, drop.table))
     while True:
@@ -170,8 +138,8 @@ def _settle_in_ways(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
     *earlier, last = (partial(_come_to_rest, forms=forms, paces=paces) for paces in drop.ways)
     for way in earlier:
         with suppress(UnsupportedError):
-            return _describe(_on_top_or_mesh(drop, way))
-    return _describe(_on_top_or_mesh(drop, last))
+            return describe(_on_top_or_mesh(drop, way))
+    return describe(_on_top_or_mesh(drop, last))
 
 
 Result = TypeVar("Result")
@@ -192,7 +160,7 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
     return dataclasses.replace(effects, ran=(*effects.ran, *names))
 
 
-def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence[Pace]) -> _Ending:
+def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence[Pace]) -> Ending:
     """Release at these paces until at rest.
 
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
@@ -200,17 +168,17 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
     """
     exact, heaped, seconds = drop.physics.exact_rest, bool(drop.lying), drop.seconds
     if exact and (landed := land(drop, flat, forms)) is not None:
-        return _Ending(drop, *landed)
+        return Ending(drop, *landed)
     placement, moved = None, 0
     most = POURED_RELEASES if heaped else MOST_RELEASES
     for _ in range(most):
         outcome = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces)
         seconds += outcome.seconds
-        _require_calm(drop, outcome, range(len(drop.starts)), moving=heaped and exact)
+        require_calm(drop, outcome, range(len(drop.starts)), moving=heaped and exact)
         if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
             return standing
         placement = placement or _place(drop, outcome.poses, forms)
-        ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s, bool(outcome.spinning))
+        ending = Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s, bool(outcome.spinning))
         if not exact:
             return ending
         rested = hold(drop, placement, outcome.poses)
@@ -252,7 +220,7 @@ def _pour(drop: Drop, flat: bool) -> Drop:
             poses[number] = T
         lost, thrown = (tuple(falling[k] for k in some) for some in (outcome.lost, outcome.thrown))
         whole = dataclasses.replace(outcome, poses=tuple(poses), lost=lost, thrown=frozenset(thrown))
-        _require_calm(drop, whole, falling, moving=True)
+        require_calm(drop, whole, falling, moving=True)
         seconds, starts = drop.seconds + outcome.seconds, moved_to(drop.starts, poses)
         drop = dataclasses.replace(drop, starts=starts, lying=frozenset(falling), seconds=seconds)
     return drop
@@ -278,7 +246,7 @@ def _briefly(drop: Drop, most_s: float) -> Drop:
     return dataclasses.replace(drop, physics=drop.physics.model_copy(update={"max_settle_s": seconds}))
 
 
-def _rest_as_placed(drop: Drop, forms: Sequence[Form], poses: tuple[Pose, ...]) -> _Ending | None:
+def _rest_as_placed(drop: Drop, forms: Sequence[Form], poses: tuple[Pose, ...]) -> Ending | None:
     """Objects that begin in touch and in balance, as a stack that was built; None where they have to fall."""
     if min(points_of(start)[:, 2].min() for start in drop.starts) > drop.table.top.height_m + PLACED_M:
         return None
@@ -287,14 +255,14 @@ def _rest_as_placed(drop: Drop, forms: Sequence[Form], poses: tuple[Pose, ...]) 
         return None
     rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
     stayed = rested.still and farthest_m(drop.starts, poses, rested.poses) <= STAYED_M
-    return _Ending(drop, placement, rested.poses) if stayed else None
+    return Ending(drop, placement, rested.poses) if stayed else None
 
 
 def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placement:
     return place(drop.starts, poses, forms, drop.table, drop.physics.friction**2)
 
 
-def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
+def _stand(drop: Drop, outcome: Outcome, seconds: float) -> Ending | None:
     """A single object turned onto the steady face of its hull that is below it, on the flat top; None where none is near."""
     (start,), table = drop.starts, drop.table
     known = None if drop.physics.collision == "box" else outcome.face  # a box has other faces than the object's hull
@@ -303,127 +271,7 @@ def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), table.mesh)) @ T
     placement = place_on_top(start, T, table, drop.physics.friction**2)
-    return _Ending(drop, placement, (T,), seconds, outcome.speed_m_s, bool(outcome.spinning))
-
-
-def _require_calm(drop: Drop, outcome: Outcome, fallen: Sequence[int], moving: bool) -> None:
-    """Raises SettleError where objects were lost or still move, which they may where they are `moving`.
-
-    fallen: the numbers of those that were let go.
-    """
-    if outcome.thrown:
-        raise UnsupportedError(
-            "thrown",
-            f"an object flew off at {outcome.thrown_m_s:.0f} m/s, which no fall gives: raise physics.step_hz, or take objects "
-            "of nearer masses",
-            sorted(outcome.thrown.union(outcome.lost)),
-            outcome.poses,
-            fallen,
-        )
-    if outcome.rested and not outcome.lost:
-        return
-    coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
-    if lost := outcome.lost or [number for number in fallen if _is_low(drop, coms[number][2])]:
-        raise _left_table(drop, lost, outcome.poses, outcome.seconds, fallen)
-    if not moving:
-        raise SettleError("not_at_rest", _what_moves(drop.physics, drop.starts[fallen[outcome.moves[0]]], outcome))
-
-
-def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
-    _, speed_m_s, spin_rad_s = outcome.moves
-    advice, reach_m = (
-        "physics.max_settle_s or physics.rolling_friction",
-        float(np.ptp(start.hull.vertices, axis=0).max()),
-    )
-    if physics.restitution > 0.0 and speed_m_s > spin_rad_s * reach_m:  # faster than it rolls
-        advice = f"physics.max_settle_s, or lower physics.restitution, which is {physics.restitution:g}"
-    elif physics.friction == 0.0:
-        advice = "physics.friction, which is 0"
-    elif physics.spinning_friction == 0.0 and speed_m_s < spin_rad_s * SPINS_M:
-        advice = "physics.spinning_friction, which is 0"
-    return (
-        f"region {start.region_id} ({start.asset.category}) still drifts at {speed_m_s * 1e3:.4g} mm/s and turns at "
-        f"{spin_rad_s:.3g} rad/s after {outcome.seconds:.1f} s: raise {advice}"
-    )
-
-
-def _is_low(drop: Drop, height_m: float) -> bool:
-    return not height_m >= drop.table.top.height_m - LEFT_M  # true of nan
-
-
-def _com(start: ObjectStart, T: Pose) -> list[float]:
-    return list(transform(T, start.asset.mass.com[None])[0].tolist())
-
-
-def _left_table(
-    drop: Drop, lost: Sequence[int], poses: Sequence[Pose], seconds: float, fallen: Iterable[int]
-) -> LostError:
-    start = drop.starts[lost[0]]
-    x, y, z = _com(start, poses[lost[0]])
-    whose, advice = "", "narrow start.offset_m or use larger tables"
-    if not drop.single:
-        whose = f" of region {start.region_id}"
-        advice = "fewer objects_per_scene, a narrower start.offset_m or larger tables"
-    message = (
-        f"after {seconds:.2f} s the centre of mass{whose} was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off the table's top"
-    )
-    return LostError("left_table", f"{message}: {advice}", lost, poses, fallen)
-
-
-def _describe(ending: _Ending) -> tuple[Settled, ...]:
-    """The rest poses with their figures, measured between the true meshes and not taken from the simulator."""
-    drop, supports = ending.drop, measure_supports(ending.placement, ending.poses)
-    coms = [_com(start, T) for start, T in zip(drop.starts, ending.poses, strict=True)]
-    # What is this low may hang on the table by a handle, or stand on its foot
-    low = [n for n, held in enumerate(supports) if _is_low(drop, coms[n][2]) and _is_low(drop, held.highest_m)]
-    if low:
-        raise _left_table(drop, low, ending.poses, ending.seconds, range(len(supports)))
-    if drop.physics.exact_rest or not drop.effects.runs("dynamics"):
-        for number, held in enumerate(supports):
-            _require_support(ending, number, held)
-    support = _support_of(ending)
-    return tuple(
-        Settled(
-            T_world_obj=frozen_array(T),
-            penetration_mm=max(0.0, -held.gap_m) * 1e3,
-            hover_gap_mm=max(0.0, held.gap_m) * 1e3,
-            support_margin_mm=held.margin_m * 1e3,
-            equilibrium_residual=held.unbalanced,
-            residual_speed_mm_s=ending.speed_m_s * 1e3,
-            settle_s=ending.seconds,
-            support=support,
-            contacts=held.forces,
-            spun=ending.spun,
-        )
-        for T, held in zip(ending.poses, supports, strict=True)
-    )
-
-
-def _support_of(ending: _Ending) -> SupportedBy:
-    """`flat_top` where the mesh was not called for and every object is over the flat top with all of its points."""
-    drop = ending.drop
-    if not drop.effects.runs("dynamics"):
-        return "placed"
-    if drop.effects.runs("table_mesh"):
-        return "mesh"
-    points = np.concatenate([points_of(start) for start in moved_to(drop.starts, ending.poses)])
-    return "flat_top" if inside_margin(points[:, :2], drop.table.top.outline).min() >= 0.0 else "mesh"
-
-
-def _require_support(ending: _Ending, number: int, held: Support) -> None:
-    """Raises UnsupportedError where an object overlaps another or the table, hovers, or is out of balance."""
-    if abs(held.gap_m) <= TOUCHING_M and held.unbalanced <= UNBALANCED:
-        return
-    drop, where = ending.drop, "inside what it touches" if held.gap_m < 0.0 else "from anything"
-    raise UnsupportedError(
-        "unsupported",
-        f"{'it' if drop.single else f'region {drop.starts[number].region_id}'} came to rest {abs(held.gap_m) * 1e3:.3f} mm "
-        f"{where}, with {held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and "
-        f"{UNBALANCED:.1%}: lower physics.rest.speed_mm_s",
-        [number],
-        ending.poses,
-        range(len(drop.starts)),
-    )
+    return Ending(drop, placement, (T,), seconds, outcome.speed_m_s, bool(outcome.spinning))
 
 
 LEFT_TOP, LEFT_ROOM = "a footprint left the table's flat top", "an object left the room that it had to itself"

@@ -191,15 +191,15 @@ def _opaque(material: Material, color: Any) -> Bsdf:
     width = max(material.roughness**2, LEAST_WIDTH)
     metal: Bsdf = {"type": "roughconductor", "material": "none", "specular_reflectance": color}
     metal["alpha"] = max(width, LEAST_METAL_WIDTH)
-    if material.metallic >= 1.0:
-        return _both_sides(metal)
     if material.roughness >= MATTE_ROUGHNESS:
         body: Bsdf = {"type": "diffuse", "reflectance": color}
     else:
         body = {"type": "roughplastic", "alpha": width, "diffuse_reflectance": color, "int_ior": 1.5}
-    if material.metallic <= 0.0:
-        return _both_sides(body)
-    return _both_sides({"type": "blendbsdf", "weight": material.metallic, "first": body, "second": metal})
+    if material.metallic >= 1.0:
+        body = metal
+    elif material.metallic > 0.0:
+        body = {"type": "blendbsdf", "weight": material.metallic, "first": body, "second": metal}
+    return {"type": "twosided", "nested": body}
 
 
 def _glass(mi: ModuleType, part: Part, body: Bsdf) -> Bsdf:
@@ -232,10 +232,6 @@ def tint_of(part: Part) -> Array:
             clear = material.transmission_map == material.transmission_map.max()
         color = color * SRGB_STEPS[texture[..., :3][clear]].mean(axis=0)
     return np.asarray(color**GLASS_PALENESS, np.float64)
-
-
-def _both_sides(bsdf: Bsdf) -> Bsdf:
-    return {"type": "twosided", "nested": bsdf}
 
 
 def _color(mi: ModuleType, part: Part) -> Any:
@@ -427,10 +423,6 @@ def _shares(count: int, step: float, fine: int) -> Array:
     return np.maximum(overlap, 0.0) / step
 
 
-SEEDS = 2**32
-"""Number of seeds that Mitsuba's samplers tell apart."""
-
-
 def draw_view(
     renderer: Renderer,
     things: Sequence[Placed],
@@ -448,7 +440,7 @@ def draw_view(
     drawn = renderer.draw(things, appearance, camera, render, effects)
     if render.tier != "pathtraced" or not effects.runs("rgb"):
         return drawn
-    seed = int(rng().integers(SEEDS))
+    seed = int(rng().integers(2**32))  # as many as Mitsuba's samplers tell apart
     rgb = encode_light(shared_tracer().radiance(things, appearance, camera, render, effects, seed))
     rgb.setflags(write=False)
     return replace(drawn, rgb=rgb)

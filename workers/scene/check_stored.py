@@ -1,6 +1,6 @@
 """Check of stored labels: derives each again from the stored images, the rows and the job, by the producer's functions."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,18 +94,15 @@ def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faul
     return View(role, *ids, camera, rgb, depth, region, labels, images)
 
 
-def _check_amodal(view: View, objects: Sequence[Row]) -> list[str]:
+def _check_amodal(view: View, objects: Sequence[Row]) -> Iterator[str]:
     """Extents of silhouettes that are not those of their images; each holds the pixels that the mask shows of its object."""
-    faults, masks = [], view.further.get("amodal", ())
+    masks = view.further.get("amodal", ())
     rows = {row["region_id"]: row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)}
     for region_id, mask in enumerate(masks, start=REGION_FIRST_OBJECT):
         expected = amodal_columns(mask)
         stored = {name: rows[region_id][name] for name in expected}
         if stored != expected:
-            faults.append(
-                f"{_named(view)}, region {region_id}: its image amodal gives {expected}, objects says {stored}"
-            )
-    return faults
+            yield f"{_named(view)}, region {region_id}: its image amodal gives {expected}, objects says {stored}"
 
 
 def _differs(a: ArrayLike, b: ArrayLike) -> bool:
@@ -116,33 +113,33 @@ def _named(view: View) -> str:
     return f"pose {view.pose_id} ({view.role})"
 
 
-def _check_labels(job: Job, view: View, objects: Sequence[Row], scene: Row) -> list[str]:
+def _check_labels(job: Job, view: View, objects: Sequence[Row], scene: Row) -> Iterator[str]:
     """Compare rows of `objects` with the mask, the poses, and the share of its patch that each object fills."""
     assert view.region is not None
     T_world = read_world_poses(scene)
     if {label.region_id for label in view.labels} != set(T_world):
         regions = [label.region_id for label in view.labels]
-        return [f"{_named(view)}: objects has the regions {regions}, scenes {list(T_world)}"]
+        yield f"{_named(view)}: objects has the regions {regions}, scenes {list(T_world)}"
+        return
     rows = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
     shares = {row["region_id"]: row["patch_object_fraction"] for row in rows}
-    extents, faults = measure_regions(view.region), []
+    extents = measure_regions(view.region)
     for label in view.labels:
         pixels, box = extents[label.region_id]
         name = f"{_named(view)}, region {label.region_id}"
         stored_share, share = shares[label.region_id], patch_object_fraction(view, label, job.images.patch)
         if pixels != label.pixels:
-            faults.append(f"{name}: the mask has {pixels} pixels, objects says {label.pixels}")
+            yield f"{name}: the mask has {pixels} pixels, objects says {label.pixels}"
         if box != label.bbox_xywh:
-            faults.append(f"{name}: the mask's box is {box}, objects says {label.bbox_xywh}")
+            yield f"{name}: the mask's box is {box}, objects says {label.bbox_xywh}"
         if image_coordinates(label.T_cam_obj, view.camera.intrinsics) != (label.u, label.v):
-            faults.append(f"{name}: T_cam_obj projects to another pixel than ({label.u}, {label.v})")
+            yield f"{name}: T_cam_obj projects to another pixel than ({label.u}, {label.v})"
         if _differs(invert(view.camera.T_world_cam) @ T_world[label.region_id], label.T_cam_obj):
-            faults.append(f"{name}: T_cam_obj does not follow from the camera's and the object's poses")
+            yield f"{name}: T_cam_obj does not follow from the camera's and the object's poses"
         if not 0.0 <= label.visible_fraction <= 1.0:
-            faults.append(f"{name}: visible_fraction {label.visible_fraction} is no share")
+            yield f"{name}: visible_fraction {label.visible_fraction} is no share"
         if label.region_id >= REGION_FIRST_OBJECT and share != stored_share:
-            faults.append(f"{name}: fills {share} of its patch, objects says {stored_share}")
-    return faults
+            yield f"{name}: fills {share} of its patch, objects says {stored_share}"
 
 
 def _is_captured(scene: Row) -> bool:
@@ -150,60 +147,56 @@ def _is_captured(scene: Row) -> bool:
     return scene["capture"] is not None
 
 
-def _check_images(view: View, scene: Row) -> list[str]:
+def _check_images(view: View, scene: Row) -> Iterator[str]:
     """Compare the mask with the depth, and its regions with those of `objects`.
 
     Nothing, in a photograph, is what is neither board nor object, and may have depth; a view that was made of photographs
     shows nothing without depth.
     """
     assert view.region is not None
-    where, faults = _named(view), []
-    known = {0, 1} | {label.region_id for label in view.labels}
+    where, known = _named(view), {0, 1} | {label.region_id for label in view.labels}
     if foreign := set(np.unique(view.region).tolist()) - known:
-        faults.append(f"{where}: the mask has regions {sorted(foreign)} that objects lacks")
+        yield f"{where}: the mask has regions {sorted(foreign)} that objects lacks"
     if not _is_captured(scene) and (view.depth[view.region == 0] != 0).any():
-        faults.append(f"{where}: depth where the mask says that nothing was hit")
+        yield f"{where}: depth where the mask says that nothing was hit"
     if _is_captured(scene) and view.role == "mirror" and (view.region[view.depth == 0] != 0).any():
-        faults.append(f"{where}: the mask has regions where there is no depth")
-    return faults
+        yield f"{where}: the mask has regions where there is no depth"
 
 
-def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: Row) -> list[str]:
+def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: Row) -> Iterator[str]:
     """Patches that are not the crop of their image, and files that are missing or too many.
 
     `labelled` is the view that holds the labels: the mirror view for a projected one, else the view itself.
     """
-    listed, faults = {file["path"] for file in row["files"]}, []
+    listed = {file["path"] for file in row["files"]}
     objects = [label for label in labelled.labels if label.region_id >= REGION_FIRST_OBJECT]
     expected = set()
     for path, kind, box in image_boxes(view, objects, row["category"], job.images.patch):
         expected.add(path)
         full = view.images.get(kind)
         if box and path in listed and full is not None and not np.array_equal(read(path), full[box]):
-            faults.append(f"{path}: is not the crop of its image")
+            yield f"{path}: is not the crop of its image"
     if expected != listed:
         wrong = sorted(expected ^ listed)
-        faults.append(f"{_named(view)}: files {wrong} should be there, or should not")
-    return faults
+        yield f"{_named(view)}: files {wrong} should be there, or should not"
 
 
-def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
+def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> Iterator[str]:
     """Compare d_z with the input's stored depth, and the other poses with the input pose and d_z."""
-    first, faults = stored["input"], []
+    first = stored["input"]
     assert first.region is not None
     d_z = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
     mirror = place_mirror_camera(first.camera, d_z, job.cameras.mirror)
     poses = {**place_beside(first.camera, job), "mirror": mirror, "projected": mirror}
     for role, camera in poses.items():
         if role in stored and _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
-            faults.append(f"{_named(stored[role])}: T_world_cam does not follow from the input pose and d_z")
+            yield f"{_named(stored[role])}: T_world_cam does not follow from the input pose and d_z"
     for role, row in views.items():
         if abs(row["d_z_m"] - d_z) > ROUNDING:
-            faults.append(f"pose {row['pose_id']} ({role}): d_z_m is {row['d_z_m']}, the input depth gives {d_z}")
-    return faults
+            yield f"pose {row['pose_id']} ({role}): d_z_m is {row['d_z_m']}, the input depth gives {d_z}"
 
 
-def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
+def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> Iterator[str]:
     """Compare the agreement of the two views."""
     mirror = stored["mirror"]
     agreement = compare_views(stored["input"], mirror, job.images, job.check.mirror_agreement_mm)
@@ -212,19 +205,19 @@ def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, R
     if (row is None) != (derived is None) or (
         derived and _differs(np.array(derived), [row["median_mm"], row["share"]])
     ):
-        return [f"pose {mirror.pose_id} (mirror): the two views agree to {derived}, views says {row}"]
-    return []
+        yield f"pose {mirror.pose_id} (mirror): the two views agree to {derived}, views says {row}"
 
 
-def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row], effects: EffectPlan) -> list[str]:
+def _check_projection(
+    job: Job, stored: Mapping[str, View], views: Mapping[str, Row], effects: EffectPlan
+) -> Iterator[str]:
     """The projected images to the byte, and their shares; `effects` are those that the scene's receipt names."""
     first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
-    where, faults = _named(projected), []
+    where = _named(projected)
     rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion, effects)
     same_rgb = rgb is None or (projected.rgb is not None and np.array_equal(rgb, projected.rgb))
     if not same_rgb or not np.array_equal(depth, projected.depth):
-        faults.append(f"{where}: the stored input depth projects to other images")
+        yield f"{where}: the stored input depth projects to other images"
     shares = projection_shares(depth, mirror.depth, job.images)
     if _differs(shares, [views["projected"][f"projected_{name}_share"] for name in ("filled", "hidden")]):
-        faults.append(f"{where}: the shares filled and hidden are {shares}, and not what views says")
-    return faults
+        yield f"{where}: the shares filled and hidden are {shares}, and not what views says"

@@ -76,19 +76,13 @@ class Skin(NamedTuple):
     places: NDArray[np.int64]
 
 
-def paint_albedo(seen: SeenFaces, skin: Skin, k: Intrinsic, image: NDArray[np.uint8]) -> None:
-    """Writes the base colour, sRGB, of what is seen into an image [H, W, 3].
+@compiled
+def paint_albedo(seen: SeenFaces, skin: Skin, k: Intrinsic, codes: NDArray[np.uint8], image: NDArray[np.uint8]) -> None:
+    """Writes the base colour of what is seen into an image [H, W, 3]; codes [65536]: sRGB of linear light (`CODES`).
 
     Textures are bilinear among four texels in linear light, and repeat beyond their edges; uv (0, 0) is their lower left corner.
+    In runs of pixels of one face, whose loops the compiler can make vectors of.
     """
-    _paint_albedo(seen, skin, k, CODES, image)
-
-
-@compiled
-def _paint_albedo(
-    seen: SeenFaces, skin: Skin, k: Intrinsic, codes: NDArray[np.uint8], image: NDArray[np.uint8]
-) -> None:
-    """In runs of pixels of one face, whose loops the compiler can make vectors of."""
     face, depth = seen
     height, width = face.shape
     weights_by_ray, by_ray = np.zeros((3, 3)), np.zeros((5, 3))

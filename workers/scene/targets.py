@@ -16,12 +16,14 @@ from schemas.job.views import Images, Targets
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Material, Mesh, Part, Shape
 from schemas.scene.view import FULL, LAYERS, Camera, PixelKind
+from workers.geometry.camera import unproject
 from workers.geometry.colour import SRGB_STEPS, decode_srgb
 from workers.geometry.frames import invert, transform
 from workers.geometry.mesh import corner_weights, mix
 from workers.geometry.pixels import quantise_depth
 from workers.scene.context import Stopwatch
 from workers.scene.painting import (
+    CODES,
     Skin,
     paint_albedo,
     paint_faces,
@@ -80,13 +82,6 @@ class Seen:
         self.things, self.camera = things, camera
         self.triangles = triangles_of(things, camera)
         self.face, self.z = nearest_faces(self.triangles, region, drawn)
-
-    def points_at(self, pixels: NDArray[np.int64]) -> Array:
-        """[N, 3]: the points, in the camera's frame, that are seen at pixels (flat numbers)."""
-        k = self.triangles.intrinsics
-        rows, columns = np.divmod(pixels, k.width)
-        z = self.z.reshape(-1)[pixels]
-        return np.stack([(columns + 0.5 - k.cx) / k.fx * z, (rows + 0.5 - k.cy) / k.fy * z, z], axis=1)
 
     def by_thing(self) -> Iterator[tuple[Placed, NDArray[np.int64]]]:
         """Each thing with the pixels (flat numbers) that show it."""
@@ -150,7 +145,7 @@ def draw_albedo(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     base = decode_srgb(np.array([part.material.base_color[:3] for part in parts]))
     values = np.concatenate([_values_of(part) for part in parts])
     skin = Skin(np.concatenate(points), values, corners, part_of, base, *_textures_of(parts))
-    paint_albedo((seen.face, seen.z), skin, triangles.k, image)
+    paint_albedo((seen.face, seen.z), skin, triangles.k, CODES, image)
     return image
 
 
@@ -217,12 +212,13 @@ def _parts_of(
     seen: Seen, thing: Placed, pixels: NDArray[np.int64]
 ) -> Iterator[tuple[Part, NDArray[np.int64], NDArray[np.int32], Array]]:
     """Each part that is seen: the pixels (flat numbers) that show it, and the corners and weights [N, 3] of what they show."""
-    face = seen.triangles.face[seen.face.reshape(-1)[pixels]]
+    face, k = seen.triangles.face[seen.face.reshape(-1)[pixels]], seen.triangles.intrinsics
+    seen_points = unproject(*np.divmod(pixels, k.width), seen.z.reshape(-1)[pixels], k)
     T_shape_cam, start = invert(thing.T_world_shape) @ seen.camera.T_world_cam, 0
     for part in thing.shape.parts:
         inside = np.flatnonzero((face >= start) & (face < start + len(part.faces)))
         if len(inside):
-            points = transform(T_shape_cam, seen.points_at(pixels[inside]))
+            points = transform(T_shape_cam, seen_points[inside])
             weighed = corner_weights(points, Mesh(part.vertices, part.faces), face[inside] - start)
             yield part, pixels[inside], *weighed
         start += len(part.faces)

@@ -11,7 +11,7 @@ from workers.assets.library.collection import SUFFIXES
 from workers.assets.library.copies import Item, find_copies, find_doubles
 from workers.assets.library.guess import find_joined, guess_groups, guess_ups, name_categories
 from workers.assets.library.placement import Measured, sample_look
-from workers.door.meshes.mesh import DEFAULT
+from workers.door.meshes.raw import DEFAULT
 
 CATEGORIES = (
     (None, {"mug/a.obj": "mug"}),

@@ -18,12 +18,7 @@ from workers.assets.library.reading import UP_AXES, place_asset
 from workers.assets.library.table import Row
 from workers.assets.mass import mass_properties, shell_mass, weigh
 from workers.door.meshes.formats import load_shape
-from workers.door.meshes.mesh import (
-    LoadedMesh,
-    find_flips,
-    is_solid,
-    transform_shape,
-)
+from workers.door.meshes.mesh import LoadedMesh, find_flips, is_solid, transform_shape
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 

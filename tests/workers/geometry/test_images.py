@@ -1,25 +1,37 @@
-"""Loops over pixels, colours and projections between two views, against numpy, planes and plain definitions."""
+"""Loops over pixels, colours and projections between two views, against numpy, planes and plain definitions; lenses against
+OpenCV, which puts pixel centres on integers.
+"""
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
+from schemas.job.views import Distortion
 from schemas.scene.view import Camera, Intrinsics
 from tests.kit.planes import HERE as PLANE_HERE
 from tests.kit.planes import IMAGES, plane_view
 from tests.kit.planes import THERE as PLANE_THERE
+from tests.workers.geometry.made_up_kinect import COLOR, COLOR_LENS, DEPTH, DEPTH_LENS, opencv_rays, smaller
 from workers.geometry.camera import orbit_pose, project, unproject
 from workers.geometry.colour import decode_codes, encode_codes, encode_srgb
 from workers.geometry.frames import invert, pose, transform, uniform_rotation
 from workers.geometry.pixels import (
+    WIDEST,
     count_filled,
+    distort,
     facing_cosine,
     fill_plane_depth,
-    gather_colours,
     is_smooth,
     measure_regions,
+    opencv_lens,
+    opencv_matrix,
+    pixel_rays,
+    project_points,
     round_depth,
+    undistort,
+    usable_radius,
 )
 from workers.geometry.projection import (
     BLOCK,
@@ -67,12 +79,6 @@ def test_depth_is_rounded_to_the_nearest_unit_and_is_zero_outside_the_open_range
         assert round_depth(depth, 0.2, 8.0, 5000.0).tolist() == expected.astype(int).tolist()
         halves = np.array([[0.5, 1.5, 2.5]], dtype)
         assert round_depth(halves, 0.0, 9.0, 1.0).tolist() == [[0, 2, 2]], "ties go to even"
-
-
-def test_colours_come_from_where_the_source_says_and_holes_are_black():
-    rgb = np.random.default_rng(2).integers(0, 256, (4, 5, 3)).astype(np.uint8)
-    gathered = gather_colours(rgb, np.array([[19, -1], [0, 7]]))
-    np.testing.assert_array_equal(gathered, [[rgb[3, 4], (0, 0, 0)], [rgb[0, 0], rgb[1, 2]]])
 
 
 def test_every_code_comes_back_and_light_between_two_codes_goes_to_the_nearest():
@@ -265,3 +271,60 @@ def test_nothing_else_is_compared():
     ):
         difference_m, region = compare(source, target, bounds)
         assert len(difference_m) == len(region) == 0, why
+
+
+# ---------------------------------------------------------------------------------------------- lenses
+
+PAIRS = [(smaller(COLOR, 0.1), COLOR_LENS), (smaller(DEPTH, 0.2), DEPTH_LENS)]
+VGA = Intrinsics(width=640, height=480, fx=525.0, fy=520.0, cx=322.0, cy=239.0)
+
+
+def test_points_are_drawn_where_opencv_draws_them_and_rays_lead_back():
+    for k, lens in PAIRS:
+        points = np.random.default_rng(1).uniform([-0.5, -0.4, 0.9], [0.5, 0.4, 2.0], (500, 3))
+        theirs, _ = cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), opencv_matrix(k), np.asarray(lens))
+        assert project_points(points, k, lens) - 0.5 == pytest.approx(theirs[:, 0], abs=1e-9)
+        rays = pixel_rays(k, lens)
+        assert rays == pytest.approx(opencv_rays(k, lens)[:, :, :2], abs=1e-9)
+        u, v = np.meshgrid(np.arange(k.width) + 0.5, np.arange(k.height) + 0.5)
+        at = project_points(np.column_stack([rays.reshape(-1, 2), np.ones(u.size)]) * 0.7, k, lens)
+        assert at == pytest.approx(np.stack([u.ravel(), v.ravel()], axis=1), abs=1e-8)
+    assert opencv_matrix(VGA)[0, 2] == VGA.cx - 0.5
+
+
+def test_the_lens_of_a_scene_agrees_with_opencv_both_ways():
+    u, v = (a.ravel() for a in np.meshgrid(np.linspace(0.5, 639.5, 33), np.linspace(0.5, 479.5, 25)))
+    rays = np.stack([(u - VGA.cx) / VGA.fx, (v - VGA.cy) / VGA.fy, np.ones_like(u)], axis=1)
+    for lens in (
+        Distortion(k1=-0.25, k2=0.06, p1=0.001, p2=-0.002, k3=0.01),
+        Distortion(k1=0.1, k2=-0.2, p1=0.001, p2=0.0005, k3=0.1),
+        Distortion(p1=0.01),
+        Distortion(p2=0.01),
+        Distortion(k1=0.5),
+    ):
+        theirs, _ = cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), opencv_matrix(VGA), opencv_lens(lens))
+        assert np.stack(distort(u, v, lens, VGA), axis=1) - 0.5 == pytest.approx(theirs[:, 0], abs=1e-9)
+        straight = undistort(u, v, lens, VGA)
+        assert np.stack(distort(*straight, lens, VGA)) == pytest.approx(np.stack([u, v]), abs=1e-6)
+
+
+def test_a_lens_is_used_up_to_its_fold_and_no_farther():
+    lens = np.array([-0.3, 0, 0, 0, 0, 0, 0, 0])  # r (1 - 0.3 r2) rises up to r = 1 / sqrt(0.9)
+    assert usable_radius(lens) == pytest.approx(1 / np.sqrt(0.9), abs=2e-3) and usable_radius(np.zeros(8)) == WIDEST
+    inside, beyond, behind, within = project_points(
+        np.array([[1.0, 0, 1.0], [1.2, 0, 1.0], [0, 0, -1.0], [0, 0, 0.0]]), VGA, lens
+    )
+    assert np.isfinite(inside).all() and np.isnan([beyond, behind, within]).all()
+
+
+def test_pixels_that_the_lens_does_not_reach_have_no_ray_wherever_they_lie():
+    """r (1 - r^2) is at most 0.385: farther out nothing is drawn, and the axis's other side is none of a pixel's rays."""
+    folding = Distortion(k1=-1.0)
+    v, u = np.mgrid[0 : VGA.height : 7, 0 : VGA.width : 7] + 0.5
+    radius = np.hypot((u - VGA.cx) / VGA.fx, (v - VGA.cy) / VGA.fy)
+    x, y = undistort(u, v, folding, VGA)
+    assert np.isnan(x[radius > 0.386]).all() and np.isfinite(x[radius < 0.383]).all()
+    found = radius < 0.383
+    assert ((x - VGA.cx) * (u - VGA.cx) >= 0)[found].all() and ((y - VGA.cy) * (v - VGA.cy) >= 0)[found].all()
+    rays = pixel_rays(smaller(DEPTH, 0.2), np.array([-0.6, 0, 0, 0, 0, 0, 0, 0]))
+    assert np.isnan(rays[0, 0]).all() and np.isfinite(rays[68, 64]).all()

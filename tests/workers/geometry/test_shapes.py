@@ -20,14 +20,11 @@ from tests.kit.contacts import box, mesh_of
 from workers.assets.builtin.make import make_asset
 from workers.geometry import mesh as meshes
 from workers.geometry.camera import (
-    inclination,
     is_outside_views,
-    orbit_pose,
     project,
     project_bounds,
     spread_evenly,
     unproject,
-    yaw,
 )
 from workers.geometry.distance import distance_to_mesh, nearest_on_segments
 from workers.geometry.frames import (
@@ -88,17 +85,6 @@ def test_projection_agrees_with_opencv_and_unprojection_undoes_it():
     points = np.array([(0.0, 0.0, 1.0), (-1.0, 0.5, 1.0), (0.1, -0.2, 2.0)])
     assert project_bounds(points, K, 0.05) == pytest.approx((320.0 - 525.0, 240.0 - 52.0, 320.0 + 26.25, 240.0 + 260.0))
     assert project_bounds(np.array([(0.0, 0.0, 1.0), (0.0, 0.0, 0.05)]), K, 0.05) == (0.0, 0.0, 640.0, 480.0)
-
-
-def test_orbit_camera_looks_at_its_centre_at_its_inclination_and_yaw_without_roll():
-    centre = np.array([0.1, -0.2, 0.7])
-    for angle in (-math.pi, -2.0, 0.0, 1.0, math.pi):
-        T = orbit_pose(centre, 0.8, angle, 2.5)
-        assert T[:3, 3] + 2.5 * T[:3, 2] == pytest.approx(centre, abs=1e-12)
-        assert inclination(T) == pytest.approx(0.8, abs=1e-12)
-        assert math.cos(yaw(T) - angle) == pytest.approx(1.0, abs=1e-12)
-        assert T[2, 0] == pytest.approx(0.0, abs=1e-12)  # the image's x axis is level
-        assert T[2, 1] < 0  # and its y axis points down
 
 
 def test_no_camera_on_the_way_sees_a_point_of_what_is_outside():

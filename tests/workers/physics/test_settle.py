@@ -28,29 +28,26 @@ from tests.physics.settling import (
     settle_single,
 )
 from workers.geometry.frames import rotation_about, translation
-from workers.physics import release as module
-from workers.physics import settle
+from workers.physics import ending, settle
+from workers.physics import hold as holding
+from workers.physics import release as releasing
 from workers.physics.bullet import World
 from workers.physics.effects import called_for
 from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, Outcome, fall
+from workers.physics.hold import HELD, MOST_HOLDS, RELEASE_RATE, hold, release_again
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.pour import NOTHING_MORE, Pouring, points_of
 from workers.physics.release import (
     DOUBTFUL_RISE,
-    HELD,
     KNOWN_RISE,
     MANY,
-    MOST_HOLDS,
     MOST_RISE,
     PACES,
     PACES_MANY,
     PACES_TOGETHER,
-    RELEASE_RATE,
     Drop,
-    hold,
     release,
-    release_again,
 )
 from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_S, Rest, settle_scene
 
@@ -155,7 +152,7 @@ def test_the_gate_refuses_a_gap_an_overlap_and_an_imbalance_each_by_itself():
         held = SimpleNamespace(gap_m=gap_mm * 1e-3, unbalanced=unbalanced)
         refused = pytest.raises(SettleError, match=words) if words else contextlib.nullcontext()
         with refused:
-            settle._require_support(
+            ending._require_support(
                 SimpleNamespace(drop=SimpleNamespace(single=True, starts=[start]), poses=()), 0, held
             )
 
@@ -171,7 +168,8 @@ def told_by(monkeypatch, change=lambda outcome: outcome) -> list[tuple]:
         seen.append((given[4], change(fall(*given, **more))))
         return seen[-1][1]
 
-    monkeypatch.setattr(module, "fall", told)
+    for module in (releasing, holding):
+        monkeypatch.setattr(module, "fall", told)
     return seen
 
 
@@ -288,7 +286,7 @@ def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatc
         by_m = 2.0 * HELD_M if left[0] >= 0 else 0.5 * HELD_M
         return (poses[0], translation(by_m, 0.0, 0.0) @ poses[1]), False
 
-    monkeypatch.setattr(module, "let_go", slip)
+    monkeypatch.setattr(holding, "let_go", slip)
     held = hold(*released(starts, TABLE), [one.T_world_obj for one in starts])
     assert held.still == (slips < MOST_HOLDS)
     assert held.poses[1][0, 3] == pytest.approx(2.0 * HELD_M * slips, abs=1e-9)

@@ -1,4 +1,6 @@
-"""Labels: depth and regions against the ray caster, region by region, and against arithmetic; the floor that is known."""
+"""Labels: depth and regions against the ray caster, region by region, and against arithmetic; the floor that is known; what a
+table's top hides.
+"""
 
 import math
 from collections import defaultdict
@@ -15,11 +17,13 @@ from schemas.base import frozen_array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
 from schemas.scene.view import Camera, Intrinsics
-from tests.workers.render.looks import FLAT, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     EYE,
+    FLAT,
     FLOOR_HALF_M,
+    FOUR,
+    RASTER,
     VGA,
     WHITE,
     camera,
@@ -34,11 +38,15 @@ from tests.workers.render.random_scenes import (
     shape_of,
     small,
     stand,
+    table_shape,
+    without,
 )
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.geometry.zbuffer import count_covered
+from workers.render.raster import draw_calls
+from workers.render.raster.batches import find_cover
 from workers.render.raster.context import is_software
 from workers.render.raster.gbuffer import Renderer
 from workers.render.raster.ground import fills_image, find_ground
@@ -140,29 +148,6 @@ def test_any_image_size_agrees_with_rays(renderer, width, height):
     assert (edge_distance_px(things, view, np.argwhere(seen.region != region)) < EDGE_PX).all()
     floor_seen = (region == 1) & (seen.region == 1)
     assert np.abs(seen.depth_m - depth)[floor_seen].max(initial=0.0) < 2e-6 * max(1.0, depth.max())
-
-
-def test_depth_is_taken_at_pixel_centres(renderer):
-    """On a plane this steep half a pixel is 5 mm of depth; float32 has a few units in the last place."""
-    normal, h = np.array([0.0, 1.0, 0.4]), 3.0
-    corners = [[x, y, (1.0 - normal[1] * y) / normal[2]] for x, y in ((-h, -0.2), (h, -0.2), (h, 0.9), (-h, 0.9))]
-    k = VGA.model_copy(update={"cx": 317.2, "cy": 251.9})
-    seen = renderer.draw([Placed(7, quad(corners), EYE)], APPEARANCE, camera(k))
-    hit = seen.region == 7
-    expected = np.broadcast_to(1.0 / ((np.arange(k.height)[:, None] + 0.5 - k.cy) / k.fy + 0.4), hit.shape)
-    assert hit.mean() > 0.5
-    assert np.abs(seen.depth_m - expected)[hit].max() < 1e-6
-    assert np.abs(expected[1:] - expected[:-1])[hit[1:]].min() > 1e-3, "the plane is too flat to tell half pixels"
-
-
-def test_a_mask_ends_between_the_pixel_centres_on_both_sides_of_an_edge(renderer):
-    k = small(20, 10, fx=10.0, fy=10.0, cx=0.0, cy=0.0)  # at z = 10 a metre is a pixel
-    for right, columns in {7.49: 7, 7.51: 8, 7.98: 8, 8.49: 8, 8.51: 9}.items():
-        tile = quad([[2, 3, 10], [right, 3, 10], [right, 6, 10], [2, 6, 10]])
-        region = renderer.draw([Placed(3, tile, EYE)], APPEARANCE, camera(k)).region
-        expected = np.zeros((10, 20), bool)
-        expected[3:6, 2:columns] = True
-        np.testing.assert_array_equal(region == 3, expected, err_msg=f"right edge at {right}")
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["same-triangles", "other-triangles"])
@@ -305,3 +290,73 @@ def test_nothing_of_the_image_before_is_left_whether_or_not_the_floor_fills_the_
     for name in ("rgb", "depth_m", "region"):
         np.testing.assert_array_equal(*(getattr(one, name) for one in seen))
     assert (seen[0].region == 0).any() == (abs(inclination) < 0.5)
+
+
+# ---------------------------------------------------------------------------------------------- what a top hides
+
+SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+RING = [[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]]
+
+
+def level(points: object, faces: object, z: float = 0.5) -> np.ndarray:
+    """Triangles [F, 3, 3] float32 on one level."""
+    flat = np.array(points, np.float32)
+    return np.column_stack([flat, np.full(len(flat), z, np.float32)])[np.array(faces)]
+
+
+def disc(corners: int) -> np.ndarray:
+    angles = 2 * np.pi * np.arange(corners) / corners
+    points = np.vstack([np.column_stack([np.cos(angles), 0.6 * np.sin(angles)]), [[0.0, 0.0]]])
+    return level(points, [[corners, n, (n + 1) % corners] for n in range(corners)])
+
+
+def test_a_convex_top_without_holes_is_a_cover_and_its_sides_are_its_outline():
+    for triangles, sides in ((level(SQUARE, [[0, 1, 2], [0, 2, 3]]), 4), (disc(31), 31)):
+        cover = find_cover(triangles)
+        assert cover is not None and len(cover.sides) == sides and cover.level_m == pytest.approx(0.5)
+        np.testing.assert_allclose(np.hypot(*cover.sides[:, :2].T), 1.0)
+        assert (cover.sides[:, 2] < 0).all(), "the middle is inside"
+
+
+@pytest.mark.parametrize(
+    ("points", "faces"),
+    [
+        ([*SQUARE, [0, 0]], [[0, 1, 4], [1, 2, 4], [2, 3, 4]]),  # not convex
+        ([*SQUARE, *[[x + 3, y] for x, y in SQUARE]], [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]),  # two islands
+        ([*SQUARE, [0, -1]], [[0, 4, 3], [0, 1, 2], [0, 2, 3]]),  # one face over two
+        ([*SQUARE, *[[x / 3, y / 3] for x, y in SQUARE]], RING),  # a hole
+        ([*SQUARE, [0, 0.1]], [[0, 1, 2], [0, 4, 3], [4, 2, 3]]),  # a gap along the diagonal
+    ],
+)
+def test_tops_with_gaps_holes_and_hollows_are_no_cover(points, faces):
+    assert find_cover(level(points, faces)) is None
+
+
+@pytest.mark.parametrize("look", [FLAT, RASTER, FOUR], ids=["flat", "raster", "four samples"])
+def test_images_are_the_same_with_all_that_is_hidden(renderer, monkeypatch, look):
+    """Tables from far and near, from above, from their own level and from below."""
+    rng, drawn_indices, own = np.random.default_rng(11), [], renderer._draw
+
+    def draw(call, textured):
+        drawn_indices.append(call.count)
+        own(call, textured)
+
+    monkeypatch.setattr(renderer, "_draw", draw)
+    counts = {True: 0, False: 0}
+    for _ in range(6):
+        shape, height = table_shape(rng)
+        things = [floor(), Placed(2, shape, translation(0.0, 0.0, 0.0))]
+        for inclination in (1.3, 0.8, 0.5, 0.15, 0.0, -0.4):
+            middle, away_m = np.array([0.0, 0.0, height]), rng.uniform(0.3, 3.0)
+            view = camera(small(96, 72), orbit_pose(middle, inclination, rng.uniform(-3, 3), away_m))
+            images = []
+            for hides in (True, False):
+                with monkeypatch.context() as patch:
+                    if not hides:
+                        patch.setattr(draw_calls, "seen_ranges", lambda positions, faces, cover, eye: [(0, len(faces))])
+                    drawn_indices.clear()
+                    images.append(renderer.draw(things, APPEARANCE, view, *look))
+                    counts[hides] += sum(drawn_indices)
+            for name in ("rgb", "depth_m", "region"):
+                np.testing.assert_array_equal(*(getattr(image, name) for image in images))
+    assert counts[True] < 0.95 * counts[False]

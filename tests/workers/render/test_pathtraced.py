@@ -15,19 +15,27 @@ from schemas.base import frozen_array
 from schemas.errors import InputError
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, Material
-from tests.workers.render.looks import BLACK, FLAT, FOUR, RASTER, matte, paths, traced, with_material, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
+    BLACK,
     EYE,
+    FLAT,
+    FOUR,
+    RASTER,
     WHITE,
     camera,
     facing,
     floor,
+    matte,
     orbit_and_mirror,
+    paths,
     procedural_things,
     random_things,
     shape_of,
     small,
+    traced,
+    with_material,
+    without,
 )
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, invert, pose, rotation_about, translation

@@ -8,15 +8,16 @@ import pytest
 
 from schemas.errors import ViewError
 from schemas.job.job import Job
-from schemas.job.views import Distortion, Patch, Projection
+from schemas.job.views import Distortion, Patch, Projection, Targets
 from schemas.scene.scene import EffectPlan, Placed, PosedScene
-from schemas.scene.view import Camera, Intrinsics, ObjectLabel, crop_box
+from schemas.scene.view import Camera, Intrinsics, ObjectLabel
 from tests.kit.planes import HERE, IMAGES, THERE, K, plane_view
-from tests.kit.shapes import asset_of, box, table
-from workers.geometry.camera import inclination, look_at, orbit_pose
+from tests.kit.shapes import asset_of, box, shape_of, table
+from workers.geometry.camera import inclination, look_at, orbit_pose, unproject
 from workers.geometry.frames import half_turn, pose, rotation_about, translation
 from workers.geometry.pixels import Extent, distort
 from workers.scene.chance import SceneChance
+from workers.scene.context import Stopwatch
 from workers.scene.labels import (
     carry_depth,
     compare_views,
@@ -29,8 +30,9 @@ from workers.scene.labels import (
     pixels_behind,
     projection_shares,
 )
-from workers.scene.pairs import front_distance, mirror_pose, object_distance, place_beside, place_mirror_camera
+from workers.scene.pairs import mirror_pose, object_distance
 from workers.scene.plan import draw_scene
+from workers.scene.targets import draw_targets
 
 JOB = Job(name="t")
 CAMERA = Camera(Intrinsics.of(JOB.cameras.sensor), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5))
@@ -54,60 +56,24 @@ def article_product(T_world_cam: np.ndarray, d_z_m: float, T_z_m: float = 1.3) -
     return T_world_cam @ translation(0, 0, d_z_m) @ pose(turn, np.zeros(3)) @ translation(0, 0, -T_z_m)
 
 
-def random_camera(seed: int, roll: bool) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    T = look_at(rng.uniform((-3, -3, 1), (3, 3, 7)), rng.uniform(-0.5, 0.5, 3))
-    return T @ pose(rotation_about(Z_AXIS, rng.uniform(-3, 3)), np.zeros(3)) if roll else T
-
-
-def test_mirror_camera_looks_at_the_pivot_from_exactly_T_z_with_the_same_inclination_and_the_opposite_heading():
-    for seed in range(20):
-        for roll in (False, True):
-            T, d_z = random_camera(seed, roll), 0.7 + 0.1 * seed
-            mirror = mirror_pose(T, d_z, 1.3)
-            pivot = T[:3, 3] + d_z * T[:3, 2]
-            assert mirror[:3, 3] + 1.3 * mirror[:3, 2] == pytest.approx(pivot, abs=1e-9)
-            assert np.linalg.norm(mirror[:3, 3] - pivot) == pytest.approx(1.3, abs=1e-9)
-            assert mirror[:3, :3].T @ mirror[:3, :3] == pytest.approx(np.eye(3), abs=1e-9)
-            assert np.linalg.det(mirror[:3, :3]) == pytest.approx(1.0, abs=1e-9)
-            assert inclination(mirror) == pytest.approx(inclination(T), abs=1e-9)
-            assert mirror[:2, 2] == pytest.approx(-T[:2, 2], abs=1e-9)
-            assert T[2, 3] - mirror[2, 3] == pytest.approx((d_z - 1.3) * math.sin(inclination(T)), abs=1e-9)
-            assert mirror_pose(mirror_pose(T, 1.3, 1.3), 1.3, 1.3) == pytest.approx(T, abs=1e-9)
-
-
 def test_the_mirror_pose_is_the_articles_product_at_zero_roll_and_another_with_roll():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         T = orbit_pose(np.array([0, 0, 0.7]), rng.uniform(0.7, 0.9), rng.uniform(-math.pi, math.pi), 2.5)
         d_z = rng.uniform(2.0, 2.6)
         assert mirror_pose(T, d_z, 1.3) == pytest.approx(article_product(T, d_z, 1.3), abs=1e-9)
-    T = random_camera(3, roll=True)
+    rng = np.random.default_rng(3)
+    T = look_at(rng.uniform((-3, -3, 1), (3, 3, 7)), rng.uniform(-0.5, 0.5, 3))
+    T = T @ pose(rotation_about(Z_AXIS, 1.0), np.zeros(3))
     assert np.abs(mirror_pose(T, 2.0) - article_product(T, 2.0)).max() > 0.1
-
-
-def test_the_depth_camera_stands_off_in_the_rgb_cameras_axes_and_the_mirror_camera_keeps_its_intrinsics():
-    aligned, R = place_beside(CAMERA, JOB)["aligned"], CAMERA.T_world_cam[:3, :3]
-    assert R.T @ (aligned.position - CAMERA.position) == pytest.approx([-0.051, 0.001, -0.001])
-    assert np.array_equal(aligned.T_world_cam[:3, :3], R)
-    mirror = place_mirror_camera(CAMERA, 2.2, JOB.cameras.mirror)
-    assert mirror.intrinsics == CAMERA.intrinsics
-    assert np.linalg.norm(mirror.position - CAMERA.position - 2.2 * R[:, 2]) == pytest.approx(1.3)
 
 
 def test_the_front_distance_is_read_from_the_depth_of_whichever_object_is_seen():
     mirror = JOB.cameras.mirror
-    depth = np.concatenate([np.linspace(1.0, 2.0, 101), np.full(500, 0.3), [0.0]])[None, :]
-    mask = np.zeros(depth.shape, bool)
-    mask[0, :101] = mask[0, -1] = True  # the last pixel has no depth and must not count as nearest
-    for percentile, expected in ((2.0, 1.02), (50.0, 1.5), (0.0, 1.0)):
-        distance = front_distance(depth, mask, mirror.model_copy(update={"percentile": percentile}))
-        assert distance == pytest.approx(expected)
-    for depths in ([2.0], [2.0, 2.1]):
-        assert 2.0 <= front_distance(np.array([depths]), np.ones((1, len(depths)), bool), mirror) <= 2.1
     region = np.full((10, 10), 1, np.uint8)  # the first object is hidden, the second stands at 2 m, the third at 3 m
     region[2:4], region[6:8] = 4, 5
     depth = np.where(region == 4, 10_000, np.where(region == 5, 15_000, 5_000)).astype(np.uint16)
+    depth[2, 0] = 0  # the pixel has no depth and must not count as nearest
     assert object_distance(depth, region, JOB.images, mirror) == pytest.approx(2.0)
     region[region == 4] = 2
     assert object_distance(depth, region, JOB.images, mirror) == pytest.approx(3.0)
@@ -167,23 +133,15 @@ def test_what_the_processor_cannot_count_is_counted_by_the_renderer():
     assert count_unoccluded([far], HERE, nothing_left) == [36]
 
 
-def label(u: int, v: int) -> ObjectLabel:
-    return ObjectLabel(3, "mug", "m", np.eye(4), u, v, (0, 0, 0, 0), 1, 1.0)
-
-
-def test_a_patch_is_centred_on_the_object_left_out_where_it_would_leave_the_image_and_filled_by_its_share():
-    patch = Patch(width=128, height=96)
-    assert crop_box(label(80, 60), HERE, patch) == (slice(12, 108), slice(16, 144))
-    assert crop_box(label(64, 48), HERE, patch) == (slice(0, 96), slice(0, 128))
-    hidden = dataclasses.replace(label(80, 60), pixels=0)
-    for labelled in (label(63, 60), label(97, 60), label(80, 73), label(-1, -1), hidden):
-        assert crop_box(labelled, HERE, patch) is None
+def test_a_patch_is_left_out_where_it_would_leave_the_image_and_filled_by_the_share_of_its_object():
     region = np.full_like(SOURCE.region, 2)
     region[:60] = 3
     view, patch = dataclasses.replace(SOURCE, region=region), Patch(width=32, height=24)
-    for labelled, share in ((label(80, 60), 0.5), (label(80, 40), 1.0), (label(5, 60), None)):
-        assert patch_object_fraction(view, labelled, patch) == share
-    assert patch_object_fraction(dataclasses.replace(view, region=None), label(80, 60), patch) is None
+    seen, hidden = ((80, 60, 0.5), (80, 40, 1.0), (16, 60, 0.5), (15, 60, None)), ((80, 60, None),)
+    for u, v, share, pixels in (*((*place, 1) for place in seen), *((*place, 0) for place in hidden)):
+        label = ObjectLabel(3, "mug", "m", np.eye(4), u, v, (0, 0, 0, 0), pixels, 1.0)
+        assert patch_object_fraction(view, label, patch) == share
+        assert patch_object_fraction(dataclasses.replace(view, region=None), label, patch) is None
 
 
 # ---------------------------------------------------------------------------------------------- two views
@@ -199,16 +157,7 @@ def test_two_views_of_one_plane_agree_to_the_quantisation_and_of_two_disagree_by
     assert few.median_mm is None and few.points == 0 and few.scene_median_mm < 0.1
 
 
-def test_projected_colours_come_from_the_pixels_that_the_depth_came_from():
-    rgb, depth = derive_projected(SOURCE, THERE, IMAGES, None, NO_EFFECTS)
-    projected = carry_depth(SOURCE, THERE, IMAGES, NO_EFFECTS)
-    filled = projected.source >= 0
-    assert filled.sum() > 2000
-    assert np.array_equal(rgb[filled], SOURCE.rgb.reshape(-1, 3)[projected.source[filled]])
-    assert (rgb[~filled] == 0).all() and (depth[~filled] == 0).all()
-    exact = plane_view("mirror", THERE).depth.astype(int)
-    # The source pixel's centre lands anywhere in its target pixel, so depths differ by the plane's slope over a pixel.
-    assert np.abs(depth.astype(int) - exact)[filled].max() < 5000 * 0.05
+def test_the_shares_are_of_what_is_filled_and_of_what_is_hidden():
     near = np.array([[0, 5000, 5100, 5040]], np.uint16)
     assert projection_shares(near, np.full_like(near, 5000), IMAGES) == (0.75, pytest.approx(1 / 3))
 
@@ -240,3 +189,23 @@ def test_behind_a_lens_a_depth_pixel_has_the_colour_of_the_pixel_that_its_centre
     assert pixels.tolist() == [centre, int(v[0]) * K.width + int(u[0]), -1]
     assert pixels[1] > K.width
     assert pixels_behind(Distortion(k1=0.2), np.array([0]), K).tolist() == [-1]
+
+
+# ---------------------------------------------------------------------------------------------- targets
+
+
+@pytest.mark.parametrize("side_m", [0.4, 40.0])
+def test_what_reaches_behind_the_camera_is_cut_at_the_near_plane_and_has_its_normal_everywhere(side_m):
+    """A floor; the second derivation holds all other targets (tests/judge/test_targets.py)."""
+    T_world_cam = look_at(np.array([0.5, 0.3, 0.4]), np.zeros(3))
+    floor = Placed(1, shape_of(box(side_m, side_m, 0.01, (0, 0, -0.005))), np.eye(4))
+    rows, columns = np.divmod(np.arange(K.height * K.width), K.width)
+    rays = unproject(rows, columns, np.ones(len(rows)), K) @ T_world_cam[:3, :3].T
+    z = -T_world_cam[2, 3] / rays[:, 2]
+    hit = T_world_cam[:3, 3] + z[:, None] * rays
+    region = (
+        ((np.abs(hit[:, :2]) < side_m / 2 - 0.01).all(axis=1) & (z > 0)).astype(np.uint8).reshape(K.height, K.width)
+    )
+    plan, job = EffectPlan(("normals",), {}), Job(name="t", targets=Targets(views=("normals",)))
+    drawn = draw_targets([floor], Camera(K, T_world_cam), region, job, plan, Stopwatch())["normals"][region > 0]
+    assert len(drawn) > 500 and np.abs(drawn - np.rint((T_world_cam[2, :3] + 1.0) / 2.0 * 65535.0)).max() <= 1.0

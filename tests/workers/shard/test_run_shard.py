@@ -1,4 +1,6 @@
-"""A shard of small scenes through the real path onto disk: ranges, commits under way, errors, and the stack's fingerprint."""
+"""A shard of small scenes through the real path onto disk: ranges, commits under way, errors, the fingerprint, and cameras
+that nobody would choose: each scene is made whole, against the ray caster, or is a row that says why not.
+"""
 
 import itertools
 import os
@@ -12,17 +14,22 @@ from collections.abc import Callable
 from importlib.metadata import distribution
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from schemas.dataset.layout import FINGERPRINT_FILE, commit_path
-from schemas.dataset.shard import Blame, Fingerprint, ShardReport
+from schemas.dataset.commit import Span
+from schemas.dataset.layout import FINGERPRINT_FILE, IMAGES, commit_path
+from schemas.dataset.shard import Blame, Fingerprint, ShardOrder, ShardReport
 from schemas.errors import FingerprintError, MachineError
+from schemas.job.job import Job
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import MODALITIES
 from services.job.job_file import validate_job
 from services.run.worker_entry import processor_flags
 from tests.effects.scenes import SMALL
-from tests.workers.shard import shards
+from workers.assets.catalogue import open_catalogue
 from workers.physics.bullet import World
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard import fingerprint
@@ -35,12 +42,24 @@ from workers.shard.fingerprint import (
     numpy_simd,
     take_fingerprint,
 )
-from workers.shard.run_shard import describe, explain, keep_traceback
+from workers.shard.run_shard import describe, explain, keep_traceback, run_shard
 from workers.source import SOURCE_PACKAGES, code_digest
 from workers.store.attempt import Attempt, blamed_scene, staged_attempts
-from workers.store.commit import read_record
+from workers.store.commit import committed_files, read_record
+from workers.store.images import decode_png
 from workers.store.ledger import range_rows
 from workers.store.local import LocalStage, LocalStore
+
+
+def run_job(
+    job: Job, out: Path, *spans: tuple[int, int], is_over: Callable[[], bool] = lambda: False, **changes: Any
+) -> ShardReport:
+    """The report of a shard of these ranges, with changes of its order."""
+    whole = tuple(Span(start=start, stop=stop) for start, stop in spans)
+    order = ShardOrder.of(str(out), job, "test").model_copy(update={"spans": whole, **changes})
+    LocalStore(out).prepare()
+    return run_shard(order, open_catalogue(job.assets, Path(), tuple(job.categories)), is_over)
+
 
 ROOT = Path(__file__).resolve().parents[3]
 OTHER = Fingerprint(canary="0" * 64, code="0" * 64, libraries={}, simd="none", renderer="none")
@@ -49,7 +68,7 @@ OTHER = Fingerprint(canary="0" * 64, code="0" * 64, libraries={}, simd="none", r
 def run(out: Path, *starts: int, mode: str = "record", **changes) -> ShardReport:
     """A shard of ranges of two scenes."""
     job = validate_job({**SMALL, "run": {"fingerprint": mode}}, "a test")
-    return shards.run(job, out, *((start, start + 2) for start in starts or (0,)), **changes)
+    return run_job(job, out, *((start, start + 2) for start in starts or (0,)), **changes)
 
 
 def failures_of(out: Path) -> list[dict]:
@@ -287,3 +306,84 @@ def test_a_copy_of_the_code_has_the_same_digest_and_a_changed_line_another(tmp_p
     with (tmp_path / "workers" / "scene" / "plan.py").open("a") as file:
         file.write("# changed\n")
     assert asked(ask, tmp_path)[0] != code_digest()
+
+
+# ---------------------------------------------------------------------------------------------- extreme cameras
+
+ARTICLE = [image for image in IMAGES if MODALITIES[image.pixels].target is None]
+"""The images that a job without targets has."""
+IN_THE_MIDDLE = {"offset_m": [0.0, 0.0], "pose": "placed"}
+EVERY_EFFECT = {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}
+HARD_TO_DERIVE = {"projection": {"splat": 15, "hidden_point_removal": True}}
+
+
+def job_of(width: int, height: int, focal: float, **changes):
+    """A job whose sensor looks along the middle of its image."""
+    sensor = {"width": width, "height": height, "fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
+    cameras = {"sensor": sensor, **changes.pop("cameras", {})}
+    tree = {"name": "extreme", "seed": 5, "cameras": cameras, "check": {"raycast_share": 1.0}, **changes}
+    return validate_job(tree, "test")
+
+
+def made_in(job, out: Path, scenes: int = 2):
+    """(scenes made, failures by reason, the store) of a shard of one range."""
+    (span,) = run_job(job, out, (0, scenes)).spans
+    assert span.made + sum(span.failed.values()) == scenes
+    return span.made, span.failed, LocalStore(out)
+
+
+def images_of(store: LocalStore) -> dict[str, np.ndarray]:
+    """Every image of the range, read back."""
+    record = read_record(store, 0)
+    assert record is not None
+    paths = [entry.path for entry in committed_files(store, record) if entry.path.endswith(".png")]
+    return {path: decode_png(store.read(path), path) for path in paths}
+
+
+@pytest.mark.minute
+def test_images_of_one_pixel_or_without_an_inside_are_made_whole(tmp_path):
+    hard = {"sensor": EVERY_EFFECT, "images": HARD_TO_DERIVE}
+    sizes = ((2, 2), (3, 1), (1, 3), (2, 640), (4096, 1))
+    cases = [(1, 1, 525.0, {"render": {"samples": 4}, **changes}) for changes in ({}, hard)]
+    cases += [(width, height, 60.0, hard) for width, height in sizes]
+    for number, (width, height, focal, changes) in enumerate(cases):
+        job = job_of(width, height, focal, start=IN_THE_MIDDLE, **changes)
+        made, failed, store = made_in(job, tmp_path / str(number), scenes=4)
+        assert made > 0 and set(failed) <= {"intrinsic: object_not_seen"}, (width, height)
+        images = images_of(store)
+        assert {image.shape[:2] for image in images.values()} == {(height, width)}
+        assert len(images) == made * len(ARTICLE), "and no patch, which would be larger than the image"
+
+
+@pytest.mark.minute
+def test_a_sensor_that_sees_half_the_world_in_a_pixel_says_that_it_sees_no_object(tmp_path):
+    for n, focal in enumerate((0.001, 0.5)):
+        made, failed, _ = made_in(job_of(64, 48, focal), tmp_path / str(n))
+        assert (made, failed) == (0, {"intrinsic: object_not_seen": 2})
+
+
+@pytest.mark.minute
+def test_a_sensor_that_sees_micrometres_makes_scenes_or_says_what_disagrees(tmp_path):
+    made, failed, store = made_in(job_of(64, 48, 1e6, start=IN_THE_MIDDLE), tmp_path, scenes=4)
+    assert set(failed) <= {f"intrinsic: {reason}" for reason in ("views_disagree", "object_not_seen")}
+    assert made > 0
+    paths = [path for path in images_of(store) if Path(path).name.startswith("segment") and "patch" not in path]
+    assert paths and all(decode_png(store.read(path), path).min() >= REGION_FIRST_OBJECT for path in paths[:1])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("changes", [{}, {"sensor": EVERY_EFFECT, "render": {"samples": 4}}])
+def test_the_largest_image_is_made_whole(tmp_path, changes):
+    job = job_of(4096, 4096, 3360.0, check={"raycast_share": 0.0}, run={"scene_timeout_s": 1000.0}, **changes)
+    made, failed, store = made_in(job, tmp_path, scenes=1)
+    assert (made, failed) == (1, {})
+    whole = [image for path, image in images_of(store).items() if "/patches/" not in path]
+    assert len(whole) == len(ARTICLE) and {image.shape[:2] for image in whole} == {(4096, 4096)}
+
+
+def test_a_gpu_that_is_asked_for_and_not_there_stops_the_shard_before_any_scene(tmp_path, monkeypatch):
+    monkeypatch.setattr(shared_renderer(), "name", "llvmpipe (LLVM 15.0.6, 256 bits)")
+    with pytest.raises(MachineError, match=r"run\.device is gpu"):
+        made_in(job_of(64, 48, 60.0, run={"device": "gpu"}), tmp_path)
+    assert not (tmp_path / FINGERPRINT_FILE).exists() and not (tmp_path / commit_path(0)).exists()

@@ -61,8 +61,8 @@ def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
         left_out.append(LeftOut(_relative(error.filename, root), "permission", f"cannot be listed: {error.strerror}"))
 
     for parent, folders, files in os.walk(root, onerror=cannot_list):
-        folders[:] = sorted(one for one in folders if not one.startswith((".", "__MACOSX")))
-        links = [Path(parent, one) for one in folders if os.path.islink(Path(parent, one))]
+        folders[:] = sorted(below for below in folders if not below.startswith((".", "__MACOSX")))
+        links = [Path(parent, below) for below in folders if os.path.islink(Path(parent, below))]
         left_out += [LeftOut(_relative(str(p), root), "link", OUTSIDE) for p in links if not _is_inside(p, root)]
         current = _current_version(Path(parent, "model.config"), files)
         for file in sorted(files):

@@ -73,25 +73,25 @@ def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, st
     by_folder: dict[str, list[str]] = {}
     for path in originals:
         by_folder.setdefault(_parent(path), []).append(path)
-    found = {}
+    copies = {}
     for path in paths:
         if (match := _EVALUATION.fullmatch(path)) and (model := f"{match[1]}models/{match[2]}") in split:
-            found[path] = f"made for evaluation, of {model}"
+            copies[path] = f"made for evaluation, of {model}"
             continue
         stem, level = split[path]
         if level is None or path in posed:
             continue
         finest = levels.get((_parent(path), stem), (0, path))[1] if level >= 0 else None
         near = _near(path, by_folder) if finest in (None, path) else []
-        of = next((one for one in near if _stem(one) == stem), None)
+        of = next((original for original in near if _stem(original) == stem), None)
         if of is None and level < 0:
-            alike = [one for one in near if stem in _stem(one) or _stem(one) in stem]
-            meshes = [one for one in near if one not in posed] or near
+            alike = [original for original in near if stem in _stem(original) or _stem(original) in stem]
+            meshes = [original for original in near if original not in posed] or near
             of = min(alike or (meshes if len(meshes) == 1 or _in_folder(path) else []), default=None)
         of = of or (finest if finest != path else None)
         if of is not None:
-            found[path] = f"{'collision shape' if level < 0 else 'coarser level of detail'} of {of}"
-    return found
+            copies[path] = f"{'collision shape' if level < 0 else 'coarser level of detail'} of {of}"
+    return copies
 
 
 def _split(path: str) -> tuple[str, int | None]:
@@ -117,10 +117,10 @@ def _near(path: str, by_folder: Mapping[str, list[str]]) -> list[str]:
         return by_folder.get("/".join(parts), [])
     above = "/".join(parts[:depth])
     return [
-        one
+        other
         for folder, some in by_folder.items()
         if f"{folder}/".startswith(f"{above}/" if above else "")
-        for one in some
+        for other in some
     ]
 
 

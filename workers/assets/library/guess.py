@@ -67,23 +67,28 @@ AGREE = 2 / 3
 
 def guess_groups(items: Sequence[Item]) -> list[Group]:
     """The files by their scale, with the reasons of each format."""
-    found: dict[tuple[float, float | None], list[tuple[list[Item], str]]] = {}
+    scales: dict[tuple[float, float | None], list[tuple[list[Item], str]]] = {}
     for suffix in sorted({item.suffix for item in items}):
         mine = [item for item in items if item.suffix == suffix]
         for factor, diagonal_m, some, why in _guess_scales(suffix, mine):
-            found.setdefault((factor, diagonal_m), []).append((some, why))
+            scales.setdefault((factor, diagonal_m), []).append((some, why))
     return [
-        Group(tuple(item.path for some, _ in told for item in some), factor, tuple(why for _, why in told), diagonal_m)
-        for (factor, diagonal_m), told in found.items()
+        Group(
+            tuple(item.path for some, _ in of_scale for item in some),
+            factor,
+            tuple(why for _, why in of_scale),
+            diagonal_m,
+        )
+        for (factor, diagonal_m), of_scale in scales.items()
     ]
 
 
 def _guess_scales(suffix: str, items: Sequence[Item]) -> list[tuple[float, float | None, list[Item], str]]:
     """Of the files of one format: scale, diagonal where sizes are normalised, the files that it holds for, and why."""
-    found = list[tuple[float, float | None, list[Item], str]]()
+    scales = list[tuple[float, float | None, list[Item], str]]()
     for unit in sorted({item.measured.unit_m for item in items if item.measured.unit_m is not None}):
         some = [item for item in items if item.measured.unit_m == unit]
-        found.append((unit, None, some, f"{_told(suffix, some, items)}: {STATED[unit]}, as the files say"))
+        scales.append((unit, None, some, f"{_told(suffix, some, items)}: {STATED[unit]}, as the files say"))
     rest = [item for item in items if item.measured.unit_m is None]
     sizes = [item.diagonal for item in rest]
     alike = (
@@ -91,12 +96,12 @@ def _guess_scales(suffix: str, items: Sequence[Item]) -> list[tuple[float, float
     )
     if alike and suffix not in METRIC:
         why = f"{_told(suffix, rest, items)}, all alike, as shapes without a unit have it: resized to 0.25 m"
-        return [*found, (1.0, 0.25, rest, why)]
+        return [*scales, (1.0, 0.25, rest, why)]
     units = _guess_units({item.path: item.diagonal for item in rest}, suffix in METRIC)
     for number, (factor, name) in enumerate(UNITS):
         if some := [item for item in rest if units[item.path] == number]:
-            found.append((factor, None, some, f"{_told(suffix, some, items)}: {_reading(suffix, some, factor, name)}"))
-    return found
+            scales.append((factor, None, some, f"{_told(suffix, some, items)}: {_reading(suffix, some, factor, name)}"))
+    return scales
 
 
 def _told(suffix: str, some: Sequence[Item], items: Sequence[Item]) -> str:
@@ -150,17 +155,19 @@ class _Folder:
             unit = self.costs.index(min(self.costs))
         if not self.below:
             return {path[1:]: unit}
-        files = [one for one in self.below.values() if not one.below]
-        usual = [math.log(one.size * UNITS[unit][0]) for one in files if not one._leaves(unit)] or [math.log(USUAL_M)]
-        found = dict[str, int]()
-        for name, one in self.below.items():
-            if not one.below and one._leaves(unit):
-                apart = [abs(math.log(one.size * metres) - median(usual)) for metres, _ in UNITS]
-                costs = [cost + far for cost, far in zip(one.costs, apart, strict=True)]
-                found[f"{path}/{name}"[1:]] = costs.index(min(costs))
+        files = [part for part in self.below.values() if not part.below]
+        usual = [math.log(part.size * UNITS[unit][0]) for part in files if not part._leaves(unit)] or [
+            math.log(USUAL_M)
+        ]
+        chosen = dict[str, int]()
+        for name, part in self.below.items():
+            if not part.below and part._leaves(unit):
+                apart = [abs(math.log(part.size * metres) - median(usual)) for metres, _ in UNITS]
+                costs = [cost + far for cost, far in zip(part.costs, apart, strict=True)]
+                chosen[f"{path}/{name}"[1:]] = costs.index(min(costs))
             else:
-                found |= one.units(unit, f"{path}/{name}")
-        return found
+                chosen |= part.units(unit, f"{path}/{name}")
+        return chosen
 
     def _leaves(self, unit: int) -> bool:
         return self.costs[unit] > min(self.costs) + SPLIT
@@ -214,20 +221,23 @@ def guess_ups(items: Sequence[Item]) -> dict[str, tuple[UpAxis, str]]:
 
 def _decide(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis, str]:
     """The axis that is up in the files of one format, and why."""
-    axis, count, told = _majority(items, specified)
+    axis, count, message = _majority(items, specified)
     if axis is not None:
-        return axis, told
+        return axis, message
     if specified is not None:
         against = sum(item.measured.confidence == "sure" and item.measured.up != specified for item in items)
         return specified, "by the format's specification" + (
-            f", though {told.removeprefix('sure: ')}: look at the pictures"
+            f", though {message.removeprefix('sure: ')}: look at the pictures"
             if against
             else "; nothing in the shapes speaks against it"
         )
     likely = Counter(item.measured.up for item in items if item.measured.up is not None)
-    for found, count in likely.most_common(1):
+    for up, count in likely.most_common(1):
         if count >= AGREE * likely.total():
-            return found, f"likely: {count} of {len(items)} stand firmer so than upside down; look at the pictures"
+            return (
+                up,
+                f"likely: {count} of {len(items)} stand firmer so than upside down; look at the pictures",
+            )
     return "z", "not known: the shapes stand on several axes or on none; look at the pictures"
 
 
@@ -238,13 +248,13 @@ def _majority(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis |
     """
     votes = Counter(item.measured.up for item in items if item.measured.confidence == "sure")
     axis, count = votes.most_common(1)[0] if votes else (None, 0)
-    told = (
+    message = (
         f"sure: {count} of {len(items)} stand on {'this axis' if specified is None else axis} alone"
         if len(items) > 1
         else "sure: it stands on this axis alone"
     )
     enough = count >= AGREE * votes.total() if specified in (None, axis) else 2 * count > len(items)
-    return axis if enough else None, votes.total(), told
+    return axis if enough else None, votes.total(), message
 
 
 # ---------------------------------------------------------------------------------------------- categories

@@ -44,6 +44,7 @@ from workers.assets.library.table import (
     write_table,
 )
 from workers.pool import Answers
+from workers.source import code_digest
 
 MOST_READ = 5000
 """Candidates up to which all are read before anything is decided; of more, so many are, evenly spaced."""
@@ -126,15 +127,7 @@ def _check_shapes(library: Library) -> None:
 def code_version() -> str:
     """Digest of the code that decisions and shapes depend on, and of the versions of libraries."""
     names = ("manifold3d", "numpy", "pillow", "scipy", "trimesh")
-    whole = hashlib.sha256(repr([version(name) for name in names]).encode())
-    here = Path(__file__).resolve()
-    workers = here.parents[2]
-    for folder in (here.parent, workers / "door" / "meshes", workers / "geometry"):
-        for file in sorted(folder.glob("*.py")):
-            whole.update(hashlib.sha256(file.read_bytes()).digest())
-    for file in (workers / "assets" / name for name in ("mass.py", "glb.py", "samples.py")):
-        whole.update(hashlib.sha256(file.read_bytes()).digest())
-    return whole.hexdigest()[:16]
+    return hashlib.sha256(repr([code_digest(), *map(version, names)]).encode()).hexdigest()[:16]
 
 
 def locate_folder(name: str, job_folder: Path) -> Path:
@@ -262,7 +255,7 @@ def _pybullet(source: Path) -> Iterator[Row]:
 
 def _guess_rows(source: Path, making: Making, watch: Watch) -> list[Row]:
     paths, unusable = walk_folder(source)
-    beside = [one.path for one in unusable]
+    beside = [left.path for left in unusable]
     copies = find_copies(paths, [*paths, *beside])
     left_out = {path: LeftOut(path, COPY, why) for path, why in copies.items()}
     asked = [path for path in paths if path not in left_out]
@@ -278,8 +271,8 @@ def _guess_rows(source: Path, making: Making, watch: Watch) -> list[Row]:
     rows = _apply_sample(source, asked, surveys, making) if is_large else _decide(surveys, left_out, making)
     rows = [replace(row, licence=find_licence(source / row.path, source, licences)) for row in rows]
     listed = {row.path for row in rows}
-    aside = [one for one in (*unusable, *left_out.values()) if one.path not in listed]
-    return rows + [Row(path=one.path, use=False, reason=one.reason, why=one.why) for one in aside]
+    aside = [left for left in (*unusable, *left_out.values()) if left.path not in listed]
+    return rows + [Row(path=left.path, use=False, reason=left.reason, why=left.why) for left in aside]
 
 
 def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: Making) -> list[Row]:
@@ -292,7 +285,7 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
         return (making.unit_of(item.path) or of[item.path].unit(item)) * item.diagonal
 
     fit = [item for item in items if SMALLEST_M <= size_m(item) <= LARGEST_M]
-    doubles = {one.path: one for one in find_doubles(fit, size_m, SUFFIXES)}
+    doubles = {double.path: double for double in find_doubles(fit, size_m, SUFFIXES)}
     different = [item for item in items if item.path not in doubles]
     of = {path: group for group in guess_groups(different) for path in group.paths}
     ups = guess_ups(different)

@@ -16,7 +16,7 @@ from schemas.job.assets import UpAxis
 from schemas.scene.shape import MassProperties, Shape
 from workers.assets.samples import colors_at, draw_points
 from workers.door.meshes.dae import find_up
-from workers.door.meshes.mesh import DEFAULT
+from workers.door.meshes.raw import DEFAULT
 from workers.door.opening import as_utf8
 from workers.geometry.mesh import face_areas
 
@@ -243,8 +243,8 @@ def find_unit(path: Path, diagonal: float) -> float | None:
             sizes = json.loads(as_utf8(info.read_bytes())[0])[match[1]]
             unit = 0.001 * math.hypot(*(float(sizes[f"size_{axis}"]) for axis in "xyz")) / diagonal
             return next((known for known in _UNITS.values() if abs(unit / known - 1.0) < INFO_SLACK), None)
-    found = _UNIT.search(_head(path)) if path.suffix.lower() == ".obj" else None
-    word = found[1].decode().lower() if found else ""
+    remark = _UNIT.search(_head(path)) if path.suffix.lower() == ".obj" else None
+    word = remark[1].decode().lower() if remark else ""
     return _UNITS.get(word, _UNITS.get(word.removesuffix("s")))
 
 

@@ -23,9 +23,9 @@ from workers.assets.glb import asset_glb
 from workers.assets.library.placement import INFO_FILE, measure_shape, measure_thinness
 from workers.assets.library.table import Row, SourceFile
 from workers.assets.mass import weigh
-from workers.door.meshes.caps import LONGEST_NOTE, MOST_NOTES, find_inside
 from workers.door.meshes.formats import FORMATS, list_mesh_files, load_shape
 from workers.door.meshes.mesh import LoadedMesh, transform_shape
+from workers.door.meshes.raw import LONGEST_NOTE, MOST_NOTES, find_inside
 from workers.door.meshes.urdf import POSED, list_named, list_seen, load_posed
 from workers.door.opening import describe_error
 from workers.geometry.frames import pose
@@ -81,10 +81,7 @@ def ask(questions: Iterable[Question], limits: MeshLimits) -> Iterator[tuple[Que
 
 def refusal_of(message: bytes) -> MeshError:
     """The error of an answer that begins with `REFUSAL`."""
-    reason, detail, kind = json.loads(message[len(REFUSAL) :])
-    error = MeshError(reason, detail)
-    error.kind = kind
-    return error
+    return MeshError(*json.loads(message[len(REFUSAL) :]))
 
 
 def describe_refusal(error: MeshError) -> bytes:
@@ -116,11 +113,9 @@ def answer(question: Question) -> bytes:
             raise MemoryError from error
         refusal = MeshError("unreadable", f"{path} cannot be read: {describe_error(error)}")
     detail = refusal.detail if path.name in refusal.detail else f"{path}: {refusal.detail}"
-    named = MeshError(refusal.reason, detail)
-    named.kind = refusal.kind
+    reason = [refusal.reason, plain_line(detail, LONGEST_NOTE), refusal.kind]
     if question.row is not None:
-        return describe_refusal(named)
-    reason = [named.reason, plain_line(named.detail, LONGEST_NOTE), named.kind]
+        return REFUSAL + json.dumps(reason).encode()
     return json.dumps({"files": _stat_of(path, question.folder), "named": [], "refused": reason}).encode()
 
 
@@ -154,7 +149,8 @@ def make_glb(question: Question, row: Row) -> bytes:
     files = hash_files(list_files(folder, path, question.limits), folder)
     known = [(file.path, file.sha256) for file in row.files if file.sha256]
     if known and known != [(file.path, file.sha256) for file in files]:
-        raise environmental("changed", f"{path} has changed since its library was made: run `verso init` again")
+        why = "has changed since its library was made: run `verso init` again"
+        raise MeshError("changed", f"{path} {why}", "environmental")
     loaded = load_file(folder, path, question.limits)
     asset = place_asset(loaded, row, question.limits)
     if row.category != TABLE:
@@ -285,16 +281,8 @@ def check_unchanged(folder: Path, files: Iterable[SourceFile]) -> None:
     for file in files:
         stat = (folder / file.path).stat()
         if (stat.st_size, stat.st_mtime_ns) != (file.bytes, file.mtime_ns):
-            raise environmental(
-                "changed", f"{folder / file.path} changes while it is read: start again when nobody writes"
-            )
-
-
-def environmental(reason: str, detail: str) -> MeshError:
-    """A refusal for which neither job nor seed is to blame: the scene may be tried again."""
-    error = MeshError(reason, detail)
-    error.kind = "environmental"
-    return error
+            why = "changes while it is read: start again when nobody writes"
+            raise MeshError("changed", f"{folder / file.path} {why}", "environmental")
 
 
 HEAD_BYTES = 4096

@@ -20,7 +20,6 @@ from workers.assets.library.reading import (
     Question,
     ask,
     describe_refusal,
-    environmental,
     refusal_of,
 )
 from workers.assets.library.table import Library, Row, write_whole
@@ -57,32 +56,26 @@ def open_shape(library: Library, row: Row) -> tuple[Shape, dict[str, Any]]:
 
     Raises MeshError where it is refused, or where it is gone or damaged and its source is not here.
     """
-    if (data := _read_kept(library, row)) is not None:
-        return _open(data, row)
+    if (kept := _read_kept(library, row)) is not None:
+        return kept[1]
     if not library.source.is_dir():
-        raise environmental("missing", _describe_lost(library, row))
+        path = shape_path(library, row)
+        how = "is not what library.parquet says" if path.exists() else "is missing"
+        more = f"and {library.source}, of which it was made, is not here: `verso init` again where it is"
+        raise MeshError("missing", f"{path} {how}, {more}", "environmental")
     ((_, answer),) = make_shapes(library, [row])
     if isinstance(answer, MeshError):
         raise answer
     return _open(answer, row)
 
 
-def _describe_lost(library: Library, row: Row) -> str:
-    path = shape_path(library, row)
-    how = "is not what library.parquet says" if path.exists() else "is missing"
-    return f"{path} {how}, and {library.source}, of which it was made, is not here: `verso init` again where it is"
-
-
-def _read_kept(library: Library, row: Row) -> bytes | None:
-    """The GLB of a row; None where there is none, or it is not what the table says."""
-    try:
+def _read_kept(library: Library, row: Row) -> tuple[bytes, tuple[Shape, dict[str, Any]]] | None:
+    """The GLB of a row, and what is in it; None where there is none, or it is not what the table says."""
+    with suppress(OSError, MeshError):
         data = shape_path(library, row).read_bytes()
-        if row.glb_sha256 is not None and hashlib.sha256(data).hexdigest() != row.glb_sha256:
-            return None
-        _open(data, row)
-    except (OSError, MeshError):
-        return None
-    return data
+        if row.glb_sha256 in (None, hashlib.sha256(data).hexdigest()):
+            return data, _open(data, row)
+    return None
 
 
 def _open(data: bytes, row: Row) -> tuple[Shape, dict[str, Any]]:
@@ -111,8 +104,8 @@ def make_shapes(
     for row in rows:
         if (message := refused.get(row.key)) is not None:
             yield row, refusal_of(message)
-        elif (data := _read_kept(library, row)) is not None:
-            yield row, data
+        elif (kept := _read_kept(library, row)) is not None:
+            yield row, kept[0]
         else:
             asked[row.path] = row
     questions = (Question(library.source, row.path, library.limits, row) for row in asked.values())
@@ -124,7 +117,7 @@ def make_shapes(
         else:
             if row.glb_sha256 is not None and hashlib.sha256(answer).hexdigest() != row.glb_sha256:
                 more = "came out otherwise than library.parquet says: `verso init` again"
-                answer = environmental("changed", f"{shape_path(library, row)} {more}")
+                answer = MeshError("changed", f"{shape_path(library, row)} {more}", "environmental")
             else:
                 with suppress(*(() if must_keep else (OutputError,))):
                     write_whole(shape_path(library, row), answer)

@@ -227,8 +227,8 @@ def read_table(folder: Path) -> Library:
         about = json.loads(rows[0]["library"])
         version, source = about["version"], Path(about["folder"])
     except (pa.ArrowException, ValueError, TypeError, KeyError, OSError, OverflowError) as error:
-        told = plain_line(str(error).splitlines()[0] if str(error) else repr(error), 200)
-        raise AssetSourceError(f"{name} is no table of a library: {told}; `verso init` makes it again") from error
+        message = plain_line(str(error).splitlines()[0] if str(error) else repr(error), 200)
+        raise AssetSourceError(f"{name} is no table of a library: {message}; `verso init` makes it again") from error
     if version != VERSION:
         raise AssetSourceError(
             f"{name} is of version {version!r:.20}, and this program reads {VERSION}: `verso init` again"
@@ -248,7 +248,7 @@ def _row(tree: dict) -> Row:
     path = tree["path"]
     if not path or path.startswith("/") or ".." in PurePosixPath(path).parts:
         raise ValueError(f"path {path!r}: must lie below the source's folder")
-    for name, fits, told in (
+    for name, fits, rule in (
         ("up", tree["up"] in ("x", "y", "z"), "must be x, y or z"),
         ("unit", tree["unit"] is not None and 0.0 < tree["unit"] < math.inf, "must be a positive number, metres"),
         ("use", tree["use"] is not None, "must be true or false"),
@@ -261,7 +261,7 @@ def _row(tree: dict) -> Row:
         ("files", bool(tree["files"]) and tree["files"][0]["path"] == path, "must begin with path"),
     ):
         if not fits and (name != "files" or tree["use"]):
-            raise ValueError(f"{path}: {name} {tree[name]!r:.60}: {told}")
+            raise ValueError(f"{path}: {name} {tree[name]!r:.60}: {rule}")
     files = tuple(SourceFile(**file) for file in tree["files"] or ())
     extents = None if tree["extents_m"] is None else tuple(tree["extents_m"])
     values = {field.name: tree[field.name] for field in fields(Row)}

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
-from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
+from schemas.capture import CLUTTERED, CaptureEstimate, DepthCorrection, ViewEstimate
 from workers.capture.poses.corners import Doubt, find_rolling, fit_camera
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
-from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation
+from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
 from workers.capture.poses.standing import SEEN_THROUGH_M, object_groups
 from workers.capture.poses.terms import (
     NAMES,
@@ -125,9 +125,10 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     groups, clutter = [everyone], dict[int, NDArray[np.bool_]]()
     if off_m <= SEEN_THROUGH_M / SIGNIFICANT:
         groups, clutter = _groups(problem, joint, everyone)
-    clutter |= {n: np.ones(len(problem.observations[n].object_patches), bool) for group in groups[1:] for n in group}
-    if clutter:
+    if clutter or len(groups) > 1:
         still = [o.without(clutter[n]) if n in clutter else o for n, o in enumerate(problem.observations)]
+        for n in (n for group in groups[1:] for n in group):
+            still[n] = dataclasses.replace(still[n], object_patches=no_patches())
         problem = dataclasses.replace(problem, observations=tuple(still))
         joint = solve_jointly(problem, evidence.spec)
     if doubt is None and camera is not None and (camera.significant or evidence.spec.calibrate):
@@ -209,7 +210,11 @@ def _result(problem: Views, joint: Joint, doubt: Doubt | None, evidence: Evidenc
         views[problem.index[place]] = view
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
     cause = doubt.note if doubt is not None and doubt.note else scale_note(joint, sigma, evidence)
-    notes = tuple(note for note in (cause, *noise_notes(joint, problem)) if note)
+    cluttered = ", ".join(str(o.number) for o in problem.observations if o.is_cluttered)
+    clutter = (
+        f"what one view alone has on the board, such as a hand, is left out: views {cluttered}" if cluttered else ""
+    )
+    notes = tuple(note for note in (clutter, cause, *noise_notes(joint, problem)) if note)
     ordered = tuple(views[index] for index in sorted(views))
     scale, steps = solution.shared.print_scale, solution.iterations
     return CaptureEstimate("joint", ordered, correction, scale, steps, solution.converged, notes)
@@ -227,7 +232,7 @@ def _joint_view(
         joint.solution.poses[place],
         joint.covariance[block, block] * max(wider, widening),
         ("ambiguous: a pose of another tilt fits markers and depth as well",) * problem.ambiguous[place],
-        (seen.given_by,) * bool(problem.fixed[place]),
+        (*(seen.given_by,) * bool(problem.fixed[place]), *(CLUTTERED,) * problem.observations[place].is_cluttered),
         by_corners=False,
     )
     view = judge(seen, judgement, evidence, correction, joint.solution.shared.print_scale)

@@ -78,6 +78,8 @@ class Observation:
     manual_T_board_cam: Pose | None = None
     given_by: str = ""
     """Where the pose that was given is from, in words."""
+    is_cluttered: bool = False
+    """Whether patches of things that are no part of the object were left out."""
 
     @property
     def markers(self) -> int:
@@ -86,7 +88,7 @@ class Observation:
 
     def without(self, clutter: NDArray[np.bool_]) -> "Observation":
         """The view without these of the object's patches [P]."""
-        return replace(self, object_patches=self.object_patches[~clutter])
+        return replace(self, object_patches=self.object_patches[~clutter], is_cluttered=True)
 
 
 @dataclass(frozen=True, eq=False)

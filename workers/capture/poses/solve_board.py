@@ -17,7 +17,7 @@ from schemas.base import Array, Pose
 from schemas.errors import CaptureError, command_line
 from schemas.job.captures import Board
 from workers.capture.board import LARGEST, PREDEFINED, id_words, open_dictionary, smallest_dictionary
-from workers.capture.board_kinds import KIND_WORDS, board_of_markers, recognise_board
+from workers.capture.board_kinds import board_of_markers, recognise_board
 from workers.capture.detect import find_markers, other_dictionary, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
@@ -100,12 +100,12 @@ def other_board(folder: CaptureFolder) -> str:
     if recognised is None:
         return words
     kind, sizes = recognised
-    show = f"the photographs show {KIND_WORDS[kind].format(f'{sizes.columns} x {sizes.rows}')} of {sizes.dictionary}"
+    words = f"{kind.replace('charuco', 'ChArUco')} board of {sizes.columns} x {sizes.rows} of {sizes.dictionary}"
     options = ["--kind", kind, "--size", f"{sizes.columns}x{sizes.rows}", "--dictionary", sizes.dictionary]
     options += ["--marker", f"{sizes.marker_m:g}", "--pitch", f"{sizes.pitch_m:g}"]
     command = command_line("capture", "board", folder.path / "board.json", *options)
     remedy = f"move it away, and `{command}` writes the right one; measure both lengths on the print"
-    return f"{show}, and board.json has another board: {remedy}"
+    return f"the photographs show a {words}, and board.json has another board: {remedy}"
 
 
 def describe(solved: SolvedBoard) -> list[str]:

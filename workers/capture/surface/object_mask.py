@@ -317,9 +317,20 @@ RIM_M = 0.0005
 """Points of an open edge that lie nearer to the cut above the board than this are on it."""
 
 
-def silhouette(mesh: Mesh, camera: Camera) -> NDArray[np.bool_]:
-    """[H, W] bool: the pixels whose centres see the mesh; nothing hides it, because nothing else stands on the board."""
-    return draw_depth(mesh, camera) > 0.0
+IN_FRONT_M = 0.02
+"""What is so much nearer than the object hides it: more than a surface is off."""
+IN_FRONT_PX = 5
+"""And is as wide, at least: narrower are pixels that fly between two surfaces."""
+
+
+def silhouette(mesh: Mesh, camera: Camera, depth_m: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
+    """[H, W] bool: the pixels whose centres see the mesh; nothing hides it but what a depth image shows before it."""
+    drawn = draw_depth(mesh, camera)
+    if depth_m is None:
+        return drawn > 0.0
+    near = ((depth_m > 0.0) & (depth_m < drawn - IN_FRONT_M)).astype(np.uint8)
+    hidden = cv2.morphologyEx(near, cv2.MORPH_OPEN, np.ones((IN_FRONT_PX, IN_FRONT_PX), np.uint8))
+    return (drawn > 0.0) & (hidden == 0)
 
 
 def down_to_board(mesh: Mesh, ground: Ground) -> Mesh:

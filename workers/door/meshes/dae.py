@@ -22,33 +22,36 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import UpAxis
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver, check_counts, check_nodes
-from workers.door.meshes.mesh import (
+from workers.door.meshes.posed import MOST_ABOVE, parse_tree
+from workers.door.meshes.raw import (
     DEFAULT,
     WHITE,
+    FolderResolver,
     Indices,
     MeshVisual,
     RawMesh,
+    check_counts,
     check_indices,
+    check_nodes,
     cut_faces,
     cut_strip,
     index_corners,
     make_material,
     roughness_of,
 )
-from workers.door.meshes.posed import MOST_ABOVE, parse_tree
 from workers.geometry.frames import pose, rotation_about
 
 _UP = re.compile(rb"<up_axis>\s*([XYZ])_UP")
 _AXES: Mapping[bytes, UpAxis] = {b"X": "x", b"Y": "y", b"Z": "z"}
+_READ = ("POSITION", "TEXCOORD", "NORMAL", "COLOR")
 _NO_FACES = ("lines", "linestrips")
 _NOT_SHAPE = ("instance_camera", "instance_light", "asset", "evaluate_scene", "extra")
 
 
 def find_up(head: bytes) -> UpAxis:
     """The axis that is up in a file that begins so; y where it states none, as the format has it."""
-    found = _UP.search(head)
-    return _AXES[found[1]] if found else "y"
+    stated = _UP.search(head)
+    return _AXES[stated[1]] if stated else "y"
 
 
 def named_by_dae(path: Path, data: bytes) -> list[str]:
@@ -132,7 +135,8 @@ class _File:
         if mesh is None:
             raise MeshError("format", f"{self.path} has a shape that is no mesh: export it as triangles")
         bound = {
-            one.get("symbol"): one for one in instance.iterfind("bind_material/technique_common/instance_material")
+            material.get("symbol"): material
+            for material in instance.iterfind("bind_material/technique_common/instance_material")
         }
         for primitive in mesh:
             filled = primitive.find("p") is not None or primitive.find("ph") is not None
@@ -142,8 +146,10 @@ class _File:
     def _mesh(self, primitive: Element, bound: Mapping[str | None, Element], matrix: Pose) -> Iterator[RawMesh]:
         inputs = self._inputs(primitive)
         width = 1 + max(offset for _, _, offset, _ in inputs)
-        offset, points = next((at, values) for kind, _, at, values in inputs if kind == "POSITION")
-        corners = _corners(self.path, primitive, width, offset, points[:, :3])
+        given = {kind: (at, values) for kind, _, at, values in reversed(inputs)}
+        offset, points = given["POSITION"]
+        given["POSITION"] = offset, points[:, :3]
+        corners = _corners(self.path, primitive, width, *given["POSITION"])
         if not len(corners):
             return
         symbol = primitive.get("material")
@@ -152,37 +158,39 @@ class _File:
         at = None if binding is None else binding.find(f"bind_vertex_input[@semantic='{coordinates}']")
         sets = {number: (at, values) for kind, number, at, values in inputs if kind == "TEXCOORD"}
         wanted = int("0" if at is None else at.get("input_set", "0"))
-        uv = sets.get(wanted, next(iter(sets.values()), None)) if sets else None
-        normals = next(((at, values) for kind, _, at, values in inputs if kind == "NORMAL"), None)
-        colors = next(((at, values) for kind, _, at, values in inputs if kind == "COLOR"), None)
-        used = [(offset, points[:, :3]), *(one for one in (uv, normals, colors) if one is not None)]
-        columns = corners[:, :, [at for at, _ in used]]
-        for k, (_, values) in enumerate(used):
-            check_indices(self.path, columns[..., k], len(values))
-        own, faces = index_corners(columns, [len(values) for _, values in used])
-        rows = {id(values): values[own[:, k]] for k, (_, values) in enumerate(used)}
-        flat = None if uv is None else rows[id(uv[1])][:, :2]
+        if wanted in sets:
+            given["TEXCOORD"] = sets[wanted]
+        kinds = [kind for kind in _READ if kind in given]
+        columns = corners[:, :, [given[kind][0] for kind in kinds]]
+        for k, kind in enumerate(kinds):
+            check_indices(self.path, columns[..., k], len(given[kind][1]))
+        vertices, faces = index_corners(columns, [len(given[kind][1]) for kind in kinds])
+        rows = {kind: given[kind][1][vertices[:, k]] for k, kind in enumerate(kinds)}
+        flat = rows["TEXCOORD"][:, :2] if "TEXCOORD" in rows else None
         if material.texture is not None and (flat is None or not np.isfinite(flat).all()):
             material = replace(material, texture=None)
         visual = MeshVisual(material, flat if material.texture is not None else None)
-        if colors is not None and material.texture is None:
-            visual = MeshVisual(replace(WHITE, roughness=material.roughness), None, _bytes(rows[id(colors[1])]))
-        shaded = None if normals is None else rows[id(normals[1])][:, :3]
-        yield RawMesh(rows[id(used[0][1])], faces, shaded, visual, matrix)
+        if "COLOR" in rows and material.texture is None:
+            visual = MeshVisual(replace(WHITE, roughness=material.roughness), None, _bytes(rows["COLOR"]))
+        shaded = rows["NORMAL"][:, :3] if "NORMAL" in rows else None
+        yield RawMesh(rows["POSITION"], faces, shaded, visual, matrix)
 
     def _inputs(self, primitive: Element) -> list[tuple[str, int, int, Array]]:
         """(what, number of its set, place in a corner, values [N, stride]) of each array that a primitive reads."""
-        found = []
-        for one in primitive.iterfind("input"):
-            offset, number, source = int(one.get("offset", "0")), int(one.get("set", "0")), self.find(one.get("source"))
+        inputs = []
+        for item in primitive.iterfind("input"):
+            offset, number, source = (
+                int(item.get("offset", "0")),
+                int(item.get("set", "0")),
+                self.find(item.get("source")),
+            )
             if offset < 0:
                 raise ValueError(f"an input at {offset}")
             if source.tag == "vertices":
-                found += [(str(inner.get("semantic")), number, offset, inner) for inner in source.iterfind("input")]
+                inputs += [(str(inner.get("semantic")), number, offset, inner) for inner in source.iterfind("input")]
             else:
-                found.append((str(one.get("semantic")), number, offset, one))
-        read = ("POSITION", "NORMAL", "TEXCOORD", "COLOR")
-        return [(kind, number, at, self._values(one)) for kind, number, at, one in found if kind in read]
+                inputs.append((str(item.get("semantic")), number, offset, item))
+        return [(kind, number, at, self._values(item)) for kind, number, at, item in inputs if kind in _READ]
 
     def _values(self, given: Element) -> Array:
         source = self.find(given.get("source"))
@@ -265,13 +273,13 @@ class _Effect:
 
     def color(self, name: str) -> Array | None:
         """A property's colour [4]."""
-        found = self._value(name, "color", "float3", "float4")
-        return None if found is None else np.append(_floats(found.text)[:4], np.ones(4))[:4]
+        value = self._value(name, "color", "float3", "float4")
+        return None if value is None else np.append(_floats(value.text)[:4], np.ones(4))[:4]
 
     def number(self, name: str) -> float | None:
         """A property's number."""
-        found = self._value(name, "float")
-        return None if found is None else float(found.text or "")
+        value = self._value(name, "float")
+        return None if value is None else float(value.text or "")
 
     def has_picture(self, name: str) -> bool:
         """Whether a property has a picture."""
@@ -345,10 +353,10 @@ def _bytes(colors: Array) -> NDArray[np.uint8]:
 
 def _image_name(image: Element) -> str | None:
     """The name of a picture's file: of version 1.4 the text, of 1.5 the element in it."""
-    found = next((one for one in image.iter() if one.tag in ("init_from", "ref") and (one.text or "").strip()), None)
-    if found is None:
+    named = next((e for e in image.iter() if e.tag in ("init_from", "ref") and (e.text or "").strip()), None)
+    if named is None:
         return None
-    return unquote(re.sub(r"^file:/*(?=\w:|/)", "", (found.text or "").strip()).removeprefix("file:"))
+    return unquote(re.sub(r"^file:/*(?=\w:|/)", "", (named.text or "").strip()).removeprefix("file:"))
 
 
 def _corners(path: Path, primitive: Element, width: int, offset: int, points: Array) -> Indices:

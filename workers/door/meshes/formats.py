@@ -22,22 +22,23 @@ from schemas.errors import MeshError, VersoError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
 from workers.door import opening
-from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.dae import named_by_dae, read_dae
 from workers.door.meshes.gltf import named_by_gltf, read_gltf
-from workers.door.meshes.mesh import (
-    DEFAULT,
-    WHITE,
-    LoadedMesh,
-    MeshVisual,
-    RawMesh,
-    clean_shape,
-    cut_faces,
-    place_mesh,
-)
+from workers.door.meshes.mesh import LoadedMesh, clean_shape, place_mesh
 from workers.door.meshes.mjcf import count_msh, read_msh
 from workers.door.meshes.obj import count_obj, named_by_mtl, named_by_obj, read_obj
 from workers.door.meshes.ply import count_ply, decode_head, named_by_ply, read_ply
+from workers.door.meshes.raw import (
+    DEFAULT,
+    WHITE,
+    Budget,
+    FolderResolver,
+    MeshVisual,
+    RawMesh,
+    check_counts,
+    check_nodes,
+    cut_faces,
+)
 from workers.door.opening import as_utf8, describe_error
 
 _OFF = re.compile(r"\s*(ST)?(C)?(N)?(4)?(n)?OFF(?!\s+BINARY)")
@@ -56,17 +57,17 @@ def read_off(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     lines = [line.split() for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
     vertices, faces = int(lines[0][0]), int(lines[0][1])
     rows = np.array(lines[1 : 1 + vertices], dtype=np.float64).reshape(vertices, -1)
-    told = lines[1 + vertices : 1 + vertices + faces]
-    counts = np.array([int(line[0]) for line in told])
-    corners = np.array([word for line in told for word in line[1 : 1 + int(line[0])]], dtype=np.int64)
-    if len(told) < faces or len(corners) != counts.sum():
-        raise ValueError(f"{len(told)} of {faces} faces")
+    listed = lines[1 + vertices : 1 + vertices + faces]
+    counts = np.array([int(line[0]) for line in listed])
+    corners = np.array([word for line in listed for word in line[1 : 1 + int(line[0])]], dtype=np.int64)
+    if len(listed) < faces or len(corners) != counts.sum():
+        raise ValueError(f"{len(listed)} of {faces} faces")
     places, face = cut_faces(path, corners, counts, rows[:, :3])
     first = 6 if head is not None and head[3] else 3
     colors = _off_colors(lines[1 : 1 + vertices], first) if head is not None and head[2] else None
-    shown = None if colors is not None else _off_colors([line[int(line[0]) :] for line in told], 1)
+    shown = None if colors is not None else _off_colors([line[int(line[0]) :] for line in listed], 1)
     normals = rows[:, 3:6] if first == 6 else None
-    if any(len(line) == 2 + int(line[0]) for line in told):
+    if any(len(line) == 2 + int(line[0]) for line in listed):
         resolver.notes.append("not drawn: colours of a map by their numbers")
     visual = MeshVisual(DEFAULT if colors is None and shown is None else WHITE, None, colors)
     visual = visual if shown is None else replace(visual, face_colors=shown[face])

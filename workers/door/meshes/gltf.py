@@ -22,9 +22,18 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
-from workers.door.meshes.caps import LONGEST_NAME, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.gltf_materials import Materials, image_of, read_references
-from workers.door.meshes.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, cut_strip
+from workers.door.meshes.raw import (
+    DEFAULT,
+    LONGEST_NAME,
+    WHITE,
+    FolderResolver,
+    MeshVisual,
+    RawMesh,
+    check_counts,
+    check_nodes,
+    cut_strip,
+)
 from workers.door.opening import split_glb
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import rotation_from_quaternion
@@ -253,22 +262,22 @@ class _File:
     def _accessor(self, number: int, width: int | None) -> NDArray:
         """An accessor [count, width]: float64, integers that are not normalised as they are. Sparse values are put in."""
         accessor = self.tree["accessors"][number]
-        count, component, own = int(accessor["count"]), accessor["componentType"], _WIDTHS[accessor["type"]]
-        if number < 0 or own != (width or own) or count < 1:
+        count, component, size = int(accessor["count"]), accessor["componentType"], _WIDTHS[accessor["type"]]
+        if number < 0 or size != (width or size) or count < 1:
             raise ValueError(f"an accessor of {count} {accessor['type']}")
         if "bufferView" in accessor:
             stride = int(self.tree["bufferViews"][accessor["bufferView"]].get("byteStride", 0))
-            values = self._elements(accessor, component, own, count, stride)
+            values = self._elements(accessor, component, size, count, stride)
         elif "sparse" in accessor:
             if count > max(self.resolver.limits.max_vertices, self.resolver.limits.max_faces):
                 raise ValueError(f"a sparse accessor of {count} elements")
-            values = np.zeros((count, own), _TYPES[component])
+            values = np.zeros((count, size), _TYPES[component])
         else:
             raise ValueError("an accessor without a view")
         if (sparse := accessor.get("sparse")) is not None:
             few, values = int(sparse["count"]), values.copy()
             at = self._elements(sparse["indices"], sparse["indices"]["componentType"], 1, few, 0)[:, 0].astype(np.int64)
-            values[at] = self._elements(sparse["values"], component, own, few, 0)
+            values[at] = self._elements(sparse["values"], component, size, few, 0)
         if accessor.get("normalized", False) and values.dtype.kind in "iu":
             return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
         return values if width == 1 else values.astype(np.float64)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver
-from workers.door.meshes.mesh import MIN_TINT, MeshVisual, make_material
+from workers.door.meshes.raw import MIN_TINT, FolderResolver, MeshVisual, make_material
 from workers.geometry.colour import encode_srgb
 
 Tree = dict[str, Any]
@@ -117,9 +116,9 @@ class Materials:
         """Linear colour [4], metalness and roughness; a metal where nothing is diffuse and much is specular."""
         diffuse, specular = _factor(gloss.get("diffuseFactor"), 4), _factor(gloss.get("specularFactor"), 3)
         shine, reference = float(gloss.get("glossinessFactor", 1.0)), gloss.get("specularGlossinessTexture")
-        found = None if reference is None else self._picture(reference)
-        if found is not None:
-            mean = found.reshape(-1, found.shape[2]).mean(axis=0) / 255.0
+        shining = None if reference is None else self._picture(reference)
+        if shining is not None:
+            mean = shining.reshape(-1, shining.shape[2]).mean(axis=0) / 255.0
             specular = specular * mean[:3] ** 2.2
             shine *= float(mean[3]) if len(mean) == 4 else 1.0
         if picture is None and diffuse[:3].max() < MIN_TINT and specular.max() > 0.3:
@@ -211,17 +210,17 @@ def color_of(material: Tree) -> Tree | None:
     """A material's reference to the picture of its colour."""
     gloss = material.get("extensions", {}).get(GLOSS)
     rough = material.get("pbrMetallicRoughness", {})
-    found = rough.get("baseColorTexture") if gloss is None else gloss.get("diffuseTexture")
-    return found if isinstance(found, dict) else None
+    reference = rough.get("baseColorTexture") if gloss is None else gloss.get("diffuseTexture")
+    return reference if isinstance(reference, dict) else None
 
 
 def read_references(material: Tree) -> Iterator[Tree]:
     """References to the pictures of a material that may be read: colour, metal and roughness, gloss, emission."""
     gloss = material.get("extensions", {}).get(GLOSS, {})
     rough = material.get("pbrMetallicRoughness", {})
-    found = (rough.get("metallicRoughnessTexture"), gloss.get("specularGlossinessTexture"))
+    others = (rough.get("metallicRoughnessTexture"), gloss.get("specularGlossinessTexture"))
     yield from (
-        item for item in (color_of(material), *found, material.get("emissiveTexture")) if isinstance(item, dict)
+        item for item in (color_of(material), *others, material.get("emissiveTexture")) if isinstance(item, dict)
     )
 
 
@@ -253,7 +252,7 @@ _PLAIN_MAPS = ("normalTexture", "occlusionTexture")
 
 def _left_out(source: Tree, emits: bool) -> list[str]:
     """What of a material is not drawn."""
-    found = [name for name in _PLAIN_MAPS if name in source]
+    names = [name for name in _PLAIN_MAPS if name in source]
     lit = max(_factor(source.get("emissiveFactor", (0.0, 0.0, 0.0)), 3)) > 0.0
-    found += ["emission"] if lit and not emits else []
-    return found + sorted(name for name in source.get("extensions", {}) if name not in (GLOSS, STRENGTH))
+    names += ["emission"] if lit and not emits else []
+    return names + sorted(name for name in source.get("extensions", {}) if name not in (GLOSS, STRENGTH))

@@ -5,11 +5,9 @@ Cuts polygons, merges points, winds faces, finds closed bodies, drops doubled an
 A mesh that cannot be used raises a MeshError that says why not.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -17,24 +15,14 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Part, Shape
+from workers.door.meshes.raw import Indices, Mask, RawMesh, check_indices
 from workers.geometry.frames import transform
 
 MERGE_RELATIVE = 1e-8
 """Vertices within this share of the bounding box's diagonal are one point, which allows for the rounding of text files."""
 THIN_RELATIVE = 1e-6
 """A closed sheet whose volume is below this share of area times diagonal is a sheet with two sides, not a solid."""
-
-MIN_TINT = 0.02
-"""Darkest base colour that multiplies a texture; below it the colour is an exporter's leftover and is ignored."""
-MIN_ALPHA = 0.01
-"""Smallest alpha that is believed; below it alpha is 1, because some exporters write opacity inverted."""
-WHITE = Material(base_color=(1.0, 1.0, 1.0, 1.0))
-DEFAULT = Material()
-"""The material of a mesh that has none; parts with it are recognised by identity."""
-
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,76 +175,6 @@ class LoadedMesh:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class MeshVisual:
-    """Material, uv [V, 2] or None, colors [V, 4] uint8 sRGB or None, face_colors [F, 4] uint8 sRGB or None."""
-
-    material: Material
-    uv: Array | None = None
-    colors: NDArray[np.uint8] | None = None
-    face_colors: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class RawMesh:
-    """Triangles as a file has them: vertices [V, 3], faces [F, 3] int64, normals [V, 3] or None.
-
-    matrix: the pose [4, 4] of the node that shows them; once placed (`place_mesh`), the identity.
-    """
-
-    vertices: NDArray
-    faces: Indices
-    normals: NDArray | None
-    visual: MeshVisual
-    matrix: Pose
-
-
-def make_material(
-    color: Array,
-    metallic: float,
-    roughness: float,
-    texture: NDArray[np.uint8] | None,
-    notes: list[str],
-    left_out: Sequence[str] = (),
-) -> Material:
-    """A material that can be drawn, from a file's colour [4] (sRGB and alpha) and numbers, which may be anything.
-
-    What was changed is noted, and what is `left_out` of it.
-    """
-    if color[3] < MIN_ALPHA:
-        color[3] = 1.0
-        notes.append("an alpha of 0 was read as 1")
-    if left_out:
-        notes.append(f"not drawn: {', '.join(left_out)}")
-    if texture is not None and color[:3].max() < MIN_TINT:
-        color[:3] = 1.0
-    red, green, blue, alpha = (float(c) for c in np.clip(np.nan_to_num(color, nan=0.7), 0.0, 1.0))
-    metallic, roughness = (float(np.clip(np.nan_to_num(value, nan=0.6), 0.0, 1.0)) for value in (metallic, roughness))
-    return Material((red, green, blue, alpha), metallic, roughness, texture)
-
-
-def roughness_of(exponent: float | None) -> float:
-    """Perceptual roughness of a Blinn-Phong exponent, None: 1.
-
-    By way of the GGX alpha (Karis, "Specular BRDF reference", 2013).
-    """
-    known = exponent if exponent is not None and np.isfinite(exponent) else 1.0
-    return float((2.0 / (max(known, 0.0) + 2.0)) ** 0.25)
-
-
-def index_corners(corners: Indices, counts: Sequence[int]) -> tuple[Indices, Indices]:
-    """(vertices [V, K], faces [T, 3] into them): one vertex for each combination that corners [T, 3, K] of triangles have.
-
-    counts [K]: how many values each of the K numbers of a corner may name.
-    """
-    flat = corners.reshape(-1, len(counts))
-    key = flat[:, 0]
-    for k in range(1, len(counts)):
-        key = np.unique(key, return_inverse=True)[1] * counts[k] + flat[:, k]
-    _, first, faces = np.unique(key, return_index=True, return_inverse=True)
-    return flat[first], faces.reshape(-1, 3)
-
-
 def transform_shape(shape: Shape, matrix: Pose) -> Shape:
     """The shape taken through an affine transform [4, 4]; a mirroring turns the faces over as well."""
     mirrored = float(np.linalg.det(matrix[:3, :3])) < 0
@@ -292,74 +210,6 @@ def place_mesh(path: Path, mesh: RawMesh) -> RawMesh:
         visual = replace(visual, colors=np.repeat(visual.face_colors, 3, axis=0), face_colors=None)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
     return RawMesh(vertices, faces, normals, visual, np.eye(4))
-
-
-def cut_polygons(points: Array) -> Indices:
-    """[F, n - 2, 3]: which corners of polygons [F, n, 3] their triangles have.
-
-    A fan where a polygon is convex, else ears (mapbox's earcut); a fan also where that finds no way, of one that meets itself.
-    """
-    count = points.shape[1]
-    fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
-    triangles = np.broadcast_to(fan, (len(points), *fan.shape)).copy()
-    if count > 3:
-        flat, convex = _flatten(points)
-        for number in np.flatnonzero(~convex):
-            ears = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat[number]), np.array([count], np.uint32))
-            if len(ears) == triangles[number].size:
-                triangles[number] = ears.reshape(-1, 3)
-    return triangles
-
-
-def cut_faces(path: Path, corners: Indices, counts: Indices, points: Array) -> tuple[Indices, Indices]:
-    """(places in `corners` [T, 3], face [T]) of the triangles of faces with `counts` [F] corners, told one after the other.
-
-    corners [C] are numbers of points [N, 3]; MeshError `index_out_of_range` where one of a face is none.
-    """
-    starts = np.cumsum(counts) - counts
-    made, owners = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
-    for size in np.unique(counts[counts > 2]).tolist():
-        which = np.flatnonzero(counts == size)
-        places = starts[which][:, None] + np.arange(size)
-        check_indices(path, corners[places], len(points))
-        triangles = cut_polygons(points[corners[places]])
-        made.append(places[np.arange(len(which))[:, None, None], triangles].reshape(-1, 3))
-        owners.append(np.repeat(which, size - 2))
-    owner = np.concatenate(owners)
-    order = np.argsort(owner, kind="stable")
-    return np.concatenate(made)[order], owner[order]
-
-
-def _flatten(corners: Array) -> tuple[Array, Mask]:
-    """[F, n, 2] polygons [F, n, 3] seen along their normals (Newell's), counter-clockwise; and which are convex."""
-    after = np.roll(corners, -1, axis=1)
-    centre = corners.mean(axis=1, keepdims=True)
-    normal = np.cross(corners - centre, after - centre).sum(axis=1)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal /= np.where(length == 0.0, 1.0, length)
-    aside = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    x = np.cross(aside, normal)
-    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
-    axes = np.stack([x, np.cross(normal, x)], axis=-1)
-    flat = (corners - centre) @ axes
-    ahead = np.roll(flat, -1, axis=1) - flat
-    behind = np.roll(ahead, 1, axis=1)
-    turn = behind[..., 0] * ahead[..., 1] - behind[..., 1] * ahead[..., 0]
-    slack = 1e-9 * length
-    return flat, (turn >= -slack).all(axis=1)
-
-
-def cut_strip(corners: NDArray[np.int64]) -> Indices:
-    """[F, 3]: the triangles of a strip of corners [F + 2]; every second one is turned."""
-    faces = np.column_stack([corners[:-2], corners[1:-1], corners[2:]])
-    faces[1::2] = faces[1::2, [1, 0, 2]]
-    return faces
-
-
-def check_indices(path: Path, faces: Indices, count: int) -> None:
-    """MeshError `index_out_of_range` where faces, of any shape, name a vertex beyond the first `count`."""
-    if faces.min() < 0 or faces.max() >= count:
-        raise MeshError("index_out_of_range", f"{path}: a face names vertex {faces.max()} of {count}")
 
 
 def check_coordinates(path: Path, vertices: Array) -> None:

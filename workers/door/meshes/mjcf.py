@@ -14,9 +14,8 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
-from workers.door.meshes.caps import FolderResolver, check_nodes
-from workers.door.meshes.mesh import DEFAULT, MeshVisual, RawMesh
 from workers.door.meshes.posed import MOST_ABOVE, Model, Source, Visual, make_body, numbers, scaled
+from workers.door.meshes.raw import DEFAULT, FolderResolver, MeshVisual, RawMesh, check_nodes
 from workers.geometry.frames import half_turn, pose, rotation_about, rotation_between, rotation_from_quaternion
 
 Attributes = Mapping[str, str]
@@ -57,17 +56,17 @@ def read_mjcf(source: Source) -> Model:
             raise MeshError(
                 "format", f"{path} has <{tag}>, which is not read: write the whole model with MuJoCo's mj_saveLastXML"
             )
-    compiler = {name: value for one in root.iterfind("compiler") for name, value in one.attrib.items()}
+    compiler = {name: value for item in root.iterfind("compiler") for name, value in item.attrib.items()}
     defaults = {"": dict[str, Attributes]()}
     for top in root.iterfind("default"):
         _add_defaults(top, defaults[""], defaults, 0)
         defaults[""] = defaults.get(top.get("class", "main"), defaults[""])
     document = _Document(path, root, compiler, defaults)
     meshes = {_name_of(mesh): mesh for mesh in root.iterfind("asset/mesh")}
-    seen = [one for world in root.iterfind("worldbody") for one in _seen(document, world, np.eye(4), "", 0)]
+    seen = [item for world in root.iterfind("worldbody") for item in _seen(document, world, np.eye(4), "", 0)]
     visuals = (_visual(document, geom, T, meshes) for geom, T in seen)
     names = (_file_of(document, mesh, "meshdir") for mesh in meshes.values() if mesh.get("file"))
-    return Model(tuple(one for one in visuals if one is not None), tuple(dict.fromkeys(names)))
+    return Model(tuple(item for item in visuals if item is not None), tuple(dict.fromkeys(names)))
 
 
 def _include(source: Source, element: Node, depth: int) -> None:
@@ -89,7 +88,7 @@ def _include(source: Source, element: Node, depth: int) -> None:
 
 
 def _add_defaults(
-    element: Node, above: Mapping[str, Attributes], found: dict[str, dict[str, Attributes]], depth: int
+    element: Node, above: Mapping[str, Attributes], defaults: dict[str, dict[str, Attributes]], depth: int
 ) -> None:
     if depth > MOST_ABOVE:
         return
@@ -97,9 +96,9 @@ def _add_defaults(
     for child in element:
         if child.tag != "default":
             mine[child.tag] = {**mine.get(child.tag, {}), **child.attrib}
-    found[element.get("class", "main")] = mine
+    defaults[element.get("class", "main")] = mine
     for child in element.iterfind("default"):
-        _add_defaults(child, mine, found, depth + 1)
+        _add_defaults(child, mine, defaults, depth + 1)
 
 
 def _name_of(asset: Node) -> str:
@@ -156,9 +155,9 @@ def _visual(document: _Document, geom: Attributes, T: Pose, meshes: Mapping[str,
 def _look(document: _Document, geom: Attributes) -> tuple[Array | None, str | None]:
     """The colour and the picture of a geom: those of its material, or its own colour."""
     material = _asset(document, "material", geom.get("material"))
-    own = numbers(document.path, geom["rgba"], 4) if "rgba" in geom else None
+    rgba = numbers(document.path, geom["rgba"], 4) if "rgba" in geom else None
     if material is None:
-        return (None if own is None else np.clip(own, 0.0, 1.0)), None
+        return (None if rgba is None else np.clip(rgba, 0.0, 1.0)), None
     given = document.attributes(material, "")
     layers = [
         layer.get("texture") for layer in material.iterfind("layer") if layer.get("role", "rgb") in ("rgb", "rgba")
@@ -166,14 +165,14 @@ def _look(document: _Document, geom: Attributes) -> tuple[Array | None, str | No
     texture = _asset(document, "texture", given.get("texture") or next(iter(layers), None))
     # A picture of another type than 2d is put on by direction, and not by the mesh's coordinates.
     flat = texture is not None and texture.get("type", "cube") == "2d" and texture.get("file")
-    colour = np.clip(own if own is not None else document.numbers(given, "rgba", "1 1 1 1"), 0.0, 1.0)
+    colour = np.clip(rgba if rgba is not None else document.numbers(given, "rgba", "1 1 1 1"), 0.0, 1.0)
     return colour, _file_of(document, texture, "texturedir") if texture is not None and flat else None
 
 
 def _asset(document: _Document, tag: str, name: str | None) -> Node | None:
     if name is None:
         return None
-    return next((one for one in document.root.iterfind(f"asset/{tag}") if _name_of(one) == name), None)
+    return next((asset for asset in document.root.iterfind(f"asset/{tag}") if _name_of(asset) == name), None)
 
 
 def _ends(document: _Document, given: Attributes) -> Array | None:

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver
-from workers.door.meshes.mesh import (
+from workers.door.meshes.raw import (
     DEFAULT,
     WHITE,
+    FolderResolver,
     Indices,
     MeshVisual,
     RawMesh,
@@ -258,16 +258,16 @@ def _mesh(
                 "index_out_of_range", f"{path}: a face names number {corners[..., kind].max() + 1} of {len(listed)}"
             )
     shown = [0, *([1] if textured else []), *([2] if shaded else [])]
-    own, faces = index_corners(corners[..., shown], [len(values[k]) for k in shown])
-    coordinates = uv[own[:, 1]] if textured else None
+    vertices, faces = index_corners(corners[..., shown], [len(values[k]) for k in shown])
+    coordinates = uv[vertices[:, 1]] if textured else None
     if coordinates is not None and not np.isfinite(coordinates).all():
         coordinates = None
     if material is not None and coordinates is None:
         material = replace(material, texture=None)
     visual = MeshVisual(material or DEFAULT, coordinates)
     if colors is not None and visual.material.texture is None:
-        visual = MeshVisual(WHITE, coordinates, colors[own[:, 0]])
-    return RawMesh(points[own[:, 0]], faces, normals[own[:, -1]] if shaded else None, visual, np.eye(4))
+        visual = MeshVisual(WHITE, coordinates, colors[vertices[:, 0]])
+    return RawMesh(points[vertices[:, 0]], faces, normals[vertices[:, -1]] if shaded else None, visual, np.eye(4))
 
 
 # ---------------------------------------------------------------------------------------------- materials
@@ -296,15 +296,15 @@ def _read_libraries(path: Path, lines: Iterable[str], resolver: FolderResolver) 
 
 def _read_mtl(text: str, resolver: FolderResolver) -> dict[str, Material]:
     """The materials of a file by name; the last statement of a kind counts."""
-    found: dict[str, dict[str, str]] = {}
+    materials: dict[str, dict[str, str]] = {}
     statements: dict[str, str] = {}
     for line in text.split("\n"):
         word, _, rest = _partition(line)
         if word.lower() == "newmtl":
-            statements = found.setdefault(rest, {})
+            statements = materials.setdefault(rest, {})
         elif word and not word.startswith("#"):
             statements[word.lower()] = rest
-    return {name: _material(stated, resolver) for name, stated in found.items()}
+    return {name: _material(stated, resolver) for name, stated in materials.items()}
 
 
 def _material(stated: dict[str, str], resolver: FolderResolver) -> Material:
@@ -352,7 +352,7 @@ _PLAIN_OPTIONS = {"-s": {1.0}, "-o": {0.0}, "-t": {0.0}}
 
 def _picture_name(words: str) -> tuple[str, list[str]]:
     """The name in a statement such as `-s 2 2 1 -clamp on wood.png`, and the options before it that would change the look."""
-    rest, told = words.strip(), []
+    rest, options = words.strip(), []
     while rest.startswith("-") and " " in rest:
         option, _, rest = rest.partition(" ")
         values: list[str] = []
@@ -365,9 +365,9 @@ def _picture_name(words: str) -> tuple[str, list[str]]:
             rest = after
         numbers = {float(value) for value in values if _numbers(value) is not None}
         if option.lower() != "-clamp" and numbers != _PLAIN_OPTIONS.get(option.lower(), set()):
-            told.append(" ".join([option, *values]))
+            options.append(" ".join([option, *values]))
         rest = rest.lstrip()
-    return rest.strip().strip('"'), told
+    return rest.strip().strip('"'), options
 
 
 def _numbers(words: str | None) -> Array | None:

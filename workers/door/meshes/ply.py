@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver
-from workers.door.meshes.mesh import (
+from workers.door.meshes.raw import (
     DEFAULT,
     WHITE,
+    FolderResolver,
     Indices,
     MeshVisual,
     RawMesh,
@@ -297,7 +297,7 @@ def _corner_coordinates(lists: NDArray, face: Indices, place: Indices) -> Array:
 def _colors(element: Element) -> NDArray[np.uint8] | None:
     """[N, 4] uint8 sRGB of an element's own colours: whole numbers up to 255, or floats in [0, 1]."""
     names = {name for name, column in element.items() if column.ndim == 1 and column.dtype != object}
-    rgb = next((found for found in _COLORS if set(found) <= names), None)
+    rgb = next((kinds for kinds in _COLORS if set(kinds) <= names), None)
     if rgb is None:
         return None
     columns = [element[name] for name in (*rgb, *(["alpha"] if "alpha" in names else []))]

@@ -15,8 +15,7 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
-from workers.door.meshes.caps import LONGEST_NAME, FolderResolver, check_nodes, find_inside
-from workers.door.meshes.mesh import DEFAULT
+from workers.door.meshes.raw import DEFAULT, LONGEST_NAME, FolderResolver, check_nodes, find_inside
 from workers.door.opening import as_utf8, read_bytes
 from workers.geometry.frames import pose, rotation_about
 

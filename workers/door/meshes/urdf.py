@@ -14,9 +14,8 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.door.meshes.caps import check_counts, check_nodes, find_inside
 from workers.door.meshes.formats import load_shape, with_jpeg
-from workers.door.meshes.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
+from workers.door.meshes.mesh import LoadedMesh, check_coordinates, transform_shape
 from workers.door.meshes.mjcf import read_mjcf
 from workers.door.meshes.posed import (
     MAX_XML_BYTES,
@@ -29,6 +28,7 @@ from workers.door.meshes.posed import (
     turned,
     wrap_body,
 )
+from workers.door.meshes.raw import DEFAULT, check_counts, check_nodes, find_inside
 from workers.door.opening import as_utf8, read_bytes
 
 
@@ -84,8 +84,8 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
 
 def _dressed(part: Part, visual: Visual, source: Source) -> Part:
     """The part in the colour and picture that the file gives it."""
-    own = part.material is not DEFAULT or part.colors is not None
-    if (visual.colour is None and visual.texture is None) or (own and not visual.dresses):
+    has_look = part.material is not DEFAULT or part.colors is not None
+    if (visual.colour is None and visual.texture is None) or (has_look and not visual.dresses):
         return part
     texture = None if visual.texture is None else source.picture(visual.texture)
     if texture is not None and part.uv is None:
@@ -204,7 +204,7 @@ def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | N
     name = (script.findtext("name") or "").strip()
     places = [place for uri in script.iterfind("uri") for place in source.places(uri.text or "")]
     listed = [file for place in places for file in (sorted(place.glob("*.material")) if place.is_dir() else [place])]
-    for file in dict.fromkeys(path for one in listed if (path := find_inside(source.root, one)) is not None):
+    for file in dict.fromkeys(path for place in listed if (path := find_inside(source.root, place)) is not None):
         text = _COMMENT.sub("", as_utf8(read_bytes(file, MAX_XML_BYTES, MeshError))[0].decode("utf-8", "replace"))
         head = re.search(
             rf"^\s*material\s+\"?{re.escape(name)}\"?\s*(?::[^{{]*)?{{(?P<rest>.*)", text, re.MULTILINE | re.DOTALL
@@ -227,17 +227,17 @@ def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | N
 
 def _sdf_pose(path: Path, element: ElementTree.Element) -> Pose:
     """[4, 4] of a <pose>: a shift, then roll, pitch and yaw about fixed axes."""
-    found = element.find("pose")
-    if found is None or not (found.text or "").strip():
+    stated = element.find("pose")
+    if stated is None or not (stated.text or "").strip():
         return np.eye(4)
     if (
-        found.get("relative_to", "__model__") not in ("", "__model__")
-        or found.get("rotation_format", "euler_rpy") != "euler_rpy"
+        stated.get("relative_to", "__model__") not in ("", "__model__")
+        or stated.get("rotation_format", "euler_rpy") != "euler_rpy"
     ):
         raise MeshError("format", f"{path} has poses relative to other frames, or as quaternions, which are not read")
-    values = (found.text or "").split()
+    values = (stated.text or "").split()
     return turned(
-        path, " ".join(values[:3]), " ".join(values[3:]), np.pi / 180 if found.get("degrees") == "true" else 1.0
+        path, " ".join(values[:3]), " ".join(values[3:]), np.pi / 180 if stated.get("degrees") == "true" else 1.0
     )
 
 

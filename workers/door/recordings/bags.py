@@ -322,7 +322,7 @@ def _check(path: Path, contents: _Contents) -> None:
     for name, stream in (("colour", contents.color), ("depth", contents.depth)):
         if not stream.topic:
             with _opened(path) as readers:
-                kinds = {one.topic: one.msgtype for _, reader in readers for one in reader.connections}
+                kinds = {each.topic: each.msgtype for _, reader in readers for each in reader.connections}
             packed = any("CompressedImage" in kind for kind in kinds.values())
             why = "its images are compressed: convert them (rosrun image_transport republish compressed raw)"
             topics = ", ".join(sorted(topic for topic, kind in kinds.items() if "Image" in kind))
@@ -367,8 +367,8 @@ def _lens(path: Path, info: _Info) -> Array:
     """[8]; raises CaptureError for a lens of another kind whose numbers are not all 0."""
     model = info.model.lower().removeprefix("modified ").removeprefix("inverse ")
     if not np.isfinite(info.D).all() or (np.any(info.D) and (model not in FORWARD or len(info.D) > 8)):
-        told = f"the lens {info.model!r:.60} with {info.D[:16].tolist()} is not read: export frames"
-        raise CaptureError("calibration", f"{path}: {told}")
+        message = f"the lens {info.model!r:.60} with {info.D[:16].tolist()} is not read: export frames"
+        raise CaptureError("calibration", f"{path}: {message}")
     return frozen_array(np.append(info.D[:8], np.zeros(8))[:8])
 
 

@@ -185,12 +185,14 @@ BOP_FILE = "scene_camera.json"
 def _open_bop(path: Path) -> Recorded:
     described = path / BOP_FILE
     tree, frames = _tree_of(described), []
-    if not isinstance(tree, dict) or not all(isinstance(one, dict) and name.isdecimal() for name, one in tree.items()):
+    if not isinstance(tree, dict) or not all(
+        isinstance(entry, dict) and name.isdecimal() for name, entry in tree.items()
+    ):
         raise _wrong(described, "is no list of cameras by the number of an image")
-    for name, one in sorted(tree.items(), key=lambda item: int(item[0])):
+    for name, entry in sorted(tree.items(), key=lambda item: int(item[0])):
         stamp = int(name) * NO_TIME_US
         color, z = _bop_file(path, ("rgb", "gray"), int(name)), _bop_file(path, ("depth",), int(name))
-        K, scale = one.get("cam_K"), one.get("depth_scale")
+        K, scale = entry.get("cam_K"), entry.get("depth_scale")
         if not isinstance(K, list) or len(K) != 9:
             raise _wrong(described, f"{name}: cam_K must be nine numbers")
         if not isinstance(scale, int | float) or not 0 < scale < 1e6:
@@ -198,7 +200,7 @@ def _open_bop(path: Path) -> Recorded:
         k = read_intrinsics(described, _size_of(color), (K[0], K[4], K[2], K[5]), 0.0)
         frames.append(_color(stamp, partial(_bytes_of, color), k))
         frames.append(_depth(stamp, partial(_bytes_of, z), k, 1000.0 / scale))
-    finest = max((1000.0 / one["depth_scale"] for one in tree.values()), default=UNITS_PER_M)
+    finest = max((1000.0 / entry["depth_scale"] for entry in tree.values()), default=UNITS_PER_M)
     return _recorded(path, frames, (), min(max(finest, UNITS_PER_M), 10_000.0))
 
 
@@ -263,14 +265,14 @@ def _open_record3d(path: Path) -> Recorded:
     tree = _tree_of(path, _member(path, "metadata"))
     with zipfile.ZipFile(path) as archive:
         names = set(archive.namelist())
-    numbers = sorted(int(found[1]) for name in names if (found := re.fullmatch(r"rgbd/([0-9]{1,9})\.jpg", name)))
+    numbers = sorted(int(match[1]) for name in names if (match := re.fullmatch(r"rgbd/([0-9]{1,9})\.jpg", name)))
     with as_refusal(f"{path}: its metadata", CaptureError):
         size, depth_size = ((int(tree[w]), int(tree[h])) for w, h in (("w", "h"), ("dw", "dh")))
         K = tree.get("K") or [0] * 9
-        own = tree.get("perFrameIntrinsicCoeffs") or []
+        of_frames = tree.get("perFrameIntrinsicCoeffs") or []
         times = tree.get("frameTimestamps") or [n / float(tree.get("fps", 30)) for n in range(len(numbers))]
         stamps = [round(float(times[n]) * 1e6) for n in numbers]
-        cameras = [own[n] if n < len(own) else (K[0], K[4], K[6], K[7]) for n in numbers]
+        cameras = [of_frames[n] if n < len(of_frames) else (K[0], K[4], K[6], K[7]) for n in numbers]
     if not all(0 < side <= 20_000 for side in (*size, *depth_size)):
         raise _wrong(path, f"images of {size} and depth of {depth_size} cannot be")
     frames = []
@@ -342,10 +344,10 @@ def _open_arkit(path: Path) -> Recorded:
 
 def _milliseconds(path: Path) -> int:
     """Of the name VIDEO_SECONDS. Raises CaptureError."""
-    found = re.fullmatch(r"[0-9]+_([0-9]{1,9}(?:\.[0-9]{1,6})?)", path.stem)
-    if not found:
+    match = re.fullmatch(r"[0-9]+_([0-9]{1,9}(?:\.[0-9]{1,6})?)", path.stem)
+    if not match:
         raise _wrong(path, "must be named VIDEO_SECONDS, such as 41069021_305.377.png")
-    return round(float(found[1]) * 1000)
+    return round(float(match[1]) * 1000)
 
 
 # ---------------------------------------------------------------------------------------------- all formats

@@ -50,9 +50,9 @@ def head_size(data: bytes) -> Size:
 
 
 def _check_size(data: bytes, size: Size) -> None:
-    found = head_size(data)
-    if found != size:
-        raise PictureError(f"is {found[0]} x {found[1]}, and its camera has {size[0]} x {size[1]}")
+    stated = head_size(data)
+    if stated != size:
+        raise PictureError(f"is {stated[0]} x {stated[1]}, and its camera has {size[0]} x {size[1]}")
 
 
 def decode_rgb(data: bytes, size: Size) -> NDArray[np.uint8]:
@@ -131,16 +131,16 @@ def _load_exr(data: bytes, size: Size) -> NDArray:
     try:
         head = OpenEXR.File(io.BytesIO(data), header_only=True).header()
         low, high = head["dataWindow"]
-        found = int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
+        stated = int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
         names = [channel.name for channel in head["channels"]]
-        if found == size and (len(names) == 1 or "Z" in names):
+        if stated == size and (len(names) == 1 or "Z" in names):
             channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
             stored = np.asarray(channels[names[0] if len(names) == 1 else "Z"].pixels)
             return stored.astype(np.float32) if stored.dtype == np.float16 else stored
     except (RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise PictureError("is OpenEXR, and cut or altered: copy it again") from error
-    if found != size:
-        raise PictureError(f"is {found[0]} x {found[1]}, and its camera has {size[0]} x {size[1]}")
+    if stated != size:
+        raise PictureError(f"is {stated[0]} x {stated[1]}, and its camera has {size[0]} x {size[1]}")
     raise PictureError(f"has the channels {', '.join(names)}: depth is one channel, or the one named Z")
 
 

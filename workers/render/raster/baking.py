@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of
@@ -239,12 +238,15 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     columns, rows = (low[axis] + (np.arange(MAP_PX) + 0.5) * step[axis] for axis in (0, 1))
     u, v, z = _place_level(light.unit_from_world, columns, rows, float(low[2]), np.float32(len(depth)))
     nearest = np.asarray(cv2.remap(depth, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0), np.float32)
-    away_m, dark = _compare_depth(nearest, z, np.float32(light.bounds[1, 2] - light.bounds[0, 2]), np.float32(BIAS_M))
+    away_m = (z - nearest) * np.float32(light.bounds[1, 2] - light.bounds[0, 2])
+    dark = ((away_m > np.float32(BIAS_M)) & (nearest < 1.0)).astype(
+        np.float32
+    )  # elsewhere the level itself is nearest to it
     farthest_m = float((high[2] - low[2]) / max(float(towards[2]), LOWEST_SINE))
     wide_px = max(0.3 * LAMP_RAD * farthest_m / float(step[0]), 1.0)
     narrow = cv2.GaussianBlur(dark, (0, 0), 0.8)
     wide = cv2.GaussianBlur(dark, (0, 0), wide_px)
-    away = cv2.GaussianBlur(away_m, (0, 0), wide_px)
+    away = cv2.GaussianBlur(away_m * dark, (0, 0), wide_px)
     narrow, wide, away = (np.asarray(image, np.float32) for image in (narrow, wide, away))
     return _blend_shadows(narrow, wide, away, np.float32(farthest_m))
 
@@ -263,15 +265,6 @@ def _place_level(
             v[i, j] = np.float32(M[1, 0] * x + M[1, 1] * y + M[1, 2] * level_m + M[1, 3]) * side_px - half
             z[i, j] = np.float32(M[2, 0] * x + M[2, 1] * y + M[2, 2] * level_m + M[2, 3])
     return u, v, z
-
-
-def _compare_depth(
-    nearest: NDArray[np.float32], z: NDArray[np.float32], depth_m: np.float32, bias_m: np.float32
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(metres to what is nearest to the light, 0 where that is the level itself; 1 where it is not), both [R, C]."""
-    away = (z - nearest) * depth_m
-    dark = ((away > bias_m) & (nearest < 1.0)).astype(np.float32)
-    return away * dark, dark
 
 
 @compiled_for("f4[:,::1], f4[:,::1], f4[:,::1], f4")
@@ -293,19 +286,9 @@ def _blend_shadows(
 def triangles_of(things: Sequence[Placed]) -> Triangles:
     """The triangles of all things together."""
     vertices = [transform(thing.T_world_shape, thing.shape.vertices) for thing in things]
-    starts = np.cumsum([0, *(len(one) for one in vertices)])[:-1]
+    starts = np.cumsum([0, *(len(points) for points in vertices)])[:-1]
     faces = [thing.shape.faces + start for thing, start in zip(things, starts, strict=True)]
     return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
-
-
-def shadow_casters(things: Sequence[Placed]) -> list[Placed]:
-    """Everything but the floor."""
-    return [thing for thing in things if thing.region_id > REGION_FLOOR]
-
-
-def objects_of(things: Sequence[Placed]) -> list[Placed]:
-    """The objects that stand on the table."""
-    return [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
 
 
 def shadow_filter(light: Box) -> tuple[float, float, float]:

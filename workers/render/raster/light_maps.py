@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Pose
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FLOOR, Appearance
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Appearance
 from workers.render.raster import baking
 from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore
@@ -92,7 +92,8 @@ class LightMaps:
         program.set_maps(self._placements[id(thing)][1])
 
     def _bake(self, things: Sequence[Placed], appearance: Appearance, shadows: bool, occlusion: bool) -> Baked:
-        casters, objects = baking.shadow_casters(things), baking.objects_of(things)
+        casters = [thing for thing in things if thing.region_id > REGION_FLOOR]
+        objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
         if not casters or not appearance.lights or not (shadows or occlusion):
             return Baked()
         towards = appearance.lights[0].direction
