@@ -101,6 +101,23 @@ def fitting_m() -> float:
     return WALL_M + WALL_M * (HIGH_M - WALL_M) / (CUP_M[1] - CUP_M[0])
 
 
+@functools.cache
+def plate() -> Asset:
+    """A plate 200 mm across with a rim that rises at 20 in 51, and a foot 1 mm wider than its inner floor."""
+    outline = [[0, 0], [0.05, 0], [0.1, 0.02], [0.1, 0.024], [0.049, 0.004], [0, 0.004]]
+    return asset_of(trimesh.creation.revolve(np.array(outline), sections=48), mass_kg=0.3)
+
+
+PLATES_M = 0.004 + 0.001 * 20 / 51
+"""How far above a plate's foot the next one's stands, on the rim."""
+
+
+def plates(count: int) -> Group:
+    """Plates, each a millimetre above where it stands on the one below."""
+    table = level()
+    return together(table, [put(plate(), table, 0.001 + k * (PLATES_M + 0.001)) for k in range(count)])
+
+
 def lifted(step_m: float, bound_mm: float = 0.01) -> Measure:
     """How far the lowest corner of each is from a step above that of the one before."""
 
@@ -243,6 +260,18 @@ HOLLOWS = (
         "three tapered cups in one another",
         both(lifted(fitting_m(), 0.2), tilts(0, 0, 0, bound_deg=1.0)),
         lambda: cups(3),
+    ),
+    settles(
+        "five tapered cups in one another",
+        both(lifted(fitting_m(), 0.4), tilts(0, 0, 0, 0, 0, bound_deg=1.0)),
+        lambda: cups(5),
+        again="slow",
+    ),
+    settles(
+        "six plates on one another",
+        both(lifted(PLATES_M, 0.3), tilts(*[0] * 6, bound_deg=2.0)),
+        lambda: plates(6),
+        again="slow",
     ),
     settles("three open boxes in one another", both(lifted(0.003), tilts(0, 0, 0, bound_deg=0.1)), boxes_in_boxes),
     settles("two mugs linked by their handles", both(tilt(0.5), apart(15.0)), linked_mugs, tier="minute", again="slow"),
