@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from schemas.base import Array, Pose
 from schemas.errors import CaptureError, InputError
 from schemas.job.captures import Board, BoardFrame
-from workers.geometry.frames import pose
+from workers.geometry.frames import invert, pose, transform
 
 TOUCHING_M = 1e-5
 """Corners so near to one another are one: places in a file are rounded."""
@@ -297,3 +297,29 @@ def _instructions(board: Board, right: float, margin: float, top: float) -> list
     high = min(0.003, 0.1 * margin)
     x = right - margin + 0.35 * margin
     return [Words(x + i * 1.5 * high, top, high, line, -90) for i, line in enumerate(reversed(lines))]
+
+
+FLAT = 1e-4
+"""Points whose thickness is less than this share of their extent are a plane: a board's print is flatter than that."""
+
+
+def first_poses(points: Array, rays: Array) -> list[Pose]:
+    """T_points_cam of the one or two poses that see points [K, 3] along rays [K, 2]: a plane looks alike from both (IPPE).
+
+    Points that lie in no plane have one pose (SQPnP, Terzakis and Lourakis 2020).
+    """
+    middle = points.mean(axis=0)
+    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    flat, T_points_plane = bool(extents[2] <= FLAT * extents[0]), np.eye(4)
+    if flat and points[:, 2].any():
+        T_points_plane = pose(axes.T * np.linalg.det(axes), middle)
+    kind = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
+    return [T_points_plane @ invert(T) for T in opencv_poses(transform(invert(T_points_plane), points), rays, kind)]
+
+
+def opencv_poses(points: Array, rays: Array, kind: int) -> list[Pose]:
+    """The poses [4, 4] that take points [K, 3] to the camera that sees them along rays [K, 2], the likeliest first."""
+    count, turns, shifts, _ = cv2.solvePnPGeneric(points[:, None], rays[:, None], np.eye(3), None, flags=kind)
+    matrices = [cv2.Rodrigues(turn)[0].astype(np.float64) for turn in turns[:count]]
+    poses = [pose(R, shift.ravel().astype(np.float64)) for R, shift in zip(matrices, shifts[:count], strict=True)]
+    return [T for T in poses if np.isfinite(T).all()]

@@ -15,8 +15,16 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
-from workers.capture.board import LARGEST, PREDEFINED, Geometry, board_geometry, id_words, smallest_dictionary
-from workers.geometry.camera import first_poses, spread_evenly
+from workers.capture.board import (
+    LARGEST,
+    PREDEFINED,
+    Geometry,
+    board_geometry,
+    first_poses,
+    id_words,
+    smallest_dictionary,
+)
+from workers.geometry.camera import spread_evenly
 from workers.geometry.colour import SRGB_STEPS
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import project_points, rays_of_pixels

@@ -21,7 +21,7 @@ from tests.workers.capture.drawn import (
     observe,
     project,
 )
-from workers.capture.board import marker_corners
+from workers.capture.board import first_poses, marker_corners
 from workers.capture.poses.markers import (
     Judged,
     fit_markers,
@@ -39,7 +39,7 @@ from workers.capture.poses.observation import (
     object_patches,
 )
 from workers.capture.poses.terms import moved
-from workers.geometry.camera import first_poses, look_at
+from workers.geometry.camera import look_at
 from workers.geometry.frames import invert, transform, translation
 
 SPEC = Estimation()

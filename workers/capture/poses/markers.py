@@ -13,6 +13,7 @@ from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, DepthCorrection, Detection, ViewEstimate, ViewStatus
 from schemas.errors import CaptureError
 from schemas.job.captures import Estimation
+from workers.capture.board import first_poses
 from workers.capture.poses.corners import FLOOR_PX, CornerTerm, corner_sigma
 from workers.capture.poses.observation import (
     Corners,
@@ -26,7 +27,6 @@ from workers.capture.poses.observation import (
     pixels_of_points,
 )
 from workers.capture.poses.terms import MAD, POSE, SHARED, Problem, Shared, minimise
-from workers.geometry.camera import first_poses
 from workers.geometry.frames import angle_between, invert, pose, transform
 from workers.geometry.pixels import rays_of_pixels
 

@@ -16,13 +16,13 @@ from scipy.optimize import least_squares
 from schemas.base import Array, Pose
 from schemas.errors import CaptureError, command_line
 from schemas.job.captures import Board
-from workers.capture.board import LARGEST, PREDEFINED, id_words, open_dictionary, smallest_dictionary
+from workers.capture.board import LARGEST, PREDEFINED, id_words, open_dictionary, opencv_poses, smallest_dictionary
 from workers.capture.board_kinds import board_of_markers, recognise_board
 from workers.capture.detect import find_markers, other_dictionary, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
 from workers.capture.poses.terms import cross_matrix, moved
-from workers.geometry.camera import opencv_poses, spread_evenly
+from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import rays_of_pixels
 
