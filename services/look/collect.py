@@ -11,7 +11,7 @@ from schemas.job.assets import SplitShares
 from services.dataset.dataset import Splits, collect_ids, split_by_category, strictest
 from services.look.charts import DEPTH_M, Histogram
 from services.read.dataset_reader import StoredTables
-from services.read.query import ask, query
+from services.read.query import Question, asking, query
 
 MOST_RANGES = 256
 """Largest number of ranges that are read of a dataset that is not merged; more are sampled evenly."""
@@ -95,43 +95,39 @@ from failures group by reason, kind, stage order by scenes desc, min(scene_id)
 
 def collect(tables: StoredTables) -> Figures:
     """The figures of all rows."""
+    with asking(tables) as answer:
 
-    def rows(sql: str) -> list[dict[str, Any]]:
-        return query(tables, sql).to_pylist()
+        def rows(sql: str) -> list[dict[str, Any]]:
+            return answer(sql).read_all().to_pylist()
 
-    def histograms(column: str, low: float, high: float) -> dict[str, Histogram]:
-        return {role: _histogram(tables, column, role, Histogram(low, high)) for role in ("input", "mirror")}
+        def histograms(column: str, low: float, high: float) -> dict[str, Histogram]:
+            return {role: _histogram(answer, column, role, Histogram(low, high)) for role in ("input", "mirror")}
 
-    by_category = rows("select category, count(*) as scenes from scenes group by 1 order by 1")
-    ((instances,),) = (row.values() for row in rows(f"select count(distinct instance_id) from assets where {_OBJECTS}"))
-    ((seconds,),) = (row.values() for row in rows("select coalesce(sum(total_s), 0.0) from timings"))
-    effects, stages = _read_costs(rows)
-    return Figures(
-        tables.sampled,
-        Counter({row["category"]: row["scenes"] for row in by_category}),
-        instances,
-        **rows(_VIEWS)[0],
-        seconds=seconds,
-        visibility=histograms("visible_fraction", 0.0, 1.0),
-        inclination=histograms("degrees(inclination_rad)", -96.0, 96.0),
-        distance=_histogram(tables, "d_z_m", "input", Histogram(*DEPTH_M)),
-        effects=dict(sorted(effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0]))),
-        stages=dict(sorted(stages.items(), key=lambda item: -item[1].seconds)),
-        failures=[Failure(**row) for row in rows(_FAILURES)],
-    )
+        by_category = rows("select category, count(*) as scenes from scenes group by 1 order by 1")
+        effects, stages = _read_costs(rows)
+        return Figures(
+            tables.sampled,
+            Counter({row["category"]: row["scenes"] for row in by_category}),
+            **rows(f"select count(distinct instance_id) as instances from assets where {_OBJECTS}")[0],
+            **rows(_VIEWS)[0],
+            **rows("select coalesce(sum(total_s), 0.0) as seconds from timings")[0],
+            visibility=histograms("visible_fraction", 0.0, 1.0),
+            inclination=histograms("degrees(inclination_rad)", -96.0, 96.0),
+            distance=_histogram(answer, "d_z_m", "input", Histogram(*DEPTH_M)),
+            effects=dict(sorted(effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0]))),
+            stages=dict(sorted(stages.items(), key=lambda item: -item[1].seconds)),
+            failures=[Failure(**row) for row in rows(_FAILURES)],
+        )
 
 
 _OBJECTS = "category not in ('table', 'board')"
 """Of assets; what they stand on is not counted."""
 
 
-def _histogram(tables: StoredTables, column: str, role: str, histogram: Histogram) -> Histogram:
+def _histogram(answer: Question, column: str, role: str, histogram: Histogram) -> Histogram:
     """The histogram with a column of the views of a role, batch by batch."""
-    with ask(
-        tables, f"select {column}::double as value from views where role = '{role}' and value is not null"
-    ) as batches:
-        for batch in batches:
-            histogram = histogram.add(batch.column("value"))
+    for batch in answer(f"select {column}::double as value from views where role = '{role}' and value is not null"):
+        histogram = histogram.add(batch.column("value"))
     return histogram
 
 

@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import IO, BinaryIO, Literal, TextIO, cast
 
@@ -35,12 +35,15 @@ BATCH_ROWS = 4096
 """Rows of a batch of the answer: some megabytes of the widest table."""
 
 
+Question = Callable[[str], pa.RecordBatchReader]
+
+
 @contextmanager
-def ask(source: Store | StoredTables, sql: str) -> Iterator[pa.RecordBatchReader]:
-    """The result of one SQL query over the tables scenes, views, objects, assets, failures and timings, as it comes.
+def asking(source: Store | StoredTables) -> Iterator[Question]:
+    """What answers SQL queries over the tables scenes, views, objects, assets, failures and timings, one after the other.
 
     A finished dataset is read from its merged tables, an unfinished one through its commits, where a retry's rows replace
-    the first try's. Raises, also while the reader is read, InputError with the database's message where the SQL is wrong,
+    the first try's. Raises, also while an answer is read, InputError with the database's message where the SQL is wrong,
     OutputError where there is no dataset, CorruptError where a file is damaged.
     """
     store = source.store if isinstance(source, StoredTables) else source
@@ -49,14 +52,26 @@ def ask(source: Store | StoredTables, sql: str) -> Iterator[pa.RecordBatchReader
             _register(connection, source if isinstance(source, StoredTables) else StoredTables(source))
             connection.execute("SET enable_progress_bar = false")  # it goes to standard output, into the answer
             connection.execute("SET lock_configuration = true")
-            if not connection.extract_statements(sql):
-                raise InputError(_NO_QUESTION)
-            shown = sql.strip().rstrip("; ").lower() == "show tables"
-            relation = connection.sql(_SHOW_TABLES if shown else sql)  # `execute` would keep the whole answer
-            if relation is None:
-                raise InputError("the statement answers nothing: ask with `select`")
-            answer = relation.to_arrow_reader(BATCH_ROWS)
-        yield pa.RecordBatchReader.from_batches(answer.schema, _batches(store, answer))
+
+        def answer(sql: str) -> pa.RecordBatchReader:
+            with _explained(store):
+                if not connection.extract_statements(sql):
+                    raise InputError(_NO_QUESTION)
+                shown = sql.strip().rstrip("; ").lower() == "show tables"
+                relation = connection.sql(_SHOW_TABLES if shown else sql)  # `execute` would keep the whole answer
+                if relation is None:
+                    raise InputError("the statement answers nothing: ask with `select`")
+                rows = relation.to_arrow_reader(BATCH_ROWS)
+            return pa.RecordBatchReader.from_batches(rows.schema, _batches(store, rows))
+
+        yield answer
+
+
+@contextmanager
+def ask(source: Store | StoredTables, sql: str) -> Iterator[pa.RecordBatchReader]:
+    """The result of one SQL query as it comes, as `asking` answers it."""
+    with asking(source) as answer:
+        yield answer(sql)
 
 
 _SHOW_TABLES = (

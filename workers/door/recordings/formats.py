@@ -127,14 +127,6 @@ def _recorded(
     return Recorded(path, camera, None, *clock, units_per_m=units_per_m, **more)
 
 
-def _below(folder: Path, name: str) -> Path:
-    """The file of a name that a list in the folder gives. Raises CaptureError where it leads out of the folder."""
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise _wrong(folder, f"names the file {name!r}, which is not in it")
-    return path
-
-
 # ---------------------------------------------------------------------------------------------- TUM RGB-D
 
 TUM_UNITS_PER_M = 5000.0
@@ -173,7 +165,10 @@ def _tum_list(folder: Path, name: str) -> Iterator[tuple[int, Path]]:
         if parts and not line.lstrip().startswith("#"):
             if len(parts) != 2 or not re.fullmatch(r"[0-9]{1,12}(\.[0-9]{1,12})?", parts[0]):
                 raise _wrong(folder / name, f"the line {line[:60]!r} is not a time in seconds and a file")
-            yield round(float(parts[0]) * 1e6), _below(folder, parts[1])
+            file = folder / parts[1]
+            if not file.resolve().is_relative_to(folder.resolve()):
+                raise _wrong(folder, f"names the file {parts[1]!r}, which is not in it")
+            yield round(float(parts[0]) * 1e6), file
 
 
 # ---------------------------------------------------------------------------------------------- BOP, Open3D
@@ -186,7 +181,7 @@ def _open_bop(path: Path) -> Recorded:
     described = path / BOP_FILE
     tree, frames = _tree_of(described), []
     if not isinstance(tree, dict) or not all(
-        isinstance(entry, dict) and name.isdecimal() for name, entry in tree.items()
+        isinstance(each, dict) and name.isdecimal() for name, each in tree.items()
     ):
         raise _wrong(described, "is no list of cameras by the number of an image")
     for name, entry in sorted(tree.items(), key=lambda item: int(item[0])):
@@ -238,8 +233,7 @@ def _open3d_camera(path: Path, size: Size) -> tuple[Seen, str]:
 
 
 def _open_open3d(path: Path, units_per_m: float = UNITS_PER_M) -> Recorded:
-    folder = _open3d_folder(path)
-    assert folder is not None
+    folder = _open3d_folder(path) or path
     color, depth = (sorted(f for f in each.iterdir() if f.is_file()) for each in (folder, path / "depth"))
     if not color or [file.stem for file in color] != [file.stem for file in depth]:
         counts = f"{len(color)} images in {folder.name}/ and {len(depth)} in depth/"
