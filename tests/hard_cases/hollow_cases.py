@@ -12,7 +12,7 @@ from schemas.base import Array
 from schemas.scene.shape import Asset
 from tests.hard_cases import outside
 from tests.hard_cases.bodies import ball, built_in
-from tests.hard_cases.case import EITHER, Case, settles
+from tests.hard_cases.case import EITHER, UNDEFINED, Case, settles
 from tests.hard_cases.drops import Drop, X, level, table_of, turn
 from tests.hard_cases.groups import FREE_M, Group, heavy, in_a_bowl, in_a_tray, open_box, place, put, together
 from tests.hard_cases.measures import (
@@ -261,16 +261,20 @@ HOLLOWS = (
         both(lifted(fitting_m(), 0.2), tilts(0, 0, 0, bound_deg=1.0)),
         lambda: cups(3),
     ),
-    settles(
+    # Let go on 821 faces, one of four nudged seeds uses up what letting go may cost, and is refused by name.
+    Case(
         "five tapered cups in one another",
+        UNDEFINED,
         both(lifted(fitting_m(), 0.4), tilts(0, 0, 0, 0, 0, bound_deg=1.0)),
         lambda: cups(5),
+        tier="minute",
         again="slow",
     ),
     settles(
         "six plates on one another",
         both(lifted(PLATES_M, 0.3), tilts(*[0] * 6, bound_deg=2.0)),
         lambda: plates(6),
+        tier="minute",
         again="slow",
     ),
     settles("three open boxes in one another", both(lifted(0.003), tilts(0, 0, 0, bound_deg=0.1)), boxes_in_boxes),

@@ -129,6 +129,16 @@ def test_two_edges_across_one_another_touch_in_one_point():
         assert found.gaps == pytest.approx(gap_m, abs=1e-9)
 
 
+@pytest.mark.parametrize("gap_m", [1e-6, 0.0, -1e-6])
+def test_two_rings_that_pull_on_one_another_in_inner_corners_of_their_holes_touch_there(gap_m):
+    """Rings of eight sides, 25 mm to the inner corners, one across the other: all nearest points are at the ends of edges."""
+    ring = trimesh.creation.torus(0.03, 0.005, major_sections=8, minor_sections=4)
+    other = ring.copy().apply_transform(pose(rotation_about(X, np.pi / 2), np.array([0.05 - gap_m, 0.0, 0.0])))
+    found = touching(mesh_of(ring), mesh_of(other))
+    assert len(found.gaps) >= 2 and np.abs(found.gaps).max() <= 1e-6
+    assert (np.abs(found.normals[:, 0]) > 0.7).all()
+
+
 def test_many_contacts_are_all_found():
     """More than the sixty-four that the loops begin with."""
     feet = [box((0.01, 0.01, 0.02), (x, y, 0.01)) for x in np.arange(-5, 5) * 0.09 for y in np.arange(-5, 5) * 0.09]
