@@ -272,6 +272,13 @@ def test_a_camera_that_is_not_this_one_is_told_with_the_right_number_and_its_err
     assert 0.75 < np.sqrt(np.mean(np.square(off_mm)) / np.mean(np.square(sigma_mm))) < 1.25
 
 
+def test_a_centre_half_a_pixel_off_is_told_and_no_rolling_shutter():
+    rng = np.random.default_rng(0)
+    given = with_numbers(PINHOLE, cx=KINECT.cx - 0.5, cy=KINECT.cy - 0.5)
+    found = estimate_joint(seen_as(given, PINHOLE, hand_held(rng, 10), rng, 0.02))
+    assert "is pixel_centre right?" in found.notes[0] and not any("rows" in note for note in found.notes)
+
+
 @pytest.mark.minute
 def test_the_right_camera_is_never_blamed_nor_any_by_views_that_cannot_tell():
     for seed in range(20):

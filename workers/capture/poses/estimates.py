@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
-from workers.capture.poses.corners import Doubt, find_rolling, fit_camera
+from schemas.job.captures import Estimation
+from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, gather, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
@@ -204,12 +205,8 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     problem = measure_corners(problem, evidence.spec)
     joint = solve_jointly(problem, evidence.spec)
     pixels = np.concatenate([o.corners.pixels for o in problem.observations])
-    camera = fit_camera(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
-    doubt: Doubt | None = camera if camera is not None and camera.note else None
-    doubt = doubt or find_rolling(problem.corner_term(), joint.solution, problem.camera.intrinsics.height)
-    everyone = list(range(len(problem.index)))
-    # Poses of another camera see the object elsewhere although it rests.
-    groups = [everyone] if doubt else _groups(problem, joint, everyone)
+    doubt = find_doubt(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
+    groups = _groups(*_explained(problem, joint, doubt, evidence.spec), list(range(len(problem.index))))
     if len(groups) > 1:
         elsewhere = {number for group in groups[1:] for number in group}
         still = tuple(
@@ -218,13 +215,13 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
         )
         problem = dataclasses.replace(problem, observations=still)
         joint = solve_jointly(problem, evidence.spec)
-    if doubt is None and camera is not None and (camera.significant or evidence.spec.calibrate):
-        doubt = camera
     estimate = _result(problem, joint, doubt, evidence)
     if len(groups) > 1:
         numbers = [[problem.observations[n].number for n in group] for group in groups]
-        estimate = _mark_moved(estimate, numbers, len(_groups(problem, joint, groups[0])) == 1)
-    return dataclasses.replace(estimate, camera=camera.camera if camera is not None and camera.is_known else None)
+        estimate = _mark_moved(
+            estimate, numbers, len(_groups(*_explained(problem, joint, doubt, evidence.spec), groups[0])) == 1
+        )
+    return dataclasses.replace(estimate, camera=doubt.camera if doubt is not None and doubt.is_known else None)
 
 
 def _pose_problem(evidence: Evidence) -> Views | None:
@@ -260,7 +257,30 @@ def _tilt_misfit(seen: Observation, T: Pose) -> float:
     return float((np.minimum(np.abs(height - np.median(height)) / sigma, 5.0) ** 2).sum())
 
 
-def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
+def _explained(
+    problem: Views, joint: Joint, doubt: Doubt | None, spec: Estimation
+) -> tuple[Views, Joint, Array | None]:
+    """The problem and its solution as the explanation of the corners has them, which moves poses and depth; its covariance."""
+    if doubt is None:
+        return problem, joint, None
+    camera, fixed = problem.camera, np.ones_like(problem.fixed)
+    reread = [
+        dataclasses.replace(
+            o,
+            board_patches=doubt.reread(o.board_patches, camera),
+            object_patches=doubt.reread(o.object_patches, camera),
+        )
+        for o in problem.observations
+    ]
+    poses = np.where(problem.fixed[:, None, None], problem.poses, doubt.poses)
+    other = dataclasses.replace(problem, observations=tuple(reread), poses=poses, fixed=fixed)
+    covariance = doubt.covariance
+    if not doubt.fits:
+        covariance = covariance + doubt.motion[:, :, None] * doubt.motion[:, None]
+    return dataclasses.replace(other, fixed=problem.fixed), solve_jointly(other, spec), covariance
+
+
+def _groups(problem: Views, joint: Joint, covariance: Array | None, among: list[int]) -> list[list[int]]:
     """The views among these by where the object stands; poses that were given by hand are nobody's to doubt."""
     if problem.fixed.any():
         return [among]
@@ -268,7 +288,7 @@ def _groups(problem: Views, joint: Joint, among: list[int]) -> list[list[int]]:
     sigma_m = 0.0 if term is None else float(np.median(term.sigma_m / term.growth))
     # An object that moved pulls the poses after it: those by the board alone do not know of it.
     solution, seen = joint.by_board, [problem.observations[n] for n in among]
-    covariance = solution.of_views()
+    covariance = solution.of_views() if covariance is None else covariance
     place, turn = (np.trace(covariance[:, block, block], axis1=1, axis2=2) for block in (slice(3), slice(3, 6)))
     unsure_m = np.sqrt(place + (solution.poses[:, :3, 3] ** 2).sum(axis=1) * turn)
     groups = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])

@@ -1,0 +1,502 @@
+"""Why the corners of all views do not lie where their poses put them: the explanations, compared on the same residuals.
+
+Each explanation moves corners in the image along known directions, its fields, by numbers that all views share or that each
+view has of its own; these are fitted beside the poses. What fits is told by Schwarz's criterion (1978): twice the gain in log
+likelihood against the number of parameters. The noise is what a smooth free field in each view leaves, whatever bends the
+corners (the pure error of a test for lack of fit); an explanation that leaves much more than that does not explain.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, frozen_array
+from schemas.capture import CaptureCamera
+from schemas.job.captures import Estimation
+from workers.capture.poses.corners import CornerTerm
+from workers.capture.poses.observation import Patches
+from workers.capture.poses.terms import (
+    GROW_M,
+    GROW_PX,
+    GROWTH_M,
+    POSE,
+    SHARED,
+    SIGNIFICANT,
+    Rows,
+    Shared,
+    Solution,
+    motion_between,
+    moved,
+)
+from workers.geometry.pixels import project_points, rays_of_pixels
+
+MATERIAL = 5e-4
+"""What turns a pose by more radians, or moves it by more than this share of its distance, is told: no calibration is better."""
+ALIKE_PX = 0.01
+"""By so much markers may be displaced alike in all views, by what is printed beside them: no explanation is believed for it."""
+FITS = 1.5
+"""An explanation leaves at most so many times the noise of a corner; else something else bends them."""
+EXPLAINED = 0.2
+"""What explains a smaller share of the misfit is no finding: noise of a lens or of hidden markers is alike nearby."""
+SWEPT = 0.005
+"""Sigma of the motion of a hand while an image is read, metres and radians: 0.15 m/s and 9 degrees/s for 1/30 s. A step across
+the rows and a turn that undoes it look alike on a board: of the two, the markers tell only the sum."""
+LOOSE = 0.1
+"""Sigma of numbers of a camera, shares of its focal length, and of a stretch: wide, so that only what is not seen stays."""
+STEPS, SETTLED, REGULAR, HELD = 8, 1e-6, 1e-2, 1e12
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """How corners [K] move in the image, pixels, by each number of an explanation.
+
+    alike [K, 2, A]: by those that all views share; of_view [K, 2, N]: by those that each view has of its own; sigma [A + N]: of
+    each number beforehand.
+    """
+
+    alike: Array
+    of_view: Array
+    sigma: Array
+
+    @staticmethod
+    def of(alike: Array | None, of_view: Array | None = None, sigma: float | Array = LOOSE) -> "Fields":
+        """Of either kind or both."""
+        some = alike if alike is not None else of_view
+        assert some is not None
+        none = np.zeros((*some.shape[:2], 0))
+        alike, of_view = none if alike is None else alike, none if of_view is None else of_view
+        return Fields(alike, of_view, np.broadcast_to(sigma, alike.shape[2] + of_view.shape[2]))
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An explanation at its least cost: poses [V, 4, 4], growth of squares, its numbers, and the rows there.
+
+    covariance [V, 6, 6] of the poses and alike_covariance [A, A], where rows have unit variance.
+    """
+
+    poses: Array
+    shared: Shared
+    alike: Array
+    own: Array
+    rows: Rows
+    covariance: Array
+    alike_covariance: Array
+
+    @property
+    def cost(self) -> float:
+        """Robust sum of squares, in sigma of a corner squared."""
+        return self.rows.cost
+
+
+def fit_fields(term: CornerTerm, fields: Fields, poses: Array, shared: Shared, hold: float = 0.0) -> Fitted:
+    """The poses and numbers of least robust cost, by Gauss and Newton, each view's own unknowns eliminated in turn.
+
+    hold: by how much a pose resists, where a view's fields can do all that it does.
+    """
+    views, (A, N) = len(poses), (fields.alike.shape[2], fields.of_view.shape[2])
+    alike, own = np.zeros(A), np.zeros((views, N))
+    prior = np.concatenate([[GROW_M, GROW_PX], fields.sigma[:A]]) ** -2.0
+    own_prior = np.concatenate([np.full(POSE, hold), fields.sigma[A:] ** -2.0])
+    best: Fitted | None = None
+    for _ in range(STEPS):
+        values = term.values(poses, shared)
+        values[..., 0] += fields.alike @ alike + np.einsum("kcn,kn->kc", fields.of_view, own[term.view])
+        order = (values[..., : 1 + POSE], fields.of_view, values[..., 1 + POSE :], fields.alike)
+        rows = term.white_rows(np.concatenate(order, axis=2), SHARED + A)
+        matrix, gradient = np.diag(prior), prior * np.concatenate([[shared.growth_m, shared.growth_px], alike])
+        parts = []
+        for number in range(views):
+            J, residual, by = rows.of_view(number)
+            by = by[:, GROWTH_M:]
+            inverse = np.linalg.inv(J.T @ J + np.diag(own_prior + REGULAR))
+            g = J.T @ residual + own_prior * np.concatenate([np.zeros(POSE), own[number]])
+            cross = by.T @ J
+            matrix = matrix + by.T @ by - cross @ inverse @ cross.T
+            gradient = gradient + by.T @ residual - cross @ inverse @ g
+            parts.append((inverse, g, cross))
+        covariance = np.linalg.pinv(matrix, hermitian=True)
+        of_poses = np.stack([i[:POSE, :POSE] + (i @ c.T @ covariance @ c @ i)[:POSE, :POSE] for i, _, c in parts])
+        now = Fitted(poses, shared, alike, own, rows, of_poses, covariance[2:, 2:])
+        if best is None or now.cost < best.cost:
+            best = now
+        step = -covariance @ gradient
+        of_views = np.stack([-i @ (g + c.T @ step) for i, g, c in parts])
+        if max(np.abs(step).max(), np.abs(of_views).max()) < SETTLED:
+            break
+        poses, own, alike = moved(poses, of_views[:, :POSE]), own + of_views[:, POSE:], alike + step[2:]
+        growth = shared.growth_m + float(step[0]), shared.growth_px + float(step[1])
+        shared = dataclasses.replace(shared, growth_m=growth[0], growth_px=growth[1])
+    assert best is not None
+    return best
+
+
+# ---------------------------------------------------------------------------------------------- the explanations
+
+DEGREES = {24: 5, 18: 4, 14: 3, 0: 2}
+"""The degree of the smooth field of a view by how many markers it has at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What explanations are made of: the corners at the poses to begin with, their pixels [K, 2], and the camera."""
+
+    term: CornerTerm
+    poses: Array
+    shared: Shared
+    pixels: Array
+    camera: CaptureCamera
+
+    def rays_by(self, camera: CaptureCamera) -> Array:
+        """[K, 2]: the corners' rays as another camera has them; nan where it has none."""
+        return rays_of_pixels(self.pixels, camera.intrinsics, camera.lens)
+
+    def without_lens(self) -> "Seen":
+        """Read by a pinhole: of another lens some corners have no ray, and those near its edge hold it fast."""
+        camera = dataclasses.replace(self.camera, lens=frozen_array(np.zeros(8)))
+        return dataclasses.replace(self, term=dataclasses.replace(self.term, rays=self.rays_by(camera)), camera=camera)
+
+    def by_pose(self) -> Array:
+        """[K, 2, 6]: how corners move by a motion of their camera."""
+        return self.term.values(self.poses, self.shared)[..., 1 : 1 + POSE]
+
+    def by_board(self, motion: Array) -> Array:
+        """[K, 2, M]: how corners move where their places on the board do, by motion [K, 3, M] metres."""
+        R = self.poses[self.term.view, :3, :3]
+        return np.asarray(-self.by_pose()[..., :3] @ (R.swapaxes(1, 2) @ motion))
+
+
+CENTRE, PINHOLE, BENT, WHOLE = (2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4), tuple(range(12))
+"""Which numbers of a camera are free: of fx, fy, cx, cy, shares of its focal length, and the eight of its lens."""
+DIFFERENCE = 1e-5
+"""Step of the numbers of a camera by which rays are differentiated: rays are exact to 1e-11."""
+
+
+def _numbers(seen: Seen, chosen: tuple[int, ...]) -> Fields:
+    """By those numbers of the camera; where a step leaves a corner without a ray, it is not moved."""
+    columns = []
+    for n in chosen:
+        rays = [seen.rays_by(changed_camera(seen.camera, (n,), np.array([step]))) for step in (DIFFERENCE, -DIFFERENCE)]
+        columns.append(np.nan_to_num(-seen.term.focal * (rays[0] - rays[1]) / (2 * DIFFERENCE)))
+    return Fields.of(np.stack(columns, axis=2), sigma=np.where(np.array(chosen) < len(PINHOLE), LOOSE, 1.0))
+
+
+def changed_camera(camera: CaptureCamera, chosen: tuple[int, ...], by: Array) -> CaptureCamera:
+    """The camera after corrections of those of its numbers, as `WHOLE` has them."""
+    k, numbers = camera.intrinsics, np.zeros(len(WHOLE))
+    numbers[list(chosen)] = by
+    fx, fy, cx, cy = numbers[:4].tolist()
+    update = {"fx": k.fx * (1 + fx), "fy": k.fy * (1 + fy), "cx": k.cx + k.fx * cx, "cy": k.cy + k.fy * cy}
+    return dataclasses.replace(
+        camera, intrinsics=k.model_copy(update=update), lens=frozen_array(camera.lens + numbers[4:])
+    )
+
+
+def _focus(seen: Seen) -> Fields:
+    return Fields.of(None, (seen.term.focal * seen.term.rays)[..., None])
+
+
+def _rolling(seen: Seen) -> Fields:
+    share = seen.pixels[:, 1] / seen.camera.intrinsics.height - 0.5
+    return Fields.of(None, share[:, None, None] * seen.by_pose(), sigma=SWEPT)
+
+
+def _bent(seen: Seen) -> Fields:
+    """A plane board that sags: z by x^2, x y and y^2, each so many metres at a metre."""
+    x, y, _ = seen.term.board.T
+    up = np.zeros((len(x), 3, 3))
+    up[:, 2] = np.stack([x * x, x * y, y * y], axis=1)
+    return Fields.of(seen.by_board(up), sigma=1.0)
+
+
+def _stretched(seen: Seen) -> Fields:
+    """A print that is longer along x than along y, and leans."""
+    along = np.zeros((len(seen.pixels), 3, 2))
+    along[:, 0] = seen.term.board[:, :2]
+    return Fields.of(seen.by_board(along))
+
+
+def _smooth(seen: Seen) -> Fields:
+    """A polynomial over the image in each view, whose degree is that which its markers bear."""
+    view, rays = seen.term.view, seen.term.rays
+    views, size = len(seen.poses), (max(DEGREES.values()) + 1) * (max(DEGREES.values()) + 2) // 2
+    of_view = np.zeros((len(view), 2, 2 * size))
+    for number in range(views):
+        here = view == number
+        if not here.any():
+            continue
+        p = rays[here] - rays[here].mean(axis=0)
+        p = p / np.maximum(np.abs(p).max(axis=0), 1e-9)
+        degree = next(d for markers, d in DEGREES.items() if here.sum() >= 4 * markers)
+        powers = [p[:, 0] ** i * p[:, 1] ** (d - i) for d in range(degree + 1) for i in range(d + 1)]
+        for n, power in enumerate(powers):
+            of_view[here, 0, 2 * n] = of_view[here, 1, 2 * n + 1] = power
+    return Fields.of(None, of_view, sigma=100.0)
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """One way in which corners come to lie elsewhere: its fields, its words, and which numbers of the camera it frees."""
+
+    name: str
+    fields: Callable[[Seen], Fields]
+    words: str
+    numbers: tuple[int, ...] = ()
+
+
+CAMERA_FITS_NOT = "camera.json does not fit: the markers say {numbers}, which moves the poses by {by}. "
+TAKE = "Calibrate the camera at this size of image, or use --calibrate (estimation.calibrate), which takes what the markers say"
+LENS = "Its lens is another one: are all numbers of `distortion` there, and is it no fisheye? "
+EXPLANATIONS = (
+    Explanation("none", lambda seen: Fields.of(np.zeros((len(seen.pixels), 2, 0))), ""),
+    Explanation("centre", lambda seen: _numbers(seen, CENTRE), CAMERA_FITS_NOT + "{half}" + TAKE, CENTRE),
+    Explanation("camera", lambda seen: _numbers(seen, PINHOLE), CAMERA_FITS_NOT + TAKE, PINHOLE),
+    Explanation("lens k1", lambda seen: _numbers(seen, BENT), CAMERA_FITS_NOT + TAKE, BENT),
+    Explanation("lens", lambda seen: _numbers(seen, WHOLE), CAMERA_FITS_NOT + LENS + TAKE, WHOLE),
+    Explanation(
+        "focus",
+        _focus,
+        "the focal length changes from view to view by {spread:.1%}, which moves the poses by {by}: switch autofocus and "
+        "stabilisation off, or give each view its camera_00000.json",
+    ),
+    Explanation(
+        "rolling shutter",
+        _rolling,
+        "the corners lie as if the camera moved while the rows of an image were read, which moves the poses by {by}: "
+        "hold it still for each photograph, or use a global shutter",
+    ),
+    Explanation(
+        "bent board",
+        _bent,
+        "the board is bent by {sag:.1f} mm, which moves the poses by {by}: glue the print to a flat, stiff plate",
+    ),
+    Explanation(
+        "stretched print",
+        _stretched,
+        "the print is {stretch:.2%} longer along x than along y, which moves the poses by {by}: print without "
+        "scaling to the page, or describe the markers one by one in board.json",
+    ),
+)
+NONE_FITS = (
+    "the corners lie {off:.2f} px off, {times:.0f} times their noise, and no explanation fits (camera.json, its lens, focus, "
+    "rolling shutter, a bent or stretched print): the nearest is {name}, which leaves {left:.2f} px. Calibrate the camera at "
+    "this size of image, and look at the print"
+)
+ALIKE_VIEWS = (
+    "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is wrong: "
+    "calibrate the camera at this size of image, or take views from more sides"
+)
+HALF = "Both are half a pixel off: is pixel_centre right? "
+
+
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """What the poses may need: motion [V, 6] to the poses [V, 4, 4] that explain the corners, with its covariance [V, 6, 6].
+
+    Why, by name and in words, empty where it is too little; whether it leaves no more than the noise; the camera that explains
+    the corners, and whether it is so well known that it brings the poses nearer to the truth.
+    """
+
+    poses: Array
+    motion: Array
+    covariance: Array
+    name: str
+    note: str
+    fits: bool
+    camera: CaptureCamera
+    is_known: bool
+
+    def reread(self, patches: Patches, given: CaptureCamera) -> Patches:
+        """Patches of depth where the camera of this explanation has them."""
+        if self.camera == given or not len(patches):
+            return patches
+        pixels = project_points(patches.ray, given.intrinsics, given.lens)
+        rays = rays_of_pixels(pixels, self.camera.intrinsics, self.camera.lens)
+        seen = np.isfinite(rays).all(axis=1)
+        ray, normal, sigma_m = (
+            np.column_stack([rays, np.ones(len(rays))])[seen],
+            patches.normal[seen],
+            patches.sigma_m[seen],
+        )
+        return Patches(ray * patches.ray_z[seen, 2:], ray, normal, sigma_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """An explanation as it fits: the corners as its camera reads them, and how many numbers it took."""
+
+    explanation: Explanation
+    seen: Seen
+    fitted: Fitted
+    count: int
+
+
+ROUNDS, SAME = 5, 0.1
+"""How often the noise is measured anew about the best explanation, until it is the same to a tenth: what a smooth field leaves
+of a strong bend is no noise."""
+
+
+def find_doubt(
+    term: CornerTerm, seen: tuple[Array, CaptureCamera], fixed: NDArray[np.bool_], begun: Solution, spec: Estimation
+) -> Doubt | None:
+    """The explanation that fits the corners best, begun at their poses; None where it is that nothing is wrong.
+
+    seen: pixels [K, 2] of the corners, centres at +0.5, and camera.json's; fixed [V]: poses given by hand, which do not move.
+    With `calibrate` the camera is of this capture's own markers, and what they do not tell of it is in the covariance.
+    """
+    start = Seen(term, begun.poses, begun.shared, *seen)
+    count, about, before, variance = 2 * len(term.board), start, np.full(4, np.inf), 1.0
+    best: _Tried | None = None
+    for _ in range(ROUNDS):
+        sigma_px, left = _noise(about, spec)
+        if left is None or len(begun.poses) < 2:
+            return None
+        if np.allclose(sigma_px, before, rtol=SAME):
+            break
+        start, about = (
+            dataclasses.replace(s, term=dataclasses.replace(s.term, sigma_px=sigma_px)) for s in (start, about)
+        )
+        begin = {WHOLE: start.without_lens()} | ({best.explanation.numbers: about} if best else {})
+        tried = [_try(explanation, begin.get(explanation.numbers or None, start)) for explanation in EXPLANATIONS]
+        before, variance, usual = sigma_px, left, tried[0]
+        best = min(tried, key=lambda t: t.fitted.cost / variance + t.count * np.log(count))
+        if best is usual:
+            break
+        about = dataclasses.replace(best.seen, poses=best.fitted.poses, shared=best.fitted.shared)
+    if best is usual and spec.calibrate:
+        best = next(t for t in tried if t.explanation.numbers == WHOLE)
+        return _doubt(best, usual, start, fixed, variance, begun.poses)
+    gain = usual.fitted.cost - best.fitted.cost
+    alike = 0.25 * count * (ALIKE_PX / start.term.sigma_px[0]) ** 2  # two of a marker's eight are its place
+    wanted = EXPLAINED * usual.fitted.cost
+    if best.fitted.alike.size:
+        wanted = best.count * np.log(count) * variance * max(1.0, _scatter(best, variance)) + alike
+    return None if best is usual or gain < wanted else _doubt(best, usual, start, fixed, variance, begun.poses)
+
+
+def _noise(about: Seen, spec: Estimation) -> tuple[Array, float | None]:
+    """(sigma_px [4] of what a smooth field in each view leaves of the corners, the variance left by it); None of too few."""
+    fields, term, poses, shared = _smooth(about), about.term, about.poses, about.shared
+    for _ in range(3):
+        smooth = fit_fields(term, fields, poses, shared, HELD)
+        before, term, shared = term, term.measured(smooth.rows, spec), smooth.shared
+    columns = int((np.abs(fields.of_view).max(axis=(0, 1)) > 0).sum())
+    count = len(smooth.rows.residual)
+    free = count - columns * len(about.poses)
+    variance = smooth.cost / free if free >= count // 4 else None
+    sigma_px = before.sigma_px.copy()
+    if (most := PLACE * sigma_px[2]) < sigma_px[0]:
+        sigma_px[0], variance = most, variance and min(variance, 1.0)
+    return sigma_px, variance
+
+
+PLACE = 3.0
+"""A marker's place is at most so many times noisier than its shape, which no camera bends much."""
+CAMERAS, HALVINGS = 6, 4
+"""How often a camera is fitted anew about the one before, and how often its step is halved where it has no ray for a corner."""
+
+
+def _try(explanation: Explanation, start: Seen) -> _Tried:
+    """The explanation at its least cost; one of the camera is fitted anew about the camera that it says."""
+    seen, fields = start, explanation.fields(start)
+    fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
+    count = int(fields.alike.shape[2] + fields.of_view.shape[2] * len(seen.poses))
+    for _ in range(CAMERAS if explanation.numbers else 0):
+        before, part, rays = fitted.cost, 1.0, np.full(1, np.nan)
+        for _ in range(HALVINGS):
+            camera = changed_camera(seen.camera, explanation.numbers, part * fitted.alike)
+            rays, part = seen.rays_by(camera), 0.5 * part
+            if np.isfinite(rays).all():
+                break
+        else:
+            break
+        term = dataclasses.replace(seen.term, rays=rays)
+        seen = dataclasses.replace(seen, term=term, poses=fitted.poses, shared=fitted.shared, camera=camera)
+        fields = explanation.fields(seen)
+        fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
+        if abs(fitted.cost - before) < 1e-3 * before and part == 0.5:
+            break
+    return _Tried(explanation, seen, fitted, count)
+
+
+def _scatter(tried: _Tried, variance: float) -> float:
+    """Mean, over the views, of what their gradients by the shared numbers come to over what independent corners make them."""
+    ratios, rows = [], tried.fitted.rows
+    for number in range(len(tried.seen.poses)):
+        J, residual, by = rows.of_view(number)
+        if len(J) <= J.shape[1]:
+            continue
+        by = by[:, SHARED:]
+        by = by - J @ np.linalg.pinv(J.T @ J, hermitian=True) @ (J.T @ by)  # what no pose takes up
+        strength, directions = np.linalg.eigh(by.T @ by)
+        kept = strength > WEAK * strength[-1]
+        along = directions[:, kept].T @ (by.T @ residual)
+        ratios.append(float((along**2 / strength[kept]).mean()) / variance)
+    return float(np.mean(ratios)) if ratios else 1.0
+
+
+WEAK = 1e-3
+"""Of what one view tells of shared numbers, directions with less than this share of the strongest are left aside."""
+
+
+def _doubt(best: _Tried, usual: _Tried, start: Seen, fixed: NDArray[np.bool_], variance: float, begun: Array) -> Doubt:
+    """The best explanation, its words, and whether its camera is known; variance: of rows that have no more than noise."""
+    fitted, explanation = best.fitted, best.explanation
+    motion = np.stack([motion_between(a, b) for a, b in zip(begun, fitted.poses, strict=True)])
+    motion[fixed] = 0.0
+    noise = variance * len(fitted.rows.residual)
+    shift_m, turn = (np.linalg.norm(motion[:, part], axis=1) for part in (slice(3), slice(3, 6)))
+    unsure_m = np.sqrt(variance * np.trace(fitted.covariance[:, :3, :3], axis1=1, axis2=2))
+    off, left = (float(np.sqrt(tried.fitted.cost / noise)) for tried in (usual, best))
+    fits = left <= FITS
+    is_known = (
+        bool(explanation.numbers) and fits and best is not usual and bool(np.median(shift_m) > np.median(unsure_m))
+    )
+    material = (
+        max(float(np.median(shift_m / np.linalg.norm(begun[:, :3, 3], axis=1))), float(np.median(turn))) >= MATERIAL
+    )
+    note = ""
+    if material and fits:
+        by = f"{1000 * np.median(shift_m):.1f} mm, {np.degrees(np.median(turn)):.2f} degrees"
+        note = _words(best, start, variance, by, is_known)
+    elif material:
+        px = float(start.term.sigma_px[0])
+        note = NONE_FITS.format(off=px * off, times=off, name=explanation.name, left=px * left)
+    camera = best.seen.camera if explanation.numbers else start.camera
+    return Doubt(
+        fitted.poses, motion, max(variance, 1.0) * fitted.covariance, explanation.name, note, fits, camera, is_known
+    )
+
+
+def _words(best: _Tried, start: Seen, variance: float, by: str, is_known: bool) -> str:
+    """What an explanation that fits says; by: how far it moves the poses."""
+    fitted, numbers, words = best.fitted, best.explanation.numbers, best.explanation.words
+    if not numbers:
+        of_view = np.abs(fitted.own - np.median(fitted.own)) if fitted.own.size else np.zeros(1)
+        alike = fitted.alike if len(fitted.alike) else np.zeros(1)
+        reach_m = 0.5 * np.ptp(start.term.board, axis=0).max()
+        sag, stretch = 1000 * np.abs(alike).max() * reach_m**2, alike[0]
+        return words.format(by=by, spread=of_view.max(), sag=sag, stretch=stretch)
+    k, of = best.seen.camera.intrinsics, start.camera.intrinsics
+    change = np.array([k.fx / of.fx - 1, k.fy / of.fy - 1, (k.cx - of.cx) / of.fx, (k.cy - of.cy) / of.fy])
+    index, sigma = [n for n in numbers if n < len(PINHOLE)], np.sqrt(variance * np.diag(fitted.alike_covariance))
+    sure = np.append(np.zeros(len(PINHOLE), np.bool_), len(numbers) > len(PINHOLE))
+    sure[index] = np.abs(change[index]) > SIGNIFICANT * sigma[: len(index)]
+    sure[:2] = sure[:2].any()
+    if not (is_known and sure.any()):
+        return ALIKE_VIEWS
+    shift = np.array([k.cx - of.cx, k.cy - of.cy])
+    half = HALF if (np.abs(np.abs(shift) - 0.5) < 0.15).all() and shift.prod() > 0 else ""
+    return words.format(numbers=compare_cameras(best.seen.camera, start.camera, sure), by=by, half=half)
+
+
+def compare_cameras(camera: CaptureCamera, given: CaptureCamera, chosen: NDArray[np.bool_] | None = None) -> str:
+    """Numbers of two cameras in words, as camera.json has them with pixel_centre 0: all five, or those chosen."""
+    k, of = camera.intrinsics, given.intrinsics
+    pairs = [(k.fx, of.fx), (k.fy, of.fy), (k.cx_opencv, of.cx_opencv), (k.cy_opencv, of.cy_opencv)]
+    words = [f"{name} = {a:.1f} ({b:.1f} given)" for name, (a, b) in zip(("fx", "fy", "cx", "cy"), pairs, strict=True)]
+    words.append(f"k1 = {camera.lens[0]:.4f} ({given.lens[0]:.4f} given)")
+    return ", ".join(word for n, word in enumerate(words) if chosen is None or chosen[n])
