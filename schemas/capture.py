@@ -66,20 +66,25 @@ class RecordedFrame:
 class Recorded:
     """An opened recording of any format: what every reader of one gives.
 
-    `frames` may be called again, and gives frames of colour and depth each in the order of time. `depth` is None where depth
-    is registered to the colour camera. Time is microseconds; depth frames are `depth_delay_us` later than the colour
-    frames they belong to; `duration_us` is the last time stamp by the file's own word, None where it has none because the
-    recorder was interrupted. `told` goes into recording.json.
+    `color` is None where nothing in it says what its colour camera is, and `missing` then says so. `units_per_m` keeps the
+    steps of its depth; `with_units` opens it with others, where the format has no place for them. `frames` may be called
+    again, and gives frames of colour and depth each in the order of time. `depth` is None where depth is registered to the
+    colour camera. Time is microseconds; depth frames are `depth_delay_us` later than the colour frames they belong to;
+    `duration_us` is the last time stamp by the file's own word, None where it has none because the recorder was interrupted.
+    `told` goes into recording.json.
     """
 
     path: Path
-    color: CaptureCamera
+    color: CaptureCamera | None
     depth: DepthCamera | None
     period_us: float
     frames: Callable[[], Iterator[RecordedFrame]]
     duration_us: float | None
     depth_delay_us: float = 0.0
     told: Mapping[str, str] = field(default_factory=dict)
+    units_per_m: float = 1000.0
+    missing: str = ""
+    with_units: "Callable[[float], Recorded] | None" = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,9 +252,9 @@ class Reconstruction:
 class SynthesizedView:
     """A view from a pose that was not captured.
 
-    rgb [H, W, 3] uint8; depth_m [H, W] float64, 0 where there is nothing; mask [H, W] bool of the object; measured [H, W]
-    bool: pixels that hold a measurement and were not filled; measured_share of the filled pixels; `sources`: numbers of the
-    captured views that were merged.
+    rgb [H, W, 3] uint8; depth_m [H, W] float64, 0 where there is nothing; mask [H, W] bool of the object, also where no view
+    saw it; measured [H, W] bool: pixels that hold a measurement, which were not filled and, of the object, lie on its merged
+    surface; measured_share of those with depth or of the object; `sources`: numbers of the captured views that were merged.
     """
 
     rgb: np.ndarray

@@ -24,6 +24,7 @@ because an exception that crosses processes is rebuilt from them.
 """
 
 import difflib
+import shlex
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Literal
@@ -166,6 +167,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A question with the nearest of the known words and a space behind it; empty where none is near."""
     near = difflib.get_close_matches(word, known, n=1)
     return f"did you mean '{near[0]}'? " if near else ""
+
+
+def command_line(*words: object) -> str:
+    """A command of ours as a shell takes it, whatever its words hold."""
+    return shlex.join(["verso", *map(str, words)])
 
 
 _SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (48 * 3600.0, 3600.0, "h"), (float("inf"), 86400.0, "d"))

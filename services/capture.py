@@ -154,7 +154,9 @@ def simulate(options: argparse.Namespace) -> int:
     assert job.captures is not None
     path, begun = Path(options.out), time.perf_counter()
     from workers.assets.catalogue import open_catalogue
+    from workers.capture.folder import open_folder
     from workers.capture.make_capture import load_object
+    from workers.capture.score import describe_true_grazing
     from workers.capture.simulate.simulate import simulate_capture
     from workers.render.tiers import require_tier
     from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
@@ -172,15 +174,17 @@ def simulate(options: argparse.Namespace) -> int:
         f"{path}: {plural(views, 'view')} of {asset.instance_id} in {seconds:.1f} s; effects: {', '.join(ran) or 'none'}"
     )
     print(f"{path / 'truth'}: poses and the true mesh, which only `verso capture evaluate` reads")
+    if (note := describe_true_grazing(open_folder(path))) is not None:
+        print(f"note: {note}")
     if options.json:
         answer = {"ok": True, "out": str(path), "views": views, "category": asset.category}
-        answer |= {"instance_id": asset.instance_id, "seed": job.seed, "effects": ran, "seconds": seconds}
+        answer |= {"instance_id": asset.instance_id, "seed": job.seed, "effects": ran, "seconds": seconds, "note": note}
         print(json.dumps(answer))
     return 0
 
 
 def import_recording(options: argparse.Namespace) -> int:
-    """Reads options.recording, `out`, `frames`, `board` (a path or None), `name`, `category` and `json`. Returns 0.
+    """Reads options.recording, `out`, `frames`, `board` and `camera` (paths or None), `name`, `category`, `json`. Returns 0.
 
     Raises InputError and OutputError for what cannot be, CaptureError for a recording that cannot be used.
     """
@@ -197,11 +201,11 @@ def import_recording(options: argparse.Namespace) -> int:
     board = read_board(Path(options.board)) if options.board else Board()
     if not recording.exists():
         raise InputError(f"{recording}: no such file or folder")
-    made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
-    notes = work.describe_losses(made.losses)
+    made = work.import_recording(recording, _make_empty(out), about, board, options.frames, options.camera)
     views = f"{plural(len(made.views), 'view')} of {plural(made.frames, 'frame')}"
-    print(f"{out}: {views}, depth registered by the recording's own calibration")
-    print("\n".join(f"  {note}" for note in notes), end="\n" if notes else "")
+    print(f"{out}: {views}, depth registered by {made.calibration}")
+    for note in made.notes:
+        print(f"  {note}")
     if not options.board:
         print(f"  no --board: board.json is the default board ({board.words}, {board.dictionary})")
     if options.json:
@@ -209,7 +213,6 @@ def import_recording(options: argparse.Namespace) -> int:
             "ok": True,
             "out": str(out),
             "frames": made.frames,
-            "notes": notes,
             "default_board": not options.board,
         }
         print(json.dumps({**answer, **asdict(made)}))

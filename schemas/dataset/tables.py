@@ -110,7 +110,7 @@ redraws | int64 | count | - | How often the start position was drawn again befor
 effects | list of string | - | - | Names of the effects that ran.
 skipped | list of struct | - | - | Effects that did not run.
 skipped[].effect | string | - | - | Name of the effect.
-skipped[].why | string | - | - | Why it was not needed.
+skipped[].why | string | - | - | Why it was not needed, and by which proof.
 penetration_mm | double, scenes | mm | - | {overlap}
 hover_gap_mm | double, scenes | mm | - | {gap}
 support_margin_mm | double, scenes | mm | - | {margin}

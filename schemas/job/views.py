@@ -4,9 +4,10 @@ Targets are what networks are trained on beside the images of the article, by vi
 """
 
 import math
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from schemas.base import Frozen, Interval, NonNegative, Positive, PositiveInt, Range, Share
 
@@ -17,15 +18,43 @@ Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
 """Bounds far beyond any camera, within which float32 on the GPU does not overflow."""
 
 
+FIT_SHARE = 0.06
+"""What `fit` stands for: a round thing then is a quarter of the picture wide."""
+
+
+def _read_share(text: str) -> str:
+    if text != "fit" and not (re.fullmatch(r"\d+(\.\d+)? ?%", text) and 0.0 < float(text.rstrip("% ")) <= 50.0):
+        raise ValueError("write metres, fit, or a share of the picture, such as 6%, up to 50%")
+    return text
+
+
+def _kind(value: object) -> str:
+    return "[fit]" if isinstance(value, str) else "[metres]"
+
+
+Framed = Annotated[
+    Annotated[Reach, Tag("[metres]")] | Annotated[str, AfterValidator(_read_share), Tag("[fit]")], Discriminator(_kind)
+]
+Behind = Annotated[Annotated[Reach, Tag("[metres]")] | Annotated[Literal["fit"], Tag("[fit]")], Discriminator(_kind)]
+
+
 class Orbit(Frozen):
-    """Where input cameras stand: spherical coordinates about the centre of the table top [A]."""
+    """Where input cameras stand: spherical coordinates about the centre of the table top [A], or of the objects at rest."""
 
     inclination_rad: Interval = Range(0.7, 0.9)
     """Angle of the optical axis below the horizontal."""
     yaw_rad: Interval = Range(-math.pi, math.pi)
     """Direction from the table to the camera."""
-    radius_m: Reach = 2.5
-    """Distance from the centre of the table top."""
+    radius_m: Framed = 2.5
+    """Distance from the centre of the table top. `6%`, or `fit`, which is the same: as near to the middle of the objects at rest
+    as they cover that share of the picture, none is cut off, and all are in the range of depth."""
+
+    @property
+    def share(self) -> float | None:
+        """The share of the picture that objects are to cover; None where the distance is given."""
+        if isinstance(self.radius_m, str):
+            return FIT_SHARE if self.radius_m == "fit" else float(self.radius_m.rstrip("% ")) / 100.0
+        return None
 
 
 class Sensor(Frozen):
@@ -54,15 +83,24 @@ class DepthCamera(Frozen):
     """Translation in the RGB camera's optical axes."""
 
 
+MIRROR_FIT = 1.5
+"""T_z by d_z where it is `fit`: what is beyond the pivot lies lower in the mirror view, and tall things are still seen whole."""
+
+
 class Mirror(Frozen):
     """The camera on the other side [A, C]."""
 
     enabled: bool = True
     """Whether there are mirror views; without them camPoses.csv has one row a pair, with an even id."""
-    T_z_m: Reach = 1.3
-    """Distance of the mirror camera from its pivot, the point it looks at."""
+    T_z_m: Behind = 1.3
+    """Distance of the mirror camera from its pivot, the point it looks at. `fit`: 1.5 d_z, from where a framed object looks
+    a little smaller."""
     percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
     """d_z, the distance to the object's front surface, is this percentile of the object's stored input depth; 0: the nearest."""
+
+    def distance_m(self, d_z_m: float) -> float:
+        """T_z, metres, for a pivot d_z_m ahead of the input camera."""
+        return MIRROR_FIT * d_z_m if isinstance(self.T_z_m, str) else self.T_z_m
 
 
 class Cameras(Frozen):

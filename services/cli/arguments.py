@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from schemas.errors import plain_line
+from schemas.errors import did_you_mean, plain_line
 from services.job.packed import MOST_CHARACTERS, is_packed
 
 JOB_ID: Final = r"j[0-9a-f]{8}"
@@ -19,7 +19,21 @@ MOST_PATH_CHARACTERS: Final = 4000
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are short and hold no control characters, whatever was typed."""
+    """A parser whose errors are short, hold no control characters, and name the nearest word that it knows."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Refuses what is too much here, with the usage of the command that it was typed for."""
+        parsed, extras = super().parse_known_args(args, namespace)
+        if extras:
+            near = did_you_mean(extras[0].partition("=")[0], self._option_string_actions).strip()
+            self.error(f"unrecognized arguments: {plain_line(' '.join(extras))}{near and f'; {near}'}")
+        return parsed, extras
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            known = list(map(str, action.choices))
+            words = f"invalid choice: {value!r}; {did_you_mean(str(value), known)}choose from {', '.join(known)}"
+            raise argparse.ArgumentError(action, words)
 
     def error(self, message: str) -> NoReturn:
         """Prints the usage and one line, and exits with 2."""
@@ -75,9 +89,9 @@ read_job_id = reader(
     JOB_ID, ": an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
 )
 read_unit = reader(
-    r"\d{1,9}(?:\.\d{1,12})?(?:e-?\d)?",
-    " is no unit: write metres, such as 0.001 for millimetres",
-    lambda match: float(match[0]) or None,
+    r"(?:([^=]{1,500})=)?(\d{1,9}(?:\.\d{1,12})?(?:e-?\d)?)",
+    " is no unit: write metres, such as 0.001 for millimetres, or PATTERN=METRES, such as 'scans/*=0.001'",
+    lambda match: (match[1] or "*", float(match[2])) if float(match[2]) else None,
 )
 read_host = reader(
     rf"{HOST}|[0-9a-fA-F:.]{{2,45}}",

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 import shutil
 import subprocess
 import sys
@@ -14,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.dataset.layout import COMMITS
-from schemas.errors import InputError, RunError, VersoError, needs_making, plural
+from schemas.errors import InputError, RunError, VersoError, command_line, needs_making, plural
 from schemas.job.job import Job
 from services.cli.environment import host_place
 from services.job.job_file import load_job, pack_job
 from services.job.record import read_job, require_dataset, require_job
 from services.read.verdict import explain_damage
-from services.run.progress import ProgressLine
+from services.run.progress import ProgressLine, finish
 from workers.store.local import open_store
 from workers.store.store import Store
 
@@ -85,22 +84,16 @@ def tell_result(out: str, job: Job, result: "RunResult") -> tuple[bool, dict[str
         f"{plural(result.made_now, 'scene')} made now, {made} in all, {failed} failed, in {result.seconds:.1f} s{rate}"
     )
     print(f"{out}{host_place(out)}: dataset digest {merged.digest}")
-    print(f'next: verso report {out} · verso query {out} "select category, count(*) from scenes group by category"')
+    question = "select category, count(*) from scenes group by category"
+    print(f"next: {command_line('report', out)} · {command_line('query', out, question)}")
     if again := merged.scenes["environmental"]:
         why = f"{plural(again, 'scene')} failed for environmental reasons: try again with --retry-failed"
         print(f"verso: {why}", file=sys.stderr)
     elif not complete:
         why = f"{share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}"
-        asks = f'verso query {out} "select reason, count(*) from failures group by reason"'
+        asks = command_line("query", out, "select reason, count(*) from failures group by reason")
         print(f"verso: {why}: `{asks}` says why", file=sys.stderr)
     return complete, {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
-
-
-def finish(options: argparse.Namespace, ok: bool, /, **answer: Any) -> int:
-    """The exit code of a command; prints what `--json` asks for: one object in the last line."""
-    if options.json:
-        print(json.dumps({"ok": ok, **answer}))
-    return 0 if ok else 1
 
 
 def pack(options: argparse.Namespace) -> int:
@@ -144,6 +137,7 @@ def verify(options: argparse.Namespace) -> int:
     from services.read.verify import verify as read_back
 
     store = open_store(options.out)
+    deep = _deep_checks() if options.independent or options.audit else ()  # before hours of reading
     if next(iter(store.files(COMMITS)), None) is None:  # it may have lost its job.yaml
         require_dataset(store)
     scenes = 0
@@ -158,7 +152,6 @@ def verify(options: argparse.Namespace) -> int:
     if verdict.not_derived:
         print(f"files and tables alone were checked: {verdict.not_derived}")
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
-    deep = _deep_checks() if options.independent or options.audit else ()
     for name, check, describe in deep:
         if count := getattr(options, name):
             try:

@@ -1,7 +1,6 @@
 """`verso doctor`: what this machine has, what is missing, and the fingerprint of its stack."""
 
 import argparse
-import json
 import os
 import platform
 import shutil
@@ -13,6 +12,7 @@ from pathlib import Path
 
 from schemas.errors import MachineError, VersoError
 from services.run.machine import usable_cores
+from services.run.progress import finish
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,7 @@ def main(options: argparse.Namespace) -> int:
         if not finding.ok:
             print(f"         {'':{width}}  -> {finding.remedy}")
     ok = all(finding.ok for finding in findings)
-    if options.json:
-        print(json.dumps({"ok": ok, "findings": [asdict(finding) for finding in findings]}))
-    return 0 if ok else 1
+    return finish(options, ok, findings=[asdict(finding) for finding in findings])
 
 
 def _python() -> Finding:

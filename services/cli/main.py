@@ -10,10 +10,10 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from schemas.errors import VersoError, needs_making
+from schemas.errors import VersoError, command_line, needs_making
 from services.cli.arguments import Command, Parser
 from services.cli.environment import enter_stack_environment, speak_as_typed, typed_program
-from services.cli.rows import COMMANDS, JSON, KEPT
+from services.cli.rows import COMMANDS, JSON, KEPT, THERE
 from services.run.supervisor import supervise
 
 if TYPE_CHECKING:
@@ -44,13 +44,22 @@ def _run(options: argparse.Namespace) -> int:
     """The exit code of a command; errors are told in one line. KeyboardInterrupt passes."""
     speak_as_typed()  # once more: a child of the supervisor has another standard error
     try:
+        from services.job.record import require_folder
+
+        for name in options.there:  # before anything is loaded or written
+            value = getattr(options, name)
+            for place in value if isinstance(value, list) else [value] if value else []:
+                require_folder(place)
         module, _, function = options.handler.partition(":")
         with needs_making(f"`{options.command}`"):
             return int(getattr(importlib.import_module(f"..{module}", __package__), function)(options) or 0)
     except VersoError as error:
-        print(f"verso: {error}", file=sys.stderr)
+        message, out = str(error), getattr(options, "out", None)
+        if out is not None:  # what reads a file does not know in whose dataset it lies
+            message = message.replace("verso verify OUT", command_line("verify", out))
+        print(f"verso: {message}", file=sys.stderr)
         if getattr(options, "json", False):
-            print(json.dumps({"ok": False, "error": str(error), "kind": type(error).__name__}))
+            print(json.dumps({"ok": False, "error": message, "kind": type(error).__name__}))
         return error.exit_code
     except BrokenPipeError:
         return 1
@@ -107,6 +116,7 @@ def _add_commands(parsers: "Commands", commands: Mapping[str, Command], above: s
             starts_ray=entry.starts_ray,
             kept=entry.kept,
             quiet=entry.quiet,
+            there=[names[0].lstrip("-") for names, settings in entry.options if (names, settings) in THERE],
         )
 
 

@@ -11,13 +11,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, MachineError, RunError, plural
+from schemas.errors import InputError, MachineError, RunError, command_line, plural
 from schemas.queue import JobRequest
 from services.cli import rows
-from services.cli.commands import finish, tell_result
+from services.cli.commands import tell_result
 from services.cli.environment import default_queue
 from services.job.job_file import load_job, name_of, read_text, refuse_folders
 from services.queue.queue import Queue, make_queue, new_id, open_queue
+from services.run.progress import finish
 
 if TYPE_CHECKING:
     from services.queue.drivers import Ending
@@ -107,15 +108,16 @@ def supervise(options: argparse.Namespace) -> int:
 
     queue = make_queue(_place(options))
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    rules = Rules(options.at_once, _driver_command(options))
+    rules, failed = Rules(options.at_once, _driver_command(options), options.until_empty), []
     on_own = options.address == rows.OWN_RAY or (options.address is None and not answers(rows.DASHBOARD))
     try:
         place = own_ray(queue.name, _say) if on_own else contextlib.nullcontext(_cluster_drivers(options))
-        supervise(queue, place, rules, _say)
+        failed = supervise(queue, place, rules, _say)
+        _say("the queue is empty" + (f"; failed: {', '.join(failed)}: `verso logs ID` says why" if failed else ""))
     except KeyboardInterrupt:
         then = "its jobs wait" if on_own else "jobs that run go on, the others wait"
         _say(f"supervision ends; {then} for the next `verso supervise`")
-    return finish(options, True, queue=queue.name)
+    return finish(options, not failed, queue=queue.name, failed=failed)
 
 
 def drive(options: argparse.Namespace) -> int:
@@ -185,7 +187,7 @@ def _describe_supervisor(queue: Queue) -> str:
 
     holder = read_holder(queue.store)
     if holder is None or (is_here(holder) and not shows_life(queue.store, holder)):
-        return f"no supervisor is running: `verso supervise --queue {queue.name}` starts the jobs"
+        return f"no supervisor is running: `{command_line('supervise', '--queue', queue.name)}` starts the jobs"
     return f"supervised by process {holder.pid} on {holder.host}"
 
 

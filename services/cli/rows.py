@@ -12,10 +12,18 @@ KEPT: Final = "what is committed is kept, the same command goes on from there"
 JSON = flag("--json", "print one JSON object as the last line of standard output")
 JOB = option("job", "JOB.yaml", kind=read.read_job)
 OUT = option("out", "OUT", kind=read.read_place)
+FOLLOWED = option("out", "OUT", "may be made later", read.read_place)
 OUT_DIR = option("--out", "DIR", "output folder (default: data/<job name>)", read.read_place)
 NEW_DIR = path("--out", "DIR", "folder of the capture, new or empty", required=True)
 FOLDER = path("folder", "DIR", "folder of the capture")
 BOARD = path("--board", "board.json", "the board's sizes and dictionary (default: 7 x 5 of 60 mm)")
+MESHES = path("folder", "FOLDER")
+PREDICTIONS = path(
+    "predictions", "PREDICTIONS", "depth/ID.png|npy, rgb/ID.png, shape/ID.glb, ..., poses.csv", nargs="?"
+)
+SCORES = path("--compare", "DIR", "which of two scores is better, A B", nargs=2)
+THERE: Final = (OUT, FOLDER, MESHES, PREDICTIONS, SCORES)
+"""Arguments that name folders which have to be there."""
 MORE_SCENES = number("--scenes", "how many scenes; more than before extends the dataset")
 PICTURES = number("--scenes", "scenes with pictures, equally many of each category (default: 24)", 24)
 RETRY = flag("--retry-failed", "try scenes again that failed for environmental reasons")
@@ -67,6 +75,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         ),
         NEW_DIR,
         number("--frames", "frames that are kept, chosen by sharpness and movement (default: 40)", 40),
+        path("--camera", "camera.json", "the colour camera (docs/captures.md), in place of what the recording says"),
         BOARD,
         option("--name", "NAME", "of the object (default: the name of DIR)"),
         option("--category", "NAME", "folder that the capture has in a dataset (default: object)", default="object"),
@@ -114,7 +123,7 @@ REPORT_COMMANDS: Final[dict[str, Command]] = {
     "serve": command(
         "the same page live while a job runs; read-only",
         "data/tabletop --port 8722",
-        OUT,
+        FOLLOWED,
         option("--port", "N", "default: 8722; 0: any that is free", read.read_port, default=8722),
         option(
             "--host",
@@ -219,6 +228,7 @@ QUEUE_COMMANDS: Final[dict[str, Command]] = {
         "--queue /shared/queue --at-once 2",
         QUEUE,
         SUPERVISED,
+        flag("--until-empty", "end when every job has; exit code 1 where one failed"),
         number("--at-once", "jobs that run at once, and share the cluster evenly (default: 2)", 2),
         path(
             "--driver",
@@ -245,7 +255,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "init": command(
         "make a library of a folder of your own meshes: clean metric shapes, a table, pictures, and the job that uses it",
         "~/my_meshes --out my_library",
-        path("folder", "FOLDER"),
+        MESHES,
         path(
             "--out",
             "LIBRARY",
@@ -259,9 +269,11 @@ COMMANDS: Final[dict[str, Command]] = {
         ),
         option(
             "--unit",
-            "METRES",
-            "of all files, such as 0.001 for millimetres (default: a guess)",
+            "[PATTERN=]METRES",
+            "of all files, or of those whose path fits, such as 0.001 for millimetres; the last counts (default: a guess)",
             read.read_unit,
+            action="append",
+            default=[],
         ),
         choice("--up", ("x", "y", "z"), "the axis that points up in all files (default: a guess)"),
         option("--licence", "TEXT", "of the shapes (default: the nearest licence file)"),
@@ -339,12 +351,12 @@ COMMANDS: Final[dict[str, Command]] = {
         "score predictions of a dataset's other side: depth, RGB, shapes, volumes, poses",
         "data/tabletop predictions",
         OUT,
-        path("predictions", "PREDICTIONS", "depth/ID.png|npy, rgb/ID.png, shape/ID.glb, ..., poses.csv", nargs="?"),
+        PREDICTIONS,
         path("--out", "DIR", "where the score goes (default: PREDICTIONS/score)", dest="score"),
         choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
         choice("--align", ("none", "scale", "similarity"), "of depth and shapes with the truth", default="none"),
         flag("--flip", "FLIP of RGB as well (0.7 s an image; needs verso extra study)"),
-        path("--compare", "DIR", "which of two scores is better, A B", nargs=2),
+        SCORES,
         handler="score.command:main",
         kept="what is scored is kept",
     ),

@@ -19,7 +19,7 @@ import pyarrow.dataset as ds
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import SCHEMAS, TABLES
-from schemas.errors import InputError, did_you_mean
+from schemas.errors import InputError, command_line, did_you_mean
 from schemas.job.assets import SplitShares
 from schemas.job.job import Job
 from schemas.scene.view import ROLES
@@ -50,6 +50,11 @@ class Splits:
         if asset["category"] in self.held_out:
             return "test"
         return self.by_id.get(asset["instance_id"], asset["split"])
+
+
+def strictest(splits: Iterable[str]) -> str:
+    """The split of a scene whose objects are of these, so that no scene of `train` shows an object of `test`."""
+    return max(splits, key=("train", "val", "test").index)
 
 
 def collect_ids(batches: Iterable[Iterable[Row]]) -> dict[str, set[str] | None]:
@@ -200,7 +205,7 @@ class Dataset:
         pairs = [pair for pair in self.scene(scene_id) if pair.pose_id == pose_id - pose_id % 2]
         if not pairs:
             raise InputError(
-                f"{self.place} has no pair {pose_id}: `verso status {self.place}` tells which scenes are there"
+                f"{self.place} has no pair {pose_id}: `{command_line('status', self.place)}` tells which scenes are there"
             )
         return pairs[0]
 

@@ -1,5 +1,6 @@
 """One scene of a job, made in this process and kept in memory: no Ray, no folder."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from schemas.scene.scene import SceneOutput
 from services.dataset.dataset import iter_pairs
 from services.dataset.pair import Pair
 from services.dataset.shapes import Shapes
-from services.job.job_file import load_job, validate_job
+from services.job.job_file import change_key, load_job, validate_job
 from services.job.record import JobRecord, record_job
 from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, open_worker
@@ -24,8 +25,8 @@ def make_scene(
 ) -> tuple[Pair, ...]:
     """The pairs of one scene, the same to the byte as a run of the job stores them.
 
-    `job`: a job file with `changes` such as "start.pose=tumbled", or its keys, or a Job. Relative folders start from the
-    job file, else from here. The first call of a process prepares the renderer. Raises JobError where the job is wrong,
+    `job`: a job file, or its keys, or a Job, with `changes` such as "start.pose=tumbled". Relative folders start from the job
+    file, else from here. The first call of a process prepares the renderer. Raises JobError where the job is wrong,
     SceneError where this scene cannot be made.
     """
     parsed, folder = _parse(job, changes)
@@ -41,7 +42,10 @@ def _parse(job: str | Path | Mapping[str, Any] | Job, changes: Sequence[str]) ->
     """The job, and the folder that its relative paths start from."""
     if isinstance(job, str | Path):
         return load_job(Path(job), changes), Path(job).parent
-    return (job if isinstance(job, Job) else validate_job(dict(job), "the job")), Path()
+    tree = job.model_dump(mode="json") if isinstance(job, Job) else copy.deepcopy(dict(job))
+    for change in changes:
+        change_key(tree, change)
+    return validate_job(tree, "the job"), Path()
 
 
 class _MadeFiles:

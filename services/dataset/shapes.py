@@ -111,5 +111,5 @@ class RangeFiles:
             return read_committed(self._files.store, record, path)
         members = self._files.tar(record, path.partition("/")[0])
         if path not in members:
-            raise CorruptError(f"{path} is committed and in no tar: `verso verify {self._files.store.name}` tells more")
+            raise CorruptError(f"{path} is committed and in no tar: `verso verify OUT` tells more")
         return members[path]

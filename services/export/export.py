@@ -1,7 +1,6 @@
 """`verso export`: a dataset in another layout, scene by scene in constant memory, gone on with after a kill."""
 
 import argparse
-import json
 import sys
 import time
 from collections import Counter
@@ -14,15 +13,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import OutputError, plural
+from schemas.errors import InputError, OutputError, command_line, did_you_mean, plural
 from services.export.folder import ExportFolder
 from services.export.formats import Choice, Chooser, ExportRequest, Writer
 from services.export.source import iter_records, scenes_of, splits_of
 from services.export.table import FORMATS
 from services.job.record import JobRecord, read_success, require_dataset, require_job
 from services.read.dataset_reader import read_stored
+from services.read.query import query
 from services.read.verdict import explain_damage
-from services.run.progress import ProgressLine
+from services.run.progress import ProgressLine, finish
 from workers.store.commit import list_codes
 from workers.store.local import open_store
 
@@ -60,12 +60,32 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
     if (done := folder.finished()) is not None:
         folder.refuse_other(done, plan)
         return ExportResult(done, 0)
+    if not folder.work.exists():
+        _refuse_empty(request, chooser)
     with folder.claimed(plan) as progress:
         codes = _snapshot(request, folder, fresh=progress is None)
         begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
         writer = FORMATS[request.format].load()(request, record, folder, begun["writer"])
         with closing(writer):
             return _Export(writer, codes, begun).run(chooser, report)
+
+
+def _refuse_empty(request: ExportRequest, chooser: Chooser) -> None:
+    """Raises InputError where no object has a category that is named, or no scene is chosen: before anything is written."""
+    store, choice = request.store, request.choice
+    for option, names, table in (
+        ("--category", choice.categories, "scenes"),
+        ("--held-out", choice.held_out, "assets"),
+    ):
+        there = (
+            query(store, f"select distinct category from {table} order by 1")["category"].to_pylist() if names else []
+        )
+        if unknown := sorted(set(names) - set(there)):
+            known = f"{did_you_mean(unknown[0], there)}Its are {', '.join(there)}"
+            raise InputError(f"{option} {unknown[0]}: {store.name} has no such object; {known}")
+    if not any(chooser.choose(read_stored(store, records)) for records in iter_records(store, list_codes(store))):
+        listed = command_line("query", store.name, "select scene_id, category from scenes")
+        raise InputError(f"no scene of {store.name} is what was asked for: `{listed}` lists what is there")
 
 
 class _Export:
@@ -147,10 +167,7 @@ def _snapshot(request: ExportRequest, folder: ExportFolder, fresh: bool) -> NDAr
         temporary = folder.temporary("commits.npy")
         np.save(temporary, codes)
         folder.install(temporary, f"{folder.work.name}/{kept.name}")
-    codes = np.load(kept)
-    if not len(codes):
-        raise OutputError(f"{request.store.name} has no finished scene yet: there is nothing to export")
-    return codes
+    return np.load(kept)
 
 
 def main(options: argparse.Namespace) -> int:
@@ -177,7 +194,8 @@ def main(options: argparse.Namespace) -> int:
 
         result = export(request, report)
     _print_result(options, result, time.monotonic() - begun)
-    return 0 if result.manifest["pairs"] else 1
+    pairs = result.manifest["pairs"] > 0
+    return finish(options, pairs, dir=options.dir, pairs_now=result.pairs_now, **result.manifest)
 
 
 def _print_result(options: argparse.Namespace, result: ExportResult, seconds: float) -> None:
@@ -193,8 +211,4 @@ def _print_result(options: argparse.Namespace, result: ExportResult, seconds: fl
     for line in manifest.get("not_exported", ()):
         print(f"  not exported: {line}")
     if not manifest["pairs"]:
-        reason = "every pair was left out" if manifest["pairs_left_out"] else "no scene was chosen"
-        print(f"verso: {options.dir} holds no pair: {reason}", file=sys.stderr)
-    if options.json:
-        answer = {"ok": manifest["pairs"] > 0, "dir": options.dir, "pairs_now": result.pairs_now}
-        print(json.dumps({**answer, **manifest}))
+        print(f"verso: {options.dir} holds no pair: every pair was left out", file=sys.stderr)

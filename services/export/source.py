@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import PixelKind, patch_index
-from schemas.errors import CorruptError, InputError
+from schemas.errors import CorruptError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import DRAWN_ROLES, Role
-from services.dataset.dataset import Splits, collect_ids, split_by_category
+from services.dataset.dataset import Splits, collect_ids, split_by_category, strictest
 from services.read.dataset_reader import (
     ReadFile,
     StoredRange,
@@ -36,8 +36,6 @@ from workers.store.store import Store
 SIDES: tuple[Role, ...] = ("input", "mirror")
 """Views from two sides; that of the depth camera beside the input camera shows what the input view does."""
 MM_PER_M = 1000.0
-
-_STRICTNESS = ("train", "val", "test")
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +140,8 @@ class ExportScene:
 
     @property
     def split(self) -> str:
-        """train, val or test: the strictest of its objects, so that no scene of `train` shows an object of `test`."""
-        places = [_STRICTNESS.index(self.assets[name]["split"]) for _, name in self.instances.values()]
-        return _STRICTNESS[max(places)]
+        """train, val or test: the strictest of its objects."""
+        return strictest(self.assets[name]["split"] for _, name in self.instances.values())
 
 
 def in_units(data: bytes, units_per_m: float, wanted_per_m: float) -> bytes:
@@ -164,13 +161,11 @@ def iter_records(store: Store, codes: NDArray[np.int64]) -> Iterator[list[Commit
 def splits_of(
     store: Store, codes: NDArray[np.int64], shares: SplitShares, held_out: Collection[str], by_category: bool
 ) -> Splits:
-    """The splits of the instances in the ranges that `codes` name. Raises InputError for a category that none has."""
+    """The splits of the instances in the ranges that `codes` name."""
     if not by_category and not held_out:
         return Splits({})
     tables = (range_rows(store, records, "assets") for records in iter_records(store, codes))
     ids = collect_ids(table.select(["instance_id", "category"]).to_pylist() for table in tables)
-    if unknown := sorted(set(held_out) - ids.keys()):
-        raise InputError(f"--held-out {unknown[0]}: the dataset has no such object; its are {', '.join(sorted(ids))}")
     return Splits(split_by_category(ids, shares) if by_category else {}, frozenset(held_out))
 
 

@@ -3,6 +3,7 @@
 import argparse
 import io
 import json
+import math
 import os
 import re
 import shutil
@@ -15,7 +16,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from schemas.errors import AssetSourceError, InputError, MachineError, MeshError, OutputError, plain_line
+from schemas.errors import AssetSourceError, InputError, MachineError, MeshError, OutputError, command_line, plain_line
 from schemas.job.assets import TABLE, Assets, LibrarySource, MeshLimits, is_usable
 from schemas.job.physics import Physics
 from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_table, plural
@@ -26,6 +27,7 @@ from services.run.progress import show_counts
 from workers.assets.catalogue import Watch
 from workers.assets.library.categories import BY_FILE, BY_FOLDER, BY_PARENT
 from workers.assets.library.copies import COPY, PART
+from workers.assets.library.guess import ON_TABLE_M, length
 from workers.assets.library.making import Making, locked, remake_library
 from workers.assets.library.shapes import load_shape, make_shapes, with_shape
 from workers.assets.library.table import TABLE_FILE, Library, Row, write_table, write_whole
@@ -64,11 +66,18 @@ assets:
   objects:
     - source: library
       folder: . # this one
-      # Objects keep their own size; in place of that, `diagonal_m: 0.25` makes each as large as the article's objects are,
-      # for which the cameras stand where they do. Or move them: cameras.orbit.radius_m and cameras.mirror.T_z_m.
+      # Objects keep their own size; `diagonal_m: 0.25` makes each as large as the article's objects are.
       # With `copy_assets: true` the dataset holds the shapes too: see `licence` in the table.
       copy_assets: false
   # What they stand on{tables}
+# Cameras stand where objects fill 6 % of the input view, or a little less than that of what is long or near. The article's
+# distances: radius_m: 2.5, T_z_m: 1.3. Depth begins nearer than by default, and a patch holds such an object.
+cameras:
+  orbit: {{radius_m: fit}}
+  mirror: {{T_z_m: fit}}
+images:
+  depth_range_m: [0.05, 8.0]
+  patch: {{width: 256, height: 192}}
 start:
   # upright: as it stands in the pictures, at any yaw; tumbled: dropped in any rotation.
   pose: upright
@@ -104,13 +113,15 @@ def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) 
         )
     print("\n".join([*draw_table([cells_of(row) for row in used], width), *draw_left_out(left_out, width)]))
     title = f"{folder}: {plural(len(used), 'object')}"
-    sheet = out / SHEET_FILE if _draw(out / SHEET_FILE, title, library, used, left_out) else None
+    asked = ask_about_large(used)
+    notes = [*asked, *draw_left_out(left_out, None)]
+    sheet = out / SHEET_FILE if _draw(out / SHEET_FILE, title, library, used, notes) else None
     categories = sorted({row.category for row in used} - {TABLE})
     _write_job(out, folder, used)
     print(f"{out}: {plural(len(used), 'object')} in {plural(len(categories), 'category')}")
-    print("\n".join(f"  {line}" for line in describe_decisions(used)))
+    print("\n".join(f"  {line}" for line in (*describe_decisions(used), *asked)))
     look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
-    print(look, f"verso run {out / JOB_FILE} --scenes 8")
+    print(look, command_line("run", out / JOB_FILE, "--scenes", 8))
     if options.json:
         tree = {
             "library": str(out),
@@ -143,7 +154,7 @@ def read_making(options: argparse.Namespace) -> Making:
         raise InputError(f"--limit {plain_line(str(first['loc'][0]))}: write NAME=VALUE: {what}") from error
     if options.licence is not None and not (options.licence.strip() and options.licence.isprintable()):
         raise InputError("--licence: write some words")
-    return Making(by, options.unit, options.up, options.licence, limits)
+    return Making(by, tuple(options.unit), options.up, options.licence, limits)
 
 
 def _check_target(out: Path) -> None:
@@ -224,12 +235,30 @@ def describe_decisions(used: Sequence[Row]) -> list[str]:
     return [*lines, f"and {len(reasons) - MOST_NAMED} more: see the table"] if len(reasons) > MOST_NAMED else lines
 
 
+def ask_about_large(used: Sequence[Row]) -> list[str]:
+    """The question about things that no table carries, with the answers there are; nothing where there is none."""
+    sizes = {row.path: math.hypot(*row.extents_m or (0.0,)) for row in used if row.category != TABLE}
+    large = sorted((path for path, size in sizes.items() if size > ON_TABLE_M[1]), key=lambda path: sizes[path])
+    if not large:
+        return []
+    units = {row.path: row.unit for row in used}
+    unit = f"{units[large[-1]] * ON_TABLE_M[1] / sizes[large[-1]]:.2g}"
+    span = " to ".join(dict.fromkeys(length(sizes[path]) for path in (large[0], large[-1])))
+    what = f"{plural(len(large), 'object')} of {span} ({large[-1]}) {'is' if len(large) == 1 else 'are'} too large for a table"
+    return [
+        f"? {what}. Run `verso init` again with",
+        f"    --unit {unit}                 all files smaller, in proportion; or --unit 'PATTERN={unit}' for some",
+        f"    --limit max_size_m={ON_TABLE_M[1]:g}        what is larger left out",
+        "  or write diagonal_m: 0.25 in the job, which resizes every object. As it is, a scene that cannot be framed fails",
+    ]
+
+
 def dataset_name(folder: Path) -> str:
     """A name for the job, after the folder."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64] or "meshes"
 
 
-def _draw(sheet: Path, title: str, library: Library, used: Sequence[Row], left_out: Sequence[Row]) -> bool:
+def _draw(sheet: Path, title: str, library: Library, used: Sequence[Row], notes: Sequence[str]) -> bool:
     """Writes the pictures; whether it could."""
     try:
         renderer = shared_renderer()
@@ -238,7 +267,7 @@ def _draw(sheet: Path, title: str, library: Library, used: Sequence[Row], left_o
         return False
     settings = LibrarySource(source="library", folder=os.curdir)
     drawn = [(row, partial(load_shape, library, row, settings, Assets(), row.instance_id)) for row in used]
-    page, data = draw_sheet(title, drawn, draw_left_out(left_out, None), renderer), io.BytesIO()
+    page, data = draw_sheet(title, drawn, notes, renderer), io.BytesIO()
     page.save(data, "JPEG", quality=88)
     write_whole(sheet, data.getvalue())
     return True

@@ -94,9 +94,9 @@ def _one_of(given: object, allowed: str) -> str:
 
 
 def _written(place: Sequence[str | int]) -> list[str | int]:
-    """The parts of a place that the job file has: not the kind that follows a source's position, nor the mark of a key."""
+    """The parts of a place that the job file has: not the kind that follows a source's position, nor a mark in brackets."""
     parts = [part for before, part in zip((None, *place), place, strict=False) if not isinstance(before, int)]
-    return parts[:-1] if parts[-1:] == ["[key]"] else parts
+    return parts[:-1] if str(parts[-1:]).startswith("['[") else parts
 
 
 def load_job(path: Path, changes: Sequence[str] = ()) -> Job:

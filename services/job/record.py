@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING, SUCCESS_FILE, is_merged_path
-from schemas.errors import CorruptError, JobError, OutputError
+from schemas.errors import CorruptError, JobError, OutputError, did_you_mean
 from schemas.job.job import Job, compare_jobs, job_digest
 from services.job.job_file import parse_yaml, validate_job
 from workers.store.commit import is_sealed, seal
@@ -131,8 +131,22 @@ def is_job_sealed(data: bytes) -> bool:
     return is_sealed(data, SEAL)
 
 
+def require_folder(place: str | Path) -> None:
+    """Raises OutputError where a folder of this machine is not there; a bucket is not asked."""
+    path = Path(place)
+    if "://" in str(place) or path.is_dir():
+        return
+    if path.exists():
+        raise OutputError(f"{place} is a file, and should be a folder")
+    beside = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
+    near = did_you_mean(path.name, beside).strip()
+    raise OutputError(f"{place}: there is no such folder{near and f'; {near}'}")
+
+
 def require_dataset(store: Store) -> Store:
     """The store itself. Raises OutputError where it holds no dataset."""
+    if store.root is not None:
+        require_folder(store.root)
     if store.size(JOB_FILE) is None:
         raise OutputError(f"{store.name} holds no {JOB_FILE}: it is not an output folder of `verso run`")
     return store

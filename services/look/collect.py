@@ -95,28 +95,10 @@ class Failure:
     detail: str
 
 
-@dataclass(frozen=True)
-class CaptureQuality:
-    """The figures of one capture; None where there is no truth to compare with."""
-
-    scene_id: int
-    name: str
-    category: str
-    views: int
-    left_out: int
-    estimate: str
-    reprojection_px: float | None
-    measured_share: float | None
-    pose_mm: float | None
-    cloud_median_mm: float | None
-    completeness: float | None
-
-
 GROUNDS = ("table", "board")
 """Categories of assets that objects stand on."""
 
 MOST_EXAMPLES = 5
-MOST_CAPTURES = 50
 DISTANCE_M = (0.0, 9.6)
 
 
@@ -146,7 +128,6 @@ class Figures:
     stages: dict[str, Cost] = field(default_factory=dict)
     """The costliest first."""
     failures: tuple[Failure, ...] = ()
-    captures: list[CaptureQuality] = field(default_factory=list)
 
     @property
     def scenes(self) -> int:
@@ -169,7 +150,7 @@ def collect(tables: Tables) -> Figures:
 
 
 def _read_scenes(tables: Tables, figures: Figures) -> None:
-    columns = ("scene_id", "category", "effects", "skipped", "capture")
+    columns = ("scene_id", "category", "effects", "skipped")
     for rows in tables.batches("scenes", columns):
         figures.by_category.update(_counts(rows.column("category")))
         for name, runs in _counts(_flat(rows, "effects")).items():
@@ -179,7 +160,6 @@ def _read_scenes(tables: Tables, figures: Figures) -> None:
         for reason, times in _counts(both).items():
             name, _, why = reason.partition("\0")
             figures.effects.setdefault(name, Cost()).skips[why] += times
-        figures.captures += _captures(rows, MOST_CAPTURES - len(figures.captures))
 
 
 def _read_views(tables: Tables, figures: Figures) -> None:
@@ -232,18 +212,6 @@ def _count_instances(tables: Tables) -> int:
         objects = rows.filter(pc.invert(pc.is_in(rows.column("category"), value_set=pa.array(GROUNDS))))
         seen.update(objects.column("instance_id").to_pylist())
     return len(seen)
-
-
-def _captures(rows: pa.Table, most: int) -> Iterator[CaptureQuality]:
-    """The rows that are captures, at most so many."""
-    captured = rows.filter(pc.field("capture").is_valid())
-    for row in captured.select(["scene_id", "category", "capture"]).slice(0, max(most, 0)).to_pylist():
-        capture = row["capture"]
-        figures = ("reprojection_px", "measured_share", "pose_mm", "cloud_median_mm", "completeness")
-        yield CaptureQuality(
-            row["scene_id"], capture["name"], row["category"], capture["views"], len(capture["left_out"]),
-            capture["estimate"], **{name: capture[name] for name in figures},
-        )  # fmt: skip
 
 
 def _counts(values: pa.Array | pa.ChunkedArray) -> Counter[str]:

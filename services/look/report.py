@@ -11,14 +11,14 @@ from urllib.parse import quote
 
 import trimesh
 
-from schemas.errors import MachineError, OutputError, plural
+from schemas.errors import MachineError, OutputError, command_line, plural
 from services.job.record import JobRecord, read_success, require_job
 from services.look.charts import Histogram
 from services.look.clouds import Space, pack_spaces, read_spaces
 from services.look.collect import Figures, collect, open_tables
 from services.look.pictures import ShownScene, choose_scenes, show_scenes
+from services.look.scene_table import SceneTable, read_scene_table, scene_table_html
 from services.look.sections import (
-    captures_html,
     charts_html,
     effects_html,
     failures_html,
@@ -157,6 +157,9 @@ class Report:
     depth: Mapping[str, Histogram]
     """Of the object pixels in these scenes, by role, metres."""
     spaces: tuple[Space, ...]
+    table: SceneTable
+    place: str
+    """Of the dataset."""
 
 
 def read_report(store: Store, scenes: int) -> Report:
@@ -168,7 +171,9 @@ def read_report(store: Store, scenes: int) -> Report:
     tables = open_tables(store)
     shown, depth = show_scenes(store, choose_scenes(tables, scenes))
     spaces = read_spaces(store, [scene.scene_id for scene in shown])
-    return Report(record, (read_success(store) or {}).get("digest"), collect(tables), shown, depth, spaces)
+    figures = collect(tables)
+    table = read_scene_table(tables, record.job.assets.split, figures.scenes)
+    return Report(record, (read_success(store) or {}).get("digest"), figures, shown, depth, spaces, table, store.name)
 
 
 def page_of(report: Report, address: Address) -> Page:
@@ -176,22 +181,26 @@ def page_of(report: Report, address: Address) -> Page:
     figures, scenes, job = report.figures, report.scenes, report.record.job
     failed = sum(failure.scenes for failure in figures.failures)
     sections = (
-        Section("overview", "Overview", overview_html(figures, job, failed)),
-        Section("pictures", "Pictures", sheets_html(scenes, address)),
+        Section("overview", "Overview", overview_html(figures, job, failed, report.table.splits)),
+        Section("scenes", "All scenes", scene_table_html(report.table, report.place)),
+        Section("pictures", "Pictures", sheets_html(scenes, address) + _of_all(report)),
         Section("compare", "Compare", compare_html(scenes)),
         Section("space", "In space", space_html(report.spaces, pack_spaces(report.spaces))),
         Section("figures", "Figures", charts_html(figures, report.depth)),
         Section("effects", "Effects", effects_html(figures)),
         Section("failures", "Failures", failures_html(figures.failures, figures.scenes + failed)),
-        Section("captures", "Captures", captures_html(figures)),
     )
     what = "captures" if job.captures is not None else "scenes"
     state = f"finished, digest {report.digest[:12]}" if report.digest else "not finished"
-    footer = (
-        f"Pictures are of {plural(len(scenes), 'scene')}, chosen evenly from each category. "
-        f"Job {report.record.digest[:12]}. Made by verso report; this page fetches nothing."
-    )
+    footer = f"Job {report.record.digest[:12]}. Made by verso report; this page fetches nothing."
     return Page(job.name, f"{job.scenes:,} {what} asked, seed {job.seed}, {state}", sections, footer)
+
+
+def _of_all(report: Report) -> str:
+    """Of how many scenes there are pictures, and how to see more."""
+    shown, there = len(report.scenes), report.figures.scenes
+    more = f" More: {command_line('report', report.place, '--scenes', there)}" if shown < there else ""
+    return f'<p class="note">{shown} of {plural(there, "scene")}, chosen evenly from each category.{escape(more)}</p>'
 
 
 def write_report(store: Store, scenes: int, target: Path) -> tuple[int, Report]:

@@ -42,8 +42,10 @@ def space_html(spaces: Sequence[Space], data: str) -> str:
     )
 
 
-def overview_html(figures: Figures, job: Job, failed: int) -> str:
-    """Totals, and the scenes of each category."""
+def overview_html(
+    figures: Figures, job: Job, failed: int, splits: Mapping[str, Mapping[str, int]] | None = None
+) -> str:
+    """Totals, and the scenes of each category, and of its splits."""
     tiles = [
         ("scenes", f"{figures.scenes:,}", f"of {job.scenes:,} asked"),
         ("failed", f"{failed:,}", f"{number(round(100 * failed / max(failed + figures.scenes, 1), 2))} % of those tried"),
@@ -60,13 +62,22 @@ def overview_html(figures: Figures, job: Job, failed: int) -> str:
     frame = 'class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true"'
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td class="wide"><svg {frame}><rect class="bar" '
-        f'width="{100 * count / most:.1f}" height="8"/></svg></td><td>{count:,}</td></tr>'
+        f'width="{100 * count / most:.1f}" height="8"/></svg></td><td>{count:,}</td>{_split_cells(name, splits)}</tr>'
         for name, count in figures.by_category.items()
     )
-    table = f'<table class="bars"><caption>Scenes by category</caption><tbody>{rows}</tbody></table>' if rows else ""
+    by_split = "; of train, val and test, as they are exported" if splits else ""
+    table = (
+        f'<table class="bars"><caption>Scenes by category{by_split}</caption><tbody>{rows}</tbody></table>'
+        if rows
+        else ""
+    )
     sampled = "The dataset is not finished and large: the figures are of ranges chosen evenly from it."
     note = f'<p class="note">{sampled}</p>' if figures.sampled else ""
     return f'<dl class="tiles">{tiles_html}</dl>{table}{note}'
+
+
+def _split_cells(category: str, splits: Mapping[str, Mapping[str, int]] | None) -> str:
+    return "".join(f"<td>{splits[category][name]:,}</td>" for name in ("train", "val", "test")) if splits else ""
 
 
 def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
@@ -136,30 +147,6 @@ def failures_html(failures: Iterable[Failure], scenes: int) -> str:
     return f'<ul class="failures">{"".join(items)}</ul>'
 
 
-def captures_html(figures: Figures) -> str:
-    """The quality of each capture; empty where the dataset is of scenes."""
-    if not figures.captures:
-        return ""
-    head = ("capture", "views", "corner error", "pose", "cloud", "complete", "measured")
-    rows = [
-        (
-            f"{escape(one.name)}<small>{escape(one.category)}, scene {one.scene_id}, {escape(one.estimate)}</small>",
-            f"{one.views}{f'<small>{one.left_out} left out</small>' if one.left_out else ''}",
-            _figure(one.reprojection_px, "px"),
-            _figure(one.pose_mm, "mm"),
-            _figure(one.cloud_median_mm, "mm"),
-            _figure(one.completeness, "%", 100.0),
-            _figure(one.measured_share, "%", 100.0),
-        )
-        for one in figures.captures
-    ]
-    note = (
-        "Corner error: median over the views after estimation. Pose, cloud (median) and completeness are held against the"
-        " truth, which photographs do not have. Measured: share of the mirror views that is measured and not filled."
-    )
-    return f'{table_html(head, rows, "Quality")}<p class="note">{note}</p>'
-
-
 def table_html(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str = "") -> str:
     """A table of HTML cells; the first is the row's name."""
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
@@ -185,7 +172,3 @@ def _times(cost: Cost) -> tuple[str, str]:
     if not cost.timed:
         return ("–", "–")
     return describe_seconds(cost.seconds), milliseconds(1e3 * cost.seconds / cost.timed)
-
-
-def _figure(value: float | None, unit: str, times: float = 1.0) -> str:
-    return "–" if value is None else f"{number(value * times)} {unit}"

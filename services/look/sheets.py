@@ -49,11 +49,11 @@ def _scene_html(scene: ShownScene, address: Address) -> str:
         if _in_both(scene)
         else ""
     )
-    cells = [name for name in CELLS if name in scene.pictures] + ([] if targets else close)
+    cells = ([] if targets else close) + [name for name in CELLS if name in scene.pictures]
     return (
         f'<article class="scene" data-category="{escape(scene.category)}" data-scene="{scene.scene_id}">'
         f"<header><h3>{escape(scene.category)} <span>scene {scene.scene_id}{several}</span></h3>{compare}</header>"
-        f"{_cells('cells', scene, cells, address)}{_targets(scene, targets, close, address) if targets else ''}"
+        f"{_targets(scene, targets, close, address) if targets else ''}{_cells('cells', scene, cells, address)}"
         f'<p class="note">{escape(_facts(scene))}</p></article>\n'
     )
 

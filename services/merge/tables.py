@@ -67,7 +67,7 @@ class MergedTable:
             if before >= after:
                 raise CorruptError(
                     f"{self._table}: the key {after} comes after {before}: the ranges do not join; "
-                    "`verso verify` lists what is damaged"
+                    "`verso verify OUT` lists what is damaged"
                 )
         self._last_key = keys[-1:] or self._last_key
         self.digest.update(rows)

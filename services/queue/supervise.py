@@ -133,6 +133,8 @@ class Rules:
 
     at_once: int
     command: Sequence[str]
+    until_empty: bool = False
+    """Whether to end once every job of the queue has."""
 
 
 class Supervisor:
@@ -156,6 +158,10 @@ class Supervisor:
         """By job: how many events it had, and when that was seen first."""
         self._kept: set[str] = set()
         """Drivers whose logs are in the queue, or could not be had."""
+        self._waited_for: set[str] = set()
+        """Jobs that had not ended at some look."""
+        self.is_empty = False
+        """Whether the last look saw no job but ended ones, with their logs kept."""
         self._share = 0
         self._fails = False
         """Whether the last look did."""
@@ -166,6 +172,7 @@ class Supervisor:
 
         `require_held` raises RunError where another supervisor took over.
         """
+        self.is_empty = False
         try:
             require_held()
             self._look()
@@ -188,6 +195,13 @@ class Supervisor:
         left = [view.request.id for view in views if not view.ended]
         self._do_all(choose_starts(self._queue.read_all(left)[0], self._rules.at_once, self._is_due))
         self._tell_share(left)
+        self._waited_for |= {*left}
+        self.is_empty = self._settled >= {view.request.id for view in views}
+
+    def failures(self) -> list[str]:
+        """Ids of the jobs that failed, or were lost, while they were looked after."""
+        views, _ = self._queue.read_all(self._waited_for)
+        return sorted(view.request.id for view in views if view.state in ("failed", "lost"))
 
     def note_ends(self) -> None:
         """Notes that all drivers were stopped: their jobs wait for the next supervisor, and no death is counted."""
@@ -271,16 +285,18 @@ class Supervisor:
 
 def supervise(
     queue: Queue, place: contextlib.AbstractContextManager[Drivers], rules: Rules, say: Callable[[str], None]
-) -> None:
-    """Looks after a queue until it is interrupted; `place` is entered once the queue is held.
+) -> list[str]:
+    """Looks after a queue until it is interrupted, or empty where the rules say so; `place` is entered once the queue is held.
 
-    Raises RunError where another supervisor does, or took over.
+    Ids of the jobs that failed meanwhile. Raises RunError where another supervisor does, or took over.
     """
     with hold_queue(queue) as lock, place as drivers:
         supervisor = Supervisor(queue, drivers, rules, say, time.monotonic)
         try:
             while True:
                 supervisor.look(lock.require_held)
+                if rules.until_empty and supervisor.is_empty:
+                    return supervisor.failures()
                 time.sleep(EVERY_S)
         finally:
             if drivers.close():

@@ -17,7 +17,7 @@ from schemas.base import Pose
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import FINGERPRINT_FILE, is_shape, stored_images, stored_roles
 from schemas.dataset.shard import Fingerprint
-from schemas.errors import CorruptError, InputError, SceneError, plural
+from schemas.errors import CorruptError, InputError, SceneError, command_line, plural
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
@@ -288,7 +288,7 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     if record.job.captures is not None:
         raise InputError(
             "--audit forces effects that the plan of a scene left out, and a capture has no such plan: "
-            f"`verso replay {store.name} CAPTURE` makes one again and compares every byte"
+            f"`{command_line('replay', store.name)} CAPTURE` makes one again and compares every byte"
         )
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))

@@ -36,7 +36,7 @@ from schemas.dataset.layout import (
     range_table_path,
 )
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, TABLES
-from schemas.errors import CorruptError, InputError, OutputError
+from schemas.errors import CorruptError, InputError, OutputError, command_line
 from schemas.scene.view import MODALITIES
 from services.job.record import read_success
 from workers.store.commit import code_of, commit_names, list_codes, read_record, split_code
@@ -115,7 +115,9 @@ def find_records(store: Store, scene_id: int) -> list[CommitRecord]:
         records = read_range(store, start, retries)
         if scene_id < records[0].span.stop:
             return records
-    raise InputError(f"scene {scene_id} is not in {store.name}: `verso status {store.name}` tells which scenes are")
+    raise InputError(
+        f"scene {scene_id} is not in {store.name}: `{command_line('status', store.name)}` tells which scenes are"
+    )
 
 
 def file_reader(read: ReadFile, stored: StoredRange) -> ReadFile:

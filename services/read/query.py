@@ -92,7 +92,7 @@ def _explained(store: Store) -> Iterator[None]:
             line, *more = str(error).splitlines()
             line += "".join(f"; {words}" for words in more if words.startswith(("Did you mean", "Candidate")))
             if "orrupt" in line or "CRC" in line or "thrift" in line.lower():
-                raise CorruptError(f"{line}; `verso verify` lists every damaged file") from error
+                raise CorruptError(f"{line}; `verso verify OUT` lists every damaged file") from error
             if not isinstance(error, duckdb.Error) and not _DATABASE_SAYS.match(line):
                 raise
             raise InputError(f"the query failed: {line}") from error

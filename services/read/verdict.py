@@ -10,7 +10,7 @@ from typing import Literal
 import pyarrow as pa
 
 from schemas.dataset.layout import SUCCESS_FILE, commit_path
-from schemas.errors import CorruptError
+from schemas.errors import CorruptError, command_line
 from services.merge.reading import open_scratch
 from workers.store.store import Store
 
@@ -107,7 +107,7 @@ def explain_damage(store: Store) -> Iterator[None]:
         fault = f"{store.name} holds a damaged file: {(str(error).splitlines() or [type(error).__name__])[0]}"
     else:
         return
-    raise CorruptError(f"{printable(fault)}; `verso verify {store.name}` lists every damaged file")
+    raise CorruptError(f"{printable(fault)}; `{command_line('verify', store.name)}` lists every damaged file")
 
 
 _TABLE = "CREATE TABLE paths (path BLOB PRIMARY KEY, sha256 TEXT) WITHOUT ROWID"

@@ -13,7 +13,7 @@ import pyarrow as pa
 from schemas.dataset.commit import CommitRecord, FileEntry
 from schemas.dataset.layout import COMMITS, RANGES, commit_path, is_shape, parse_commit_name, stored_roles
 from schemas.dataset.tables import DETERMINISTIC_TABLES, TABLES
-from schemas.errors import CorruptError, needs_making
+from schemas.errors import CorruptError, command_line, needs_making
 from schemas.job.job import Job
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image
 from services.read.verdict import COPY, MOST_FAULTS, PathIndex, Verdict, describe_os_error
@@ -246,7 +246,7 @@ class ReadRange:
         }
         for scene_id, fault in faults:
             if scene_id not in spoilt:
-                again = f"`verso replay {self.verdict.out} {scene_id}` makes it again and compares"
+                again = f"`{command_line('replay', self.verdict.out, scene_id)}` makes it again and compares"
                 self.verdict.tell(fault, f"its files are as committed; {again}")
 
 

@@ -20,7 +20,7 @@ from ray.exceptions import NodeDiedError, OutOfMemoryError, RayError, RayTaskErr
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardReport
-from schemas.errors import CommitConflict, RunError, VersoError
+from schemas.errors import CommitConflict, RunError, VersoError, command_line
 from services.run.machine import Process, send
 from services.run.progress import Tally, log_event, say
 from services.run.ray_cluster import LOOK_EVERY_S, Slots, alive_nodes, on_node
@@ -35,7 +35,7 @@ NODE_PATIENCE = 5
 """A node that is lost is seldom the scene's fault: so many times more of them than of other deaths are borne."""
 
 EXPLANATIONS: dict[Reason, str] = {
-    "time": "the scene took longer than run.scene_timeout_s each time: raise it, then run with --retry-failed",
+    "time": "the scene took longer than run.scene_timeout_s: raise it, then run with --retry-failed",
     "memory": "the worker ran out of memory each time: use fewer workers, then run with --retry-failed",
     "killed": "the worker was killed or crashed in this scene each time: see OUT/_logs, then run with --retry-failed",
 }
@@ -50,15 +50,24 @@ class Deaths:
         self._counts: Counter[tuple[bool, str, int]] = Counter()
         self._blamed: dict[int, Blame] = {}
 
-    def count(self, start: int, scene: int | None, reason: Reason, message: str, with_node: bool = False) -> None:
+    def count(
+        self,
+        start: int,
+        scene: int | None,
+        reason: Reason,
+        message: str,
+        with_node: bool = False,
+        timed_out: bool = False,
+    ) -> None:
         """Counts a death with the range from `start`, in `scene` if it had begun one; `with_node`: its whole node was lost.
 
-        Blames the scene after too many. Raises RunError where workers die before they begin one.
+        Blames the scene after too many, and at once where the worker computed until its time was up (`timed_out`): it would
+        compute the same again. Raises RunError where workers die before they begin one.
         """
         place = (with_node, "range", start) if scene is None else (with_node, "scene", scene)
         self._counts[place] += 1
         deaths = self._counts[place]
-        if deaths < self._attempts * (NODE_PATIENCE if with_node else 1):
+        if not (timed_out and scene is not None) and deaths < self._attempts * (NODE_PATIENCE if with_node else 1):
             return
         if scene is None:
             raise RunError(
@@ -230,7 +239,7 @@ class Coordinator:
             reasons = ", ".join(f"{count} x {reason}" for reason, count in self._tally.failed.most_common(3))
             raise RunError(
                 f"{self._tally.failed.total()} of {self._tally.asked} scenes have failed ({reasons}), which is more than "
-                'run.max_failure_share allows: see `verso query OUT "select * from failures"`'
+                f"run.max_failure_share allows: see `{command_line('query', self._store.name, 'select * from failures')}`"
             )
 
     def _take_lost_hosts(self) -> set[str]:
@@ -314,7 +323,7 @@ class Coordinator:
         message = " ".join(str(error).split())[:300]
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
         self._tally.lost[reason] += 1
-        self._deaths.count(span.start, scene, reason, message, isinstance(error, NodeDiedError))
+        self._deaths.count(span.start, scene, reason, message, isinstance(error, NodeDiedError), timed_out)
         self._again.extend((span,) for span in left)
 
     def _find_evidence(self, left: Sequence[Span]) -> tuple[Span, int | None, bool]:

@@ -1,5 +1,6 @@
 """What long work tells: a bar on a terminal, soon a line a minute elsewhere, JSON lines in OUT/_logs, counts for Prometheus."""
 
+import argparse
 import json
 import logging
 import logging.handlers
@@ -278,3 +279,10 @@ def serve(meter: Meter, place: str | None) -> Iterator[None]:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+def finish(options: argparse.Namespace, ok: bool, /, **answer: Any) -> int:
+    """The exit code of a command; prints what `--json` asks for: one object in the last line."""
+    if options.json:
+        print(json.dumps({"ok": ok, **answer}))
+    return 0 if ok else 1

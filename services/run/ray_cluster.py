@@ -246,7 +246,7 @@ def cluster_ray(address: str, workers: int | None, sharing: Callable[[], int] | 
     The user's own settings of authentication (RAY_AUTH_MODE, RAY_AUTH_TOKEN) count. Raises MachineError where no Ray
     answers at the address, or where it wants another token.
     """
-    _check_reachable(address)
+    require_answer(address)
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(connection(address))
@@ -282,9 +282,9 @@ def connection(address: str, **settings: Any) -> Iterator[None]:
             ray.shutdown()
 
 
-def _check_reachable(address: str) -> None:
+def require_answer(address: str | None) -> None:
     """Raises MachineError unless something accepts a connection; Ray itself would wait for a minute."""
-    if address == "auto":
+    if address in (None, "auto"):
         return
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or "://" in host:

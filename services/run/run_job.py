@@ -18,12 +18,13 @@ from services.job.record import JobRecord, encode_job, record_job, refuse_foreig
 from services.merge.merge import merge
 from services.merge.tables import MergeResult, describe_sources, write_card
 from services.run.coordinator import Coordinator, Limits
+from services.run.framing import require_framed
 from services.run.lock import Lock, explain_lost_folder, hold_lock, read_holder, shows_life
 from services.run.machine import usable_cores
 from services.run.parts import find_parts
 from services.run.progress import Meter, ProgressLine, Tally, event_log, log_event, serve, show_counts
 from services.run.range_planner import MAX_SHARD, SpanPlan, deal_shards, find_lost, plan_spans
-from services.run.ray_cluster import Slots, alive_nodes, join_cluster, open_ray, share_gpus
+from services.run.ray_cluster import Slots, alive_nodes, join_cluster, open_ray, require_answer, share_gpus
 from services.run.worker_entry import Pattern, terms_of_driver
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
@@ -68,7 +69,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     `cluster` is entered if there is something to make; by default it is the one that the request asks for.
     """
     begun, made_now = time.monotonic(), 0
-    catalogue, store = open_inputs(request.job, request.job_folder, request.out)
+    catalogue, store = open_inputs(request.job, request.job_folder, request.out, request.address)
     refuse_foreign(store)
     store.prepare()
     meter = Meter(request.job.name)
@@ -98,16 +99,21 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     return RunResult(merged, time.monotonic() - begun, made_now)
 
 
-def open_inputs(job: Job, job_folder: Path, out: str) -> tuple[Catalogue, Store]:
+def open_inputs(job: Job, job_folder: Path, out: str, address: str | None = None) -> tuple[Catalogue, Store]:
     """The job's catalogue and its output folder, which need not be there yet; says which files are left out or doubtful.
 
-    Shows how many files are listed and checked, which takes long where there are many new ones.
+    Raises what can be known before anything is written: a tier that cannot draw here, a cluster that does not answer, and
+    of a new folder scenes that cannot be planned or framed. Shows how many files are listed and checked, which takes long
+    where there are many new ones.
     """
     lines = describe_idle(job)
+    require_answer(address)
     with show_counts("assets") as watch:
         require_tier(job.drawn)
         catalogue = open_sources(job, job_folder, watch)
         store = open_store(out)
+    if store.size(JOB_FILE) is None:
+        require_framed(job, catalogue)
     for line in (*lines, *catalogue.describe_left_out(), *catalogue.describe_doubts()):
         print(f"verso: {line}", file=sys.stderr)
     find_parts(job, catalogue)
@@ -206,7 +212,7 @@ LONGEST_S = 10.0
 
 def describe_plan(request: RunRequest) -> list[str]:
     """Lines that tell what a run would do; changes nothing. Raises what the run would raise before its first scene."""
-    catalogue, store = open_inputs(request.job, request.job_folder, request.out)
+    catalogue, store = open_inputs(request.job, request.job_folder, request.out, request.address)
     _require_writable(store)
     refuse_foreign(store)
     job = record_inputs(request.job, request.job_folder, catalogue, store).job
@@ -254,7 +260,10 @@ def _describe_holder(store: Store) -> Iterator[str]:
 
 def _describe_cost(job: Job, catalogue: Catalogue, left: int, here: bool) -> Iterator[str]:
     """What the scenes that are left take, `here` with this machine's cores; nothing for captures."""
-    if job.captures is None and (cost := measure_scene(job, catalogue)) is not None:
+    cost = None if job.captures is not None else measure_scene(job, catalogue)
+    if isinstance(cost, str):
+        yield f"what that takes is not known, for the first scenes cannot be made: {cost}"
+    elif cost is not None:
         seconds, size = cost
         cores = job.run.workers or usable_cores()
         where = f", {describe_seconds(left * seconds / cores)} with {cores} workers here" if here else ""
@@ -264,16 +273,16 @@ def _describe_cost(job: Job, catalogue: Catalogue, left: int, here: bool) -> Ite
         )
 
 
-def measure_scene(job: Job, catalogue: Catalogue) -> tuple[float, float] | None:
-    """(seconds of processor, bytes of files) of a scene, made in memory, the first one apart, which compiles; None where none is.
+def measure_scene(job: Job, catalogue: Catalogue) -> tuple[float, float] | str | None:
+    """(seconds of processor, bytes of files) of a scene, made in memory, the first one apart, which compiles.
 
-    Scenes that fail count with their time.
+    Where none can be made, why the last could not; None where that is a bug. Scenes that fail count with their time.
     """
     from workers.scene.context import Stopwatch, open_worker  # load GL and PyBullet
     from workers.shard.run_shard import run_scene
 
     context = open_worker(job, catalogue)
-    took, sizes = [], []
+    took, sizes, why = [], [], None
     for number in range(min(1 + TIMED_SCENES, job.scenes)):
         began = time.process_time()
         try:
@@ -282,8 +291,9 @@ def measure_scene(job: Job, catalogue: Catalogue) -> tuple[float, float] | None:
             continue
         took.append(time.process_time() - began)
         sizes.append(sum(len(file.data) for file in output.files))
+        why = next((f"{row['reason']}: {row['detail']}" for row in output.rows.get("failures", ())), why)
         if sum(took[1:]) > LONGEST_S:
             break
     made = [size for size in sizes if size]
     times = took[1:] or took
-    return (sum(times) / len(times), sum(made) / len(made)) if made else None
+    return (sum(times) / len(times), sum(made) / len(made)) if made else why

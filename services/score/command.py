@@ -19,12 +19,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.errors import InputError, number, plural
+from schemas.errors import InputError, command_line, number, plural
 from services.job.record import read_success, require_dataset
 from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.report import POLICY, Page, Section, fill_page, read_web
 from services.look.sections import table_html
 from services.read.verdict import explain_damage
+from services.run.progress import finish
 from services.score.items import Asked
 from services.score.predictions import find_predictions
 from services.score.run import ITEMS_FILE, describe_refused, score_dataset
@@ -69,7 +70,7 @@ def main(options: argparse.Namespace) -> int:
     print(answer_of(summary))
     print(f"page: {target / PAGE_FILE}")
     answer = {name: summary[name] for name in ("items", "missing", "refused", "metrics")}
-    return _finish(options, not summary["refused"], answer | {"page": str(target / PAGE_FILE)})
+    return finish(options, not summary["refused"], **answer, page=str(target / PAGE_FILE))
 
 
 def _print_metrics(metrics: dict[str, Any]) -> None:
@@ -82,7 +83,7 @@ def _print_metrics(metrics: dict[str, Any]) -> None:
 
 def _compare(options: argparse.Namespace) -> int:
     """Prints which of two scores is better by each metric, with a paired interval."""
-    (a, one), (b, other) = (_read_score(path) for path in options.compare)
+    (a, one), (b, other) = (_read_score(options.out, path) for path in options.compare)
     if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != options.out:
         raise InputError(f"{options.compare[0]} and {options.compare[1]} are scores of different datasets")
     if one["align"] != other["align"]:
@@ -97,15 +98,15 @@ def _compare(options: argparse.Namespace) -> int:
         print(
             f"{name:28}{in_words(name, row['a']):>12}{in_words(name, row['b']):>12}  b - a: {interval(name, row):28}{verdict}"
         )
-    return _finish(options, True, {"a": str(options.compare[0]), "b": str(options.compare[1]), "metrics": metrics})
+    return finish(options, True, a=str(options.compare[0]), b=str(options.compare[1]), metrics=metrics)
 
 
-def _read_score(path: Path) -> tuple[pa.Table, dict[str, Any]]:
+def _read_score(out: str, path: Path) -> tuple[pa.Table, dict[str, Any]]:
     """The items and the summary of a folder of predictions or of its score. Raises InputError where it is not scored."""
     for folder in (path, path / "score"):
         if (folder / ITEMS_FILE).is_file() and (folder / SUMMARY_FILE).is_file():
             return pq.read_table(folder / ITEMS_FILE), json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
-    raise InputError(f"{path} has no score: make one with verso score OUT {path}")
+    raise InputError(f"{path} has no score: make one with {command_line('score', out, path)}")
 
 
 def _write(path: Path, text: str) -> None:
@@ -113,12 +114,6 @@ def _write(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)
-
-
-def _finish(options: argparse.Namespace, ok: bool, answer: dict[str, Any]) -> int:
-    if options.json:
-        print(json.dumps({"ok": ok, **answer}))
-    return 0 if ok else 1
 
 
 _SHOWN: Final = ("depth_mae_m", "rgb_psnr_db", "shape_chamfer_l1_m", "volume_iou", "pose_add_m")

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from schemas.base import Array
-from schemas.errors import needs_making
+from schemas.errors import MachineError, needs_making
 
 Alignment = Literal["none", "scale", "similarity"]
 """Of a prediction with the truth before it is scored, where that is asked for. `none`: as it is. `scale`: one factor.
@@ -39,8 +39,7 @@ def score_colour(predicted: NDArray[np.uint8], true: NDArray[np.uint8], flip: bo
     ms_ssim: the same at five scales (Wang, Simoncelli and Bovik 2003, eq. 7): product of the mean contrast and structure at
     each scale, and of luminance too at the last, to the powers `SCALES`; a scale is the means of 2 x 2 pixels of the one before,
     an odd last row or column left out; a negative mean counts as 0.
-    flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None where `flip` is false, and without
-    flip-evaluator.
+    flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None where `flip` is false.
 
     nan where there is nothing to compare: no pixels (all), no whole window (ssim), none at the fifth scale (ms_ssim: images below
     176 pixels).
@@ -89,13 +88,18 @@ def _halve(image: Array) -> Array:
     return (even[0::2, 0::2] + even[0::2, 1::2] + even[1::2, 0::2] + even[1::2, 1::2]) / 4.0
 
 
-def _flip(predicted: NDArray[np.uint8], true: NDArray[np.uint8]) -> float | None:
-    if importlib.util.find_spec("flip_evaluator") is None:
-        return None
-    with needs_making("FLIP"):
-        from services.study.truths import flip_between
+def _flip(predicted: NDArray[np.uint8], true: NDArray[np.uint8]) -> float:
+    from services.study.truths import flip_between
 
     return flip_between(true, predicted) if true.size else math.nan
+
+
+def require_flip() -> None:
+    """Raises MachineError where this installation cannot compute FLIP."""
+    with needs_making("FLIP"):
+        import services.study.truths  # noqa: F401
+    if importlib.util.find_spec("flip_evaluator") is None:
+        raise MachineError("--flip needs flip-evaluator: `verso extra study` installs it in a checkout, pip elsewhere")
 
 
 SLACK_M = 1e-9

@@ -28,6 +28,7 @@ from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
+from services.score.images import require_flip
 from services.score.items import Asked, score_pair
 from services.score.predictions import Key, Predictions, digest_of
 from workers.store.ledger import iter_committed, range_rows
@@ -100,6 +101,8 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
     if "shape" in asked.kinds:
         with needs_making("scoring shapes"):
             import services.score.shape  # noqa: F401
+    if asked.flip and "rgb" in asked.kinds:
+        require_flip()
     out.mkdir(parents=True, exist_ok=True)
     todo, scored = list(_ranges(store, predictions, asked)), list[_Range]()
     unknown, metrics = set(predictions.names), set[str]()

@@ -7,8 +7,9 @@ from schemas.errors import InputError, RunError, describe_seconds, did_you_mean,
 from schemas.job.job import Job
 from services.study.model import ERRORS, Figure, Proof, Row, Targets, amount, short, times
 
-AS_CHEAP = 1.05
-"""Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %."""
+AS_CHEAP, WORTH = 1.05, 0.05
+"""Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %. And the
+share of the job's time that a change has to save, with its whole interval below the job's time, to be worth making."""
 
 FEWEST_SCENES, MORE_FAILED = 4, 0.01
 """Fewer scenes recommend nothing, as what is better in one or two is so by chance; and the share of scenes that a setting may
@@ -119,21 +120,28 @@ def excess(row: Row, targets: Targets, rows: Sequence[Row], end: str) -> float:
 def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
     """The cheapest of some of the rows, at least one, so that the choice is repeatable.
 
-    Errors are, to the bit, because scenes are a pure function of job and seed; times are not. So every cost up to `AS_CHEAP`
-    times the least upper end of an interval counts as the least, and facts without noise decide among those: the job itself
-    first, because a change for 5 % is not worth making; then the least sum of errors relative to the job's own, where what
-    is negligible counts as the bound of that; then the fewest changes; then the name.
+    The job itself stays unless others save `WORTH`, surely. Errors are repeatable to the bit, because scenes are a pure
+    function of job and seed; times are not. So every cost up to `AS_CHEAP` times the least upper end of an interval counts
+    as the least, and facts without noise decide among those: the fewest changes; then the least sum of errors relative to the
+    job's own, where what is negligible counts as the bound of that; then the name.
     """
     own = own_row(rows).errors
+    if any(not row.setting.parts for row in some):
+        some = [row for row in some if saves(row)] or [own_row(rows)]
 
-    def order(row: Row) -> tuple[bool, float, int, str]:
+    def order(row: Row) -> tuple[int, float, str]:
         least = {name: ERRORS[name].negligible for name in own}
         values = {name: (error_of(row, name, rows) or own[name]).value for name in own}
         relative = sum(max(values[name], least[name]) / max(own[name].value, least[name]) for name in own)
-        return bool(row.setting.parts), round(relative, 6), len(row.setting.parts), row.setting.name
+        return len(row.setting.parts), round(relative, 6), row.setting.name
 
     least_ratio = min(max(row.ratio, row.ratio_most) for row in some)
     return min((row for row in some if row.ratio <= least_ratio * AS_CHEAP), key=order)
+
+
+def saves(row: Row) -> bool:
+    """Whether a setting takes so much less time than the job that a change is worth making, with its interval clear of 1."""
+    return row.ratio <= 1.0 - WORTH and row.ratio_most < 1.0
 
 
 def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
@@ -166,6 +174,12 @@ def describe_answer(
         words = f"{names} did not keep the targets on fresh scenes. A longer --budget tells more."
         return f"Nothing is recommended: {words}", ""
     asked = default_targets(rows)[0] if targets is None else targets
+    own, others = own_row(rows), [row for row in rows if row.setting.parts]
+    few = [row for row in others if not all(tells(row, name) for name in row.errors)]
+    judged = len(few) < len(others) or any(proof.setting != own.setting.name for proof in proofs)
+    if not judged or not all(tells(own, name) for name in asked if name in own.errors):
+        words = f"fewer than {FEWEST_SCENES} scenes of the job, or of every other setting, were measured"
+        return f"No verdict: {words}, which promise nothing of others. Give a longer --budget.", ""
     limits = listed([f"{amount(name, most)} of {short(name)}" for name, most in asked.items()])
     wish = f"at most {limits}" if asked else "any error at all"
     wish += ", and nothing else worse than the job has it" if targets is None else ""
@@ -173,7 +187,6 @@ def describe_answer(
         chosen = recommend(rows, targets)
     except TargetError as error:
         return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {error}.", ""
-    own = own_row(rows)
     use = "use the job as it is" if chosen is own else f"use {chosen.setting.name}"
     saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
     losses = [
@@ -186,6 +199,8 @@ def describe_answer(
     cost = f"{milliseconds(chosen.ms)} of processor a scene ({plural(scenes, 'scene')}: {whole})"
     unproved = " It is not proved: the budget left no time for fresh scenes." if asked and not proofs else ""
     doubt = _doubt(chosen, targets or {}, rows)
+    if few:
+        doubt += f" Of {plural(len(few), 'setting')} fewer than {FEWEST_SCENES} scenes were measured: nothing is said of these."
     return f"For {wish}, {use}, which costs {cost}{saved}{loss}.{doubt}{unproved}", chosen.setting.name
 
 

@@ -72,7 +72,7 @@ def finish(study: Study, options: argparse.Namespace, targets: Targets | None) -
     """Writes the job for targets. Raises RunError where nothing is recommended."""
     if not study.chosen:
         recommend(study.rows, targets)  # says which target nothing meets
-        raise RunError("nothing is recommended: no setting kept the targets on fresh scenes; the page has each")
+        raise RunError(f"nothing is recommended: the page has each setting. {study.answer}")
     chosen = next(row for row in study.rows if row.setting.name == study.chosen)
     if options.target:
         tree = job_tree_with(chosen.setting.changes, read_tree(options.job, options.changes))

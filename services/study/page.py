@@ -3,7 +3,9 @@
 import base64
 import io
 import json
+import math
 import os
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from html import escape
@@ -18,9 +20,10 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.cbook import pts_to_poststep
 from matplotlib.figure import Figure as Picture
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from pydantic import TypeAdapter
 
-from schemas.errors import describe_seconds, milliseconds, number, size
+from schemas.errors import describe_seconds, milliseconds, number, plural, size
 from services.study.choose import front, own_row, tells
 from services.study.model import ERRORS, Proof, Row, Study, amount, short, shown, times, unit
 
@@ -150,7 +153,8 @@ def _group_table(study: Study, group: str) -> str:
 def _line(study: Study, row: Row, best: Mapping[str, Sequence[Row]]) -> str:
     own = own_row(study.rows)
     same = "≈ " if row is not own and row.ratio_least <= 1.0 <= row.ratio_most else ""
-    spread = f"<small>{number(row.ratio_least)} – {number(row.ratio_most)}</small>" if row is not own else ""
+    ends = f"{number(row.ratio_least)} – {number(row.ratio_most)}" if row.ratio_most < math.inf else "of one scene"
+    spread = f"<small>{ends}</small>" if row is not own else ""
     cells = [
         escape(row.setting.name),
         f"{same}{times(row.ratio)}{spread}",
@@ -174,10 +178,11 @@ def _figure(name: str, row: Row, own: Row, is_best: bool) -> str:
     marks = {"worse": "▲ "} if figure.low > mine.high else {"better": "▼ "} if figure.high < mine.low else {"": ""}
     ((side, mark),) = marks.items() if tells(row, name) else (("few", ""),)
     value, low, high = (number(shown(name, end)) for end in (figure.value, figure.low, figure.most))
-    return f'<td class="{side}{" front" * is_best}">{mark}{value}<small>{low} – {high}</small></td>'
+    ends = f"{low} – {high}" if tells(row, name) else f"of {plural(figure.scenes, 'scene')}"
+    return f'<td class="{side}{" front" * is_best}">{mark}{value}<small>{ends}</small></td>'
 
 
-PANELS, MOVED, REACH = 4, 0.05, 4.0
+PANELS, WIDE_IN, MOVED, REACH = 4, 5.2, 0.05, 4.0
 """The most panels of a picture; changes up to this share of the job's own error are negligible too; and an interval is cut
 where it reaches beyond this many times its middle, which would otherwise fill the axis."""
 
@@ -195,30 +200,50 @@ MARKS: Mapping[str, dict[str, Any]] = {
 
 @style.context(["default", {"font.family": "DejaVu Sans", "font.size": 9.5, "axes.edgecolor": "#888888"}])
 def draw_tradeoff(study: Study) -> bytes:
-    """A PNG with panels of errors that a knob moves over processor time, both logarithmic: the first of each group first."""
+    """A PNG with a panel for each error that a knob moves, over processor time, both logarithmic: the first of each group first.
+
+    One below another, narrow enough to be read on a phone: `WIDE_IN` on the 390 points of one leave letters of 9 points.
+    """
     every = {name: moving_rows(study.rows, name) for name in ERRORS}
     moving = {name: rows for name, rows in every.items() if any(row.setting.kind == "single" for row in rows)}
     by_group = [[name for name in moving if ERRORS[name].group == group] for group in GROUPS]
     panels = [name for rank in zip_longest(*by_group) for name in rank if name is not None][:PANELS]
-    lines = max(1, -(-len(panels) // 2))
-    picture = Picture((12.0, lines * 4.6 + 1.0), dpi=150, layout="constrained")
-    title = f"{study.job[:40]}: a scene takes {milliseconds(own_row(study.rows).ms)}; {sample(study)}"
-    picture.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    picture = Picture((WIDE_IN, max(1, len(panels)) * 3.6 + 1.6), dpi=150, layout="constrained")
+    title = f"{study.job[:40]}: {milliseconds(own_row(study.rows).ms)} a scene\n{sample(study)}"
+    picture.suptitle(title, x=0.01, ha="left", fontsize=10.5, fontweight="bold")
     knobs = dict.fromkeys(row.setting.knob for row in study.rows if row.setting.kind == "single")
     looks = {knob: look for knob, *look in zip(knobs, cycle(COLORS), cycle("o^svPX"), strict=False)}
     legend: dict[str, Any] = {}
     for place, name in enumerate(panels, start=1):
-        axes = picture.add_subplot(lines, 2, place)
-        axes.set_title(GROUPS[ERRORS[name].group], loc="left", fontsize=11)
+        axes = picture.add_subplot(len(panels), 1, place)
+        axes.set_title(question_of(study.rows, name), loc="left", x=-0.14, fontsize=9.5)
         _draw_panel(axes, moving[name], name, looks)
         handles, labels = axes.get_legend_handles_labels()
         legend |= dict(zip(labels, handles, strict=True))
     if legend:
-        picture.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=5, frameon=False)
+        picture.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=2, frameon=False)
     data = io.BytesIO()
     # Neither a date nor the library's name, so that the same study gives the same bytes.
     picture.savefig(data, format="png", metadata={"Software": None})
     return data.getvalue()
+
+
+def question_of(rows: Sequence[Row], error: str) -> str:
+    """What a panel asks, and what is surely so: the cheapest of the fewest changes whose interval is below the job's.
+
+    An answer only where `FEWEST_SCENES` measured both.
+    """
+    own, words = own_row(rows), f"{short(error)}: what does less cost?"
+    if not tells(own, error):
+        return words
+    able = [row for row in rows if row is not own and tells(row, error)]
+    better = [row for row in able if row.errors[error].high < own.errors[error].low]
+    if not better:
+        return f"{words}\nNothing that was measured is surely better than the job."
+    row = min(better, key=lambda row: (len(row.setting.parts), row.ratio, row.setting.name))
+    less = 1.0 - row.errors[error].value / own.errors[error].value
+    span = f"{number(row.ratio_least)} to {number(row.ratio_most)}"
+    return f"{words}\n{row.setting.name[:30]}: {less:.0%} less, {times(row.ratio)} the time ({span})"
 
 
 def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
@@ -241,13 +266,15 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str,
             color, marker = looks[row.setting.knob]
             mark |= {"color": color, "marker": marker, "label": row.setting.knob}
         if not tells(row, error):
-            mark |= {"alpha": 0.4}  # fewer than `FEWEST_SCENES` scenes
-        low, high = max(figure.low, figure.value / REACH), min(figure.most, figure.value * REACH)
-        axes.vlines(row.ms, shown(error, low), shown(error, high), color=mark["color"], lw=0.8, alpha=0.5)
+            mark |= {"alpha": 0.4}  # fewer than `FEWEST_SCENES` scenes, whose interval says nothing
+        else:
+            low, high = max(figure.low, figure.value / REACH), min(figure.most, figure.value * REACH)
+            axes.vlines(row.ms, shown(error, low), shown(error, high), color=mark["color"], lw=0.8, alpha=0.5)
         axes.plot(*place[row.setting.name], ls="", **mark)
         if row.setting.kind == "preset" or (row in best and row.setting.kind == "single"):
             text = row.setting.parts[0][1][:26]
-            axes.annotate(text, place[row.setting.name], (6.0, 3.0), textcoords="offset points", zorder=6)
+            beside = (6.0, 3.0 if row.setting.kind == "preset" else -11.0)  # those of one place stay apart
+            axes.annotate(text, place[row.setting.name], beside, textcoords="offset points", zorder=6)
     if best:
         corners = pts_to_poststep(*zip(*(place[row.setting.name] for row in best), strict=True))
         axes.plot(*corners, color="#222222", lw=1.3, zorder=2, label="front: none is cheaper and better")
@@ -260,10 +287,16 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str,
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
             low, high = axis.get_view_interval()
-            subs = (1.0, 2.0, 5.0) if high > 4.0 * low else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-            axis.set_major_locator(LogLocator(subs=subs, numticks=8))
+            subs = (1.0,) if high > 1e2 * low else (1.0, 2.0, 5.0)
+            axis.set_major_locator(LogLocator(subs=subs, numticks=6) if high > 4.0 * low else MaxNLocator(4))
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
     axes.set(xlabel="ms of processor a scene", ylabel=", ".join(filter(None, [short(error), unit(error)])))
     axes.grid(color="#e8e8e8")
     axes.spines[["top", "right"]].set_visible(False)
+
+
+if __name__ == "__main__":  # draws the pictures of kept studies anew: python -m services.study.page docs/tradeoff/*
+    for folder in map(Path, sys.argv[1:]):
+        kept = TypeAdapter(Study).validate_json((folder / "study.json").read_bytes())
+        (folder / "tradeoff.png").write_bytes(draw_tradeoff(kept))

@@ -297,7 +297,8 @@ class Table:
             return None
         figure = share([mine[n]["s"] for n in both], [own[n]["s"] for n in both])
         weight = 1e3 * self._own_s[timed] / self.own_ms
-        value, low, high = (1.0 + weight * (ratio - 1.0) for ratio in (figure.value, figure.low, figure.high))
+        ends = (figure.low, figure.high) if len(both) > 1 else (-math.inf, math.inf)  # one scene says nothing of others
+        value, low, high = (1.0 + weight * (ratio - 1.0) for ratio in (figure.value, *ends))
         return Figure(value, low, high, low, high, figure.scenes)
 
     def row(self, setting: Setting) -> Row | None:

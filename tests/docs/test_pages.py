@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -37,7 +38,7 @@ from workers.capture.simulate.simulate import simulate_capture
 from workers.scene.chance import SceneChance
 
 ROOT = Path(__file__).resolve().parents[2]
-DIGEST = "b303d85c6dfab8bd410e5279ff917e5084a55b4b35abd3c06585001e9a88c3d0"
+DIGEST = "2eb89837f52c05a7ee1aba49a460050c4b61ae4518b068e70c1119ebc72705b2"
 FIRST = "./verso run deploy/jobs/tabletop.yaml"
 
 ELSEWHERE = {
@@ -61,6 +62,7 @@ SMALLER = {
     r"tests/hard_cases": "tests/test_layers.py",
     r"--scenes 64 --workers 2": "--scenes 2",
     r"(\./verso tradeoff .*)": r"\1 --budget 60s --knobs step",
+    r"(--out data/targets)": r"\1 --scenes 2",
     r"(run deploy/jobs/captures.yaml)": r"\1 --scenes 1 --set captures.simulate.views=8 " + TINY,
     r"--views 40 --category mug": f"--views 10 --category mug {TINY}",
     r"~/my_meshes": "meshes",
@@ -79,19 +81,35 @@ PAGES = {
     "docs/measured.md": pytest.mark.minute,
     "docs/own_meshes.md": pytest.mark.slow,
     "docs/queue.md": pytest.mark.slow,
-    "docs/reading.md": pytest.mark.slow,
     "docs/report.md": pytest.mark.slow,
     "deploy/README.md": pytest.mark.minute,
     "deploy/examples/README.md": pytest.mark.slow,
 }
 
-_BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$|((?:^ {4,}[^\n]*\n)+)", re.MULTILINE | re.DOTALL)
+READERS = ("docs/export.md", "docs/reading.md")
+"""Pages that are typed where verso-read is installed, but for blocks that name another installation (test_installations.py)."""
+
+_BLOCK = re.compile(r"^ *```(\w*) ?(\w*)\n(.*?)^ *```$|((?:^ {4,}[^\n]*\n)+)", re.MULTILINE | re.DOTALL)
 _COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\./verso|verso|docker|kubectl|\.venv/bin/\w+|export) ?")
+
+
+def blocks(page: str) -> Iterator[tuple[str, str, str]]:
+    """(language, installation, text) of every block of a page: ```sh checkout; without a word the page's own."""
+    usual = "reader" if page in READERS else "checkout"
+    for language, installation, fenced, indented in _BLOCK.findall((ROOT / page).read_text()):
+        yield language, installation or usual, textwrap.dedent(fenced or indented)
+
+
+def steps_of(page: str, installation: str) -> Iterator[tuple[str, str]]:
+    """(language, what to run) of the blocks for an installation."""
+    for language, where, text in blocks(page):
+        if where == installation:
+            yield from steps(f"```{language}\n{text}```\n")
 
 
 def steps(text: str) -> Iterator[tuple[str, str]]:
     """(language, what to run) of every block of a page: Python as a whole, of others each command."""
-    for language, fenced, indented in _BLOCK.findall(text):
+    for language, _, fenced, indented in _BLOCK.findall(text):
         if language == "python":
             yield "python", fenced
             continue
@@ -107,7 +125,7 @@ def steps(text: str) -> Iterator[tuple[str, str]]:
 
 def test_every_page_with_a_block_is_run_and_steps_are_found_in_order():
     pages = [ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/**/*.md")]
-    assert {str(page.relative_to(ROOT)) for page in pages if list(steps(page.read_text()))} <= PAGES.keys()
+    assert {str(page.relative_to(ROOT)) for page in pages if list(steps(page.read_text()))} <= {*PAGES, *READERS}
     text = 'x\n\n    $ ./verso run a  # so\n    made\n\n```python\nx = 1\n```\n\n- y\n\n      ./verso query d "a\n      b"\n'
     assert list(steps(text)) == [("sh", "./verso run a"), ("python", "x = 1\n"), ("sh", './verso query d "a b"')]
     assert next(line for _, line in steps((ROOT / "README.md").read_text())) == FIRST
@@ -123,7 +141,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def test_every_link_leads_to_a_file_and_a_heading_and_every_command_is_one_that_the_command_line_takes(capsys):
-    for page in [ROOT / "CHANGELOG.md", *(ROOT / page for page in PAGES), *ROOT.glob("docs/**/*.md")]:
+    for page in [ROOT / "CHANGELOG.md", *(ROOT / page for page in (*PAGES, *READERS)), *ROOT.glob("docs/**/*.md")]:
         text = page.read_text()
         for target in re.findall(r"\[[^\]]*\]\(([^)\s]+)\)", re.sub(r"(?ms)^```.*?^```$|`[^`\n]+`", "", text)):
             path, _, anchor = target.partition("#")
@@ -238,7 +256,7 @@ def test_a_page_runs_from_top_to_bottom(page, first, tmp_path, monkeypatch):
         write_realsense(made_on_charuco(tmp_path / "shots"), root / "recording.bag")
     names: dict = {}
     job = "j0a1b2c3d"
-    for language, line in steps((ROOT / page).read_text()):
+    for language, line in steps_of(page, "checkout"):
         if language == "python":
             if all(map(importlib.util.find_spec, re.findall(r"^import (\w+)$", line, re.MULTILINE))):
                 exec(compile(line, page, "exec"), names)

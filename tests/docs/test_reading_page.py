@@ -19,7 +19,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 def blocks_of(page: Path, language: str) -> list[str]:
     """The fenced blocks of a page in one language, in order."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}(?: data)?\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
 
 
 def run_blocks(page: Path) -> dict:
@@ -79,7 +79,7 @@ def test_the_commands_of_the_page_answer(here, monkeypatch, capfdbinary):
     answers = []
     for line in "".join(blocks_of(DOCS / "reading.md", "sh")).splitlines():
         program, *words = shlex.split(line)
-        assert program == "./verso"
+        assert program == "verso"
         if ">" in words and not words[-1].isdigit():
             words = words[:-2]
         assert main(words) == 0

@@ -164,7 +164,7 @@ PROOFS: dict[str, Proof] = {
         only_with(lambda made: "object_contacts" not in made.scene.called),
     ),
     "decomposition": Proof(dropped(mug_on_peg()), rests),
-    "fine_step": Proof(dropped(drop(cube(0.005), ring(0.001), 1.0, xy=(0.45, 0.0))), rests),
+    "fine_step": Proof(dropped(drop(cube(0.005), ring(0.001), 1.0, turn(X, 20), (0.45, 0.0))), rests),
     "rolling_friction": Proof(
         dropped(drop(built_in("bottle"), level(), R=turn(X, 60) @ turn(Y, 20)), physics={"max_settle_s": 1.5}), rests
     ),

@@ -84,6 +84,45 @@ def nested_up(count: int) -> Measure:
     )
 
 
+CUP_M, WALL_M, HIGH_M = (0.02, 0.03), 0.002, 0.08
+"""Radii below and above, wall and height of a tapered cup."""
+
+
+def cups(count: int) -> Group:
+    """Tapered cups of 48 sides over one another, each with its foot in the one below, a fall of 2 mm from where it fits."""
+    (low, high), table = CUP_M, level()
+    outline = [[0, 0], [low, 0], [high, HIGH_M], [high - WALL_M, HIGH_M], [low - WALL_M, WALL_M], [0, WALL_M]]
+    cup = asset_of(trimesh.creation.revolve(np.array(outline), sections=48), mass_kg=0.03)
+    return together(table, [put(cup, table, 0.001 + 0.02 * k) for k in range(count)])
+
+
+def fitting_m() -> float:
+    """How far above a cup's foot its wall is as wide as the foot of the next: w + w (h - w) / (R - r)."""
+    return WALL_M + WALL_M * (HIGH_M - WALL_M) / (CUP_M[1] - CUP_M[0])
+
+
+def lifted(step_m: float, bound_mm: float = 0.01) -> Measure:
+    """How far the lowest corner of each is from a step above that of the one before."""
+
+    def off(made: Made, rest: Rest) -> float:
+        pairs = zip(made.starts, rest, strict=True)
+        low = [transform(one.T_world_obj, start.hull.vertices)[:, 2].min() for start, one in pairs]
+        return float(np.abs(np.diff(low) - step_m).max()) * 1e3
+
+    return Measure("worst step off what it must be, mm", bound_mm, off)
+
+
+def boxes_in_boxes() -> Group:
+    """Three open boxes in one another, 5 mm of air about each."""
+    table, starts = level(), []
+    for k in range(3):
+        side_m = 0.1 - 0.02 * k
+        hollow = box(side_m - 0.006, side_m - 0.006, 0.05, (0, 0, 0.003))
+        shell = asset_of(box(side_m, side_m, 0.05).difference(hollow), mass_kg=0.1)
+        starts.append(put(shell, table, 0.0005 + 0.004 * k))
+    return together(table, starts)
+
+
 def lowest_within(bound_mm: float, body: int = 1, other: int = 0) -> Measure:
     """Sideways from the middle of one object's frame to the lowest point of another."""
 
@@ -199,6 +238,13 @@ HOLLOWS = (
         tier="minute",
         again="slow",
     ),
+    settles("two tapered cups in one another", lifted(fitting_m(), 0.2), lambda: cups(2)),
+    settles(
+        "three tapered cups in one another",
+        both(lifted(fitting_m(), 0.2), tilts(0, 0, 0, bound_deg=1.0)),
+        lambda: cups(3),
+    ),
+    settles("three open boxes in one another", both(lifted(0.003), tilts(0, 0, 0, bound_deg=0.1)), boxes_in_boxes),
     settles("two mugs linked by their handles", both(tilt(0.5), apart(15.0)), linked_mugs, tier="minute", again="slow"),
     settles(
         "spoon in a mug from a file",

@@ -179,6 +179,21 @@ def beside(bound_mm: float, body: int = 1, other: int = 0) -> Measure:
     return Measure("sideways from the other, mm", bound_mm, off)
 
 
+def bounces_for(drop_m: float, restitution: float) -> Measure:
+    """Between the time to rest of what falls straight down and bounces, and the sum of its flights.
+
+    The first takes t = sqrt(2 h / g), each further one 2 t times a power of the contact's restitution. The last window of rest
+    takes up to 0.25 s more, a ball of flat faces rocks for another 0.06 s, and what is slower than 0.05 m/s does not bounce,
+    which is as long at 0.99.
+    """
+    seconds = math.sqrt(2.0 * drop_m / 9.81) * (1.0 + restitution) / (1.0 - restitution)
+    return Measure(
+        "seconds off the sum of its flights",
+        0.08 * seconds + 0.35,
+        lambda _, rest: abs(max(one.settle_s for one in rest) - seconds),
+    )
+
+
 def both(*measures: Measure) -> Measure:
     """Several at once: the one that is worst against its bound, as a share of it."""
     return Measure(

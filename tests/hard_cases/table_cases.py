@@ -3,7 +3,7 @@
 import math
 
 from tests.hard_cases.bodies import ball, built_in, cube, handle_reach, mug_handle_over_edge, mug_on_peg, over_edge
-from tests.hard_cases.case import EITHER, Case, falls, settles
+from tests.hard_cases.case import EITHER, Case, falls, refuse, settles
 from tests.hard_cases.drops import (
     EDGE_M,
     X,
@@ -18,7 +18,7 @@ from tests.hard_cases.drops import (
     with_hole,
     with_raised_ring,
 )
-from tests.hard_cases.measures import Measure, both, flat, height, leaning, on_a_face, shift, tilt
+from tests.hard_cases.measures import Measure, both, bounces_for, flat, height, leaning, on_a_face, shift, tilt
 from tests.hard_cases.rolling_cases import SMOOTH
 from tests.hard_cases.thin_cases import plate
 
@@ -93,11 +93,27 @@ SURFACES = (
         lambda: drop(cube(), level(), 0.1),
         {"restitution": 0.9},
     ),
+    *(
+        settles(
+            f"ball from 100 mm, restitution {e:g}",
+            both(on_a_face(), bounces_for(0.1, e * e)),
+            lambda: drop(ball(0.04), level(), 0.1),
+            {"restitution": e},
+            again="minute",
+        )
+        for e in (0.3, 0.5, 0.7, 0.9, 0.95, 0.99)
+    ),
     settles(
-        "ball from 100 mm, restitution 0.9",
-        on_a_face(),
+        "cube from 100 mm flat, restitution 0.95",
+        both(flat(0.1), bounces_for(0.1, 0.95**2)),
+        lambda: drop(cube(), level(), 0.1),
+        {"restitution": 0.95},
+    ),
+    Case(
+        "ball from 100 mm, restitution 1",
+        refuse("not_at_rest"),
+        None,
         lambda: drop(ball(0.04), level(), 0.1),
-        {"restitution": 0.9},
-        again="minute",
+        {"restitution": 1.0},
     ),
 )

@@ -25,8 +25,8 @@ from tests.judge.table import STILL_DEG, STILL_MM
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.physics.fall import FINEST
-from workers.physics.release import moved_by, release_again
-from workers.physics.settle import RECHECK_RATE, RECHECK_S, settle_scene
+from workers.physics.release import RELEASE_RATE, moved_by, release_again
+from workers.physics.settle import RECHECK_S, settle_scene
 from workers.scene.chance import SceneChance
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.plan import plan_scene
@@ -64,7 +64,7 @@ def compare(job: Job, catalogue: Catalogue, scene_id: int) -> Iterator[Compared]
     places.append(("lifted", translation(0.0, 0.0, lift_mm / 1e3) @ rest.T_world_obj))
     for kind, T in places:
         found = []
-        for rate in (FINEST, RECHECK_RATE):
+        for rate in (FINEST, RELEASE_RATE):
             begun = time.process_time()
             placed = [dataclasses.replace(rest, T_world_obj=T)]
             (after,) = release_again(plan, placed, job.physics, effects, RECHECK_S, rate)

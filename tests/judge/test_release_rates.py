@@ -31,7 +31,7 @@ def catalogue(tmp_path_factory):
 
 def test_an_object_is_let_go_from_rest_turned_twice_and_lifted(catalogue, monkeypatch):
     seen = []
-    monkeypatch.setattr(release_rates, "release_again", moves({FINEST: 0.0, release_rates.RECHECK_RATE: 0.05}, seen))
+    monkeypatch.setattr(release_rates, "release_again", moves({FINEST: 0.0, release_rates.RELEASE_RATE: 0.05}, seen))
     compared = list(compare(JOB, catalogue, 5001))
     assert [one.kind for one in compared] == ["at rest", "turned", "turned", "lifted"]
     assert all(one.refused == (False, False) and one.quarter[0] == pytest.approx(0.05) for one in compared)
@@ -47,7 +47,7 @@ def test_an_object_is_let_go_from_rest_turned_twice_and_lifted(catalogue, monkey
 
 @pytest.mark.parametrize(("finest_mm", "quarter_mm", "code"), [(0.2, 0.2, 0), (0.05, 0.2, 0), (0.2, 0.05, 1)])
 def test_only_what_the_quarter_alone_lets_pass_is_an_error(finest_mm, quarter_mm, code, monkeypatch, capsys):
-    rates = {FINEST: finest_mm, release_rates.RECHECK_RATE: quarter_mm}
+    rates = {FINEST: finest_mm, release_rates.RELEASE_RATE: quarter_mm}
     monkeypatch.setattr(release_rates, "release_again", moves(rates))
     monkeypatch.setattr("sys.argv", ["release_rates", "--scenes", "1"])
     assert main() == code

@@ -81,6 +81,8 @@ class Checkout:
             (self.bin / name).chmod(0o755)
         self.venv = self.root / ".venv"
         self.environ: dict[str, str] = {}
+        self.through: list[str] = []
+        """What starts the launcher."""
 
     def start(self, *args: str, launcher: Path | None = None, cwd: Path | None = None) -> subprocess.Popen[str]:
         environ = {
@@ -90,7 +92,7 @@ class Checkout:
             "PYTHONDONTWRITEBYTECODE": "1",
         }
         environ |= {"HOME": str(self.faults.parent), **self.environ}
-        command = [str(launcher or self.root / "verso"), *args]
+        command = [*self.through, str(launcher or self.root / "verso"), *args]
         pipe = subprocess.PIPE
         return subprocess.Popen(
             command, env=environ, cwd=cwd or self.faults, stdout=pipe, stderr=pipe, text=True, start_new_session=True

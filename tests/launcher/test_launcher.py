@@ -1,5 +1,7 @@
 """The launcher: it sets up once, brings up to date what changed, survives kills and faults, and starts the command."""
 
+import os
+import re
 import tomllib
 
 import pytest
@@ -21,6 +23,21 @@ def test_the_first_start_installs_the_lock_then_the_project_and_the_second_nothi
     elsewhere.mkdir()
     (checkout.faults / "exit").write_text("2")  # the command's exit code is the launcher's
     assert checkout.run("doctor", launcher=link, cwd=elsewhere)[:2] == (2, f"doctor|path=|in={elsewhere}|typed={link}|")
+    assert checkout.calls() == []
+
+
+@pytest.mark.parametrize("locked", ["", ".venv", ".venv.lock"])
+def test_an_environment_that_is_somebody_elses_is_told_in_one_line_and_works_where_it_is_whole(checkout, locked):
+    assert checkout.run("status")[0] == 0
+    checkout.calls()
+    (checkout.root / locked).chmod(0o555)
+    checkout.through = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+    assert checkout.run("status")[0] == 0
+    code, _, told = checkout.run("tradeoff", "job.yaml")
+    (checkout.root / locked).chmod(0o755)
+    assert code == 1 and re.fullmatch(
+        r"verso: .*/\.venv lacks what this command needs, and \w+ cannot write there: .*\n", told
+    )
     assert checkout.calls() == []
 
 

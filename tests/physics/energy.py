@@ -71,8 +71,8 @@ def watched(assets: Sequence[Asset], spin: Sequence[float] = (0.0, 0.0, 0.0)) ->
             super().set_velocity(velocity, spin, body)
             self.energies[:] = [sum(energy(self, each) for each in range(len(self.bodies)))]
 
-    def begin(client: int, grounds: tuple[int, ...], bodies: tuple[int, ...], steps: int) -> World:
-        world = Watched(client, grounds, bodies, 1, together=steps)
+    def begin(client: int, grounds: tuple[int, ...], bodies: tuple[int, ...], steps: int, slop_m: float) -> World:
+        world = Watched(client, grounds, bodies, 1, slop_m, together=steps)
         places = [world.pose(body) for body in range(len(bodies))]
         # A free fall ends at another height over a mesh
         falls[tuple(np.round([value for (x, y, _), turned in places for value in (x, y, *turned)], 9))] = world.energies

@@ -60,7 +60,7 @@ def settle_single(
 
 
 def recheck_group(
-    starts: Sequence[ObjectStart], settled: Sequence[Settled], on: Table, physics: Physics, level_rate: float = FINEST
+    starts: Sequence[ObjectStart], settled: Sequence[Settled], on: Table, physics: Physics, rate: float = FINEST
 ) -> list[tuple[float, float]]:
     """(mm that the farthest point moves, degrees that it turns) of every object, when all are released again.
 
@@ -69,12 +69,12 @@ def recheck_group(
     effects = effects_of(starts, on, physics)
     if any(each.support == "mesh" for each in settled):
         effects = EffectPlan((*effects.ran, *called_for_with("table_mesh", starts, physics)), {})
-    after = release_again(scene_of(starts, on), settled, physics, effects, RECHECK_S, level_rate)
+    after = release_again(scene_of(starts, on), settled, physics, effects, RECHECK_S, rate)
     return [moved_by(one, rest.T_world_obj, T) for one, rest, T in zip(starts, settled, after, strict=True)]
 
 
 def recheck(
-    start: ObjectStart, settled: Settled, on: Table, physics: Physics, level_rate: float = FINEST
+    start: ObjectStart, settled: Settled, on: Table, physics: Physics, rate: float = FINEST
 ) -> tuple[float, float]:
     """The same of one object."""
-    return recheck_group((start,), (settled,), on, physics, level_rate)[0]
+    return recheck_group((start,), (settled,), on, physics, rate)[0]

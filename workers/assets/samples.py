@@ -111,21 +111,26 @@ def _draw_surface(shape: Shape, solid: Mesh | None, count: int, rng: np.random.G
     mesh = shape.mesh
     kept: list[tuple[NDArray, ...]] = []
     while sum(len(face) for face, _, _ in kept) < count:
-        drawn = _draw_points(mesh, count, rng)
+        drawn = draw_points(mesh, rng.random((3, count)))
         outer = slice(None) if solid is None else distance_to_mesh(drawn[2], solid)[0] <= INNER_M
         kept.append(tuple(array[outer] for array in drawn))
     face, weights, points = (np.concatenate(arrays)[:count] for arrays in zip(*kept, strict=True))
-    colors, start = np.empty((count, 3), np.uint8), 0
+    return {
+        "surface_points": points.astype(np.float32),
+        "surface_normals": face_normals(mesh.vertices, mesh.faces)[face].astype(np.float32),
+        "surface_colors": colors_at(shape, face, weights),
+    }
+
+
+def colors_at(shape: Shape, face: NDArray[np.int64], weights: Array) -> NDArray[np.uint8]:
+    """[N, 3] sRGB of base colours, vertex colours and textures at points of faces [N], by weights [N, 3] of their corners."""
+    colors, start = np.empty((len(face), 3), np.uint8), 0
     for part in shape.parts:
         mine = np.flatnonzero((face >= start) & (face < start + len(part.faces)))
         corners = np.ascontiguousarray(part.faces[face[mine] - start])
         colors[mine] = encode_codes(_base_light(part, corners, np.ascontiguousarray(weights[mine])))
         start += len(part.faces)
-    return {
-        "surface_points": points.astype(np.float32),
-        "surface_normals": face_normals(mesh.vertices, mesh.faces)[face].astype(np.float32),
-        "surface_colors": colors,
-    }
+    return colors
 
 
 def _base_light(part: Part, corners: NDArray[np.int32], weights: Array) -> Array:
@@ -153,7 +158,7 @@ def _draw_volume(
     near = count // 2
     spread = (lower + upper) / 2.0 + (rng.random((count - near, 3)) - 0.5) * GROWN * (upper - lower)
     away = NEAR * float(np.linalg.norm(upper - lower)) * rng.standard_normal((near, 3))
-    stored = np.concatenate([spread, _draw_points(boundary, near, rng)[2] + away]).astype(np.float32)
+    stored = np.concatenate([spread, draw_points(boundary, rng.random((3, near)))[2] + away]).astype(np.float32)
     points = stored.astype(np.float64)
     distance = distance_to_mesh(points, boundary)[0]
     number = winding_of_closed(points, boundary) if closed else winding_numbers(points, boundary)
@@ -165,12 +170,15 @@ def _draw_volume(
     }, float(unclear.mean())
 
 
-def _draw_points(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], Array, Array]:
-    """(faces [N], weights of their corners [N, 3], points [N, 3]) of a mesh, uniform by area (Osada et al. 2002, 4.1)."""
+def draw_points(mesh: Mesh, chance: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """(faces [N], weights of their corners [N, 3], points [N, 3]) of a mesh, uniform by area (Osada et al. 2002, 4.1).
+
+    chance [3, N]: numbers in [0, 1).
+    """
     areas = face_areas(mesh.vertices, mesh.faces)
     ends = np.cumsum(areas)
-    face = np.searchsorted(ends, rng.random(count) * ends[-1], side="right").clip(max=np.flatnonzero(areas)[-1])
-    root, along = np.sqrt(rng.random(count)), rng.random(count)
+    face = np.searchsorted(ends, chance[0] * ends[-1], side="right").clip(max=np.flatnonzero(areas)[-1])
+    root, along = np.sqrt(chance[1]), chance[2]
     weights = np.stack([1.0 - root, root * (1.0 - along), root * along], axis=1)
     a, b, c = (mesh.vertices[mesh.faces[face, k]] * weights[:, k, None] for k in range(3))
     return face, weights, a + b + c

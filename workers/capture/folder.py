@@ -143,7 +143,7 @@ def open_folder(path: Path, board: Board | None = None) -> CaptureFolder:
     With a `board` there need be no board.json.
     """
     if not path.is_dir():
-        raise CaptureError("missing", f"{path} is no folder")
+        raise CaptureError("missing", f"{path}: there is no such folder")
     numbers, spec, about = _view_numbers(path), _read_json(path / CAMERA_FILE, CameraFile), path / CAPTURE_FILE
     described = _read_json(about, CaptureFile) if about.exists() else CaptureFile(name=derive_name(path.resolve().name))
     board = board or _read_json(path / BOARD_FILE, Board)
@@ -186,6 +186,11 @@ def read_board(path: Path) -> Board:
     return _read_json(path, Board)
 
 
+def read_camera_file(path: Path) -> CameraFile:
+    """What a camera.json says, wherever it is. Raises CaptureError that names the file."""
+    return _read_json(path, CameraFile)
+
+
 def read_view(folder: CaptureFolder, number: int) -> CapturedView:
     """One view's images. Raises CaptureError where one cannot be read or has the wrong size."""
     common, path = folder.camera.intrinsics, folder.file("camera", number)
@@ -207,7 +212,7 @@ def _as_read(folder: CaptureFolder, image: NDArray, k: Intrinsics, between: bool
     common = _intrinsics(stored, stored)  # the markers' camera may be in place of it
     if k != folder.camera.intrinsics:
         image = change_camera(image, k, common, between)
-    if not _is_taken_out(stored):
+    if not is_taken_out(stored):
         return image
     return remap(image, pinhole_maps(common, tuple(stored.distortion), stored.lens_model == "fisheye"), between)
 
@@ -254,14 +259,15 @@ def write_view(path: Path, view: CapturedView) -> None:
         (path / f"mask_{view.number:05d}.png").write_bytes(encode_mask(view.mask))
 
 
-def write_description(path: Path, about: CaptureFile, camera: CaptureCamera, board: Board) -> None:
-    """Writes camera.json, board.json and capture.json; the principal point with pixel centres at 0, as the Kinect has it."""
-    for name, model in ((CAMERA_FILE, describe_camera(camera)), (BOARD_FILE, board), (CAPTURE_FILE, about)):
+def write_description(path: Path, about: CaptureFile, camera: CaptureCamera | CameraFile, board: Board) -> None:
+    """Writes camera.json, board.json and capture.json."""
+    spec = camera if isinstance(camera, CameraFile) else describe_camera(camera)
+    for name, model in ((CAMERA_FILE, spec), (BOARD_FILE, board), (CAPTURE_FILE, about)):
         (path / name).write_text(model.model_dump_json(indent=1, exclude=board.unwritten) + "\n", encoding="utf-8")
 
 
 def describe_camera(camera: CaptureCamera) -> CameraFile:
-    """What camera.json says of a camera."""
+    """What camera.json says of a camera; the principal point with pixel centres at 0, as the Kinect has it."""
     k = camera.intrinsics
     return CameraFile(
         **k.model_dump(include={"width", "height", "fx", "fy"}),
@@ -307,11 +313,11 @@ def _is_rigid(T: Pose) -> bool:
 
 def camera_of(spec: CameraFile) -> CaptureCamera:
     """The camera that camera.json describes, as its pictures are read."""
-    lens = _eight([] if _is_taken_out(spec) else spec.distortion)
+    lens = _eight([] if is_taken_out(spec) else spec.distortion)
     return CaptureCamera(_intrinsics(spec, spec), lens, spec.depth_units_per_m, spec.depth)
 
 
-def _is_taken_out(spec: CameraFile) -> bool:
+def is_taken_out(spec: CameraFile) -> bool:
     """Whether the lens is none that the steps after this one know, so that pictures are read without it."""
     return spec.lens_model == "fisheye" or len(spec.distortion) > 8
 

@@ -1,7 +1,7 @@
 """From a recording of any format to the folder of a capture: frames paired, chosen and registered."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,20 @@ from schemas.capture import CapturedView, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
 from schemas.scene.view import Intrinsics
-from workers.capture.folder import CaptureFile, stored_depth, write_description, write_view
+from workers.capture.folder import (
+    CAMERA_FILE,
+    CameraFile,
+    CaptureFile,
+    camera_of,
+    describe_camera,
+    is_taken_out,
+    read_camera_file,
+    stored_depth,
+    write_description,
+    write_view,
+)
 from workers.door.opening import as_refusal
+from workers.door.recordings.folders import scaled_camera
 from workers.door.recordings.formats import open_any
 from workers.door.recordings.pictures import change_camera
 from workers.geometry.zbuffer import register_depth
@@ -173,15 +185,70 @@ class Imported:
     frames: int
     """Colour frames with depth, of which the views were chosen."""
     losses: Losses
+    calibration: str
+    """Whose the camera is, in words."""
+    notes: tuple[str, ...]
+    """What is missing or was taken for granted, sentences."""
 
 
-def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, views: int) -> Imported:
+def _open(path: Path, file: Path | None) -> tuple[Recorded, CameraFile, list[str]]:
+    """(recording, its camera.json, notes): with the camera of a file, or of such a file beside pictures that have no other.
+
+    Raises CaptureError where there is none, or one of pictures of another size.
+    """
+    opened = open_any(path)
+    if file is None and opened.color is not None:
+        return opened, describe_camera(opened.color), []
+    file = file or path / CAMERA_FILE
+    if opened.color is None and not file.is_file():
+        how = f"describe it in a {CAMERA_FILE} (docs/captures.md has its keys) and name that by --camera"
+        raise CaptureError("calibration", f"{path}: {opened.missing}: {how}, or put it into the folder")
+    spec, notes = read_camera_file(file), []
+    if "depth_units_per_m" not in spec.model_fields_set:
+        units = opened.color.depth_units_per_m if opened.color else opened.units_per_m
+        spec = spec.model_copy(update={"depth_units_per_m": units})
+        if opened.with_units:
+            notes = [f"depth is taken for {units:g} units a metre: {file} can say depth_units_per_m"]
+    elif opened.with_units:
+        opened = opened.with_units(spec.depth_units_per_m)
+    colors = (frame for frame in opened.frames() if not frame.is_depth)
+    image = next((image for frame in colors if (image := _load(opened, frame, False)) is not None), None)
+    if image is not None and image.shape[1::-1] != (spec.width, spec.height):
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise CaptureError("size", f"{path}: its pictures are {size}, and {file} says {spec.width} x {spec.height}")
+    told = {**opened.told, "calibration": str(file)}
+    return replace(_with_camera(opened, spec, file), told=told), spec, notes
+
+
+def _with_camera(opened: Recorded, spec: CameraFile, file: Path) -> Recorded:
+    """The recording as a camera.json has it: depth stays where its camera is described, and else is registered as it was."""
+    camera, depth = camera_of(spec), None if spec.depth_camera else opened.depth
+
+    def seen_by(frame: RecordedFrame) -> RecordedFrame:
+        if spec.depth_camera is not None or not isinstance(frame.camera, DepthCamera):
+            return replace(frame, camera=None)
+        k = frame.camera.intrinsics
+        scaled = scaled_camera(camera.intrinsics, (k.width, k.height))
+        return replace(frame, camera=replace(scaled, lens=camera.lens))
+
+    first = next((each for frame in opened.frames() if (each := seen_by(frame)).is_depth), None)
+    registers = depth is not None or (first is not None and first.camera is not None)
+    if registers and (spec.depth == "ray" or is_taken_out(spec)):
+        how = "depth of another camera is registered as z, and with a lens of at most eight numbers: describe depth_camera"
+        raise CaptureError("calibration", f"{file}: {how}")
+    return replace(opened, color=camera, depth=depth, frames=lambda: map(seen_by, opened.frames()))
+
+
+def import_recording(
+    path: Path, out: Path, about: CaptureFile, board: Board, views: int, camera: Path | None = None
+) -> Imported:
     """Writes a capture folder into `out`, which must exist: `views` chosen frames with depth in the colour camera.
 
-    The images keep the lens of the colour camera, which camera.json has. What describes the folder is written last, so that a
-    folder that was left half-made is not taken for a capture. Raises CaptureError for a recording that cannot be used.
+    The images keep the lens of the colour camera, which camera.json has: the recording's, or that of the file `camera` in its
+    place. What describes the folder is written last, so that a folder that was left half-made is not taken for a capture.
+    Raises CaptureError for a recording that cannot be used.
     """
-    recording = open_any(path)
+    recording, stored, notes = _open(path, camera)
     color_us, measures, depth_us, damaged = _measure(recording)
     pairs = pair_frames(color_us, depth_us, recording.period_us, recording.depth_delay_us)
     if not pairs:
@@ -197,11 +264,15 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
         ImportedView(n, int(color_us[i]), int(depth_us[pairs[i]]), measures[i].sharpness) for n, i in enumerate(chosen)
     )
     _write_views(recording, made, out)
-    origin: dict[str, Any] = {"recording": path.name, **recording.told}
+    origin: dict[str, Any] = {
+        "recording": path.name,
+        "calibration": "the recording's own calibration",
+        **recording.told,
+    }
     origin |= {"losses": asdict(losses), "views": [asdict(view) for view in made]}
     (out / RECORDING_FILE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
-    write_description(out, about, recording.color, board)
-    return Imported(made, len(pairs), losses)
+    write_description(out, about, stored, board)
+    return Imported(made, len(pairs), losses, origin["calibration"], (*describe_losses(losses), *notes))
 
 
 def _measure(recording: Recorded) -> tuple[Stamps, list[FrameMeasure], Stamps, int]:
@@ -249,6 +320,7 @@ def _view(recording: Recorded, number: int, color: RecordedFrame, depth: Recorde
     if rgb is None or depth_m is None:
         raise CaptureError("unreadable", f"{recording.path}: the colour frame of view {number} cannot be decoded")
     common = recording.color
+    assert common is not None
     k = color.camera if isinstance(color.camera, Intrinsics) else common.intrinsics
     camera = depth.camera if isinstance(depth.camera, DepthCamera) else recording.depth
     if camera is None:

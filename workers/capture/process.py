@@ -26,7 +26,7 @@ from schemas.capture import (
 )
 from schemas.dataset.codec import Row, camera_columns
 from schemas.dataset.tables import SCHEMAS
-from schemas.errors import CaptureError, OutputError, ViewError
+from schemas.errors import CaptureError, OutputError, ViewError, command_line
 from schemas.job.captures import Captures
 from schemas.job.views import Mirror
 from schemas.scene.shape import Mesh
@@ -129,7 +129,7 @@ def read_poses(path: Path) -> tuple[ViewEstimate, ...]:
     try:
         rows = pq.read_table(path / POSES_FILE, schema=SCHEMA).to_pylist()
     except FileNotFoundError:
-        words = f"{path / POSES_FILE} is not there: run `verso capture process {path}`"
+        words = f"{path / POSES_FILE} is not there: run `{command_line('capture', 'process', path)}`"
         raise CaptureError("not_processed", words) from None
     except (pa.ArrowException, OSError) as error:
         raise CaptureError("unreadable", f"{path / POSES_FILE} is damaged: process the capture again") from error
@@ -272,7 +272,7 @@ class CaptureViews:
         """What `camera` sees, poses in the board frame; `without` names a view that must not be a source."""
         axes = {number: T[:3, 2] for number, T in self.cameras.items() if number != without}
         chosen = choose_sources(axes, camera, self.captures.synthesis)
-        return synthesize_view([self._source(number) for number in chosen], camera)
+        return synthesize_view([self._source(number) for number in chosen], camera, self.body)
 
     def mirror(self, number: int) -> tuple[Camera, float, SynthesizedView]:
         """(camera, d_z in metres, view) from the other side of the object, half a turn about the board's normal.
@@ -288,7 +288,7 @@ class CaptureViews:
         if number not in self._sources:
             view = self.posed(number)
             fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics)
-            self._sources[number] = prepare_source(view, fitted, silhouette(self.body, view.depth_camera))
+            self._sources[number] = prepare_source(view, fitted)
             while len(self._sources) > max(KEPT, 2 * self.captures.synthesis.views):
                 self._sources.popitem(last=False)
         self._sources.move_to_end(number)
@@ -299,7 +299,9 @@ def read_result(path: Path) -> CaptureViews:
     """What processing wrote. Raises CaptureError where the folder was not processed, or a file is missing or damaged."""
     folder, record = open_folder(path), read_record(path)
     if record is None:
-        raise CaptureError("not_processed", f"{path} was not processed: run `verso capture process {path}`")
+        raise CaptureError(
+            "not_processed", f"{path} was not processed: run `{command_line('capture', 'process', path)}`"
+        )
     try:
         captures = Captures.model_validate(record["settings"])
         if captures.estimation.calibrate:

@@ -22,6 +22,7 @@ from workers.capture.poses.estimates import estimate_article, estimate_joint, es
 from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, observe_view
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.results import own_files
+from workers.capture.surface.coverage import describe_grazing
 from workers.capture.surface.fusion import fuse_views
 from workers.capture.surface.object_mask import ObjectRegion, down_to_board, find_object
 from workers.capture.surface.posed_view import PosedView, pose_view
@@ -149,8 +150,12 @@ def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: St
         region = find_object(views, given.folder.board, spec)
     with watch.stage("fuse"):
         surface = fuse_views(views, region, spec)
-    merged = Merged(region, surface, down_to_board(Mesh(surface.vertices, surface.faces), region))
-    return replace(merged, notes=(*region.notes, *_notes(merged, len(estimate.used) - len(views))))
+    mesh = Mesh(surface.vertices, surface.faces)
+    merged = Merged(region, surface, down_to_board(mesh, region))
+    with watch.stage("coverage"):
+        grazing = describe_grazing(mesh, {view.number: view.depth_camera for view in views})
+    notes = (*region.notes, *_notes(merged, len(estimate.used) - len(views)), *([grazing] if grazing else ()))
+    return replace(merged, notes=notes)
 
 
 def _notes(merged: Merged, missing: int) -> Iterator[str]:

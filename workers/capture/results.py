@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.capture import CaptureListing, Reconstruction
-from schemas.errors import AssetSourceError, CaptureError, InputError
+from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW, TRUTH
@@ -107,7 +107,9 @@ def _columns(rows: Element, names: Sequence[str]) -> NDArray:
 
 def _read_ply(file: Path, kind: np.dtype) -> dict[str, Element]:
     if not file.exists():
-        raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`")
+        raise CaptureError(
+            "not_processed", f"{file} is not there: run `{command_line('capture', 'process', file.parent)}`"
+        )
     with suppress(InputError), as_refusal(file):
         elements = parse_ply(file.read_bytes())
         types = {name: column.dtype for name, column in elements["vertex"].items()}
@@ -176,7 +178,7 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
 def _list_capture(folder: Path, key: str) -> CaptureListing:
     """A folder and the digest of its input files. Raises AssetSourceError that names the key of the job file."""
     if not folder.is_dir():
-        raise AssetSourceError(f"{key}: {folder} is no folder")
+        raise AssetSourceError(f"{key}: {folder}: there is no such folder")
     try:
         return CaptureListing(folder, digest_inputs(folder))
     except CaptureError as error:

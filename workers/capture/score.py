@@ -19,6 +19,7 @@ from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.folder import MESH_FILE, TRUTH, CaptureFolder, read_truth
 from workers.capture.process import CaptureViews
+from workers.capture.surface.coverage import describe_grazing, sample_surface
 from workers.capture.surface.posed_view import PosedView, facing_cosine, placed, visible_points
 from workers.geometry.camera import project, spread_evenly
 from workers.geometry.distance import distance_to_mesh
@@ -27,9 +28,6 @@ from workers.geometry.raycast import cast_view
 
 SAMPLES = 40_000
 """Points of the true surface: their share within a distance is known to a quarter of a percent."""
-
-SEED = 20_240_801
-"""Of the surface samples, so that the same capture has the same figures."""
 
 COMPLETE_M = 0.003
 
@@ -96,22 +94,6 @@ def compare_poses(estimated: Sequence[Pose], true: Sequence[Pose]) -> PoseErrors
     mm = [1e3 * float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in zip(estimated, true, strict=True)]
     deg = [float(np.degrees(angle_between(a[:3, :3], b[:3, :3]))) for a, b in zip(estimated, true, strict=True)]
     return PoseErrors(mm, deg)
-
-
-def sample_surface(mesh: Mesh, count: int = SAMPLES) -> tuple[Array, Array]:
-    """(points, unit normals), each [N, 3]: evenly over the area, the same for the same mesh."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    across = np.cross(b - a, c - a)
-    area = np.linalg.norm(across, axis=1)
-    total = np.cumsum(area)
-    rng = np.random.default_rng(SEED)
-    # One sample in each of N equal shares of the area.
-    at = (np.arange(count) + rng.uniform(size=count)) / count * total[-1]
-    face = np.minimum(np.searchsorted(total, at, side="right"), len(area) - 1)
-    s, t = rng.uniform(size=(2, count))
-    s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)
-    points = a[face] + s[:, None] * (b - a)[face] + t[:, None] * (c - a)[face]
-    return points, across[face] / np.maximum(area[face], 1e-300)[:, None]
 
 
 def measured_points(points: Array, normals: Array, view: PosedView) -> NDArray[np.bool_]:
@@ -246,6 +228,13 @@ def read_whole_truth(folder: CaptureFolder) -> Truth | None:
     return Truth(poses, Mesh(transform(truth.T_board_obj, mesh.vertices), mesh.faces))
 
 
+def describe_true_grazing(folder: CaptureFolder) -> str | None:
+    """What `describe_grazing` says of a simulated capture's true surface and poses; None of a real one."""
+    truth, k = read_whole_truth(folder), folder.camera.intrinsics
+    cameras = {n: Camera(k, T) for n, T in truth.T_board_cam.items()} if truth else {}
+    return describe_grazing(truth.surface, cameras) if truth else None
+
+
 def score_capture(views: CaptureViews, truth: Truth, held_out: int = HELD_OUT) -> Score:
     """The errors of poses, surface and synthesised views. Raises CaptureError where no used view has a true pose."""
     used = {view.number: view.T_board_cam for view in views.estimate.used if view.T_board_cam is not None}
@@ -264,7 +253,7 @@ def score_capture(views: CaptureViews, truth: Truth, held_out: int = HELD_OUT) -
 
 def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]) -> SurfaceErrors:
     """Cloud and mesh against the true surface, of which the cameras see a part."""
-    samples, normals = sample_surface(true)
+    samples, normals = sample_surface(true, SAMPLES)
     visible = visible_points(true, samples, normals, cameras)
     distance_m, _ = cKDTree(surface.points).query(samples)
     off, _ = distance_to_mesh(surface.points, true)
@@ -285,7 +274,7 @@ def score_measured(views: CaptureViews, truth: Truth) -> tuple[float, float]:
 
     A surface that is seen at a grazing angle alone, or between two edges, is visible and has no depth.
     """
-    samples, normals = sample_surface(truth.surface)
+    samples, normals = sample_surface(truth.surface, SAMPLES)
     numbers = sorted(set(views.cameras) & set(truth.T_board_cam))
     k = views.folder.camera.intrinsics
     visible = visible_points(truth.surface, samples, normals, [Camera(k, truth.T_board_cam[n]) for n in numbers])

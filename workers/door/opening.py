@@ -10,7 +10,7 @@ import re
 import stat
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -105,6 +105,36 @@ def describe_error(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return plain_line(_ADDRESS.sub("", repr(error)), 200)
+
+
+_MARKS = {
+    b"\xef\xbb\xbf": "utf-8-sig",
+    b"\xff\xfe\0\0": "utf-32",
+    b"\0\0\xfe\xff": "utf-32",
+    b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+    b"<\0": "utf-16-le",
+    b"\0<": "utf-16-be",
+}
+"""What a text begins with, and its encoding: byte order marks, and the first letter of XML without one (XML 1.0, appendix F)."""
+_DECLARED = re.compile(rb"\s*<\?xml[^>]*?\sencoding\s*=\s*[\"']([\w.:-]+)")
+
+
+def as_utf8(data: bytes) -> tuple[bytes, str | None]:
+    """A text from outside as UTF-8 without a byte order mark, and what to note of it.
+
+    By its mark, what its XML declaration says, as UTF-8, or else as Latin-1, which any bytes are: that alone is noted.
+    """
+    declared = _DECLARED.match(data)
+    marks = [encoding for mark, encoding in _MARKS.items() if data.startswith(mark)]
+    if not marks and declared is None and data.isascii():
+        return data, None
+    for encoding in (*marks[:1], *([declared[1].decode()] if declared else []), "utf-8"):
+        with suppress(LookupError, UnicodeError):
+            text = data.decode(encoding)
+            if declared is None or text.startswith(declared[0].decode()):  # some declare UTF-16, and are not
+                return text.encode(), None
+    return data.decode("latin-1").encode(), "is not in UTF-8: read as Latin-1"
 
 
 _HEADER = struct.Struct("<4sIII4s")

@@ -125,6 +125,9 @@ MOST_KEPT = 64
 NO_THRESHOLD = 1e18
 """Bullet's default: contacts are solved as soon as they are predicted."""
 
+LEAST_BOUNCE_M_S = 0.05
+"""Slower impacts do not bounce, in Bullet at four times the speed: the rebound is at most an eighth of a millimetre high."""
+
 AWAY_M = 100.0
 """Between bodies that are put away, and from the world's middle."""
 
@@ -140,12 +143,13 @@ def bullet_file() -> str:
 
 @dataclass(frozen=True)
 class World:
-    """A ground of one shape or more, and bodies, numbered in order. `advance` takes `steps` steps."""
+    """A ground of one shape or more, and bodies, numbered in order. `advance` takes `steps` steps; `slop_m` of overlap stays."""
 
     client: int
     grounds: tuple[int, ...]
     bodies: tuple[int, ...]
     steps: int
+    slop_m: float
 
     def advance(self) -> None:
         """Take the steps that the world was opened for."""
@@ -194,8 +198,11 @@ class World:
         """Set the restitution of ground and bodies; a contact's is the product of the two.
 
         Bullet solves contacts before they close and removes speed in portions too slow to bounce: with steps shorter than
-        its contact distance over the speed nothing bounces. So contacts that bounce are solved only once bodies overlap.
+        its contact distance over the speed nothing bounces. So contacts that bounce are solved only once bodies overlap, and no
+        overlap is left to them: what is left over the step's time is missing from the rebound's speed.
         """
+        slop_m = 0.0 if restitution > 0.0 else self.slop_m
+        pybullet.setPhysicsEngineParameter(contactSlop=slop_m, physicsClientId=self.client)
         changes = {"restitution": restitution, "contactProcessingThreshold": 0.0 if restitution > 0.0 else NO_THRESHOLD}
         for thing in (*self.grounds, *self.bodies):
             pybullet.changeDynamics(thing, -1, physicsClientId=self.client, **changes)
@@ -221,6 +228,7 @@ def open_world(
     new one costs as much as a simulation. Blocks do not nest.
     """
     client = _empty_world(plain=len(placed) == 1 and isinstance(ground, float))
+    slop_m = min(SLOP_M, SLOP_SHARE * min(body.margin_m for body, _ in placed))
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
         deterministicOverlappingPairs=1,
@@ -228,7 +236,8 @@ def open_world(
         useSplitImpulse=1,
         splitImpulsePenetrationThreshold=0.0,
         warmStartingFactor=kept if len(placed) > 1 else 0.0,
-        contactSlop=min(SLOP_M, SLOP_SHARE * min(body.margin_m for body, _ in placed)),
+        restitutionVelocityThreshold=LEAST_BOUNCE_M_S,
+        contactSlop=slop_m,
         contactBreakingThreshold=min(REACH_SHARE, reach_m / min(_size_m(body) for body, _ in placed)),
         physicsClientId=client,
     )
@@ -241,7 +250,7 @@ def open_world(
         _set_surface(client, things[-1], physics, body)
         position, quaternion = T_world_body[:3, 3].tolist(), quaternion_from_rotation(T_world_body[:3, :3]).tolist()
         pybullet.resetBasePositionAndOrientation(things[-1], position, quaternion, physicsClientId=client)
-    world = World(client, grounds, tuple(things), steps)
+    world = World(client, grounds, tuple(things), steps, slop_m)
     world.set_rate(physics.step_hz)
     if physics.restitution > 0.0:
         world.set_restitution(physics.restitution)

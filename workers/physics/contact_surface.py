@@ -243,12 +243,12 @@ def _near(p: Array, p_faces: Index, q: Array, q_faces: Index, pairs: Index, with
     return near
 
 
-def skin_of(surface: Surface, which: Index, deepest_m: float) -> tuple[Array, ...]:
+def skin_of(surface: Surface, which: Index, deepest_m: float, inset_m: float) -> tuple[Array, ...]:
     """Pyramids [N, 3] below these faces: their corners, and a point at most `deepest_m` below their middle.
 
     Faces in one plane that fill a convex outline are one piece, else each is its own. No pyramid reaches out of a wedge between
     faces: its sides lean by at most half of the wedge's angle, and by 45 degrees at most. On a surface without an inside, and
-    where a wedge is sharp, it is flat.
+    where a wedge is sharp, it is flat. All of it is `inset_m` further inside.
     """
     vertices, faces = surface.vertices, surface.faces
     normals = face_normals(vertices, faces)
@@ -260,19 +260,20 @@ def skin_of(surface: Surface, which: Index, deepest_m: float) -> tuple[Array, ..
         group = members[first[number] : first[number + 1]]
         whole = _outline(vertices, faces[group], normals[group[0]])
         if whole is not None:
-            pieces.append(_pyramid(whole, outward * normals[group[0]], lean[group].min(), deepest_m))
+            pieces.append(_pyramid(whole, outward * normals[group[0]], lean[group].min(), deepest_m, inset_m))
         else:
             for face in group[np.isin(group, which)]:
-                pieces.append(_pyramid(vertices[faces[face]], outward * normals[face], lean[face], deepest_m))
+                pieces.append(_pyramid(vertices[faces[face]], outward * normals[face], lean[face], deepest_m, inset_m))
     return tuple(pieces)
 
 
-def _pyramid(outline: Array, outward: Array, lean: float, deepest_m: float) -> Array:
-    """The corners [N, 3] of a convex outline, in order, with a point below its middle."""
+def _pyramid(outline: Array, outward: Array, lean: float, deepest_m: float, inset_m: float) -> Array:
+    """The corners [N, 3] of a convex outline, in order, with a point below its middle; all `inset_m` below its plane."""
     middle, ahead = outline.mean(axis=0), np.roll(outline, -1, axis=0) - outline
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     inside_m = float(np.linalg.norm(np.cross(ahead, middle - outline), axis=1).min())
-    return np.concatenate([outline, (middle - min(deepest_m, lean * inside_m) * outward)[None]])
+    apex = middle - min(deepest_m, lean * inside_m) * outward
+    return np.concatenate([outline, apex[None]]) - inset_m * outward
 
 
 def _outline(vertices: Array, faces: Index, normal: Array) -> Array | None:

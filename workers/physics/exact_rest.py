@@ -182,11 +182,15 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class Rested:
-    """Where bodies came to rest, or how far they came: `T_world_obj` [4, 4] of each. `still`: whether they rest."""
+    """Where bodies came to rest, or how far they came: `T_world_obj` [4, 4] of each. `still`: whether they rest.
+
+    balanced: whether forces would hold them that nothing makes, as in a slot of their width, whatever the friction.
+    """
 
     poses: tuple[Pose, ...]
     still: bool
     steps: int
+    balanced: bool = False
 
 
 def rest(

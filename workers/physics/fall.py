@@ -16,7 +16,7 @@ from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import add_up, invert, translation
 from workers.geometry.hull import least_width_m
-from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
+from workers.physics.bullet import GRAVITY_M_S2, LEAST_BOUNCE_M_S, GroundShape, World, open_world
 from workers.physics.rigid_body import Body, BodyPose, as_pose
 from workers.physics.support import Face, find_face, inside_margin, support_height
 
@@ -160,8 +160,8 @@ THIN_SHARE = 0.05
 SKIPPED_TO_M = 2e-4
 """Height of the lowest point above the ground at which the simulation takes over from free fall."""
 
-BOUNCES_M_S = 0.1
-"""Slower impacts do not bounce: the rebound is at most half a millimetre high."""
+TOP_S = 2.0 * LEAST_BOUNCE_M_S / GRAVITY_M_S2
+"""Time for which what bounces is as slow about the top of its flight as impacts that do not bounce."""
 
 
 THROWN, SLOW_M_S = 3.0, 0.5
@@ -317,7 +317,8 @@ class _Simulation:
 
     def __init__(self, world: World, bodies: Sequence[Body], physics: Physics, steps: StepSizes, watch: Watch) -> None:
         self.world, self.bodies, self.physics, self.steps, self.watch = world, bodies, physics, steps, watch
-        self.time, self.rate_hz, self.bounces = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0
+        self.time, self.rate_hz = 0.0, physics.step_hz * 1.0
+        self.bounces, self.slow_s = physics.restitution > 0.0, math.inf
         self._read()
         self.speeds = _speeds(bodies, self.moving)
         self.still = [_Stillness(pose) for pose in self.at]
@@ -358,7 +359,8 @@ class _Simulation:
     def _set_pace(self) -> None:
         """Steps as short as the speeds ask for, and no more bounces once all is slow."""
         wanted_hz = self.steps.rate_hz(max(self.speeds))
-        if self.bounces and max(self.speeds) < BOUNCES_M_S:
+        self.slow_s = min(self.slow_s, self.time) if max(self.speeds) < LEAST_BOUNCE_M_S else math.inf
+        if self.bounces and self.time - self.slow_s > TOP_S:
             self.world.set_restitution(0.0)
             self.bounces, self.rate_hz = False, 0.0
         if wanted_hz != self.rate_hz:

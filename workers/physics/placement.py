@@ -9,6 +9,7 @@ import manifold3d
 import numpy as np
 
 from schemas.base import Pose, frozen_array
+from schemas.errors import SettleError
 from schemas.scene.scene import ContactForce, ObjectStart, Table
 from schemas.scene.shape import REGION_TABLE, Mesh
 from workers.geometry.frames import DOWN, motion_between, transform
@@ -169,6 +170,21 @@ class Support:
 def forms_of(starts: Sequence[ObjectStart]) -> tuple[Form, ...]:
     """The meshes of objects, each in its own frame."""
     return tuple(Form(start.asset.shape.mesh, outward=start.asset.shape.closed) for start in starts)
+
+
+ROUNDED_M = 1e-8
+"""Greatest rounding of an object's coordinates: a thousandth of the bound on its overlap."""
+
+
+def require_near_origin(start: ObjectStart) -> None:
+    """Raises SettleError where a mesh is so far from its own origin that its coordinates are rounded to what contacts leave."""
+    far_m = float(np.abs(start.hull.vertices).max())
+    if far_m * np.finfo(np.float64).eps > ROUNDED_M:
+        raise SettleError(
+            "unsupported",
+            f"the mesh of region {start.region_id} ({start.asset.category}) lies {far_m:.3g} m from its origin, where "
+            f"coordinates are rounded to {far_m * np.finfo(np.float64).eps:.1g} m: move the mesh to its origin",
+        )
 
 
 def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: float) -> Placement:

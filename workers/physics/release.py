@@ -8,17 +8,18 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array, Pose
+from schemas.errors import SettleError
 from schemas.job.physics import Physics, Rest
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, Table
 from workers.geometry.frames import motion_between, transform
-from workers.physics.bullet import SLOP_SHARE, GroundShape
+from workers.physics.bullet import SLOP_M, SLOP_SHARE, GroundShape
 from workers.physics.contact_surface import faces_within, skin_of
 from workers.physics.contacts import contacts_within
 from workers.physics.convex_parts import parts_of
@@ -108,13 +109,24 @@ PACES_POURED = (dataclasses.replace(PACES_MANY[0], rate=0.25),)
 done than to drop all at a finer pace."""
 
 
+@dataclass
+class Budget:
+    """What letting go may still cost a scene: steps times the square of the pieces that take part."""
+
+    left: float = math.inf
+
+
+LET_GO_COST = 3e8
+"""What letting go may cost a scene: some five seconds, at 16 nanoseconds each (measured of 190 to 820 pieces)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Drop:
     """Objects to be released over a table, with the settings and the plan of effects.
 
     room_m: how far the centre of mass of a single object may go sideways. lying, ready: the numbers of those that have fallen
     already, and of those that were drawn again and start from where they are; clearances_m: of each over those before it;
-    seconds: that waves took.
+    seconds: that waves took. budget: of letting go.
     """
 
     starts: tuple[ObjectStart, ...]
@@ -127,6 +139,7 @@ class Drop:
     ready: frozenset[int] = frozenset()
     clearances_m: tuple[float, ...] = ()
     seconds: float = 0.0
+    budget: Budget = field(default_factory=Budget)
 
     @property
     def many(self) -> bool:
@@ -260,6 +273,15 @@ UNEVEN, UNEVEN_M = 8.0, 9e-5
 the forces, a cube creeps by 24 micrometres under a hundred times its weight and by 60 under a thousand times; there by 240 with
 a thirtieth of the iterations."""
 
+STOPPED_M = 5e-5
+"""The same of what has come to rest again: a cup in a tapered cup rises by eight times what its pieces stand out, which is up to
+2 micrometres, as Bullet rounds them."""
+
+RELEASE_RATE = 4.0
+"""Steps a second in which objects are let go, in the settings'. In four times as many friction holds five times worse: of a gap
+of nanometres Bullet lets a body close as much in a step as the step is short. Of single objects, at rest, tilted and lifted, both
+refuse the same."""
+
 POURED_HOLD_S = 0.1
 """The same time for what fell in waves: a second of fifteen takes 32 s."""
 
@@ -302,10 +324,10 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
             return rested
         # No larger groups for what may move farther: the solver ends too early in them, and hides what slips
         groups = _groups(placement, rested.poses, level=False)
-        poses = let_go(held, placement, rested.poses, far_m, groups)
-        if farthest_m(drop.starts, rested.poses, poses) <= held_m:
+        poses, stopped = let_go(held, placement, rested.poses, far_m, groups)
+        if farthest_m(drop.starts, rested.poses, poses) <= (max(held_m, STOPPED_M) if stopped else held_m):
             return rested
-    return Rested(tuple(poses), False, 0)
+    return Rested(tuple(poses), False, 0, balanced=True)
 
 
 def let_go(
@@ -314,20 +336,21 @@ def let_go(
     poses: Sequence[Pose],
     far_m: float = FAR_M,
     groups: Sequence[list[int]] | None = None,
-    level_rate: float = FINEST,
-) -> tuple[Pose, ...]:
-    """The `T_world_obj` of objects, let go at these in the finest steps, once they rest, or one of them has moved by `far_m`.
+    rate: float = RELEASE_RATE,
+) -> tuple[tuple[Pose, ...], bool]:
+    """(`T_world_obj` of objects, let go at these, once they rest, or one of them has moved by `far_m`; whether all came to rest).
 
     What cannot meet is let go on its own: beside others Bullet's solver ends before it has found the forces of each. groups:
-    of those to let go; all, if not given. level_rate: steps a second, in the settings', of what meets level ground alone.
+    of those to let go; all, if not given. rate: steps a second, in the settings', but of one on anything else than level ground.
     """
-    went = list(poses)
+    went, rested = list(poses), True
     for group in _groups(placement, poses, level=True) if groups is None else groups:
         few = dataclasses.replace(drop, starts=tuple(drop.starts[k] for k in group))
-        outcome = _let_go(few, placement.of(group), [poses[k] for k in group], far_m, level_rate)
+        outcome = _let_go(few, placement.of(group), [poses[k] for k in group], far_m, rate)
+        rested = rested and outcome.rested
         for k, T in zip(group, outcome.poses, strict=True):
             went[k] = T
-    return tuple(went)
+    return tuple(went), rested
 
 
 def _groups(placement: Placement, poses: Sequence[Pose], level: bool) -> list[list[int]]:
@@ -340,7 +363,7 @@ def _groups(placement: Placement, poses: Sequence[Pose], level: bool) -> list[li
     return [np.flatnonzero(groups == each).tolist() for each in asked]
 
 
-def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float, level_rate: float) -> Outcome:
+def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float, rate: float) -> Outcome:
     """The fall of objects that may meet.
 
     Their shapes are the skins of their meshes where they are near one another, in convex pieces: exact, and each with contacts of
@@ -351,23 +374,41 @@ def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: floa
     points = np.concatenate([transform(T, one.hull.vertices) for one, T in zip(drop.starts, poses, strict=True)])
     low_m, inside_m = points[:, 2].min(), inside_margin(points[:, :2], top.outline).min()
     level = top.convex and low_m > top.height_m - near_m and inside_m > near_m
-    physics = settings_of(drop, Pace(rate=level_rate if level and drop.single else FINEST))
-    skins = _skins(placement, poses, near_m, top.height_m if level else -math.inf)
+    physics = settings_of(drop, Pace(rate=rate if level or not drop.single else FINEST))
+    margins_m = [THIN * make_body(start).margin_m for start in drop.starts]
+    slop_m = min(SLOP_M, SLOP_SHARE * min(margins_m))
+    insets_m = [0.0 if drop.single else margin_m - slop_m / 2.0 for margin_m in margins_m]
+    skins = _skins(placement, poses, near_m, top.height_m if level else -math.inf, insets_m)
     whole = [make_body(start, parts) for start, parts in zip(drop.starts, skins, strict=True)]
-    bodies = [dataclasses.replace(body, margin_m=THIN * body.margin_m) for body in whole]
+    bodies = [dataclasses.replace(body, margin_m=margin_m) for body, margin_m in zip(whole, margins_m, strict=True)]
     ground: GroundShape = split_by_side(drop.table.mesh)
     if level:
-        ground = top.height_m - bodies[0].margin_m * (1.0 - SLOP_SHARE)
+        ground = top.height_m - (margins_m[0] - insets_m[0] - slop_m)
     begun = np.stack([(T @ body.T_obj_body)[:3, 3] for T, body in zip(poses, bodies, strict=True)])
-    watch = Watch({"far": strays(begun, far_m)})
-    return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, watch, reach_m=SKIN_M)
+    watch, pieces = Watch({"far": strays(begun, far_m)}), sum(map(len, skins))
+    if drop.budget.left <= 0.0:
+        raise SettleError("unsupported", _too_much(drop, pieces))
+    outcome = fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, watch, reach_m=SKIN_M)
+    drop.budget.left -= outcome.seconds * physics.step_hz * pieces**2
+    return outcome
 
 
-def _skins(placement: Placement, poses: Sequence[Pose], near_m: float, level_m: float) -> list[tuple[Array, ...]]:
+def _too_much(drop: Drop, pieces: int) -> str:
+    names = ", ".join(f"{start.region_id} ({start.asset.category})" for start in drop.starts)
+    return (
+        f"regions {names} touch with {pieces} faces and do not stay when they are let go, which was tried for as long as a "
+        "scene may take: use coarser meshes or fewer objects_per_scene, or let them fall apart by a wider start.pile_offset_m"
+    )
+
+
+def _skins(
+    placement: Placement, poses: Sequence[Pose], near_m: float, level_m: float, insets_m: Sequence[float]
+) -> list[tuple[Array, ...]]:
     """The pieces [N, 3] of each object, in its own frame, that are within this of others or of the table.
 
-    level_m: height of the half-space that the table is here, -inf if it is none. Only corners of an object's hull can meet it:
-    they stand for the foot of one that is not convex, a ring of a hundred faces.
+    insets_m: how far each one's are inside of its mesh, as margins and overlap stand out: a cup in a tapered cup would rise by
+    eight times as much. level_m: height of the half-space that the table is here, -inf if it is none. Only corners of an object's
+    hull can meet it: they stand for the foot of one that is not convex, a ring of a hundred faces.
     """
     surfaces, level = placement.surfaces, [math.isfinite(level_m) and not is_convex(one) for one in placement.starts]
     points = [transform(T, one.vertices) for T, one in zip((*poses, np.eye(4)), surfaces, strict=True)]
@@ -379,8 +420,8 @@ def _skins(placement: Placement, poses: Sequence[Pose], near_m: float, level_m: 
     skins = []
     for number, (start, T) in enumerate(zip(placement.starts, poses, strict=True)):
         low = start.hull.vertices[level[number] & (transform(T, start.hull.vertices)[:, 2] <= level_m + near_m)]
-        skin = skin_of(surfaces[number], np.flatnonzero(near[number]), SKIN_M)
-        skins.append((*skin, *(corner + SPIKE @ T[:3, :3] for corner in low)))
+        skin = skin_of(surfaces[number], np.flatnonzero(near[number]), SKIN_M, insets_m[number])
+        skins.append((*skin, *(corner + np.add(SPIKE, [0.0, 0.0, insets_m[number]]) @ T[:3, :3] for corner in low)))
     return skins
 
 
@@ -390,18 +431,18 @@ def release_again(
     physics: Physics,
     effects: EffectPlan,
     seconds: float,
-    level_rate: float = FINEST,
+    rate: float = RELEASE_RATE,
 ) -> tuple[Pose, ...]:
     """`T_world_obj` [4, 4] of every object this long after its release from where it rests, or once one moved by `FAR_M`.
 
-    With the effects of the plan, without correction. Nothing counts as resting before the end. In the finest steps, and a single
-    object on level ground in `level_rate` times as many a second as the settings say.
+    With the effects of the plan, without correction. Nothing counts as resting before the end. rate: steps a second, in the
+    settings'.
     """
     calm = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
     physics = physics.model_copy(update={"max_settle_s": seconds, "rest": calm})
     starts, poses = plan.objects, [each.T_world_obj for each in settled]
     placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
-    return let_go(Drop(starts, plan.table, physics, effects), placement, poses, level_rate=level_rate)
+    return let_go(Drop(starts, plan.table, physics, effects), placement, poses, rate=rate)[0]
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:

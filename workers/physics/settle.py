@@ -20,6 +20,7 @@ from workers.geometry.frames import transform, translation
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
 from workers.physics.exact_rest import rest
 from workers.physics.fall import Outcome
+from workers.physics.landing import land
 from workers.physics.placement import (
     TOUCHING_M,
     Form,
@@ -33,6 +34,7 @@ from workers.physics.placement import (
     place,
     place_on_top,
     placed_mesh,
+    require_near_origin,
 )
 from workers.physics.pour import (
     NOTHING_MORE,
@@ -45,7 +47,18 @@ from workers.physics.pour import (
     points_of,
     renumbered,
 )
-from workers.physics.release import LEFT_M, Drop, Pace, hold, moved_by, release, release_again
+from workers.physics.release import (
+    LEFT_M,
+    LET_GO_COST,
+    RELEASE_RATE,
+    Budget,
+    Drop,
+    Pace,
+    hold,
+    moved_by,
+    release,
+    release_again,
+)
 from workers.physics.support import inside_margin, snap_to_face, vertical_gap
 
 UNBALANCED = 1e-3
@@ -101,7 +114,10 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
     Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`, and LeftRoomError
     where a single object leaves its room.
     """
+    drop = dataclasses.replace(drop, budget=Budget(LET_GO_COST))
     forms, again = forms_of(drop.starts), dict[int, int]()
+    for start in drop.starts:
+        require_near_origin(start)
     poses = tuple(start.T_world_obj for start in drop.starts)
     if not drop.effects.runs("dynamics"):
         return drop.starts, _describe(_Ending(drop, _place(drop, poses, forms), poses))
@@ -183,6 +199,8 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
     as they tip or slip, and released again where that takes them far. Raises LeftTopError, LeftRoomError and SettleError.
     """
     exact, heaped, seconds = drop.physics.exact_rest, bool(drop.lying), drop.seconds
+    if exact and (landed := land(drop, flat, forms)) is not None:
+        return _Ending(drop, *landed)
     placement, moved = None, 0
     most = POURED_RELEASES if heaped else MOST_RELEASES
     for _ in range(most):
@@ -203,8 +221,9 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
         drop = dataclasses.replace(drop, starts=moved_to(drop.starts, rested.poses))
     raise UnsupportedError(
         "unsupported",
-        f"{'it tips or slips' if drop.single else 'something tips or slips'} on without end: released {most} times, "
-        f"for {seconds:.1f} s in all, it never came into balance: lower physics.rest.speed_mm_s, or raise physics.friction",
+        f"{'it' if drop.single else f'region {drop.starts[moved].region_id} ({drop.starts[moved].asset.category})'} tips or "
+        f"slips on without end: released {most} times, for {seconds:.1f} s in all, it never came into balance"
+        f"{': let it fall elsewhere, or in another size' if rested.balanced or not drop.single else ': raise physics.friction'}",
         [moved],
         rested.poses,
         range(len(drop.starts)),
@@ -312,8 +331,13 @@ def _require_calm(drop: Drop, outcome: Outcome, fallen: Sequence[int], moving: b
 
 def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
     _, speed_m_s, spin_rad_s = outcome.moves
-    advice = "physics.max_settle_s or physics.rolling_friction"
-    if physics.friction == 0.0:
+    advice, reach_m = (
+        "physics.max_settle_s or physics.rolling_friction",
+        float(np.ptp(start.hull.vertices, axis=0).max()),
+    )
+    if physics.restitution > 0.0 and speed_m_s > spin_rad_s * reach_m:  # faster than it rolls
+        advice = f"physics.max_settle_s, or lower physics.restitution, which is {physics.restitution:g}"
+    elif physics.friction == 0.0:
         advice = "physics.friction, which is 0"
     elif physics.spinning_friction == 0.0 and speed_m_s < spin_rad_s * SPINS_M:
         advice = "physics.spinning_friction, which is 0"
@@ -459,17 +483,13 @@ def _settle_alone(
 RECHECK_S = 1.0
 """Simulated time of the second release."""
 
-RECHECK_RATE = 4.0
-"""Steps a second of the second release, in the settings', of a single object on level ground: a quarter of the finest. Nothing
-slips slowly there. At rest, tilted and lifted, both rates refuse the same (docs/rest.md), this one in 0.31 of the time."""
-
 
 def recheck_scene(
-    plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan, level_rate: float = RECHECK_RATE
+    plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan, rate: float = RELEASE_RATE
 ) -> Rest:
-    """The same rest, with the motion of every object after a second release of all. level_rate: as of `release_again`."""
+    """The same rest, with the motion of every object after a second release of all. rate: as of `release_again`."""
     effects, plan = add_effects(effects, rest.called), dataclasses.replace(plan, objects=rest.starts)
-    poses = release_again(plan, rest.settled, physics, effects, RECHECK_S, level_rate)
+    poses = release_again(plan, rest.settled, physics, effects, RECHECK_S, rate)
     settled = []
     for start, before, after in zip(rest.starts, rest.settled, poses, strict=True):
         moved_mm, turned_deg = moved_by(start, before.T_world_obj, after)

@@ -63,6 +63,8 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
     if asked := forced & names_of_kind("asked"):
         raise ValueError(f"switches of the job, which cannot be forced: {', '.join(sorted(asked))}")
     reasons = {effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}
+    for name in names_of_kind("no_op"):
+        reasons[name] = None if reasons[name] is None else f"{reasons[name]}; proof: exact, forced it changes no byte"
     # Not in the receipt of a job without them, which is then as it was before there were any.
     unasked = set(get_args(ViewTarget)) if not facts.job.targets.views else set()
     return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
@@ -181,6 +183,8 @@ def _table(facts: Facts) -> str | None:
 
 def _outside(facts: Facts, points: Array) -> str | None:
     """Whether no view sees anything of the convex hull of points [N, 3], world."""
+    if facts.job.cameras.orbit.share is not None:
+        return None  # where the cameras stand follows from where the objects come to rest
     unseen = all(is_outside_views(points, cameras) for cameras in _views(facts))
     return "outside of every view" if unseen else None
 

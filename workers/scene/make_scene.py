@@ -14,7 +14,7 @@ from workers.scene.chance import SceneChance
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene, plan_effects
 from workers.scene.pairs import SettledScene, make_pair
-from workers.scene.plan import plan_scene, pouring_of
+from workers.scene.plan import frame_cameras, plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
 
 
@@ -71,7 +71,7 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
     if effects.runs("release_again"):
         with stopwatch.stage("recheck", "release_again"):
             rest = recheck_scene(plan, rest, job.physics, effects)
-    return Laid(plan, effects, rest)
+    return Laid(frame_cameras(job, plan, [each.T_world_obj for each in rest.settled]), effects, rest)
 
 
 def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Scene:

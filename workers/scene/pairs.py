@@ -44,7 +44,7 @@ def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
 
 def place_mirror_camera(camera: Camera, d_z_m: float, mirror: Mirror) -> Camera:
     """The camera on the other side of the object."""
-    return Camera(camera.intrinsics, frozen_array(mirror_pose(camera.T_world_cam, d_z_m, mirror.T_z_m)))
+    return Camera(camera.intrinsics, frozen_array(mirror_pose(camera.T_world_cam, d_z_m, mirror.distance_m(d_z_m))))
 
 
 def mirror_pose(T_world_cam: Pose, d_z_m: float, T_z_m: float = 1.3, up: Array = UP) -> Pose:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
-from schemas.errors import StartError
+from schemas.errors import StartError, ViewError
 from schemas.job.job import Job
 from schemas.job.physics import Start
 from schemas.job.views import Cameras
@@ -19,32 +19,14 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
-from workers.geometry.camera import orbit_pose
-from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
+from workers.geometry.camera import NEAR_M, orbit_pose, project
+from workers.geometry.frames import UP, invert, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
+from workers.geometry.zbuffer import count_covered
 from workers.physics.pour import Pouring, points_of
-from workers.physics.support import place_table, sample_elevation, support_height, support_margin
+from workers.physics.support import columns_apart, place_table, sample_elevation, support_height, support_margin
 from workers.scene.chance import SceneChance, Stream
-
-APART_M = 0.001
-"""Columns nearer to each other than this count as touching."""
-
-_ANGLES = math.pi * np.arange(90) / 90
-AXES = frozen_array(np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1))
-"""[90, 2] the horizontal axes that are tried for a separating plane. None is further than 1 degree from the best one, so
-that two footprints of 0.2 m that are more than 4 mm apart are found to be so."""
-
-
-def columns_apart(points: Array, others: Array) -> bool:
-    """Whether a vertical plane separates two clouds [N, 3] by at least `APART_M` of air.
-
-    Two bodies that fall straight down then do not meet. The theorem of the separating axis, applied to `AXES` alone:
-    clouds that almost touch may count as touching.
-    """
-    mine, theirs = points[:, :2] @ AXES.T, others[:, :2] @ AXES.T
-    gap = np.maximum(theirs.min(axis=0) - mine.max(axis=0), mine.min(axis=0) - theirs.max(axis=0))
-    return bool(gap.max() >= APART_M)
-
+from workers.scene.pairs import place_beside
 
 MOST_REDRAWS = 20
 """Of a position that is not over the table or has no room, and of an object that was lost: hardly a scene needs five."""
@@ -209,5 +191,80 @@ def draw_camera(rng: np.random.Generator, cameras: Cameras, centre: Array) -> Ca
     """An input camera on the job's orbit about the centre of the table top."""
     inclination = rng.uniform(cameras.orbit.inclination_rad.low, cameras.orbit.inclination_rad.high)
     yaw = rng.uniform(cameras.orbit.yaw_rad.low, cameras.orbit.yaw_rad.high)
-    T = orbit_pose(centre, inclination, yaw, cameras.orbit.radius_m)
+    radius = cameras.orbit.radius_m
+    T = orbit_pose(centre, inclination, yaw, 1.0 if isinstance(radius, str) else radius)
     return Camera(Intrinsics.of(cameras.sensor), frozen_array(T))
+
+
+INSIDE = 0.95
+"""Share of the picture's width and height, about its middle, that framed objects lie in, and their least distance times the
+least depth that is stored."""
+
+SEARCHED, STEPS = 40, 4
+"""Doublings, and then halvings, of a distance; corrections of one by the pixels that objects cover."""
+
+
+def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan:
+    """The plan with input cameras that frame its objects, where the orbit says so, in the directions that were drawn.
+
+    poses: `T_world_obj` [4, 4] of each object.
+    Raises ViewError `not_framed` where a camera stands nearer to an object than the object is large, or where the objects do
+    not fit into the picture and the range of depth.
+    """
+    placed = list(zip(plan.objects, poses, strict=True))
+    cameras = plan.input_cameras
+    if job.cameras.orbit.share is not None:
+        cameras = tuple(_frame(job, camera, placed, job.cameras.orbit.share) for camera in cameras)
+    for start, T in placed:
+        box = start.asset.shape.bounds
+        size, middle = float(np.linalg.norm(box[1] - box[0])), transform(T, box.mean(axis=0)[None, :])[0]
+        if (near := min(float(np.linalg.norm(camera.position - middle)) for camera in cameras)) < size:
+            raise ViewError(
+                "not_framed",
+                f"{start.asset.instance_id} is {size:.3g} m across, and the input camera stands {near:.3g} m from its middle: "
+                "set cameras.orbit.radius_m: fit, or make the object smaller",
+            )
+    return replace(plan, input_cameras=cameras)
+
+
+def _frame(job: Job, camera: Camera, placed: Sequence[tuple[ObjectStart, Pose]], share: float) -> Camera:
+    """The camera as near to the middle of the objects as `share`, the picture's edges and the range of depth allow."""
+    points = np.concatenate([transform(T, start.hull.vertices) for start, T in placed])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    middle, size, k = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower)), camera.intrinsics
+    nearest_m, farthest_m = max(NEAR_M, job.images.depth_range_m.low) / INSIDE, job.images.depth_range_m.high
+    edges = 0.5 * np.array([k.width, k.height])
+
+    def at(radius_m: float) -> Camera:
+        T = camera.T_world_cam.copy()
+        T[:3, 3] = middle - radius_m * T[:3, 2]
+        return replace(camera, T_world_cam=frozen_array(T))
+
+    def is_inside(radius_m: float) -> bool:
+        for view in (at(radius_m), *place_beside(at(radius_m), job).values()):
+            seen = transform(invert(view.T_world_cam), points)
+            if (
+                seen[:, 2].min() <= nearest_m
+                or (np.abs(np.stack(project(seen, k), axis=1) - edges) > INSIDE * edges).any()
+            ):
+                return False
+        return True
+
+    least_m = next((size * 2.0**n for n in range(SEARCHED) if is_inside(size * 2.0**n)), math.inf)
+    step_m = 0.5 * least_m
+    for _ in range(SEARCHED if least_m < math.inf else 0):
+        least_m -= step_m if is_inside(least_m - step_m) else 0.0
+        step_m *= 0.5
+    radius_m = max(least_m, 0.5 * size * math.sqrt(k.fx * k.fy * math.pi / (share * k.width * k.height)))
+    for _ in range(STEPS if radius_m < math.inf else 0):
+        T_cam_world = invert(at(radius_m).T_world_cam)
+        counts = [count_covered(start.asset.shape, T_cam_world @ T, k) for start, T in placed]
+        covered = sum(4 * k.width * k.height if count is None else count for count in counts) / (k.width * k.height)
+        radius_m = max(least_m, radius_m * math.sqrt(covered / share))
+    if not radius_m + 0.5 * size <= farthest_m:
+        raise ViewError(
+            "not_framed",
+            f"the objects are {size:.3g} m across together: the camera that frames them does not see them within "
+            f"images.depth_range_m, {nearest_m * INSIDE:g} to {farthest_m:g} m: use smaller ones, or widen that",
+        )
+    return at(radius_m)

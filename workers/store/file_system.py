@@ -257,15 +257,17 @@ def explain_disk_errors(what: str) -> Iterator[None]:
         raise
 
 
-_LOCK = ".in-use"
+_LOCK, _FREE = ".in-use", ".made"
+"""Names of a temporary folder's lock file: held, and before it is."""
 
 
 @contextlib.contextmanager
 def temporary_folder(name: str) -> Iterator[Path]:
     """An empty folder. Its owner holds a lock on a file in it, which the kernel gives back when the process ends."""
     remove_abandoned(name)
-    with tempfile.TemporaryDirectory(prefix=f"verso-{name}-") as folder, open(Path(folder, _LOCK), "wb") as lock:
+    with tempfile.TemporaryDirectory(prefix=f"verso-{name}-") as folder, open(Path(folder, _FREE), "wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
+        os.rename(Path(folder, _FREE), Path(folder, _LOCK))  # once it is held: whoever finds it free removes the folder
         inner = Path(folder, "files")
         inner.mkdir()
         yield inner

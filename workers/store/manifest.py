@@ -223,7 +223,7 @@ def decode_rows(data: bytes, name: str) -> pa.Table:
 
 
 def _unreadable(name: str, error: Exception) -> CorruptError:
-    return CorruptError(f"{name} cannot be read: {plain_line(str(error))}; `verso verify` lists every damaged file")
+    return CorruptError(f"{name} cannot be read: {plain_line(str(error))}; `verso verify OUT` lists every damaged file")
 
 
 _SHAPE_FILES = [field.name for field in SHAPE_FILE_COLUMNS]

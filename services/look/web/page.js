@@ -52,6 +52,25 @@ function compare(scene) {
   document.getElementById("wipe-range").focus({ preventScroll: true });
 }
 
+function sortScenes(head) { // pressed once the largest are first, pressed again the smallest
+  const rows = [...document.querySelectorAll("#scenes-table tbody tr")], at = head.cellIndex, up = head.getAttribute("aria-sort") === "descending";
+  document.querySelectorAll("#scenes-table thead th").forEach((one) => one.removeAttribute("aria-sort"));
+  head.setAttribute("aria-sort", up ? "ascending" : "descending");
+  const of = (row) => { const text = row.cells[at].textContent, value = Number(text.replaceAll(",", "")); return text === "–" ? NaN : Number.isNaN(value) ? text : value; };
+  const order = (a, b) => { // unknown last
+    const [x, y] = [of(a), of(b)];
+    return Number.isNaN(x) || Number.isNaN(y) ? Number.isNaN(x) - Number.isNaN(y) : (x < y ? -1 : x > y ? 1 : 0) * (up ? 1 : -1);
+  };
+  rows.sort(order).forEach((row) => row.parentElement.append(row));
+}
+function filterScenes(words) {
+  const wanted = words.toLowerCase().split(/\s+/).filter(Boolean);
+  document.querySelectorAll("#scenes-table tbody tr").forEach((row) => {
+    const texts = [...row.cells].slice(0, 3).map((one) => one.textContent.toLowerCase());
+    row.hidden = !wanted.every((word) => texts.some((text) => text.includes(word)));
+  });
+}
+
 function connect() { // also after the live page has put new contents in
   each("[data-theme-to]", "click", (one) => { setTheme(one.dataset.themeTo); kept(one.dataset.themeTo); });
   connectPictures();
@@ -62,6 +81,10 @@ function connectPictures() {
   each("[data-compare]", "click", (one) => compare(one.dataset.compare));
   each("#wipe-range, #wipe-member", "input", drawWipe);
   each("#compare-scene, #wipe-close", "change", drawWipe);
+  each("#scenes-filter", "input", (one) => filterScenes(one.value));
+  each("#scenes-table thead th", "click", sortScenes);
+  each("#scenes-table thead th", "keydown", (one, event) => { if (event.key === "Enter") sortScenes(one); });
+  document.querySelectorAll("#scenes-table thead th").forEach((one) => { one.tabIndex = 0; });
   each("[data-kind]", "click", (one) => { press([...document.querySelectorAll("[data-kind]")], one); drawWipe(); });
   const first = document.querySelectorAll("[data-show]")[1];
   if (first) showCategory(first.dataset.show);

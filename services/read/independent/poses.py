@@ -25,6 +25,9 @@ from services.read.independent.derive import (
 )
 from services.read.independent.targets import check_targets
 
+FIT, FIT_SLACK, MIRROR_FIT = 0.06, 1.05, 1.5
+"""What `fit` stands for: the share of the picture that objects cover, at most but for the last step of the search; T_z by d_z."""
+
 BOARD_M = 0.05
 """Largest median height of a captured board's pixels over its plane: depth or a pose in another convention is further off."""
 
@@ -33,9 +36,14 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
     """The input camera of a scene on its orbit."""
     orbit, T_in = pair.job["cameras"]["orbit"], matrix(pair.views["input"], "T_world_cam")
     axis = T_in[:3, 2]
-    target = T_in[:3, 3] + orbit["radius_m"] * axis
     low, high = np.sin(orbit["inclination_rad"])
-    if distance(target[:2], np.zeros(2)) > ROUNDING or abs(T_in[2, 0]) > ROUNDING:
+    if isinstance(radius := orbit["radius_m"], str):
+        share = FIT if radius == "fit" else float(radius.rstrip("% ")) / 100.0
+        seen = np.count_nonzero(pair.images["input", "region"] >= FIRST_OBJECT) / pair.images["input", "region"].size
+        off = 0.0 if seen <= FIT_SLACK * share else math.inf
+    else:
+        off = distance((T_in[:3, 3] + radius * axis)[:2], np.zeros(2))
+    if off > ROUNDING or abs(T_in[2, 0]) > ROUNDING:
         yield "the input camera does not look at the table's centre from cameras.orbit.radius_m without roll"
     if not low - ROUNDING <= -axis[2] <= high + ROUNDING:
         yield "the input camera's inclination is outside cameras.orbit.inclination_rad"
@@ -63,8 +71,9 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
     expected = {
         role: T_in @ _transform(np.eye(3), beside["offset_m"]) for role, beside in derive.beside(pair.job).items()
     }
+    T_z = cameras["mirror"]["T_z_m"]
     other_side = _derive_rolled_mirror if pair.is_captured else _derive_mirror
-    expected["mirror"] = expected["projected"] = other_side(T_in, d_z, cameras["mirror"]["T_z_m"])
+    expected["mirror"] = expected["projected"] = other_side(T_in, d_z, MIRROR_FIT * d_z if T_z == "fit" else T_z)
     for role, T in expected.items():
         if role in pair.views and not (off := distance(matrix(pair.views[role], "T_world_cam"), T)) <= ROUNDING:
             yield f"T_world_cam of {role} is off by {off:.3g} from its definition"

@@ -185,7 +185,7 @@ def test_process_writes_results_by_the_estimate_that_is_asked_for(run, tmp_path)
     assert record["settings"]["fusion"]["voxel_m"] == 0.003 and answer["seconds"] == record["seconds"]
     assert run("process", path, "--estimate", "markers", *quick)[3]["estimate"] == "markers"
     code, _, err, _ = run("process", tmp_path / "nowhere")
-    assert code != 0 and "is no folder" in err
+    assert code == 2 and "there is no such folder" in err
 
 
 @pytest.mark.minute

@@ -3,6 +3,8 @@
 import argparse
 import json
 import os
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -91,8 +93,6 @@ REFUSED = (
     (["run", TABLETOP, "--set", "assets.objects.0={source: library, folder: /nowhere/at/all}"], ["/nowhere/at/all"]),
     (["run", TABLETOP, "--set", "assets.objects.0={source: library, folder: .}"], ["deploy/jobs has no mesh"]),
     (["run", TABLETOP, "--address", "nonsense"], ["HOST:PORT"]),
-    (["query", "nowhere", "select 1"], ["nowhere", "job.yaml"]),
-    (["verify", "nowhere"], ["nowhere", "job.yaml"]),
     (["replay", "nowhere", "x"], ["'x'"]),
     (["status", str(ROOT)], ["job.yaml"]),
     (["extra", "study"], ["pip install 'verso-data[study]'"]),
@@ -108,6 +108,47 @@ def test_bad_input_is_told_by_key_value_and_remedy(capsys, tmp_path, monkeypatch
         assert code == 2 and all(word in text for word in words), text
         assert list(tmp_path.iterdir()) == []
     assert answer(capsys, "run", "nowhere.yaml")[2]["kind"] == "JobError"
+
+
+READERS = (
+    *(["status", "*"], ["verify", "*"], ["query", "*", "select 1"], ["replay", "*", "3"], ["report", "*"]),
+    *(
+        ["export", "*", "new", "--format", "bop"],
+        ["score", "*", "."],
+        ["score", ".", "*"],
+        ["init", "*", "--out", "new"],
+    ),
+    ["score", ".", "--compare", "*", "*"],
+    *(["capture", "process", "*"], ["capture", "synthesize", "*", "--mirror"], ["capture", "evaluate", "*"]),
+)
+
+
+def test_a_missing_folder_is_told_alike_by_all_that_read_one_and_nothing_is_written(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my data").mkdir()
+    for words in READERS:
+        code, text = told(capsys, *("my dta" if word == "*" else word for word in words))
+        assert (code, text) == (2, "verso: my dta: there is no such folder; did you mean 'my data'?\n"), words
+    assert [path.name for path in tmp_path.iterdir()] == ["my data"]
+    code, text = told(capsys, "status", "my data")
+    assert code == 2 and "holds no job.yaml" in text
+
+
+def test_a_reader_says_that_it_cannot_check_before_it_reads_anything(made, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "services.read.audit", None)  # as where verso-read is installed
+    monkeypatch.setattr("services.read.verify.verify", lambda *_: pytest.fail("everything was read first"))
+    code, text = told(capsys, "verify", made.name, "--independent", "2")
+    assert code == 1 and "verify --independent or --audit needs what makes data" in text
+
+
+def test_a_remedy_can_be_pasted_into_a_shell(made, capsys, tmp_path):
+    shutil.copytree(made.name, tmp_path / "my data")
+    victim = next((tmp_path / "my data").glob("manifest/scenes/*/*.parquet"))
+    victim.write_bytes(victim.read_bytes()[:-40])
+    _, text = told(capsys, "query", str(tmp_path / "my data"), "select * from scenes")
+    assert f"`verso verify '{tmp_path}/my data'` lists every damaged file" in text
+    _, text = told(capsys, "replay", str(tmp_path / "my data"), "99")
+    assert shlex.split(text.partition("`")[2].partition("`")[0]) == ["verso", "status", f"{tmp_path}/my data"]
 
 
 def test_a_folder_without_a_usable_mesh_is_refused_with_what_was_found(capsys, tmp_path):

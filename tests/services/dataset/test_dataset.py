@@ -122,7 +122,7 @@ def test_what_is_wrong_is_told_at_once_and_clearly(files, tmp_path):
         (InputError, "filter cannot be used", lambda: dataset.pairs(pc.field("input", "nothing") > 1)),
         (InputError, "filter cannot be used", lambda: dataset.pairs(pc.field("category") == 1)),
         (InputError, "part", lambda: dataset.pairs(part=(2, 2))),
-        (OutputError, r"holds no job\.yaml", lambda: open_dataset(tmp_path / "nowhere")),
+        (OutputError, "there is no such folder", lambda: open_dataset(tmp_path / "nowhere")),
         (InputError, "no image of kind 'region', only rgb, depth", lambda: pair.projected.segment()),
         (InputError, r"region 9 is no object of this view; its objects are \[3\]", lambda: pair.input.patch(region=9)),
         (InputError, r"has the regions \[2, 3\], and no 1", lambda: pair.mesh(region=1)),

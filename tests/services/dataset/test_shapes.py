@@ -147,8 +147,9 @@ def test_a_scene_in_memory_is_the_stored_one(files, tmp_path):
                 assert np.array_equal(a.rgb(), b.rgb()) and np.array_equal(a.depth(), b.depth())
             assert np.array_equal(mine.input.patch().segment(), theirs.input.patch().segment())
             assert mine.mesh().bounds == pytest.approx(theirs.mesh().bounds, abs=1e-12)
-    (pair,) = make_scene(path, 0, ["pairs_per_scene=1", "start.pose=placed"])
-    assert pair.scene["pose"] == "placed"
+    for job in (KEYS, path, validate_job(KEYS, "test")):
+        (pair,) = make_scene(job, 0, ["pairs_per_scene=1", "start.pose=placed"])
+        assert pair.scene["pose"] == "placed"
     with pytest.raises(JobError, match="there is no such key"):
         make_scene(path, 0, ["start.poze=placed"])
     with pytest.raises(SceneError, match="scene 0 cannot be made"):

@@ -11,7 +11,7 @@ from services.export.table import FORMATS
 from tests.services.export.exported import contents
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "export.md").read_text()
-COMMANDS = [shlex.split(line)[1:] for line in PAGE.splitlines() if line.strip().startswith("./verso export")]
+COMMANDS = [shlex.split(line)[1:] for line in PAGE.splitlines() if line.strip().startswith("verso export")]
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
@@ -39,7 +39,7 @@ def test_every_command_of_the_page_exports(folder):
 @pytest.mark.parametrize("example", EXAMPLES)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 def test_the_examples_run(example, folder, monkeypatch):
-    found = re.search(r"^import (webdataset|datasets)$", example, re.MULTILINE)
+    found = re.search(r"^import (webdataset|datasets)\b", example, re.MULTILINE)
     assert found is not None
     pytest.importorskip(found[1])
     monkeypatch.chdir(folder)

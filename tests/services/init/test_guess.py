@@ -2,12 +2,17 @@
 
 from dataclasses import replace
 
+import numpy as np
+import trimesh
+
 from schemas.job.assets import is_usable
-from workers.assets.library.categories import name_categories
+from schemas.scene.shape import Material, Part, Shape
+from workers.assets.library.categories import find_joined, name_categories
 from workers.assets.library.collection import SUFFIXES
 from workers.assets.library.copies import Item, find_copies, find_doubles
 from workers.assets.library.guess import guess_groups, guess_ups
-from workers.assets.library.placement import Measured
+from workers.assets.library.placement import Measured, sample_look
+from workers.door.meshes.mesh import DEFAULT
 
 CATEGORIES = (
     (None, {"mug/a.obj": "mug"}),
@@ -45,6 +50,12 @@ def test_categories_follow_from_where_files_lie_and_what_they_and_their_folders_
     for source, categories in CATEGORIES:
         assert name_categories(categories, source) == categories
         assert all(is_usable(name) for name in categories.values())
+
+
+def test_different_names_that_become_one_are_told():
+    paths = ["a: b/x.obj", "a: b/y.obj", "a #b/x.obj", "a #b/y.obj", "c/x.obj", "c/y.obj"]
+    assert set(name_categories(paths, None).values()) == {"a-b", "c"}
+    assert find_joined(paths, None) == {"a-b": "category a-b is of 'a #b', 'a: b'"}
 
 
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure", **more):
@@ -87,6 +98,12 @@ UNITS = (
         {1.0: 4, 0.001: 3},
         "millimetres",
     ),  # 58.8 alone might be centimetres
+    (cubes(1.0, 1.6, 0.9, 4.4, 5.2, 2.6, 2.2, 389.0, 638.0), {1.0: 7, 0.001: 2}, "millimetres, 51.3 cm"),
+    (
+        cubes(20.0, 15.0, 30.0, 12.0, 25.0, 0.25, 2500.0),
+        {0.01: 5, 1.0: 1, 0.001: 1},
+        "metres, 25 cm",
+    ),  # apart, each its own
     (cubes(250.0, 90.0, 4.0), {0.001: 3}, "millimetres"),  # a screw among millimetres is small
     # A remark in the file.
     ([item("a.obj", (8.0, 8.0, 12.0), unit_m=0.0254)], {0.0254: 1}, "inches, as the files say"),
@@ -187,6 +204,50 @@ def solid(path, size=1.0, turned=False, faces=200, look=None, volume=0.3, **more
     return Item(path, replace(measured, **more), path)
 
 
+def ball(front=0.05, back=0.05, tint=1.0, axes=(0, 1, 2), cell=7):
+    """A look: of a ball whose sides of x use two places of one palette, each an eighth of it; or a picture of a pattern."""
+    palette = np.repeat(np.random.default_rng(cell).integers(0, 256, (1, 8, 3), dtype=np.uint8), 64, axis=1)
+    mesh = trimesh.creation.uv_sphere(0.1, count=[24, 24])
+    faces = mesh.faces[np.argsort(mesh.triangles_center[:, 0])]
+    u = np.where(mesh.vertices[:, 0] > 0.0, front, back)
+    vertices, material = mesh.vertices[:, axes], Material((tint, tint, tint, 1.0), texture=palette)
+    part = Part("", vertices, faces.astype(np.int32), material, uv=np.stack([u, np.full(len(u), 0.5)], axis=1))
+    return sample_look(Shape((part,)))
+
+
+RED, RED_TURNED, BLUE = ball(0.06, 0.06), ball(0.065, 0.06, axes=(1, 2, 0)), ball(0.19, 0.19)
+
+
+def test_looks_differ_by_the_colours_where_faces_lie_and_not_by_how_the_thing_is_turned():
+    def like(one, other):
+        pair = [solid(f"{k}.obj", look=look, textures=1) for k, look in enumerate((one, other))]
+        return len(find_doubles(pair, lambda item: item.diagonal, SUFFIXES)) == 1
+
+    two = ball(0.06, 0.19)
+    for axes in ((1, 2, 0), (0, 2, 1)):
+        assert like(two, ball(0.06, 0.19, axes=axes)) and like(two, ball(0.19, 0.06, axes=axes)), "turned by half"
+    assert not like(two, RED) and not like(RED, BLUE) and not like(RED, ball(0.06, 0.06, tint=0.5))
+    assert sample_look(Shape((Part("", np.eye(3), np.array([[0, 1, 2]], np.int32), DEFAULT),))) is None
+    patterned = [sample_look(patterned_box(seed)) for seed in (1, 1, 2)]
+    means = [np.reshape(look, (-1, 3)).sum(axis=0) for look in patterned]
+    assert np.allclose(means[0], means[2], atol=1.0), "as bright in the mean"
+    assert like(*patterned[:2]) and not like(*patterned[1:])
+
+
+def patterned_box(seed):
+    """A cube with one picture on each side: as many black as white squares, in an order of its own."""
+    squares = np.random.default_rng(seed).permutation(np.repeat(np.array([0, 255], np.uint8), 18)).reshape(6, 6)
+    picture = np.repeat(np.repeat(squares, 16, axis=0), 16, axis=1)[:, :, None].repeat(3, axis=2)
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+    corners = mesh.triangles.reshape(-1, 3)
+    normals = np.repeat(mesh.face_normals, 3, axis=0)
+    uv = np.array(
+        [np.delete(corner, np.abs(n).argmax()) / 0.1 + 0.5 for corner, n in zip(corners, normals, strict=True)]
+    )
+    faces = np.arange(36, dtype=np.int32).reshape(-1, 3)
+    return Shape((Part("", corners, faces, Material((1.0, 1.0, 1.0, 1.0), texture=picture), uv=uv),))
+
+
 def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
     doubles = (
         (solid("a/model.urdf", textures=1), solid("a/visual.ply", 1000.0)),  # in another unit
@@ -195,8 +256,8 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("a/textured.obj", textures=1, faces=12), solid("a/nontextured.ply", faces=12)),
         (solid("bread.xml"), solid("meshes/bread.obj", 1.25)),  # which the model scales
         (solid("x/a.urdf", faces=12), solid("x/visual/b.obj", faces=12)),
-        (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b/a.obj", look=(203.0, 9.0, 9.0), textures=1)),
-        (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b/a.obj", look=(90.0, 9.0, 9.0))),
+        (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=RED_TURNED, textures=1)),
+        (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=BLUE)),
     )
     for first, second in doubles:
         for pair in ((first, second), (second, first)):
@@ -208,7 +269,7 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("a.obj"), solid("b.obj", volume=0.31)),
         (solid("a.obj"), solid("b.obj", faces=201)),
         (solid("a/box.obj", faces=12), solid("b/box.obj", faces=12)),
-        (solid("a.obj", look=(200.0, 9.0, 9.0), textures=1), solid("b.obj", look=(9.0, 9.0, 200.0), textures=1)),
+        (solid("a.obj", look=RED, textures=1), solid("b.obj", look=BLUE, textures=1)),
     ):
         assert find_doubles([first, second], lambda item: item.diagonal, SUFFIXES) == []
     assert len(find_doubles([item("a.obj"), replace(item("b.obj"), digest="a.obj")], lambda one: 1.0, SUFFIXES)) == 1

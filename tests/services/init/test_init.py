@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
+import trimesh
 from PIL import Image
 
 from schemas.errors import AssetSourceError, MachineError
-from schemas.job.assets import ProceduralSource
+from schemas.job.assets import MeshLimits, ProceduralSource
 from services.cli.main import main
 from services.init import command, shown
 from services.init.shown import (
@@ -35,7 +36,10 @@ from tests.workers.door.oracles import write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.assets.library import collection
-from workers.assets.library.collection import SUFFIXES, walk_folder
+from workers.assets.library.collection import OUTSIDE, SUFFIXES, walk_folder
+from workers.assets.library.copies import find_copies
+from workers.assets.library.placement import find_unit
+from workers.assets.library.reading import list_files
 from workers.assets.library.table import Row, read_table
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
@@ -90,7 +94,7 @@ def test_a_mixed_folder_becomes_a_library_and_a_job_that_offers_exactly_what_was
     assert left_out == {
         "002_can/google_16k/nontextured.ply": ("copy", "double of 002_can/copy/textured.obj"),
         "002_can/google_16k/textured.obj": ("copy", "double of 002_can/copy/textured.obj"),
-        "mugs/out.glb": ("link", "leads out of the folder: copy it there"),
+        "mugs/out.glb": ("link", OUTSIDE),
         "robot/collision.obj": ("part", "part of robot/model.urdf"),
         "robot/textured.obj": ("part", "part of robot/model.urdf"),
         "scene.fbx": ("format", ".fbx is not read: run `assimp export FILE FILE.glb`, or use Blender"),
@@ -104,7 +108,7 @@ def test_a_mixed_folder_becomes_a_library_and_a_job_that_offers_exactly_what_was
 
 
 WRONG = (
-    (("none",), "none is not there"),
+    (("none",), "none: there is no such folder"),
     (("file",), "file is a file"),
     (("empty",), "empty is empty"),
     (("other",), "other has no mesh"),
@@ -132,6 +136,22 @@ def test_wrong_input_is_one_clear_line_and_leaves_and_overwrites_nothing(tmp_pat
         assert before == {path: path.is_file() and path.read_bytes() for path in sorted(tmp_path.rglob("*"))}, words
     code, _, err = init("broken", capsys=capsys)
     assert code == 2 and "none of its meshes can be used: 1 left out" in err
+
+
+def test_what_no_table_carries_is_asked_about_and_is_scaled_or_left_out_where_one_says_so(tmp_path, capsys):
+    for name, side in (("crate", 3.0), ("barrel", 1.5), ("cup", 0.1)):
+        write_mesh(tmp_path / f"m/{name}.glb", trimesh.creation.box((side, side, side)))
+    for k, (words, asked, used) in enumerate((
+        ((), "2 objects of 2.6 m to 5.2 m (crate.glb) are too large", {"crate": 5.196, "barrel": 2.598, "cup": 0.173}),
+        (("--unit", "crate*=0.1", "--unit", "barrel*=0.5"), "1 object of 1.3 m", {"crate": 0.52, "barrel": 1.299, "cup": 0.173}),
+        (("--unit", "0.1"), None, {"crate": 0.52, "barrel": 0.26, "cup": 0.017}),
+        (("--limit", "max_size_m=1"), None, {"cup": 0.173}),
+    )):  # fmt: skip
+        code, told, _ = init(tmp_path / "m", "--out", tmp_path / f"lib{k}", "--json", *words, capsys=capsys)
+        objects = json.loads(told.splitlines()[-1])["objects"]
+        sizes = {one["category"]: round(float(np.linalg.norm(one["extents_m"])), 3) for one in objects}
+        assert (code, sizes) == (0, used), words
+        assert ("? " in told) == (asked is not None) and (asked or "") in told, told
 
 
 def test_a_disk_that_is_full_at_any_file_is_told_in_a_line_and_the_next_init_goes_on(tmp_path, capsys, monkeypatch):
@@ -179,6 +199,29 @@ def test_scanned_meshes_offer_their_urdfs_and_a_bottle_that_lies_is_stood_up(tmp
     assert "plain base colour used" in str(objects["mug"]["mended"]) and objects["blue_cup"]["pictures"] == 1
 
 
+CASES = {
+    "palette_twins": lambda rows: len(rows) == 2 and {row["pictures"] for row in rows} == {1},
+    "sdf_two_versions": lambda rows: [row["path"] for row in rows] == ["model.sdf"],
+    "sdf_ogre_script": lambda rows: rows[0]["pictures"] == 1,
+    "unit_of_second_group": lambda rows: (
+        {row["path"]: row["unit"] for row in rows if row["path"] > "b"}
+        == {"b0.obj": 0.001, "b1.obj": 0.001, "bunny.obj": 1.0}
+    ),
+    "dae_latin1": lambda rows: rows[0]["extents_m"] == pytest.approx([0.1, 0.16, 0.24]),
+    "obj_mtl_bom": lambda rows: [row["pictures"] for row in rows] == [1, 1],
+}
+"""What is right of folders in `../shared/data/mesh_cases`."""
+
+
+@pytest.mark.minute
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", CASES)
+def test_folders_that_were_read_wrong_are_read_right(tmp_path, capsys, name):
+    folder = ROOT.parent / "shared/data/mesh_cases" / name
+    code, told, _ = init(folder, "--out", tmp_path / "lib", "--json", capsys=capsys)
+    assert code == 0 and CASES[name](json.loads(told.splitlines()[-1])["objects"]), told
+
+
 # ------------------------------------------------------------------------------------------------ what is found and shown
 
 
@@ -191,16 +234,25 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
     # The system is asked through `os`, because root may read everything.
     monkeypatch.setattr(collection.os, "access", lambda path, how: "locked" not in str(path))
     write(tmp_path / "in/a/robot.xml", "<!-- x --><mujoco/>")
-    for name, text in (("package.xml", "<package/>"), ("a/r.urdf.xacro", ""), ("a/all.tar.gz", ""), ("a/scan.FBX", "")):
+    for name, text in (
+        ("package.xml", "<package/>"),
+        ("a/r.urdf.xacro", ""),
+        ("a/all.tar.gz", ""),
+        ("a/scan.FBX", ""),
+        ("a/b.vrm", ""),
+    ):
         write(tmp_path / "in" / name, text)
     paths, left_out = walk_folder(tmp_path / "in")
     told = {one.path: one.why for one in left_out if one.reason == "format"}
-    assert set(told) == {"a/r.urdf.xacro", "a/all.tar.gz", "a/scan.FBX"} and "`xacro FILE" in told["a/r.urdf.xacro"]
+    assert (
+        set(told) == {"a/r.urdf.xacro", "a/all.tar.gz", "a/scan.FBX", "a/b.vrm"}
+        and "`xacro FILE" in told["a/r.urdf.xacro"]
+    )
     left_out = [one for one in left_out if one.path not in told]
     assert paths == ["a/b/c.GLB", "a/robot.xml", "a/x.urdf", "b.obj"]
     reasons = {"bad\\nname.obj": "name", "bad\\udcff.obj": "name", "dead.obj": "missing", "link.obj": "link"}
     assert {one.path: one.reason for one in left_out} == {**reasons, "locked.obj": "permission"}
-    with pytest.raises(AssetSourceError, match=r"bad\\nname is not there"):
+    with pytest.raises(AssetSourceError, match=r"bad\\nname: there is no such folder"):
         walk_folder(tmp_path / "bad\nname")
 
     def deny(self):
@@ -209,6 +261,48 @@ def test_meshes_are_found_at_any_depth_and_what_cannot_be_used_is_named(tmp_path
     monkeypatch.setattr(collection.Path, "iterdir", deny)
     with pytest.raises(AssetSourceError, match="cannot be listed: Permission denied"):
         walk_folder(tmp_path / "in")
+
+
+def test_of_packages_each_object_is_offered_once_by_what_they_say_of_themselves(tmp_path):
+    root = tmp_path / "in"
+    for version, name in (("1.10", "model.sdf"), ("1.9", "model-1_9.sdf"), ("1.11", "gone.sdf")):
+        write(root / "sign" / name, "<sdf/>") if name != "gone.sdf" else None
+        config = root / "sign/model.config"
+        config.write_text((config.read_text() if config.exists() else "") + f"<sdf version='{version}'>{name}</sdf>\n")
+    write(root / "old/model.sdf", "<sdf/>")  # without a word of versions, as it was
+    write(root / "old/model-1_2.sdf", "<sdf/>")
+    write(root / "bop/models/obj_000001.ply", "")
+    write(root / "bop/models_eval/obj_000001.ply", "")
+    write(root / ".annex/77a9", "")
+    (root / "linked").mkdir()
+    (root / "linked/cup.obj").symlink_to(root / ".annex/77a9")
+    (root / "linked/cup2.obj").symlink_to(root / ".annex/77a9")
+    (root / "away").symlink_to(tmp_path / "out", target_is_directory=True)
+    (root / "again").symlink_to(root / "bop", target_is_directory=True)
+    (tmp_path / "out").mkdir()
+    paths, left_out = walk_folder(root)
+    told = {one.path: one.why for one in left_out}
+    assert paths == [
+        *("bop/models/obj_000001.ply", "bop/models_eval/obj_000001.ply", "linked/cup.obj"),
+        *("old/model-1_2.sdf", "old/model.sdf", "sign/model.sdf"),
+    ]
+    assert told.pop("sign/model-1_9.sdf") == "other version of model.sdf, by model.config"
+    assert "cp -rL" in told.pop("away") and not told
+    assert find_copies(paths, paths) == {paths[1]: f"made for evaluation, of {paths[0]}"}
+
+
+def test_bops_table_of_models_gives_their_unit(tmp_path):
+    info = {"1": {"diameter": 150.0, "size_x": 30.0, "size_y": 40.0, "size_z": 120.0}, "2": {"size_x": "?"}}
+    write(tmp_path / "models_info.json", json.dumps(info))
+    for name, diagonal, unit in (
+        *(("obj_000001.ply", 130.0, 0.001), ("obj_000001.ply", 0.1302, 1.0), ("obj_000001.ply", 99.0, None)),
+        *(("obj_000002.ply", 130.0, None), ("obj_000003.ply", 130.0, None), ("mug.ply", 130.0, None)),
+    ):
+        assert find_unit(tmp_path / name, diagonal) == unit, name
+    mesh = write_mesh(tmp_path / "obj_000001.ply", cup())
+    assert list_files(tmp_path, mesh, MeshLimits()) == (mesh, tmp_path / "models_info.json"), (
+        "so that a change is noticed"
+    )
 
 
 ROW = (
@@ -308,6 +402,9 @@ def test_its_commands_run_as_printed_and_make_a_dataset_in_which_everything_stan
     ]
     scenes, assets = (table.to_table().to_pylist() for table in tables)
     assert len(scenes) == 8 and len({row["category"] for row in scenes}) > 2
+    views = ds.dataset(tmp_path / "data/meshes/manifest/views", partitioning="hive").to_table().to_pylist()
+    shares = [row["object_pixels"] / (640 * 480) for row in views if row["role"] == "input"]
+    assert len(shares) == 8 and min(shares) > 0.03 and max(shares) < 0.1, "objects of any size are framed"
     heights = {row["path"]: row["extents_m"][2] for row in assets if row["source"] == "library"}
     true = {"mugs/mug_0.glb": 0.08, "mugs/mug_1.glb": 0.1, "mugs/mug_2.glb": 0.12, "gltf cup/model.gltf": 0.1}
     drawn = {path: height for path, height in heights.items() if path in true}

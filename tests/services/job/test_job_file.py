@@ -74,6 +74,14 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("start: {offset_m: [1, 2, 3]}", ["start.offset_m: [1, 2, 3]: must have at most 2 of them"]),
     ("start: {pose: uprigth}", ["start.pose: 'uprigth': did you mean 'upright'? must be 'upright', 'tumbled' or"]),
     ("cameras: {depth: {offset_m: [0, 0, x]}}", ["cameras.depth.offset_m.2: 'x'"]),
+    *(
+        (
+            f"cameras: {{orbit: {{radius_m: {text}}}}}",
+            [f"cameras.orbit.radius_m: '{text}': write metres, fit, or a share"],
+        )
+        for text in ("fitt", "60%", "0%", "6 cm")
+    ),
+    ("cameras: {mirror: {T_z_m: 6%}}", ["cameras.mirror.T_z_m: '6%': must be 'fit'"]),
     ("cameras: {orbit: {radius_m: -1}}", ["cameras.orbit.radius_m: -1: must be greater than 0"]),
     ("categories: [mug, sofa]", ["categories.sofa", "no source offers it", "bottle, camera"]),
     ("categories: [mug, mug]", ["categories", "twice"]),
@@ -291,7 +299,8 @@ def peak_mb() -> float:
 
 @pytest.mark.parametrize("numbers", [range(40), pytest.param(range(100, 2100), marks=pytest.mark.slow)], ids=len)
 def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(run_job, "measure_scene", lambda job, catalogue: None)  # this is about reading jobs
+    for name in ("measure_scene", "require_framed"):  # this is about reading jobs
+        monkeypatch.setattr(run_job, name, lambda job, catalogue: None)
     path, out, outcomes = tmp_path / "job.yaml", str(tmp_path / "out"), Counter()
     main(["run", str(EXAMPLES[-1]), "--dry-run", "--out", out])  # loads what reading a job loads
     before = peak_mb()

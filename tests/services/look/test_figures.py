@@ -11,11 +11,17 @@ import pyarrow.dataset as ds
 import pytest
 
 from schemas.dataset.layout import SUCCESS_FILE
+from schemas.job.assets import SplitShares
 from schemas.job.job import Job
+from services.dataset.dataset import open_dataset
 from services.look import collect as module
 from services.look.charts import FINE, HEIGHT, Chart, Histogram, amount, bars_of, chart_html
-from services.look.collect import CaptureQuality, Cost, Failure, choose_spread, collect, open_tables
-from services.look.sections import captures_html, charts_html, effects_html, failures_html, overview_html
+from services.look.collect import Cost, Failure, choose_spread, collect, open_tables
+from services.look.scene_table import (
+    COLUMNS as HEADINGS,
+)
+from services.look.scene_table import MOST_RANKED, SceneTable, read_scene_table, scene_table_html, worst_first
+from services.look.sections import charts_html, effects_html, failures_html, overview_html
 from tests.made_up_scenes import attempt_at
 from tests.services.look.conftest import HOSTILE, Handmade
 from workers.store.local import LocalStore
@@ -39,24 +45,38 @@ def test_tables_made_by_hand_give_the_figures_that_can_be_counted(figures):
     assert (first.reason, first.scenes, first.examples, first.detail) == ("left_table", 2, (2, 4), "at 0.7 m")
     assert (second.reason, second.scenes) == ("no_rest", 1)
     none = collect(Handmade())
-    assert (none.scenes, none.views, none.failures, none.captures) == (0, 0, (), [])
+    assert (none.scenes, none.views, none.failures) == (0, 0, ())
 
 
-def test_captures_have_their_quality():
-    capture = {
-        "name": "shots/mug", "estimate": "joint", "views": 22, "markers": 35, "reprojection_px": 0.21,
-        "left_out": [{"number": 3, "status": "blurred", "why": "x"}], "pose_mm": 0.4, "cloud_median_mm": None,
-        "completeness": 0.98, "measured_share": 0.9, "depth_offset_m": 0.0, "depth_scale": 1.0, "print_scale": 1.0,
-        "identified": [], "depth_corrected": False, "undistorted": False, "converged": True, "iterations": 3,
-        "cloud_points": 7, "notes": [],
-    }  # fmt: skip
-    scenes = [{"scene_id": 7, "category": "mug", "effects": [], "skipped": [], "capture": capture}]
-    figures = collect(Handmade(scenes=scenes))
-    (one,) = figures.captures
-    assert (one.name, one.views, one.left_out, one.pose_mm, one.cloud_median_mm) == ("shots/mug", 22, 1, 0.4, None)
-    html = captures_html(figures)
-    assert all(words in html for words in ("0.21 px", "0.4 mm", "98 %", "1 left out", "<td>–</td>"))
-    assert captures_html(collect(Handmade())) == ""
+def test_every_scene_has_its_split_and_figures_the_worst_first_and_so_has_a_capture(shown, captures):
+    table = read_scene_table(open_tables(shown), SplitShares(), 4)
+    rows = {row["scene_id"]: row for row in table.rows}
+    assert set(rows) == {0, 1, 2, 3} and sum(map(Counter.total, table.splits.values())) == 4
+    dataset = open_dataset(shown.root)
+    splits = dataset.splits()
+    for pair in dataset.pairs():
+        row = rows[pair.scene_id]
+        assert row["split"] == splits[pair.instance_id] and row["category"] == pair.category
+        assert row["visible, %"] == pytest.approx(
+            100 * min(pair.input.visible_fraction, pair.mirror.visible_fraction), abs=1e-3
+        )
+        assert row["support margin, mm"] == pytest.approx(pair.scene["support_margin_mm"], abs=1e-3)
+    html = scene_table_html(read_scene_table(open_tables(captures), SplitShares(), 1), "my data")
+    assert "corner error, px" in html and "penetration" not in html and "verso query &#x27;my data&#x27;" in html
+    assert scene_table_html(read_scene_table(open_tables(shown), SplitShares(), MOST_RANKED + 1), "d") == ""
+
+
+def test_a_scene_is_as_bad_as_the_figure_in_which_most_others_do_better():
+    usual = dict.fromkeys(HEADINGS) | {
+        "visible, %": 90.0,
+        "penetration, mm": 0.0,
+        "hover, mm": None,
+        "processor, s": 1.0,
+    }
+    odd = [{}, {"penetration, mm": 0.2}, {"visible, %": 20.0}, {"visible, %": 60.0}, {"processor, s": 99.0}, {}]
+    ranked = worst_first([{**usual, "scene_id": at, **changes} for at, changes in enumerate(odd)])
+    assert [row["scene_id"] for row in ranked] == [1, 2, 3, 0, 4, 5]
+    assert [row["worst"] for row in ranked[:3]] == ["penetration, mm", "visible, %", "visible, %"]
 
 
 COLUMNS = {"views": ("pose_id", "role", "category", "visible_fraction"), "scenes": ("scene_id", "category", "skipped")}
@@ -181,8 +201,9 @@ def test_what_comes_from_the_dataset_is_text_and_never_markup(figures):
         by_category=skips,
         effects={HOSTILE: Cost(1, 0.0, 0, skips), f"{HOSTILE}2": Cost(0, 0.0, 0, skips)},
         stages={HOSTILE: Cost(1, 1.0, 1)},
-        captures=(CaptureQuality(0, HOSTILE, HOSTILE, 3, 1, HOSTILE, 0.2, None, None, None, None),),
     )
     overview = overview_html(hostile, Job(name="small", seed=1, scenes=3), 0)
-    for part in (overview, effects_html(hostile), failures_html([failure], 1), captures_html(hostile)):
+    row = dict.fromkeys(HEADINGS) | {"scene_id": 0, "category": HOSTILE, "name": HOSTILE, "split": "train", "worst": ""}
+    table = scene_table_html(SceneTable([row]), HOSTILE)
+    for part in (overview, effects_html(hostile), failures_html([failure], 1), table):
         assert "<script" not in part and "&lt;script&gt;" in part

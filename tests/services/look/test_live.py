@@ -139,7 +139,7 @@ def test_a_folder_is_followed_from_nothing_to_its_report_and_a_thread_looks_by_i
         follower.stop()
     assert not follower._thread.is_alive()
     assert "Finished" in follower.view.live and follower.view.name == "small"
-    assert follower.view.shape == "overview pictures compare space figures effects failures"
+    assert follower.view.shape == "overview scenes pictures compare space figures effects failures"
 
 
 def test_a_report_is_not_made_again_while_nothing_changes_nor_at_once(shown, monkeypatch):

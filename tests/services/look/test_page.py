@@ -139,7 +139,8 @@ def test_every_picture_is_shown_a_category_alone_where_asked_and_nothing_is_fetc
     opened.run(f"{PICTURES}.forEach((one) => {{ one.loading = 'eager'; }})")
     opened.until(f"{PICTURES}.every((one) => one.complete)")
     widths = opened.run(f"{PICTURES}.map((one) => one.naturalWidth)")
-    assert len(widths) == 4 * 9 + 2 and min(widths) > 0
+    scenes = opened.run("document.querySelectorAll('.scene').length")
+    assert scenes > 1 and len(widths) == scenes * 9 + 2 and min(widths) > 0
     shown = "[...document.querySelectorAll('.scene:not([hidden])')].map((one) => one.dataset.category)"
     for name, kept in (("can", {"can"}), ("", {"box", "can"})):
         opened.run(f"document.querySelector('[data-show=\"{name}\"]').click()")
@@ -208,6 +209,22 @@ def test_layers_are_slid_through_close_to_the_object(tab, targets, tmp_path):
 
 
 @in_browser
+def test_the_table_of_scenes_sorts_by_a_heading_and_keeps_what_has_all_words(opened):
+    rows = "[...document.querySelectorAll('#scenes-table tbody tr')].filter((one) => !one.hidden)"
+    cells = f"{rows}.map((one) => Number(one.cells[{{0}}].textContent))"
+    head = "document.querySelectorAll('#scenes-table thead th')[{}].click()"
+    for column in (0, 7):
+        opened.run(head.format(column))
+        falling = opened.run(cells.format(column))
+        opened.run(head.format(column))
+        assert falling == sorted(falling, reverse=True) and opened.run(cells.format(column)) == falling[::-1]
+    words = opened.run(f"{rows}.map((one) => one.cells[1].textContent + one.cells[2].textContent)")
+    asked = "(one) => {{ one.value = '{}'; one.dispatchEvent(new Event('input')); }}"
+    opened.run(f"({asked.format('box TRAIN')})(document.getElementById('scenes-filter'))")
+    assert opened.run(f"{rows}.length") == words.count("boxtrain") < len(words)
+
+
+@in_browser
 def test_light_and_dark_follow_the_system_until_one_is_chosen_and_a_phone_scrolls_downwards_only(tab, page):
     for dark, chosen in ((True, ""), (False, "dark"), (True, "light"), (False, "")):
         tab.open(page.as_uri(), dark=dark)
@@ -219,7 +236,7 @@ def test_light_and_dark_follow_the_system_until_one_is_chosen_and_a_phone_scroll
     tab.open(page.as_uri(), 380, 800)
     tab.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     assert tab.run("document.documentElement.scrollWidth") == 380
-    wide = "(one) => one.getBoundingClientRect().right > 381 && !one.closest('svg')"
+    wide = "(one) => one.getBoundingClientRect().right > 381 && !one.closest('svg, #scenes-table')"
     wide = f"[...document.querySelectorAll('main *')].filter({wide})"
     assert tab.run(f"{wide}.map((one) => one.outerHTML.slice(0, 80))") == []
 

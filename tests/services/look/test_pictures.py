@@ -122,6 +122,9 @@ def test_sheets_and_the_slider_show_each_scene_that_has_the_pictures_and_no_mark
     html = sheets_html([scene(3, "box"), scene(7, "mug")], address)
     assert re.findall(r'data-show="([^"]*)"', html) == ["", "box", "mug"]
     assert re.findall(r'data-name="([^"]*)"', html) == ["input rgb", "mirror rgb", "over"] * 2
+    names = ("input rgb", "input rgb patch", "mirror rgb", "mirror rgb patch", "over")
+    patches_first = re.findall(r'data-name="([^"]*)"', sheets_html([scene(3, "box", names)], address))
+    assert patches_first == ["input rgb patch", "mirror rgb patch", "input rgb", "mirror rgb", "over"]
     assert html.count('src="/picture/') == 6 and "2 objects" in html
     assert "98% visible in the input view, d_z 2.346 m" in html
     assert "data-show" not in sheets_html([scene(3, "box")], address)

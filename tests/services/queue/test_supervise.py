@@ -1,5 +1,6 @@
 """A queue looked after: turns, deaths, cancelling, and a supervisor that is killed, or not alone, at any step."""
 
+import contextlib
 import itertools
 from dataclasses import replace
 from typing import Any
@@ -13,9 +14,11 @@ from services.queue.supervise import (
     PAUSES_S,
     Action,
     Driver,
+    Rules,
     choose_starts,
     hold_queue,
     pause_of,
+    supervise,
     tend_drivers,
     waiting_for_folder,
 )
@@ -55,6 +58,26 @@ def test_the_next_turn_is_by_priority_and_age_while_there_is_room_and_never_two_
     assert started(view(A, "failed", 1, out="/o"), view(B, out="/o")) == [B]
     assert waiting_for_folder([view(A, "running", 1, out="/o"), view(B, out="/o"), view(C)]) == {B}
     assert [pause_of(view(A, "queued", n, deaths=n)) for n in range(4)] == [0.0, *PAUSES_S] == sorted([0.0, *PAUSES_S])
+
+
+def test_a_supervisor_that_is_asked_to_ends_with_the_last_job_and_names_those_that_failed(tmp_path, monkeypatch):
+    world = World(make_queue(str(tmp_path / "q")))
+    for job in (A, B, C):
+        world.submit(job)
+    assert world.queue.append(C, "cancel") is not None  # before anybody looked: it ended, and waits for nobody
+
+    def pass_time(seconds: float) -> None:
+        assert world.ticks < MOST_TICKS
+        world.tick()
+        if world.queue.read(B).began:
+            world.queue.append(B, "ended", 1, code=1)
+
+    monkeypatch.setattr("services.queue.supervise.time.sleep", pass_time)
+    rules = Rules(1, ["verso"], until_empty=True)
+    assert supervise(world.queue, contextlib.nullcontext(world), rules, print) == [B]
+    assert [world.queue.read(job).state for job in (A, B, C)] == ["done", "failed", "cancelled"]
+    assert world.queue.has_log(A, 1) and world.queue.has_log(B, 1)
+    assert supervise(world.queue, contextlib.nullcontext(world), rules, print) == []  # at once, where there is nothing
 
 
 def test_what_is_done_about_a_driver():

@@ -14,6 +14,7 @@ import workers.geometry.projection as projection
 import workers.render.pathtraced as pathtraced
 import workers.scene.labels as labels
 import workers.scene.pairs as pairs
+import workers.scene.plan as plan
 from schemas.dataset.shard import Fingerprint
 from schemas.scene.view import Camera, Intrinsics
 from services.read.audit import describe_independent, verify_independently
@@ -37,6 +38,7 @@ HEALTHY = {
     "no mirror": {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}},
     "no colour": {"cameras": {"depth": {"enabled": False}}, "render": {"rgb": False}},
     "noise": {"sensor": {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}},
+    "framed": {"cameras": {"orbit": {"radius_m": "4%"}, "mirror": {"T_z_m": "fit"}}},
     "splat": {"images": {"projection": {"splat": 3}}},
 }
 
@@ -196,6 +198,14 @@ def test_a_wrong_formula_passes_plain_verify_and_not_the_second_derivation(tmp_p
     assert faults_of(store) == []
     faults = verify_independently(store, 3, lambda _: None).faults
     assert any(told in fault for fault in faults), faults
+
+
+def test_a_framed_object_that_covers_more_than_was_asked_for_is_found(tmp_path, plant):
+    plant(plan._frame, lambda *given, right=plan._frame: right(*given[:-1], 1.2 * given[-1]))
+    store, _ = make_dataset(tmp_path, scenes=1, **HEALTHY["framed"])
+    assert faults_of(store) == []
+    (fault,) = verify_independently(store, 1, lambda _: None).faults
+    assert "cameras.orbit.radius_m" in fault
 
 
 @pytest.mark.parametrize("wrong", [lambda _: turned_mirror(1.0), farther_mirror], ids=["without roll", "T_z"])

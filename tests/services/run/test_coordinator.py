@@ -191,6 +191,8 @@ def test_a_scene_is_blamed_after_as_many_deaths_as_attempts_and_later_where_its_
     (blame,) = deaths.blamed_in([mine])
     assert (blame.scene_id, blame.reason, blame.attempts) == (5, "memory", 3)
     assert deaths.blamed_in([other]) == ()
+    deaths.count(8, 9, "time", "", timed_out=True)  # it would take as long again
+    assert deaths.blamed_in([other])[0].attempts == 1
     lost = Deaths(1)
     for _ in range(NODE_PATIENCE - 1):
         lost.count(4, 5, "killed", "", with_node=True)

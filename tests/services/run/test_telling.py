@@ -10,11 +10,13 @@ import sys
 import urllib.error
 from collections import Counter
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from schemas.base import set_key
 from schemas.dataset.layout import LOG_FOLDER
-from schemas.errors import MachineError, OutputError, VersoError
+from schemas.errors import MachineError, OutputError, SettleError, VersoError
 from schemas.job.job import Job
 from services.cli.main import main
 from services.job.record import encode_job, record_job
@@ -46,6 +48,55 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
     assert lines[-2] == "0 of 4 scenes are there, 4 are left to make"
     assert "about 2 s of processor, 1 s with 2 workers here, and 8 MB (500 ms and 2.00 MB a scene" in lines[-1]
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (
+            {"cameras.orbit.radius_m": 125},
+            r"input camera has the object 12\d to 12\d m before .* change cameras\.orbit",
+        ),
+        ({"cameras.orbit.radius_m": 0.05}, r"object -0\.\d+ to .* change cameras\.orbit\.radius_m, which is 0\.05"),
+        (
+            {"images.depth_range_m": [3, 4]},
+            r"object 2\.\d+ to 2\.\d+ m before it, outside images\.depth_range_m \[3, 4\]",
+        ),
+        ({"cameras.mirror.T_z_m": 60}, r"mirror camera has the object (59\.\d|60) to .* change cameras\.mirror\.T_z_m"),
+        ({"cameras.sensor.cx": -5000}, r"beside its picture or smaller than a pixel: see cameras\.sensor"),
+        (
+            {"cameras.orbit.radius_m": "fit", "cameras.mirror.T_z_m": "fit", "images.depth_range_m": [3.0, 3.05]},
+            r"m across together: the camera that frames them .* 3 to 3\.05 m",
+        ),
+        ({"start.offset_m": [3, 4]}, r"none of 21 positions .* narrow start\.offset_m"),
+    ],
+)
+def test_a_job_whose_scenes_cannot_be_framed_is_refused_before_anything_is_written(keys, message, tmp_path, capsys):
+    job, out = tmp_path / "job.yaml", tmp_path / "out"
+    tree = {"name": "t", "scenes": 3}
+    for key, value in keys.items():
+        set_key(tree, key, value)
+    job.write_text(json.dumps(tree))
+    for more in ([], ["--dry-run"]):
+        assert main(["run", str(job), "--out", str(out), *more]) == 2
+        assert re.search(
+            f"job t: none of the first 3 scenes can be planned and framed: .*{message}", capsys.readouterr().err
+        )
+    assert main(["run", str(job), "--out", str(out), "--address", "127.0.0.1:1"]) == 1  # nobody answers there
+    assert not out.exists()
+
+
+def test_cameras_that_frame_their_objects_are_asked_where_they_will_stand(tmp_path):
+    """Before a scene is at rest they stand at a distance that stands for one."""
+    framed = {"orbit": {"radius_m": "fit"}, "mirror": {"T_z_m": "fit"}}
+    asked = request(tmp_path / "new", cameras=framed, images={"depth_range_m": [1.3, 3.0]})
+    assert open_inputs(asked.job, asked.job_folder, asked.out)
+
+
+def test_a_dry_run_says_why_scenes_cannot_be_made_that_can_be_framed(tmp_path, monkeypatch):
+    monkeypatch.setattr("workers.shard.run_shard.make_scene", Mock(side_effect=SettleError("not_at_rest", "it rolls")))
+    last = describe_plan(request(tmp_path / "new"))[-1]
+    assert last.endswith("the first scenes cannot be made: not_at_rest: it rolls")
 
 
 def test_a_scene_is_measured_by_making_it():

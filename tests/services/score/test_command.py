@@ -1,5 +1,6 @@
 """`verso score` from the command line: truth is perfect, each fault is an item with a reason, scores are compared and kept."""
 
+import importlib.util
 import io
 import json
 import os
@@ -63,6 +64,17 @@ def test_truth_is_perfect_and_its_page_needs_no_network(files, truth, tmp_path, 
     assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page
     rows = pq.read_table(tmp_path / "items.parquet").to_pylist()
     assert len(rows) == 3 * PAIRS and {row["status"] for row in rows} == {"ok"}
+
+
+def test_what_this_installation_cannot_score_is_told_before_anything_is_written(
+    files, truth, tmp_path, capsys, monkeypatch
+):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *a: None if name == "flip_evaluator" else find(name, *a)
+    )
+    status, _, told = score(capsys, files.root, truth, "--out", tmp_path / "new", "--flip")
+    assert status == 1 and "`verso extra study` installs it" in told and not (tmp_path / "new").exists()
 
 
 def archive(path, flags=0, method=0, shape=(4, 3)):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from schemas.errors import InputError, milliseconds, number, size
 from services.study.choose import (
-    AS_CHEAP,
+    WORTH,
     TargetError,
     choose,
     describe_answer,
@@ -59,9 +59,15 @@ def test_the_cheapest_that_meets_all_targets_is_chosen():
 
 
 def test_of_settings_about_as_cheap_facts_without_noise_decide():
-    """The job itself first, then the least errors relative to the job's, then the fewest changes and the name."""
-    just, well = (row("step=1", 1 / AS_CHEAP + off, noise=0.0, depth_mm=0.01) for off in (1e-6, -1e-6))
-    unsure = dataclasses.replace(well, ratio_most=1.1)  # its interval holds the job's own time
+    """The job stays unless 5 % is surely saved; then the fewest changes, the least errors relative to the job's, the name."""
+    just, well = (row("step=1", 1 - WORTH + off, noise=0.0, depth_mm=0.01) for off in (1e-6, -1e-6))
+    unsure = dataclasses.replace(well, ratio=0.9, ratio_most=1.01)  # its interval holds the job's own time
+    close = row("a=1, b=1, c=1", 0.985, noise=0.005, depth_mm=0.05)  # about as cheap as what saves 6 %, and more exact
+    saving = row("step=1", 0.94, noise=0.03, depth_mm=0.1)
+    assert recommend([OWN, close], None) is OWN and recommend([OWN, close, saving], None) is saving
+    many = row("step=1, tier=flat", 0.91, noise=0.03, depth_mm=0.05)
+    assert choose([OWN, many, saving], {"depth_mm": 1.0}) is saving  # as cheap, with fewer changes
+    assert choose([row(depth_mm=2.0), close], {"depth_mm": 1.0}) is close  # the job itself misses what was asked
     assert choose([OWN, unsure], {"depth_mm": 1.0}) is OWN
     assert choose([OWN, just], {"depth_mm": 1.0}) is OWN and choose([OWN, well], {"depth_mm": 1.0}) is well
     a = row("step=a", 0.50, depth_mm=0.09, penetration_mm=0.03)  # 0.9 + 3 + 1 times the job's
@@ -106,6 +112,12 @@ def test_a_setting_that_few_scenes_measured_is_not_recommended():
     with pytest.raises(TargetError, match=r"depth of objects fewer than 4 scenes of the job .*--budget"):
         choose([unknown], {"depth_mm": 0.2})
     assert recommend([unknown], None) is unknown  # who asks for nothing keeps the job
+    four, three = row(scenes=4, depth_mm=0.1), row("step=60", 0.5, scenes=3, depth_mm=0.01)
+    for rows in ([unknown], [four], [unknown, row("step=60", 0.5, depth_mm=0.01)], [four, three]):
+        words, chosen = describe_answer(rows, None, (), 64)
+        assert chosen == "" and words.startswith("No verdict: fewer than 4 scenes") and "--budget" in words
+    words, chosen = describe_answer([four, three, row("size=small", 0.5, scenes=4, depth_mm=0.1)], None, (), 64)
+    assert chosen == "size=small" and "Of 1 setting fewer than 4 scenes were measured: nothing is said" in words
 
 
 UNMET = (

@@ -16,9 +16,9 @@ from services.cli.main import main
 from services.job.job_file import load_job
 from services.study import command
 from services.study.choose import refuse_unmeasured
-from services.study.measure import RESTS, Unit, answer_unit, measure_capture
+from services.study.measure import RESTS, measure_capture
 from services.study.model import Setting
-from services.study.study import HEADER, JOURNAL_FILE, SPENT, Journal
+from services.study.study import HEADER, JOURNAL_FILE, SPENT, Journal, Unit, answer_unit
 from tests.services.cli.test_commands import TABLETOP, told
 from tests.services.study.made_up import read_study
 from workers.assets.catalogue import open_catalogue

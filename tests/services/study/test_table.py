@@ -140,6 +140,8 @@ def test_times_of_parts_add_up_and_a_preset_is_put_together_of_parts_that_were_m
     assert "depth_mm" not in step.errors and "penetration_mm" not in flat.errors
     assert (flat.ratio, flat.kilobytes, flat.errors["flip"].value) == (pytest.approx(3.5 / 4), 0.4, 0.5)
     assert fast.ratio == pytest.approx(3.0 / 4) and {"penetration_mm", "depth_mm", "flip"} <= set(fast.errors)
+    once = Table(PARTS, journal(1)).row(STEP)  # one scene says nothing of others
+    assert (once.ratio, once.ratio_least, once.ratio_most) == (pytest.approx(3.5 / 4), -math.inf, math.inf)
     assert PARTS.of[FAST.name]["rest"] == STEP and len(PARTS.measured["rest"]) == 2 + len(REFERENCES)
 
 

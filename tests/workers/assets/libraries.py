@@ -10,7 +10,7 @@ from workers.assets.library.making import Making, make_library
 def library_of(folder: Path, category: str = "mug", **making) -> dict[str, str]:
     """The source of a library of all meshes of a folder, which are in metres with z up, unless `making` says otherwise."""
     out = folder.parent / f"{folder.name}_library"
-    how = {"unit": 1.0, "up": "z", "licence": "MIT", **making}
+    how = {"units": (("*", 1.0),), "up": "z", "licence": "MIT", **making}
     make_library(folder, out, Making(category, **how))
     return {"source": "library", "folder": str(out)}
 

@@ -61,7 +61,7 @@ def load(library, row, settings=SETTINGS, **assets):
 def test_a_shape_comes_back_from_its_glb_as_it_was_but_for_the_rounding_of_float32(tmp_path):
     textured_cube(tmp_path / "in")
     write(tmp_path / "in/skin.png", picture(colour=None))
-    library = made(tmp_path / "in", unit=0.1, up="y")
+    library = made(tmp_path / "in", units=(("*", 0.1),), up="y")
     (row,) = library.rows
     read = load_file(tmp_path / "in", tmp_path / "in/cube.obj", MeshLimits())
     there, here = load(library, row), place_asset(read, row, MeshLimits())
@@ -261,7 +261,7 @@ def test_a_large_collection_is_listed_and_not_read(tmp_path, monkeypatch):
     rows = decide_rows(tmp_path / "in", Making())
     assert len(rows) == 200 and len({row.unit for row in rows}) == 1 and len({row.instance_id for row in rows}) == 200
     assert all(row.files[0].sha256 == "" and "files that were read" in row.why for row in rows)
-    catalogue = open_folder(tmp_path / "in", unit=None, up=None)
+    catalogue = open_folder(tmp_path / "in", units=(), up=None)
     asset = catalogue.load(choose_object(catalogue, "mug", np.random.default_rng(0)))
     assert len(asset.sha256) == 64 and len(list((tmp_path / "in_library/shapes").iterdir())) == 1
 

@@ -145,7 +145,7 @@ def test_a_wrong_or_missing_description_names_file_and_key(folder):
     (folder / "camera.json").mkdir()
     refused(folder, "unreadable", "camera.json cannot be read")
     refused(folder.parent, "missing", "has no rgb_00000.png")
-    refused(folder / "nothing", "missing", "is no folder")
+    refused(folder / "nothing", "missing", "there is no such folder")
 
 
 def test_images_that_do_not_belong_together_or_are_torn_are_refused_by_name(folder):

@@ -276,7 +276,16 @@ def test_a_centre_half_a_pixel_off_is_told_and_no_rolling_shutter():
     rng = np.random.default_rng(0)
     given = with_numbers(PINHOLE, cx=KINECT.cx - 0.5, cy=KINECT.cy - 0.5)
     found = estimate_joint(seen_as(given, PINHOLE, hand_held(rng, 10), rng, 0.02))
-    assert "is pixel_centre right?" in found.notes[0] and not any("rows" in note for note in found.notes)
+    said = re.search(r"cx = ([0-9.]+) \(", found.notes[0])
+    assert said and abs(float(said[1]) - KINECT.cx_opencv) < 0.2 and not any("rows" in note for note in found.notes)
+
+
+def test_a_lens_that_no_five_numbers_explain_is_named_and_its_camera_is_never_taken_or_advised():
+    rng = np.random.default_rng(1)
+    whole = dataclasses.replace(PINHOLE, lens=np.array([0.33, -2.4, 1e-3, 0, 1.4, 0.21, -2.2, 1.3]))
+    given = dataclasses.replace(whole, lens=whole.lens * (np.arange(8) < 5))
+    found = estimate_joint(seen_as(given, whole, hand_held(rng, 10), rng, 0.02))
+    assert "`distortion`" in found.notes[0] and "--calibrate" not in found.notes[0] and found.camera is None
 
 
 @pytest.mark.minute

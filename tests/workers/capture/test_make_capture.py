@@ -296,7 +296,7 @@ def test_folders_are_relative_to_the_job_file_and_their_files_decide_the_digest(
     changed = open_sources(folders_job("moved/mug", "moved/box"), tmp_path)
     assert changed.digest != before.digest and changed.captures[0].sha256 == before.captures[0].sha256
     assert open_sources(folders_job("moved/box", "moved/mug"), tmp_path).digest != changed.digest
-    with pytest.raises(AssetSourceError, match=r"captures\.folders\.1: .*nowhere is no folder") as caught:
+    with pytest.raises(AssetSourceError, match=r"captures\.folders\.1: .*nowhere: there is no such folder") as caught:
         open_sources(folders_job("moved/mug", "nowhere"), tmp_path)
     assert caught.value.exit_code == 2
     for keys in ({}, {"captures": {}}):  # without folders the digest is that of the shapes alone

@@ -1,6 +1,7 @@
 """Views as pinholes see them, from elsewhere too, against exact ones; and the measures of what is off."""
 
 import functools
+import re
 
 import cv2
 import numpy as np
@@ -13,13 +14,13 @@ from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera, Intrinsics
-from tests.workers.capture.analytic_capture import Thing, capture, cast, kinect, poses
+from tests.workers.capture.analytic_capture import HIGH, LOW, RADIUS, SPHERE, Thing, capture, cast, kinect, poses
 from workers.capture.score import (
     align_mesh,
     measured_points,
-    sample_surface,
     score_surface,
 )
+from workers.capture.surface.coverage import describe_grazing, sample_surface
 from workers.capture.surface.posed_view import (
     UNSEEN,
     PosedView,
@@ -40,7 +41,7 @@ from workers.capture.surface.synthesize import (
 )
 from workers.capture.surface.tsdf import fit_depth
 from workers.geometry.camera import look_at
-from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
+from workers.geometry.frames import angle_between, invert, pose, rotation_about, transform, translation
 from workers.geometry.pixels import opencv_matrix
 from workers.geometry.raycast import cast_view
 
@@ -140,19 +141,17 @@ HOME = camera_at(0.5, 0.1, 0.45)
 def source_at(shift_m=0.0):
     """The thing as a device at HOME sees it, whose depth camera stands so far to its right."""
     depth_camera = Camera(K, frozen_array(HOME.T_world_cam @ translation(shift_m, 0, 0))) if shift_m else HOME
-    depth, mask, _ = cast(THING, depth_camera)
-    view = PosedView(0, HOME, depth_camera, cast(THING, HOME)[2], depth.astype(np.float32))
-    return prepare_source(view, fit_depth(view.depth_m, K), mask)
+    depth = cast(THING, depth_camera)[0].astype(np.float32)
+    return prepare_source(PosedView(0, HOME, depth_camera, cast(THING, HOME)[2], depth), fit_depth(depth, K))
 
 
-def test_depth_colour_and_mask_are_those_that_the_other_camera_has():
+def test_depth_and_colour_are_those_that_the_other_camera_has():
     for position in ((0.5, 0.1, 0.45), (0.45, 0.2, 0.4), (0.35, 0.0, 0.35), (0.6, 0.1, 0.7)):
         camera = camera_at(*position)
-        layer, (depth, mask, rgb) = warp(source_at(), camera), cast(THING, camera)
+        layer, (depth, _, rgb) = warp(source_at(), camera), cast(THING, camera)
         seen = layer.weight > 0
         off = np.abs(layer.depth_m - depth)[seen]
         assert seen.sum() > 5000 and np.median(off) < 1e-4 and np.quantile(off, 0.95) < 2e-3
-        assert (layer.mask == mask)[seen].mean() > 0.98
         assert np.median(np.abs(layer.rgb.astype(int) - rgb)[seen]) <= 2
     assert np.allclose(warp(source_at(), camera, 0.25).weight, 0.25 * layer.weight)
 
@@ -183,9 +182,77 @@ def test_colours_and_depth_follow_a_depth_camera_that_stands_elsewhere():
 # ---------------------------------------------------------------------------------------------- many views
 
 
-def sources(sigma_m, count=24, seed=0):
+def body(*open_at):
+    """The thing as a mesh, without the box's bottom and its upper faces within 25 mm of (x, y) where that is given."""
+    ball, box = trimesh.creation.icosphere(5, RADIUS), trimesh.creation.box(bounds=np.stack([LOW, HIGH]))
+    box = box.subdivide().subdivide().subdivide().subdivide()
+    for place in open_at:
+        middle = box.triangles_center
+        top, bottom = middle[:, 2] > HIGH[2] - 1e-6, middle[:, 2] < 1e-6
+        box.update_faces(~bottom & ~(top & (np.hypot(*(middle[:, :2] - place).T) < 0.025)))
+    mesh = trimesh.util.concatenate([ball.apply_translation(SPHERE), box])
+    return Mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int32))
+
+
+def sources(sigma_m, count=24, seed=0, spoil=lambda depth_m, camera: depth_m):
     views = capture(THING, count=count, sigma_m=sigma_m, seed=seed)
-    return [prepare_source(view, fit_depth(view.depth_m, K), cast(THING, view.camera)[1]) for view in views]
+    fitted = [fit_depth(spoil(view.depth_m, view.camera), K) for view in views]
+    return [prepare_source(*pair) for pair in zip(views, fitted, strict=True)]
+
+
+def off_by(view, camera):
+    """[H, W] distance of a view's depth from what a pixel or one beside it truly has."""
+    framed = np.pad(cast(THING, camera)[0], 1)
+    around = [framed[i : i + K.height, j : j + K.width] for i in range(3) for j in range(3)]
+    return np.min([np.abs(view.depth_m - truth) for truth in around], axis=0)
+
+
+def at_place(place, camera, size):
+    """The square of pixels about a point of the board frame."""
+    x, y, z = transform(invert(camera.T_world_cam), np.array([place]))[0]
+    u, v = int(K.fx * x / z + K.cx), int(K.fy * y / z + K.cy)
+    return np.s_[v - size : v + size, u - size : u + size]
+
+
+def test_what_is_called_measured_lies_on_the_object_or_the_board_whatever_single_views_show():
+    def spoil(depth_m, camera):
+        depth_m, (true, thing, _) = depth_m.copy(), cast(THING, camera)
+        depth_m[at_place((0.11, 0.0, 0.0), camera, 3)] -= 0.03  # floats over the board beside the box
+        through = at_place((0.0, 0.0, 0.1), camera, 3)
+        depth_m[through] = np.where(thing[through], true[through] + 0.06, true[through])  # the board inside the box
+        return depth_m
+
+    camera = camera_at(0.6, 0.25, 0.5)
+    ready = [source for source in sources(0.001, spoil=spoil) if source.number % 4 == 1]
+    view = synthesize_view(ready, camera, body())
+    assert (off_by(view, camera)[view.measured & (view.depth_m > 0)] < 0.01).mean() > 0.9998
+    assert (view.measured & view.mask).sum() > 0.8 * view.mask.sum()
+
+
+def test_what_no_view_sees_of_the_object_is_its_own_and_counts_as_not_measured():
+    camera, place = camera_at(0.3, 0.1, 0.7), (0.03, 0.0)
+
+    def spoil(depth_m, camera):
+        depth, thing, _ = cast(THING, camera)
+        rays = np.stack(
+            [
+                (np.arange(K.width) + 0.5 - K.cx) / K.fx * depth,
+                (np.arange(K.height)[:, None] + 0.5 - K.cy) / K.fy * depth,
+                depth,
+            ],
+            axis=-1,
+        )
+        at = transform(camera.T_world_cam, rays.reshape(-1, 3)).reshape(rays.shape)
+        lost = thing & (np.hypot(at[..., 0] - place[0], at[..., 1] - place[1]) < 0.025) & (at[..., 2] > 0.09)
+        return np.where(lost, np.float32(0), depth_m)
+
+    whole, holed = (synthesize_view(sources(0.0, spoil=spoil)[:8], camera, body(*where)) for where in ((), (place,)))
+    mask = cast(THING, camera)[1]
+    for view in (whole, holed):
+        assert (view.mask & mask).sum() > 0.97 * mask.sum() and (view.mask & ~mask).sum() < 0.04 * mask.sum()
+        lost = view.mask & ~view.measured
+        assert 0.1 < lost.sum() / mask.sum() < 0.35
+        assert view.measured_share == pytest.approx(view.measured.sum() / ((view.depth_m > 0) | view.mask).sum())
 
 
 @pytest.mark.parametrize("sigma_m", [0.002, pytest.param(0.004, marks=pytest.mark.minute)])
@@ -196,7 +263,7 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
         best = choose_sources(
             {source.number: source.camera.T_world_cam[:3, 2] for source in ready}, camera, Synthesis()
         )
-        view = synthesize_view([ready[number] for number in best], camera)
+        view = synthesize_view([ready[number] for number in best], camera, body())
         depth, mask, rgb = cast(THING, camera)
         both = (view.depth_m > 0) & view.mask & mask
         worst = max(worst, float(np.median(np.abs(view.depth_m - depth)[both])) * 1e3)
@@ -207,7 +274,7 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
     assert worst < 1.0
     away = Camera(K, frozen_array(look_at(np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.0, 2.0]))))
     with pytest.raises(CaptureError, match="shows anything to this camera") as refusal:
-        synthesize_view(ready[:4], away)
+        synthesize_view(ready[:4], away, body())
     assert refusal.value.reason == "nothing_seen"
     down = Camera(K, frozen_array(look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))))  # ranked by the cosine of the axes
     axes = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, -0.8], [0.0, 0.0, -1.0], [-0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
@@ -215,26 +282,26 @@ def test_a_view_from_a_held_out_pose_is_the_true_one(sigma_m, record_figure):
 
 
 def halves():
-    """(rgb, depth, mask) of a near surface at the left and a farther one at the right."""
+    """(rgb, depth) of a near surface at the left and a farther one at the right."""
     depth = np.full((60, 80), 1.0)
     depth[:, :40] = 0.8
     rgb = np.where(depth[..., None] < 0.9, [200, 10, 10], [10, 10, 200]).astype(np.uint8)
-    return rgb, depth, depth < 0.9
+    return rgb, depth
 
 
 def test_small_holes_are_filled_from_the_farther_surface_and_large_ones_and_outer_edges_stay():
     for hole in (np.s_[20:24, 10:14], np.s_[:, 39:42]):  # within a surface; a gap between two is shared
-        rgb, depth, mask = halves()
-        depth[hole], rgb[hole], mask[hole] = 0.0, 0, False
-        for got, expected in zip(fill_holes(rgb, depth, mask, 3), halves(), strict=True):
+        rgb, depth = halves()
+        depth[hole], rgb[hole] = 0.0, 0
+        for got, expected in zip(fill_holes(rgb, depth, 3), halves(), strict=True):
             assert np.allclose(got[5:-5], expected[5:-5])
         assert not depth[hole].any(), "what was given is not changed"
-    rgb, depth, mask = halves()
+    rgb, depth = halves()
     depth[10:21, 10:21], depth[35:50, 10:25], depth[:, 60:] = 0.0, 0.0, 0.0
-    filled = fill_holes(rgb, depth, mask, 3)[1]
+    filled = fill_holes(rgb, depth, 3)[1]
     assert np.allclose(filled[10:21, 10:21], 0.8), "an enclosed hole is filled whole"
     assert not filled[39:46, 14:21].any() and not filled[:, 60:].any()
-    assert np.array_equal(fill_holes(rgb, depth, mask, 0)[1], depth)
+    assert np.array_equal(fill_holes(rgb, depth, 0)[1], depth)
 
 
 # ---------------------------------------------------------------------------------------------- errors made on purpose
@@ -257,6 +324,32 @@ def test_samples_are_even_over_the_area_and_surface_errors_are_the_distances_tha
     assert errors.surface_median_mm == pytest.approx(0.0, abs=1e-6) and errors.completeness > 0.97
     seen = visible_points(MESH, samples, normals, [ABOVE]).mean()
     assert errors.visible_share == pytest.approx(seen, abs=0.01) and 0.3 < seen < 0.7
+
+
+def ring(elevation_deg, turns_deg):
+    """Distant cameras about the origin at an elevation and angles about the vertical, by number."""
+    wide, found = Intrinsics(width=200, height=200, fx=900.0, fy=900.0, cx=100.0, cy=100.0), {}
+    for number, turn in enumerate(np.radians(turns_deg)):
+        e = np.radians(elevation_deg)
+        position = 5.0 * np.array([np.cos(e) * np.cos(turn), np.cos(e) * np.sin(turn), np.sin(e)])
+        found[number] = Camera(wide, frozen_array(look_at(position, np.zeros(3))))
+    return found
+
+
+def test_what_is_seen_only_at_grazing_angles_is_a_share_and_a_place_from_where_it_is_seen_well():
+    made = trimesh.creation.icosphere(4, 0.1)
+    ball, all_around = Mesh(np.array(made.vertices), np.array(made.faces, np.int32)), np.arange(0, 360, 10)
+    note = describe_grazing(ball, ring(50.0, all_around))
+    # A belt of a sphere has an area as its height: seen down to 40 degrees below the middle, at 70 down to 20 below.
+    share = (np.sin(np.radians(40)) - np.sin(np.radians(20))) / (1 + np.sin(np.radians(40)))
+    assert abs(int(note.split("%")[0]) - 100 * share) < 2 and "about 10 degrees above the board all around" in note
+    lower = {number + 36: camera for number, camera in ring(10.0, all_around).items()}
+    assert describe_grazing(ball, {**ring(50.0, all_around), **lower}) is None
+    views = ring(45.0, [92, 100, 180, 268, 20])  # the box's face towards +x is seen by the last alone
+    assert describe_grazing(MESH, views) is None
+    views[4] = ring(45.0, [72])[0]  # 77 degrees from that face's normal
+    told = describe_grazing(MESH, views)
+    assert re.search("about (10|25|40) degrees above the board on the side of view 4", told)
 
 
 def test_points_are_measured_where_a_pixel_has_their_depth():

@@ -6,15 +6,17 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.door.oracles import CUBE, picture, textured_obj, urdf, visual, write, write_all
-from tests.workers.door.test_statements import dae, geometry
+from tests.workers.door.test_statements import dae, geometry, seen
 from workers.assets.library.reading import list_files
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.formats import load_shape
-from workers.door.meshes.urdf import find_named, list_named, list_seen, load_posed
+from workers.door.meshes.posed import Source
+from workers.door.meshes.urdf import list_named, list_seen, load_posed
 
 LIMITS = MeshLimits()
 
@@ -130,6 +132,63 @@ def test_a_body_with_a_look_has_its_picture_or_colour_and_one_without_coordinate
         assert len(meshes) == 1 and len(pictures) == (name in ("a.xml", "c.xml", "e.urdf"))
 
 
+SCRIPTED = """<sdf><model><link><visual><geometry>{}</geometry><material><script><uri>model://m/materials/scripts</uri>
+<uri>model://m/materials/textures</uri><name>M/{}</name></script></material></visual></link></model></sdf>"""
+SCRIPTS = """material M/Blue // as M/Red
+{ technique { pass { ambient 1 0 0
+   diffuse 0 0 1.0 1
+} } }
+/* material M/Gone {
+ diffuse 1 0 0 } */
+material "M/Bands" : M/Blue
+{
+ technique { pass {
+   diffuse 1 1 1
+   texture_unit {
+     texture bands.png
+   } } }
+}
+material M/Lost { pass { texture_unit {
+ texture lost.png
+} } }
+material M/Shaded {
+}
+"""
+
+
+def test_an_ogre_script_gives_colour_and_picture_to_meshes_and_to_simple_bodies_or_is_named(tmp_path):
+    bands = Image.fromarray(np.repeat(np.array([[[200, 0, 0], [0, 200, 0]]], np.uint8), 2, axis=0).repeat(8, axis=1))
+    (tmp_path / "m/materials/textures").mkdir(parents=True)
+    bands.save(tmp_path / "m/materials/textures/bands.png")
+    write(tmp_path / "m/materials/scripts/a.material", SCRIPTS)
+    box, tube = "<box><size>1 2 3</size></box>", "<cylinder><radius>1</radius><length>2</length></cylinder>"
+    for name, body, colours, note in (
+        ("Blue", box, {(0, 0, 255)}, ""),
+        ("Bands", box, {(200, 0, 0), (0, 200, 0)}, ""),
+        ("Bands", tube, {(200, 0, 0), (0, 200, 0)}, ""),
+        ("Lost", box, {(178, 178, 178)}, "lost.png is missing"),
+        ("Gone", box, {(178, 178, 178)}, "the material script M/Gone is not had"),
+        ("Shaded", box, {(178, 178, 178)}, "the material script M/Shaded is not had"),
+    ):
+        path = write(tmp_path / "m/model.sdf", SCRIPTED.format(body, name))
+        loaded = load_posed(path, LIMITS, tmp_path)
+        (part,) = loaded.shape.parts
+        assert {tuple(c) for c in seen(loaded.shape)} == colours and note in "; ".join(loaded.notes), (
+            name,
+            loaded.notes,
+        )
+        assert ({file.name for file in list_files(tmp_path, path, LIMITS)} >= {"a.material"}) == (name != "Gone")
+        if name == "Bands":  # from outside the left half of each side is red, with z up
+            a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
+            level = np.abs(np.cross(b - a, c - a)[:, 2]) < 1e-9
+            right = np.cross([0.0, 0.0, 1.0], np.cross(b - a, c - a))
+            u = part.uv[part.faces][..., 0]
+            grows = ((b - a) * right).sum(axis=1) * (u[:, 1] - u[:, 0]) + ((c - a) * right).sum(axis=1) * (
+                u[:, 2] - u[:, 0]
+            )
+            assert level.sum() >= 8 and (grows[level] > 0.0).all() and np.ptp(u, axis=1).max() <= 1.0
+
+
 SDF = """<sdf version="1.6"><model name="m"><pose>0 0 1 0 0 0</pose><link name="l"><pose degrees="true">1 0 0 0 0 90</pose>
 <collision name="c"><geometry><mesh><uri>hull.obj</uri></mesh></geometry></collision>
 <visual name="v"><pose>1 0 0 0 0 0</pose><geometry><mesh><uri>model://mug/meshes/cube.obj</uri><scale>0.1 0.2 0.3</scale></mesh>
@@ -153,6 +212,30 @@ def test_an_sdf_is_read_as_its_poses_say_and_what_it_does_not_hold_is_named(tmp_
     assert named == {"cube.obj", "hull.obj"}, "collision shapes are parts too"
 
 
+def test_an_mjcf_is_read_with_what_it_includes_as_mujoco_has_it(tmp_path):
+    write(tmp_path / "m/cube.obj", CUBE)
+    write(
+        tmp_path / "parts/bodies.xml",
+        """<mujocoinclude><body pos="1 0 0"><geom type="mesh" mesh="c"/><include file="parts/tip.xml"/>
+    </body></mujocoinclude>""",
+    )
+    write(tmp_path / "parts/tip.xml", '<mujoco><body pos="0 2 0"><geom type="box" size="0.1 0.2 0.3"/></body></mujoco>')
+    write(
+        tmp_path / "assets.xml",
+        '<mujoco><compiler meshdir="m"/><asset><mesh name="c" file="cube.obj"/></asset></mujoco>',
+    )
+    path = write(
+        tmp_path / "a.xml",
+        """<mujoco><include file="assets.xml"/><worldbody><include file="parts/bodies.xml"/>
+    </worldbody></mujoco>""",
+    )
+    ours = boxes(load_posed(path, LIMITS, tmp_path).shape)
+    assert np.allclose(ours, seen_by_mujoco(path), atol=1e-6) and len(ours) == 2
+    files = {file.name for file in list_files(tmp_path, path, LIMITS)}
+    assert files == {"a.xml", "assets.xml", "bodies.xml", "tip.xml", "cube.obj"}
+    assert files - {"a.xml"} == {file.name for file in list_named(path, tmp_path, LIMITS)}, "parts, and no objects"
+
+
 WRONG = (
     ("a.sdf", "<sdf><world><model/></world></sdf>", "format", "is a world, and no object"),
     (
@@ -169,7 +252,9 @@ WRONG = (
     ),
     ("a.sdf", "<sdf/>", "no_faces", "no visual geometry"),
     ("a.xml", "<mujoco/>", "no_faces", "no visual geometry"),
-    ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "format", "has <include>"),
+    ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "missing", "names 'b.xml'"),
+    ("a.xml", '<mujoco><include file="a.xml"/></mujoco>', "unreadable", "includes a.xml twice"),
+    ("a.xml", '<mujoco><attach file="b.xml"/></mujoco>', "format", "has <attach>"),
     (
         "a.xml",
         '<mujoco><worldbody><geom type="mesh" mesh="m"/></worldbody></mujoco>',
@@ -207,7 +292,7 @@ def test_what_cannot_be_read_of_them_is_one_reason(tmp_path, name, text, reason,
 
 def test_names_are_found_by_every_tail_of_them_in_the_folders_above_and_never_outside(tmp_path):
     root, path = tmp_path / "in", tmp_path / "in/robot/urdf/r.urdf"
-    for name in ("robot/meshes/a.obj", "robot/urdf/b.obj", "c.obj", "textures/d.png"):
+    for name in ("robot/meshes/a.obj", "robot/urdf/b.obj", "c.obj", "textures/d.png", "my robot/e.stl", "100%20.obj"):
         write(root / name, "")
     write(tmp_path / "out.obj", "")
     for name, found in (
@@ -218,11 +303,13 @@ def test_names_are_found_by_every_tail_of_them_in_the_folders_above_and_never_ou
         ("b.obj", "robot/urdf/b.obj"),
         ("model://x/y/c.obj", "c.obj"),
         ("../../textures/d.png", "textures/d.png"),
+        ("package://pkg/my%20robot/e.stl", "my robot/e.stl"),
+        ("100%20.obj", "100%20.obj"),
     ):
-        assert find_named(name, path, root) == root / found
+        assert Source(path, root, LIMITS).find(name) == root / found
     for name in ("../../../out.obj", str(tmp_path / "out.obj"), "", "x" * 9999, "a" + "/x" * 500, "gone.obj"):
         with pytest.raises(MeshError, match="is not inside"):
-            find_named(name, path, root)
+            Source(path, root, LIMITS).find(name)
 
 
 def test_mujocos_own_meshes_are_read(tmp_path):

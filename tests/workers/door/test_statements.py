@@ -17,7 +17,8 @@ from PIL import Image
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
-from tests.workers.door.oracles import glb, welded, write_all
+from tests.workers.door.oracles import CUBE, glb, urdf, visual, welded, write_all
+from workers.assets.library.reading import list_files, load_file
 from workers.door.meshes.formats import load_shape
 
 CORNERS = np.array([[x, y, z] for z in (0, 0.2) for x, y in ((-0.1, -0.1), (0.1, -0.1), (0.1, 0.1), (-0.1, 0.1))])
@@ -281,6 +282,13 @@ INPUTS = '<input semantic="VERTEX" source="#v" offset="0"/><input semantic="TEXC
 RING = [f"{c} {k}" for side in SIDES for k, c in enumerate(side)]
 
 
+def wrong_count(count, cut=0):
+    """The cube as a binary STL whose head tells another count, and that misses its last bytes."""
+    (data,) = stl().values()
+    data = data[:80] + struct.pack("<I", count) + data[84:]
+    return {"a.stl": data[: len(data) - cut]}
+
+
 def part(kind, *orders, more=""):
     """A primitive of the six sides, each once for every order of its corners."""
     runs = [" ".join(RING[4 * k + i] for i in order) for k in range(6) for order in orders]
@@ -426,7 +434,7 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "black Kd": (obj("Kd 0 0 0\nmap_Kd t.png\n"), Right(note="grey Kd")),
     "grey Kd": (obj("Kd 0.588 0.588 0.588\nmap_Kd t.png\n"), Right(note="a grey Kd of 0.588")),
     "red Kd": (obj("Kd 1 0 0\nmap_Kd t.png\n"), Right(((200, 0, 0),))),
-    "no material file": (obj(first="", use=""), Right((GREY,))),
+    "no material file": (obj(first="", use=""), Right((GREY,), note="t.png beside it was not used")),
     "a material file that is missing": (
         obj(first="mtllib n.mtl", files={"a.mtl": b""}),
         Right((GREY,), note="a.mtl was read"),
@@ -617,6 +625,17 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "off in binary": (off("OFF BINARY"), "three dimensions"),
     "stl": (stl(), Right((GREY,))),
     "stl with bytes behind": (stl(b"\0\0"), Right((GREY,))),
+    "stl with a count too small": (wrong_count(7), Right((GREY,), note="its head tells 7 faces, and 12 are there")),
+    "stl with a count too large": (
+        wrong_count(4711),
+        Right((GREY,), note="its head tells 4711 faces, and 12 are there"),
+    ),
+    "stl without a count": (wrong_count(0), Right((GREY,), note="its head tells 0 faces, and 12 are there")),
+    "stl that ends early": (wrong_count(12, cut=20), "ends early: 11 of 12 faces are there"),
+    "clear vertices": (
+        ply(f"{RGB}property uchar alpha\n", row=lambda k, c: "220 30 30 0"),
+        Right((RED,), note="an alpha of 0 of vertices"),
+    ),
     "stl with a colour in its head": (stl(colour=b"COLOR=\xff\0\0\xff"), Right((GREY,))),
 }
 
@@ -678,6 +697,52 @@ def test_what_a_file_states_is_obeyed_or_named(tmp_path):
         elif told := list(faults(path, right)):
             found[name] = told
     assert not found, "\n".join(f"{name}: {told}" for name, told in found.items())
+
+
+DECLARED = '<?xml version="1.0" encoding="{}"?>'
+SPHERE = "<sphere><radius>0.1</radius></sphere>"
+TEXTS = {
+    "a.obj": obj("map_Kd ü.png\n", "mtllib ü.mtl"),
+    "a.dae": dae(image="ü.png"),
+    "a.ply": ply_by_vertex("s", "t"),
+    "a.urdf": {"a.urdf": urdf(visual('<mesh filename="ü.obj"/>')).encode()},
+    "a.sdf": {"a.sdf": f"<sdf><model><link>{visual(SPHERE)}</link></model><!-- ü --></sdf>".encode()},
+    "a.xml": {"a.xml": "<mujoco model='ü'><worldbody><geom type='mesh' mesh='ü'/></worldbody>"
+              "<asset><mesh file='ü.obj'/></asset></mujoco>".encode()},
+    "a.off": {"a.off": b"OFF # \xc3\xbc\n" + off()["a.off"].removeprefix(b"OFF")},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_text_is_read_by_its_mark_its_declaration_or_as_latin_1_with_a_note(tmp_path, name):
+    kind = name[2:]
+    for k, (encoding, declares) in enumerate(
+        (("utf-8", ""), ("utf-8-sig", ""), ("utf-16", ""), ("iso-8859-1", ""), ("iso-8859-1", "iso-8859-1"),
+         ("windows-1250", "windows-1250"), ("utf-8", "utf-16"), ("iso-8859-1", "utf-8"), ("utf-8", "no-such"))
+    ):  # fmt: skip
+        if (kind in ("obj", "ply", "off") and declares) or (kind == "ply" and encoding == "utf-16"):
+            continue
+        files = {
+            "ü.obj": CUBE.encode(),
+            "ü.mtl": b"newmtl a\nmap_Kd \xc3\xbc.png\n",
+            "ü.png": image(SKIN),
+            **TEXTS[name],
+        }
+        for text in (name, "ü.mtl"):
+            whole = (
+                files[text]
+                .decode()
+                .replace("TextureFile t.png", "TextureFile ü.png")
+                .replace('<?xml version="1.0"?>', "")
+            )
+            files[text] = (DECLARED.format(declares) * bool(declares) * (text == name) + whole).encode(encoding)
+        path = write_all(tmp_path / str(k), files).with_name(name)
+        list_files(path.parent, path, MeshLimits())
+        loaded = load_file(path.parent, path, MeshLimits())
+        if kind in ("obj", "dae", "ply"):
+            assert {tuple(colour) for colour in seen(loaded.shape)} == {SKIN}, (encoding, declares)
+        told = f"{name} is not in UTF-8: read as Latin-1" in loaded.notes
+        assert told == (encoding == "iso-8859-1" and declares != "iso-8859-1"), (encoding, declares, loaded.notes)
 
 
 def polygon(corners):

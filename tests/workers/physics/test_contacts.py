@@ -92,7 +92,7 @@ def test_no_piece_of_a_skin_reaches_out_of_the_mesh():
         vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         whole = manifold3d.Manifold(manifold3d.Mesh64(vertices, faces.astype(np.uint64)))
         assert whole.volume() > 0.0
-        for piece in skin_of(surface_of(Mesh(vertices, faces), True), np.arange(len(faces)), 1e-3):
+        for piece in skin_of(surface_of(Mesh(vertices, faces), True), np.arange(len(faces)), 1e-3, 0.0):
             assert (manifold3d.Manifold.hull_points(np.ascontiguousarray(piece)) - whole).volume() < 1e-15
 
 

@@ -13,9 +13,10 @@ from schemas.errors import SettleError
 from schemas.scene.scene import EffectPlan, ObjectStart, Settled, Table
 from schemas.scene.shape import Mesh
 from tests.hard_cases.bodies import ball, built_in, cube, over_edge
-from tests.hard_cases.drops import Y, level, turn
+from tests.hard_cases.drops import Y, drop, level, turn
 from tests.hard_cases.groups import place as at
 from tests.hard_cases.groups import put, together, tray
+from tests.hard_cases.hollow_cases import cups
 from tests.kit.shapes import asset_of, box
 from tests.physics.settling import (
     PHYSICS,
@@ -45,18 +46,21 @@ from workers.physics.release import (
     PACES,
     PACES_MANY,
     PACES_TOGETHER,
+    RELEASE_RATE,
     Drop,
     hold,
     release,
     release_again,
 )
-from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_RATE, RECHECK_S, Rest, settle_scene
+from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_S, Rest, settle_scene
 
 TABLE = level()
 TOP = TABLE.top.height_m
 ALL = ("dynamics", "fine_step", "object_contacts", "rolling_friction")
 CUBE = cube(0.06)
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+LEANS = turn(X, 1.0)
+"""So that it does not stand where it lands, and falls in the simulator."""
 
 
 def group_of(starts: Sequence[ObjectStart], physics=PHYSICS) -> tuple[Settled, ...]:
@@ -127,7 +131,7 @@ def test_what_does_not_rest_is_refused_with_what_was_measured(monkeypatch):
         (at(ball(0.05, 2), TABLE, (0, 0, 0.2)), TABLE, hurried, "not_at_rest", r"rad/s after 0\.1 s"),
         (beyond, TABLE, PHYSICS, "left_table", r"off the table's top: narrow start.offset_m"),
         # PyBullet itself stops with `createCollisionShape failed`, which would end the worker
-        (at(CUBE, TABLE, (0, 0, 0.1)), fine, PHYSICS, "table_too_fine", "takes 131072 and 174762"),
+        (at(CUBE, TABLE, (0, 0, 0.1), LEANS), fine, PHYSICS, "table_too_fine", "takes 131072 and 174762"),
         (hover, TABLE, PHYSICS, "unsupported", r"it came to rest 0.020 mm from anything, with 100.0% of its weight"),
     ):
         if start is hover:
@@ -176,7 +180,9 @@ def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(monke
     for height_m, side_m, travel_m in ((0.02, 0.06, 2e-3), (1.5, 0.06, 3e-3), (0.3, 0.006, 3e-4)):
         with monkeypatch.context() as patch:
             seen = told_by(patch)
-            group_of([at(CUBE, TABLE, (0, 0, 0.031)), at(cube(side_m), TABLE, (0.2, 0.0, height_m + side_m / 2))])
+            group_of(
+                [at(CUBE, TABLE, (0, 0, 0.031), LEANS), at(cube(side_m), TABLE, (0.2, 0.0, height_m + side_m / 2))]
+            )
         told = [(steps.base_hz, pytest.approx(steps.max_travel_m)) for steps, _ in seen]
         assert told == [(PHYSICS.step_hz, travel_m)]
 
@@ -242,7 +248,7 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
     rest = settle_single(start, TABLE, PHYSICS)
     seen = told_by(monkeypatch)
     recheck(start, rest, TABLE, PHYSICS)
-    release_again(scene_of([start], TABLE), [rest], PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), 0.5)
+    release_again(scene_of([start], TABLE), [rest], PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), 0.5, FINEST)
     assert [outcome.seconds for _, outcome in seen] == pytest.approx([RECHECK_S, 0.5], abs=1e-3)
 
 
@@ -256,7 +262,7 @@ def test_what_is_let_go_again_shows_whether_it_rested():
         (0.701, 0.0, 0.2, 0.5),  # 1 mm outside
     ):
         start = at(CUBE, TABLE, (x_m, 0.0, 0.03 + up_m))
-        for rate in (RECHECK_RATE, FINEST):
+        for rate in (RELEASE_RATE, FINEST):
             moved = dataclasses.replace(rest, T_world_obj=start.T_world_obj)
             moved_mm, _ = recheck(start, moved, TABLE, PHYSICS, rate)
             assert least_mm <= moved_mm <= most_mm, (x_m, up_m, rate)
@@ -276,11 +282,11 @@ def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatc
     starts = together(TABLE, [put(cube(0.05), TABLE, 0.0), put(cube(0.04), TABLE, 0.05)]).starts
     left, seen = [slips], []
 
-    def slip(_drop, _placement, poses, _far_m, _groups):
+    def slip(_drop, _placement, poses, *_):
         seen.append(poses[1][0, 3])
         left[0] -= 1
         by_m = 2.0 * HELD_M if left[0] >= 0 else 0.5 * HELD_M
-        return poses[0], translation(by_m, 0.0, 0.0) @ poses[1]
+        return (poses[0], translation(by_m, 0.0, 0.0) @ poses[1]), False
 
     monkeypatch.setattr(module, "let_go", slip)
     held = hold(*released(starts, TABLE), [one.T_world_obj for one in starts])
@@ -320,7 +326,7 @@ def test_what_leaves_the_table_is_drawn_again_above_the_others_or_removed_or_the
 
 def test_what_finds_no_balance_is_removed_where_what_leaves_is(monkeypatch):
     """Of three the second is said to slip by 1 mm as often as it is let go among them."""
-    starts = together(TABLE, [at(CUBE, TABLE, (x, 0.0, 0.031)) for x in (0.0, 0.08, 0.16)]).starts
+    starts = together(TABLE, [at(CUBE, TABLE, (x, 0.0, 0.031), LEANS) for x in (0.0, 0.08, 0.16)]).starts
     usual = settle.hold
 
     def slips(drop, placement, poses):
@@ -340,7 +346,7 @@ def test_what_finds_no_balance_is_removed_where_what_leaves_is(monkeypatch):
 @pytest.mark.parametrize("push_m_s", [(40.0, 0.0, 0.0), (0.0, 0.0, 10.0)])
 def test_what_was_thrown_is_told_so_and_never_rests_nor_counts_as_lost(push_m_s, pouring, monkeypatch):
     """Whatever throws the second of two, here a push as its fall begins; upwards it comes down on the table again."""
-    starts = together(TABLE, [at(CUBE, TABLE, (0.0, 0.0, 0.031)), at(CUBE, TABLE, (0.2, 0, 0.04))]).starts
+    starts = together(TABLE, [at(CUBE, TABLE, (0.0, 0.0, 0.031), LEANS), at(CUBE, TABLE, (0.2, 0, 0.04))]).starts
     set_velocity = World.set_velocity
 
     def pushed(world, velocity, spin=(0.0, 0.0, 0.0), body=0):
@@ -367,3 +373,17 @@ def test_a_pile_of_more_than_eight_falls_in_waves_above_what_lies(monkeypatch):
     for wave, lying in zip(waves[:2], (0, 5), strict=True):
         tops = np.maximum.accumulate([TOP, *(heights.max() for heights in wave)])[lying:]
         assert [heights.min() for heights in wave[lying:]] == pytest.approx(tops[:-1] + 0.04, abs=1e-9)
+
+
+def test_letting_go_ends_at_its_budget_and_names_the_objects(monkeypatch):
+    monkeypatch.setattr(settle, "LET_GO_COST", 0.0)
+    group = cups(2)
+    with pytest.raises(SettleError, match=r"regions 3 \(\w+\), 4 \(\w+\) touch with \d+ faces.*coarser meshes"):
+        settle_group(group.starts, group.table, PHYSICS)
+
+
+def test_a_mesh_far_from_its_origin_is_refused_by_name_and_not_as_off_the_table():
+    far = box(0.05, 0.05, 0.05)
+    far.apply_translation([1e9, 0.0, 0.0])
+    with pytest.raises(SettleError, match=r"region 3 .* lies 1e\+09 m from its origin, .*: move the mesh"):
+        settle_group([drop(asset_of(far), TABLE, 0.01).start], TABLE, PHYSICS)

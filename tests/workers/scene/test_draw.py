@@ -1,7 +1,9 @@
 """The draw of a scene: named streams, ranges that are filled and never left, and objects that begin without touching."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,18 +11,18 @@ import shapely
 import trimesh
 
 import workers.scene.plan as planning
-from schemas.errors import StartError
+from schemas.errors import StartError, ViewError
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, ScenePlan
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box, table
-from workers.geometry.camera import inclination, yaw
-from workers.geometry.frames import pose, rotation_about, transform, translation
+from workers.geometry.camera import inclination, project, yaw
+from workers.geometry.frames import invert, pose, rotation_about, transform, translation
 from workers.geometry.hull import hull_of
-from workers.physics.support import place_table
+from workers.physics.support import APART_M, columns_apart, place_table
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import is_raycast_scene
-from workers.scene.plan import APART_M, choose_category, columns_apart, count_objects, draw_scene, stands_on
+from workers.scene.plan import choose_category, count_objects, draw_scene, frame_cameras, stands_on
 
 BOX = asset_of(box(0.1, 0.08, 0.2))
 TABLE = table()
@@ -123,6 +125,65 @@ def test_starts_and_cameras_fill_their_ranges_and_never_leave_them():
         assert np.abs(sorted_share - (np.arange(300) + 0.5) / 300).max() < 1.95 / math.sqrt(300)
     distances = [np.linalg.norm(p.input_cameras[0].position - [0, 0, height]) for p in plans]
     assert distances == pytest.approx([2.5] * 300)
+
+
+def framed(*objects, radius_m="fit", at=(0.3, -0.2), **changes):
+    """(camera, points [N, 3] of the hulls as the camera has them) of objects that rest side by side there."""
+    drawn = job(cameras={"orbit": {"radius_m": radius_m}}, **changes)
+    planned = draw_scene(drawn, SceneChance(5, 3), TABLE, objects[0])
+    starts = [replace(planned.objects[0], asset=asset, hull=hull_of(asset.shape)) for asset in objects]
+    poses = [translation(at[0] + 0.1 * k, at[1], 0.9) for k in range(len(objects))]
+    rests = [SimpleNamespace(T_world_obj=T) for T in poses]
+    (camera,) = frame_cameras(
+        drawn, replace(planned, objects=tuple(starts)), [rest.T_world_obj for rest in rests]
+    ).input_cameras
+    before = planned.input_cameras[0]
+    assert np.array_equal(camera.T_world_cam[:3, :3], before.T_world_cam[:3, :3]), "the direction that was drawn"
+    points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
+    return camera, transform(invert(camera.T_world_cam), points), before
+
+
+NEAR_DEPTH = {"images": {"depth_range_m": [0.05, 8.0]}}
+
+
+def test_framed_objects_cover_their_share_wherever_they_rest_unless_the_edges_or_the_range_of_depth_forbid_it():
+    picture = 640 * 480
+    for radius, text, share in ((0.015, "fit", 0.06), (0.1, "fit", 0.06), (0.1, "3%", 0.03), (0.6, "10 %", 0.1)):
+        camera, seen, _ = framed(asset_of(trimesh.creation.icosphere(4, radius)), radius_m=text, **NEAR_DEPTH)
+        u, v = project(seen, camera.intrinsics)
+        middle = 0.5 * (
+            transform(camera.T_world_cam, seen).min(axis=0) + transform(camera.T_world_cam, seen).max(axis=0)
+        )
+        distance = np.linalg.norm(camera.position - middle)
+        covers = math.pi * 525.0**2 * radius**2 / (distance**2 - radius**2)  # a ball on the optical axis is a disc
+        assert (camera.T_world_cam[:3, 2] @ (middle - camera.position)) == pytest.approx(distance)
+        assert covers / picture == pytest.approx(share, rel=0.01 if radius > 0.02 else 0.25), (
+            "the depth camera sees it too"
+        )
+        assert abs(u.mean() - 320) < 2 and abs(v.mean() - 240) < 2
+    for objects, changes in (
+        ([asset_of(box(0.3, 0.004, 0.004))], NEAR_DEPTH),  # so long that it would be cut off
+        ([asset_of(box(0.02, 0.02, 0.02))], {}),  # so small that it would have no depth
+        ([SMALL, CAN, SMALL, CAN, BIG], NEAR_DEPTH),
+    ):
+        camera, seen, _ = framed(*objects, **changes)
+        u, v = project(seen, camera.intrinsics)
+        inside = max(np.abs(u / 320 - 1).max(), np.abs(v / 240 - 1).max())
+        assert inside <= 0.95 + 1e-9 and seen[:, 2].min() >= (0.2 if not changes else 0.05)
+        assert shapely.MultiPoint(np.stack([u, v], axis=1)).convex_hull.area / picture < 0.12
+    camera, _, before = framed(BOX, radius_m=2.5)
+    assert camera.T_world_cam.tobytes() == before.T_world_cam.tobytes(), "a distance that is given stays"
+
+
+def test_a_scene_that_cannot_be_framed_is_refused_before_it_is_drawn():
+    for side, radius, words in (
+        (13.0, "fit", "do not see|does not see"),
+        (13.0, 2.5, "22.5 m across"),
+        (2.0, 1.5, "radius_m: fit"),
+    ):
+        with pytest.raises(ViewError, match=words) as caught:
+            framed(asset_of(box(side, side, side)), radius_m=radius)
+        assert caught.value.reason == "not_framed"
 
 
 def test_upright_objects_stand_tumbled_ones_do_not_and_placed_ones_touch_the_table_unless_they_would_tip():

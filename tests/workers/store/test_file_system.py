@@ -1,5 +1,6 @@
 """What only a disk has: flushing, hard links, errors explained, and temporary folders of processes that may die."""
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -122,3 +123,17 @@ def test_a_temporary_folder_is_kept_while_its_process_lives_and_goes_after_it_wa
     with temporary_folder("test") as mine:
         assert not os.path.isdir(folder) and os.listdir(mine) == []
     assert list(tmp_path.iterdir()) == [young]
+
+
+def test_a_temporary_folder_that_another_process_looks_at_while_it_is_being_made_stays(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    lock = fcntl.flock
+
+    def late(file: object, flags: int) -> None:
+        if flags == fcntl.LOCK_EX:
+            remove_abandoned("test")
+        lock(file, flags)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with temporary_folder("test") as mine:
+        assert mine.is_dir()

@@ -34,6 +34,25 @@ def name_categories(paths: Iterable[str], source: str | None) -> dict[str, str]:
     name says nothing (`meshes`, an identifier) that above it; where none says something, the file. A number at the end that
     tells several apart goes.
     """
+    if source not in (None, BY_FOLDER, BY_FILE, BY_PARENT):
+        return dict.fromkeys(paths, str(source))
+    return {path: usable_name(word) for path, word in _words_of(paths, source).items()}
+
+
+def find_joined(paths: Iterable[str], source: str | None) -> dict[str, str]:
+    """By category, the different names that became one, in a phrase."""
+    joined: dict[str, set[str]] = {}
+    for word in _words_of(paths, source).values():
+        joined.setdefault(usable_name(word), set()).add(word)
+    return {
+        name: f"category {name} is of {', '.join(map(repr, sorted(words)))}"
+        for name, words in joined.items()
+        if len(words) > 1
+    }
+
+
+def _words_of(paths: Iterable[str], source: str | None) -> dict[str, str]:
+    """What names the category of each path, as it is written."""
     folders = {path: PurePosixPath(path).parts[:-1] for path in paths}
     if source not in (None, BY_FOLDER, BY_FILE, BY_PARENT):
         return dict.fromkeys(folders, str(source))
@@ -57,7 +76,7 @@ def name_categories(paths: Iterable[str], source: str | None) -> dict[str, str]:
             words[path] = next(filter(_says, [*above[shared:depth][::-1], *rest]), of_file)
     stems = {word: _NUMBER.sub("", word) or word for word in set(words.values())}
     series = Counter(stems.values())
-    return {path: usable_name(stems[word] if series[stems[word]] > 1 else word) for path, word in words.items()}
+    return {path: stems[word] if series[stems[word]] > 1 else word for path, word in words.items()}
 
 
 def _says(name: str) -> bool:

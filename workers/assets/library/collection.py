@@ -3,19 +3,22 @@
 import hashlib
 import json
 import os
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from schemas.errors import AssetSourceError, MeshError, plain_line
 from schemas.job.assets import MeshLimits
-from workers.assets.library.copies import LeftOut
+from workers.assets.library.copies import COPY, LeftOut
 from workers.assets.library.placement import Measured, read_measured
 from workers.assets.library.reading import Question, ask, digest_of
 from workers.assets.library.table import UNKNOWN, SourceFile
 from workers.door.meshes.formats import FORMATS
 from workers.door.meshes.urdf import POSED
+from workers.door.opening import as_utf8
 from workers.pool import Answers
 
 SUFFIXES = (*POSED, *FORMATS)
@@ -27,6 +30,10 @@ _REMEDIES = {
     "export it as .glb by the program that wrote it": ".max .mb .ma .c4d .skp",
     "export it as .stl by a CAD program": ".step .stp .iges .igs .fcstd .sldprt",
     "it has points and no faces, so make a mesh of it": ".pcd .las .laz .xyz .e57 .splat .spz",
+    "run `draco_decoder -i FILE -o FILE.ply`": ".drc",
+    "run `ctmconv FILE FILE.ply`": ".ctm",
+    "it is a GLB, so copy it under a name that ends in .glb": ".vrm",
+    "arrays say not which are a mesh, so write it as .ply": ".npz",
     "unpack it": ".zip .tar .gz .tgz .bz2 .xz .7z .rar",
     "run `xacro FILE > FILE.urdf`": ".xacro",
 }
@@ -37,23 +44,27 @@ FOREIGN: Mapping[str, str] = {suffix: remedy for remedy, suffixes in _REMEDIES.i
 def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
     """Paths of every mesh and URDF below the folder, in order, and what was left out already; hidden names are left aside.
 
-    Links to folders are not followed. AssetSourceError where the folder is none, cannot be listed, or has no mesh.
+    Links to folders are not followed; of links to one file the first is kept, or the file itself. AssetSourceError where the
+    folder is none, cannot be listed, or has no mesh.
     """
     name = plain_line(str(folder), 300)
     if not folder.is_dir():
-        what = "is a file: name the folder that it lies in" if folder.exists() else "is not there"
-        raise AssetSourceError(f"{name} {what}")
+        what = "is a file: name the folder that it lies in" if folder.exists() else "there is no such folder"
+        raise AssetSourceError(f"{name}: {what}")
     try:
         empty = not any(folder.iterdir())
     except OSError as error:
         raise AssetSourceError(f"{name} cannot be listed: {error.strerror}") from error
-    root, paths, left_out = folder.resolve(), dict[str, None](), list[LeftOut]()
+    root, paths, left_out = folder.resolve(), dict[str, str](), list[LeftOut]()
 
     def cannot_list(error: OSError) -> None:
         left_out.append(LeftOut(_relative(error.filename, root), "permission", f"cannot be listed: {error.strerror}"))
 
     for parent, folders, files in os.walk(root, onerror=cannot_list):
         folders[:] = sorted(one for one in folders if not one.startswith((".", "__MACOSX")))
+        links = [Path(parent, one) for one in folders if os.path.islink(Path(parent, one))]
+        left_out += [LeftOut(_relative(str(p), root), "link", OUTSIDE) for p in links if not _is_inside(p, root)]
+        current = _current_version(Path(parent, "model.config"), files)
         for file in sorted(files):
             suffix = os.path.splitext(file)[1].lower()
             if file.startswith(".") or suffix not in (*SUFFIXES, *FOREIGN):
@@ -63,19 +74,39 @@ def walk_folder(folder: Path) -> tuple[list[str], list[LeftOut]]:
                 continue
             if (why := _unusable(path, root)) is not None:
                 left_out.append(LeftOut(_relative(str(path), root), *why))
+            elif current is not None and suffix == ".sdf" and file != current:
+                left_out.append(
+                    LeftOut(_relative(str(path), root), COPY, f"other version of {current}, by model.config")
+                )
             else:
-                paths[path.resolve().relative_to(root).as_posix()] = None
+                paths[path.relative_to(root).as_posix()] = path.resolve().relative_to(root).as_posix()
     if not paths and not left_out:
         what = "is empty" if empty else f"has no mesh ({', '.join(SUFFIXES)})"
         raise AssetSourceError(f"{name} {what}: name a folder that has some")
-    return sorted(paths), left_out
+    first = {target: path for path, target in sorted(paths.items(), reverse=True)}
+    return sorted({target if target in paths else first[target] for target in paths.values()}), left_out
+
+
+_VERSION = re.compile(rb"<sdf(?:\s+version\s*=\s*[\"']([\d.]+)[\"'])?\s*>\s*([^<]+?)\s*</sdf>")
+
+
+def _current_version(config: Path, files: Sequence[str]) -> str | None:
+    """Of the files beside a Gazebo model's `model.config`, the one that it names for the newest version; None without any."""
+    if config.name not in files:
+        return None
+    with suppress(OSError), config.open("rb") as stream:
+        text = re.sub(rb"<!--.*?-->", b"", as_utf8(stream.read(1 << 16))[0], flags=re.DOTALL)
+        named = [(version.split(b"."), name.decode()) for version, name in _VERSION.findall(text)]
+        known = [([int(part or 0) for part in version], name) for version, name in named if name in files]
+        return max(known, default=(None, None))[1]
+    return None
 
 
 def _is_mjcf(path: Path) -> bool:
     """Whether an XML file is one of MuJoCo's: others are of no concern."""
     try:
         with path.open("rb") as stream:
-            return b"<mujoco" in stream.read(1 << 16)
+            return b"<mujoco" in as_utf8(stream.read(1 << 16))[0]
     except OSError:
         return False
 
@@ -86,11 +117,18 @@ def _unusable(path: Path, root: Path) -> tuple[str, str] | None:
         return "format", f"{path.suffix.lower()} is not read: {FOREIGN[path.suffix.lower()]}"
     if not str(path.relative_to(root)).isprintable():
         return "name", "its name is not printable UTF-8: rename it"
-    if not path.resolve().is_relative_to(root):
-        return "link", "leads out of the folder: copy it there"
+    if not _is_inside(path, root):
+        return "link", OUTSIDE
     if not path.is_file():
         return "missing", "is no file, or a link to nothing"
     return None if os.access(path, os.R_OK) else ("permission", "may not be read by this user")
+
+
+OUTSIDE = "leads out of the folder: `cp -rL` copies a folder with what its links name"
+
+
+def _is_inside(path: Path, root: Path) -> bool:
+    return path.resolve().is_relative_to(root)
 
 
 def _relative(path: str, root: Path) -> str:

@@ -6,9 +6,12 @@ Such as a collision shape, a coarser level, a double.
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations, product
 from pathlib import PurePosixPath
 
-from workers.assets.library.placement import Measured
+import numpy as np
+
+from workers.assets.library.placement import LOOK_SIDE, Measured
 from workers.door.meshes.urdf import POSED
 
 PART, COPY = "part", "copy"
@@ -50,6 +53,8 @@ _NAMED_BEFORE = re.compile(r"(?:UCX|UBX|USP|UCP)_(.+?)(?:_\d+)?")
 """As Unreal has it."""
 _FOLDER = re.compile(rf"(?:{_COLLIDES})(?:[\s_.-]*mesh(?:es)?)?", re.IGNORECASE)
 _LEVEL = re.compile(r"(.+?)[\s_.-]*lod[\s_.-]*(\d+)", re.IGNORECASE)
+_EVALUATION = re.compile(r"(.*/|)models_[a-z]+/(obj_\d+\.ply)")
+"""BOP has an object's coarser meshes beside its `models`."""
 _SEEN = re.compile(r"[\s_.-]+(?:vis|visual)$", re.IGNORECASE)
 
 
@@ -71,6 +76,9 @@ def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, st
         by_folder.setdefault(_parent(path), []).append(path)
     found = {}
     for path in paths:
+        if (match := _EVALUATION.fullmatch(path)) and (model := f"{match[1]}models/{match[2]}") in split:
+            found[path] = f"made for evaluation, of {model}"
+            continue
         stem, level = split[path]
         if level is None or path in posed:
             continue
@@ -134,16 +142,25 @@ FEW = 50
 SMALL = 0.02
 """Below this, metres or a share of a size, a difference counts as that of something so large."""
 
-ALIKE_COLOUR = 6.0
-"""Difference of mean colours, of 255, up to which two meshes may be one: pictures are compressed again."""
+ALIKE_COLOUR = 2.0
+"""Mean difference of colours by place, of 255, up to which two meshes may be one: a picture in half its size, compressed
+again as JPEG, differs by about 1."""
+
+_TURNS = [
+    (axes, flips)
+    for axes in permutations(range(3))
+    for flips in product((1, -1), repeat=3)
+    if np.linalg.det(np.eye(3)[list(axes)] * flips) > 0
+]
+"""The 24 rotations that take axes to axes, as an order of axes and their directions."""
 
 
 def find_doubles(items: Sequence[Item], size_m: Callable[[Item], float], formats: Sequence[str]) -> list[LeftOut]:
     """The items that are another one again: the same shape and size in metres, or in one folder the same shape.
 
     Two shapes are the same that have as many faces, and extents, area and volume alike in whatever order of axes; unless
-    both have pictures, or neither has, and their colours differ. That stays which has pictures, then colours, then the
-    format that comes first in `formats`.
+    both have pictures, or neither has, and their colours differ where faces lie. That stays which has pictures, then colours,
+    then the format that comes first in `formats`.
     """
     order = sorted(
         items,
@@ -163,19 +180,24 @@ def _is_double(item: Item, other: Item, size_m: Callable[[Item], float]) -> bool
     if item.digest == other.digest:
         return True
     mine, theirs = item.measured, other.measured
-    coloured_alike = bool(mine.textures) == bool(theirs.textures) and mine.look is not None and theirs.look is not None
-    if (
-        coloured_alike
-        and max(abs(a - b) for a, b in zip(mine.look or (), theirs.look or (), strict=True)) > ALIKE_COLOUR
-    ):
-        return False
     posed = (item.suffix in POSED) != (other.suffix in POSED)
     near = item.suffix != other.suffix and _nested(_parent(item.path), _parent(other.path), posed)
     if mine.faces < FEW and not (near and (_name(item) == _name(other) or posed)):
         return False
     ours, others = _shape(item), _shape(other)
     pairs = zip(ours if near else (*ours, size_m(item)), others if near else (*others, size_m(other)), strict=True)
-    return all(abs(a - b) <= ALIKE * max(abs(a), abs(b), SMALL) for a, b in pairs)
+    if not all(abs(a - b) <= ALIKE * max(abs(a), abs(b), SMALL) for a, b in pairs):
+        return False
+    if mine.look is None or theirs.look is None or bool(mine.textures) != bool(theirs.textures):
+        return True
+    return _differ(mine.look, theirs.look) <= ALIKE_COLOUR
+
+
+def _differ(look: Sequence[float], other: Sequence[float]) -> float:
+    """The mean difference of two `sample_look`, of 255, in that of `_TURNS` in which they are most alike."""
+    one, two = (np.reshape(colours, (LOOK_SIDE, LOOK_SIDE, LOOK_SIDE, 3)) for colours in (look, other))
+    turned = (two.transpose(*axes, 3)[tuple(slice(None, None, flip) for flip in flips)] for axes, flips in _TURNS)
+    return min(float(np.abs(one - each).max(axis=-1).sum()) for each in turned)
 
 
 def _name(item: Item) -> str:

@@ -141,7 +141,7 @@ class _Folder:
     def units(self, unit: int, path: str = "") -> dict[str, int]:
         """The number of the unit of every file below, where the folder above has `unit`.
 
-        Files that leave their folder's unit have one together: that which makes them as large as those that stay.
+        A file that leaves its folder's unit is judged by itself, and by the size of those that stay.
         """
         if self._leaves(unit):
             unit = self.costs.index(min(self.costs))
@@ -149,15 +149,12 @@ class _Folder:
             return {path[1:]: unit}
         files = [one for one in self.below.values() if not one.below]
         usual = [math.log(one.size * UNITS[unit][0]) for one in files if not one._leaves(unit)] or [math.log(USUAL_M)]
-        leaving = [math.log(one.size) for one in files if one._leaves(unit)]
-        together = min(
-            range(len(UNITS)),
-            key=lambda k: sum(abs(size + math.log(UNITS[k][0]) - median(usual)) for size in leaving),
-        )
         found = dict[str, int]()
         for name, one in self.below.items():
             if not one.below and one._leaves(unit):
-                found[f"{path}/{name}"[1:]] = together
+                apart = [abs(math.log(one.size * metres) - median(usual)) for metres, _ in UNITS]
+                costs = [cost + far for cost, far in zip(one.costs, apart, strict=True)]
+                found[f"{path}/{name}"[1:]] = costs.index(min(costs))
             else:
                 found |= one.units(unit, f"{path}/{name}")
         return found

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +20,7 @@ from pathlib import Path
 from schemas.environment import cache_folder
 from schemas.errors import AssetSourceError, InUseError, OutputError, plain_line
 from schemas.job.assets import BUILT_IN, TABLE, MeshLimits, UpAxis
-from workers.assets.library.categories import name_categories
+from workers.assets.library.categories import find_joined, name_categories
 from workers.assets.library.collection import (
     SUFFIXES,
     Survey,
@@ -69,13 +70,20 @@ USUAL_LIMITS = MeshLimits()
 
 @dataclass(frozen=True)
 class Making:
-    """How a folder becomes a library: in place of a guess, one category or its kind of name, unit, axis, licence; limits."""
+    """How a folder becomes a library: in place of a guess, one category or its kind of name, units, axis, licence; limits.
+
+    units: of the files whose paths a pattern of the shell fits; the last that does.
+    """
 
     category_from: str | None = None
-    unit: float | None = None
+    units: tuple[tuple[str, float], ...] = ()
     up: UpAxis | None = None
     licence: str | None = None
     limits: MeshLimits = USUAL_LIMITS
+
+    def unit_of(self, path: str) -> float | None:
+        """The unit that was asked for, metres."""
+        return next((unit for pattern, unit in reversed(self.units) if fnmatchcase(path, pattern)), None)
 
 
 def open_library(name: str, job_folder: Path, watch: Watch = ignore) -> Library:
@@ -125,7 +133,7 @@ def code_version() -> str:
     for folder in (here.parent, workers / "door" / "meshes", workers / "geometry"):
         for file in sorted(folder.glob("*.py")):
             whole.update(hashlib.sha256(file.read_bytes()).digest())
-    for file in (workers / "assets" / "mass.py", workers / "assets" / "glb.py"):
+    for file in (workers / "assets" / name for name in ("mass.py", "glb.py", "samples.py")):
         whole.update(hashlib.sha256(file.read_bytes()).digest())
     return whole.hexdigest()[:16]
 
@@ -206,10 +214,10 @@ def decide_rows(source: Path, making: Making, watch: Watch = ignore) -> tuple[Ro
     changed = [
         replace(
             row,
-            unit=making.unit or row.unit,
+            unit=making.unit_of(row.path) or row.unit,
             up=making.up or row.up,
             licence=making.licence or row.licence,
-            why=row.why if not row.use or (making.unit is None and making.up is None) else "as asked for",
+            why=row.why if not row.use or (making.unit_of(row.path) is None and making.up is None) else "as asked for",
         )
         for row in rows
     ]
@@ -282,7 +290,7 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
     of = {path: group for group in guess_groups(items) for path in group.paths}
 
     def size_m(item: Item) -> float:
-        return (making.unit or of[item.path].unit(item)) * item.diagonal
+        return (making.unit_of(item.path) or of[item.path].unit(item)) * item.diagonal
 
     fit = [item for item in items if SMALLEST_M <= size_m(item) <= LARGEST_M]
     doubles = {one.path: one for one in find_doubles(fit, size_m, SUFFIXES)}
@@ -290,7 +298,7 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
     of = {path: group for group in guess_groups(different) for path in group.paths}
     ups = guess_ups(different)
     objects = [survey.path for survey in known if survey.path not in doubles]
-    categories = name_categories(objects, making.category_from)
+    categories, joined = name_categories(objects, making.category_from), find_joined(objects, making.category_from)
     by_path, rows = {item.path: item for item in items}, []
     for survey in known:
         row = Row(path=survey.path, files=survey.files, sha256=survey.files[0].sha256 if survey.files else "")
@@ -302,10 +310,11 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
             rows.append(replace(row, use=False, reason=survey.refused[0], why=survey.refused[1]))
             continue
         item = by_path[survey.path]
-        unit, (up, why) = making.unit or of[item.path].unit(item), ups[item.path]
-        rows.append(
-            _sized(_measured(replace(row, unit=unit, up=making.up or up), survey, why, of[item.path].why), item)
-        )
+        unit, (up, why) = making.unit_of(item.path) or of[item.path].unit(item), ups[item.path]
+        row = _measured(replace(row, unit=unit, up=making.up or up), survey, why, of[item.path].why)
+        if row.category in joined:
+            row = replace(row, why=f"{row.why}; {joined[row.category]}")
+        rows.append(_sized(row, item))
     return rows
 
 

@@ -1,7 +1,9 @@
 """Pure but for a file's head: what a person asks about a mesh: its sizes, its unit, which axis points up (`find_upright`)."""
 
+import json
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -12,8 +14,11 @@ from scipy.spatial import ConvexHull, QhullError
 from schemas.base import Array
 from schemas.job.assets import UpAxis
 from schemas.scene.shape import MassProperties, Shape
+from workers.assets.samples import colors_at, draw_points
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.mesh import DEFAULT
+from workers.door.opening import as_utf8
+from workers.geometry.mesh import face_areas
 
 FLAT_SHARE, ROUGH_SHARE = 0.004, 0.016
 """Shares of the diagonal within which points count as touching the ground: of smooth bottoms, and of scanned ones, which
@@ -137,9 +142,9 @@ class Measured:
     """One file: sizes along its own axes, in units of its source's `scale`; what was mended, left out or is missing.
 
     area, volume: of its surface, and between the surface and the middle of its bounding box, in the same units; thin: its
-    least extent in any direction, by its diagonal; textures: how many pictures its parts have; look: their mean colour, of
-    255, None where it has none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says so; up,
-    confidence: what its shape tells about the axis that is up, or None.
+    least extent in any direction, by its diagonal; textures: how many pictures its parts have; look: its colours by place, as
+    `sample_look`, None where it has none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says
+    so; up, confidence: what its shape tells about the axis that is up, or None.
     """
 
     extents: tuple[float, float, float]
@@ -153,7 +158,7 @@ class Measured:
     area: float = 0.0
     volume: float = 0.0
     thin: float = 1.0
-    look: tuple[float, float, float] | None = None
+    look: tuple[float, ...] | None = None
     unit_m: float | None = None
     stated_up: UpAxis | None = None
 
@@ -179,8 +184,8 @@ def measure_shape(
         area=0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()),
         volume=abs(float((a * np.cross(b, c)).sum())) / 6.0,
         thin=measure_thinness(hull_vertices),
-        look=_mean_colour(shape),
-        unit_m=find_unit(path),
+        look=sample_look(shape),
+        unit_m=find_unit(path, math.dist(lower, upper)),
         stated_up=find_up(_head(path)) if path.suffix.lower() == ".dae" else None,
     )
 
@@ -191,21 +196,29 @@ def read_measured(tree: dict[str, Any]) -> Measured:
     return Measured(**{**tree, "extents": tuple(tree["extents"]), "notes": tuple(tree["notes"]), "look": look})
 
 
-def _mean_colour(shape: Shape) -> tuple[float, float, float] | None:
-    """The mean of the pictures, vertex colours and plain colours of all parts by their faces, of 255; None for no material."""
-    total, weight = np.zeros(3), 0
-    for part in shape.parts:
-        if part.material.texture is not None:
-            colour = part.material.texture.reshape(-1, part.material.texture.shape[-1])[:, :3].mean(axis=0)
-        elif part.colors is not None:
-            colour = part.colors[:, :3].mean(axis=0)
-        elif part.material == DEFAULT:
-            continue
-        else:
-            colour = 255.0 * np.array(part.material.base_color[:3])
-        total, weight = total + len(part.faces) * colour, weight + len(part.faces)
-    red, green, blue = total / max(weight, 1)
-    return (float(red), float(green), float(blue)) if weight else None
+LOOK_SIDE, LOOK_SAMPLES = 4, 1 << 15
+"""Nodes along each side of the box that colours are told by, and points of the surface that are looked at: with so
+many, two ways to cut a face with a fine pattern into triangles differ by about 1 of 255."""
+
+
+def sample_look(shape: Shape) -> tuple[float, ...] | None:
+    """[LOOK_SIDE^3 * 3]: by place in the bounding box, colour where faces lie, of 255; None for no material, or no area.
+
+    Each node of a grid has the mean of its neighbourhood times its share of the surface (trilinear, so that rounding moves
+    little): all sum to the mean colour. The points are the R2 sequence (Roberts 2018) over faces in their order, by area.
+    """
+    bare = all(part.material is DEFAULT and part.colors is None for part in shape.parts)
+    if bare or not face_areas(shape.vertices, shape.faces).any():
+        return None
+    k = np.arange(LOOK_SAMPLES)
+    face, weights, points = draw_points(
+        shape.mesh, np.stack([(k + 0.5) / len(k), k * 0.7548776662466927 % 1.0, k * 0.5698402909980532 % 1.0])
+    )
+    lower, upper = shape.bounds
+    at = (LOOK_SIDE - 1) * (points - lower) / np.where(upper > lower, upper - lower, 1.0)
+    near = np.maximum(0.0, 1.0 - np.abs(at[:, :, None] - np.arange(LOOK_SIDE)))
+    sums = np.einsum("ni,nj,nk,nc->ijkc", *near.transpose(1, 0, 2), colors_at(shape, face, weights), optimize=True)
+    return tuple(np.round(sums.ravel() / len(k), 3).tolist())
 
 
 HEAD_BYTES = 65_536
@@ -217,9 +230,23 @@ _UNITS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, 
 _UNITS |= {"millimeter": 0.001, "millimetre": 0.001, "inch": 0.0254, "inche": 0.0254, "in": 0.0254}
 _UNITS |= {"foot": 0.3048, "feet": 0.3048, "ft": 0.3048}
 
+INFO_FILE = "models_info.json"
+_INFO = re.compile(r"obj_0*(\d+)")
+INFO_SLACK = 0.02
+"""By how much a mesh may differ from the size that BOP tells of it, and still be in that unit."""
 
-def find_unit(path: Path) -> float | None:
-    """Metres in a unit of an OBJ file that states its unit in a remark at its start; else None."""
+
+def find_unit(path: Path, diagonal: float) -> float | None:
+    """Metres in a unit of a file of a diagonal, in its units; None where nothing says it.
+
+    An OBJ file may state its unit in a remark at its start; BOP's `models_info.json` tells the size of `obj_000001` in mm.
+    """
+    match, info = _INFO.fullmatch(path.stem), path.with_name(INFO_FILE)
+    if match is not None and info.is_file():
+        with suppress(OSError, ValueError, LookupError, TypeError, ArithmeticError):
+            sizes = json.loads(as_utf8(info.read_bytes())[0])[match[1]]
+            unit = 0.001 * math.hypot(*(float(sizes[f"size_{axis}"]) for axis in "xyz")) / diagonal
+            return next((known for known in _UNITS.values() if abs(unit / known - 1.0) < INFO_SLACK), None)
     found = _UNIT.search(_head(path)) if path.suffix.lower() == ".obj" else None
     word = found[1].decode().lower() if found else ""
     return _UNITS.get(word, _UNITS.get(word.removesuffix("s")))
@@ -227,4 +254,4 @@ def find_unit(path: Path) -> float | None:
 
 def _head(path: Path) -> bytes:
     with path.open("rb") as stream:
-        return stream.read(HEAD_BYTES)
+        return as_utf8(stream.read(HEAD_BYTES))[0]

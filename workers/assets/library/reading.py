@@ -20,10 +20,10 @@ from schemas.errors import MachineError, MeshError
 from schemas.job.assets import TABLE, Assets, MeshLimits
 from schemas.scene.shape import Asset, Shape
 from workers.assets.glb import asset_glb
-from workers.assets.library.placement import find_upright, measure_shape, measure_thinness
+from workers.assets.library.placement import INFO_FILE, find_upright, measure_shape, measure_thinness
 from workers.assets.library.table import Row, SourceFile
 from workers.assets.mass import weigh
-from workers.door.meshes.caps import MOST_NOTES, describe_error, one_line
+from workers.door.meshes.caps import MOST_NOTES, describe_error, find_inside, one_line
 from workers.door.meshes.formats import FORMATS, list_mesh_files, load_shape
 from workers.door.meshes.mesh import LoadedMesh, transform_shape
 from workers.door.meshes.urdf import POSED, list_named, list_seen, load_posed
@@ -260,6 +260,8 @@ def list_files(folder: Path, path: Path, limits: MeshLimits) -> tuple[Path, ...]
         files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits)), *pictures]
     else:
         files = list_mesh_files(path, folder, limits)
+    if (info := find_inside(folder, path.with_name(INFO_FILE))) is not None and path.stem.startswith("obj_"):
+        files.append(info)
     files = list(dict.fromkeys(files))
     size, cap = sum(file.stat().st_size for file in files), limits.max_asset_mb
     if size > cap * 1e6:

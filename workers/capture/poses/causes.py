@@ -16,20 +16,15 @@ from numpy.typing import NDArray
 from schemas.base import Array, frozen_array
 from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
-from workers.capture.poses.corners import CornerTerm
+from workers.capture.poses.corners import LOOSE, CornerTerm, Fields, Fitted, fit_fields, measure_noise
 from workers.capture.poses.observation import Patches
 from workers.capture.poses.terms import (
-    GROW_M,
-    GROW_PX,
-    GROWTH_M,
     POSE,
     SHARED,
     SIGNIFICANT,
-    Rows,
     Shared,
     Solution,
     motion_between,
-    moved,
 )
 from workers.geometry.pixels import project_points, rays_of_pixels
 
@@ -44,100 +39,9 @@ EXPLAINED = 0.2
 SWEPT = 0.005
 """Sigma of the motion of a hand while an image is read, metres and radians: 0.15 m/s and 9 degrees/s for 1/30 s. A step across
 the rows and a turn that undoes it look alike on a board: of the two, the markers tell only the sum."""
-LOOSE = 0.1
-"""Sigma of numbers of a camera, shares of its focal length, and of a stretch: wide, so that only what is not seen stays."""
-STEPS, SETTLED, REGULAR, HELD = 8, 1e-6, 1e-2, 1e12
-
-
-@dataclass(frozen=True, eq=False)
-class Fields:
-    """How corners [K] move in the image, pixels, by each number of an explanation.
-
-    alike [K, 2, A]: by those that all views share; of_view [K, 2, N]: by those that each view has of its own; sigma [A + N]: of
-    each number beforehand.
-    """
-
-    alike: Array
-    of_view: Array
-    sigma: Array
-
-    @staticmethod
-    def of(alike: Array | None, of_view: Array | None = None, sigma: float | Array = LOOSE) -> "Fields":
-        """Of either kind or both."""
-        some = alike if alike is not None else of_view
-        assert some is not None
-        none = np.zeros((*some.shape[:2], 0))
-        alike, of_view = none if alike is None else alike, none if of_view is None else of_view
-        return Fields(alike, of_view, np.broadcast_to(sigma, alike.shape[2] + of_view.shape[2]))
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """An explanation at its least cost: poses [V, 4, 4], growth of squares, its numbers, and the rows there.
-
-    covariance [V, 6, 6] of the poses and alike_covariance [A, A], where rows have unit variance.
-    """
-
-    poses: Array
-    shared: Shared
-    alike: Array
-    own: Array
-    rows: Rows
-    covariance: Array
-    alike_covariance: Array
-
-    @property
-    def cost(self) -> float:
-        """Robust sum of squares, in sigma of a corner squared."""
-        return self.rows.cost
-
-
-def fit_fields(term: CornerTerm, fields: Fields, poses: Array, shared: Shared, hold: float = 0.0) -> Fitted:
-    """The poses and numbers of least robust cost, by Gauss and Newton, each view's own unknowns eliminated in turn.
-
-    hold: by how much a pose resists, where a view's fields can do all that it does.
-    """
-    views, (A, N) = len(poses), (fields.alike.shape[2], fields.of_view.shape[2])
-    alike, own = np.zeros(A), np.zeros((views, N))
-    prior = np.concatenate([[GROW_M, GROW_PX], fields.sigma[:A]]) ** -2.0
-    own_prior = np.concatenate([np.full(POSE, hold), fields.sigma[A:] ** -2.0])
-    best: Fitted | None = None
-    for _ in range(STEPS):
-        values = term.values(poses, shared)
-        values[..., 0] += fields.alike @ alike + np.einsum("kcn,kn->kc", fields.of_view, own[term.view])
-        order = (values[..., : 1 + POSE], fields.of_view, values[..., 1 + POSE :], fields.alike)
-        rows = term.white_rows(np.concatenate(order, axis=2), SHARED + A)
-        matrix, gradient = np.diag(prior), prior * np.concatenate([[shared.growth_m, shared.growth_px], alike])
-        parts = []
-        for number in range(views):
-            J, residual, by = rows.of_view(number)
-            by = by[:, GROWTH_M:]
-            inverse = np.linalg.inv(J.T @ J + np.diag(own_prior + REGULAR))
-            g = J.T @ residual + own_prior * np.concatenate([np.zeros(POSE), own[number]])
-            cross = by.T @ J
-            matrix = matrix + by.T @ by - cross @ inverse @ cross.T
-            gradient = gradient + by.T @ residual - cross @ inverse @ g
-            parts.append((inverse, g, cross))
-        covariance = np.linalg.pinv(matrix, hermitian=True)
-        of_poses = np.stack([i[:POSE, :POSE] + (i @ c.T @ covariance @ c @ i)[:POSE, :POSE] for i, _, c in parts])
-        now = Fitted(poses, shared, alike, own, rows, of_poses, covariance[2:, 2:])
-        if best is None or now.cost < best.cost:
-            best = now
-        step = -covariance @ gradient
-        of_views = np.stack([-i @ (g + c.T @ step) for i, g, c in parts])
-        if max(np.abs(step).max(), np.abs(of_views).max()) < SETTLED:
-            break
-        poses, own, alike = moved(poses, of_views[:, :POSE]), own + of_views[:, POSE:], alike + step[2:]
-        growth = shared.growth_m + float(step[0]), shared.growth_px + float(step[1])
-        shared = dataclasses.replace(shared, growth_m=growth[0], growth_px=growth[1])
-    assert best is not None
-    return best
 
 
 # ---------------------------------------------------------------------------------------------- the explanations
-
-DEGREES = {24: 5, 18: 4, 14: 3, 0: 2}
-"""The degree of the smooth field of a view by how many markers it has at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +63,10 @@ class Seen:
         camera = dataclasses.replace(self.camera, lens=frozen_array(np.zeros(8)))
         return dataclasses.replace(self, term=dataclasses.replace(self.term, rays=self.rays_by(camera)), camera=camera)
 
+    def expected(self) -> "Seen":
+        """With pixels where corners should be: numbers that scale what was measured would fit by making its noise smaller."""
+        return dataclasses.replace(self, pixels=self.pixels + self.term.values(self.poses, self.shared)[..., 0])
+
     def by_pose(self) -> Array:
         """[K, 2, 6]: how corners move by a motion of their camera."""
         return self.term.values(self.poses, self.shared)[..., 1 : 1 + POSE]
@@ -177,9 +85,11 @@ DIFFERENCE = 1e-5
 
 def _numbers(seen: Seen, chosen: tuple[int, ...]) -> Fields:
     """By those numbers of the camera; where a step leaves a corner without a ray, it is not moved."""
-    columns = []
+    columns, expected = [], seen.expected()
     for n in chosen:
-        rays = [seen.rays_by(changed_camera(seen.camera, (n,), np.array([step]))) for step in (DIFFERENCE, -DIFFERENCE)]
+        rays = [
+            expected.rays_by(changed_camera(seen.camera, (n,), np.array([step]))) for step in (DIFFERENCE, -DIFFERENCE)
+        ]
         columns.append(np.nan_to_num(-seen.term.focal * (rays[0] - rays[1]) / (2 * DIFFERENCE)))
     return Fields.of(np.stack(columns, axis=2), sigma=np.where(np.array(chosen) < len(PINHOLE), LOOSE, 1.0))
 
@@ -196,7 +106,8 @@ def changed_camera(camera: CaptureCamera, chosen: tuple[int, ...], by: Array) ->
 
 
 def _focus(seen: Seen) -> Fields:
-    return Fields.of(None, (seen.term.focal * seen.term.rays)[..., None])
+    expected = seen.term.focal * seen.term.rays + seen.term.values(seen.poses, seen.shared)[..., 0]
+    return Fields.of(None, expected[..., None])
 
 
 def _rolling(seen: Seen) -> Fields:
@@ -219,24 +130,6 @@ def _stretched(seen: Seen) -> Fields:
     return Fields.of(seen.by_board(along))
 
 
-def _smooth(seen: Seen) -> Fields:
-    """A polynomial over the image in each view, whose degree is that which its markers bear."""
-    view, rays = seen.term.view, seen.term.rays
-    views, size = len(seen.poses), (max(DEGREES.values()) + 1) * (max(DEGREES.values()) + 2) // 2
-    of_view = np.zeros((len(view), 2, 2 * size))
-    for number in range(views):
-        here = view == number
-        if not here.any():
-            continue
-        p = rays[here] - rays[here].mean(axis=0)
-        p = p / np.maximum(np.abs(p).max(axis=0), 1e-9)
-        degree = next(d for markers, d in DEGREES.items() if here.sum() >= 4 * markers)
-        powers = [p[:, 0] ** i * p[:, 1] ** (d - i) for d in range(degree + 1) for i in range(d + 1)]
-        for n, power in enumerate(powers):
-            of_view[here, 0, 2 * n] = of_view[here, 1, 2 * n + 1] = power
-    return Fields.of(None, of_view, sigma=100.0)
-
-
 @dataclass(frozen=True)
 class Explanation:
     """One way in which corners come to lie elsewhere: its fields, its words, and which numbers of the camera it frees."""
@@ -249,13 +142,17 @@ class Explanation:
 
 CAMERA_FITS_NOT = "camera.json does not fit: the markers say {numbers}, which moves the poses by {by}. "
 TAKE = "Calibrate the camera at this size of image, or use --calibrate (estimation.calibrate), which takes what the markers say"
-LENS = "Its lens is another one: are all numbers of `distortion` there, and is it no fisheye? "
+LENS = (
+    "camera.json does not fit the markers, and no other focal length, principal point or k1 does, but another lens, which moves "
+    "the poses by {by}: see that `distortion` has all numbers of the calibration (k4, k5, k6 too) and that it is no fisheye, or "
+    "calibrate the camera at this size of image with a lens of eight numbers"
+)
 EXPLANATIONS = (
     Explanation("none", lambda seen: Fields.of(np.zeros((len(seen.pixels), 2, 0))), ""),
     Explanation("centre", lambda seen: _numbers(seen, CENTRE), CAMERA_FITS_NOT + "{half}" + TAKE, CENTRE),
     Explanation("camera", lambda seen: _numbers(seen, PINHOLE), CAMERA_FITS_NOT + TAKE, PINHOLE),
     Explanation("lens k1", lambda seen: _numbers(seen, BENT), CAMERA_FITS_NOT + TAKE, BENT),
-    Explanation("lens", lambda seen: _numbers(seen, WHOLE), CAMERA_FITS_NOT + LENS + TAKE, WHOLE),
+    Explanation("lens", lambda seen: _numbers(seen, WHOLE), LENS, WHOLE),
     Explanation(
         "focus",
         _focus,
@@ -349,9 +246,9 @@ def find_doubt(
     """
     start = Seen(term, begun.poses, begun.shared, *seen)
     count, about, before, variance = 2 * len(term.board), start, np.full(4, np.inf), 1.0
-    best: _Tried | None = None
+    best = usual = _try(EXPLANATIONS[0], start)
     for _ in range(ROUNDS):
-        sigma_px, left = _noise(about, spec)
+        sigma_px, left = measure_noise(about.term, about.poses, about.shared, spec)
         if left is None or len(begun.poses) < 2:
             return None
         if np.allclose(sigma_px, before, rtol=SAME):
@@ -359,8 +256,8 @@ def find_doubt(
         start, about = (
             dataclasses.replace(s, term=dataclasses.replace(s.term, sigma_px=sigma_px)) for s in (start, about)
         )
-        begin = {WHOLE: start.without_lens()} | ({best.explanation.numbers: about} if best else {})
-        tried = [_try(explanation, begin.get(explanation.numbers or None, start)) for explanation in EXPLANATIONS]
+        begin = {WHOLE: start.without_lens(), best.explanation.numbers: about, (): start}
+        tried = [_try(explanation, begin.get(explanation.numbers, start)) for explanation in EXPLANATIONS]
         before, variance, usual = sigma_px, left, tried[0]
         best = min(tried, key=lambda t: t.fitted.cost / variance + t.count * np.log(count))
         if best is usual:
@@ -368,33 +265,15 @@ def find_doubt(
         about = dataclasses.replace(best.seen, poses=best.fitted.poses, shared=best.fitted.shared)
     if best is usual and spec.calibrate:
         best = next(t for t in tried if t.explanation.numbers == WHOLE)
-        return _doubt(best, usual, start, fixed, variance, begun.poses)
+        return _doubt(best, usual, start, fixed, variance, begun.poses, spec)
     gain = usual.fitted.cost - best.fitted.cost
     alike = 0.25 * count * (ALIKE_PX / start.term.sigma_px[0]) ** 2  # two of a marker's eight are its place
     wanted = EXPLAINED * usual.fitted.cost
     if best.fitted.alike.size:
         wanted = best.count * np.log(count) * variance * max(1.0, _scatter(best, variance)) + alike
-    return None if best is usual or gain < wanted else _doubt(best, usual, start, fixed, variance, begun.poses)
+    return None if best is usual or gain < wanted else _doubt(best, usual, start, fixed, variance, begun.poses, spec)
 
 
-def _noise(about: Seen, spec: Estimation) -> tuple[Array, float | None]:
-    """(sigma_px [4] of what a smooth field in each view leaves of the corners, the variance left by it); None of too few."""
-    fields, term, poses, shared = _smooth(about), about.term, about.poses, about.shared
-    for _ in range(3):
-        smooth = fit_fields(term, fields, poses, shared, HELD)
-        before, term, shared = term, term.measured(smooth.rows, spec), smooth.shared
-    columns = int((np.abs(fields.of_view).max(axis=(0, 1)) > 0).sum())
-    count = len(smooth.rows.residual)
-    free = count - columns * len(about.poses)
-    variance = smooth.cost / free if free >= count // 4 else None
-    sigma_px = before.sigma_px.copy()
-    if (most := PLACE * sigma_px[2]) < sigma_px[0]:
-        sigma_px[0], variance = most, variance and min(variance, 1.0)
-    return sigma_px, variance
-
-
-PLACE = 3.0
-"""A marker's place is at most so many times noisier than its shape, which no camera bends much."""
 CAMERAS, HALVINGS = 6, 4
 """How often a camera is fitted anew about the one before, and how often its step is halved where it has no ray for a corner."""
 
@@ -413,7 +292,8 @@ def _try(explanation: Explanation, start: Seen) -> _Tried:
                 break
         else:
             break
-        term = dataclasses.replace(seen.term, rays=rays)
+        k = camera.intrinsics
+        term = dataclasses.replace(seen.term, rays=rays, focal=np.array([k.fx, k.fy]))
         seen = dataclasses.replace(seen, term=term, poses=fitted.poses, shared=fitted.shared, camera=camera)
         fields = explanation.fields(seen)
         fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
@@ -442,7 +322,9 @@ WEAK = 1e-3
 """Of what one view tells of shared numbers, directions with less than this share of the strongest are left aside."""
 
 
-def _doubt(best: _Tried, usual: _Tried, start: Seen, fixed: NDArray[np.bool_], variance: float, begun: Array) -> Doubt:
+def _doubt(
+    best: _Tried, usual: _Tried, start: Seen, fixed: NDArray[np.bool_], variance: float, begun: Array, spec: Estimation
+) -> Doubt:
     """The best explanation, its words, and whether its camera is known; variance: of rows that have no more than noise."""
     fitted, explanation = best.fitted, best.explanation
     motion = np.stack([motion_between(a, b) for a, b in zip(begun, fitted.poses, strict=True)])
@@ -455,13 +337,15 @@ def _doubt(best: _Tried, usual: _Tried, start: Seen, fixed: NDArray[np.bool_], v
     is_known = (
         bool(explanation.numbers) and fits and best is not usual and bool(np.median(shift_m) > np.median(unsure_m))
     )
+    if explanation.numbers == WHOLE:
+        is_known = is_known and spec.calibrate
     material = (
         max(float(np.median(shift_m / np.linalg.norm(begun[:, :3, 3], axis=1))), float(np.median(turn))) >= MATERIAL
     )
     note = ""
     if material and fits:
         by = f"{1000 * np.median(shift_m):.1f} mm, {np.degrees(np.median(turn)):.2f} degrees"
-        note = _words(best, start, variance, by, is_known)
+        note = LENS.format(by=by) if explanation.numbers == WHOLE else _words(best, start, variance, by, is_known)
     elif material:
         px = float(start.term.sigma_px[0])
         note = NONE_FITS.format(off=px * off, times=off, name=explanation.name, left=px * left)

@@ -13,6 +13,8 @@ from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
 from workers.capture.poses.observation import Corners
 from workers.capture.poses.terms import (
+    GROW_M,
+    GROW_PX,
     GROWTH_M,
     GROWTH_PX,
     MAD,
@@ -23,6 +25,7 @@ from workers.capture.poses.terms import (
     Shared,
     cross_matrix,
     median_of_chi_square,
+    moved,
     pose_halves,
     robust,
 )
@@ -162,3 +165,141 @@ def outward_motion(corners: Array, square: NDArray[np.bool_]) -> Array:
     motion = np.zeros_like(corners)
     motion[square] = ((before - along) / (2.0 * sine)).reshape(-1, corners.shape[1])
     return motion
+
+
+# ---------------------------------------------------------------------------------------------- what displaces corners
+
+LOOSE = 0.1
+"""Sigma of numbers of a camera, shares of its focal length, and of a stretch: wide, so that only what is not seen stays."""
+STEPS, NOISE_STEPS, SETTLED, REGULAR, HELD = 8, 3, 1e-6, 1e-2, 1e12
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """How corners [K] move in the image, pixels, by each number of an explanation.
+
+    alike [K, 2, A]: by those that all views share; of_view [K, 2, N]: by those that each view has of its own; sigma [A + N]: of
+    each number beforehand.
+    """
+
+    alike: Array
+    of_view: Array
+    sigma: Array
+
+    @staticmethod
+    def of(alike: Array | None, of_view: Array | None = None, sigma: float | Array = LOOSE) -> "Fields":
+        """Of either kind or both."""
+        some = alike if alike is not None else of_view
+        assert some is not None
+        none = np.zeros((*some.shape[:2], 0))
+        alike, of_view = none if alike is None else alike, none if of_view is None else of_view
+        return Fields(alike, of_view, np.broadcast_to(sigma, alike.shape[2] + of_view.shape[2]))
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An explanation at its least cost: poses [V, 4, 4], growth of squares, its numbers, and the rows there.
+
+    covariance [V, 6, 6] of the poses and alike_covariance [A, A], where rows have unit variance.
+    """
+
+    poses: Array
+    shared: Shared
+    alike: Array
+    own: Array
+    rows: Rows
+    covariance: Array
+    alike_covariance: Array
+
+    @property
+    def cost(self) -> float:
+        """Robust sum of squares, in sigma of a corner squared."""
+        return self.rows.cost
+
+
+def fit_fields(
+    term: CornerTerm, fields: Fields, poses: Array, shared: Shared, hold: float = 0.0, steps: int = STEPS
+) -> Fitted:
+    """The poses and numbers of least robust cost, by Gauss and Newton, each view's own unknowns eliminated in turn.
+
+    hold: by how much a pose resists, where a view's fields can do all that it does, which takes few steps.
+    """
+    views, (A, N) = len(poses), (fields.alike.shape[2], fields.of_view.shape[2])
+    alike, own = np.zeros(A), np.zeros((views, N))
+    prior = np.concatenate([[GROW_M, GROW_PX], fields.sigma[:A]]) ** -2.0
+    own_prior = np.concatenate([np.full(POSE, hold), fields.sigma[A:] ** -2.0])
+    best: Fitted | None = None
+    for _ in range(steps):
+        values = term.values(poses, shared)
+        values[..., 0] += fields.alike @ alike + np.einsum("kcn,kn->kc", fields.of_view, own[term.view])
+        order = (values[..., : 1 + POSE], fields.of_view, values[..., 1 + POSE :], fields.alike)
+        rows = term.white_rows(np.concatenate(order, axis=2), SHARED + A)
+        matrix, gradient = np.diag(prior), prior * np.concatenate([[shared.growth_m, shared.growth_px], alike])
+        parts = []
+        for number in range(views):
+            J, residual, by = rows.of_view(number)
+            by = by[:, GROWTH_M:]
+            inverse = np.linalg.inv(J.T @ J + np.diag(own_prior + REGULAR))
+            g = J.T @ residual + own_prior * np.concatenate([np.zeros(POSE), own[number]])
+            cross = by.T @ J
+            matrix = matrix + by.T @ by - cross @ inverse @ cross.T
+            gradient = gradient + by.T @ residual - cross @ inverse @ g
+            parts.append((inverse, g, cross))
+        covariance = np.linalg.pinv(matrix, hermitian=True)
+        of_poses: Array = np.stack(
+            [i[:POSE, :POSE] + (i @ c.T @ covariance @ c @ i)[:POSE, :POSE] for i, _, c in parts]
+        )
+        now = Fitted(poses, shared, alike, own, rows, of_poses, np.asarray(covariance[2:, 2:], np.float64))
+        if best is None or now.cost < best.cost:
+            best = now
+        step = -covariance @ gradient
+        of_views = np.stack([-i @ (g + c.T @ step) for i, g, c in parts])
+        if max(np.abs(step).max(), np.abs(of_views).max()) < SETTLED:
+            break
+        poses, own, alike = moved(poses, of_views[:, :POSE]), own + of_views[:, POSE:], alike + step[2:]
+        growth = shared.growth_m + float(step[0]), shared.growth_px + float(step[1])
+        shared = dataclasses.replace(shared, growth_m=growth[0], growth_px=growth[1])
+    assert best is not None
+    return best
+
+
+DEGREES = {24: 5, 18: 4, 14: 3, 0: 2}
+"""The degree of the smooth field of a view by how many markers it has at least."""
+
+
+def _smooth(term: CornerTerm, views: int) -> Fields:
+    """A polynomial over the image in each view, whose degree is that which its markers bear."""
+    view, rays = term.view, term.rays
+    size = (max(DEGREES.values()) + 1) * (max(DEGREES.values()) + 2) // 2
+    of_view = np.zeros((len(view), 2, 2 * size))
+    for number in range(views):
+        here = view == number
+        if not here.any():
+            continue
+        p = rays[here] - rays[here].mean(axis=0)
+        p = p / np.maximum(np.abs(p).max(axis=0), 1e-9)
+        degree = next(d for markers, d in DEGREES.items() if here.sum() >= 4 * markers)
+        powers = [p[:, 0] ** i * p[:, 1] ** (d - i) for d in range(degree + 1) for i in range(d + 1)]
+        for n, power in enumerate(powers):
+            of_view[here, 0, 2 * n] = of_view[here, 1, 2 * n + 1] = power
+    return Fields.of(None, of_view, sigma=100.0)
+
+
+def measure_noise(term: CornerTerm, poses: Array, shared: Shared, spec: Estimation) -> tuple[Array, float | None]:
+    """(sigma_px [4] of what a smooth field in each view leaves of the corners, the variance left by it); None of too few."""
+    fields = _smooth(term, len(poses))
+    for _ in range(3):
+        smooth = fit_fields(term, fields, poses, shared, HELD, NOISE_STEPS)
+        before, term, shared = term, term.measured(smooth.rows, spec), smooth.shared
+    columns = int((np.abs(fields.of_view).max(axis=(0, 1)) > 0).sum())
+    count = len(smooth.rows.residual)
+    free = count - columns * len(poses)
+    variance = smooth.cost / free if free >= count // 4 else None
+    sigma_px = before.sigma_px.copy()
+    if (most := PLACE * sigma_px[2]) < sigma_px[0]:
+        sigma_px[0], variance = most, variance and min(variance, 1.0)
+    return sigma_px, variance
+
+
+PLACE = 3.0
+"""A marker's place is at most so many times noisier than its shape, which no camera bends much."""

@@ -10,20 +10,22 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from schemas.base import Array
 from schemas.capture import SynthesizedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
+from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera, Intrinsics
 from workers.capture.surface.posed_view import PosedView, project_pixels, sample_pixels
 from workers.capture.surface.tsdf import FittedDepth
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
-from workers.geometry.zbuffer import corner_weights, draw_triangles
+from workers.geometry.zbuffer import corner_weights, draw_depth, draw_triangles
 
-Images = tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]
-"""(rgb [H, W, 3], depth_m [H, W] float64, mask [H, W] of the object)."""
+Images = tuple[NDArray[np.uint8], Array]
+"""(rgb [H, W, 3], depth_m [H, W] float64)."""
 
 SAME_SURFACE = 0.012
 """Neighbouring pixels whose 1/z differs by a larger share are not joined."""
@@ -43,29 +45,27 @@ class Layer:
     """What a view shows to another camera.
 
     depth_m [H, W] float32, 0 where nothing; weight [H, W] float32, 0 where nothing, or where a surface is seen from behind and
-    hides what is farther; rgb [H, W, 3] uint8; mask [H, W] bool of the object.
+    hides what is farther; rgb [H, W, 3] uint8.
     """
 
     depth_m: NDArray[np.float32]
     weight: NDArray[np.float32]
     rgb: NDArray[np.uint8]
-    mask: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A view ready to be drawn from elsewhere: its fitted depth, and colour, mask and weight of each depth pixel."""
+    """A view ready to be drawn from elsewhere: its fitted depth, and colour and weight of each depth pixel."""
 
     number: int
     camera: Camera
     fitted: FittedDepth
     rgb: NDArray[np.uint8]
-    mask: NDArray[np.bool_]
     weight: NDArray[np.float32]
 
 
-def prepare_source(view: PosedView, fitted: FittedDepth, mask: NDArray[np.bool_]) -> Source:
-    """The source of a view whose depth is fitted in the whole image; `mask` is the object's in the depth camera."""
+def prepare_source(view: PosedView, fitted: FittedDepth) -> Source:
+    """The source of a view whose depth is fitted in the whole image."""
     k, rgb = view.camera.intrinsics, view.rgb
     if not np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
         known, points = _lift(fitted.inverse, k)
@@ -77,7 +77,7 @@ def prepare_source(view: PosedView, fitted: FittedDepth, mask: NDArray[np.bool_]
     known = np.clip(2.0 * inner - 1.0, 0.02, 1.0)
     # The inverse variance of depth, times the share of the neighbourhood that was measured.
     weight = fitted.facing**2 * fitted.inverse**4 * known
-    return Source(view.number, view.depth_camera, fitted, rgb, mask, weight.astype(np.float32))
+    return Source(view.number, view.depth_camera, fitted, rgb, weight.astype(np.float32))
 
 
 def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> NDArray[np.float32]:
@@ -85,7 +85,7 @@ def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> 
     inverse = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0.0)
     fitted = FittedDepth(inverse, np.ones_like(inverse))
     blank = np.zeros((*depth_m.shape, 3), np.uint8)
-    layer = warp(Source(0, source, fitted, blank, blank[..., 0] > 0, np.ones_like(inverse)), target)
+    layer = warp(Source(0, source, fitted, blank, np.ones_like(inverse)), target)
     return np.where(layer.weight > 0.0, layer.depth_m, np.float32(0.0))
 
 
@@ -97,7 +97,7 @@ def warp(source: Source, camera: Camera, factor: float = 1.0) -> Layer:
     depth, drawn = draw_triangles(pixels, z, triangles, (k.height, k.width), EDGE_SLACK, True)
     shares = corner_weights(pixels, triangles, drawn)
     weight = source.weight * np.float32(factor)
-    painted = _paint(drawn, shares, triangles, pixels, weight, source.rgb, source.mask)
+    painted = _paint(drawn, shares, triangles, pixels, weight, source.rgb)
     return Layer(depth.astype(np.float32), *painted)
 
 
@@ -142,13 +142,11 @@ def _paint(
     pixels: NDArray[np.float32],
     weight: NDArray[np.float32],
     rgb: NDArray[np.uint8],
-    mask: NDArray[np.bool_],
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]]:
-    """(weight, rgb, mask) of a layer, between the corners of the triangle that is drawn at each pixel."""
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """(weight, rgb) of a layer, between the corners of the triangle that is drawn at each pixel."""
     height, width = drawn.shape
     weights, colours = np.zeros((height, width), np.float32), np.zeros((height, width, 3), np.uint8)
-    inside = np.zeros((height, width), np.bool_)
-    weight_of, rgb_of, mask_of = weight.ravel(), rgb.reshape(-1, 3), mask.ravel()
+    weight_of, rgb_of = weight.ravel(), rgb.reshape(-1, 3)
     for y in range(height):
         for x in range(width):
             if drawn[y, x] < 0:
@@ -161,24 +159,23 @@ def _paint(
             weights[y, x] = wa * weight_of[a] + wb * weight_of[b] + wc * weight_of[c]
             for i in range(3):
                 colours[y, x, i] = np.uint8(wa * rgb_of[a, i] + wb * rgb_of[b, i] + wc * rgb_of[c, i] + 0.5)
-            inside[y, x] = mask_of[a if wa >= wb and wa >= wc else (b if wb >= wc else c)]
-    return weights, colours, inside
+    return weights, colours
 
 
 STEP_M = 0.01
 """Depths that differ by more are of two surfaces; a pixel that both touch belongs to the farther one."""
 
 
-def fill_holes(rgb: NDArray[np.uint8], depth_m: Array, mask: NDArray[np.bool_], size_px: int) -> Images:
-    """(rgb, depth_m, mask) where small holes are filled from their rims inwards, and outer edges stay as they are.
+def fill_holes(rgb: NDArray[np.uint8], depth_m: Array, size_px: int) -> Images:
+    """(rgb, depth_m) where small holes are filled from their rims inwards, and outer edges stay as they are.
 
     Small are gaps of up to about 2 * size_px across, and holes that are enclosed and have at most (4 * size_px)^2 pixels.
     """
     holes = np.argwhere(_small_holes(depth_m > 0.0, size_px))
-    framed = [np.pad(image, [(1, 1), (1, 1), (0, 0)][: image.ndim]) for image in (rgb, depth_m, mask)]
+    framed = [np.pad(image, [(1, 1), (1, 1), (0, 0)][: image.ndim]) for image in (rgb, depth_m)]
     while len(holes):
         around = [[image[holes[:, 0] + i, holes[:, 1] + j] for i in range(3) for j in range(3)] for image in framed]
-        colours, depths, inside = (np.array(values, np.float64) for values in around)
+        colours, depths = (np.array(values, np.float64) for values in around)
         farthest = depths.max(axis=0)
         rim = farthest > 0.0
         if not rim.any():
@@ -188,10 +185,9 @@ def fill_holes(rgb: NDArray[np.uint8], depth_m: Array, mask: NDArray[np.bool_], 
         at = tuple((holes[rim] + 1).T)
         framed[0][at] = (colours[:, rim] * shares[..., None]).sum(axis=0) / count[:, None] + 0.5
         framed[1][at] = (depths[:, rim] * shares).sum(axis=0) / count
-        framed[2][at] = (inside[:, rim] * shares).sum(axis=0) / count > 0.5
         holes = holes[~rim]
-    colour, depth, filled = (image[1:-1, 1:-1] for image in framed)
-    return np.asarray(colour, np.uint8), np.asarray(depth, np.float64), np.asarray(filled, np.bool_)
+    colour, depth = (image[1:-1, 1:-1] for image in framed)
+    return np.asarray(colour, np.uint8), np.asarray(depth, np.float64)
 
 
 def _small_holes(known: NDArray[np.bool_], size_px: int) -> NDArray[np.bool_]:
@@ -209,6 +205,9 @@ def _small_holes(known: NDArray[np.bool_], size_px: int) -> NDArray[np.bool_]:
 AGREE_M = 0.006
 """Surfaces nearer to one another than this along a pixel's ray are one, whose depth is the views' mean."""
 
+LEAST_M = 0.01
+"""What floats beside the object and is narrower is mixed pixels."""
+
 SHARPNESS = 8
 """Power of the cosine between two optical axes that weighs a view: one 30 degrees off counts a third."""
 
@@ -223,31 +222,69 @@ def choose_sources(axes: Mapping[int, Array], camera: Camera, spec: Synthesis) -
     return [numbers[n] for n in np.argsort(-cosines, kind="stable")[: spec.views]]
 
 
-def synthesize_view(sources: Sequence[Source], camera: Camera) -> SynthesizedView:
+def synthesize_view(sources: Sequence[Source], camera: Camera, body: Mesh) -> SynthesizedView:
     """What `camera` would see, made of sources, with small holes filled as `fill_holes` does.
 
-    Raises CaptureError where none of them shows anything to it.
+    The object's pixels are those of its surface down to the board, `body`, whether or not a source shows them, and what a
+    source shows elsewhere is a mixed pixel. Raises CaptureError where none of them shows anything to the camera.
     """
-    numbers, layers = [source.number for source in sources], []
+    numbers, layers, body_m = [source.number for source in sources], [], draw_depth(body, camera)
     for source in sources:
         cosine = max(float(source.camera.T_world_cam[:3, 2] @ camera.T_world_cam[:3, 2]), 0.0)
-        layers.append(warp(source, camera, max(cosine**SHARPNESS, 1e-6)))
+        layer = warp(source, camera, max(cosine**SHARPNESS, 1e-6))
+        wrong = (layer.weight > 0.0) & ~_agrees(layer.depth_m, body_m, camera)
+        depth, weight = (np.where(wrong, np.float32(0.0), image) for image in (layer.depth_m, layer.weight))
+        layers.append(Layer(depth, weight, layer.rgb))
     if not any(layer.weight.any() for layer in layers):
         raise CaptureError(
             "nothing_seen",
             f"none of the {len(numbers)} nearest views ({', '.join(map(str, numbers))}) shows anything to this camera",
         )
-    merged = merge_layers(layers)
-    rgb, depth_m, mask = fill_holes(*merged, FILL_PX)
-    measured = merged[1] > 0.0
-    share = float(measured.sum() / max(int((depth_m > 0.0).sum()), 1))
+    rgb, merged_m = merge_layers(layers)
+    unseen = _unseen_holes(body_m > 0.0, merged_m > 0.0)
+    rgb[unseen], merged_m[unseen] = 0, 0.0
+    rgb, depth_m = fill_holes(rgb, merged_m, FILL_PX)
+    mask, measured = (body_m > 0.0) | unseen, (merged_m > 0.0) & ~_between(merged_m, body_m)
+    share = float(measured.sum() / max(int(((depth_m > 0.0) | mask).sum()), 1))
     return SynthesizedView(rgb, depth_m, mask, measured, share, tuple(numbers))
 
 
+def _agrees(depth_m: NDArray[np.float32], body_m: Array, camera: Camera) -> NDArray[np.bool_]:
+    """[H, W] bool: depth that is the body's, which may be a pixel off; beside it, the board's or behind, or a wider thing's."""
+    k, T, (height, width) = camera.intrinsics, camera.T_world_cam, depth_m.shape
+    x, y = (np.arange(width) + 0.5 - k.cx) / k.fx, (np.arange(height) + 0.5 - k.cy) / k.fy
+    height_m = depth_m * (T[2, 0] * x[None, :] + T[2, 1] * y[:, None] + T[2, 2]) + T[2, 3]
+    framed, on_body, drawn = np.pad(body_m, 1), np.zeros(depth_m.shape, np.bool_), body_m > 0.0
+    for i, j in np.ndindex(3, 3):
+        on_body |= np.abs(framed[i : i + height, j : j + width] - depth_m) < AGREE_M
+    floats = (height_m >= AGREE_M) & ~drawn & (depth_m > 0.0)
+    size = 1 + round(LEAST_M * k.fx / float(np.median(depth_m[floats]))) if floats.any() else 1
+    thing = cv2.morphologyEx(floats.view(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0
+    return np.asarray(np.where(drawn, on_body, ~floats | thing))
+
+
+def _between(depth_m: Array, body_m: Array) -> NDArray[np.bool_]:
+    """[H, W] bool: pixels of the body whose depth is not one place's: it is not the body's, or that jumps on both sides."""
+    framed = np.pad(np.where(body_m > 0.0, body_m, np.inf), 1, constant_values=np.inf)
+    middle, apart = framed[1:-1, 1:-1], np.abs(depth_m - body_m) > STEP_M
+    with np.errstate(invalid="ignore"):  # beside the body
+        for before, after in ((framed[:-2, 1:-1], framed[2:, 1:-1]), (framed[1:-1, :-2], framed[1:-1, 2:])):
+            apart |= np.minimum(np.abs(before - middle), np.abs(after - middle)) > STEP_M
+    return apart & (body_m > 0.0)
+
+
+def _unseen_holes(body: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[H, W] bool: holes in the body through which less than half is known: they are the object's, as what no view saw."""
+    label, count = ndimage.label(~body)
+    few = ndimage.mean(known, label, np.arange(count + 1)) < 0.5
+    few[[0, *label[[0, -1]].ravel(), *label[:, [0, -1]].ravel()]] = False
+    return np.asarray(few[label])
+
+
 def merge_layers(layers: Sequence[Layer]) -> Images:
-    """(rgb, depth_m, mask): at each pixel the mean of the layers' nearest surface; empty where one is seen from behind."""
+    """(rgb, depth_m): at each pixel the mean of the layers' nearest surface; empty where one is seen from behind."""
     shape = layers[0].depth_m.shape
-    nearest, hidden, total, depth, inside = (np.full(shape, start) for start in (np.inf, np.inf, 0.0, 0.0, 0.0))
+    nearest, hidden, total, depth = (np.full(shape, start) for start in (np.inf, np.inf, 0.0, 0.0))
     colour = np.zeros((*shape, 3))
     for layer in layers:
         z = np.where(layer.depth_m > 0.0, layer.depth_m, np.inf)
@@ -259,7 +296,6 @@ def merge_layers(layers: Sequence[Layer]) -> Images:
         total += weight
         depth += weight * layer.depth_m
         colour += weight[..., None] * layer.rgb
-        inside += weight * layer.mask
     known = np.where(shown, total, 1.0)
     rgb = np.where(shown[..., None], colour / known[..., None] + 0.5, 0.0).astype(np.uint8)
-    return rgb, depth / known, inside > 0.5 * total
+    return rgb, depth / known

@@ -287,8 +287,9 @@ def empty_volume(low: Array, high: Array, voxel_m: float) -> Volume:
 def integrate(volume: Volume, fitted: SurfaceDepth, camera: Camera) -> None:
     """Adds the depth of one view, whose first pixel is the camera's, to the volume."""
     k, T = camera.intrinsics, invert(camera.T_world_cam)
-    pinhole, pictures = (k.fx, k.fy, k.cx_opencv, k.cy_opencv), (fitted.inverse, fitted.facing, fitted.beyond)
-    _integrate(volume.distance_m, volume.weight, volume.origin, volume.voxel_m, T, pinhole, pictures)
+    into = volume.distance_m, volume.weight, volume.origin, volume.voxel_m
+    pinhole = k.fx, k.fy, k.cx_opencv, k.cy_opencv
+    _integrate(*into, T, pinhole, fitted.inverse, fitted.facing, fitted.beyond)
 
 
 @compiled
@@ -311,10 +312,6 @@ def sample_inverse(inverse: NDArray[np.float32], x: float, y: float) -> float:
     return (a * (1.0 - s) + b * s) * (1.0 - t) + (c * (1.0 - s) + d * s) * t
 
 
-Pictures = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-"""`inverse`, `facing` and `beyond` of a `SurfaceDepth`."""
-
-
 @compiled
 def _integrate(
     distance_m: NDArray[np.float32],
@@ -323,42 +320,36 @@ def _integrate(
     voxel_m: float,
     T: Array,
     k: tuple[float, float, float, float],
-    pictures: Pictures,
+    inverse: NDArray[np.float32],
+    facing: NDArray[np.float32],
+    beyond: NDArray[np.float32],
 ) -> None:
-    """T: board to camera; k: fx, fy, cx, cy with pixel centres on integers."""
+    """T: board to camera; k: fx, fy, cx, cy with pixel centres on integers; the last three are a `SurfaceDepth`'s.
+
+    One loop: a call for each voxel with a tuple of pictures takes three times as long.
+    """
+    front, back, full = FRONT_VOXELS * voxel_m, BACK_VOXELS * voxel_m, 0.5 * BACK_VOXELS * voxel_m
+    height, width = inverse.shape
     for i in range(distance_m.shape[0]):
         for j in range(distance_m.shape[1]):
             for n in range(distance_m.shape[2]):
                 x, y, z = pixel_of(T, k, origin[0] + i * voxel_m, origin[1] + j * voxel_m, origin[2] + n * voxel_m)
-                s, w = _measure(x, y, z, voxel_m, pictures)
-                if w > 0.0:
-                    total = weight[i, j, n] + w
-                    distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
-                    weight[i, j, n] = total
-
-
-@compiled
-def _measure(x: float, y: float, z: float, voxel_m: float, pictures: Pictures) -> tuple[float, float]:
-    """(distance to the surface that pixel (x, y) sees from a voxel at depth z, its weight); weight 0 where that is unknown."""
-    inverse, facing, beyond = pictures
-    back, full = BACK_VOXELS * voxel_m, 0.5 * BACK_VOXELS * voxel_m
-    height, width = inverse.shape
-    if not (z > 0.0 and -0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
-        return 0.0, 0.0
-    row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
-    q, slope, behind = sample_inverse(inverse, x, y), facing[row, column], back
-    if q == 0.0:  # of the board a view says where nothing is
-        q, behind = beyond[row, column], 0.0
-        if q == 0.0:
-            return 0.0, 0.0
-    s = (1.0 / q - z) * slope
-    if s <= -behind:
-        return 0.0, 0.0
-    # Depth's standard deviation grows with z^2 and with 1 / cosine.
-    w = slope * slope * q * q * q * q
-    if s < -full:
-        w *= (back + s) / (back - full)
-    return min(s, FRONT_VOXELS * voxel_m), w
+                if not (z > 0.0 and -0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
+                    continue
+                row, column = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                q, slope, behind = sample_inverse(inverse, x, y), facing[row, column], back
+                if q == 0.0:  # of the board a view says where nothing is
+                    q, behind = beyond[row, column], 0.0
+                s = (1.0 / q - z) * slope if q > 0.0 else -back
+                if s <= -behind:
+                    continue
+                # Depth's standard deviation grows with z^2 and with 1 / cosine.
+                w = slope * slope * q * q * q * q
+                if s < -full:
+                    w *= (back + s) / (back - full)
+                total = weight[i, j, n] + w
+                distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + min(s, front) * w) / total
+                weight[i, j, n] = total
 
 
 def extract_surface(volume: Volume) -> Mesh:

@@ -16,6 +16,7 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 
 _PICTURES = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "TGA")
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".tga")
 _OTHERS = {
     b"\xabKTX": "is a KTX picture, which is not read: convert it to PNG",
     b"DDS ": "is a DDS picture, which is not read: convert it to PNG",
@@ -177,6 +178,11 @@ class FolderResolver:
         last = Path(name).name
         places = [exact, self.folder / name, self.folder / last, *(self.folder / folder / last for folder in _FOLDERS)]
         return find_inside(self.root, *places) or find_inside(self.root, *map(_other_case, places[1:3]))
+
+    def picture_beside(self) -> str | None:
+        """The name of the first picture in the folder of the mesh; None where there is none."""
+        names = sorted(entry.name for entry in os.scandir(self.folder))
+        return next((name for name in names if Path(name).suffix.lower() in _SUFFIXES), None)
 
     def refuse(self, name: str, why: str) -> FileNotFoundError:
         """Notes why a file is not read, and returns the error that says so."""

@@ -56,7 +56,7 @@ def find_up(head: bytes) -> UpAxis:
 
 def named_by_dae(path: Path, data: bytes) -> list[str]:
     """Names of the pictures in a COLLADA file; MeshError `unreadable`."""
-    images = parse_tree(path, data, "COLLADA", "a COLLADA file").iter("image")
+    images = parse_tree(path, data, ["COLLADA"], "a COLLADA file").iter("image")
     return list(dict.fromkeys(filter(None, map(_image_name, images))))
 
 
@@ -67,7 +67,7 @@ def read_dae(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     `index_out_of_range`, `too_large` or `unreadable`.
     """
     try:
-        return list(_File(path, parse_tree(path, data, "COLLADA", "a COLLADA file"), resolver).meshes())
+        return list(_File(path, parse_tree(path, data, ["COLLADA"], "a COLLADA file"), resolver).meshes())
     except _MALFORMED as error:
         raise unreadable(path, error) from error
 

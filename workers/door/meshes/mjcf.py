@@ -14,16 +14,15 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
-from schemas.job.assets import MeshLimits
-from workers.door.meshes.caps import FolderResolver
+from workers.door.meshes.caps import FolderResolver, check_nodes
 from workers.door.meshes.mesh import DEFAULT, MeshVisual, RawMesh
-from workers.door.meshes.posed import MOST_ABOVE, Model, Visual, make_body, numbers, parse_xml, scaled
+from workers.door.meshes.posed import MOST_ABOVE, Model, Source, Visual, make_body, numbers, scaled
 from workers.geometry.frames import half_turn, pose, rotation_about, rotation_between, rotation_from_quaternion
 
 Attributes = Mapping[str, str]
 Node = ElementTree.Element
 
-NOT_READ = ("include", "attach", "composite", "flexcomp", "replicate", "skin")
+NOT_READ = ("attach", "composite", "flexcomp", "replicate", "skin")
 """Elements that put a body together from something else."""
 
 HIDDEN_GROUP = 3
@@ -49,9 +48,10 @@ class _Document:
         return numbers(self.path, given.get(name, usual), len(usual.split()))
 
 
-def read_mjcf(path: Path, limits: MeshLimits) -> Model:
+def read_mjcf(source: Source) -> Model:
     """The geoms of an MJCF's bodies that are seen, joints at zero, in the frame of the world, metres."""
-    root = parse_xml(path, limits, "mujoco", "an MJCF")
+    path, root = source.path, source.parse(source.path, ["mujoco"], "an MJCF")
+    _include(source, root, 0)
     for tag in NOT_READ:
         if root.find(f".//{tag}") is not None:
             raise MeshError(
@@ -68,6 +68,24 @@ def read_mjcf(path: Path, limits: MeshLimits) -> Model:
     visuals = (_visual(document, geom, T, meshes) for geom, T in seen)
     names = (_file_of(document, mesh, "meshdir") for mesh in meshes.values() if mesh.get("file"))
     return Model(tuple(one for one in visuals if one is not None), tuple(dict.fromkeys(names)))
+
+
+def _include(source: Source, element: Node, depth: int) -> None:
+    """Puts what included files have in place of each <include>; MeshError `unreadable` where one is included twice."""
+    if depth > MOST_ABOVE:
+        raise MeshError("unreadable", f"{source.path} has more than {MOST_ABOVE} bodies inside one another")
+    for number, child in reversed(list(enumerate(element))):
+        if child.tag == "include":
+            path = source.find(child.get("file", ""))
+            if path in (*source.files, source.path.resolve()):
+                raise MeshError("unreadable", f"{source.path} includes {path.name} twice")
+            source.files[path] = None
+            check_nodes(source.path, len(source.files), "included files", source.limits)
+            included = source.parse(path, ["mujoco", "mujocoinclude"], "an MJCF")
+            _include(source, included, depth + 1)
+            element[number : number + 1] = list(included)
+        else:
+            _include(source, child, depth + 1)
 
 
 def _add_defaults(

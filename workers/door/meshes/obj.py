@@ -31,6 +31,7 @@ from workers.door.meshes.mesh import (
     make_material,
     roughness_of,
 )
+from workers.door.opening import as_utf8
 
 _LIBRARY = re.compile(r"^[ \t]*mtllib[ \t]+(.+?)[ \t]*$", re.MULTILINE)
 _DIGITS = str.maketrans("", "", "0123456789-+")
@@ -83,6 +84,10 @@ def read_obj(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     points, colors = lines.points(resolver)
     uv, normals = lines.columns("vt", 2), lines.columns("vn", 3)
     materials = _read_libraries(path, lines.libraries, resolver)
+    if not lines.libraries and len(uv) and (picture := resolver.picture_beside()) is not None:
+        resolver.notes.append(
+            f"no material file is named: {picture} beside it was not used; write `mtllib` and an .mtl"
+        )
     by_material: dict[str | None, list[_Run]] = {}
     for run in lines.runs:
         if run.faces:
@@ -282,7 +287,10 @@ def _read_libraries(path: Path, lines: Iterable[str], resolver: FolderResolver) 
             if resolver.find(name) is None and resolver.find(beside) is not None:
                 resolver.notes.append(f"{name} is missing: {beside} was read in its place")
                 name = beside
-            materials = _read_mtl(_decode(resolver.read(name)), resolver) | materials
+            data, encoding = as_utf8(resolver.read(name))
+            if encoding is not None:
+                resolver.notes.append(f"{name} {encoding}")
+            materials = _read_mtl(_decode(data), resolver) | materials
     return materials
 
 

@@ -23,11 +23,19 @@ def count_stl(data: bytes) -> tuple[int, int]:
 
 
 def _binary_faces(data: bytes) -> int:
-    """How many faces a binary STL file has; 0 for one in text. Some programs leave bytes behind the last face."""
-    faces = int(struct.unpack_from("<I", data, 80)[0]) if len(data) >= 84 else 0
-    behind = len(data) - 84 - 50 * faces
-    text = data[:5].lower() == b"solid" and b"facet" in data[:1024]
-    return faces if behind == 0 or (0 < behind < 1024 and not text) else 0
+    """How many faces a binary STL file has; 0 for one in text, or that ends within a face.
+
+    Some programs leave bytes behind the last face, and some a wrong count: then all whole faces are meant.
+    """
+    faces = _declared_faces(data)
+    behind, text = len(data) - 84 - 50 * faces, b"facet" in data[:1024]
+    if behind == 0 or (0 < behind < 1024 and behind % 50 and not (text and data[:5].lower() == b"solid")):
+        return faces
+    return 0 if text or behind % 50 else max(len(data) - 84, 0) // 50
+
+
+def _declared_faces(data: bytes) -> int:
+    return int(struct.unpack_from("<I", data, 80)[0]) if len(data) >= 84 else 0
 
 
 _OFF = re.compile(r"\s*(ST)?(C)?(N)?(4)?(n)?OFF(?!\s+BINARY)")
@@ -79,7 +87,13 @@ def _off_colors(lines: list[list[str]], first: int) -> NDArray[np.uint8] | None:
 def read_stl(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
     """The solids of an STL file; MeshError `unreadable`."""
     if count := _binary_faces(data):
-        data = data[: 84 + 50 * count]  # trimesh takes a file with bytes behind the last face for text
+        if count != (declared := _declared_faces(data)):
+            resolver.notes.append(f"its head tells {declared} faces, and {count} are there: all were read")
+        # trimesh takes a file with bytes behind the last face for text
+        data = data[:80] + struct.pack("<I", count) + data[84 : 84 + 50 * count]
+    elif (declared := _declared_faces(data)) and b"facet" not in data[:1024]:
+        whole = max(len(data) - 84, 0) // 50
+        raise MeshError("unreadable", f"{path} ends early: {whole} of {declared} faces are there: copy it again")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -26,6 +26,7 @@ from workers.door.meshes.mesh import (
     cut_strip,
     make_material,
 )
+from workers.door.opening import as_utf8
 
 Element = dict[str, NDArray]
 """Columns by name: [N], of lists [N, n] where all are as long, else [N] objects, each an array."""
@@ -185,6 +186,13 @@ def encode_ply(comment: str, **elements: Mapping[str, NDArray]) -> bytes:
 def named_by_ply(path: Path, data: bytes) -> list[str]:
     """Names of the pictures that a PLY file asks for."""
     return decode_names(_TEXTURE.findall(_head(data)))
+
+
+def decode_head(data: bytes) -> tuple[bytes, str | None]:
+    """The file with its header in UTF-8, as `as_utf8`."""
+    end = max(data.find(b"end_header"), 0)
+    head, note = as_utf8(data[:end])
+    return (data if head == data[:end] else head + data[end:]), note
 
 
 def count_ply(data: bytes) -> tuple[int, int]:

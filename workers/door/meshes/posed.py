@@ -1,9 +1,10 @@
 """Edge: files that pose meshes and simple bodies, parsed with the standard library: their XML, and what of them is seen."""
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,9 +14,9 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
-from workers.door.meshes.caps import check_nodes
+from workers.door.meshes.caps import LONGEST_NAME, check_nodes, find_inside
 from workers.door.meshes.mesh import DEFAULT
-from workers.door.opening import read_bytes
+from workers.door.opening import as_utf8, read_bytes
 from workers.geometry.frames import pose, rotation_about
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
@@ -47,32 +48,67 @@ class Visual:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a file poses: what is seen of it, the names of all its meshes, also of those that only collide, and notes."""
+    """What a file poses: what is seen of it, and the names of all its meshes, also of those that only collide."""
 
     visuals: tuple[Visual, ...]
     meshes: tuple[str, ...]
-    notes: tuple[str, ...] = ()
 
 
-def parse_xml(path: Path, limits: MeshLimits, tag: str, kind: str) -> ElementTree.Element:
-    """The root element of a file that poses others; MeshError `missing`, `too_large` or as `parse_tree`."""
-    data = read_bytes(path, MAX_XML_BYTES, MeshError)
-    root = parse_tree(path, data, tag, kind)
-    for what, many in (
-        ("link", "links"),
-        ("joint", "joints"),
-        ("visual", "visuals"),
-        ("body", "bodies"),
-        ("geom", "geoms"),
-    ):
-        check_nodes(path, sum(1 for _ in root.iter(what)), many, limits)
-    return root
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A file that poses others, and the folder below which all that it names must lie.
+
+    files, notes: what else it reads beside meshes and pictures, and what is to be said of it, filled while it is read.
+    """
+
+    path: Path
+    root: Path
+    limits: MeshLimits
+    files: dict[Path, None] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def parse(self, path: Path, tags: Sequence[str], kind: str) -> ElementTree.Element:
+        """The root element of this file, or of one that it includes; MeshError `missing`, `too_large` or as `parse_tree`."""
+        data, encoding = as_utf8(read_bytes(path, MAX_XML_BYTES, MeshError))
+        if encoding is not None:
+            self.notes.append(f"{path.name} {encoding}")
+        root = parse_tree(path, data, tags, kind)
+        for what, many in _COUNTED.items():
+            check_nodes(path, sum(1 for _ in root.iter(what)), many, self.limits)
+        return root
+
+    def find(self, name: str) -> Path:
+        """The file inside `root` that a name means; MeshError `missing`.
+
+        `package://`, `model://` and folders that are not there are passed over: every tail of the name is looked for, the
+        longest first, in the file's own folder and in those above it up to `root`; as it stands, and then with `%20` for a space.
+        """
+        if (path := find_inside(self.root.resolve(), *self.places(name))) is not None:
+            return path
+        raise MeshError("missing", f"{self.path} names {name!r:.200}, which is not inside {self.root}")
+
+    def places(self, name: str) -> Iterator[Path]:
+        """Where what a name means may lie, in that order."""
+        plain = re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
+        above = [folder for folder in (self.path.parent, *self.path.parent.parents) if folder.is_relative_to(self.root)]
+        for parts in (PurePosixPath(word).parts for word in dict.fromkeys((plain, unquote(plain)))):
+            tails = [PurePosixPath(*parts[k:]) for k in range(min(len(parts), MOST_TAILS))]
+            yield from (folder / tail for tail in tails for folder in above)
 
 
-def parse_tree(path: Path, data: bytes, tag: str, kind: str) -> ElementTree.Element:
-    """The root element, its default namespace left out; MeshError `unreadable`, also for a DTD or entities."""
+_COUNTED = {"link": "links", "joint": "joints", "visual": "visuals", "body": "bodies", "geom": "geoms"}
+
+MOST_TAILS = 32
+"""Folders of a name that may be passed over."""
+
+
+def parse_tree(path: Path, data: bytes, tags: Sequence[str], kind: str) -> ElementTree.Element:
+    """The root element, its default namespace left out; MeshError `unreadable`, also for a DTD or entities.
+
+    data: as `as_utf8` has it; tags: those that the root may have.
+    """
     if b"<!" in data.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or b"\0" in data:
-        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
+        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is no text")
     # pybullet's own files declare XML version 0.0, which no parser accepts.
     data = _NAMESPACE.sub(b"", _DECLARATION.sub(b"", data, count=1), count=1)
     if b"xmlns:" not in data:
@@ -81,7 +117,7 @@ def parse_tree(path: Path, data: bytes, tag: str, kind: str) -> ElementTree.Elem
         root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
         raise MeshError("unreadable", f"{path} is not XML: {error}") from error
-    if root.tag != tag:
+    if root.tag not in tags:
         raise MeshError("unreadable", f"{path} is not {kind}: its root is <{root.tag:.40}>")
     return root
 
@@ -104,6 +140,23 @@ def make_body(path: Path, kind: str, sizes: Array) -> Part:
     else:
         raise MeshError("unreadable", f"{path}: geometry <{kind:.40}> is not known")
     return Part(kind, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
+
+
+def wrap_body(part: Part) -> Part:
+    """The simple body with coordinates of a picture: once on each flat side, once around a round one; seen from outside, z up."""
+    corners, size = part.vertices[part.faces], np.ptp(part.vertices, axis=0)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.abs(normal).argmax(axis=1)
+    up = np.eye(3)[np.where(axis == 2, 1, 2)]
+    right = np.cross(up, np.eye(3)[axis] * np.sign(np.take_along_axis(normal, axis[:, None], axis=1)))
+    around = np.arctan2(corners[..., 1], corners[..., 0]) / (2.0 * np.pi) + 0.5
+    around += (around < 0.5) & (np.ptp(around, axis=1, keepdims=True) > 0.5)  # a face across the seam
+    uv = np.stack([around, corners[..., 2] / size[2] + 0.5], axis=-1)
+    flat = (part.name == "box") | (np.abs(normal[:, 2]) > 0.999 * np.linalg.norm(normal, axis=1))
+    uv[flat] = (np.einsum("fkc,afc->fka", corners / size, np.stack([right, up])) + 0.5)[flat]
+    faces = np.arange(corners.size // 3, dtype=np.int32).reshape(-1, 3)
+    vertices = frozen_array(corners.reshape(-1, 3))
+    return replace(part, vertices=vertices, faces=frozen_array(faces, np.int32), uv=frozen_array(uv.reshape(-1, 2)))
 
 
 def read_body(path: Path, element: ElementTree.Element, size_of: Callable[[str], str | None]) -> Part:

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from os.path import relpath
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,91 +16,81 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.door.meshes.caps import (
-    LONGEST_NAME,
-    Budget,
-    FolderResolver,
-    check_counts,
-    check_nodes,
-    find_inside,
-)
+from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes, find_inside
 from workers.door.meshes.formats import load_shape, with_jpeg
 from workers.door.meshes.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
 from workers.door.meshes.mjcf import read_mjcf
-from workers.door.meshes.posed import MOST_ABOVE, Model, Visual, numbers, parse_xml, read_body, scaled, turned
+from workers.door.meshes.posed import (
+    MAX_XML_BYTES,
+    MOST_ABOVE,
+    Model,
+    Source,
+    Visual,
+    numbers,
+    read_body,
+    scaled,
+    turned,
+    wrap_body,
+)
+from workers.door.opening import as_utf8, read_bytes
 
 
-def find_named(name: str, path: Path, root: Path) -> Path:
-    """The file inside `root` that a posing file at `path` names; MeshError `missing`.
-
-    `package://`, `model://` and folders that are not there are passed over: every tail of the name is looked for, the longest
-    first, in the file's own folder and in those above it up to `root`.
-    """
-    parts = PurePosixPath(
-        re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
-    ).parts
-    above = [folder for folder in (path.parent, *path.parent.parents) if folder.is_relative_to(root)]
-    tails = [PurePosixPath(*parts[k:]) for k in range(min(len(parts), MOST_TAILS))]
-    found = find_inside(root.resolve(), *(folder / tail for tail in tails for folder in above))
-    if found is None:
-        raise MeshError("missing", f"{path} names the mesh {name!r:.200}, which is not inside {root}")
-    return found
-
-
-MOST_TAILS = 32
-"""Folders of a name that may be passed over."""
-
-
-def read_model(path: Path, limits: MeshLimits) -> Model:
-    """What a URDF, SDF or MJCF poses; MeshError as `parse_xml`, `no_faces` where nothing of it is seen."""
-    model = POSED[path.suffix.lower()](path, limits)
+def read_model(path: Path, root: Path, limits: MeshLimits) -> tuple[Source, Model]:
+    """What a URDF, SDF or MJCF poses; MeshError as `Source.parse`, `no_faces` where nothing of it is seen."""
+    source = Source(path, root, limits)
+    model = POSED[path.suffix.lower()](source)
     check_nodes(path, len(model.visuals), "visuals", limits)
     if not model.visuals:
         raise MeshError("no_faces", f"{path} has no visual geometry")
-    return model
+    return source, model
 
 
 def list_seen(path: Path, root: Path, limits: MeshLimits) -> tuple[list[Path], list[Path]]:
-    """The meshes of all that is seen, each once, and the pictures that are there; MeshError where a mesh is not inside `root`."""
-    visuals = read_model(path, limits).visuals
-    names = dict.fromkeys(visual.mesh for visual in visuals if visual.mesh is not None)
-    pictures = dict.fromkeys(visual.texture for visual in visuals if visual.texture is not None)
-    return list(dict.fromkeys(find_named(name, path, root) for name in names)), _found(pictures, path, root)
+    """The meshes of all that is seen, each once, and what else is read that is there, such as pictures.
+
+    MeshError where a mesh is not inside `root`.
+    """
+    source, model = read_model(path, root, limits)
+    names = dict.fromkeys(visual.mesh for visual in model.visuals if visual.mesh is not None)
+    pictures = dict.fromkeys(visual.texture for visual in model.visuals if visual.texture is not None)
+    return list(dict.fromkeys(map(source.find, names))), [*source.files, *_found(pictures, source)]
 
 
 def list_named(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
-    """The meshes of all that is seen or collides, of those inside `root`."""
-    return _found(POSED[path.suffix.lower()](path, limits).meshes, path, root)
+    """The meshes of all that is seen or collides, of those inside `root`, and the files that it includes."""
+    source = Source(path, root, limits)
+    return [*_found(POSED[path.suffix.lower()](source).meshes, source), *source.files]
 
 
-def _found(names: Iterable[str], path: Path, root: Path) -> list[Path]:
+def _found(names: Iterable[str], source: Source) -> list[Path]:
     found = []
     for name in names:
         with suppress(MeshError):
-            found.append(find_named(name, path, root))
+            found.append(source.find(name))
     return list(dict.fromkeys(found))
 
 
 def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     """All that is seen, joints at zero, in the frame of the first root, metres; MeshError as `load_shape`."""
-    model, budget = read_model(path, limits), Budget(limits)
+    (source, model), budget = read_model(path, root, limits), Budget(limits)
     resolver = FolderResolver(path, root, limits, budget)
-    parts, notes, vertices, faces = list[Part](), list(model.notes), 0, 0
+    parts, notes, vertices, faces = list[Part](), source.notes, 0, 0
 
     @cache
     def load(name: str) -> LoadedMesh:
-        return load_shape(find_named(name, path, root), limits, root, budget)
+        return load_shape(source.find(name), limits, root, budget)
 
     @cache
     def picture(name: str) -> NDArray[np.uint8] | None:
         try:
-            return resolver.picture(relpath(find_named(name, path, root), path.parent))
+            return resolver.picture(relpath(source.find(name), path.parent))
         except MeshError:
             resolver.note(name, "is missing")
             return None
 
     for visual in model.visuals:
-        loaded = load(visual.mesh or "") if visual.body is None else LoadedMesh(Shape((visual.body,)), ())
+        body = wrap_body(visual.body) if visual.body is not None and visual.texture is not None else visual.body
+        loaded = load(visual.mesh or "") if body is None else LoadedMesh(Shape((body,)), ())
         notes += loaded.notes
         for part in transform_shape(loaded.shape, visual.T).parts:
             check_coordinates(path, part.vertices)
@@ -127,9 +117,9 @@ def _dressed(part: Part, visual: Visual, picture: Callable[[str], NDArray[np.uin
     return replace(part, material=Material((red, green, blue, alpha or 1.0), texture=texture), colors=None)
 
 
-def read_urdf(path: Path, limits: MeshLimits) -> Model:
+def read_urdf(source: Source) -> Model:
     """The visuals of all links of a URDF, joints at zero; the frame of the first root link."""
-    robot = parse_xml(path, limits, "robot", "a URDF")
+    path, robot = source.path, source.parse(source.path, ["robot"], "a URDF")
     looks = {m.get("name", ""): _look(path, m) for m in robot.iterfind("material")}
     visuals = []
     for link, T_root_link in _link_poses(path, robot):
@@ -187,26 +177,30 @@ def _origin(path: Path, element: ElementTree.Element) -> Pose:
     return np.eye(4) if origin is None else turned(path, origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0"))
 
 
-def read_sdf(path: Path, limits: MeshLimits) -> Model:
+def read_sdf(source: Source) -> Model:
     """The visuals of all links of an SDF's model, joints at zero."""
-    root = parse_xml(path, limits, "sdf", "an SDF")
+    path, root = source.path, source.parse(source.path, ["sdf"], "an SDF")
     for tag in ("world", "include", "submesh", "heightmap", "polyline"):
         if root.find(f".//{tag}") is not None:
             what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
             raise MeshError("format", f"{path} {what}: init its models' own files")
-    visuals = [visual for model in root.iterfind("model") for visual in _of_model(path, model, np.eye(4), 0)]
+    visuals = [visual for model in root.iterfind("model") for visual in _of_model(source, model, np.eye(4), 0)]
     names = dict.fromkeys((mesh.findtext("uri") or "").strip() for mesh in root.iterfind(".//geometry/mesh"))
     return Model(tuple(visuals), tuple(names))
 
 
-def _of_model(path: Path, model: ElementTree.Element, T_above: Pose, depth: int) -> Iterator[Visual]:
+def _of_model(source: Source, model: ElementTree.Element, T_above: Pose, depth: int) -> Iterator[Visual]:
+    path = source.path
     if depth > MOST_ABOVE:
         raise MeshError("unreadable", f"{path} has more than {MOST_ABOVE} models inside one another")
     T = T_above @ _sdf_pose(path, model)
     for link in model.iterfind("link"):
         for visual in link.iterfind("visual"):
             one = _sdf_geometry(path, visual, T @ _sdf_pose(path, link) @ _sdf_pose(path, visual))
-            if one is not None:
+            script = visual.find("material/script")
+            if one is not None and script is not None and (look := _read_script(source, script)) is not None:
+                yield replace(one, colour=look[0], texture=look[1], dresses=True)
+            elif one is not None:
                 diffuse, albedo = visual.findtext("material/diffuse"), visual.findtext("material/pbr/metal/albedo_map")
                 rgba = (
                     None
@@ -215,7 +209,41 @@ def _of_model(path: Path, model: ElementTree.Element, T_above: Pose, depth: int)
                 )
                 yield replace(one, colour=rgba, texture=albedo and albedo.strip())
     for inner in model.iterfind("model"):
-        yield from _of_model(path, inner, T, depth + 1)
+        yield from _of_model(source, inner, T, depth + 1)
+
+
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+_DIFFUSE = re.compile(r"^\s*diffuse((?:\s+(?:\d+\.?\d*|\.\d+)){3,4})\s*$", re.MULTILINE)
+_TEXTURE = re.compile(r"^\s*texture\s+(\S+)", re.MULTILINE)
+
+
+def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | None, str | None] | None:
+    """Colour and picture of the Ogre material that a visual names, first pass first; None, and a note, where it is not had.
+
+    After the manual of Ogre 1.9, "Material Scripts"; what a material has of another (`:`) is not read.
+    """
+    name, root = (script.findtext("name") or "").strip(), source.root.resolve()
+    places = [place for uri in script.iterfind("uri") for place in source.places(uri.text or "")]
+    listed = [file for place in places for file in (sorted(place.glob("*.material")) if place.is_dir() else [place])]
+    for file in dict.fromkeys(path for one in listed if (path := find_inside(root, one)) is not None):
+        text = _COMMENT.sub("", as_utf8(read_bytes(file, MAX_XML_BYTES, MeshError))[0].decode("utf-8", "replace"))
+        head = re.search(
+            rf"^\s*material\s+\"?{re.escape(name)}\"?\s*(?::[^{{]*)?{{(?P<rest>.*)", text, re.MULTILINE | re.DOTALL
+        )
+        if head is None:
+            continue
+        source.files[file] = None
+        inside = re.split(r"^\s*material\s", head["rest"], maxsplit=1, flags=re.MULTILINE)[0]
+        diffuse, picture = _DIFFUSE.search(inside), _TEXTURE.search(inside)
+        if diffuse is not None or picture is not None:
+            colour = None if diffuse is None else np.clip([*map(float, diffuse[1].split()), 1.0][:4], 0.0, 1.0)
+            if picture is None:
+                return colour, None
+            near = [folder / picture[1] for folder in (*places, file.parent, file.parent.with_name("textures"))]
+            there = find_inside(root, *near)
+            return colour, picture[1] if there is None else relpath(there, source.path.parent)
+    source.notes.append(f"the material script {name:.80} is not had, or has no colour: plain base colour used")
+    return None
 
 
 def _sdf_geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual | None:
@@ -244,5 +272,5 @@ def _sdf_pose(path: Path, element: ElementTree.Element) -> Pose:
     )
 
 
-POSED: Mapping[str, Callable[[Path, MeshLimits], Model]] = {".urdf": read_urdf, ".xml": read_mjcf, ".sdf": read_sdf}
+POSED: Mapping[str, Callable[[Source], Model]] = {".urdf": read_urdf, ".xml": read_mjcf, ".sdf": read_sdf}
 """The formats of files that pose meshes, by suffix."""

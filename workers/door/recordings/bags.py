@@ -1,9 +1,11 @@
 """ROS bags of a RealSense, by the library rosbags: its SDK's, and those of its ROS drivers with depth registered to colour.
 
-Of ROS 1 a .bag, of ROS 2 a .db3, a .mcap, or the folder that holds them. Four kinds of messages are read, by their published
+Of ROS 1 a .bag, of ROS 2 a .db3, a .mcap, or the folder that holds them. Few kinds of messages are read, by their published
 definitions; those in a bag are a stranger's, and would be compiled. What the topics mean is in the SDK's sources:
 /device_0/sensor_N/Depth_0/image/data, .../info/camera_info, .../tf/0 (a transform that takes coordinates of the reference
-stream to the stream's), .../option/Depth Units/value.
+stream to the stream's), .../option/Depth_Units/value. The SDK's .db3 has texts in place of all but images: .../camera_info
+"width=...;ppx=...;model=...;coeffs=...", .../tf/ref_0 "rotation=(column by column);translation=..."; and each message may be
+compressed by itself.
 """
 
 import bz2
@@ -40,7 +42,10 @@ LONGEST_SIDE = 20_000
 """Of an image, pixels."""
 
 IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
-TRANSFORM, FLOAT = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32"
+TRANSFORM, FLOAT, TEXT = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32", "std_msgs/msg/String"
+
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""First bytes of a message of ROS 2 that is compressed."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ class _Kind:
 
     def decode(self, data: bytes, kind: str) -> Any:
         """The message with its fields."""
+        if data.startswith(ZSTD):
+            data = _unpack(zstd.ZstdDecompressor, data)
         return getattr(_definitions(self.store), self.method)(data, kind)
 
 
@@ -104,6 +111,8 @@ def _files(path: Path) -> list[Path]:
     """The files of a bag: itself, or those in its folder by name."""
     if not path.is_dir():
         return [path]
+    if packed := next((file for file in path.iterdir() if file.name.endswith((".db3.zstd", ".mcap.zstd"))), None):
+        raise CaptureError("format", f"{packed} is compressed: unpack it (zstd -d FILE), and import what comes out")
     return sorted(file for file in path.iterdir() if file.suffix in (".db3", ".mcap"))
 
 
@@ -144,18 +153,32 @@ def _messages(path: Path) -> Iterator[_Message]:
         yield from heapq.merge(*(_of_file(*pair) for pair in readers), key=lambda message: message.stamp_us)
 
 
+def _part(topic: str, kind: str) -> str:
+    """What a topic of a type is about: the type of its message in ROS 1; "" for what is not needed."""
+    if kind in (TEXT, INFO) and topic.endswith("/camera_info"):
+        return INFO
+    if kind in (TEXT, TRANSFORM) and "/tf/" in topic:
+        return TRANSFORM
+    if kind in (TEXT, FLOAT) and topic.replace("_", " ").endswith("/option/Depth Units/value"):
+        return FLOAT
+    return IMAGE if kind == IMAGE else ""
+
+
 def _of_file(kind: _Kind, reader: Any) -> Iterator[_Message]:
-    wanted = [one for one in reader.connections if one.msgtype in (IMAGE, INFO, TRANSFORM, FLOAT)]
+    wanted = [connection for connection in reader.connections if _part(connection.topic, connection.msgtype)]
     for connection, stamp_ns, data in reader.messages(wanted) if wanted else ():
         content = partial(kind.decode, bytes(data), connection.msgtype)
-        yield _Message(connection.topic, connection.msgtype, stamp_ns // 1000, content)
+        yield _Message(connection.topic, _part(connection.topic, connection.msgtype), stamp_ns // 1000, content)
 
 
 # ---------------------------------------------------------------------------------------------- messages
 
 COLORS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
-PACKED = {"yuyv": cv2.COLOR_YUV2RGB_YUY2, "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2, "uyvy": cv2.COLOR_YUV2RGB_UYVY}
-"""OpenCV's conversions of encodings of colour, of 3 or 4 bytes a pixel and of 2."""
+PACKED = {
+    **dict.fromkeys(("yuyv", "YUYV", "yuv422_yuy2"), cv2.COLOR_YUV2RGB_YUY2),
+    **dict.fromkeys(("uyvy", "UYVY", "yuv422"), cv2.COLOR_YUV2RGB_UYVY),
+}
+"""OpenCV's conversions of encodings of colour, of 3 or 4 bytes a pixel and of 2; the SDK has capitals, or yuv422 for UYVY."""
 
 DEPTHS = {"mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
 
@@ -183,19 +206,35 @@ class _Info:
     model: str
 
 
+def _fields(text: str) -> dict[str, Any]:
+    """Of "name=number,number;name=word": arrays, or words."""
+    pairs = (part.partition("=")[::2] for part in text.split(";"))
+    return {name: value if name == "model" else np.array(value.split(","), np.float64) for name, value in pairs}
+
+
 def _info(content: Any) -> _Info:
+    if hasattr(content, "data"):
+        said = _fields(content.data)
+        width, height, fx, fy, cx, cy = (said[name].item() for name in ("width", "height", "fx", "fy", "ppx", "ppy"))
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return _Info((int(width), int(height)), K, said["coeffs"], said["model"])
     K, D = (content.K, content.D) if hasattr(content, "K") else (content.k, content.d)
     return _Info((content.width, content.height), np.reshape(K, (3, 3)), np.asarray(D), content.distortion_model)
 
 
 def _transform(content: Any) -> Pose:
-    """[4, 4]. Raises ValueError where a number is none or the quaternion is not one of a rotation."""
-    shift, turn = content.translation, content.rotation
-    q = np.array([turn.x, turn.y, turn.z, turn.w])
-    T = pose(rotation_from_quaternion(q), np.array([shift.x, shift.y, shift.z]))
-    if not np.isfinite(T).all() or not 0.99 < np.linalg.norm(q) < 1.01:
-        raise ValueError(f"the quaternion {q.tolist()}")
-    return T
+    """[4, 4]. Raises ValueError where a number is none or the rotation is none."""
+    if hasattr(content, "data"):
+        said = _fields(content.data)
+        R, t = said["rotation"].reshape(3, 3).T, said["translation"]
+        length = np.sqrt(np.abs(np.linalg.det(R)))
+    else:
+        shift, turn = content.translation, content.rotation
+        q, t = np.array([turn.x, turn.y, turn.z, turn.w]), np.array([shift.x, shift.y, shift.z])
+        R, length = rotation_from_quaternion(q), np.linalg.norm(q)
+    if not np.isfinite([*R.ravel(), *t]).all() or not 0.99 < length < 1.01 or np.abs(R @ R.T - np.eye(3)).max() > 0.01:
+        raise ValueError(f"the rotation {R.tolist()}")
+    return pose(R, t)
 
 
 # ---------------------------------------------------------------------------------------------- what a bag holds
@@ -232,15 +271,15 @@ class _Contents:
         if message.kind == IMAGE:
             stream = self.depth if "depth" in topic.lower() else self.color
             better = not stream.topic or (not stream.is_registered and _Stream(topic).is_registered)
-            if better and "infra" not in topic.lower():
+            if better and not any(word in topic.lower() for word in ("infra", "confidence", "fisheye")):
                 stream.topic, stream.encoding = topic, message.content().encoding
             self.stamps_us.setdefault(topic, []).append(message.stamp_us)
         elif message.kind == INFO:
             self.infos[topic.removesuffix("/camera_info").removesuffix("/info")] = _info(message.content())
-        elif message.kind == TRANSFORM and "/tf/" in topic:
+        elif message.kind == TRANSFORM:
             self.transforms[topic] = _transform(message.content())
-        elif topic.replace("_", " ").endswith("/option/Depth Units/value"):
-            metres = message.content().data
+        else:
+            metres = float(message.content().data)
             if 1e-6 <= metres <= 0.01:
                 self.units_per_m = round(1.0 / metres, 3)
 
@@ -268,8 +307,8 @@ def open_bag(path: Path) -> Recorded:
                 is_depth = message.topic == contents.depth.topic
                 yield RecordedFrame(is_depth, message.stamp_us, partial(_load, message, is_depth, contents))
 
-    told = {"topic": contents.color.topic}
-    return Recorded(path, color, depth, max(period, 1.0), frames, float(stamps[-1]), told=told)
+    clock, topic = (max(period, 1.0), frames, float(stamps[-1])), contents.color.topic
+    return Recorded(path, color, depth, *clock, told={"topic": topic}, missing=f"it has no camera_info for {topic}")
 
 
 def _base(topic: str) -> str:
@@ -292,16 +331,17 @@ def _check(path: Path, contents: _Contents) -> None:
         if stream.encoding not in usable:
             wanted = f"not one of {', '.join(usable)}: record it as one of those"
             raise CaptureError("format", f"{path}: {name} is {stream.encoding!r:.60}, {wanted}")
-        if stream.info is None:
+        if stream.info is None and not contents.depth.is_registered:
             raise CaptureError("calibration", f"{path} has no camera_info for {stream.topic}: record it as well")
 
 
-def _cameras(path: Path, contents: _Contents) -> tuple[CaptureCamera, DepthCamera | None]:
+def _cameras(path: Path, contents: _Contents) -> tuple[CaptureCamera | None, DepthCamera | None]:
     color, depth = contents.color, contents.depth
-    assert color.info is not None and depth.info is not None
+    if color.info is None:
+        return None, None
     units_per_m = contents.units_per_m if contents.units_per_m <= 10_000 else 1000.0
     camera = CaptureCamera(_intrinsics(path, color.info), _lens(path, color.info), units_per_m)
-    if depth.is_registered:
+    if depth.is_registered or depth.info is None:
         return camera, None
     if color.T_stream_ref is None or depth.T_stream_ref is None or color.reference != depth.reference:
         raise CaptureError(
@@ -321,12 +361,15 @@ def _intrinsics(path: Path, info: _Info) -> Intrinsics:
     return Intrinsics(**size, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + 0.5, cy=K[1, 2] + 0.5)
 
 
-FORWARD = ("plumb_bob", "rational_polynomial", "brown conrady", "modified brown conrady", "none", "")
+FORWARD = ("plumb_bob", "rational_polynomial", "brown conrady", "none", "")
+"""Models whose numbers are OpenCV's; the SDK's modified and inverse one, which a D455's colour has, differ by 0.03 pixels there:
+its rs2_project_point_to_pixel uses both forwards."""
 
 
 def _lens(path: Path, info: _Info) -> Array:
     """[8]; raises CaptureError for a lens of another kind whose numbers are not all 0."""
-    if not np.isfinite(info.D).all() or (np.any(info.D) and (info.model.lower() not in FORWARD or len(info.D) > 8)):
+    model = info.model.lower().removeprefix("modified ").removeprefix("inverse ")
+    if not np.isfinite(info.D).all() or (np.any(info.D) and (model not in FORWARD or len(info.D) > 8)):
         told = f"the lens {info.model!r:.60} with {info.D[:16].tolist()} is not read: export frames"
         raise CaptureError("calibration", f"{path}: {told}")
     return frozen_array(np.append(info.D[:8], np.zeros(8))[:8])
@@ -339,9 +382,9 @@ def _load(message: _Message, is_depth: bool, contents: _Contents, small: bool) -
     with suppress(CaptureError), as_refusal(message.topic, CaptureError):
         image = message.content()
         pixels = _pixels(image)
-    if image is None or pixels is None or stream.info is None:
+    if image is None or pixels is None or image.encoding != stream.encoding:
         return None
-    if image.encoding != stream.encoding or pixels.shape[1::-1] != stream.info.size:
+    if stream.info is not None and pixels.shape[1::-1] != stream.info.size:
         return None
     if is_depth:
         scale = contents.units_per_m if image.encoding != "32FC1" else 1.0

@@ -1,8 +1,9 @@
 """Recordings that are folders of images, and Record3D's archive of them, each by its published layout.
 
 TUM RGB-D (rgb.txt, depth.txt, 5000 units a metre, registered; the calibrations of its three cameras), BOP scenes
-(scene_camera.json; depth_scale in millimetres), Open3D's recorder (intrinsic.json, column by column), Record3D (.r3d: a zip of
-JPEG and of depth in metres compressed by LZFSE), Polycam's raw data (keyframes/), ARKitScenes (lowres_wide/).
+(scene_camera.json; depth_scale in millimetres), Open3D's recorder (intrinsic.json, column by column) and folders like it,
+Record3D (.r3d: a zip of JPEG and of depth in metres compressed by LZFSE), Polycam's raw data (keyframes/), ARKitScenes
+(lowres_wide/). Depth to which a phone gives the lowest confidence, 0, is none.
 
 Principal points count from the first pixel's centre in the first three, and from the image's corner in Apple's.
 """
@@ -11,6 +12,8 @@ import json
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +24,7 @@ from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
 from workers.door.opening import as_refusal, read_bytes
-from workers.door.recordings.pictures import Size, decode_depth, decode_rgb, decode_small, head_size
+from workers.door.recordings.pictures import Size, decode_confidence, decode_depth, decode_rgb, decode_small, head_size
 
 MOST_BYTES = 256_000_000
 """Of one file or one member of an archive."""
@@ -69,33 +72,54 @@ def _intrinsics(path: Path, size: Size, numbers: Iterable[Any], centre: float) -
         return Intrinsics(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx + shift, cy=cy + shift)
 
 
-def _scaled(k: Intrinsics, size: Size) -> DepthCamera:
+def scaled_camera(k: Intrinsics, size: Size) -> DepthCamera:
     """A depth camera that sees the same as a colour camera, in an image of another size."""
     x, y = size[0] / k.width, size[1] / k.height
     small = Intrinsics(width=size[0], height=size[1], fx=x * k.fx, fy=y * k.fy, cx=x * k.cx, cy=y * k.cy)
     return DepthCamera(small, frozen_array(np.zeros(8)), frozen_array(np.eye(4)))
 
 
-def _color(stamp_us: int, read: Read, k: Intrinsics) -> RecordedFrame:
-    size = (k.width, k.height)
-    return RecordedFrame(False, stamp_us, lambda small: (decode_small if small else decode_rgb)(read(), size), k)
+Seen = Intrinsics | Size
+"""A colour camera, or the size of its images where nothing else is known of it."""
 
 
-def _depth(stamp_us: int, read: Read, k: Intrinsics, units_per_m: float, size: Size | None = None) -> RecordedFrame:
+def _of_size(k: Seen) -> Size:
+    return (k.width, k.height) if isinstance(k, Intrinsics) else k
+
+
+def _color(stamp_us: int, read: Read, k: Seen) -> RecordedFrame:
+    def load(small: bool) -> np.ndarray:
+        return (decode_small if small else decode_rgb)(read(), _of_size(k))
+
+    return RecordedFrame(False, stamp_us, load, k if isinstance(k, Intrinsics) else None)
+
+
+def _depth(stamp_us: int, read: Read, k: Seen, units_per_m: float, size: Size | None = None) -> RecordedFrame:
     """Of the colour camera `k`, registered to it or, with a `size`, seen by it in an image of that size."""
-    own = size or (k.width, k.height)
-    camera = k if own == (k.width, k.height) else _scaled(k, own)
+    own, camera = size or _of_size(k), k if isinstance(k, Intrinsics) else None
 
     def load(small: bool) -> np.ndarray | None:
         return np.zeros(0) if small else decode_depth(read(), own, units_per_m)
 
-    return RecordedFrame(True, stamp_us, load, camera)
+    return RecordedFrame(True, stamp_us, load, scaled_camera(camera, own) if camera and own != _of_size(k) else camera)
+
+
+def _trusted(frame: RecordedFrame, sure: Read | None) -> RecordedFrame:
+    """The frame without depth of the lowest confidence, 0, where the phone wrote how sure it is of each pixel."""
+
+    def load(small: bool) -> np.ndarray | None:
+        depth = frame.load(small)
+        if small or depth is None or sure is None:
+            return depth
+        return np.where(decode_confidence(sure(), depth.shape[::-1]) > 0, depth, 0.0)
+
+    return replace(frame, load=load)
 
 
 def _recorded(
-    path: Path, frames: list[RecordedFrame], lens: Iterable[float] = (), units_per_m: float = UNITS_PER_M
+    path: Path, frames: list[RecordedFrame], lens: Iterable[float] = (), units_per_m: float = UNITS_PER_M, **more: Any
 ) -> Recorded:
-    """A recording of these frames, its camera that of the middle focal length. Raises CaptureError without any."""
+    """A recording of these frames, its camera that of the middle focal length, if any. Raises CaptureError without frames."""
     frames = sorted(frames, key=lambda frame: (frame.stamp_us, frame.is_depth))
     colors = [frame for frame in frames if not frame.is_depth]
     if not colors or len(colors) == len(frames):
@@ -104,13 +128,16 @@ def _recorded(
     sizes = {(k.width, k.height) for k in cameras}
     if len(sizes) > 1:
         raise _wrong(path, f"has colour images of {len(sizes)} sizes: import each by itself")
-    k = sorted(cameras, key=lambda one: one.fx)[len(cameras) // 2]
     whole = np.zeros(8)
     whole[: len(tuple(lens))] = tuple(lens)
     stamps = np.array([frame.stamp_us for frame in colors])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else float(NO_TIME_US)
-    camera = CaptureCamera(k, frozen_array(whole), units_per_m)
-    return Recorded(path, camera, None, max(period, 1.0), lambda: iter(frames), float(stamps[-1]))
+    camera = None
+    if cameras:
+        k = sorted(cameras, key=lambda each: each.fx)[len(cameras) // 2]
+        camera = CaptureCamera(k, frozen_array(whole), units_per_m)
+    clock = max(period, 1.0), lambda: iter(frames), float(stamps[-1])
+    return Recorded(path, camera, None, *clock, units_per_m=units_per_m, **more)
 
 
 def _below(folder: Path, name: str) -> Path:
@@ -132,26 +159,28 @@ TUM_CAMERAS = {
 }
 """fx, fy, cx, cy and lens of the colour cameras, by a word in the folder's name, as the data set's page has them."""
 
+TUM_SIZE = (640, 480)
+
 
 def _is_tum(path: Path) -> bool:
     return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
 
-def _open_tum(path: Path) -> Recorded:
-    word = next((word for word in TUM_CAMERAS if word in path.resolve().name.lower()), None)
-    if word is None:
-        known = ", ".join(TUM_CAMERAS)
-        raise CaptureError(
-            "calibration", f"{path} names none of {known}, and no file in it has its camera: rename the folder"
-        )
-    numbers, lens = TUM_CAMERAS[word]
+def _open_tum(path: Path, units_per_m: float = TUM_UNITS_PER_M) -> Recorded:
     color, depth = (list(_tum_list(path, name)) for name in ("rgb.txt", "depth.txt"))
     if not color:
         raise CaptureError("empty", f"{path}/rgb.txt names no image")
-    k = _intrinsics(path, _size_of(color[0][1]), numbers, 0.0)
+    word = next((word for word in TUM_CAMERAS if word in path.resolve().name.lower()), None)
+    numbers, lens = TUM_CAMERAS.get(word or "", ((), ()))
+    size, missing = _size_of(color[0][1]), "no file in it has its camera"
+    k: Seen = _intrinsics(path, size, numbers, 0.0) if word and size == TUM_SIZE else size
+    if word and size != TUM_SIZE:
+        missing += f", and the camera of TUM's {word} has images of 640 x 480, not of {size[0]} x {size[1]}"
     frames = [_color(stamp, _reader(file), k) for stamp, file in color]
-    frames += [_depth(stamp, _reader(file), k, TUM_UNITS_PER_M) for stamp, file in depth]
-    return _recorded(path, frames, lens, TUM_UNITS_PER_M)
+    frames += [_depth(stamp, _reader(file), k, units_per_m) for stamp, file in depth]
+    told = {"calibration": f"that of TUM's {word}"} if isinstance(k, Intrinsics) else {}
+    more = {"told": told, "missing": missing, "with_units": partial(_open_tum, path)}
+    return _recorded(path, frames, lens, units_per_m, **more)
 
 
 def _tum_list(folder: Path, name: str) -> Iterator[tuple[int, Path]]:
@@ -182,9 +211,7 @@ def _open_bop(path: Path) -> Recorded:
         raise _wrong(described, "is no list of cameras by the number of an image")
     for name, one in sorted(tree.items(), key=lambda item: int(item[0])):
         stamp = int(name) * NO_TIME_US
-        color = next((f for end in ("png", "jpg") if (f := path / "rgb" / f"{int(name):06d}.{end}").is_file()), None)
-        if color is None:
-            raise CaptureError("missing", f"{path} has no rgb/{int(name):06d}.png or .jpg")
+        color, z = _bop_file(path, ("rgb", "gray"), int(name)), _bop_file(path, ("depth",), int(name))
         K, scale = one.get("cam_K"), one.get("depth_scale")
         if not isinstance(K, list) or len(K) != 9:
             raise _wrong(described, f"{name}: cam_K must be nine numbers")
@@ -192,39 +219,56 @@ def _open_bop(path: Path) -> Recorded:
             raise _wrong(described, f"{name}: depth_scale is {scale!r}, and must be millimetres a unit")
         k = _intrinsics(described, _size_of(color), (K[0], K[4], K[2], K[5]), 0.0)
         frames.append(_color(stamp, _reader(color), k))
-        frames.append(_depth(stamp, _reader(path / "depth" / f"{int(name):06d}.png"), k, 1000.0 / scale))
+        frames.append(_depth(stamp, _reader(z), k, 1000.0 / scale))
     finest = max((1000.0 / one["depth_scale"] for one in tree.values()), default=UNITS_PER_M)
     return _recorded(path, frames, (), min(max(finest, UNITS_PER_M), 10_000.0))
 
 
-OPEN3D_FILES = ("intrinsic.json", "camera_intrinsic.json", "camera.json")
+def _bop_file(path: Path, folders: tuple[str, ...], number: int) -> Path:
+    names = [f"{folder}/{number:06d}.{end}" for folder in folders for end in ("png", "jpg", "tif", "tiff")]
+    file = next((path / name for name in names if (path / name).is_file()), None)
+    if file is None:
+        raise CaptureError("missing", f"{path} has no {names[0]}, nor another of {', '.join(names[1:])}")
+    return file
 
 
-def _is_open3d(path: Path) -> bool:
-    return all((path / name).is_dir() for name in ("color", "depth")) and _open3d_camera(path) is not None
+CAMERA_JSON = "camera.json"
+OPEN3D_FILES = ("intrinsic.json", "camera_intrinsic.json", CAMERA_JSON)
 
 
-def _open3d_camera(path: Path) -> Path | None:
-    return next((path / name for name in OPEN3D_FILES if (path / name).is_file()), None)
+def _open3d_folder(path: Path) -> Path | None:
+    """The folder of colour images, of which depth/ has one each by the same name."""
+    color = next((path / name for name in ("color", "rgb") if (path / name).is_dir()), None)
+    return color if (path / "depth").is_dir() else None
 
 
-def _open_open3d(path: Path) -> Recorded:
-    described = _open3d_camera(path)
-    assert described is not None
-    tree = _tree_of(described, _bytes_of(described))
-    matrix = tree.get("intrinsic_matrix") if isinstance(tree, dict) else None
-    if not isinstance(matrix, list) or len(matrix) != 9:
-        raise _wrong(described, "has no intrinsic_matrix of nine numbers, column by column")
-    color, depth = (sorted(f for f in (path / name).iterdir() if f.is_file()) for name in ("color", "depth"))
-    if [file.stem for file in color] != [file.stem for file in depth]:
-        raise CaptureError(
-            "counts", f"{path} has {len(color)} images in color/ and {len(depth)} in depth/, or of other names"
-        )
-    frames = []
+def _open3d_camera(path: Path, size: Size) -> tuple[Seen, str]:
+    """The camera of images of a size by Open3D's file, or what is missing. A camera.json may be one of ours."""
+    for described in (path / name for name in OPEN3D_FILES if (path / name).is_file()):
+        tree = _tree_of(described, _bytes_of(described))
+        matrix = tree.get("intrinsic_matrix") if isinstance(tree, dict) else None
+        if isinstance(matrix, list) and len(matrix) == 9:
+            stated = tuple(tree.get(name, side) for name, side in zip(("width", "height"), size, strict=True))
+            if stated != size:
+                return size, f"{described.name} is of {stated[0]} x {stated[1]}, its images are {size[0]} x {size[1]}"
+            return _intrinsics(described, size, (matrix[i] for i in (0, 4, 6, 7)), 0.0), ""
+        if described.name != CAMERA_JSON:
+            raise _wrong(described, "has no intrinsic_matrix of nine numbers, column by column")
+    return size, f"it has no {OPEN3D_FILES[0]}"
+
+
+def _open_open3d(path: Path, units_per_m: float = UNITS_PER_M) -> Recorded:
+    folder = _open3d_folder(path)
+    assert folder is not None
+    color, depth = (sorted(f for f in each.iterdir() if f.is_file()) for each in (folder, path / "depth"))
+    if not color or [file.stem for file in color] != [file.stem for file in depth]:
+        counts = f"{len(color)} images in {folder.name}/ and {len(depth)} in depth/"
+        raise CaptureError("counts", f"{path} has {counts}, or of other names")
+    (k, missing), frames = _open3d_camera(path, _size_of(color[0])), []
     for number, (rgb, z) in enumerate(zip(color, depth, strict=True)):
-        k = _intrinsics(described, _size_of(rgb), (matrix[0], matrix[4], matrix[6], matrix[7]), 0.0)
-        frames += [_color(number * NO_TIME_US, _reader(rgb), k), _depth(number * NO_TIME_US, _reader(z), k, 1000.0)]
-    return _recorded(path, frames)
+        frames.append(_color(number * NO_TIME_US, _reader(rgb), k))
+        frames.append(_depth(number * NO_TIME_US, _reader(z), k, units_per_m))
+    return _recorded(path, frames, (), units_per_m, missing=missing, with_units=partial(_open_open3d, path))
 
 
 # ---------------------------------------------------------------------------------------------- Apple's
@@ -259,7 +303,9 @@ def _open_record3d(path: Path) -> Recorded:
         k = _intrinsics(path, size, camera, 0.5)
         frames.append(_color(stamp, _member(path, f"rgbd/{number}.jpg"), k))
         if f"rgbd/{number}.depth" in names:
-            frames.append(_depth(stamp, _member(path, f"rgbd/{number}.depth"), k, 1000.0, depth_size))
+            sure = _member(path, name) if (name := f"rgbd/{number}.conf") in names else None
+            seen = _depth(stamp, _member(path, f"rgbd/{number}.depth"), k, 1000.0, depth_size)
+            frames.append(_trusted(seen, sure))
     return _recorded(path, frames)
 
 
@@ -275,6 +321,10 @@ def _member(path: Path, name: str) -> Read:
             return data
 
     return read
+
+
+def _confidence(file: Path) -> Read | None:
+    return _reader(file) if file.is_file() else None
 
 
 def _keyframes(path: Path) -> Path:
@@ -295,7 +345,8 @@ def _open_polycam(path: Path) -> Recorded:
         k = _intrinsics(described, _size_of(color), (tree[name] for name in ("fx", "fy", "cx", "cy")), 0.5)
         frames.append(_color(int(described.stem), _reader(color), k))
         if depth.is_file():
-            frames.append(_depth(int(described.stem), _reader(depth), k, 1000.0, _size_of(depth)))
+            seen = _depth(int(described.stem), _reader(depth), k, 1000.0, _size_of(depth))
+            frames.append(_trusted(seen, _confidence(root / "confidence" / depth.name)))
     return _recorded(path, frames)
 
 
@@ -319,7 +370,8 @@ def _open_arkit(path: Path) -> Recorded:
         k = _intrinsics(camera, _size_of(file), numbers[2:], 0.5)
         frames.append(_color(1000 * at, _reader(file), k))
         if (seen := depth / file.name).is_file():
-            frames.append(_depth(1000 * at, _reader(seen), k, 1000.0, _size_of(seen)))
+            image = _depth(1000 * at, _reader(seen), k, 1000.0, _size_of(seen))
+            frames.append(_trusted(image, _confidence(path / "confidence" / file.name)))
     return _recorded(path, frames)
 
 
@@ -333,8 +385,8 @@ def _milliseconds(path: Path) -> int:
 
 FOLDERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Recorded]]] = {
     "a TUM RGB-D folder (rgb.txt, depth.txt)": (_is_tum, _open_tum),
-    "a BOP scene (scene_camera.json, rgb/, depth/)": (_is_bop, _open_bop),
-    "an Open3D folder (color/, depth/, intrinsic.json)": (_is_open3d, _open_open3d),
+    "a BOP scene (scene_camera.json, rgb/ or gray/, depth/)": (_is_bop, _open_bop),
+    "an Open3D folder (color/ or rgb/, depth/)": (lambda path: bool(_open3d_folder(path)), _open_open3d),
     "a Record3D file (.r3d)": (_is_record3d, _open_record3d),
     "Polycam's raw data (keyframes/)": (_is_polycam, _open_polycam),
     "an ARKitScenes folder (lowres_wide/, lowres_depth/)": (_is_arkit, _open_arkit),

@@ -92,6 +92,16 @@ def decode_depth(data: bytes, size: Size, units_per_m: float) -> Array:
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, 0.0)
 
 
+def decode_confidence(data: bytes, size: Size) -> NDArray[np.uint8]:
+    """[H, W] uint8 of a PNG or of bytes, as they are or compressed by LZFSE; 0: the lowest. Raises PictureError."""
+    if data.startswith(b"\x89PNG"):
+        return np.asarray(_decode(data, size, cv2.IMREAD_GRAYSCALE), np.uint8)
+    data = _expand(data, size[0] * size[1]) if data[:4] in LZFSE else data
+    if len(data) != size[0] * size[1]:
+        raise PictureError(f"has a confidence of {len(data)} bytes, and its depth is {size[0]} x {size[1]}")
+    return np.frombuffer(data, np.uint8).reshape(size[1], size[0])
+
+
 def _load_npy(data: bytes, size: Size) -> NDArray:
     try:
         stream = io.BytesIO(data)
