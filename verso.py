@@ -4,15 +4,13 @@ Reading loads neither Ray, OpenGL nor PyBullet; `make_scene` loads what making a
 loaded when a name is first asked for: every command of an installed reader imports this file.
 """
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
-from schemas.errors import CorruptError, InputError, OutputError, SceneError, VersoError, needs_making
+from schemas.errors import CorruptError, InputError, OutputError, SceneError, VersoError
 
 if TYPE_CHECKING:
     from schemas.job.job import Job
-    from services.dataset.dataset import Dataset
+    from services.dataset.dataset import Dataset, make_scene
     from services.dataset.dataset import open_dataset as open
     from services.dataset.pair import Correspondence, Pair
     from services.dataset.view import Box, Cloud, Pixels, View
@@ -41,28 +39,14 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from schemas.job.job import Job
-    from services.dataset.dataset import Dataset, open_dataset
+    from services.dataset.dataset import Dataset, make_scene, open_dataset
     from services.dataset.pair import Correspondence, Pair
     from services.dataset.view import Box, Cloud, Pixels, View
 
     names = {kind.__name__: kind for kind in (Box, Cloud, Correspondence, Dataset, Job, Pair, Pixels, View)}
-    globals().update(names, open=open_dataset)
+    globals().update(names, open=open_dataset, make_scene=make_scene)
     return globals()[name]
 
 
 def __dir__() -> list[str]:
     return __all__
-
-
-def make_scene(
-    job: Union[str, Path, Mapping[str, Any], "Job"], scene_id: int, changes: Sequence[str] = ()
-) -> tuple["Pair", ...]:
-    """The pairs of one scene, made in this process and kept in memory, with the bytes that a run would store.
-
-    `job` is a job file, its keys, or a parsed job; `changes` are `KEY=VALUE` as in `--set`. Raises SceneError where the scene
-    cannot be made, and InputError where the job is wrong.
-    """
-    with needs_making("verso.make_scene"):
-        from services.dataset.one_scene import make_scene as make
-
-    return make(job, scene_id, changes)

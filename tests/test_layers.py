@@ -101,7 +101,6 @@ STARTS = (
         ),
         ("from workers.store.local import open_store; open_store('/tmp')", {"obstore", "ray"}),
         ("import services.dataset.dataset", {"ray", "pybullet", "OpenGL", "duckdb"}),
-        ("import services.dataset.one_scene", {"ray"}),
         (f"{NO_EXTRA}; import services.bench.command, services.study.command", {"ray"}),
     ),
     (("import services.study.page", {"matplotlib.pyplot"}),),

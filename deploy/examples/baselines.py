@@ -25,9 +25,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import trimesh
+from mirror_depth import pairs_of_split
 from numpy.typing import NDArray
 from scipy import ndimage
-from splits import pairs_of_split
 
 from schemas.dataset.codec import read_matrix
 from schemas.dataset.layout import PixelKind
@@ -297,9 +297,9 @@ class SensedFiles:
         self._files, self._images = files, images
         self.patch, self.mesh, self.samples = files.patch, files.mesh, files.samples
 
-    def image(self, scene_id: int, path: str) -> bytes:
+    def image(self, path: str) -> bytes:
         """The bytes of an image."""
-        return self._images[path] if path in self._images else self._files.image(scene_id, path)
+        return self._images[path] if path in self._images else self._files.image(path)
 
 
 def sense_input(pair: Pair, job: Job) -> Pair:

@@ -1,20 +1,49 @@
-"""What a network may know of a pair before it sees the mirror view, the baseline made of that, and the scores.
+"""The pairs of a split, what a network may know of one before it sees the mirror view, the baseline made of that, and the scores.
 
 Everything lies in a crop of the mirror image about the place where the object's seen points fall. Nothing but the input
 view, the two cameras and the planes of table top and floor goes into it: the mirror view is the answer alone.
 """
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
+from services.dataset.dataset import Dataset
 from services.dataset.pair import Pair
 from services.dataset.view import Pixels, View
 from workers.geometry import camera
+
+Split = Literal["train", "val", "test"]
+
+
+def pairs_of_split(dataset: Dataset, split: Split, splits: Mapping[str, str] | None = None) -> Iterator[Pair]:
+    """Every pair whose objects are all of instances of this split.
+
+    `splits`: by instance; by default the column of `assets`, which follows from the instance's id and is the same in every
+    dataset. `dataset.splits()` has the shares in each category. A scene of several objects of different splits is in none.
+    """
+    if splits is None:
+        rows = dataset.table("assets").to_table(columns=["instance_id", "split"]).to_pylist()
+        splits = {row["instance_id"]: row["split"] for row in rows}
+    for pair in dataset.pairs(
+        pc.field("instance_id").isin(pa.array([name for name in splits if splits[name] == split], pa.string()))
+    ):
+        if all(splits[name] == split for name in instances_of(pair)):
+            yield pair
+
+
+def instances_of(pair: Pair) -> set[str]:
+    """The ids of all objects of a pair's scene."""
+    return {pair.instance_id, *(body["instance_id"] for body in pair.scene["bodies"] or ())}
+
 
 CROP = (96, 128)
 """Rows and columns, as the article's patches."""

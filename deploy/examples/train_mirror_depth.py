@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from mirror_depth import CHANNELS, SCALE_M, Example, make_example, score
-from splits import pairs_of_split
+from mirror_depth import CHANNELS, SCALE_M, Example, Split, make_example, pairs_of_split, score
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader, TensorDataset
-from torch_pairs import MirrorDepthPairs
+from torch.utils.data import Dataset as TorchDataset
 
 from services.dataset.dataset import open_dataset
 
@@ -31,6 +30,35 @@ RATE = 2e-3
 EPOCHS = 12
 
 Loss = Callable[[Any, dict[str, Tensor]], Tensor]
+
+
+class MirrorDepthPairs(TorchDataset):
+    """Pairs of one split by instance; an item is a dict of tensors [..., H, W] as `mirror_depth.Example` tells them.
+
+    The ids are looked up once; images are read and decoded when an item is asked for, so that worker processes of a
+    DataLoader share nothing.
+    """
+
+    def __init__(self, place: str, split: Split) -> None:
+        self._pairs = open_dataset(place)
+        self.ids = [pair.pose_id for pair in pairs_of_split(self._pairs, split)]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        example = make_example(self._pairs.pair(self.ids[index]))
+        if example is None:  # too near the rim: the next one stands in
+            return self[(index + 1) % len(self)]
+        known = (example.depth > 0)[None]
+        return {
+            "features": torch.from_numpy(example.features),
+            "background": torch.from_numpy(example.background)[None],
+            "depth": torch.from_numpy(example.depth)[None],
+            "mask": torch.from_numpy(example.mask)[None],
+            "known": torch.from_numpy(known),
+            "middle_m": torch.tensor(example.middle_m).reshape(1, 1, 1),
+        }
 
 
 class Net(nn.Module):

@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from mirror_depth import Split, pairs_of_split
 from occupancy import FEATURES, Example, Flags, iou, make_example
-from splits import Split, pairs_of_split
 from torch import Tensor, nn
 from torch.nn import functional
 from train_mirror_depth import keep, read_options, stack, tell_size, train

@@ -6,6 +6,7 @@ import platform
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,9 +28,7 @@ class Finding:
 
 def main(options: argparse.Namespace) -> int:
     """Examine everything and print it; returns 1 where something is missing."""
-    findings = [
-        examine() for examine in (_python, _cores, _memory, _disk, _shared_memory, _ray, _gpus, _renderer, _stack)
-    ]
+    findings = [*examine_machine(), _ray(), _gpus(), _renderer(), _stack()]
     width = max(len(finding.what) for finding in findings)
     for finding in findings:
         print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.what:{width}}  {finding.found}")
@@ -39,33 +38,22 @@ def main(options: argparse.Namespace) -> int:
     return finish(options, ok, findings=[asdict(finding) for finding in findings])
 
 
-def _python() -> Finding:
+def examine_machine() -> Iterator[Finding]:
+    """Python, cores, memory and disks."""
     ok = (3, 11) <= sys.version_info[:2] <= (3, 13) and platform.machine() == "x86_64"
     python = f"CPython {platform.python_version()} on {platform.machine()}, glibc {platform.libc_ver()[1] or 'unknown'}"
-    return Finding("python", ok, python, "use CPython 3.11 to 3.13 on x86-64, or docker compose")
-
-
-def _cores() -> Finding:
-    return Finding("cores", True, f"{usable_cores()} usable of {os.cpu_count()}: the default for --workers")
-
-
-def _memory() -> Finding:
+    yield Finding("python", ok, python, "use CPython 3.11 to 3.13 on x86-64, or docker compose")
+    yield Finding("cores", True, f"{usable_cores()} usable of {os.cpu_count()}: the default for --workers")
     available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    free = f"{available / 2**30:.1f} GiB free"
-    return Finding("memory", available > 2**30, free, "a worker takes up to 0.7 GiB: free some")
-
-
-def _disk() -> Finding:
+    remedy = "a worker takes up to 0.7 GiB: free some"
+    yield Finding("memory", available > 2**30, f"{available / 2**30:.1f} GiB free", remedy)
     free = shutil.disk_usage(Path.cwd()).free
     # A scene with one pair takes about 3.5 MB.
     room = f"{free / 2**30:.0f} GiB free here, room for about {free // 3_500_000:,} scenes"
-    return Finding("disk", free > 2**30, room, "free some")
-
-
-def _shared_memory() -> Finding:
+    yield Finding("disk", free > 2**30, room, "free some")
     free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else 0
     # Ray's object store wants 200 MiB.
-    return Finding("/dev/shm", free > 200 * 2**20, f"{free / 2**20:.0f} MiB free", "docker run --shm-size=1g")
+    yield Finding("/dev/shm", free > 200 * 2**20, f"{free / 2**20:.0f} MiB free", "docker run --shm-size=1g")
 
 
 def _ray() -> Finding:

@@ -122,7 +122,7 @@ def supervise(options: argparse.Namespace) -> int:
 
 def drive(options: argparse.Namespace) -> int:
     """`verso drive`."""
-    from services.queue.drivers import Ending, Sharing, drive
+    from services.queue.drivers import Ending, drive, sharing_of
     from services.run.run_job import RunRequest, run_job
 
     queue = open_queue(_place(options))
@@ -132,7 +132,7 @@ def drive(options: argparse.Namespace) -> int:
             file = Path(folder) / "job.yaml"
             file.write_text(asked.text, encoding="utf-8")
             job = load_job(file, asked.changes)
-        request = RunRequest(job, Path(asked.folder), asked.out, "auto", asked.retry_failed, sharing=Sharing(queue))
+        request = RunRequest(job, Path(asked.folder), asked.out, "auto", asked.retry_failed, sharing=sharing_of(queue))
         result = run_job(request)
         complete, answer = tell_result(asked.out, job, result)
         note = "" if complete else "scenes failed: `verso logs` says why"

@@ -1,15 +1,18 @@
 """A dataset opened in Python: its tables as pyarrow datasets, and its pairs one after the other.
 
 A choice of pairs is one expression over one Arrow table a range, which has the columns of scenes, views and assets. `verso.open`
-is the door to this file. Splits of instances have shares that hold within each category.
+is the door to this file. Splits of instances have shares that hold within each category. `make_scene` makes the pairs of one
+scene in this process and keeps them in memory: no Ray, no folder.
 """
 
+import copy
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,17 +22,20 @@ import pyarrow.dataset as ds
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import SCHEMAS, TABLES
-from schemas.errors import InputError, command_line, did_you_mean
+from schemas.errors import CorruptError, InputError, SceneError, command_line, did_you_mean, needs_making
 from schemas.job.assets import SplitShares
 from schemas.job.job import Job
+from schemas.job.views import Patch
+from schemas.scene.scene import SceneOutput
 from schemas.scene.view import ROLES
 from services.dataset.pair import Pair, read_pair
-from services.dataset.shapes import RangeFiles, StoredFiles
+from services.dataset.shapes import RangeFiles, Shapes, StoredFiles
 from services.dataset.view import Files
-from services.job.record import read_success, require_job
+from services.job.record import JobRecord, read_success, record_job, require_job
 from services.read.dataset_reader import StoredTables, find_records
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
+from workers.store.manifest import table_of_rows
 from workers.store.store import Store
 
 MOST_INSTANCES = 10_000
@@ -233,3 +239,59 @@ def iter_pairs(rows: Callable[[str], pa.Table], files: Files, where: pc.Expressi
         labels[row["pose_id"], row["role"]].append(row | {"asset": assets[row["instance_id"]]})
     for number in np.argsort(table.column("parent_id").to_numpy()):
         yield read_pair(table.slice(number, 1).to_pylist()[0], labels, files)
+
+
+def make_scene(
+    job: str | Path | Mapping[str, Any] | Job, scene_id: int, changes: Sequence[str] = ()
+) -> tuple[Pair, ...]:
+    """The pairs of one scene, the same to the byte as a run of the job stores them.
+
+    `job`: a job file, or its keys, or a Job, with `changes` such as "start.pose=tumbled". Relative folders start from the job
+    file, else from here. The first call of a process prepares the renderer. Raises JobError where the job is wrong,
+    SceneError where this scene cannot be made, MachineError where what makes data is not installed.
+    """
+    with needs_making("verso.make_scene"):
+        from workers.capture.results import open_sources
+        from workers.scene.context import Stopwatch, open_worker
+        from workers.shard.run_shard import run_scene
+
+    parsed, folder = _parse(job, changes)
+    catalogue = open_sources(parsed, folder)
+    output = run_scene(open_worker(parsed, catalogue), scene_id, Stopwatch())
+    for row in output.rows.get("failures", ()):
+        raise SceneError(str(row["reason"]), f"scene {scene_id} cannot be made ({row['stage']}): {row['detail']}")
+    files = _MadeFiles(output, record_job(parsed, catalogue.digest, folder))
+    return tuple(iter_pairs(lambda table: table_of_rows(table, output.rows[table]), files))
+
+
+def _parse(job: str | Path | Mapping[str, Any] | Job, changes: Sequence[str]) -> tuple[Job, Path]:
+    """The job, and the folder that its relative paths start from."""
+    from services.job.job_file import change_key, load_job, validate_job  # what opens a dataset needs none of it
+
+    if isinstance(job, str | Path):
+        return load_job(Path(job), changes), Path(job).parent
+    tree = job.model_dump(mode="json") if isinstance(job, Job) else copy.deepcopy(dict(job))
+    for change in changes:
+        change_key(tree, change)
+    return validate_job(tree, "the job"), Path()
+
+
+class _MadeFiles:
+    """The encoded files of one scene."""
+
+    def __init__(self, output: SceneOutput, record: JobRecord) -> None:
+        self._data = {file.path: file.data for file in output.files}
+        shapes = Shapes(self._shape, record)
+        self.mesh, self.samples = shapes.mesh, shapes.samples
+        self.patch: Patch = record.job.images.patch
+
+    def _shape(self, path: str) -> bytes:
+        if path not in self._data:
+            raise FileNotFoundError(path)
+        return self._data[path]
+
+    def image(self, path: str) -> bytes:
+        """The bytes of an image."""
+        if path not in self._data:
+            raise CorruptError(f"{path} was not made")
+        return self._data[path]

@@ -8,14 +8,11 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import samples_path, tar_path
-from schemas.errors import CorruptError
+from schemas.dataset.layout import samples_path
 from schemas.job.views import Patch
 from services.job.record import JobRecord
-from services.read.dataset_reader import decode_samples
-from workers.store.commit import read_committed
+from services.read.dataset_reader import Members, committed_reader, decode_samples, file_reader
 from workers.store.store import Store
-from workers.store.tars import read_tar
 
 if TYPE_CHECKING:
     import trimesh
@@ -70,9 +67,7 @@ class Shapes:
 
 
 TAR_BYTES = 256 << 20
-"""Bytes of images from tars that are kept; always at least one tar."""
-
-Members = dict[str, bytes]
+"""Bytes of images from tars that are kept."""
 
 
 class StoredFiles:
@@ -82,34 +77,13 @@ class StoredFiles:
         self.store = store
         self.shapes = Shapes(store.read, job)
         self.patch: Patch = job.job.images.patch
-        self._tars: LRUCache[str, Members] = LRUCache(TAR_BYTES, lambda tar: sum(map(len, tar.values())))
-
-    def tar(self, record: CommitRecord, category: str) -> Members:
-        """The images in a commit's tar of one category, by path; none where it has none."""
-        path = tar_path(category, record.span.start, record.span.retry)
-        if path in self._tars:
-            return self._tars[path]
-        if path not in {entry.path for entry in record.files}:
-            return {}
-        members = dict(read_tar(category, read_committed(self.store, record, path), path))
-        if sum(map(len, members.values())) <= TAR_BYTES:
-            self._tars[path] = members
-        return members
+        self.tars: LRUCache[str, Members] = LRUCache(TAR_BYTES, lambda tar: sum(map(len, tar.values())))
 
 
 class RangeFiles:
     """The files of one committed range."""
 
     def __init__(self, files: StoredFiles, records: Sequence[CommitRecord]) -> None:
-        self._files, self._records = files, records
         self.patch, self.mesh, self.samples = files.patch, files.shapes.mesh, files.shapes.samples
-
-    def image(self, scene_id: int, path: str) -> bytes:
+        self.image = file_reader(committed_reader(files.store, records), records, files.tars)
         """The bytes of an image, published or not yet. Raises CorruptError where it is missing."""
-        record = next(one for one in reversed(self._records) if scene_id in one.span.scene_ids)
-        if record.terms.layout == "files":
-            return read_committed(self._files.store, record, path)
-        members = self._files.tar(record, path.partition("/")[0])
-        if path not in members:
-            raise CorruptError(f"{path} is committed and in no tar: `verso verify OUT` tells more")
-        return members[path]

@@ -70,7 +70,7 @@ class Files(Protocol):
     patch: Patch
     """The size of patches in this dataset."""
 
-    def image(self, scene_id: int, path: str) -> bytes:
+    def image(self, path: str) -> bytes:
         """The bytes of an image. Raises CorruptError where it is missing."""
 
     def mesh(self, scene: Mapping[str, Any], region: int) -> "trimesh.Trimesh":
@@ -127,7 +127,7 @@ class Pixels:
             hint = f": a job stores it whose targets.views names {target}" if target else ""
             raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}{hint}")
         path = self._paths[kind]
-        return decode_png(self._files.image(self._scene["scene_id"], path), path)
+        return decode_png(self._files.image(path), path)
 
     def rgb(self) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB."""

@@ -1,6 +1,5 @@
 """What an export reads: the scenes and pairs of a dataset that were chosen, and the sources of their shapes."""
 
-import contextlib
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import PixelKind, patch_index
-from schemas.errors import CorruptError
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import DRAWN_ROLES, Role
@@ -22,13 +20,13 @@ from services.dataset.dataset import Splits, collect_ids, split_by_category, str
 from services.read.dataset_reader import (
     ReadFile,
     StoredRange,
+    committed_reader,
     decode_samples,
     file_reader,
     patch_paths,
-    read_image,
     view_paths,
 )
-from workers.store.commit import read_committed, split_code
+from workers.store.commit import split_code
 from workers.store.images import decode_png, encode_png
 from workers.store.ledger import range_rows, read_range
 from workers.store.store import Store
@@ -98,7 +96,7 @@ class ExportPair:
     def pixels(self, role: Role, kind: PixelKind) -> NDArray | None:
         """An image decoded: [H, W, 3] uint8 RGB, [H, W] uint16 depth, [H, W] uint8 regions; None where there is none."""
         data = self.image(role, kind)
-        return None if data is None else read_image(lambda _: data, f"{kind} of the {role} view of pose {self.pose_id}")
+        return None if data is None else decode_png(data, f"{kind} of the {role} view of pose {self.pose_id}")
 
     def depth(self, role: Role, units_per_m: float) -> bytes | None:
         """The PNG of a view's depth in other units; what does not fit 16 bits becomes 0, as all depth out of range."""
@@ -173,23 +171,11 @@ def scenes_of(store: Store, stored: StoredRange, chosen: Sequence[int], splits: 
     """The chosen scenes of a range, in order. Files are read when they are asked for; tars are read once."""
     if not chosen:
         return
-    read_plain = _committed_reader(store, stored)
-    read = file_reader(read_plain, stored)
+    read_plain = committed_reader(store, stored.records)
+    read = file_reader(read_plain, stored.records)
     assets = {row["instance_id"]: {**row, "split": splits.of(row)} for row in stored.rows["assets"]}
     rows = {row["scene_id"]: row for row in stored.rows["scenes"]}
     for scene_id in chosen:
         pairs = enumerate(stored.pairs(scene_id))
         pairs_read = tuple(ExportPair(number, views, tuple(objects), read) for number, (views, objects) in pairs)
         yield ExportScene(rows[scene_id], pairs_read, assets, read_plain, stored)
-
-
-def _committed_reader(store: Store, stored: StoredRange) -> ReadFile:
-    """Reads files of a range, published or, where a run is at work, not yet. Raises CorruptError for one that is missing."""
-
-    def read(path: str) -> bytes:
-        for record in stored.records[:-1]:
-            with contextlib.suppress(CorruptError):
-                return read_committed(store, record, path)
-        return read_committed(store, stored.records[-1], path)
-
-    return read

@@ -24,13 +24,13 @@ class Format:
 
 
 FORMATS = {
-    "mirror-recon": Format("mirror_recon", "MirrorRecon"),
+    "mirror-recon": Format("articles", "MirrorRecon"),
     "bop": Format("bop", "Bop"),
     "webdataset": Format("shards", "WebDataset", sharded=True),
     "huggingface": Format("shards", "HuggingFace", sharded=True),
     "gltf": Format("graphics", "Gltf"),
     "occnet": Format("objects", "OccNet"),
     "pcn": Format("objects", "Pcn"),
-    "nocs": Format("nocs", "Nocs"),
+    "nocs": Format("articles", "Nocs"),
     "nerf": Format("graphics", "Nerf"),
 }

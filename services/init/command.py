@@ -23,11 +23,10 @@ from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import MOST_KEYS, validate_job
 from services.run.parts import Cut, cut_shapes
-from services.run.progress import show_counts
+from services.run.progress import finish, show_counts
 from workers.assets.catalogue import Watch
-from workers.assets.library.categories import BY_FILE, BY_FOLDER, BY_PARENT
 from workers.assets.library.copies import COPY, PART
-from workers.assets.library.guess import ON_TABLE_M, length
+from workers.assets.library.guess import BY_FILE, BY_FOLDER, BY_PARENT, ON_TABLE_M, length
 from workers.assets.library.making import Making, locked, remake_library
 from workers.assets.library.shapes import load_shape, make_shapes, with_shape
 from workers.assets.library.table import TABLE_FILE, Library, Row, write_table, write_whole
@@ -91,7 +90,9 @@ def main(options: argparse.Namespace) -> int:
     folder: Path = options.folder
     out: Path = options.out or Path(f"{dataset_name(folder)}_library")
     making = read_making(options)
-    _check_target(out)
+    holds = [path.name for path in out.iterdir()] if out.is_dir() else []
+    if out.exists() and TABLE_FILE not in holds and (not out.is_dir() or set(holds) - {".lock"}):
+        raise OutputError(f"{out} is there already, and no library: remove it, or choose another --out")
     with locked(out, wait=False):
         return _init(options, folder, out, making)
 
@@ -122,16 +123,8 @@ def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) 
     print("\n".join(f"  {line}" for line in (*describe_decisions(used), *asked)))
     look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
     print(look, command_line("run", out / JOB_FILE, "--scenes", 8))
-    if options.json:
-        tree = {
-            "library": str(out),
-            "job": str(out / JOB_FILE),
-            "sheet": sheet and str(sheet),
-            "categories": categories,
-        }
-        objects, others = [_plain(row) for row in used], [_plain(row) for row in left_out]
-        print(json.dumps({"ok": True, **tree, "objects": objects, "left_out": others}))
-    return 0
+    tree = {"library": str(out), "job": str(out / JOB_FILE), "sheet": sheet and str(sheet), "categories": categories}
+    return finish(options, True, **tree, objects=list(map(_plain, used)), left_out=list(map(_plain, left_out)))
 
 
 def _plain(row: Row) -> dict[str, object]:
@@ -155,13 +148,6 @@ def read_making(options: argparse.Namespace) -> Making:
     if options.licence is not None and not (options.licence.strip() and options.licence.isprintable()):
         raise InputError("--licence: write some words")
     return Making(by, tuple(options.unit), options.up, options.licence, limits)
-
-
-def _check_target(out: Path) -> None:
-    if not out.exists() or (out / TABLE_FILE).is_file():
-        return
-    if not out.is_dir() or any(path.name != ".lock" for path in out.iterdir()):
-        raise OutputError(f"{out} is there already, and no library: remove it, or choose another --out")
 
 
 def fill_library(library: Library, watch: Watch) -> Library:

@@ -117,21 +117,6 @@ def notes_of(row: Row) -> tuple[str, ...]:
     return f"{length(size)} across, {how} for a table: see `unit`", *row.mended
 
 
-def _caption_of(row: Row) -> tuple[str, ...]:
-    """Its lines below the picture."""
-    size, _, pictures, up = describe_row(row)
-    closed = "closed" if row.watertight else "not closed"
-    return row.path, f"{row.category}, {size} cm, up: {up}", f"{row.faces} faces, {closed}, pictures: {pictures}"
-
-
-def _warnings_of(row: Row) -> tuple[str, ...]:
-    """The lines that ask for attention."""
-    if row.shape_up is None:
-        return "which way is up is not known", *notes_of(row)
-    doubt = f"by its shape {row.shape_up} is up ({'sure' if row.sure else 'likely'})"
-    return (doubt,) * (row.shape_up != row.up) + notes_of(row)
-
-
 MOST = 60
 """Pictures on a page."""
 
@@ -183,8 +168,17 @@ Line = tuple[str, str, ImageFont.FreeTypeFont | ImageFont.ImageFont]
 
 
 def _caption(row: Row, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[Line]:
-    told = [(line, "black") for line in _caption_of(row)] + [(line, WARNING) for line in _warnings_of(row)]
-    return [(line, colour, font) for text, colour in told for line in fold(_letters(text), TILE[0], font.getlength)]
+    """Its lines below the picture, and those that ask for attention."""
+    size, _, pictures, up = describe_row(row)
+    closed = "closed" if row.watertight else "not closed"
+    lines = [row.path, f"{row.category}, {size} cm, up: {up}", f"{row.faces} faces, {closed}, pictures: {pictures}"]
+    warnings = [*notes_of(row)]
+    if row.shape_up is None:
+        warnings.insert(0, "which way is up is not known")
+    elif row.shape_up != row.up:
+        warnings.insert(0, f"by its shape {row.shape_up} is up ({'sure' if row.sure else 'likely'})")
+    texts = [(text, "black") for text in lines] + [(text, WARNING) for text in warnings]
+    return [(line, colour, font) for text, colour in texts for line in fold(_letters(text), TILE[0], font.getlength)]
 
 
 def _write_lines(pen: ImageDraw.ImageDraw, at: tuple[int, int], lines: Sequence[Line]) -> int:

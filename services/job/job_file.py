@@ -3,12 +3,12 @@
 Keys that a job sets and that cannot act, because another key switches off what they shape, are told, never ignored in silence.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from schemas.base import set_key
 from schemas.dataset.layout import SWITCHES, is_stored
@@ -16,7 +16,6 @@ from schemas.errors import JobError, did_you_mean, plain_line
 from schemas.job.job import Job
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.packed import is_packed, pack, unpack
-from services.job.reference import allowed_keys
 
 MOST_BYTES = 250_000
 """Longest job file; the longest example has 2,000 bytes."""
@@ -67,6 +66,24 @@ def describe_fault(fault: Any) -> str:
     if not words:
         return message  # of several keys, which it names
     return f"{key}: {plain_line(repr(fault['input']))}: {message[:1].lower()}{message[1:]}"
+
+
+def allowed_keys(path: Sequence[str]) -> list[str]:
+    """Names of the keys that are siblings of a path's last part; the path may hold positions in lists."""
+    models: list[type[BaseModel]] = [Job]
+    for name in (part for part in path[:-1] if not part.isdigit()):
+        fields = [model.model_fields[name] for model in models if name in model.model_fields]
+        models = [branch for field in fields for branch in models_in(field.annotation)]
+    return sorted({name for model in models for name in model.model_fields})
+
+
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models in the annotation of a key."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+        return
+    for argument in get_args(annotation):
+        yield from models_in(argument)
 
 
 def _message(fault: Any) -> str:

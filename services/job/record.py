@@ -118,11 +118,10 @@ def decode_job(data: bytes, name: str) -> JobRecord:
         if not folder.startswith("/") or any(unicodedata.category(letter) == "Cc" for letter in folder):
             raise TypeError(f"folder: {folder!r} is not an absolute path")
         return JobRecord(job, **texts, inputs=inputs)
-    except JobError as error:
-        problem = str(error).splitlines()[0].removeprefix(f"{name}: ")
-        raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (JobError, ValueError, TypeError, KeyError, AttributeError) as error:
         problem = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        if isinstance(error, JobError):
+            problem = str(error).splitlines()[0].removeprefix(f"{name}: ")
         raise CorruptError(f"{name} is not a job that `verso run` wrote: {problem}; {REMEDY}") from error
 
 

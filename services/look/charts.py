@@ -12,6 +12,9 @@ from schemas.errors import number
 FINE = 960
 """Number of equal steps that are counted: a multiple of every number of bars that a chart may have."""
 
+DEPTH_M = (0.0, 9.6)
+"""Range of counted depth, metres: stored depth ends at 8 m by default."""
+
 
 @dataclass(frozen=True)
 class Histogram:

@@ -11,14 +11,13 @@ import trimesh
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.dataset.codec import Row, read_camera, read_world_poses
 from schemas.errors import VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
-from services.look.collect import choose_spread
-from services.look.pictures import PLAIN, SHOWN_ROLES, PairImages, metres_of, read_pair
-from services.read.dataset_reader import file_reader, find_scene
+from services.dataset.dataset import Dataset
+from services.dataset.view import View
+from services.look.pictures import SHOWN_ROLES
 from services.read.scene_geometry import posed_scene
-from workers.geometry.camera import unproject
+from workers.geometry.camera import spread_evenly
 from workers.store.store import Store
 
 MOST_POINTS = 90_000
@@ -81,48 +80,34 @@ class Space:
 
 def read_spaces(store: Store, scene_ids: Sequence[int]) -> tuple[Space, ...]:
     """At most `MOST_SPACES` of these scenes, evenly. Raises CorruptError for damaged images."""
-    chosen = choose_spread(scene_ids, MOST_SPACES)
+    chosen = [scene_ids[place] for place in spread_evenly(len(scene_ids), MOST_SPACES)]
     most = MOST_POINTS if len(chosen) == 1 else FEWER_POINTS
     return tuple(filter(None, (read_space(store, scene_id, most) for scene_id in chosen)))
 
 
 def read_space(store: Store, scene_id: int, most_points: int = MOST_POINTS) -> Space | None:
-    """Clouds and mesh of a scene's first pair; None where it has no depth. Raises CorruptError for damaged images."""
-    stored = find_scene(store, scene_id)
-    scene = stored.scene(scene_id)
-    if scene is None:
-        return None
-    views, _ = next(stored.pairs(scene_id))
-    images = read_pair(file_reader(store.read, stored), views, PLAIN)
-    target = np.mean([pose[:3, 3] for region, pose in read_world_poses(scene).items() if region > 2], axis=0)
-    clouds = tuple(
-        cloud_of(role, images, views[role], target, most_points) for role in SHOWN_ROLES if (role, "depth") in images
-    )
-    if not clouds:
-        return None
-    bodies, missing = _read_bodies(store, scene_id)
-    return Space(scene_id, scene["category"], target, clouds, bodies, missing)
+    """Clouds and mesh of a scene's first pair; None where it was not made. Raises CorruptError for damaged images."""
+    for pair in Dataset(store).scene(scene_id):
+        target = np.mean([pose[:3, 3] for region, pose in pair.T_world.items() if region > REGION_TABLE], axis=0)
+        views = (pair.views[role] for role in SHOWN_ROLES if role in pair.views)
+        clouds = tuple(cloud_of(view, target, most_points) for view in views)
+        return Space(scene_id, pair.category, target, clouds, *_read_bodies(store, scene_id))
+    return None
 
 
-def cloud_of(role: str, images: PairImages, view: Row, target: Array, most_points: int) -> Cloud:
+def cloud_of(view: View, target: Array, most_points: int) -> Cloud:
     """The cloud of one view's depth, in its colours; grey without RGB."""
-    camera = read_camera(view)
-    depth = metres_of(images[role, "depth"], view)
-    regions = images[role, "region"]
-    rows, columns = np.nonzero(depth > 0)
-    z = depth[rows, columns]
-    T = camera.T_world_cam
-    points = unproject(rows, columns, z, camera.intrinsics) @ T[:3, :3].T + T[:3, 3]
-    region = regions[rows, columns]
-    near = np.hypot(*(points[:, :2] - target[:2]).T) < REACH_M
+    seen = view.cloud("world", None)
+    at = tuple(seen.pixels.T)
+    region, z = view.segment()[at], view.depth()[at] / view.depth_units_per_m
+    near = np.hypot(*(seen.points[:, :2] - target[:2]).T) < REACH_M
     kept = np.zeros(0, np.int64)
     for group in (region >= REGION_FIRST_OBJECT, region == REGION_TABLE, region == REGION_FLOOR):
         kept = np.append(kept, _evenly(np.flatnonzero(near & group), most_points - len(kept)))
-    rgb = images.get((role, "rgb"))
-    colors = np.full((len(kept), 3), 150, np.uint8) if rgb is None else rgb[rows[kept], columns[kept]]
+    colors = np.full((len(kept), 3), 150, np.uint8) if seen.colours is None else seen.colours[kept]
     ours = z[region >= REGION_FIRST_OBJECT]
-    size_m = float(np.median(ours if ours.size else z)) / camera.intrinsics.fx if z.size else 0.01
-    return Cloud(role, points[kept], colors, size_m, T)
+    size_m = float(np.median(ours if ours.size else z)) / view.camera.intrinsics.fx if z.size else 0.01
+    return Cloud(view.role, seen.points[kept], colors, size_m, view.T_world_cam)
 
 
 def _evenly(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:

@@ -1,74 +1,20 @@
-"""The figures of a dataset from batches of its tables: rows of a large dataset are never all in memory."""
+"""The figures of a dataset, and of its scenes, the worst first, asked of its tables: their rows are never all in memory."""
 
-import math
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from itertools import groupby
-from operator import itemgetter
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
-from schemas.dataset.commit import CommitRecord
-from services.job.record import read_success
-from services.look.charts import Histogram
+from schemas.job.assets import SplitShares
+from services.dataset.dataset import Splits, collect_ids, split_by_category, strictest
+from services.look.charts import DEPTH_M, Histogram
 from services.read.dataset_reader import StoredTables
-from workers.store.commit import list_codes, split_code
-from workers.store.ledger import range_rows, read_range
-from workers.store.manifest import join_rows
-from workers.store.store import Store
+from services.read.query import ask, query
 
 MOST_RANGES = 256
 """Largest number of ranges that are read of a dataset that is not merged; more are sampled evenly."""
-
-BATCH_ROWS = 16_384
-
-
-@dataclass(frozen=True)
-class Tables:
-    """The rows of a dataset: its merged tables, or those of committed ranges."""
-
-    store: Store
-    merged: bool
-    ranges: tuple[tuple[int, tuple[int, ...]], ...]
-    """(first scene, retries) of the ranges that are read where it is not merged."""
-    sampled: bool
-    """Whether rows of some ranges only are read."""
-
-    def batches(self, table: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """The rows in order of files, with these columns; those that old files lack are null.
-
-        Raises CorruptError where a range's file does not match its commit, pyarrow's errors where a merged one is damaged.
-        """
-        if self.merged:
-            rows = StoredTables(self.store).dataset(table)
-            for batch in rows.to_batches(columns=list(columns), batch_size=BATCH_ROWS):
-                yield pa.table(batch)
-        for records in self._records:
-            yield join_rows(table, [range_rows(self.store, records, table)]).select(list(columns))
-
-    @cached_property
-    def _records(self) -> list[list[CommitRecord]]:
-        return [read_range(self.store, start, retries) for start, retries in self.ranges]
-
-
-def open_tables(store: Store) -> Tables:
-    """The tables of a dataset as it is now, which may have no rows yet."""
-    if read_success(store) is not None:
-        return Tables(store, True, (), False)
-    codes = map(split_code, list_codes(store))
-    ranges = [(start, tuple(retry for _, retry in group)) for start, group in groupby(codes, key=itemgetter(0))]
-    return Tables(store, False, tuple(choose_spread(ranges, MOST_RANGES)), len(ranges) > MOST_RANGES)
-
-
-def choose_spread(items: Sequence, count: int) -> list:
-    """`count` of the items, or all of them, evenly from the first to the last."""
-    if len(items) <= count:
-        return list(items)
-    return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
 @dataclass
@@ -91,43 +37,36 @@ class Failure:
     kind: str
     stage: str
     scenes: int
-    examples: tuple[int, ...]
+    examples: Sequence[int]
     detail: str
 
 
-GROUNDS = ("table", "board")
-"""Categories of assets that objects stand on."""
-
-MOST_EXAMPLES = 5
-DISTANCE_M = (0.0, 9.6)
-
-
-@dataclass
+@dataclass(frozen=True)
 class Figures:
     """What the tables of a dataset say."""
 
     sampled: bool
     """Whether some of the ranges only were read."""
-    by_category: Counter[str] = field(default_factory=Counter)
+    by_category: Counter[str]
     """Rows of `scenes` that were read."""
-    instances: int = 0
+    instances: int
     """Number of different objects; what they stand on is not counted."""
-    views: int = 0
-    pairs: int = 0
-    files: int = 0
-    bytes: int = 0
-    seconds: float = 0.0
-    visibility: dict[str, Histogram] = field(default_factory=dict)
+    views: int
+    pairs: int
+    files: int
+    bytes: int
+    seconds: float
+    visibility: Mapping[str, Histogram]
     """By role."""
-    inclination: dict[str, Histogram] = field(default_factory=dict)
+    inclination: Mapping[str, Histogram]
     """By role, degrees below the horizontal."""
-    distance: Histogram = field(default_factory=lambda: Histogram(*DISTANCE_M))
+    distance: Histogram
     """d_z of each pair, metres."""
-    effects: dict[str, Cost] = field(default_factory=dict)
+    effects: Mapping[str, Cost]
     """The costliest first."""
-    stages: dict[str, Cost] = field(default_factory=dict)
+    stages: Mapping[str, Cost]
     """The costliest first."""
-    failures: tuple[Failure, ...] = ()
+    failures: Sequence[Failure]
 
     @property
     def scenes(self) -> int:
@@ -135,95 +74,142 @@ class Figures:
         return self.by_category.total()
 
 
-def collect(tables: Tables) -> Figures:
-    """The figures of all rows, read once, by columns."""
-    figures = Figures(tables.sampled)
-    _read_scenes(tables, figures)
-    _read_views(tables, figures)
-    _read_timings(tables, figures)
-    figures.failures = _read_failures(tables)
-    figures.instances = _count_instances(tables)
-    figures.by_category = Counter(dict(sorted(figures.by_category.items())))
-    figures.effects = dict(sorted(figures.effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0])))
-    figures.stages = dict(sorted(figures.stages.items(), key=lambda item: -item[1].seconds))
-    return figures
+_VIEWS = """
+select count(*) as views, count(*) filter (role = 'input') as pairs, coalesce(sum(len(files)), 0)::bigint as files,
+  coalesce(sum(list_sum([file.bytes for file in files])), 0)::bigint as bytes from views
+"""
+_SKIPS = """
+select skip.effect as name, skip.why as why, count(*) as times from (select unnest(skipped) as skip from scenes)
+group by all order by times desc, why
+"""
+_TIMES = """
+select time.name as name, sum(time.seconds) as seconds, count(time.seconds) as timed
+from (select unnest({}) as time from timings) group by 1
+"""
+_FAILURES = """
+select reason, kind, stage, count(*) as scenes, list(scene_id order by scene_id)[:5] as examples,
+  arg_min(detail, scene_id) as detail
+from failures group by reason, kind, stage order by scenes desc, min(scene_id)
+"""
 
 
-def _read_scenes(tables: Tables, figures: Figures) -> None:
-    columns = ("scene_id", "category", "effects", "skipped")
-    for rows in tables.batches("scenes", columns):
-        figures.by_category.update(_counts(rows.column("category")))
-        for name, runs in _counts(_flat(rows, "effects")).items():
-            figures.effects.setdefault(name, Cost()).runs += runs
-        skipped = _flat(rows, "skipped")
-        both = pc.binary_join_element_wise(pc.struct_field(skipped, "effect"), pc.struct_field(skipped, "why"), "\0")
-        for reason, times in _counts(both).items():
-            name, _, why = reason.partition("\0")
-            figures.effects.setdefault(name, Cost()).skips[why] += times
+def collect(tables: StoredTables) -> Figures:
+    """The figures of all rows."""
+
+    def rows(sql: str) -> list[dict[str, Any]]:
+        return query(tables, sql).to_pylist()
+
+    def histograms(column: str, low: float, high: float) -> dict[str, Histogram]:
+        return {role: _histogram(tables, column, role, Histogram(low, high)) for role in ("input", "mirror")}
+
+    by_category = rows("select category, count(*) as scenes from scenes group by 1 order by 1")
+    ((instances,),) = (row.values() for row in rows(f"select count(distinct instance_id) from assets where {_OBJECTS}"))
+    ((seconds,),) = (row.values() for row in rows("select coalesce(sum(total_s), 0.0) from timings"))
+    effects, stages = _read_costs(rows)
+    return Figures(
+        tables.sampled,
+        Counter({row["category"]: row["scenes"] for row in by_category}),
+        instances,
+        **rows(_VIEWS)[0],
+        seconds=seconds,
+        visibility=histograms("visible_fraction", 0.0, 1.0),
+        inclination=histograms("degrees(inclination_rad)", -96.0, 96.0),
+        distance=_histogram(tables, "d_z_m", "input", Histogram(*DEPTH_M)),
+        effects=dict(sorted(effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0]))),
+        stages=dict(sorted(stages.items(), key=lambda item: -item[1].seconds)),
+        failures=[Failure(**row) for row in rows(_FAILURES)],
+    )
 
 
-def _read_views(tables: Tables, figures: Figures) -> None:
-    for rows in tables.batches("views", ("role", "visible_fraction", "inclination_rad", "d_z_m", "files")):
-        figures.views += rows.num_rows
-        sizes = pc.struct_field(_flat(rows, "files"), "bytes")
-        figures.files += len(sizes)
-        figures.bytes += pc.sum(sizes).as_py() or 0
-        for role in ("input", "mirror"):
-            of = rows.filter(pc.field("role") == role)
-            if not of.num_rows:
-                continue
-            visibility = figures.visibility.get(role, Histogram(0.0, 1.0))
-            figures.visibility[role] = visibility.add(_numbers(of, "visible_fraction"))
-            inclination = figures.inclination.get(role, Histogram(-96.0, 96.0))
-            figures.inclination[role] = inclination.add(np.degrees(_numbers(of, "inclination_rad")))
-            if role == "input":
-                figures.pairs += of.num_rows
-                figures.distance = figures.distance.add(_numbers(of, "d_z_m"))
+_OBJECTS = "category not in ('table', 'board')"
+"""Of assets; what they stand on is not counted."""
 
 
-def _read_timings(tables: Tables, figures: Figures) -> None:
-    for rows in tables.batches("timings", ("stages", "effects", "total_s")):
-        figures.seconds += float(_numbers(rows, "total_s").sum())
-        for column, costs in (("stages", figures.stages), ("effects", figures.effects)):
-            times = pa.table(pa.RecordBatch.from_struct_array(_flat(rows, column)))
-            for row in times.group_by("name").aggregate([("seconds", "sum"), ("seconds", "count")]).to_pylist():
-                if column == "stages" or row["name"] in costs:
-                    cost = costs.setdefault(row["name"], Cost())
-                    cost.seconds += row["seconds_sum"]
-                    cost.timed += row["seconds_count"]
+def _histogram(tables: StoredTables, column: str, role: str, histogram: Histogram) -> Histogram:
+    """The histogram with a column of the views of a role, batch by batch."""
+    with ask(
+        tables, f"select {column}::double as value from views where role = '{role}' and value is not null"
+    ) as batches:
+        for batch in batches:
+            histogram = histogram.add(batch.column("value"))
+    return histogram
 
 
-def _read_failures(tables: Tables) -> tuple[Failure, ...]:
-    """Each way of failing, the most frequent first."""
-    failures: dict[tuple[str, str, str], Failure] = {}
-    for rows in tables.batches("failures", ("scene_id", "reason", "kind", "stage", "detail")):
-        for row in rows.to_pylist():
-            key = (row["reason"], row["kind"], row["stage"])
-            failure = failures.setdefault(key, Failure(*key, 0, (), row["detail"]))
-            examples = (*failure.examples, row["scene_id"])[:MOST_EXAMPLES]
-            failures[key] = replace(failure, scenes=failure.scenes + 1, examples=examples)
-    return tuple(sorted(failures.values(), key=lambda failure: -failure.scenes))
+def _read_costs(rows: Callable[[str], list[dict[str, Any]]]) -> tuple[dict[str, Cost], dict[str, Cost]]:
+    """(effects that ran or were left out, stages), by name."""
+    effects, stages = defaultdict[str, Cost](Cost), defaultdict[str, Cost](Cost)
+    for row in rows("select unnest(effects) as name, count(*) as runs from scenes group by 1"):
+        effects[row["name"]].runs = row["runs"]
+    for row in rows(_SKIPS):
+        effects[row["name"]].skips[row["why"]] = row["times"]
+    for row in rows(_TIMES.format("stages")):
+        stages[row["name"]] = Cost(0, row["seconds"], row["timed"])
+    for row in rows(_TIMES.format("effects")):
+        if row["name"] in effects:
+            effects[row["name"]].seconds, effects[row["name"]].timed = row["seconds"], row["timed"]
+    return effects, stages
 
 
-def _count_instances(tables: Tables) -> int:
-    """Number of different objects; what they stand on is not counted."""
-    seen: set[str] = set()
-    for rows in tables.batches("assets", ("instance_id", "category")):
-        objects = rows.filter(pc.invert(pc.is_in(rows.column("category"), value_set=pa.array(GROUNDS))))
-        seen.update(objects.column("instance_id").to_pylist())
-    return len(seen)
+COLUMNS: Mapping[str, tuple[str, bool | None]] = {
+    "visible, %": ("100 * v.visible", False),
+    "sides disagree, mm": ("v.disagree", True),
+    "penetration, mm": ("s.penetration_mm", True),
+    "hover, mm": ("s.hover_gap_mm", True),
+    "support margin, mm": ("s.support_margin_mm", False),
+    "processor, s": ("t.seconds", None),
+    "corner error, px": ("s.capture.reprojection_px", True),
+    "pose, mm": ("s.capture.pose_mm", True),
+    "cloud, mm": ("s.capture.cloud_median_mm", True),
+    "complete, %": ("100 * s.capture.completeness", False),
+    "measured, %": ("100 * s.capture.measured_share", False),
+    "views left out": ("len(s.capture.left_out)", True),
+}
+"""By heading: the figure in SQL, and whether more is worse, None for neither. Those that no scene has are not shown."""
+
+_SCENE_ROWS = f"""
+select s.scene_id, s.category, coalesce(s.capture.name, '') as name, s.instance_id,
+  [body.instance_id for body in s.bodies] as bodies, {", ".join(f'round({sql}, 3) as "{n}"' for n, (sql, _) in COLUMNS.items())}
+from scenes s
+left join (select scene_id, min(visible_fraction) filter (role in ('input', 'mirror')) as visible,
+  max(mirror_agreement.median_mm) as disagree from views group by 1) v using (scene_id)
+left join (select scene_id, max(total_s) as seconds from timings group by 1) t using (scene_id) order by 1
+"""
+
+MOST_RANKED, MOST_ROWS = 200_000, 500
+"""Scenes that are ranked at most, and rows of the page."""
 
 
-def _counts(values: pa.Array | pa.ChunkedArray) -> Counter[str]:
-    return Counter({count["values"]: count["counts"] for count in pc.value_counts(values).to_pylist()})
+@dataclass(frozen=True)
+class SceneTable:
+    """The worst scenes, worst first, each with `split`, `worst` (a heading) and its figures by heading, None where unknown.
+
+    `splits`: scenes by category and split, of all; empty where the dataset is too large to be ranked.
+    """
+
+    rows: Sequence[Mapping[str, Any]] = ()
+    splits: Mapping[str, Counter[str]] | None = None
 
 
-def _flat(rows: pa.Table, column: str) -> pa.Array:
-    """The items of a list column."""
-    return pc.list_flatten(rows.column(column).combine_chunks())
+def read_scene_table(tables: StoredTables, shares: SplitShares, scenes: int) -> SceneTable:
+    """The table of a dataset with so many scenes."""
+    if not 0 < scenes <= MOST_RANKED:
+        return SceneTable()
+    assets = query(tables, "select instance_id, category, split from assets").to_pylist()
+    of = Splits(split_by_category(collect_ids([assets]), shares))
+    split_of = {row["instance_id"]: of.of(row) for row in assets}
+    rows, splits = query(tables, _SCENE_ROWS).to_pylist(), dict[str, Counter[str]]()
+    for row in rows:
+        row["split"] = strictest(split_of[name] for name in row["bodies"] or [row["instance_id"]])
+        splits.setdefault(row["category"], Counter())[row["split"]] += 1
+    return SceneTable(worst_first(rows)[:MOST_ROWS], splits)
 
 
-def _numbers(rows: pa.Table, column: str) -> np.ndarray:
-    """[N] float64, NaN for null."""
-    values = rows.column(column).cast(pa.float64())
-    return pc.fill_null(values, math.nan).to_numpy()
+def worst_first(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows by the figure in which each is worse than most others (`worst`): by the share of scenes that do better there."""
+    shares = np.zeros((len(COLUMNS), len(rows)))
+    for share, (name, (_, more)) in zip(shares, COLUMNS.items(), strict=True):
+        badness = np.array([row[name] for row in rows], float) * (1 if more else -1)
+        known = np.isfinite(badness) & (more is not None)
+        share[known] = np.searchsorted(np.sort(badness[known]), badness[known]) / max(1, len(rows))
+    ranked = [{**row, "worst": [*COLUMNS][at]} for row, at in zip(rows, shares.argmax(axis=0), strict=True)]
+    return [ranked[place] for place in np.argsort(-shares.max(axis=0), kind="stable")]

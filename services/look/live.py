@@ -12,12 +12,12 @@ from cachetools import LRUCache
 
 from schemas.dataset.layout import commit_path
 from schemas.errors import OutputError, VersoError, describe_seconds, number, plural
+from services.dataset.dataset import Dataset
 from services.job.record import read_job
-from services.look.charts import Histogram
-from services.look.pictures import DEPTH_M, PLAIN, Picture, ShownScene, show_scene
+from services.look.charts import DEPTH_M, Histogram
+from services.look.pictures import PLAIN, SHOWN_ROLES, Picture, ShownScene, show_pair
 from services.look.report import Section, View, page_of, read_report
 from services.look.sheets import Address, strip_html
-from services.read.dataset_reader import file_reader, read_stored
 from services.read.status import Status, read_status
 from services.read.verdict import explain_damage
 from services.run.lock import shows_life
@@ -83,16 +83,16 @@ def latest_scenes(store: Store, count: int = LATEST) -> list[ShownScene]:
     entries = {start: store.stat(commit_path(start, retry)) for start, retry in codes}
     written = {start: entry.modified_s if entry else 0.0 for start, entry in entries.items()}
     shown: list[ShownScene] = []
+    dataset, depth = Dataset(store), {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
     for start in sorted(written, key=lambda start: (-written[start], -start)):
-        if len(shown) >= count:
+        # Committed a moment ago and not in its place yet, or damaged, which the report tells.
+        with suppress(VersoError):
+            (first, *_) = read_range(store, start, [retry for begun, retry in codes if begun == start])
+            for scene_id in reversed(first.span.scene_ids):
+                if len(shown) < count and (pairs := dataset.scene(scene_id)):
+                    shown.append(show_pair(pairs[0], depth, PLAIN))
+        if len(shown) == count:
             break
-        try:
-            stored = read_stored(store, read_range(store, start, [retry for first, retry in codes if first == start]))
-            read, depth = file_reader(store.read, stored), {role: Histogram(*DEPTH_M) for role in ("input", "mirror")}
-            for row in stored.rows["scenes"][: -(count - len(shown)) - 1 : -1]:
-                shown.append(show_scene(read, stored, row, depth, PLAIN))
-        except VersoError:  # committed a moment ago and not in its place yet, or damaged, which the report tells
-            continue
     return shown
 
 

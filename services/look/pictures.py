@@ -8,28 +8,21 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import count, cycle, takewhile
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 from trimesh.visual.color import interpolate
 
-from schemas.dataset.codec import Row
-from schemas.dataset.layout import patch_index
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import MODALITIES, PixelKind
-from services.look.charts import Histogram
-from services.look.collect import Tables, choose_spread
-from services.read.dataset_reader import (
-    ReadFile,
-    StoredRange,
-    file_reader,
-    find_scene,
-    patch_paths,
-    read_image,
-    view_paths,
-)
+from services.dataset.dataset import Dataset
+from services.dataset.pair import Pair
+from services.dataset.view import Pixels
+from services.look.charts import DEPTH_M, Histogram
+from services.read.dataset_reader import StoredTables
+from services.read.query import query
+from workers.geometry.camera import spread_evenly
 from workers.store.store import Store
 
 MOST_WIDTH = 480
@@ -177,34 +170,6 @@ def _palette() -> list[int]:
     return [int(value) for value in np.concatenate([np.array(FIXED_REGIONS), objects]).ravel()]
 
 
-PairImages: TypeAlias = Mapping[tuple[str, str], NDArray]
-"""Images by role (input, mirror, projected) and kind of pixels, as `view_paths` names them, as far as they are stored."""
-
-
-def read_pair(read: ReadFile, views: Mapping[str, Row], kinds: Collection[PixelKind] | None = None) -> PairImages:
-    """The stored images of a pair but for aligned ones, of these modalities or of all.
-
-    Raises CorruptError where one is missing or damaged.
-    """
-    return {
-        (role, kind): read_image(read, path)
-        for role, row in views.items()
-        if role != "aligned"
-        for kind, path in view_paths(row).items()
-        if kinds is None or kind in kinds
-    }
-
-
-def metres_of(depth: NDArray, view: Row) -> NDArray:
-    """[H, W] float64, metres; 0 where there is no depth."""
-    metres: NDArray = depth / view["depth_units_per_m"]
-    return metres
-
-
-DEPTH_M = (0.0, 9.6)
-"""Range of counted depth, metres: stored depth ends at 8 m by default."""
-
-
 @dataclass(frozen=True)
 class ShownScene:
     """One scene of the page: its pictures by name (`input rgb`, `mirror normals patch`, `over`), and what is told beside them."""
@@ -219,15 +184,12 @@ class ShownScene:
     d_z_m: float | None
 
 
-def choose_scenes(tables: Tables, scenes: int) -> list[int]:
+def choose_scenes(tables: StoredTables, scenes: int) -> list[int]:
     """At most `scenes` scene ids, equally many of each category, evenly over its ids; at least one of each."""
-    by_category: dict[str, list[int]] = {}
-    for rows in tables.batches("scenes", ("scene_id", "category")):
-        ids, names = rows.column("scene_id").to_numpy(), np.asarray(rows.column("category").to_pylist())
-        for category in np.unique(names).tolist():
-            by_category.setdefault(category, []).extend(ids[names == category].tolist())
+    sql = "select list(scene_id order by scene_id) as ids from scenes group by category order by category"
+    by_category = query(tables, sql)["ids"].to_pylist()
     each = max(1, scenes // max(len(by_category), 1))
-    return [scene_id for name in sorted(by_category) for scene_id in choose_spread(by_category[name], each)]
+    return [ids[place] for ids in by_category for place in spread_evenly(len(ids), each)]
 
 
 def show_scenes(store: Store, scene_ids: Iterable[int]) -> tuple[list[ShownScene], Mapping[str, Histogram]]:
@@ -235,72 +197,57 @@ def show_scenes(store: Store, scene_ids: Iterable[int]) -> tuple[list[ShownScene
 
     Raises CorruptError where an image is missing or damaged.
     """
-    shown, depth = [], {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
-    for scene_id in scene_ids:
-        stored = find_scene(store, scene_id)
-        row = stored.scene(scene_id)
-        if row is not None:
-            shown.append(show_scene(file_reader(store.read, stored), stored, row, depth))
-    return shown, depth
+    dataset, depth = Dataset(store), {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
+    return [show_pair(pairs[0], depth) for scene_id in scene_ids if (pairs := dataset.scene(scene_id))], depth
 
 
-def show_scene(
-    read: ReadFile,
-    stored: StoredRange,
-    scene: Row,
-    depth: dict[str, Histogram],
-    kinds: Collection[PixelKind] | None = None,
-) -> ShownScene:
-    """The pictures of a scene's first pair, of these modalities or of all; the depth of its objects is added to `depth`."""
-    views, _ = next(stored.pairs(scene["scene_id"]))
-    images = read_pair(read, views, kinds)
-    bodies = scene["bodies"] or [scene]
-    index = patch_index(REGION_FIRST_OBJECT, len(bodies))
+def show_pair(pair: Pair, depth: dict[str, Histogram], kinds: Collection[PixelKind] | None = None) -> ShownScene:
+    """The pictures of a scene by its first pair, of these modalities or of all; the depth of its objects is added to `depth`."""
     pictures: dict[str, Picture] = {}
-    for role in (role for role in SHOWN_ROLES if role in views):
-        whole = {kind: pixels for (of, kind), pixels in images.items() if of == role}
-        patches = _read_patches(read, patch_paths(views[role], index), kinds)
-        pictures |= view_pictures(role, whole, views[role]) | view_pictures(role, patches, views[role], PATCH)
+    for role in (role for role in SHOWN_ROLES if role in pair.views):
+        view = pair.views[role]
+        whole, units_per_m = _read_images(view, kinds), view.depth_units_per_m
+        pictures |= view_pictures(role, whole, units_per_m)
+        if (patch := view.patch()) is not None:
+            plain = [kind for kind in ("rgb", "depth") if kind in patch.images and (kinds is None or kind in kinds)][:1]
+            has_targets = kinds is None and set(patch.images) - set(PLAIN)
+            pictures |= view_pictures(role, _read_images(patch, None if has_targets else plain), units_per_m, PATCH)
         if {"depth", "region"} <= whole.keys():
-            metres = metres_of(whole["depth"], views[role])
-            depth[role] = depth[role].add(metres[(whole["region"] >= REGION_FIRST_OBJECT) & (metres > 0)])
-    mirror, projected = images.get(("mirror", "rgb")), images.get(("projected", "rgb"))
-    if mirror is not None and projected is not None:
-        pictures["over"] = picture_of_projection(mirror, projected, "input view projected over the mirror view")
-    first = views["input"]
+            of_objects = (whole["region"] >= REGION_FIRST_OBJECT) & (whole["depth"] > 0)
+            depth[role] = depth[role].add(whole["depth"][of_objects] / units_per_m)
+    if pair.mirror is not None and pair.projected is not None and "rgb" in pair.projected.images:
+        over = "input view projected over the mirror view"
+        pictures["over"] = picture_of_projection(pair.mirror.rgb(), pair.projected.rgb(), over)
     return ShownScene(
-        scene["scene_id"],
-        scene["category"],
-        tuple(body["instance_id"] for body in bodies),
-        first["pose_id"],
+        pair.scene_id,
+        pair.category,
+        tuple(body["instance_id"] for body in pair.scene["bodies"] or [pair.scene]),
+        pair.pose_id,
         pictures,
-        {role: views[role]["visible_fraction"] for role in SHOWN_ROLES if role in views},
-        first["d_z_m"],
+        {role: pair.views[role].visible_fraction for role in SHOWN_ROLES if role in pair.views},
+        pair.input.d_z_m,
     )
 
 
-def _read_patches(
-    read: ReadFile, paths: Mapping[PixelKind, str], kinds: Collection[PixelKind] | None
-) -> dict[PixelKind, NDArray]:
-    """The crops about the scene's first object: all of them where there are targets, else its colours, or its depth."""
-    stored = [kind for kind in paths if kinds is None or kind in kinds]
-    plain = [kind for kind in ("rgb", "depth") if kind in stored][:1]
-    return {kind: read_image(read, paths[kind]) for kind in (stored if set(stored) - set(PLAIN) else plain)}
+def _read_images(pixels: Pixels, kinds: Collection[PixelKind] | None) -> dict[PixelKind, NDArray]:
+    return {kind: pixels.image(kind) for kind in pixels.images if kinds is None or kind in kinds}
 
 
-def view_pictures(role: str, images: Mapping[PixelKind, NDArray], view: Row, suffix: str = "") -> dict[str, Picture]:
+def view_pictures(
+    role: str, images: Mapping[PixelKind, NDArray], units_per_m: float, suffix: str = ""
+) -> dict[str, Picture]:
     """The pictures of a view's images, or of its patches, by name; depths of one series have the same span of colours."""
     there = {kind: pixels for kind in MODALITIES if (pixels := _images_of(kind, images))}
     pictures = {}
     for kinds in series_of(there).values():
-        span = _span_of(kinds, there, view)
+        span = _span_of(kinds, there, units_per_m)
         for kind in kinds:
             words = words_of(kind)
             if span:
                 words += f"{'' if kind == 'depth' else ','} {span[0]:.2f} to {span[1]:.2f} m"
             if suffix:
                 words = f"{words}, {ABOUT}" if len(there) > 1 else ABOUT
-            pictures[f"{role} {kind}{suffix}"] = _paint(kind, there, view, span, f"{role} view, {words}")
+            pictures[f"{role} {kind}{suffix}"] = _paint(kind, there, units_per_m, span, f"{role} view, {words}")
     return pictures
 
 
@@ -311,20 +258,20 @@ def _images_of(kind: PixelKind, images: Mapping[PixelKind, NDArray]) -> list[NDA
 
 
 def _span_of(
-    kinds: Sequence[PixelKind], there: Mapping[PixelKind, list[NDArray]], view: Row
+    kinds: Sequence[PixelKind], there: Mapping[PixelKind, list[NDArray]], units_per_m: float
 ) -> tuple[float, float] | None:
     """The span of the colours of depths, metres; None for other images. Targets are depths of objects alone."""
     modality = MODALITIES[kinds[0]]
     if modality.channels > 1 or modality.dtype == "uint8":
         return None
     regions = there["region"][0] if modality.target is None and "region" in there else None
-    return depth_span(np.stack([metres_of(there[kind][0], view) for kind in kinds]), regions)
+    return depth_span(np.stack([there[kind][0] for kind in kinds]) / units_per_m, regions)
 
 
 def _paint(
     kind: PixelKind,
     there: Mapping[PixelKind, list[NDArray]],
-    view: Row,
+    units_per_m: float,
     span: tuple[float, float] | None,
     words: str,
 ) -> Picture:
@@ -335,7 +282,7 @@ def _paint(
         under = there["rgb"][0] if "rgb" in there else regions[there["region"][0]]
         return picture_of_silhouettes(there[kind], under, words)
     if span is not None:
-        return picture_of_depth(metres_of(pixels, view), span, words, sharp=modality.target is not None)
+        return picture_of_depth(pixels / units_per_m, span, words, sharp=modality.target is not None)
     if modality.channels == 1:
         return picture_of_regions(pixels, words)
     return picture_of_colour(pixels, words) if modality.dtype == "uint8" else picture_of_codes(pixels, words)

@@ -15,17 +15,18 @@ from schemas.errors import MachineError, OutputError, command_line, plural
 from services.job.record import JobRecord, read_success, require_job
 from services.look.charts import Histogram
 from services.look.clouds import Space, pack_spaces, read_spaces
-from services.look.collect import Figures, collect, open_tables
+from services.look.collect import MOST_RANGES, Figures, SceneTable, collect, read_scene_table
 from services.look.pictures import ShownScene, choose_scenes, show_scenes
-from services.look.scene_table import SceneTable, read_scene_table, scene_table_html
 from services.look.sections import (
     charts_html,
     effects_html,
     failures_html,
     overview_html,
+    scene_table_html,
     space_html,
 )
 from services.look.sheets import Address, compare_html, sheets_html
+from services.read.dataset_reader import StoredTables
 from workers.store.store import Store
 
 WEB = Path(__file__).with_name("web")
@@ -168,7 +169,7 @@ def read_report(store: Store, scenes: int) -> Report:
     Raises OutputError where there is no dataset, CorruptError where a file is damaged.
     """
     record = require_job(store)
-    tables = open_tables(store)
+    tables = StoredTables(store, MOST_RANGES)
     shown, depth = show_scenes(store, choose_scenes(tables, scenes))
     spaces = read_spaces(store, [scene.scene_id for scene in shown])
     figures = collect(tables)

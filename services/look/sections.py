@@ -4,11 +4,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
 
-from schemas.errors import describe_seconds, milliseconds, number, plural, size
+from schemas.errors import command_line, describe_seconds, milliseconds, number, plural, size
 from schemas.job.job import Job
 from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.clouds import Space
-from services.look.collect import Cost, Failure, Figures
+from services.look.collect import COLUMNS, Cost, Failure, Figures, SceneTable
 from services.look.pictures import SHOWN_ROLES
 
 
@@ -172,3 +172,29 @@ def _times(cost: Cost) -> tuple[str, str]:
     if not cost.timed:
         return ("–", "–")
     return describe_seconds(cost.seconds), milliseconds(1e3 * cost.seconds / cost.timed)
+
+
+def scene_table_html(table: SceneTable, place: str) -> str:
+    """The table with a field that filters and headings that sort. `place`: the dataset, of which SQL tells the rest."""
+    if not table.rows:
+        return ""
+    shown = [name for name in COLUMNS if any(row[name] is not None for row in table.rows)]
+    rows = [
+        (
+            str(row["scene_id"]),
+            escape(f"{row['category']} {row['name']}".strip()),
+            row["split"],
+            *(_cell(row[name], name == row["worst"]) for name in shown),
+        )
+        for row in table.rows
+    ]
+    all_of_them = f"All: {command_line('query', place, 'select * from scenes')}"
+    note = f"{plural(len(rows), 'scene')}, first the worst in some figure (bold). A heading sorts. {all_of_them}"
+    field = '<label>Only with <input id="scenes-filter" type="search" placeholder="mug test"></label>'
+    html = table_html(("scene", "category", "split", *shown), rows)
+    return f'<div class="tools">{field}</div><div id="scenes-table">{html}</div><p class="note">{escape(note)}</p>'
+
+
+def _cell(value: float | None, is_worst: bool) -> str:
+    words = "–" if value is None else number(value)
+    return f"<strong>{words}</strong>" if is_worst else words

@@ -175,22 +175,19 @@ EVERY_S: Final = 5.0
 """Between two looks."""
 
 
-class Sharing:
-    """Called, it gives the number of jobs that share the cluster; what was read last where storage does not answer."""
+def sharing_of(queue: Queue, clock: Callable[[], float] = time.monotonic) -> Callable[[], int]:
+    """What tells how many jobs share the cluster, at least 1; what was read last where storage does not answer."""
+    jobs, read_at = 1, float("-inf")
 
-    def __init__(self, queue: Queue, clock: Callable[[], float] = time.monotonic) -> None:
-        self._queue = queue
-        self._clock = clock
-        self._jobs = 1
-        self._read_at = float("-inf")
-
-    def __call__(self) -> int:
-        """At least 1."""
-        if self._clock() - self._read_at >= EVERY_S:
-            self._read_at = self._clock()
+    def count() -> int:
+        nonlocal jobs, read_at
+        if clock() - read_at >= EVERY_S:
+            read_at = clock()
             with contextlib.suppress(VersoError, OSError):
-                self._jobs = self._queue.share()
-        return self._jobs
+                jobs = queue.share()
+        return jobs
+
+    return count
 
 
 FOLDER: Final = "drivers"
@@ -202,11 +199,9 @@ CONNECT_S: Final = 2.0
 def answers(http: str) -> bool:
     """Whether anything accepts a connection there."""
     place = urllib.parse.urlsplit(http)
-    try:
-        socket.create_connection((place.hostname or "", place.port or 80), timeout=CONNECT_S).close()
-    except OSError:
-        return False
-    return True
+    with contextlib.suppress(OSError), socket.create_connection((place.hostname or "", place.port or 80), CONNECT_S):
+        return True
+    return False
 
 
 class OwnDrivers(Drivers):

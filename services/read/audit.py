@@ -23,7 +23,7 @@ from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import MODALITIES, Camera, View
 from services.job.record import read_success, require_job
-from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, file_reader, find_scene
+from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
 from services.read.independent.derive import Kind, StoredPair, check_forces
 from services.read.independent.poses import check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, open_context
@@ -216,7 +216,8 @@ def verify_independently(
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
         stored = find_scene(store, scene_id)
-        scene, images = stored.scene(scene_id), file_reader(store.read, stored)
+        scene = stored.scene(scene_id)
+        images = file_reader(committed_reader(store, stored.records), stored.records)
         assert scene is not None
         verdict.faults += check_forces(job, scene)
 

@@ -6,10 +6,12 @@ Range by range or scene by scene, and as tables: pyarrow datasets.
 import io
 import itertools
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, NoReturn, TypeAlias
 
@@ -39,8 +41,8 @@ from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError, command_line
 from schemas.scene.view import MODALITIES
 from services.job.record import read_success
-from workers.store.commit import code_of, commit_names, list_codes, read_record, split_code
-from workers.store.images import decode_png
+from workers.geometry.camera import spread_evenly
+from workers.store.commit import code_of, commit_names, list_codes, read_committed, read_record, split_code
 from workers.store.ledger import list_commits, range_rows, read_range
 from workers.store.manifest import join_rows
 from workers.store.store import Store
@@ -120,40 +122,51 @@ def find_records(store: Store, scene_id: int) -> list[CommitRecord]:
     )
 
 
-def file_reader(read: ReadFile, stored: StoredRange) -> ReadFile:
-    """Reads images and shapes of a range by path, from their own place or from a tar (each tar is read once).
+def committed_reader(store: Store, records: Sequence[CommitRecord]) -> ReadFile:
+    """Reads the files of a range, published or, where a run is at work, not yet. Raises CorruptError for one that is missing."""
 
-    `read` is the store's. What comes back raises CorruptError where a file is missing.
+    def read(path: str) -> bytes:
+        for record in records[:-1]:
+            with suppress(CorruptError):
+                return read_committed(store, record, path)
+        return read_committed(store, records[-1], path)
+
+    return read
+
+
+Members = Mapping[str, bytes]
+"""Images of a tar by path."""
+
+
+def file_reader(
+    read: ReadFile, records: Sequence[CommitRecord], tars: MutableMapping[str, Members] | None = None
+) -> ReadFile:
+    """Reads images and shapes of a range by path, from their own place or from a tar, of a retry's first.
+
+    `read` gives the bytes of files and tars. A tar is read when it is first needed, and kept in `tars` by its path. What comes
+    back raises CorruptError for an image that is in no tar.
     """
+    kept = {} if tars is None else tars
+    packed = [entry.path for record in reversed(records) for entry in record.files if entry.path.endswith(".tar")]
 
-    def read_committed(path: str) -> bytes:
-        try:
+    def members_of(tar: str) -> Members:
+        if (known := kept.get(tar)) is not None:
+            return known
+        members = dict(read_tar(tar.partition("/")[0], read(tar), tar))
+        with suppress(ValueError):  # it is larger than all that is kept
+            kept[tar] = members
+        return members
+
+    def read_file(path: str) -> bytes:
+        if records[0].terms.layout == "files" or is_shape(path):
             return read(path)
-        except FileNotFoundError as error:
-            raise CorruptError(f"{path} is committed and missing: restore it from a copy") from error
+        folder = f"{path.partition('/')[0]}/"
+        for members in (members_of(tar) for tar in packed if tar.startswith(folder)):
+            if path in members:
+                return members[path]
+        raise CorruptError(f"{path} is committed and in no tar: `verso verify OUT` tells more")
 
-    if stored.records[0].terms.layout == "files":
-        return read_committed
-    members: dict[str, bytes] = {}
-    for path in (entry.path for record in stored.records for entry in record.files if entry.path.endswith(".tar")):
-        members.update(read_tar(path.partition("/")[0], read_committed(path), path))
-
-    def read_packed(path: str) -> bytes:
-        if is_shape(path):
-            return read_committed(path)
-        if path not in members:
-            raise CorruptError(f"{path} is committed and in no tar")
-        return members[path]
-
-    return read_packed
-
-
-def read_image(read: ReadFile, path: str) -> NDArray:
-    """An image by its path. Raises CorruptError where it is missing or no PNG."""
-    try:
-        return decode_png(read(path), path)
-    except ValueError as error:
-        raise CorruptError(f"{path} is not a whole PNG: {error}") from error
+    return read_file
 
 
 _SAMPLES: Mapping[str, tuple[str, tuple[int, ...]]] = {
@@ -287,30 +300,35 @@ class StoredTables:
     the first try's. Raises OutputError where there is no dataset, CorruptError where `_SUCCESS` or a commit is damaged.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, most_ranges: int | None = None) -> None:
+        """`most_ranges`: so many of an unfinished dataset are read, evenly chosen; then there may be none yet."""
+        self.store = store
+        self.sampled = False
+        """Whether rows of some ranges only are read."""
         self._done = read_success(store)
         self._plain: list[int] = []
         """Of an unfinished dataset, the ranges whose tables are in place, as they were made first."""
         self._other: list[list[CommitRecord]] = []
         """The ranges that are not published or have retries: their rows go through memory."""
         if self._done is None:
-            self._find_ranges()
+            self._find_ranges(most_ranges)
 
-    def _find_ranges(self) -> None:
-        names = commit_names(self._store)
-        if not names:
+    def _find_ranges(self, most_ranges: int | None) -> None:
+        groups = groupby(commit_names(self.store), key=itemgetter(0))
+        ranges = [(start, [retry for _, retry, _ in group]) for start, group in groups]
+        if not ranges and most_ranges is None:
             raise OutputError(
-                f"{self._store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet"
+                f"{self.store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet"
             )
         # Listed after the commits: a committed range without staging is published.
-        staged = set(self._store.children(STAGING))
-        for start, group in groupby(names, key=lambda name: name[0]):
-            retries = [retry for _, retry, _ in group]
+        staged = set(self.store.children(STAGING))
+        self.sampled = most_ranges is not None and len(ranges) > most_ranges
+        for place in spread_evenly(len(ranges), most_ranges or len(ranges)):
+            start, retries = ranges[place]
             if retries == [0] and range_name(start) not in staged:
                 self._plain.append(start)
             else:
-                records = (read_record(self._store, start, retry) for retry in retries)
+                records = (read_record(self.store, start, retry) for retry in retries)
                 self._other.append([record for record in records if record is not None])
 
     @cached_property
@@ -321,19 +339,19 @@ class StoredTables:
             any(key.startswith(f"{MANIFEST}/{table}/") for key in files) for table in TABLES
         ):
             return list(files)
-        fault = f"{SUCCESS_FILE} in {self._store.name} does not name its merged files"
+        fault = f"{SUCCESS_FILE} in {self.store.name} does not name its merged files"
         raise CorruptError(f"{fault}: remove it, and run the job again")
 
     def parts(self, table: str) -> list[Rows]:
         """The rows of one table in one or two pieces. In `assets` of an unfinished dataset an instance may be repeated."""
-        schema, files = SCHEMAS[table], file_system_of(self._store)
+        schema, files = SCHEMAS[table], file_system_of(self.store)
         if self._done is not None:
             folder = f"{MANIFEST}/{table}"
             keys = [key for key in self._merged_files if key.startswith(f"{folder}/")]
             hive: Any = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
             options = {"filesystem": files, "partition_base_dir": folder, "partitioning": hive}
             return [ds.dataset(keys, schema, _FORMAT, **options)]
-        rows = [range_rows(self._store, records, table) for records in self._other]
+        rows = [range_rows(self.store, records, table) for records in self._other]
         parts: list[Rows] = [join_rows(table, [schema.empty_table(), *rows])]
         if self._plain:
             paths = [range_table_path(start, table) for start in self._plain]

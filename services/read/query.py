@@ -36,16 +36,17 @@ BATCH_ROWS = 4096
 
 
 @contextmanager
-def ask(store: Store, sql: str) -> Iterator[pa.RecordBatchReader]:
+def ask(source: Store | StoredTables, sql: str) -> Iterator[pa.RecordBatchReader]:
     """The result of one SQL query over the tables scenes, views, objects, assets, failures and timings, as it comes.
 
     A finished dataset is read from its merged tables, an unfinished one through its commits, where a retry's rows replace
     the first try's. Raises, also while the reader is read, InputError with the database's message where the SQL is wrong,
     OutputError where there is no dataset, CorruptError where a file is damaged.
     """
+    store = source.store if isinstance(source, StoredTables) else source
     with duckdb.connect(":memory:", config=dict(LOCKED)) as connection:
         with _explained(store):
-            _register(connection, store)
+            _register(connection, source if isinstance(source, StoredTables) else StoredTables(source))
             connection.execute("SET enable_progress_bar = false")  # it goes to standard output, into the answer
             connection.execute("SET lock_configuration = true")
             if not connection.extract_statements(sql):
@@ -64,9 +65,9 @@ _SHOW_TABLES = (
 """`show tables`, without the views that tables are put together from."""
 
 
-def query(store: Store, sql: str) -> pa.Table:
+def query(source: Store | StoredTables, sql: str) -> pa.Table:
     """The whole result of `ask`."""
-    with ask(store, sql) as answer:
+    with ask(source, sql) as answer:
         return answer.read_all()
 
 
@@ -98,9 +99,8 @@ def _explained(store: Store) -> Iterator[None]:
             raise InputError(f"the query failed: {line}") from error
 
 
-def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
+def _register(connection: duckdb.DuckDBPyConnection, tables: StoredTables) -> None:
     """Make a view of each table."""
-    tables = StoredTables(store)
     for table in TABLES:
         parts = tables.parts(table)
         for number, part in enumerate(parts):

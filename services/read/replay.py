@@ -17,7 +17,7 @@ from schemas.errors import CorruptError, MachineError
 from schemas.job.job import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
-from services.read.dataset_reader import StoredRange, decode_samples, file_reader, find_scene
+from services.read.dataset_reader import StoredRange, committed_reader, decode_samples, file_reader, find_scene
 from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
@@ -89,7 +89,7 @@ def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_s
     made = {file.path: file for file in output.files if not is_glb(file.path)}
     only = sorted(made.keys() ^ scene_files.keys())
     differences = [f"{path}: only {'stored' if path in scene_files else 'made now'}" for path in only]
-    read = file_reader(store.read, stored)
+    read = file_reader(committed_reader(store, stored.records), stored.records)
     for path in sorted(made.keys() & scene_files.keys()):
         if made[path].sha256 == scene_files[path]:
             continue

@@ -4,7 +4,6 @@ import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import groupby, pairwise
 from operator import itemgetter
 
@@ -15,12 +14,13 @@ from schemas.dataset.layout import COMMITS, RANGES, commit_path, is_shape, parse
 from schemas.dataset.tables import DETERMINISTIC_TABLES, TABLES
 from schemas.errors import CorruptError, command_line, needs_making
 from schemas.job.job import Job
-from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image
+from services.read.dataset_reader import Members, ReadFile, StoredRange, file_reader
 from services.read.verdict import COPY, MOST_FAULTS, PathIndex, Verdict, describe_os_error
 from workers.store.commit import committed_files, read_committed, read_record
+from workers.store.images import decode_png
 from workers.store.ledger import range_rows
 from workers.store.store import Store
-from workers.store.tars import check_labels
+from workers.store.tars import check_labels, read_tar
 
 
 def commit_groups(store: Store) -> list[tuple[int, list[int]]]:
@@ -218,19 +218,18 @@ class ReadRange:
             return []
         stored, faults = StoredRange(span.start, span.stop, self.records, rows), list[tuple[int, str]]()
 
-        def read_file(path: str) -> bytes:
-            data = self._read(path)
-            if path.endswith(".tar"):
-                wrong = check_labels(path.partition("/")[0], data, path, rows)
-                faults.extend((pose_id // (2 * job.pairs_per_scene), fault) for pose_id, fault in wrong)
-            return data
-
-        try:
-            read = file_reader(read_file, stored)
-        except (CorruptError, OSError):
-            return []  # the archive is told by its digest
+        tars: dict[str, Members] = {}
+        for path in (entry.path for record in self.records for entry in record.files if entry.path.endswith(".tar")):
+            try:
+                category, data = path.partition("/")[0], self._read(path)
+                tars[path] = dict(read_tar(category, data, path))
+            except (CorruptError, OSError):
+                return []  # the archive is told by its digest
+            wrong = check_labels(category, data, path, rows)
+            faults += [(pose_id // (2 * job.pairs_per_scene), fault) for pose_id, fault in wrong]
         if check_scene is None:
             return faults
+        read = file_reader(self._read, self.records, tars)
         for scene_id, scene in made.items():
             faults += [(scene_id, fault) for fault in check_scene(job, stored, scene, read)]
             self.verdict.pairs += len({row["parent_id"] for row in rows["views"] if row["scene_id"] == scene_id})
@@ -273,7 +272,7 @@ def find_label_check() -> CheckScene:
                 faults.append(f"scene {scene['scene_id']}: has views {sorted(views)}, and must have {sorted(roles)}")
                 continue
             try:
-                faults += check_stored_pair(job, views, objects, scene, partial(read_image, read))
+                faults += check_stored_pair(job, views, objects, scene, lambda path: decode_png(read(path), path))
             except (CorruptError, ValueError, OSError) as error:
                 faults.append(f"scene {scene['scene_id']}: {error}")
         return faults

@@ -33,8 +33,7 @@ def require_framed(job: Job, catalogue: Catalogue) -> None:
         try:
             plan = plan_scene(job, catalogue, SceneChance(job.seed, scene_id))
             poses = [_set_down(start, plan.table) for start in plan.objects]
-            if job.cameras.orbit.share is not None:
-                plan = frame_cameras(job, plan, poses)
+            plan = frame_cameras(job, plan, poses)
             placed = zip(plan.objects, poses, strict=True)
             unseen = [_unseen(job, *pair, camera) for pair, camera in product(placed, plan.input_cameras)]
         except SceneError as error:

@@ -5,16 +5,13 @@ The folders are those of private Rays: closed to other users, with names short e
 
 import contextlib
 import ctypes
-import fcntl
 import math
 import os
-import shutil
 import signal
-import stat
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,19 +183,13 @@ def _quota(folder: Path) -> float:
 
 PREFIX = "vr-"
 
-OWNER = "owner"
-"""A file that the owner keeps locked. The kernel unlocks it when the process ends, however that happens."""
-
-INNER = "r"
-"""What Ray gets. It opens its own folder to every user (0777), so it gets one inside a folder that nobody else enters."""
-
 SOCKET_BYTES = 107
 """The longest name of a Unix socket on Linux."""
 
 SESSION_BYTES = len("/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store")
 """What Ray puts behind the name of its folder; 4194304 is the largest process id."""
 
-MAX_BASE_BYTES = SOCKET_BYTES - SESSION_BYTES - len(f"/{PREFIX}12345678/{INNER}")
+MAX_BASE_BYTES = SOCKET_BYTES - SESSION_BYTES - len(f"/{PREFIX}12345678/r")
 """The longest temporary folder that has room for a private Ray's."""
 
 OTHERS = (Path("/tmp"), Path("/var/tmp"), Path("/dev/shm"))
@@ -211,44 +202,32 @@ def private_folder() -> Iterator[Path]:
 
     Folders of processes that are gone are removed first. Raises MachineError where no place has a name short enough.
     """
-    places = _places()
-    for place in places:
-        remove_dead(place)
-    folder, owner = _make(places)
-    try:
-        yield folder / INNER
-    finally:
-        _remove(folder)
-        os.close(owner)
+    from workers.store.file_system import owned_folder  # loads models, which a supervisor does without
+
+    living_folders()
+    errors = []
+    with contextlib.ExitStack() as stack:
+        for place in _places():
+            try:
+                folder = stack.enter_context(owned_folder(place, PREFIX))
+                break
+            except OSError as error:
+                errors.append(f"{place} ({error.strerror or error})")
+        else:
+            wanted = tempfile.gettempdir()
+            tried = f"; cannot be written: {', '.join(errors)}" if errors else ""
+            raise MachineError(
+                f"no place for Ray's sockets: the name of {wanted} has {len(os.fsencode(wanted))} bytes, at most "
+                f"{MAX_BASE_BYTES} fit{tried}: set TMPDIR to a writable folder with a short name"
+            )
+        yield folder
 
 
 def living_folders() -> list[Path]:
     """This user's private folders on this machine, those of processes that are gone removed first."""
-    places = _places()
-    for place in places:
-        remove_dead(place)
-    return [folder / INNER for place in places for folder in _private_folders(place)]
+    from workers.store.file_system import INNER, owned_folders
 
-
-def remove_dead(place: Path) -> None:
-    """Removes this user's folders below `place` whose owner does not live."""
-    for folder in _private_folders(place):
-        # Locked by a process that lives, or not one of these folders, or removed by another process meanwhile.
-        with (
-            contextlib.suppress(OSError),
-            open(os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)) as owner,
-        ):
-            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            _remove(folder)
-
-
-def _private_folders(place: Path) -> Iterator[Path]:
-    """This user's below `place`."""
-    for folder in place.glob(f"{PREFIX}*"):
-        with contextlib.suppress(OSError):
-            status = folder.lstat()
-            if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and (folder / OWNER).exists():
-                yield folder
+    return [folder / INNER for place in _places() for folder in owned_folders(place, PREFIX)]
 
 
 def _places() -> list[Path]:
@@ -259,33 +238,3 @@ def _places() -> list[Path]:
         raise MachineError(f"{error.strerror}: set TMPDIR to one that can be written") from error
     places = [place for place in (wanted, *OTHERS) if len(os.fsencode(place)) <= MAX_BASE_BYTES]
     return list(dict.fromkeys(places))
-
-
-def _make(places: Sequence[Path]) -> tuple[Path, int]:
-    """A folder in the first place that takes one, and the open file that shows that its owner lives."""
-    errors = []
-    for place in places:
-        try:
-            folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
-            (folder / INNER).mkdir()
-            # It gets its name when it is locked, so nobody ever finds it unlocked before
-            unnamed = folder / f"{OWNER}.new"
-            owner = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            unnamed.rename(folder / OWNER)
-            return folder, owner
-        except OSError as error:
-            errors.append(f"{place} ({error.strerror or error})")
-    wanted = tempfile.gettempdir()
-    tried = f"; cannot be written: {', '.join(errors)}" if errors else ""
-    raise MachineError(
-        f"no place for Ray's sockets: the name of {wanted} has {len(os.fsencode(wanted))} bytes, at most {MAX_BASE_BYTES} "
-        f"fit{tried}: set TMPDIR to a writable folder with a short name"
-    )
-
-
-def _remove(folder: Path) -> None:
-    """Removes a folder, the owner's file last: what a process that is just ending wrote meanwhile is found again."""
-    shutil.rmtree(folder / INNER, ignore_errors=True)
-    if not (folder / INNER).exists():
-        shutil.rmtree(folder, ignore_errors=True)

@@ -59,7 +59,7 @@ class ProgressLine:
             self._bar.total = asked
 
     def show(self, done: int, failed: int | None = None) -> None:
-        """Shows the number done, and `failed` where failures are counted."""
+        """Shows the number done, and `failed` where failures are counted: `9 of 20 scenes, 1 failed, 0.4 scenes/s, 28 s left`."""
         if self._bar is not None:
             self._bar.n = done
             self._bar.set_postfix({} if failed is None else {"failed": failed}, refresh=True)
@@ -68,7 +68,11 @@ class ProgressLine:
         if passed_s >= self._next_s:
             soon = (second for second in FIRST_LINES_S if second > passed_s)
             self._next_s = next(soon, (passed_s // LINE_EVERY_S + 1) * LINE_EVERY_S)
-            print(f"{self._what}: {_describe(done, self._asked, self._unit, failed, passed_s)}", file=sys.stderr)
+            parts = [f"{done} of {self._asked} {self._unit}s", *([] if failed is None else [f"{failed} failed"])]
+            if done:
+                left_s = max(0, self._asked - done) * passed_s / done
+                parts += [f"{done / passed_s:.1f} {self._unit}s/s", f"{describe_seconds(left_s)} left"]
+            print(f"{self._what}: {', '.join(parts)}", file=sys.stderr)
 
     def close(self) -> None:
         """Ends the bar."""
@@ -92,15 +96,6 @@ def show_counts(of: str, unit: str = "file") -> Iterator[Callable[[str, int, int
     finally:
         for line in lines.values():
             line.close()
-
-
-def _describe(done: int, asked: int, unit: str, failed: int | None, passed_s: float) -> str:
-    """`9 of 20 scenes, 1 failed, 0.4 scenes/s, 28 s left`."""
-    parts = [f"{done} of {asked} {unit}s", *([] if failed is None else [f"{failed} failed"])]
-    if done:
-        rate = done / passed_s
-        parts += [f"{rate:.1f} {unit}s/s", f"{describe_seconds(max(0, asked - done) / rate)} left"]
-    return ", ".join(parts)
 
 
 def say(line: str) -> None:

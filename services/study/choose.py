@@ -1,11 +1,32 @@
-"""The cheapest setting that meets the targets, the front of settings that are worth their time, and the answer in words. Pure."""
+"""Which settings are measured next, the cheapest that meets the targets, the front, and the answer in words. Pure.
 
+Rounds over one table, as in successive halving (Jamieson and Talwalkar 2016), for each part of a scene by itself. A round
+brings every setting that can still win to twice as many scenes, the same ones for all. A setting is out once it surely
+misses a target, or surely takes longer than one that surely meets all. Where a round would take more than the seconds that
+it may, the less promising half of its settings is left behind, and once more, until the others fit.
+"""
+
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-from schemas.errors import InputError, RunError, describe_seconds, did_you_mean, milliseconds, plural, size
-from schemas.job.job import Job
-from services.study.model import ERRORS, Figure, Proof, Row, Targets, amount, short, times
+from schemas.errors import RunError, describe_seconds, milliseconds, plural, size
+from services.study.model import (
+    ERRORS,
+    OWN,
+    REFERENCES,
+    Figure,
+    Proof,
+    Row,
+    Setting,
+    Targets,
+    amount,
+    joined,
+    short,
+    times,
+)
+from services.study.table import PARTS, Part, Table, part_of
 
 AS_CHEAP, WORTH = 1.05, 0.05
 """Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %. And the
@@ -17,6 +38,113 @@ fail more than the job, because one that fails more is cheap as it leaves work o
 
 DEFAULT_TARGETS: Targets = {kind.name: kind.target for kind in ERRORS.values() if kind.target is not None}
 """The targets without a wish of the user: the accuracy that a dataset's labels promise."""
+
+
+LEAST, FEWEST_RACING = 8, 4
+"""Nothing is out, no part is decided and no combination is made before so many scenes; and so many settings are in every round,
+where even these do not fit in as many scenes as fit."""
+
+REFERENCE_SHARE = 0.3
+"""References, which errors of all are held against, are in a round while each takes no more than this share of the others."""
+
+
+class Wanted(NamedTuple):
+    """One scene that is to be measured with a setting of a part."""
+
+    part: Part
+    scene_id: int
+    setting: Setting
+
+
+class Standing(NamedTuple):
+    """A setting of a part: its verdict on the part's targets, whether its values miss one, and its ratio of time, if any."""
+
+    setting: Setting
+    verdict: str
+    is_missing: bool
+    ratio: Figure | None
+
+
+def standings(table: Table, part: Part, targets: Targets) -> list[Standing]:
+    """The settings that can still win: the job itself, then those that meet the targets so far, the cheapest first."""
+    asked = {name: most for name, most in targets.items() if part_of(name) == part and name in table.figures(part, OWN)}
+    every = []
+    for setting in (setting for setting in table.split.measured[part] if setting not in REFERENCES):
+        figures = table.figures(part, setting)
+        verdicts = [figures[name].verdict(most) if name in figures else "open" for name, most in asked.items()]
+        verdict = "misses" if "misses" in verdicts else "open" if "open" in verdicts else "meets"
+        is_missing = any(figures[name].value > most for name, most in asked.items() if name in figures)
+        every.append(Standing(setting, verdict, is_missing, table.ratio(part, setting)))
+    known = [some for some in every if len(table.answers(part, some.setting)) >= min(LEAST, PARTS[part].scenes)]
+    best = min((some.ratio.high for some in known if some.ratio and some.verdict == "meets"), default=math.inf)
+    out = [some for some in known if some.verdict == "misses" or (some.ratio and some.ratio.low > best * AS_CHEAP)]
+    left = [some for some in every if some not in out or some.setting == OWN]
+    return sorted(left, key=lambda s: (s.setting != OWN, s.is_missing, s.ratio.value if s.ratio else 1.0))
+
+
+def undecided(table: Table, part: Part, targets: Targets) -> list[Setting]:
+    """Settings that may turn out cheaper than the cheapest that surely meets the targets."""
+    left = standings(table, part, targets)
+    best = min((some.ratio.value for some in left if some.ratio and some.verdict == "meets"), default=math.inf)
+    return [
+        some.setting
+        for some in left
+        if some.verdict == "open"
+        and (some.ratio.low * AS_CHEAP < best if some.ratio else some.setting.kind != "several")
+    ]
+
+
+def next_round(table: Table, part: Part, targets: Targets, scenes: range, allowed_s: float) -> list[Wanted]:
+    """What is missing in these scenes of the settings in this round, scene by scene, as far as it fits."""
+    racing = [some.setting for some in standings(table, part, targets)]
+    while seconds(table, wanted := missing(table, part, racing, scenes)) > allowed_s and len(racing) > FEWEST_RACING:
+        racing = racing[: max(FEWEST_RACING, len(racing) // 2)]
+    most_s = REFERENCE_SHARE * seconds(table, wanted)
+    references = [missing(table, part, [some], scenes) for some in REFERENCES if some in table.split.measured[part]]
+    wanted += [item for some in references if seconds(table, some) <= most_s for item in some]
+    wanted.sort(key=lambda item: item.scene_id)
+    costs = itertools.accumulate(table.cost_s(part, item.setting) for item in wanted)
+    return wanted[: sum(cost <= (1.0 + REFERENCE_SHARE * len(REFERENCES)) * allowed_s for cost in costs)]
+
+
+def missing(table: Table, part: Part, settings: Iterable[Setting], scenes: range) -> list[Wanted]:
+    """What has no answer of these settings in these scenes."""
+    return [Wanted(part, n, setting) for n in scenes for setting in settings if n not in table.answers(part, setting)]
+
+
+def seconds(table: Table, wanted: Sequence[Wanted]) -> float:
+    """What these take by the clock, about, one after the other."""
+    return sum(table.cost_s(item.part, item.setting) for item in wanted)
+
+
+def promising(rows: Sequence[Row], targets: Targets | None) -> list[Setting]:
+    """Settings of two and more knobs to measure next. `rows`: the job's own first, then one value of one knob each.
+
+    Of the values that make no error worse which a target or the job holds: for each knob the cheapest that saves time; for each
+    target that the job misses the cheapest that mends it; and both.
+    """
+    own = rows[0].errors
+    limits = targets or {name: most for some in default_targets(rows) for name, most in some.items()}
+    held = {name: max(most, own[name].high) for name, most in limits.items() if name in own}
+    singles = [
+        row for row in sorted(rows[1:], key=lambda row: (row.ratio, row.setting.name)) if row.setting.kind == "single"
+    ]
+    kept = [
+        row for row in singles if all(row.errors[name].value <= held[name] for name in held.keys() & row.errors.keys())
+    ]
+    saving = [row for row in kept if row.ratio < 0.98]
+    mending: list[Row] = []
+    for name in (name for name in held if own[name].value > limits[name]):
+        mending += [row for row in kept if name in row.errors and row.errors[name].value <= limits[name]][:1]
+    settings = []
+    for some in (saving, mending, [*mending, *saving]):
+        first = {row.setting.knob: row for row in reversed(some)}.values()  # of each knob
+        if len(first) > 1:  # in the order of the table, whatever the ranks, so that names do not depend on noise
+            settings.append(joined([row.setting for row in rows if row in first]))
+    return list({setting.name: setting for setting in settings}.values())
+
+
+# ------------------------------------------------------------------------------------------------ the choice
 
 
 class TargetError(RunError):
@@ -218,55 +346,3 @@ def _doubt(row: Row, targets: Targets, rows: Sequence[Row]) -> str:
         if figure is not None and figure.most > targets[name]
     ]
     return f" It is not sure to 95 %: scenes that were not measured may have {listed(unsure)}." if unsure else ""
-
-
-def parse_targets(text: str) -> dict[str, float]:
-    """From "penetration_mm=0.1,depth_mm=0.5"; `kept_share` is 1 minus `lost_share`. Raises InputError with the remedy."""
-    targets: dict[str, float] = {}
-    for part in text.split(","):
-        name, _, value = (piece.strip() for piece in part.partition("="))
-        if not name or not value:
-            raise InputError(f"--target {part.strip() or text!r}: write it as penetration_mm=0.1,depth_mm=0.5")
-        try:
-            most = float(value)
-        except ValueError:
-            most = math.nan
-        if name == "kept_share":
-            name, most = "lost_share", round(1.0 - most, 12)
-        if name not in ERRORS:
-            raise InputError(
-                f"--target {name}: there is no such error; {did_you_mean(name, ERRORS)}Known: {', '.join(ERRORS)}"
-            )
-        if name in targets:
-            raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {most:g}")
-        if not 0.0 <= most < math.inf:
-            raise InputError(f"--target {part.strip()}: must be a number from 0 up, such as 0.001 for 0.1 %")
-        targets[name] = most
-    return targets
-
-
-_UNMEASURED: tuple[tuple[Callable[[Job], bool], str, str], ...] = (
-    (lambda job: job.captures is None, "capture", "the job has no captures"),
-    (lambda job: job.captures is not None, "physics labels mirror colour", "the job is one of captures"),
-    (lambda job: not job.cameras.mirror.enabled, "mirror", "cameras.mirror.enabled is false"),
-    (lambda job: not job.render.rgb, "colour", "render.rgb is false"),
-    (
-        lambda job: job.start.pose == "tumbled" or job.objects_per_scene.high > 1,
-        "pose_mm",
-        "where things end is random when they tumble or meet, so no pose is the true one; ask for outcome_mm",
-    ),
-)
-"""Jobs in which an error, or the errors of some groups, cannot be measured, and why."""
-
-
-def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
-    """Raises InputError for a target that no setting of the job can have, before anything is measured.
-
-    `missing` says why this machine has no truth of colour.
-    """
-    for name in targets:
-        for is_so, names, why in _UNMEASURED:
-            if is_so(job) and {name, ERRORS[name].group} & set(names.split()):
-                raise InputError(f"--target {name}: it cannot be measured here: {why}")
-        if name == "flip" and missing is not None:
-            raise InputError(f"--target flip: {missing}")

@@ -1,23 +1,25 @@
 """`verso tradeoff`: measures a job's settings within a budget, chooses one, and writes the table, the picture and the page."""
 
 import argparse
-import json
+import math
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from importlib.util import find_spec
 
 import yaml
 
-from schemas.errors import InputError, MachineError, RunError, describe_seconds
+from schemas.errors import InputError, MachineError, RunError, describe_seconds, did_you_mean
 from schemas.job.job import Job
 from services.bench.figures import describe_machine
 from services.job.job_file import load_job, read_tree
+from services.run import progress
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
-from services.study.choose import parse_targets, recommend, refuse_unmeasured
-from services.study.model import Study, Targets, apply, choose_knobs, job_tree_with, knobs_of, settings_of
+from services.study.choose import recommend
+from services.study.model import ERRORS, Study, Targets, apply, choose_knobs, job_tree_with, knobs_of, settings_of
 from services.study.study import Journal, Plan, run_study
 from services.study.truths import colour_truth_missing
 from workers.assets.catalogue import open_catalogue
@@ -58,17 +60,17 @@ def main(options: argparse.Namespace) -> int:
     print(f"measures for at most {describe_seconds(plan.budget_s)} (--budget), {plan.processes} scenes at a time")
     journal = Journal(options.out, {"job": context.settings_digest, "code": code_digest()})
     about = {"command": shlex.join(["verso", *sys.argv[1:]]), "machine": describe_machine(context.renderer.name)}
-    with closing(ProgressLine(round(plan.budget_s), "tradeoff", unit="second")) as progress:
-        study = run_study(plan, journal, progress, began, notes=notes, **about)
+    with closing(ProgressLine(round(plan.budget_s), "tradeoff", unit="second")) as bar:
+        study = run_study(plan, journal, bar, began, notes=notes, **about)
     write_study(study, options.out)
     said = {"note": study.notes, "not decided": study.doubts, "proof": map(describe_proof, study.proofs)}
     for line in (f"{word:12} {line}" for word, lines in said.items() for line in lines):
         print(line)
     print(study.answer)
-    return finish(study, options, targets)
+    return write_job(study, options, targets)
 
 
-def finish(study: Study, options: argparse.Namespace, targets: Targets | None) -> int:
+def write_job(study: Study, options: argparse.Namespace, targets: Targets | None) -> int:
     """Writes the job for targets. Raises RunError where nothing is recommended."""
     if not study.chosen:
         recommend(study.rows, targets)  # says which target nothing meets
@@ -80,10 +82,60 @@ def finish(study: Study, options: argparse.Namespace, targets: Targets | None) -
         path = options.out / "job.yaml"
         path.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
         print(f"{path}: the job with {study.chosen}, without its comments")
-    if options.json:
-        summary = {"chosen": study.chosen, "changes": dict(chosen.setting.changes), "settings": len(study.rows)}
-        print(json.dumps({**summary, "ok": True, "out": str(options.out), "ms": chosen.ms, "ratio": chosen.ratio}))
-    return 0
+    summary = {"chosen": study.chosen, "changes": dict(chosen.setting.changes), "settings": len(study.rows)}
+    return progress.finish(options, True, **summary, out=str(options.out), ms=chosen.ms, ratio=chosen.ratio)
+
+
+def parse_targets(text: str) -> dict[str, float]:
+    """From "penetration_mm=0.1,depth_mm=0.5"; `kept_share` is 1 minus `lost_share`. Raises InputError with the remedy."""
+    targets: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        if not name or not value:
+            raise InputError(f"--target {part.strip() or text!r}: write it as penetration_mm=0.1,depth_mm=0.5")
+        try:
+            most = float(value)
+        except ValueError:
+            most = math.nan
+        if name == "kept_share":
+            name, most = "lost_share", round(1.0 - most, 12)
+        if name not in ERRORS:
+            raise InputError(
+                f"--target {name}: there is no such error; {did_you_mean(name, ERRORS)}Known: {', '.join(ERRORS)}"
+            )
+        if name in targets:
+            raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {most:g}")
+        if not 0.0 <= most < math.inf:
+            raise InputError(f"--target {part.strip()}: must be a number from 0 up, such as 0.001 for 0.1 %")
+        targets[name] = most
+    return targets
+
+
+_UNMEASURED: tuple[tuple[Callable[[Job], bool], str, str], ...] = (
+    (lambda job: job.captures is None, "capture", "the job has no captures"),
+    (lambda job: job.captures is not None, "physics labels mirror colour", "the job is one of captures"),
+    (lambda job: not job.cameras.mirror.enabled, "mirror", "cameras.mirror.enabled is false"),
+    (lambda job: not job.render.rgb, "colour", "render.rgb is false"),
+    (
+        lambda job: job.start.pose == "tumbled" or job.objects_per_scene.high > 1,
+        "pose_mm",
+        "where things end is random when they tumble or meet, so no pose is the true one; ask for outcome_mm",
+    ),
+)
+"""Jobs in which an error, or the errors of some groups, cannot be measured, and why."""
+
+
+def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
+    """Raises InputError for a target that no setting of the job can have, before anything is measured.
+
+    `missing` says why this machine has no truth of colour.
+    """
+    for name in targets:
+        for is_so, names, why in _UNMEASURED:
+            if is_so(job) and {name, ERRORS[name].group} & set(names.split()):
+                raise InputError(f"--target {name}: it cannot be measured here: {why}")
+        if name == "flip" and missing is not None:
+            raise InputError(f"--target flip: {missing}")
 
 
 def make_plan(asked: Job, options: argparse.Namespace, targets: Targets | None) -> tuple[Plan, list[str]]:

@@ -4,7 +4,6 @@ import base64
 import io
 import json
 import math
-import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -26,6 +25,7 @@ from pydantic import TypeAdapter
 from schemas.errors import describe_seconds, milliseconds, number, plural, size
 from services.study.choose import front, own_row, tells
 from services.study.model import ERRORS, Proof, Row, Study, amount, short, shown, times, unit
+from workers.assets.library.table import write_whole
 
 _COST = ("ms", "ratio", "ratio_least", "ratio_most", "kilobytes", "failed_share")
 
@@ -50,8 +50,7 @@ def table_of(rows: Sequence[Row]) -> pa.Table:
 
 
 def write_study(study: Study, folder: Path) -> None:
-    """Write `tradeoff.parquet`, `study.json`, `tradeoff.png` and `index.html`, each whole or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write `tradeoff.parquet`, `study.json`, `tradeoff.png` and `index.html`, each whole or not at all. Raises OutputError."""
     table, picture = io.BytesIO(), draw_tradeoff(study)
     pq.write_table(table_of(study.rows), table)
     text = json.dumps({"verso_study": 2, **asdict(study)}, indent=1) + "\n"
@@ -61,9 +60,7 @@ def write_study(study: Study, folder: Path) -> None:
         "tradeoff.png": picture,
         "index.html": page_of(study, picture).encode(),
     }.items():
-        partial = folder / f".{name}.{os.getpid()}"
-        partial.write_bytes(data)
-        os.replace(partial, folder / name)
+        write_whole(folder / name, data)
 
 
 GROUPS = {

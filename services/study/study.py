@@ -18,11 +18,9 @@ from schemas.errors import OutputError, RunError, describe_seconds, plural
 from schemas.job.job import Job
 from services.run.progress import ProgressLine
 from services.study import choose
-from services.study.choose import DEFAULT_TARGETS, FEWEST_SCENES, TargetError, recommend
 from services.study.images import measure_colour, measure_drawn
 from services.study.measure import LIMIT, RESTS, measure_capture, measure_rest
 from services.study.model import OWN, Proof, Row, Setting, Study, Targets, apply, joined
-from services.study.rounds import LEAST, Wanted, missing, next_round, promising, seconds, undecided
 from services.study.table import AT_REST, PARTS, Part, Table, figures_of, part_of, split_settings, unit_name
 from workers.assets.catalogue import open_catalogue
 from workers.pool import Answers, Ended, Pool
@@ -152,7 +150,7 @@ class Measurement:
 
     def __post_init__(self) -> None:
         """Splits the plan's settings."""
-        self.targets = self.plan.targets or DEFAULT_TARGETS
+        self.targets = self.plan.targets or choose.DEFAULT_TARGETS
         self.add(())
 
     @property
@@ -175,7 +173,7 @@ class Measurement:
         self.plan = replace(self.plan, settings=(*self.plan.settings, *new))
         self.split = split_settings(self.plan.settings, self.plan.job.captures is not None)
 
-    def run(self, wanted: Sequence[Wanted], share: float, base: Setting = OWN) -> None:
+    def run(self, wanted: Sequence[choose.Wanted], share: float, base: Setting = OWN) -> None:
         """Measures, in order, until a share of the budget is spent, and keeps the answers; what a process died of is `broken`.
 
         Settings of one part and scene, on top of the base setting, are measured side by side in units.
@@ -184,7 +182,7 @@ class Measurement:
         where = self.plan.job.model_dump_json(), str(self.plan.job_folder), self.scratch
         for (part, scene), items in itertools.groupby(wanted, key=lambda item: (item.part, item.scene_id)):
             some = list(items)
-            size = max(1, int(UNIT_SHARE * self.plan.budget_s * len(some) / max(seconds(table, some), 1e-3)))
+            size = max(1, int(UNIT_SHARE * self.plan.budget_s * len(some) / max(choose.seconds(table, some), 1e-3)))
             took = [answer["took"] for answer in table.answers(part, OWN).values()]
             limit_s = max(LEAST_LIMIT_S, SLOW * max(took)) if took and base == OWN else math.inf
             for n in range(0, len(some), size):
@@ -220,7 +218,7 @@ def run_study(plan: Plan, journal: Journal, progress: ProgressLine, began: float
     if late := [setting.name for setting in plan.settings if table.row(setting) is None]:
         notes.append(f"not reached within the budget: {', '.join(late)}")
     for part in bench.split.measured:
-        if rivals := undecided(table, part, bench.targets):
+        if rivals := choose.undecided(table, part, bench.targets):
             names = [f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rivals]
             doubts.append(
                 f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %: {', '.join(names)}"
@@ -249,7 +247,7 @@ def run_first(bench: Measurement) -> None:
     def run_own(parts: Sequence[Part], scenes: int) -> None:
         # Part by part, so that a scene is drawn once another process has settled it.
         for part in parts:
-            wanted = missing(bench.table(), part, [OWN], range(first_scene, first_scene + scenes))
+            wanted = choose.missing(bench.table(), part, [OWN], range(first_scene, first_scene + scenes))
             bench.run(wanted, FIRST_SHARE)
 
     run_own(timed, 1)
@@ -259,7 +257,7 @@ def run_first(bench: Measurement) -> None:
             f"--budget {describe_seconds(bench.plan.budget_s)}: give more, such as --budget 2h (the first on a machine also "
             "compiles, for about a minute)"
         )
-    run_own(timed[:1], FEWEST_SCENES)
+    run_own(timed[:1], choose.FEWEST_SCENES)
     own = bench.table().answers(timed[0], OWN).values()
     if all("failed" in answer for answer in own):
         reasons = sorted({str(answer.get("broken", answer["failed"])) for answer in own})
@@ -267,7 +265,7 @@ def run_first(bench: Measurement) -> None:
             f"none of the job's first {plural(len(own), 'scene')} can be made ({'; '.join(reasons)}): "
             "a study needs scenes; `verso run` with --scenes 4 tells more of each"
         )
-    run_own(timed[1:], FEWEST_SCENES)
+    run_own(timed[1:], choose.FEWEST_SCENES)
 
 
 LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
@@ -283,15 +281,15 @@ def run_rounds(bench: Measurement) -> None:
     for level in LEVELS:
         table, share = bench.table(), PILOT_SHARE if level == 1 else RACE_SHARE
         parts = [part for part in bench.split.measured if level <= PARTS[part].scenes]
-        parts = [part for part in parts if level <= LEAST or undecided(table, part, bench.targets)]
-        weights, wanted = sum(PARTS[part].share for part in parts), list[Wanted]()
+        parts = [part for part in parts if level <= choose.LEAST or choose.undecided(table, part, bench.targets)]
+        weights, wanted = sum(PARTS[part].share for part in parts), list[choose.Wanted]()
         for part in parts:
             part_s = bench.left_s(share) * bench.plan.processes / 2 * PARTS[part].share / weights
             allowed_s = math.inf if level == 1 else part_s
-            wanted += next_round(table, part, bench.targets, range(first, first + level), allowed_s)
+            wanted += choose.next_round(table, part, bench.targets, range(first, first + level), allowed_s)
         # Scene by scene, so that what the end of the budget cuts off leaves the same scenes of all.
         bench.run(sorted(wanted, key=lambda item: item.scene_id), share)
-        if level == LEAST:
+        if level == choose.LEAST:
             bench.add(combinations(bench))
 
 
@@ -300,7 +298,7 @@ def combinations(bench: Measurement) -> list[Setting]:
     table, together = bench.table(), list[Setting]()
     for part in bench.split.timed:
         settings = [OWN, *(some for some in bench.plan.settings if bench.split.of[some.name].get(part, OWN) != OWN)]
-        together += promising([row for some in settings if (row := table.row(some))], bench.plan.targets)
+        together += choose.promising([row for some in settings if (row := table.row(some))], bench.plan.targets)
     return together
 
 
@@ -327,8 +325,8 @@ def choose_and_prove(bench: Measurement) -> tuple[list[Row], list[Row], list[Pro
     able = every = [*rows, *crossed_rows(bench, rows)]
     while True:
         try:
-            chosen = recommend(able, asked)
-        except TargetError:
+            chosen = choose.recommend(able, asked)
+        except choose.TargetError:
             break
         if chosen not in rows:
             rows.append(chosen)
@@ -354,13 +352,13 @@ def prove(bench: Measurement, chosen: Row, targets: Targets) -> Proof | None:
     digest = hashlib.sha256(repr(sorted(chosen.setting.changes.items())).encode()).hexdigest()[:8]
     fresh, first = Setting((("proof", digest),)), bench.plan.job.first_scene + FRESH_SCENE
     scenes = {part: range(first, first + min(PROVED, PARTS[part].scenes)) for part in parts}
-    wanted = [item for part in parts for item in missing(bench.table(), part, [fresh], scenes[part])]
+    wanted = [item for part in parts for item in choose.missing(bench.table(), part, [fresh], scenes[part])]
     # A scene is drawn after its rest was measured, so that no process settles what another is settling.
     wanted.sort(key=lambda item: ((item.scene_id - first) // bench.plan.processes, parts.index(item.part)))
     bench.run(wanted, 1.0, base=chosen.setting)
     answers = {part: bench.table().answers(part, fresh) for part in parts}
     count = min(map(len, answers.values()))
-    if count < FEWEST_SCENES:
+    if count < choose.FEWEST_SCENES:
         return None
     figures = {name: figure for part in parts for name, figure in figures_of(part, answers[part]).items()}
     asked = {name: target for name, target in targets.items() if name in figures}

@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from services.run.machine import Process, descendants, read_process, send
 
@@ -110,6 +111,18 @@ def disturb_at_first_commit(
         reader.join(10)
         os.close(terminal)
     return EndedRun(run.returncode, b"".join(said).decode(errors="replace"), [process.name for process in left])
+
+
+PATIENCE_S = 180.0
+
+
+def wait_for(happened: Callable[[], Any], told: Callable[[], str] = str) -> Any:
+    """What `happened` answers once that is true; fails with what is `told` after `PATIENCE_S`."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not (answer := happened()):
+        assert time.monotonic() < deadline, told()
+        time.sleep(0.05)
+    return answer
 
 
 def interrupt(pid: int, terminal: int) -> None:

@@ -1,8 +1,9 @@
-"""A ball that rolls on level ground, against the torque of rolling friction."""
+"""A ball that rolls on level ground and on another body, against the torque of rolling friction."""
 
 import pytest
 
-from tests.physics.room import PHYSICS, RATES_HZ, G, advance, at, ball_body, drop, physics
+from tests.physics.room import MARGIN_M, PHYSICS, RATES_HZ, G, advance, at, ball_body, box_body, drop, physics
+from workers.physics.bullet import open_world
 
 RADIUS_M = 0.05
 ARM_M = 2 * PHYSICS.rolling_friction * PHYSICS.friction
@@ -26,6 +27,21 @@ def test_a_rolling_ball_slows_down_by_its_rolling_friction(record_figure):
     errors = [speeds(rate, 2.0, 1.0, 1.0 / RADIUS_M)[0] - exact for rate in RATES_HZ]
     record_figure("rolling: error of the speed after 2 s, m/s", "passed", max(map(abs, errors)), 1e-9)
     assert max(map(abs, errors)) < 1e-9
+
+
+def test_a_ball_rolls_and_spins_on_another_body_against_the_torque_that_it_has_on_the_ground(record_figure):
+    """The same speed on top of a box of a tonne; and about the vertical arm g / (2 / 5 R^2), on a point."""
+    spin, below = RADIUS_M**-1, (box_body(10.0, 1.0, 0.2, 1e3), at(0, 0.1 + MARGIN_M))
+    with open_world([below, (ball_body(RADIUS_M), at(0, 0.2 + 2 * MARGIN_M + RADIUS_M))], 0.0, PHYSICS, 1) as world:
+        advance(world, PHYSICS.step_hz // 4)
+        world.set_velocity((1.0, 0.0, 0.0), (0.0, spin, spin), body=1)
+        advance(world, 2 * PHYSICS.step_hz)
+        v, w = world.velocity(1)
+    rolls = v[0] - (1.0 - 2.0 * ARM_M * G / (RADIUS_M * 1.4))
+    spins = w[2] - (spin - 2.0 * 2 * PHYSICS.spinning_friction * PHYSICS.friction * G / (0.4 * RADIUS_M**2))
+    record_figure("rolling on a body: error of the speed after 2 s, m/s", "passed", rolls, 1e-8)
+    record_figure("spinning on a body: error of the spin after 2 s, rad/s", "passed", spins, 1e-6)
+    assert abs(rolls) < 1e-8 and abs(spins) < 1e-6
 
 
 def test_a_ball_without_rolling_friction_rolls_for_ever(record_figure):

@@ -109,6 +109,15 @@ def frame_in_board(board: Board, frame: BoardFrame) -> Pose:
 
 PREDEFINED = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 """Names of OpenCV's dictionaries."""
+LARGEST = 999
+"""The last id of the families' largest dictionaries."""
+
+
+def smallest_dictionary(name: str, last_id: int) -> str:
+    """The smallest dictionary of a family that has the id; the first markers of all in a family are the same."""
+    family, _, size = name.rpartition("_")
+    sizes = ("50", "100", "250", "1000")
+    return f"{family}_{next(n for n in sizes if int(n) > last_id)}" if size in sizes else name
 
 
 def marker_corners(board: Board) -> Array:

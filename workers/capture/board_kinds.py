@@ -7,19 +7,23 @@ OpenCV's camera calibration.
 """
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from schemas.base import Array, frozen_array
 from schemas.errors import InputError
 from schemas.job.captures import Board
+from workers.capture.board import LARGEST, board_geometry, smallest_dictionary
 from workers.geometry.frames import pose, rotation_from_quaternion, transform
 
 SHEET_M = 0.03
@@ -104,6 +108,83 @@ KINDS: dict[str, Callable[[BoardSizes], Board]] = {
     "aprilgrid": make_aprilgrid,
 }
 """Kinds of boards that can be printed."""
+KIND_WORDS = {
+    "grid": "a grid of {} markers",
+    "charuco": "a ChArUco board of {} squares",
+    "charuco_old": "a ChArUco board of {} squares, as OpenCV had it before 4.6,",
+    "aprilgrid": "an aprilgrid of {} tags",
+}
+
+
+MOST_ACROSS = 25
+"""Markers or squares across a board that is recognised."""
+FITTING = 0.15
+"""A corner this near to its place, in sides of its marker, lies there: markers of another layout are a whole side away."""
+MOST_FIT = 0.8
+"""Share of the markers that lie where a layout has them, if it is the board's: some may be misread."""
+LEAST = 6
+"""Fewer markers fit several layouts."""
+NOMINAL = 0.7
+"""Side of a marker, of its pitch, before it is known."""
+SAME_PITCH = 0.03
+"""A length of board.json so near to what the photographs show is that length."""
+
+
+def recognise_board(
+    views: Sequence[Mapping[int, Array]], board: Board, dictionary: str
+) -> tuple[str, BoardSizes] | None:
+    """(kind, sizes) of the board in views, each the rays [4, 2] of markers' corners by id; None if `board` or nothing fits.
+
+    `dictionary` is the largest of the markers' family. Photographs tell the layout, and how wide a marker is beside its pitch:
+    lengths are those of `board`.
+    """
+    best_view = max(views, key=len)
+    ids, rays = np.array(sorted(best_view), np.int64), np.array([best_view[n] for n in sorted(best_view)])
+    several = [n for n, count in Counter(n for view in views for n in view).items() if count >= min(2, len(views))]
+    if min(len(ids), len(several)) < LEAST:
+        return None
+    count = max(several) + 1  # of one view alone an id may be misread
+    best, most, share = None, max(_fit_layout(ids, rays, board)[0], MOST_FIT * len(ids) - 1, LEAST - 1), 1.0
+    for kind, columns in product(KINDS, range(2, MOST_ACROSS + 1)):
+        rows = -(-count // columns) if kind in ("grid", "aprilgrid") else max(2, -(-2 * count // columns))
+        rows += kind == "charuco_old" and rows % 2  # with odd rows both patterns are one
+        sizes = BoardSizes(columns, rows, NOMINAL, 1.0, dictionary)
+        fits, side = _fit_layout(ids, rays, KINDS[kind](sizes))
+        if fits > most:
+            best, most, share = (kind, sizes), fits, NOMINAL * side
+    if best is None:
+        return None
+    names = [smallest_dictionary(dictionary, int(board_geometry(KINDS[best[0]](best[1])).ids[-1]))]
+    names += [board.dictionary] * (smallest_dictionary(board.dictionary, LARGEST) == dictionary)
+    name = max(names, key=lambda name: (len(name), name))  # the larger
+    marker_m = float(_sides(board_geometry(board).corners)[0])
+    squares = _sides(board_geometry(board).squares)[:1]
+    lengths = [marker_m / share, *squares, *(squares + marker_m), marker_m + board.scale * board.gap_m]
+    pitch_m = next((m for m in lengths[1:] if abs(m / lengths[0] - 1) < SAME_PITCH), lengths[0])
+    return best[0], replace(best[1], marker_m=round(marker_m, 5), pitch_m=round(float(pitch_m), 4), dictionary=name)
+
+
+def _sides(quads: Array) -> Array:
+    """[N]: upper sides of quads [N, 4, 3]."""
+    return np.asarray(np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1), np.float64)
+
+
+def _fit_layout(ids: NDArray[np.int64], rays: Array, board: Board) -> tuple[int, float]:
+    """(how many markers, by rays [M, 4, 2], lie as a flat board has them, their side over its), where pitch is the board's."""
+    geometry = board_geometry(board)
+    known = np.isin(ids, geometry.ids)
+    quads = geometry.corners[geometry.index(ids[known]), :, :2] / _sides(geometry.corners)[0]
+    middles = quads.mean(axis=1)
+    if len(quads) < LEAST:
+        return 0, 1.0
+    H, _ = cv2.findHomography(rays[known].mean(axis=1), middles, cv2.RANSAC, FITTING)
+    if H is None:
+        return 0, 1.0
+    lie = cv2.perspectiveTransform(rays[known].reshape(-1, 1, 2), H).reshape(-1, 4, 2) - middles[:, None]
+    square = quads - middles[:, None]
+    side = float(np.median((lie * square).sum(axis=(1, 2)) / (square**2).sum(axis=(1, 2))))
+    off = np.abs(lie - side * square).max(axis=(1, 2))
+    return int((off < FITTING * side).sum()), side
 
 
 def _as_drawn(upright: Array, dictionary: str) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
-from workers.capture.board import PREDEFINED, Geometry, board_geometry, id_words
+from workers.capture.board import LARGEST, PREDEFINED, Geometry, board_geometry, id_words, smallest_dictionary
 from workers.geometry.colour import SRGB_STEPS
 from workers.geometry.pixels import project_points, rays_of_pixels
 
@@ -267,31 +267,24 @@ def _is_corner(light: NDArray[np.float32], pair: Array, points: Array) -> bool:
     return free_px >= MIN_HALF_PX and off_px < free_px and apart > max(CONTRAST * float(np.ptp(seen)), DARK)
 
 
-def other_dictionaries(rgb: NDArray[np.uint8]) -> str:
-    """What the image holds in place of the board's markers, in words: other dictionaries, or mirrored markers; or nothing.
+def other_dictionary(rgb: NDArray[np.uint8]) -> tuple[str, str]:
+    """(what the image holds in place of the board's markers, in words, the largest dictionary of their family); or nothing.
 
-    Takes a second or so: for the message about a capture in which no marker was found.
+    Markers may be mirrored, and have no dictionary then. Takes a second or so: for the message about a capture in which no
+    marker was found.
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    best, most = "", SEVERAL - 1
+    best, most = ("", ""), SEVERAL - 1
     for picture, how in ((gray, ""), (np.ascontiguousarray(gray[:, ::-1]), ", mirrored")):
         for name in PREDEFINED:
-            if name.endswith(("_50", "_100", "_250")) or name != name.upper():
+            if name != smallest_dictionary(name, LARGEST) or name != name.upper():
                 continue  # the first markers of the dictionary of 1000, or a second name
             dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
             _, ids, _ = _detector(dictionary, CLEAR_PERIMETER).detectMarkers(picture)
             if ids is not None and len(ids) > most:
-                best, most = (
-                    f"the image holds {len(ids)} markers of {_smallest(name, int(np.median(ids)))}{how}",
-                    len(ids),
-                )
+                smallest, most = smallest_dictionary(name, int(np.median(ids))), len(ids)  # a few ids may be misread
+                best = f"the image holds {most} markers of {smallest}{how}", "" if how else name
     return best
-
-
-def _smallest(name: str, usual_id: int) -> str:
-    """The smallest dictionary of the family that has the id; a few ids may be misread."""
-    family, _, size = name.rpartition("_")
-    return f"{family}_{next(n for n in (50, 100, 250, 1000) if n > usual_id)}" if size == "1000" else name
 
 
 def _detector(

@@ -28,9 +28,8 @@ from workers.capture.folder import (
     write_view,
 )
 from workers.door.opening import as_refusal
-from workers.door.recordings.folders import scaled_camera
 from workers.door.recordings.formats import open_any
-from workers.door.recordings.pictures import change_camera
+from workers.door.recordings.pictures import change_camera, scaled_camera
 from workers.geometry.zbuffer import register_depth
 
 Stamps = NDArray[np.int64]

@@ -15,12 +15,13 @@ from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Captures, Estimate, Estimation, Fusion
 from schemas.scene.shape import Mesh
 from workers.capture.board import frame_in_board, open_dictionary
-from workers.capture.detect import detect_markers, other_dictionaries
+from workers.capture.detect import detect_markers
 from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
 from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, observe_view
 from workers.capture.poses.observation import Observation, Setup
+from workers.capture.poses.solve_board import other_board
 from workers.capture.results import own_files
 from workers.capture.surface.coverage import describe_grazing
 from workers.capture.surface.fusion import fuse_views
@@ -178,8 +179,6 @@ def processor_clock() -> Stopwatch:
     return Stopwatch(now=time.process_time)
 
 
-FEW_MARKERS = 4
-"""Where no view has as many, other markers than the board's may have been found by chance."""
 MAKE: dict[Estimate, Callable[[Evidence], CaptureEstimate]] = {
     "markers": estimate_markers,
     "article": estimate_article,
@@ -261,23 +260,13 @@ def _with_given_pose(seen: Observation, markers: MarkerPose, given: Given) -> Ob
 
 def _no_markers(folder: CaptureFolder) -> str:
     what = f"{folder.path}: no marker of {folder.board.dictionary} was found in any of {len(folder.numbers)} views"
-    others = _other_markers(folder)
-    return (
-        f"{what}; {others}: correct board.json"
-        if others
-        else f"{what}: check that they are sharp, and not over-exposed"
-    )
+    return f"{what}; {other_board(folder) or 'check that they are sharp, and not over-exposed'}"
 
 
 def _no_pose(estimate: CaptureEstimate, folder: CaptureFolder) -> str:
     first = next((f"view {view.number}: {'; '.join(view.reasons)}" for view in estimate.views if view.reasons), "")
-    few = max(view.markers for view in estimate.views) < FEW_MARKERS
-    words = [f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}", first]
-    return "; ".join(part for part in (*words, _other_markers(folder) if few else "") if part)
-
-
-def _other_markers(folder: CaptureFolder) -> str:
-    return other_dictionaries(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
+    what = f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}"
+    return f"{what}; {other_board(folder) or first}"
 
 
 def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tuple[Estimates, Merged]:

@@ -356,16 +356,14 @@ LEAST_ROLLING_M = 1e-12
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:
     """Set friction and margin of a body, or of the ground, and no damping."""
-    # A contact's arm sums over both one's rolling friction times the other's friction: the bodies have the ground's share too
-    share = 0.0 if body is None else 2.0
     # Bullet has spinning friction only where there is rolling friction (bullet3 #4188)
     least = LEAST_ROLLING_M if physics.spinning_friction else 0.0
     pybullet.changeDynamics(
         thing,
         -1,
         lateralFriction=physics.friction,
-        rollingFriction=share * max(physics.rolling_friction, least),
-        spinningFriction=share * physics.spinning_friction,
+        rollingFriction=max(physics.rolling_friction, least),
+        spinningFriction=physics.spinning_friction,
         restitution=0.0,
         collisionMargin=0.0 if body is None else body.margin_m,
         linearDamping=0.0,

@@ -9,6 +9,7 @@ import os
 import pwd
 import re
 import shutil
+import stat
 import tempfile
 import uuid
 import weakref
@@ -257,25 +258,63 @@ def explain_disk_errors(what: str) -> Iterator[None]:
         raise
 
 
-_LOCK, _FREE = ".in-use", ".made"
-"""Names of a temporary folder's lock file: held, and before it is."""
+OWNER, _FREE = ".in-use", ".made"
+"""Names of the file that the owner of a temporary folder keeps locked: held, and before it is."""
+
+INNER = "r"
+"""The folder inside that is used. Ray opens its own to every user (0777), and sockets need short names."""
 
 
 @contextlib.contextmanager
 def temporary_folder(name: str) -> Iterator[Path]:
-    """An empty folder. Its owner holds a lock on a file in it, which the kernel gives back when the process ends."""
-    remove_abandoned(name)
-    with tempfile.TemporaryDirectory(prefix=f"verso-{name}-") as folder, open(Path(folder, _FREE), "wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        os.rename(Path(folder, _FREE), Path(folder, _LOCK))  # once it is held: whoever finds it free removes the folder
-        inner = Path(folder, "files")
-        inner.mkdir()
-        yield inner
+    """An empty folder of this machine, after those of this name whose process is gone were removed."""
+    place, prefix = Path(tempfile.gettempdir()), f"verso-{name}-"
+    owned_folders(place, prefix)
+    with owned_folder(place, prefix) as folder:
+        yield folder
 
 
-def remove_abandoned(name: str) -> None:
-    """Removes the folders of this name whose process is gone, but for one that was killed before it made its lock file."""
-    for lock_file in Path(tempfile.gettempdir()).glob(f"verso-{name}-*/{_LOCK}"):
-        with contextlib.suppress(OSError), open(lock_file, "rb") as lock:  # among them that of a lock that is held
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(lock_file.parent)
+@contextlib.contextmanager
+def owned_folder(place: Path, prefix: str) -> Iterator[Path]:
+    """An empty folder inside a new one of `place`, which no other user can enter; both are removed when the block ends.
+
+    The owner holds a lock on a file there, which the kernel gives back when the process ends, however that happens. Raises
+    OSError where none can be made.
+    """
+    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+    try:
+        (folder / INNER).mkdir()
+        with open(folder / _FREE, "wb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            os.rename(folder / _FREE, folder / OWNER)  # once it is held: whoever finds it free removes the folder
+            yield folder / INNER
+    finally:
+        _remove_owned(folder)
+
+
+def owned_folders(place: Path, prefix: str) -> list[Path]:
+    """This user's folders in `place` whose owners live. Those whose process is gone are removed.
+
+    One that was killed before it made its lock file is neither.
+    """
+    owned = []
+    for folder in place.glob(f"{prefix}*"):
+        with contextlib.suppress(OSError):  # not one of these folders, or removed by another process meanwhile
+            status = folder.lstat()
+            if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+                continue
+            with open(os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)) as lock:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    owned.append(folder)
+                else:
+                    _remove_owned(folder)
+    return owned
+
+
+def _remove_owned(folder: Path) -> None:
+    """Removes a folder, the owner's file last: what a process that is just ending wrote meanwhile is found again."""
+    shutil.rmtree(folder / INNER, ignore_errors=True)
+    if not (folder / INNER).exists():
+        shutil.rmtree(folder, ignore_errors=True)

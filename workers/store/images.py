@@ -60,27 +60,22 @@ def _deflated(pixels: NDArray, sub: bool, level: int) -> bytes:
     """PNG bytes by zlib-ng, of rows as they are or, with `sub`, as differences from pixel to pixel."""
     height, width = pixels.shape[:2]
     head = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, 2 if pixels.ndim == 3 else 0, 0, 0, 0)
-    rows = _differences(pixels) if sub else _unfiltered_rows(pixels)
-    body = zlib_ng.compress(rows.reshape(-1), level)
+    body = zlib_ng.compress(_filtered_rows(pixels, sub).reshape(-1), level)
     return b"".join((_SIGNATURE, *_chunk(b"IHDR", head), *_chunk(b"IDAT", body), *_chunk(b"IEND", b"")))
 
 
-def _unfiltered_rows(pixels: NDArray) -> NDArray[np.uint8]:
-    """[H, 1 + row bytes]: each row after the number of its PNG filter, `none`, with the high byte of a sample first."""
-    rows = np.empty((len(pixels), 1 + pixels[0].nbytes), np.uint8)
-    rows[:, 0] = 0
+def _filtered_rows(pixels: NDArray, sub: bool) -> NDArray[np.uint8]:
+    """[H, 1 + row bytes]: each row after the number of its PNG filter, with the high byte of a sample first.
+
+    The filter is `none` or, of 8-bit RGB with `sub`, differences from the pixel to the left.
+    """
     samples = pixels.astype(">u2").view(np.uint8) if pixels.dtype == np.uint16 else pixels
-    rows[:, 1:] = samples.reshape(len(pixels), -1)
-    return rows
-
-
-def _differences(pixels: NDArray) -> NDArray[np.uint8]:
-    """[H, 1 + row bytes]: of RGB, each row after the number of PNG's filter `sub`: differences from the pixel to the left."""
-    samples = pixels.reshape(len(pixels), -1)
+    samples = samples.reshape(len(pixels), -1)
     rows = np.empty((len(pixels), 1 + samples.shape[1]), np.uint8)
-    rows[:, 0] = 1
-    rows[:, 1:4] = samples[:, :3]
-    np.subtract(samples[:, 3:], samples[:, :-3], out=rows[:, 4:])
+    rows[:, 0] = sub
+    rows[:, 1:] = samples
+    if sub:
+        np.subtract(samples[:, 3:], samples[:, :-3], out=rows[:, 4:])
     return rows
 
 

@@ -185,7 +185,7 @@ class ObjectStore(Store):
             with self._explained(key):
                 if size <= CONDITIONAL_BYTES:
                     put = self._put_over(local.read_bytes(), key, over)
-                elif _tag(self.stat(key)) == _tag(over):
+                elif getattr(self.stat(key), "tag", None) == getattr(over, "tag", None):
                     put = obstore.put(self._bucket, key, local)
                 else:
                     raise _replaced(key)
@@ -243,10 +243,6 @@ class ObjectStage(Stage):
 
 def _entry(meta: "obstore.ObjectMeta") -> Entry:
     return Entry(meta["path"], meta["size"], meta["last_modified"].timestamp(), meta["e_tag"])
-
-
-def _tag(entry: Entry | None) -> str | None:
-    return entry and entry.tag
 
 
 def _replaced(key: str) -> RunError:

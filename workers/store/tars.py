@@ -99,12 +99,6 @@ def decode_label(data: bytes) -> dict[str, Any]:
     return label
 
 
-def label_differences(stored: Mapping[str, Any], derived: Mapping[str, Any]) -> list[str]:
-    """Dotted paths at which a stored label differs from the tables'; of keys that were added since, none counts as equal."""
-    mine, theirs = dict(_leaves(stored)), dict(_leaves(derived))
-    return [path for path in sorted(mine.keys() | theirs) if mine.get(path, "None") != theirs.get(path)]
-
-
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
     """(dotted path, text) of every value that is not a list or a mapping with items."""
     items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
@@ -175,13 +169,14 @@ def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tupl
 
 
 def _label_fault(content: bytes, derived: Mapping[str, Any] | None) -> str:
-    """How a stored label differs from the tables'; empty where it does not."""
+    """How a stored label differs from the tables'; empty where it does not. A key that was added since is none."""
     if derived is None:
         return "is of a pose that the tables do not have"
     try:
-        different = label_differences(decode_label(content), derived)
+        mine, theirs = dict(_leaves(decode_label(content))), dict(_leaves(derived))
     except ValueError as error:
         return f"is no label: {plain_line(str(error))}"
+    different = [path for path in sorted(mine.keys() | theirs) if mine.get(path, "None") != theirs.get(path)]
     return f"differs from the tables at {', '.join(map(plain_line, different[:3]))}" if different else ""
 
 

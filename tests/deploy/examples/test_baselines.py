@@ -7,7 +7,7 @@ from pathlib import Path
 import baselines
 import numpy as np
 import pytest
-from splits import instances_of, pairs_of_split
+from mirror_depth import instances_of, pairs_of_split
 
 from services.dataset.dataset import open_dataset
 from services.job.job_file import load_job

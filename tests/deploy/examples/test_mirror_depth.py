@@ -5,8 +5,7 @@ import dataclasses
 import mirror_depth
 import numpy as np
 import pytest
-from mirror_depth import CHANNELS, CROP, is_unseen, make_example, score
-from splits import instances_of, pairs_of_split
+from mirror_depth import CHANNELS, CROP, instances_of, is_unseen, make_example, pairs_of_split, score
 
 from services.dataset.dataset import open_dataset
 from services.dataset.view import View

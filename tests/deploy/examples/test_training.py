@@ -24,10 +24,8 @@ pytestmark = pytest.mark.skipif(
 CHECKS = """
 import sys
 import torch
-from mirror_depth import make_example
-from splits import pairs_of_split
-from torch_pairs import MirrorDepthPairs
-from train_mirror_depth import Net, complete, load, loss_of
+from mirror_depth import make_example, pairs_of_split
+from train_mirror_depth import MirrorDepthPairs, Net, complete, load, loss_of
 from services.dataset.dataset import open_dataset
 
 place = sys.argv[1]

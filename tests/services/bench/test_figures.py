@@ -7,9 +7,9 @@ import re
 import pytest
 
 from services.bench import command
+from services.bench.command import gain_of, measure_scaling
 from services.bench.figures import Lap, by_processor, pinned, slope_ratio, summarise_side
 from services.bench.measure import Measured
-from services.bench.scaling import gain_of, measure_scaling
 from services.job.job_file import validate_job
 from tests.datasets import SMALL as ANY_SMALL
 

@@ -268,8 +268,9 @@ def test_a_machine_without_gl_is_told_what_to_install():
 
 
 def test_a_missing_part_is_told_with_its_remedy_and_exits_1(monkeypatch, capsys):
-    for name in ("_python", "_cores", "_memory", "_disk", "_shared_memory", "_ray", "_gpus", "_stack"):
+    for name in ("_ray", "_gpus", "_stack"):
         monkeypatch.setattr(doctor, name, lambda name=name: Finding(name, True, "there"))
+    monkeypatch.setattr(doctor, "examine_machine", lambda: [Finding(name, True, "there") for name in "abcde"])
     for suffices, code in ((True, 0), (False, 1)):
         monkeypatch.setattr(doctor, "_renderer", lambda ok=suffices: Finding("GL", ok, "found", "install it"))
         assert doctor.main(argparse.Namespace(json=True)) == code

@@ -12,7 +12,7 @@ import pytest
 
 from services.cli.arguments import Command, read_span
 from services.cli.main import build_parser
-from services.cli.reference import page, script_for
+from services.cli.reference import commands_page, script_for
 from services.cli.rows import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -50,10 +50,10 @@ def test_every_example_is_accepted_its_handler_exists_and_its_help_shows_it(caps
 
 
 def test_the_page_is_the_one_that_the_table_makes():
-    """Else: python -m services.cli.reference > docs/commands.md."""
-    assert (ROOT / "docs" / "commands.md").read_text() == page()
+    """Else: python -m services.cli.reference commands > docs/commands.md."""
+    assert (ROOT / "docs" / "commands.md").read_text() == commands_page()
     for words, _ in commands():
-        assert f"# {' '.join(words)}\n" in page()
+        assert f"# {' '.join(words)}\n" in commands_page()
 
 
 HOSTILE = (

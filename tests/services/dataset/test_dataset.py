@@ -154,7 +154,7 @@ def test_a_missing_image_is_named(copy, tars):
         pair.input.depth()
     (pair, *_) = Dataset(LocalStore(tars.root)).pairs()
     with pytest.raises(CorruptError, match=r"can/RGB99999\.png is committed and in no tar: `verso verify"):
-        pair._files.image(0, "can/RGB99999.png")
+        pair._files.image("can/RGB99999.png")
 
 
 def test_captures_are_pairs_as_scenes_are(captures):

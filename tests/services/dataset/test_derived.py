@@ -9,8 +9,7 @@ import trimesh
 
 from schemas.errors import CorruptError, InputError
 from schemas.scene.scene import Placed
-from services.dataset.dataset import open_dataset
-from services.dataset.one_scene import make_scene
+from services.dataset.dataset import make_scene, open_dataset
 from services.dataset.pair import Pair
 from tests.kit.shapes import shape_of
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit

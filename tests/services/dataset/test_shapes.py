@@ -10,8 +10,7 @@ import yaml
 
 from schemas.errors import CorruptError, InputError, JobError, SceneError
 from schemas.job.assets import CATEGORIES
-from services.dataset.dataset import open_dataset
-from services.dataset.one_scene import make_scene
+from services.dataset.dataset import make_scene, open_dataset
 from services.job.job_file import validate_job
 from services.job.record import encode_job, read_job
 from tests.datasets import SMALL, make_dataset, overlaid

@@ -90,7 +90,7 @@ def test_models_stay_right_way_out_and_classes_have_the_numbers_of_nocs(nocs):
 
 
 def test_a_folder_that_is_full_is_followed_by_the_next(heap, tmp_path, monkeypatch):
-    monkeypatch.setattr("services.export.nocs.IN_FOLDER", 2)
+    monkeypatch.setattr("services.export.articles.IN_FOLDER", 2)
     export_to(heap, tmp_path / "new", "nocs")
     files = sorted(
         path.relative_to(tmp_path / "new").as_posix() for path in (tmp_path / "new").glob("*/0*/*_color.png")

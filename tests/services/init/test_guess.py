@@ -7,10 +7,9 @@ import trimesh
 
 from schemas.job.assets import is_usable
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.library.categories import find_joined, name_categories
 from workers.assets.library.collection import SUFFIXES
 from workers.assets.library.copies import Item, find_copies, find_doubles
-from workers.assets.library.guess import guess_groups, guess_ups
+from workers.assets.library.guess import find_joined, guess_groups, guess_ups, name_categories
 from workers.assets.library.placement import Measured, sample_look
 from workers.door.meshes.mesh import DEFAULT
 
@@ -59,7 +58,7 @@ def test_different_names_that_become_one_are_told():
 
 
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure", **more):
-    return Item(path, Measured(extents, 8, 12, True, 0, (), up, confidence if up else None, **more), path)
+    return Item(path, Measured(extents, 12, True, 0, (), up, confidence if up else None, **more), path)
 
 
 def cubes(*diagonals, suffix=".obj", folder=""):
@@ -200,7 +199,7 @@ def test_collision_shapes_and_coarser_levels_are_left_out_with_what_they_belong_
 
 def solid(path, size=1.0, turned=False, faces=200, look=None, volume=0.3, **more):
     extents = (0.1 * size, 0.3 * size, 0.2 * size) if turned else (0.1 * size, 0.2 * size, 0.3 * size)
-    measured = Measured(extents, 8, faces, True, 0, (), area=0.2 * size**2, volume=volume * size**3, look=look)
+    measured = Measured(extents, faces, True, 0, (), area=0.2 * size**2, volume=volume * size**3, look=look)
     return Item(path, replace(measured, **more), path)
 
 

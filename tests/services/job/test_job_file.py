@@ -18,9 +18,9 @@ from schemas.errors import JobError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
 from services.cli.main import main
-from services.job.job_file import NEEDS, describe_idle, load_job, pack_job, validate_job
+from services.cli.reference import describe_allowed, job_page, list_keys
+from services.job.job_file import NEEDS, allowed_keys, describe_idle, load_job, pack_job, validate_job
 from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
-from services.job.reference import allowed_keys, describe_allowed, list_keys, write_doc
 from services.run import run_job
 from tests.mutations import mutated_bytes, mutated_tree
 
@@ -222,7 +222,7 @@ def test_a_count_of_objects_is_a_number_or_a_range_and_is_written_as_it_was():
 def test_every_key_is_documented_and_the_page_is_current():
     keys = {path: field for path, field, _ in list_keys()}
     assert [path for path, field in keys.items() if not field.description] == []
-    assert (ROOT / "docs" / "job.md").read_text() == write_doc()
+    assert (ROOT / "docs" / "job.md").read_text() == job_page()
     for key, words in (
         ("images.projection.splat", "integer >=1,<=15"),
         ("start.offset_m", "[low, high]"),

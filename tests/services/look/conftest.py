@@ -10,6 +10,7 @@ import pytest
 from schemas.dataset.tables import SCHEMAS
 from services.look.collect import collect
 from services.look.pictures import Picture, ShownScene, picture_of_colour
+from services.read.dataset_reader import StoredTables
 from tests.datasets import make_dataset
 from workers.store.local import LocalStore
 
@@ -64,18 +65,16 @@ ASSETS = [
 ]
 
 
-class Handmade:
-    """Tables of rows, in batches of one and of the rest."""
-
-    sampled = False
+class Handmade(StoredTables):
+    """Tables of these rows, whose other columns are null."""
 
     def __init__(self, **tables) -> None:
-        self.tables = tables
+        self.store, self.sampled, self.rows = LocalStore("handmade"), False, tables
 
-    def batches(self, table, columns):
-        schema = pa.schema([SCHEMAS[table].field(name).with_nullable(True) for name in columns])
-        rows = [{name: row.get(name) for name in columns} for row in self.tables.get(table, [])]
-        yield from (pa.Table.from_pylist(part, schema) for part in (rows[:1], rows[1:]) if part)
+    def parts(self, table):
+        schema = pa.schema([field.with_nullable(True) for field in SCHEMAS[table]])
+        rows = [dict.fromkeys(schema.names) | row for row in self.rows.get(table, [])]
+        return [pa.Table.from_pylist(rows, schema)]
 
 
 @pytest.fixture(scope="package")

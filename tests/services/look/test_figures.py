@@ -6,22 +6,26 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.dataset as ds
 import pytest
 
 from schemas.dataset.layout import SUCCESS_FILE
 from schemas.job.assets import SplitShares
 from schemas.job.job import Job
 from services.dataset.dataset import open_dataset
-from services.look import collect as module
 from services.look.charts import FINE, HEIGHT, Chart, Histogram, amount, bars_of, chart_html
-from services.look.collect import Cost, Failure, choose_spread, collect, open_tables
-from services.look.scene_table import (
-    COLUMNS as HEADINGS,
+from services.look.collect import (
+    COLUMNS,
+    MOST_RANKED,
+    Cost,
+    Failure,
+    SceneTable,
+    collect,
+    read_scene_table,
+    worst_first,
 )
-from services.look.scene_table import MOST_RANKED, SceneTable, read_scene_table, scene_table_html, worst_first
-from services.look.sections import charts_html, effects_html, failures_html, overview_html
+from services.look.sections import charts_html, effects_html, failures_html, overview_html, scene_table_html
+from services.read.dataset_reader import StoredTables
+from services.read.query import query
 from tests.made_up_scenes import attempt_at
 from tests.services.look.conftest import HOSTILE, Handmade
 from workers.store.local import LocalStore
@@ -42,14 +46,14 @@ def test_tables_made_by_hand_give_the_figures_that_can_be_counted(figures):
     assert (figures.inclination["input"].least, figures.inclination["input"].most) == pytest.approx((45.0, 47.0))
     assert (figures.distance.count, figures.distance.least, figures.distance.most) == (2, 2.1, 2.5)
     first, second = figures.failures
-    assert (first.reason, first.scenes, first.examples, first.detail) == ("left_table", 2, (2, 4), "at 0.7 m")
+    assert (first.reason, first.scenes, first.examples, first.detail) == ("left_table", 2, [2, 4], "at 0.7 m")
     assert (second.reason, second.scenes) == ("no_rest", 1)
     none = collect(Handmade())
-    assert (none.scenes, none.views, none.failures) == (0, 0, ())
+    assert (none.scenes, none.views, none.failures) == (0, 0, [])
 
 
 def test_every_scene_has_its_split_and_figures_the_worst_first_and_so_has_a_capture(shown, captures):
-    table = read_scene_table(open_tables(shown), SplitShares(), 4)
+    table = read_scene_table(StoredTables(shown), SplitShares(), 4)
     rows = {row["scene_id"]: row for row in table.rows}
     assert set(rows) == {0, 1, 2, 3} and sum(map(Counter.total, table.splits.values())) == 4
     dataset = open_dataset(shown.root)
@@ -61,13 +65,13 @@ def test_every_scene_has_its_split_and_figures_the_worst_first_and_so_has_a_capt
             100 * min(pair.input.visible_fraction, pair.mirror.visible_fraction), abs=1e-3
         )
         assert row["support margin, mm"] == pytest.approx(pair.scene["support_margin_mm"], abs=1e-3)
-    html = scene_table_html(read_scene_table(open_tables(captures), SplitShares(), 1), "my data")
+    html = scene_table_html(read_scene_table(StoredTables(captures), SplitShares(), 1), "my data")
     assert "corner error, px" in html and "penetration" not in html and "verso query &#x27;my data&#x27;" in html
-    assert scene_table_html(read_scene_table(open_tables(shown), SplitShares(), MOST_RANKED + 1), "d") == ""
+    assert scene_table_html(read_scene_table(StoredTables(shown), SplitShares(), MOST_RANKED + 1), "d") == ""
 
 
 def test_a_scene_is_as_bad_as_the_figure_in_which_most_others_do_better():
-    usual = dict.fromkeys(HEADINGS) | {
+    usual = dict.fromkeys(COLUMNS) | {
         "visible, %": 90.0,
         "penetration, mm": 0.0,
         "hover, mm": None,
@@ -79,40 +83,24 @@ def test_a_scene_is_as_bad_as_the_figure_in_which_most_others_do_better():
     assert [row["worst"] for row in ranked[:3]] == ["penetration, mm", "visible, %", "visible, %"]
 
 
-COLUMNS = {"views": ("pose_id", "role", "category", "visible_fraction"), "scenes": ("scene_id", "category", "skipped")}
-
-
-def rows_of(tables, name: str) -> list[dict]:
-    parts = list(tables.batches(name, COLUMNS[name]))
-    assert all(part.column_names == list(COLUMNS[name]) for part in parts)
-    return sorted((row for part in parts for row in part.to_pylist()), key=lambda row: tuple(map(str, row.values())))
-
-
-def test_a_finished_and_an_unfinished_dataset_give_the_rows_that_pyarrow_reads_and_no_more_columns(shown, tmp_path):
+def test_an_unfinished_dataset_has_the_figures_of_a_finished_one_and_of_many_ranges_some_are_read_evenly(
+    shown, tmp_path, unflushed
+):
     shutil.copytree(shown.root, tmp_path / "copy")
     (tmp_path / "copy" / SUCCESS_FILE).unlink()
-    for name, columns in COLUMNS.items():
-        read = ds.dataset(f"{shown.root}/manifest/{name}", partitioning="hive").to_table(columns=list(columns))
-        expected = sorted(read.to_pylist(), key=lambda row: tuple(map(str, row.values())))
-        assert (
-            rows_of(open_tables(shown), name) == rows_of(open_tables(LocalStore(tmp_path / "copy")), name) == expected
-        )
-    assert list(open_tables(LocalStore(tmp_path / "none")).batches("scenes", ("scene_id",))) == []
-    rows = next(open_tables(shown).batches("scenes", ("scene_id", "capture")))
-    assert rows.column("capture").null_count == rows.num_rows > 0
-    assert pa.types.is_struct(rows.schema.field("capture").type)
-
-
-def test_of_many_ranges_that_are_not_merged_some_are_read_evenly(tmp_path, monkeypatch, unflushed):
-    store = LocalStore(tmp_path)
+    whole, running = (collect(StoredTables(store, 9)) for store in (shown, LocalStore(tmp_path / "copy")))
+    assert vars(whole).keys() == vars(running).keys()
+    for name, figure in vars(whole).items():
+        assert str(figure) == str(vars(running)[name]), name
+    assert (whole.scenes, whole.pairs, whole.files) == (4, 8, len(list(shown.root.glob("*/**/*.png"))))
+    assert collect(StoredTables(LocalStore(tmp_path / "none"), 9)).scenes == 0
+    store = LocalStore(tmp_path / "many")
     store.prepare()
     for start in range(0, 24, 2):
         attempt_at(store, start, start + 2).commit()
-    monkeypatch.setattr(module, "MOST_RANGES", 3)
-    tables = open_tables(store)
-    assert tables.sampled and [start for start, _ in tables.ranges] == [0, 12, 22]
-    assert {row["scene_id"] // 2 * 2 for row in rows_of(tables, "scenes")} == {0, 12, 22}
-    assert [choose_spread(range(10), 4), choose_spread(range(9), 1)] == [[0, 3, 6, 9], [0]]  # with both ends
+    tables = StoredTables(store, 3)
+    read = query(tables, "select scene_id from scenes union select scene_id from failures order by 1")
+    assert tables.sampled and read.column(0).to_pylist() == [0, 1, 12, 13, 22, 23]
 
 
 # ---------------------------------------------------------------------------------------------- histograms
@@ -203,7 +191,7 @@ def test_what_comes_from_the_dataset_is_text_and_never_markup(figures):
         stages={HOSTILE: Cost(1, 1.0, 1)},
     )
     overview = overview_html(hostile, Job(name="small", seed=1, scenes=3), 0)
-    row = dict.fromkeys(HEADINGS) | {"scene_id": 0, "category": HOSTILE, "name": HOSTILE, "split": "train", "worst": ""}
+    row = dict.fromkeys(COLUMNS) | {"scene_id": 0, "category": HOSTILE, "name": HOSTILE, "split": "train", "worst": ""}
     table = scene_table_html(SceneTable([row]), HOSTILE)
     for part in (overview, effects_html(hostile), failures_html([failure], 1), table):
         assert "<script" not in part and "&lt;script&gt;" in part

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from schemas.errors import CorruptError, MachineError
+from schemas.errors import MachineError
 from services.look import clouds as module
 from services.look.clouds import Body, Cloud, Space, coarsen, pack_spaces, read_space, read_spaces
 from services.look.pictures import (
@@ -24,12 +24,10 @@ from services.look.pictures import (
     picture_of_depth,
     picture_of_projection,
     picture_of_regions,
-    read_pair,
     show_scenes,
 )
 from services.look.sections import space_html
 from services.look.sheets import compare_html, sheets_html
-from services.read.dataset_reader import file_reader, find_scene
 from tests.services.look.conftest import HOSTILE, Handmade, address, scene
 
 VIRIDIS_ENDS = ((253, 231, 37), (68, 1, 84))
@@ -75,19 +73,6 @@ def test_a_large_picture_is_shrunk_and_its_address_holds_its_bytes():
     kind, _, data = picture.inline.partition(",")
     assert kind == "data:image/jpeg;base64" and base64.b64decode(data) == picture.data
     assert picture.name != picture_of_colour(np.full((12, 16, 3), 9, np.uint8), "small").name
-
-
-def test_the_images_of_a_pair_are_those_in_its_files(shown):
-    stored = find_scene(shown, 1)
-    (views, _), folder = next(stored.pairs(1)), shown.root / stored.scene(1)["category"]
-    images = read_pair(file_reader(shown.read, stored), views)
-    assert len(images) == 8 and not any(role == "aligned" for role, _ in images)
-    for key, name in ((("input", "depth"), "depth00004"), (("mirror", "depth"), "depth00005")):
-        assert np.array_equal(images[key], cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED))
-    projected = cv2.imread(str(folder / "RGBprojected00004.png"))[..., ::-1]
-    assert np.array_equal(images["projected", "rgb"], projected)
-    with pytest.raises(CorruptError, match=r"can/RGB00004\.png is not a PNG"):
-        read_pair(lambda path: b"no PNG", views)
 
 
 def test_each_category_has_as_many_scenes_evenly_over_its_ids_and_at_least_one():

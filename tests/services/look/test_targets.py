@@ -22,7 +22,6 @@ from services.read.dataset_reader import find_scene
 from tests.services.look.conftest import address, scene
 
 LAYERS, DEPTHS = ("layer1", "layer2", "back"), ("layer1_00000", "layer2_00000", "back00000")
-ROW = {"depth_units_per_m": 5000.0}
 
 
 def decoded(picture) -> np.ndarray:
@@ -71,7 +70,7 @@ def test_a_new_modality_is_painted_and_compared_by_its_row_alone(monkeypatch):
     ):
         monkeypatch.setitem(MODALITIES, new.name, new)
     flow, rim = np.full((4, 4, 3), 0x8000, np.uint16), np.full((4, 4), 5000, np.uint16)
-    pictures = view_pictures("input", {"flow": flow, "rim": rim}, ROW)
+    pictures = view_pictures("input", {"flow": flow, "rim": rim}, 5000.0)
     assert (decoded(pictures["input flow"]) == 128).all() and pictures[
         "input rim"
     ].words == "input view, rim, 1.00 to 1.00 m"

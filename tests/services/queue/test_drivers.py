@@ -1,15 +1,13 @@
 """Drivers and what people see of them: one attempt at a job, Ray's job API where it is absent, rows and logs."""
 
-import math
 import socket
 
 import pytest
 
 from schemas.errors import CorruptError, InUseError, MachineError, OutputError, RunError
 from schemas.queue import submission_id
-from services.queue.drivers import EVERY_S, Ending, RayDrivers, Sharing, drive
+from services.queue.drivers import EVERY_S, Ending, RayDrivers, drive, sharing_of
 from services.queue.listing import follow_logs, format_rows, header, list_jobs, read_logs
-from services.run.ray_cluster import slots_of
 from tests.kit.queue_world import FakeDrivers, ids, queue_of, request_of
 from tests.made_up_datasets import dataset_at
 
@@ -91,7 +89,7 @@ def test_a_driver_whose_turn_it_is_not_does_nothing(tmp_path):
 
 def test_the_share_is_read_every_few_seconds_and_survives_a_store_that_fails(tmp_path):
     queue, now = queue_of(tmp_path / "q"), [0.0]
-    sharing = Sharing(queue, lambda: now[0])
+    sharing = sharing_of(queue, lambda: now[0])
     seen = []
     for now[0], told in ((0.0, 2), (EVERY_S - 0.1, 3), (EVERY_S, 3), (2 * EVERY_S, 4), (3 * EVERY_S, None)):
         if told is None:
@@ -101,14 +99,6 @@ def test_the_share_is_read_every_few_seconds_and_survives_a_store_that_fails(tmp
             queue.put_share(told)
         seen.append(sharing())
     assert seen == [2, 2, 3, 4, 4]
-
-
-def test_even_shares_use_every_core_and_none_is_without():
-    for cores in range(1, 20):
-        for jobs in range(1, 6):
-            slots = slots_of(cores, None, jobs)
-            assert slots.in_flight == (2 * cores if jobs == 1 else math.ceil(cores / jobs))
-            assert slots.in_flight >= 1 and jobs * slots.in_flight >= cores
 
 
 def test_a_row_for_each_job_in_the_order_of_its_turn_also_of_a_damaged_one(tmp_path):

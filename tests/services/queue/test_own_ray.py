@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +24,12 @@ from services.queue.queue import open_queue
 from services.queue.supervise import Driver, Rules, supervise
 from services.run.machine import private_folder
 from tests.datasets import run_here
-from tests.kit.killed_runs import chain_of, processes_with
+from tests.kit.killed_runs import chain_of, processes_with, wait_for
 from tests.kit.network import free_port, listeners_of
 from tests.kit.queue_world import ids, queue_of, request_of
 
 ROOT = Path(__file__).resolve().parents[3]
 TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
-PATIENCE_S = 180.0
-
-
-def wait_for(happened: Callable[[], Any], told: Callable[[], str] = str) -> Any:
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := happened()):
-        assert time.monotonic() < deadline, told()
-        time.sleep(0.05)
-    return found
 
 
 def test_drivers_are_children_that_are_told_once_to_end_and_whose_logs_are_found_while_they_run(monkeypatch):

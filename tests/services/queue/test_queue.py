@@ -186,11 +186,6 @@ def test_a_job_is_taken_up_again_three_times_and_then_lost_but_waiting_for_a_fol
     assert (waited.state, waited.deaths, waited.attempt) == ("waiting", 0, 8)
 
 
-def test_a_job_claims_its_folder_from_its_first_attempt_to_its_end():
-    claims = {"": False, "started:1": True, "started:1 died:1": True, "started:1 began:1 ended:1:1": False}
-    assert {events: after(events).claims_folder for events in claims} == claims
-
-
 KINDS = st.sampled_from(["started", "began", "busy", "ended", "died", "stopped", "cancel"])
 
 

@@ -6,8 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from services.job.job_file import load_job
 from services.queue.queue import open_queue
 from services.run.lock import read_holder
 from tests.datasets import run_here
-from tests.kit.killed_runs import processes_with
+from tests.kit.killed_runs import processes_with, wait_for
 from tests.kit.ray_head import ROOT, RayHead, ray_head
 
 TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
@@ -25,7 +24,6 @@ SCENES, MANY = 4, 4000
 SLOWLY = [*("--set", "run.range_size=1"), *("--set", "run.shard_size=1"), *("--set", "run.workers=1")]
 """Commits come one by one, and of many scenes there is always one to come."""
 HOSTILE = "o $(touch x) `touch x`; touch x 'y' \"z\""
-PATIENCE_S = 180.0
 
 
 def verso(head: RayHead, *words: str, **changes: str) -> subprocess.CompletedProcess[str]:
@@ -42,7 +40,7 @@ def supervisor(head: RayHead, queue: str, log: Path) -> Iterator[subprocess.Pope
     with log.open("ab") as words:
         process = subprocess.Popen(command, cwd=ROOT, env=head.environment, stdout=words, stderr=words)
     try:
-        wait_for("supervision", lambda: is_at_work(queue, process), log)
+        wait_for(lambda: is_at_work(queue, process), log.read_text)
         yield process
     finally:
         process.kill()
@@ -52,14 +50,6 @@ def supervisor(head: RayHead, queue: str, log: Path) -> Iterator[subprocess.Pope
 def is_at_work(queue: str, process: subprocess.Popen) -> bool:
     holder = read_holder(open_queue(queue).store)
     return process.poll() is None and holder is not None and holder.pid == process.pid
-
-
-def wait_for(what: str, happened: Callable[[], Any], log: Path) -> Any:
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := happened()):
-        assert time.monotonic() < deadline, f"{what} did not happen: {log.read_text()}"
-        time.sleep(0.05)
-    return found
 
 
 def kill_driver(head: RayHead, job: str) -> None:
@@ -131,12 +121,12 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
 
         with supervisor(head, queue, log) as first:
             for job in (killed, cancelled):
-                wait_for("a commit", lambda job=job: commits(job), log)
+                wait_for(lambda job=job: commits(job), log.read_text)
             first.kill()
             kill_driver(head, killed)
             gate.touch()
             before = commits(cancelled)
-            wait_for("a commit without a supervisor", lambda: commits(cancelled) > before, log)
+            wait_for(lambda: commits(cancelled) > before, log.read_text)
             assert read(waiting).state == "queued"  # although it is the oldest
         told = verso(head, "cancel", cancelled, "--queue", queue)
         assert (told.returncode, told.stdout) == (0, f"{cancelled}: cancelling\n")
@@ -144,8 +134,8 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
         with supervisor(head, queue, log) as second:
             again = verso(head, "supervise", "--queue", queue, "--address", head.http)
             assert again.returncode == 1 and "another supervisor works here" in again.stderr
-            wait_for("the end", lambda: all(read(job).ended for job in (killed, cancelled, waiting)), log)
-            wait_for("the last log", lambda: open_queue(queue).has_log(killed, 2), log)
+            wait_for(lambda: all(read(job).ended for job in (killed, cancelled, waiting)), log.read_text)
+            wait_for(lambda: open_queue(queue).has_log(killed, 2), log.read_text)
             second.terminate()
             assert second.wait(60) == 0
             assert read_holder(open_queue(queue).store) is None

@@ -140,25 +140,19 @@ def check_ends(world: World) -> None:
         assert all(world.queue.has_log(job, attempt) for attempt in range(1, world.queue.read(job).attempt + 1))
 
 
-def test_five_jobs_come_to_their_ends(tmp_path):
-    world, said = world_of(tmp_path), []
-    supervisor = world.supervisor(said.append)
-    supervisor.look()
-    assert world.queue.share() == 2
-    play(world, supervisor.look)
-    check_ends(world)
-    assert world.handed_over.index(submission_id(SECOND, 1)) < world.handed_over.index(submission_id(LAST, 1))
-    assert f"job {DYING}, attempt 1: its driver ended without telling how; it is taken up again in 10 s" in said
-    assert f"job {CANCELLED}: cancelled; what it committed is kept" in said
-    assert world.queue.share() == 1
-
-
 def at_each_step(tmp_path, happens) -> None:
     """Plays the world once for each of its effects; `happens(world, supervisors)` at this effect; the last one looks."""
-    whole, effects = world_of(tmp_path / "whole"), []
+    whole, effects, said = world_of(tmp_path / "whole"), [], []
     whole.effect = lambda: effects.append(whole.ticks)
-    play(whole, whole.supervisor().look)
-    assert len(effects) > 20
+    supervisor = whole.supervisor(said.append)
+    supervisor.look()
+    assert whole.queue.share() == 2
+    play(whole, supervisor.look)
+    check_ends(whole)
+    assert whole.handed_over.index(submission_id(SECOND, 1)) < whole.handed_over.index(submission_id(LAST, 1))
+    assert f"job {DYING}, attempt 1: its driver ended without telling how; it is taken up again in 10 s" in said
+    assert f"job {CANCELLED}: cancelled; what it committed is kept" in said
+    assert whole.queue.share() == 1 and len(effects) > 20
     for step in range(len(effects)):
         world = world_of(tmp_path / str(step))
         supervisors = [world.supervisor()]

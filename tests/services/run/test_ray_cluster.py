@@ -1,6 +1,8 @@
 """What is refused before Ray is asked, who can reach a private Ray and what it sends, its folder, and a cluster's slots."""
 
+import itertools
 import json
+import math
 import os
 import shutil
 import signal
@@ -21,12 +23,11 @@ from schemas.errors import MachineError
 from services.run import machine as module
 from services.run.machine import (
     MAX_BASE_BYTES,
-    OWNER,
     PREFIX,
     SESSION_BYTES,
     SOCKET_BYTES,
+    living_folders,
     private_folder,
-    remove_dead,
 )
 from services.run.ray_cluster import (
     LOOK_EVERY_S,
@@ -49,6 +50,7 @@ from tests.kit.network import (
     tree_of,
     unix_sockets_of,
 )
+from workers.store.file_system import OWNER
 
 ROOT = Path(__file__).resolve().parents[3]
 NOBODY = 65534
@@ -129,6 +131,8 @@ def test_slots_follow_the_cores_of_the_cluster_which_is_asked_now_and_then(monke
         (2, 6, Slots(2, 2 * PREFETCH)),
     ):
         assert slots_of(cores, workers) == slots
+    for cores, jobs in itertools.product(range(1, 20), range(2, 6)):  # even shares: no core is idle, no job without
+        assert slots_of(cores, None, jobs) == Slots(share := math.ceil(cores / jobs), share)
     cores, now, asked = [2], [100.0], []
 
     def count() -> int:
@@ -180,7 +184,7 @@ def test_the_folder_of_a_dead_owner_goes_at_the_next_start_and_that_of_a_living_
         dead = killed_owner(short)
         with monkeypatch.context() as busy:
             busy.setattr(shutil, "rmtree", lambda folder, **_: None)  # a process that is just ending still writes there
-            remove_dead(short)
+            living_folders()
         assert (dead / OWNER).exists(), "half removed, it is found again"
         with private_folder():
             assert not dead.exists()
@@ -196,7 +200,7 @@ def test_what_only_looks_like_one_or_is_another_users_stays(short):
     if os.geteuid() == 0:
         os.chown(killed_owner(short), NOBODY, NOBODY)
     before = sorted(short.rglob("*"))
-    remove_dead(short)
+    living_folders()
     assert sorted(short.rglob("*")) == before
 
 

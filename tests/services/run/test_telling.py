@@ -57,7 +57,10 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
             {"cameras.orbit.radius_m": 125},
             r"input camera has the object 12\d to 12\d m before .* change cameras\.orbit",
         ),
-        ({"cameras.orbit.radius_m": 0.05}, r"object -0\.\d+ to .* change cameras\.orbit\.radius_m, which is 0\.05"),
+        (
+            {"cameras.orbit.radius_m": 0.05},
+            r"m across, and the input camera stands 0\.\d+ m from its middle: set cameras\.orbit\.radius_m: fit",
+        ),
         (
             {"images.depth_range_m": [3, 4]},
             r"object 2\.\d+ to 2\.\d+ m before it, outside images\.depth_range_m \[3, 4\]",

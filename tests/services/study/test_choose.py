@@ -15,9 +15,9 @@ from services.study.choose import (
     describe_answer,
     error_of,
     front,
-    parse_targets,
     recommend,
 )
+from services.study.command import parse_targets
 from services.study.model import Row, Study, Targets, amount, times
 from tests.services.study.made_up import row, study
 

@@ -15,7 +15,7 @@ from schemas.job.job import Job
 from services.cli.main import main
 from services.job.job_file import load_job
 from services.study import command
-from services.study.choose import refuse_unmeasured
+from services.study.command import refuse_unmeasured
 from services.study.measure import RESTS, measure_capture
 from services.study.model import Setting
 from services.study.study import HEADER, JOURNAL_FILE, SPENT, Journal, Unit, answer_unit

@@ -9,7 +9,7 @@ from schemas.errors import InputError, OutputError
 from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job, JobKind, kind_of, settings_digest
 from services.study import model
-from services.study.choose import error_of, own_row
+from services.study.choose import error_of, own_row, promising
 from services.study.model import (
     ERRORS,
     REFERENCES,
@@ -20,7 +20,6 @@ from services.study.model import (
     knobs_of,
     settings_of,
 )
-from services.study.rounds import promising
 from services.study.study import JOURNAL_FILE, Journal
 from tests.services.study.made_up import row, stored
 

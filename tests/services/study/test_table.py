@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from services.study.choose import LEAST, next_round, standings, undecided
 from services.study.model import OWN, REFERENCES, Figure, Setting
-from services.study.rounds import LEAST, next_round, standings, undecided
 from services.study.table import (
     LEAST_OUTCOMES,
     Table,

@@ -19,18 +19,8 @@ from tests.workers.door.recordings import (
     write_recording,
 )
 from tests.workers.geometry.made_up_kinect import COLOR_LENS, T_COLOR_DEPTH
-from workers.door.recordings.kinect import (
-    COLOR_SIZES,
-    DEPTH_MODES,
-    FORMATS,
-    decode_color,
-    decode_depth,
-    decode_gray,
-    is_whole,
-    open_recording,
-    read_calibration,
-    read_frames,
-)
+from workers.door.recordings.formats import open_any
+from workers.door.recordings.kinect import COLOR_SIZES, DEPTH_MODES, FORMATS, decode_color, read_calibration
 from workers.geometry.frames import transform
 from workers.geometry.pixels import pixel_rays, project_points
 
@@ -46,31 +36,34 @@ def saved(folder, data: bytes):
 # ---------------------------------------------------------------------------------------------- tracks and frames
 
 
-def test_what_the_recording_says_is_read_and_every_frame_comes_back_byte_for_byte(tmp_path):
-    found = open_recording(saved(tmp_path, recording(3)))
-    assert (found.color_format, found.color_size, found.depth_size) == ("MJPG", (1280, 720), (320, 288))
-    assert (found.depth_mode, found.serial_number) == ("NFOV_2X2BINNED", "000123")
-    assert found.calibration == ATTACHED
-    assert found.period_us == pytest.approx(33_333.3, abs=0.1) and found.depth_delay_us == 160.0
-    color, depth = frames(3)
-    read = list(read_frames(found))
-    assert [(f.stamp_us, f.data) for f in read if not f.is_depth] == color
-    assert [(f.stamp_us, f.data) for f in read if f.is_depth] == depth, "and not the infra-red track's"
+def test_what_the_recording_says_is_read_and_every_frame_comes_back(tmp_path):
+    made = open_any(saved(tmp_path, recording(3)))
+    assert made.told == {"serial_number": "000123", "depth_mode": "NFOV_2X2BINNED"}
+    assert made.period_us == pytest.approx(33_333.3, abs=0.1) and made.depth_delay_us == 160.0
+    assert made.color.lens == pytest.approx(COLOR_LENS) and made.color.depth_units_per_m == 1000.0
+    assert made.depth.T_color_depth == pytest.approx(T_COLOR_DEPTH, abs=1e-12)
+    read = list(made.frames())
+    for is_depth, written in zip((False, True), frames(3), strict=True):
+        assert [frame.stamp_us for frame in read if frame.is_depth == is_depth] == [stamp for stamp, _ in written]
+    for frame, (_, data) in zip([frame for frame in read if not frame.is_depth], frames(3)[0], strict=True):
+        assert np.array_equal(frame.load(False), cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB))
+    for frame, (_, data) in zip([frame for frame in read if frame.is_depth], frames(3)[1], strict=True):
+        assert np.array_equal(frame.load(False), np.frombuffer(data, ">u2").reshape(288, 320) / 1000.0), "not infra-red"
 
 
 def test_a_cut_file_gives_the_frames_before_the_cut_and_no_half_frame(tmp_path):
-    data, whole_frames = recording(4), dict([*frames(4)[0], *frames(4)[1]])
+    data, stamps = recording(4), {stamp for written in frames(4) for stamp, _ in written}
     for share in (0.35, 0.6, 0.85):
-        found = list(read_frames(open_recording(saved(tmp_path, data[: int(len(data) * share)]))))
-        assert 0 < len(found) < 8
-        assert all(frame.data == whole_frames[frame.stamp_us] for frame in found)
+        read = list(open_any(saved(tmp_path, data[: int(len(data) * share)])).frames())
+        assert 0 < len(read) < 8
+        assert all(frame.stamp_us in stamps and frame.load(False) is not None for frame in read)
 
 
 def test_tags_find_the_tracks_where_names_do_not(tmp_path):
     data = recording(1)
     unnamed = data.replace(b"\x53\x6e\x01\0\0\0\0\0\0\x05DEPTH", b"\x53\x6e\x01\0\0\0\0\0\0\x05other")
     assert unnamed != data
-    assert open_recording(saved(tmp_path, unnamed)).depth_size == (320, 288)
+    assert len(list(open_any(saved(tmp_path, unnamed)).frames())) == 2
 
 
 def test_what_is_missing_is_named_with_a_remedy(tmp_path):
@@ -83,7 +76,7 @@ def test_what_is_missing_is_named_with_a_remedy(tmp_path):
     ]:
         path = saved(tmp_path, data)
         with pytest.raises(CaptureError, match=told) as caught:
-            open_recording(path)
+            open_any(path)
         assert caught.value.reason == reason and str(path) in caught.value.detail
 
 
@@ -96,22 +89,21 @@ SMOOTH = cv2.resize(np.random.default_rng(5).integers(60, 200, (3, 4, 3)).astype
 @pytest.mark.parametrize("fourcc", FORMATS)
 def test_colour_comes_back_and_its_grey_picture_at_half_the_size(fourcc):
     data = color_bytes(SMOOTH, fourcc)
-    rgb, gray = decode_color(data, fourcc, SIZE), decode_gray(data, fourcc, SIZE)
+    rgb, gray = (decode_color(data, fourcc, SIZE, small) for small in (False, True))
     assert rgb.dtype == np.uint8 and np.abs(rgb.astype(int) - SMOOTH).mean() < (0.01 if fourcc == "BGRA" else 4.0)
     true = cv2.resize(cv2.cvtColor(SMOOTH, cv2.COLOR_RGB2GRAY), (32, 24), interpolation=cv2.INTER_AREA)
     scale = 1.0 if fourcc in ("MJPG", "BGRA") else 219 / 255  # video range, from 16 up
     assert np.corrcoef(gray.ravel(), true.ravel())[0, 1] > 0.99
     assert gray.astype(float).std() == pytest.approx(true.std() * scale, rel=0.1)
-    assert is_whole(data, fourcc, SIZE)
-    assert not is_whole(data[:-40], fourcc, SIZE) and not is_whole(b"", fourcc, SIZE)
+    assert decode_color(data[:-40], fourcc, SIZE, False) is None and decode_color(b"", fourcc, SIZE, True) is None
 
 
 def test_jpeg_frames_may_be_padded_or_lack_huffman_tables_and_other_bytes_are_none():
     data = color_bytes(SMOOTH, "MJPG")
-    assert is_whole(data + bytes(7), "MJPG", SIZE)
-    assert decode_color(b"\xff\xd8nothing\xff\xd9", "MJPG", SIZE) is None
-    assert decode_gray(b"\xff\xd8nothing\xff\xd9", "MJPG", SIZE) is None
-    assert decode_color(data, "MJPG", (48, 64)) is None, "another size than the track's"
+    whole = decode_color(data, "MJPG", SIZE, False)
+    assert np.array_equal(decode_color(data + bytes(7), "MJPG", SIZE, False), whole)
+    assert decode_color(b"\xff\xd8nothing\xff\xd9", "MJPG", SIZE, False) is None
+    assert decode_color(data, "MJPG", (48, 64), True) is None, "another size than the track's"
     at, bare = 2, data[:2]  # cameras leave the standard tables out (segments DHT, 0xFFC4), as AVI's MJPG allows
     while data[at + 1] != 0xDA:
         length = 2 + int.from_bytes(data[at + 2 : at + 4], "big")
@@ -119,9 +111,7 @@ def test_jpeg_frames_may_be_padded_or_lack_huffman_tables_and_other_bytes_are_no
         at += length
     bare += data[at:]
     assert len(bare) < len(data)
-    assert np.array_equal(decode_color(bare, "MJPG", SIZE), decode_color(data, "MJPG", SIZE))
-    depth = decode_depth(bytes([0x01, 0x02, 0xFF, 0x00, 0x00, 0x07]), (3, 1))  # big-endian
-    assert depth.tolist() == [[0x0102, 0xFF00, 7]] and depth.dtype == np.uint16
+    assert np.array_equal(decode_color(bare, "MJPG", SIZE, False), whole)
 
 
 # ---------------------------------------------------------------------------------------------- calibration
@@ -149,40 +139,33 @@ def sdk() -> bytes:
 
 
 def test_a_point_is_where_the_sdk_puts_it():
-    device = read_calibration(sdk(), (3840, 2160), "WFOV_2X2BINNED")
-    point = np.array([[*pixel_rays(device.depth.intrinsics, device.depth.lens)[256, 256], 1.0]])
+    color, depth = read_calibration(sdk(), (3840, 2160), "WFOV_2X2BINNED")
+    point = np.array([[*pixel_rays(depth.intrinsics, depth.lens)[256, 256], 1.0]])
     assert point[0] * 1000 == pytest.approx([-2.45376134, -1.66107690, 1000.0], abs=1e-3)
-    seen = transform(device.depth.T_color_depth, point)
+    seen = transform(depth.T_color_depth, point)
     assert seen[0] * 1000 == pytest.approx([-37.6291695, 63.3947754, 1001.46521], abs=1e-3)
-    at = project_points(seen, device.color.intrinsics, device.color.lens)
+    at = project_points(seen, color.intrinsics, color.lens)
     assert at[0] - 0.5 == pytest.approx([1835.689453, 1206.290039], abs=2e-3)
 
 
 def test_modes_are_parts_of_one_sensor():
     """All colour modes use the sensor's whole width and its middle height; depth modes are cut out and binned."""
-    reference = read_calibration(sdk(), (4096, 3072), "NFOV_UNBINNED").color.intrinsics
+    reference = read_calibration(sdk(), (4096, 3072), "NFOV_UNBINNED")[0].intrinsics
     for size in COLOR_SIZES:
-        k, times = read_calibration(sdk(), size, "NFOV_UNBINNED").color.intrinsics, size[0] / 4096
+        k, times = read_calibration(sdk(), size, "NFOV_UNBINNED")[0].intrinsics, size[0] / 4096
         assert (k.fx, k.fy, k.cx) == pytest.approx((reference.fx * times, reference.fy * times, reference.cx * times))
         assert k.cy - 0.5 * k.height == pytest.approx((reference.cy - 1536) * times)
-    whole = read_calibration(sdk(), (1280, 720), "WFOV_UNBINNED").depth.intrinsics
+    whole = read_calibration(sdk(), (1280, 720), "WFOV_UNBINNED")[1].intrinsics
     for mode, (across, cut, _) in DEPTH_MODES.items():
-        k, times = read_calibration(sdk(), (1280, 720), mode).depth.intrinsics, across / 1024
+        k, times = read_calibration(sdk(), (1280, 720), mode)[1].intrinsics, across / 1024
         expected = (whole.fx * times, whole.cx * times, whole.cy * times)
         assert (k.fx, k.cx + cut[0], k.cy + cut[1]) == pytest.approx(expected)
-    narrow = read_calibration(sdk(), (1280, 720), "NFOV_2x2BINNED").depth.intrinsics  # as old recordings write it
+    narrow = read_calibration(sdk(), (1280, 720), "NFOV_2x2BINNED")[1].intrinsics  # as old recordings write it
     assert (narrow.width, narrow.height) == (320, 288)
     for size, mode in (((640, 480), "NFOV_UNBINNED"), ((1280, 720), "PASSIVE_IR"), ((1280, 720), "")):
         with pytest.raises(CaptureError) as caught:
             read_calibration(sdk(), size, mode)
         assert caught.value.reason == "mode"
-
-
-def test_a_later_calibration_of_the_whole_sensor_gives_lens_and_place():
-    device = read_calibration(ATTACHED, (1280, 720), "NFOV_2X2BINNED")
-    assert device.color.lens == pytest.approx(COLOR_LENS)
-    assert device.depth.T_color_depth == pytest.approx(T_COLOR_DEPTH, abs=1e-12)
-    assert device.color.depth_units_per_m == 1000.0
 
 
 def changed(keys: list, value: object) -> bytes:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from services.job.record import require_job
-from services.read.dataset_reader import file_reader, find_scene, read_image
+from services.read.dataset_reader import committed_reader, file_reader, find_scene
 from tests.datasets import make_dataset
 from workers.scene.check_stored import check_stored_pair, check_stored_scene
+from workers.store.images import decode_png
 
 
 @pytest.fixture(scope="module")
@@ -17,8 +18,10 @@ def stored(tmp_path_factory):
     store, _ = make_dataset(tmp_path_factory.mktemp("pair"), scenes=1, objects_per_scene=2)
     scene = find_scene(store, 0)
     ((views, objects),) = scene.pairs(0)
-    read = file_reader(store.read, scene)
-    images = {file["path"]: read_image(read, file["path"]) for view in views.values() for file in view["files"]}
+    read = file_reader(committed_reader(store, scene.records), scene.records)
+    images = {
+        file["path"]: decode_png(read(file["path"]), file["path"]) for view in views.values() for file in view["files"]
+    }
     return require_job(store).job, scene.scene(0), views, objects, images
 
 

@@ -26,7 +26,6 @@ from tests.kit.faults import REQUESTS, check_published, disk, requests
 from tests.kit.made_up_runs import (
     FIRST,
     RANGE,
-    broken_promises,
     contents,
     half_merged,
     leftovers,
@@ -38,7 +37,6 @@ from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.store import ledger
 from workers.store import store as store_module
 from workers.store.attempt import sweep
-from workers.store.commit import publish
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 from workers.store.store import Events
@@ -67,32 +65,22 @@ def append_three(root: Path) -> list[bytes]:
     return log.read()
 
 
-OPERATIONS = {
-    "a merge": (lambda root: half_merged(LocalStore(root)), lambda root: merge(LocalStore(root), 0, 4).digest),
-    "events": (lambda root: LocalStore(root).prepare(), append_three),
-}
-"""What stands before an operation, and the operation, whose result is compared."""
-
-
 @every_point
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_ended_at_a_point_with_any_loss_and_done_again_it_comes_to_the_same(name, every, tmp_path):
-    """Runs, extensions and retries are ended at points in tests/chaos/test_crashes.py."""
-    before, act = OPERATIONS[name]
+def test_events_ended_at_a_point_with_any_loss_and_appended_again_come_to_the_same(every, tmp_path):
+    """Runs, extensions and retries, their merges too, are ended at points in tests/chaos/test_crashes.py."""
     whole = tmp_path / "whole"
     with disk():
-        before(whole)
+        LocalStore(whole).prepare()
     crashed = Disk(whole)
     with recorded(whole) as steps:
-        result = act(whole)
+        result = append_three(whole)
     kept, chosen = contents(whole), points(len(steps), every)
     for number, step in enumerate(steps):
         for loss in losses(0) if number in chosen else ():
             root, where = tmp_path / f"{number}-{loss.name}", f"before step {number}, {step[:2]}: {loss.name} lost"
             write_tree(crashed.after_a_crash(loss), root)
-            assert not broken_promises(root), where
             with disk():
-                assert act(root) == result, where
+                assert append_three(root) == result, where
                 sweep(LocalStore(root))
             assert contents(root) == kept and not leftovers(root), where
         crashed.play(step)
@@ -150,45 +138,17 @@ def sweeping(root: Path, step: int, dies: bool = False) -> tuple[int, object]:
     return watched.steps, won[0] if won else None
 
 
-def overtaken(root: Path, step: int) -> tuple[int, object]:
-    """An attempt meets a rival at the same range."""
-    store, rival = prepared(root), []
-    with disk(at=step, then=lambda: rival.append(attempt_of(LocalStore(root)).commit())) as watched:
-        mine = attempt_of(store).commit()
-    for theirs in rival:
-        assert mine.won != theirs.won and mine.record == theirs.record
-        assert mine.conflict is theirs.conflict is None
-        assert not leftovers(root), f"step {step}"
-    return watched.steps, rival[0].won if rival else None
-
-
-def published(root: Path, step: int) -> tuple[int, object]:
-    """A commit meets another process that publishes what is decided."""
-    store = prepared(root)
-
-    def roll_forward():
-        for record in iter_records(LocalStore(root)):
-            publish(LocalStore(root), record)
-
-    with disk(at=step, then=roll_forward) as watched:
-        result = attempt_of(store).commit()
-    assert result.won and not leftovers(root)
-    check_published(store, result.record)
-    return watched.steps, True
-
-
 MEETINGS = {
     "an attempt is swept": (swept, {True, False}),
     "a sweep meets a commit": (sweeping, {True, False}),
     "a sweep meets a worker that dies decided": (lambda root, step: sweeping(root, step, dies=True), {True, False}),
-    "an attempt meets a rival": (overtaken, {True, False}),
-    "a commit is published by others": (published, {True}),
 }
 
 
 @every_point
 @pytest.mark.parametrize("name", MEETINGS)
 def test_meeting_another_process_at_a_point_nothing_is_lost_or_double(name, every, tmp_path):
+    """A worker that meets a rival, or somebody who publishes its range, is stopped in tests/chaos/test_stopped.py."""
     meet, outcomes = MEETINGS[name]
     with disk():
         digest = work(tmp_path / "whole")

@@ -2,9 +2,7 @@
 
 import fcntl
 import os
-import signal
 import subprocess
-import sys
 import tempfile
 from types import SimpleNamespace
 
@@ -12,7 +10,14 @@ import pytest
 
 from schemas.errors import MachineError, OutputError
 from workers.store import file_system
-from workers.store.file_system import explain_disk_errors, file_system_of, remove_abandoned, temporary_folder
+from workers.store.file_system import (
+    INNER,
+    OWNER,
+    explain_disk_errors,
+    file_system_of,
+    owned_folders,
+    temporary_folder,
+)
 from workers.store.local import LocalStore
 
 MANY = [f"c{number}/patches/x" for number in range(4)]
@@ -99,41 +104,21 @@ def test_a_real_vfat_is_refused(tmp_path):
         subprocess.run(["umount", str(mount)], check=True)
 
 
-HOLD = """
-import sys, time
-from workers.store.file_system import temporary_folder
-with temporary_folder("test") as folder:
-    (folder / "rows").write_bytes(b"12")
-    print(folder, flush=True)
-    time.sleep(600)
-"""
-
-
-def test_a_temporary_folder_is_kept_while_its_process_lives_and_goes_after_it_was_killed(tmp_path, monkeypatch):
+def test_a_temporary_folder_stays_while_another_process_looks_and_goes_where_its_own_is_gone(tmp_path, monkeypatch):
+    """It looks in the middle of the making too. How owners die is tested in tests/services/run/test_ray_cluster.py."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    with subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True, env=environment) as holder:
-        folder = holder.stdout.readline().strip()
-        remove_abandoned("test")
-        assert os.listdir(folder) == ["rows"]
-        holder.send_signal(signal.SIGKILL)
-    young = tmp_path / "verso-test-a"  # without its lock: just being made
-    young.mkdir()
-    assert os.path.isdir(folder)
-    with temporary_folder("test") as mine:
-        assert not os.path.isdir(folder) and os.listdir(mine) == []
-    assert list(tmp_path.iterdir()) == [young]
-
-
-def test_a_temporary_folder_that_another_process_looks_at_while_it_is_being_made_stays(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "verso-test-dead" / INNER).mkdir(parents=True)
+    (tmp_path / "verso-test-dead" / OWNER).touch()
     lock = fcntl.flock
 
     def late(file: object, flags: int) -> None:
         if flags == fcntl.LOCK_EX:
-            remove_abandoned("test")
+            assert not (tmp_path / "verso-test-dead").exists()
+            assert owned_folders(tmp_path, "verso-test-") == []
         lock(file, flags)
 
     monkeypatch.setattr(fcntl, "flock", late)
     with temporary_folder("test") as mine:
-        assert mine.is_dir()
+        assert mine.is_dir() and owned_folders(tmp_path, "verso-test-") == [mine.parent]
+        assert list(tmp_path.iterdir()) == [mine.parent]
+    assert list(tmp_path.iterdir()) == []

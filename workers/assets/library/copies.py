@@ -20,12 +20,11 @@ PART, COPY = "part", "copy"
 
 @dataclass(frozen=True)
 class Item:
-    """A file that can be used, what was measured of it, one digest over all files that it reads, and its category."""
+    """A file that can be used, what was measured of it, and one digest over all files that it reads."""
 
     path: str
     measured: Measured
     digest: str
-    category: str = ""
 
     @property
     def suffix(self) -> str:

@@ -20,7 +20,6 @@ from pathlib import Path
 from schemas.environment import cache_folder
 from schemas.errors import AssetSourceError, InUseError, OutputError, plain_line
 from schemas.job.assets import BUILT_IN, TABLE, MeshLimits, UpAxis
-from workers.assets.library.categories import find_joined, name_categories
 from workers.assets.library.collection import (
     SUFFIXES,
     Survey,
@@ -32,7 +31,7 @@ from workers.assets.library.collection import (
     walk_folder,
 )
 from workers.assets.library.copies import COPY, PART, Item, LeftOut, find_copies, find_doubles
-from workers.assets.library.guess import guess_groups, guess_ups, length
+from workers.assets.library.guess import find_joined, guess_groups, guess_ups, length, name_categories
 from workers.assets.library.table import (
     SHAPENET_LICENCE,
     TABLE_FILE,

@@ -141,14 +141,13 @@ PLACEHOLDER_PX = 2
 class Measured:
     """One file: sizes along its own axes, in units of its source's `scale`; what was mended, left out or is missing.
 
-    area, volume: of its surface, and between the surface and the middle of its bounding box, in the same units; thin: its
-    least extent in any direction, by its diagonal; textures: how many pictures its parts have; look: its colours by place, as
-    `sample_look`, None where it has none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says
-    so; up, confidence: what its shape tells about the axis that is up, or None.
+    area, volume: of its surface, and between the surface and the middle of its bounding box, in the same units; textures: how
+    many pictures its parts have; look: its colours by place, as `sample_look`, None where it has none; unit_m, stated_up: its
+    unit in metres and the axis that is up, where the file says so; up, confidence: what its shape tells about the axis that is
+    up, or None.
     """
 
     extents: tuple[float, float, float]
-    vertices: int
     faces: int
     watertight: bool
     textures: int
@@ -157,7 +156,6 @@ class Measured:
     confidence: Confidence | None = None
     area: float = 0.0
     volume: float = 0.0
-    thin: float = 1.0
     look: tuple[float, ...] | None = None
     unit_m: float | None = None
     stated_up: UpAxis | None = None
@@ -174,7 +172,6 @@ def measure_shape(
     a, b, c = (shape.vertices[shape.faces[:, k]] - 0.5 * (lower + upper) for k in range(3))
     return Measured(
         extents=(x, y, z),
-        vertices=len(shape.vertices),
         faces=len(shape.faces),
         watertight=mass.solid,
         textures=len({id(texture) for texture in textures if max(texture.shape[:2]) > PLACEHOLDER_PX}),
@@ -183,7 +180,6 @@ def measure_shape(
         confidence=None if fits is None else fits.confidence,
         area=0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()),
         volume=abs(float((a * np.cross(b, c)).sum())) / 6.0,
-        thin=measure_thinness(hull_vertices),
         look=sample_look(shape),
         unit_m=find_unit(path, math.dist(lower, upper)),
         stated_up=find_up(_head(path)) if path.suffix.lower() == ".dae" else None,

@@ -16,17 +16,18 @@ import numpy as np
 from scipy.spatial import QhullError
 
 from schemas.base import Array, frozen_array
-from schemas.errors import MachineError, MeshError
+from schemas.errors import MachineError, MeshError, plain_line
 from schemas.job.assets import TABLE, Assets, MeshLimits
 from schemas.scene.shape import Asset, Shape
 from workers.assets.glb import asset_glb
-from workers.assets.library.placement import INFO_FILE, find_upright, measure_shape, measure_thinness
+from workers.assets.library.placement import INFO_FILE, measure_shape, measure_thinness
 from workers.assets.library.table import Row, SourceFile
 from workers.assets.mass import weigh
-from workers.door.meshes.caps import MOST_NOTES, describe_error, find_inside, one_line
+from workers.door.meshes.caps import LONGEST_NOTE, MOST_NOTES, find_inside
 from workers.door.meshes.formats import FORMATS, list_mesh_files, load_shape
 from workers.door.meshes.mesh import LoadedMesh, transform_shape
 from workers.door.meshes.urdf import POSED, list_named, list_seen, load_posed
+from workers.door.opening import describe_error
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 from workers.pool import Ended, Limits, Pool
@@ -88,7 +89,7 @@ def refusal_of(message: bytes) -> MeshError:
 
 def describe_refusal(error: MeshError) -> bytes:
     """The answer of a refused file."""
-    return REFUSAL + json.dumps([error.reason, one_line(error.detail), error.kind]).encode()
+    return REFUSAL + json.dumps([error.reason, plain_line(error.detail, LONGEST_NOTE), error.kind]).encode()
 
 
 def _refuse_end(end: Ended, question: Question) -> MeshError:
@@ -119,7 +120,7 @@ def answer(question: Question) -> bytes:
     named.kind = refusal.kind
     if question.row is not None:
         return describe_refusal(named)
-    reason = [named.reason, one_line(named.detail), named.kind]
+    reason = [named.reason, plain_line(named.detail, LONGEST_NOTE), named.kind]
     return json.dumps({"files": _stat_of(path, question.folder), "named": [], "refused": reason}).encode()
 
 
@@ -140,7 +141,7 @@ def survey(question: Question) -> bytes:
     loaded = load_file(folder, path, limits)
     hull_vertices = check_body(loaded.shape, path)
     mass, _ = weigh(loaded.shape, 1.0, 1.0)
-    notes = tuple(one_line(note) for note in loaded.notes[:MOST_NOTES])
+    notes = tuple(plain_line(note, LONGEST_NOTE) for note in loaded.notes[:MOST_NOTES])
     measured = measure_shape(loaded.shape, mass, hull_vertices, notes, path)
     check_unchanged(folder, files)
     answer = {"files": [list(vars(file).values()) for file in files], "named": named, "measured": asdict(measured)}
@@ -157,16 +158,10 @@ def make_glb(question: Question, row: Row) -> bytes:
     loaded = load_file(folder, path, question.limits)
     asset = place_asset(loaded, row, question.limits)
     if row.category != TABLE:
-        hull_vertices = check_body(asset.shape, path)
-        fits = find_upright(
-            hull_vertices @ asset.T_source_to_object[:3, :3], asset.mass.com @ asset.T_source_to_object[:3, :3]
-        )
-    else:
-        fits = None
+        check_body(asset.shape, path)
     mass = asset.mass
     more = {
         "key": row.key,
-        "path": row.path,
         "sha256": files[0].sha256,
         "closed": asset.shape.closed,
         "watertight": asset.watertight,
@@ -177,8 +172,6 @@ def make_glb(question: Question, row: Row) -> bytes:
         "faces": len(asset.shape.faces),
         "extents_m": asset.extents_m.tolist(),
         "pictures": len({id(p.material.texture) for p in asset.shape.parts if p.material.texture is not None}),
-        "shape_up": None if fits is None else fits.axis,
-        "sure": None if fits is None else fits.confidence == "sure",
     }
     return asset_glb(replace(asset, sha256=files[0].sha256), library=more)
 
@@ -216,7 +209,7 @@ def place_asset(loaded: LoadedMesh, row: Row, limits: MeshLimits) -> Asset:
         watertight=mass.solid,
         volume_m3=None,
         shareable=False,
-        notes=tuple(one_line(note) for note in [*_note_shared(common_m3), *loaded.notes][:MOST_NOTES]),
+        notes=tuple(plain_line(n, LONGEST_NOTE) for n in [*_note_shared(common_m3), *loaded.notes][:MOST_NOTES]),
     )
 
 

@@ -105,7 +105,6 @@ MOST_LETTERS = 150
 SHAPENET_LICENCE = "ShapeNet terms of use: non-commercial research"
 
 _FILE = pa.struct([("path", pa.string()), ("bytes", pa.int64()), ("mtime_ns", pa.int64()), ("sha256", pa.string())])
-_KINDS = {str: pa.string(), bool: pa.bool_(), float: pa.float64(), int: pa.int64()}
 _TYPES = {
     **dict.fromkeys(
         ["path", "sha256", "licence", "category", "up", "reason", "why", "guessed", "shape_up", "glb", "glb_sha256"],

@@ -14,15 +14,16 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from schemas.base import Array, Pose
-from schemas.errors import CaptureError
+from schemas.errors import CaptureError, command_line
 from schemas.job.captures import Board
-from workers.capture.board import id_words, open_dictionary
-from workers.capture.board_kinds import board_of_markers
-from workers.capture.detect import find_markers, unbend_corners
+from workers.capture.board import LARGEST, PREDEFINED, id_words, open_dictionary, smallest_dictionary
+from workers.capture.board_kinds import KIND_WORDS, board_of_markers, recognise_board
+from workers.capture.detect import find_markers, other_dictionary, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
 from workers.capture.poses.markers import opencv_poses
 from workers.capture.poses.terms import cross_matrix, moved
+from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import rays_of_pixels
 
@@ -36,6 +37,11 @@ FLAT_M = 0.005
 """Tags whose corners are so near to a plane lie in it: sheets are not flat."""
 AMBIGUOUS_M = 0.01
 """Worse agreement of two views on where a tag stands is none."""
+
+LOOKED_AT = 8
+"""Views by which a board that is not board.json's is recognised."""
+FEW_MARKERS = 4
+"""Where no view has as many, other markers than the board's may have been found by chance."""
 
 Seen = Mapping[int, Mapping[int, Array]]
 """By view and tag: rays [4, 2] of its corners."""
@@ -79,6 +85,30 @@ def solve_board(folder: CaptureFolder, side_m: float, dictionary: str, border_bi
     return SolvedBoard(board, flat, len(views), residual_px, float(np.median(sigma)), float(sigma.max()), lost)
 
 
+def other_board(folder: CaptureFolder) -> str:
+    """What the photographs show in place of board.json's board, with the command that describes it; or nothing."""
+    board, words, name = folder.board, "", smallest_dictionary(folder.board.dictionary, LARGEST)
+    if name not in PREDEFINED:
+        return words
+    seen = _see(folder, open_dictionary(Board(dictionary=name)), board.border_bits, LOOKED_AT)
+    if max(map(len, seen.values())) < FEW_MARKERS:
+        words, name = other_dictionary(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
+        if not name:
+            return words
+        seen = _see(folder, open_dictionary(Board(dictionary=name)), board.border_bits, LOOKED_AT)
+        words += ": correct board.json"
+    recognised = recognise_board(list(seen.values()), board, name)
+    if recognised is None:
+        return words
+    kind, sizes = recognised
+    show = f"the photographs show {KIND_WORDS[kind].format(f'{sizes.columns} x {sizes.rows}')} of {sizes.dictionary}"
+    options = ["--kind", kind, "--size", f"{sizes.columns}x{sizes.rows}", "--dictionary", sizes.dictionary]
+    options += ["--marker", f"{sizes.marker_m:g}", "--pitch", f"{sizes.pitch_m:g}"]
+    command = command_line("capture", "board", folder.path / "board.json", *options)
+    remedy = f"move it away, and `{command}` writes the right one; measure both lengths on the print"
+    return f"{show}, and board.json has another board: {remedy}"
+
+
 def describe(solved: SolvedBoard) -> list[str]:
     """What is known of it, in words, line by line."""
     places = f"{solved.sigma_m * 1e3:.3f} mm, the worst to {solved.worst_m * 1e3:.3f} mm, beside the first"
@@ -94,15 +124,18 @@ def describe(solved: SolvedBoard) -> list[str]:
     return lines
 
 
-def _see(folder: CaptureFolder, dictionary: "cv2.aruco.Dictionary", border_bits: int) -> Seen:
-    seen = {}
-    for number in folder.numbers:
-        ids, corners = find_markers(read_view(folder, number).rgb, dictionary, border_bits)
+def _see(
+    folder: CaptureFolder, dictionary: "cv2.aruco.Dictionary", border_bits: int, most_views: int | None = None
+) -> Seen:
+    """The markers of a dictionary in all views, or in some of them."""
+    seen, count = {}, len(folder.numbers)
+    for place in spread_evenly(count, most_views or count):
+        ids, corners = find_markers(read_view(folder, folder.numbers[place]).rgb, dictionary, border_bits)
         camera = folder.camera
         rays = rays_of_pixels(unbend_corners(corners, camera).reshape(-1, 2), camera.intrinsics, camera.lens)
         quads = rays.reshape(-1, 4, 2)
         whole = np.flatnonzero(np.isfinite(quads).all(axis=(1, 2)))
-        seen[number] = {int(ids[k]): quads[k] for k in whole}
+        seen[folder.numbers[place]] = {int(ids[k]): quads[k] for k in whole}
     return seen
 
 

@@ -2,9 +2,8 @@
 
 import io
 import os
-import re
 import warnings
-from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from schemas.errors import MeshError
+from schemas.errors import MeshError, plain_line
 from schemas.job.assets import MeshLimits
+from workers.door.opening import describe_error
 
 _PICTURES = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "TGA")
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".tga")
@@ -29,7 +29,8 @@ LONGEST_NAME = 1024
 """Letters of a file name that are looked at."""
 MOST_NOTES = 20
 """Notes that are kept of an asset: they are stored in the dataset."""
-_ADDRESS = re.compile(r"\s*<[^<>]* at 0x[0-9a-fA-F]+>")
+LONGEST_NOTE = 1000
+"""Letters of a note, and of a refusal, that are kept."""
 
 
 def check_counts(path: Path, vertices: int, faces: int, limits: MeshLimits) -> None:
@@ -56,11 +57,6 @@ def _other_case(path: Path) -> Path:
     except (OSError, ValueError):
         return path
     return path.parent / found[0] if len(found) == 1 else path
-
-
-def decode_names(names: Iterable[bytes]) -> list[str]:
-    """File names as text."""
-    return [name.decode("utf-8", "replace").strip() for name in names]
 
 
 def find_inside(root: Path, *candidates: Path) -> Path | None:
@@ -104,7 +100,7 @@ class Budget:
 
 
 class FolderResolver:
-    """Hands a reader the material files and pictures of one folder, and nothing else; a resolver of trimesh's.
+    """Hands a reader the material files and pictures of one folder, and nothing else.
 
     Names are relative to the mesh, may use either slash, and must stay below `root`. A file that is refused or missing
     leaves a note in `notes`, and the mesh is loaded without it; one that is found elsewhere or in other case a note, too.
@@ -122,14 +118,17 @@ class FolderResolver:
     def picture(self, name: str) -> NDArray[np.uint8] | None:
         """The picture of a name, read once; None, and a note, where it is missing, refused or damaged."""
         if name not in self._pictures:
-            try:
-                self._pictures[name] = self.decode(self.get(name))
-            except FileNotFoundError:
-                self._pictures[name] = None
+            self._pictures[name] = None
+            with suppress(FileNotFoundError):
+                plain = name.strip().replace("\\", "/")
+                self._pictures[name] = self.decode(plain, self.read(plain))
         return self._pictures[name]
 
-    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
-        """The picture of bytes that `budget.take_image` let pass, as `decode_picture`."""
+    def decode(self, name: str, data: bytes) -> NDArray[np.uint8] | None:
+        """The picture of bytes, as `decode_picture`; None, and a note, where the budget does not allow it."""
+        if (why := self.budget.take_image(data)) is not None:
+            self.note(name, why)
+            return None
         pixels = decode_picture(data, self.notes)
         if pixels is not None and data.startswith(b"\xff\xd8\xff"):
             self._jpegs[id(pixels)] = pixels, data
@@ -138,16 +137,6 @@ class FolderResolver:
     def jpeg_of(self, pixels: NDArray[np.uint8] | None) -> bytes | None:
         """The file that a picture was decoded from, if it was a JPEG."""
         return self._jpegs[id(pixels)][1] if id(pixels) in self._jpegs else None
-
-    def get(self, key: str) -> bytes:
-        """The bytes of a material file or a picture; FileNotFoundError, and a note, where it is missing or refused."""
-        name = str(key).strip().replace("\\", "/")
-        data = self.read(name)
-        if not name.lower().endswith(".mtl") and (why := self.budget.take_image(data)) is not None:
-            raise self.refuse(name, why)
-        return data
-
-    __getitem__ = get
 
     def read(self, name: str) -> bytes:
         """The bytes of a file of any kind; FileNotFoundError, and a note, where it is missing or refused."""
@@ -162,7 +151,7 @@ class FolderResolver:
         if (why := self.budget.take_file(path.stat().st_size)) is not None:
             raise self.refuse(name, why)
         if path.name != Path(name).name:
-            self.notes.append(one_line(f"{name} is missing: {path.name} was read in its place"))
+            self.notes.append(plain_line(f"{name} is missing: {path.name} was read in its place", LONGEST_NOTE))
         return path.read_bytes()
 
     def find(self, name: str) -> Path | None:
@@ -192,25 +181,7 @@ class FolderResolver:
     def note(self, name: str, why: str) -> None:
         """Notes that a picture or material is left out."""
         if len(self.notes) < MOST_NOTES:
-            self.notes.append(one_line(f"{name:.{LONGEST_NAME}} {why}: plain base colour used"))
-
-
-def describe_error(error: Exception) -> str:
-    """Kind and message of an error without addresses in memory, because notes on meshes are stored in the dataset."""
-    return _ADDRESS.sub("", repr(error))
-
-
-def unreadable(path: Path, error: Exception) -> MeshError:
-    """What a reader raised, as a verdict on the file."""
-    kind = path.suffix.lower()[1:]
-    return MeshError("unreadable", f"{path} is not a {kind} file that can be read: {describe_error(error):.200}")
-
-
-def one_line(text: str, most: int = 1000) -> str:
-    """The text as one line that can be stored: no control characters, no half of a surrogate pair, not too long."""
-    plain = "".join(c if c.isprintable() or c == " " else " " for c in text[: most + 1])
-    plain = plain.encode("utf-8", "replace").decode()
-    return plain if len(text) <= most else f"{plain[:most]} ..."
+            self.notes.append(plain_line(f"{name:.{LONGEST_NAME}} {why}: plain base colour used", LONGEST_NOTE))
 
 
 def open_image(data: bytes, limits: MeshLimits) -> tuple[tuple[int, int], str | None]:

@@ -22,7 +22,7 @@ from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import UpAxis
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver, check_counts, check_nodes, unreadable
+from workers.door.meshes.caps import FolderResolver, check_counts, check_nodes
 from workers.door.meshes.mesh import (
     DEFAULT,
     WHITE,
@@ -38,9 +38,6 @@ from workers.door.meshes.mesh import (
 )
 from workers.door.meshes.posed import MOST_ABOVE, parse_tree
 from workers.geometry.frames import pose, rotation_about
-
-_MALFORMED = (ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
-"""What reading a stranger's numbers and references may raise."""
 
 _UP = re.compile(rb"<up_axis>\s*([XYZ])_UP")
 _AXES: Mapping[bytes, UpAxis] = {b"X": "x", b"Y": "y", b"Z": "z"}
@@ -66,10 +63,7 @@ def read_dae(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     What is missing or not drawn leaves a note. MeshError `format` where something changes the shape and is not read,
     `index_out_of_range`, `too_large` or `unreadable`.
     """
-    try:
-        return list(_File(path, parse_tree(path, data, ["COLLADA"], "a COLLADA file"), resolver).meshes())
-    except _MALFORMED as error:
-        raise unreadable(path, error) from error
+    return list(_File(path, parse_tree(path, data, ["COLLADA"], "a COLLADA file"), resolver).meshes())
 
 
 class _File:

@@ -1,30 +1,130 @@
-"""Edge: the formats of mesh files, one row of `FORMATS` each, and a file as one clean shape behind caps.
+"""Edge: the formats of mesh files, one row of `FORMATS` each, and a file as one clean shape behind caps; readers of OFF and STL.
 
 A new format is a row, and a module that lists what a file names and reads its meshes as `RawMesh`, each with the material of
-`make_material` and a picture of `decode_picture`.
+`make_material` and a picture of `decode_picture`. A reader may raise whatever it likes of malformed bytes: that is refused here.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import io
+import re
+import struct
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
-from schemas.errors import MeshError
+from schemas.errors import MeshError, VersoError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
 from workers.door import opening
 from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.dae import named_by_dae, read_dae
 from workers.door.meshes.gltf import named_by_gltf, read_gltf
-from workers.door.meshes.mesh import LoadedMesh, RawMesh, clean_shape, place_mesh
+from workers.door.meshes.mesh import (
+    DEFAULT,
+    WHITE,
+    LoadedMesh,
+    MeshVisual,
+    RawMesh,
+    clean_shape,
+    cut_faces,
+    place_mesh,
+)
 from workers.door.meshes.mjcf import count_msh, read_msh
 from workers.door.meshes.obj import count_obj, named_by_mtl, named_by_obj, read_obj
-from workers.door.meshes.plain import count_stl, read_off, read_stl
 from workers.door.meshes.ply import count_ply, decode_head, named_by_ply, read_ply
-from workers.door.opening import as_utf8
+from workers.door.opening import as_utf8, describe_error
+
+_OFF = re.compile(r"\s*(ST)?(C)?(N)?(4)?(n)?OFF(?!\s+BINARY)")
+
+
+def read_off(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
+    """The mesh of an OFF file as Geomview has it, with colours of vertices or of faces, whole numbers or shares.
+
+    A reader of its own: trimesh leaves out colours, and cuts polygons as fans. MeshError `format` for a binary or one of four
+    dimensions, `index_out_of_range`.
+    """
+    text = re.sub("#.*", "", data.decode("utf-8", "replace"))
+    head = _OFF.match(text)
+    if (head is None and text.lstrip()[:1].isalpha()) or (head is not None and (head[4] or head[5])):
+        raise MeshError("format", f"{path} is not an OFF file of three dimensions in text: export it as .ply")
+    lines = [line.split() for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
+    vertices, faces = int(lines[0][0]), int(lines[0][1])
+    rows = np.array(lines[1 : 1 + vertices], dtype=np.float64).reshape(vertices, -1)
+    told = lines[1 + vertices : 1 + vertices + faces]
+    counts = np.array([int(line[0]) for line in told])
+    corners = np.array([word for line in told for word in line[1 : 1 + int(line[0])]], dtype=np.int64)
+    if len(told) < faces or len(corners) != counts.sum():
+        raise ValueError(f"{len(told)} of {faces} faces")
+    places, face = cut_faces(path, corners, counts, rows[:, :3])
+    first = 6 if head is not None and head[3] else 3
+    colors = _off_colors(lines[1 : 1 + vertices], first) if head is not None and head[2] else None
+    shown = None if colors is not None else _off_colors([line[int(line[0]) :] for line in told], 1)
+    normals = rows[:, 3:6] if first == 6 else None
+    if any(len(line) == 2 + int(line[0]) for line in told):
+        resolver.notes.append("not drawn: colours of a map by their numbers")
+    visual = MeshVisual(DEFAULT if colors is None and shown is None else WHITE, None, colors)
+    visual = visual if shown is None else replace(visual, face_colors=shown[face])
+    return [RawMesh(rows[:, :3], corners[places], normals, visual, np.eye(4))]
+
+
+def _off_colors(lines: list[list[str]], first: int) -> NDArray[np.uint8] | None:
+    """[N, 4] uint8 sRGB of the three or four words behind the `first` of each line; None where a line has none."""
+    words = [line[first : first + 4] for line in lines]
+    if not words or min(map(len, words)) < 3:
+        return None
+    shares = any("." in word for line in words for word in line)
+    table = np.array([[*line, "1" if shares else "255"][:4] for line in words], dtype=np.float64)
+    return np.round(np.clip(np.nan_to_num(table) * (255.0 if shares else 1.0), 0.0, 255.0)).astype(np.uint8)
+
+
+def count_stl(data: bytes) -> tuple[int, int]:
+    """Vertices and faces of an STL file; of the vertices of one in text nothing is known."""
+    faces = _binary_faces(data)
+    return (3 * faces, faces) if faces else (0, data.count(b"endfacet"))
+
+
+def _binary_faces(data: bytes) -> int:
+    """How many faces a binary STL file has; 0 for one in text, or that ends within a face.
+
+    Some programs leave bytes behind the last face, and some a wrong count: then all whole faces are meant.
+    """
+    faces = _declared_faces(data)
+    behind, text = len(data) - 84 - 50 * faces, b"facet" in data[:1024]
+    if behind == 0 or (0 < behind < 1024 and behind % 50 and not (text and data[:5].lower() == b"solid")):
+        return faces
+    return 0 if text or behind % 50 else max(len(data) - 84, 0) // 50
+
+
+def _declared_faces(data: bytes) -> int:
+    return int(struct.unpack_from("<I", data, 80)[0]) if len(data) >= 84 else 0
+
+
+_STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def read_stl(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
+    """The solids of an STL file: of a binary one its only one, of text by trimesh; MeshError `unreadable`."""
+    declared = _declared_faces(data)
+    if count := _binary_faces(data):
+        if count != declared:
+            resolver.notes.append(f"its head tells {declared} faces, and {count} are there: all were read")
+        points = np.frombuffer(data, _STL_FACE, count, 84)["corners"].reshape(-1, 3)
+        solids = [(points, np.arange(len(points)).reshape(-1, 3))]
+    elif declared and b"facet" not in data[:1024]:
+        whole = max(len(data) - 84, 0) // 50
+        raise MeshError("unreadable", f"{path} ends early: {whole} of {declared} faces are there: copy it again")
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            scene = trimesh.load_scene(io.BytesIO(data), file_type="stl", process=False)
+        solids = [(np.asarray(mesh.vertices), mesh.faces.astype(np.int64)) for mesh in scene.geometry.values()]
+    return [RawMesh(points, faces, None, MeshVisual(DEFAULT), np.eye(4)) for points, faces in solids]
 
 
 @dataclass(frozen=True)
@@ -73,7 +173,8 @@ def load_shape(path: Path, limits: MeshLimits, root: Path | None = None, budget:
         raise MeshError("too_large", f"{path} {why}")
     if row.counted is not None:
         check_counts(path, *row.counted(data), limits)
-    meshes = [mesh for mesh in row.read(path, data, resolver) if len(mesh.faces)]
+    with _as_verdict(path):
+        meshes = [mesh for mesh in row.read(path, data, resolver) if len(mesh.faces)]
     check_nodes(path, len(meshes), "parts", limits)
     check_counts(path, sum(len(m.vertices) for m in meshes), sum(len(m.faces) for m in meshes), limits)
     if not meshes:
@@ -116,10 +217,25 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
     if row.counted is not None and len(data) > 8 * min(limits.max_vertices, limits.max_faces):
         check_counts(path, *row.counted(data), limits)
     resolver = FolderResolver(path, root, limits)
-    found = _find(resolver, row.named(path, data))
-    for material in [file for file in found if file.suffix.lower() == ".mtl"]:
-        found += _find(resolver, named_by_mtl(as_utf8(material.read_bytes())[0]))
-    return list(dict.fromkeys([path, *found]))
+    with _as_verdict(path):
+        files = _find(resolver, row.named(path, data))
+    for material in [file for file in files if file.suffix.lower() == ".mtl"]:
+        files += _find(resolver, named_by_mtl(as_utf8(material.read_bytes())[0]))
+    return list(dict.fromkeys([path, *files]))
+
+
+@contextmanager
+def _as_verdict(path: Path) -> Iterator[None]:
+    """Around a reader: MeshError `unreadable` for whatever it raises of a stranger's bytes."""
+    try:
+        yield
+    except (VersoError, MemoryError):
+        raise
+    except Exception as error:
+        kind = path.suffix.lower()[1:]
+        raise MeshError(
+            "unreadable", f"{path} is not a {kind} file that can be read: {describe_error(error)}"
+        ) from error
 
 
 def read_bytes(path: Path, limits: MeshLimits) -> bytes:

@@ -6,12 +6,11 @@ reads the tree and leaves buffers, pictures, node poses and every check to its u
 is obeyed or named: an attribute in `_mesh`, a property of a material in gltf_materials.py, a required extension by `_REQUIRED`.
 
 Everything that the tree says is a stranger's: counts are held to the caps before anything is built, names go through the folder's
-resolver, and whatever malformed JSON raises becomes a MeshError.
+resolver, and whatever malformed JSON raises is refused by `formats`.
 """
 
 import base64
 import json
-import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -23,15 +22,12 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
-from workers.door.meshes.caps import LONGEST_NAME, FolderResolver, check_counts, check_nodes, unreadable
+from workers.door.meshes.caps import LONGEST_NAME, FolderResolver, check_counts, check_nodes
 from workers.door.meshes.gltf_materials import Materials, image_of, read_references
 from workers.door.meshes.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, cut_strip
 from workers.door.opening import split_glb
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import rotation_from_quaternion
-
-MALFORMED = (struct.error, ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
-"""What reading a stranger's JSON may raise."""
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _REQUIRED = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_texture_basisu", "KHR_lights_punctual", INSTANCING)
@@ -46,32 +42,26 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
 def named_by_gltf(path: Path, data: bytes) -> list[str]:
-    """Names of the files that a glTF file refers to, buffers first, each once; MeshError `unreadable`."""
-    try:
-        tree, _ = _parse(path, data)
-        references = [found for material in tree.get("materials", []) for found in read_references(material)]
-        pictures = [image_of(tree, reference)[0] for reference in references]
-        images = [tree["images"][number] for number in dict.fromkeys(pictures) if number is not None]
-        uris = [item["uri"] for item in (*tree.get("buffers", []), *images) if isinstance(item.get("uri"), str)]
-        return list(dict.fromkeys(unquote(uri) for uri in uris if not uri.startswith("data:") and not _is_address(uri)))
-    except MALFORMED as error:
-        raise unreadable(path, error) from error
+    """Names of the files that a glTF file refers to, buffers first, each once."""
+    tree, _ = _parse(path, data)
+    references = [reference for material in tree.get("materials", []) for reference in read_references(material)]
+    pictures = [image_of(tree, reference)[0] for reference in references]
+    images = [tree["images"][number] for number in dict.fromkeys(pictures) if number is not None]
+    uris = [item["uri"] for item in (*tree.get("buffers", []), *images) if isinstance(item.get("uri"), str)]
+    return list(dict.fromkeys(unquote(uri) for uri in uris if not uri.startswith("data:") and not _is_address(uri)))
 
 
 def read_gltf(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
     """Every triangle mesh of the file's scene at the pose of each of its nodes, v upwards, colours sRGB.
 
     A picture that is missing or refused leaves a note. MeshError `missing` where a buffer is not below the resolver's root,
-    `too_large` where something is over a cap, `format` or `unreadable` where the file is not one that can be read.
+    `too_large` where something is over a cap, `format` where the file is not one that can be read.
     """
-    try:
-        tree, chunk = _parse(path, data)
-        _refuse_extensions(path, tree)
-        _check_caps(path, tree, len(data), resolver)
-        with np.errstate(all="ignore"):  # what is not finite is refused where the mesh is placed
-            return list(_File(path, tree, chunk, resolver).meshes())
-    except MALFORMED as error:
-        raise unreadable(path, error) from error
+    tree, chunk = _parse(path, data)
+    _refuse_extensions(path, tree)
+    _check_caps(path, tree, len(data), resolver)
+    with np.errstate(all="ignore"):  # what is not finite is refused where the mesh is placed
+        return list(_File(path, tree, chunk, resolver).meshes())
 
 
 def _parse(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:

@@ -6,6 +6,7 @@ a note.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -170,14 +171,9 @@ class Materials:
         image = self._tree["images"][number]
         uri = image.get("uri")
         name = uri if isinstance(uri, str) and not uri.startswith("data:") else f"image {number}"
-        try:
-            data = self._read_image(image)
-        except FileNotFoundError:
-            return None  # the resolver has noted it
-        if (why := self._resolver.budget.take_image(data)) is not None:
-            self._resolver.note(name, why)
-            return None
-        return self._resolver.decode(data)
+        with suppress(FileNotFoundError):  # the resolver has noted it
+            return self._resolver.decode(name, self._read_image(image))
+        return None
 
     def _sampler(self, reference: Tree) -> Tree:
         number = self._tree["textures"][reference["index"]].get("sampler") if reference else None

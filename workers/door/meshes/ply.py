@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
-from workers.door.meshes.caps import FolderResolver, decode_names, unreadable
+from workers.door.meshes.caps import FolderResolver
 from workers.door.meshes.mesh import (
     DEFAULT,
     WHITE,
@@ -185,7 +185,7 @@ def encode_ply(comment: str, **elements: Mapping[str, NDArray]) -> bytes:
 
 def named_by_ply(path: Path, data: bytes) -> list[str]:
     """Names of the pictures that a PLY file asks for."""
-    return decode_names(_TEXTURE.findall(_head(data)))
+    return [name.decode("utf-8", "replace").strip() for name in _TEXTURE.findall(_head(data))]
 
 
 def decode_head(data: bytes) -> tuple[bytes, str | None]:
@@ -211,22 +211,19 @@ def _head(data: bytes) -> bytes:
 def read_ply(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
     """One mesh for each picture of a PLY file.
 
-    Raises MeshError `index_out_of_range`, `no_faces` for points and splats, or `unreadable`.
+    Raises MeshError `index_out_of_range`, or `no_faces` for points and splats.
     """
-    try:
-        elements = parse_ply(data)
-        vertices, faces = elements["vertex"], elements.get("face", elements.get("faces"))
-        points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
-        if faces is not None and _count(faces):
-            corners, face = _triangles(path, faces, points)
-        elif "tristrips" in elements:
-            corners, face = _strips(elements["tristrips"]), None
-        else:
-            what = "Gaussian splats" if set(_SPLATS) <= set(vertices) else "a cloud of points"
-            raise MeshError("no_faces", f"{path} is {what} without triangles: make a mesh of it")
-        return _meshes(named_by_ply(path, data), vertices, points, faces, corners, face, resolver)
-    except (LookupError, ValueError, TypeError, OverflowError, StopIteration) as error:
-        raise unreadable(path, error) from error
+    elements = parse_ply(data)
+    vertices, faces = elements["vertex"], elements.get("face", elements.get("faces"))
+    points = np.column_stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"])
+    if faces is not None and _count(faces):
+        corners, face = _triangles(path, faces, points)
+    elif "tristrips" in elements:
+        corners, face = _strips(elements["tristrips"]), None
+    else:
+        what = "Gaussian splats" if set(_SPLATS) <= set(vertices) else "a cloud of points"
+        raise MeshError("no_faces", f"{path} is {what} without triangles: make a mesh of it")
+    return _meshes(named_by_ply(path, data), vertices, points, faces, corners, face, resolver)
 
 
 def _count(element: Element) -> int:

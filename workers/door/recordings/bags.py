@@ -33,6 +33,7 @@ from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
 from workers.door.opening import as_refusal, open_file
+from workers.door.recordings.pictures import read_intrinsics
 from workers.geometry.frames import invert, pose, rotation_from_quaternion
 
 MOST_BYTES = 512_000_000
@@ -354,11 +355,7 @@ def _cameras(path: Path, contents: _Contents) -> tuple[CaptureCamera | None, Dep
 
 
 def _intrinsics(path: Path, info: _Info) -> Intrinsics:
-    K = info.K
-    if not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0 or np.abs(K).max() > 1e6 or min(info.size) < 1:
-        raise CaptureError("calibration", f"{path}: a camera_info has no usable intrinsics: {K.ravel().tolist()}")
-    size = {"width": info.size[0], "height": info.size[1]}
-    return Intrinsics(**size, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + 0.5, cy=K[1, 2] + 0.5)
+    return read_intrinsics(f"{path}: a camera_info", info.size, info.K[[0, 1, 0, 1], [0, 1, 2, 2]], 0.0)
 
 
 FORWARD = ("plumb_bob", "rational_polynomial", "brown conrady", "none", "")

@@ -1,4 +1,4 @@
-"""Pictures of others as arrays: colour as PNG or JPEG, depth in any usual encoding, and images of one camera as another's.
+"""Pictures of others as arrays, and their cameras: colour as PNG or JPEG, depth in any usual encoding, one camera as another.
 
 The size in a file's head is compared with the camera's before anything is decoded, so that no small file fills the memory.
 """
@@ -6,15 +6,20 @@ The size in a file's head is compared with the camera's before anything is decod
 import functools
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from schemas.base import Array
+from schemas.base import Array, frozen_array
+from schemas.capture import DepthCamera
+from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
+from workers.door.opening import as_refusal
 from workers.geometry.pixels import opencv_matrix
 
 Size = tuple[int, int]
@@ -162,6 +167,23 @@ def _expand(data: bytes, most: int) -> bytes:
         return bytes(lzfse.decompress(data))
     except (lzfse.error, MemoryError) as error:
         raise PictureError("is compressed by LZFSE, and cut or altered: copy it again") from error
+
+
+def read_intrinsics(where: Path | str, size: Size, numbers: Iterable[Any], centre: float) -> Intrinsics:
+    """Of fx, fy, cx, cy, whose first pixel's centre is at `centre`, in the file `where`. Raises CaptureError."""
+    with as_refusal(f"{where}: its intrinsics", CaptureError):
+        fx, fy, cx, cy = (float(x) for x in numbers)
+        if not np.isfinite([fx, fy, cx, cy]).all() or min(fx, fy) <= 0 or max(abs(cx), abs(cy)) > 1e6:
+            raise ValueError(f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}")
+        shift = 0.5 - centre
+        return Intrinsics(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx + shift, cy=cy + shift)
+
+
+def scaled_camera(k: Intrinsics, size: Size) -> DepthCamera:
+    """A depth camera that sees the same as a colour camera, in an image of another size."""
+    x, y = size[0] / k.width, size[1] / k.height
+    small = Intrinsics(width=size[0], height=size[1], fx=x * k.fx, fy=y * k.fy, cx=x * k.cx, cy=y * k.cy)
+    return DepthCamera(small, frozen_array(np.zeros(8)), frozen_array(np.eye(4)))
 
 
 @functools.lru_cache(maxsize=4)

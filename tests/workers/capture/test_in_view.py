@@ -1,0 +1,75 @@
+"""What photographs show beside an object on the board of board.json: another board, a second print, a hand; simulated."""
+
+import re
+import shlex
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.capture import CaptureCamera
+from schemas.errors import CaptureError
+from schemas.job.captures import Captures, Simulate
+from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from services.cli.main import main
+from tests.workers.capture.drawn import errors
+from tests.workers.capture.simulated import asset_of
+from workers.capture.board_kinds import KINDS, BoardSizes
+from workers.capture.folder import CaptureFile, write_description, write_view
+from workers.capture.process import process_folder
+from workers.capture.simulate.simulate import photograph
+from workers.capture.simulate.studio import build_studio, place_object, plan_path
+from workers.scene.chance import SceneChance, Stream
+from workers.scene.effects import plan_capture
+
+
+def photographed(path, board, given=None, views=3, beside=lambda number: (), seed=11):
+    """The true poses of photographs of a can on a board, which board.json gives as `given`; `beside`: what else each shows."""
+    simulate, chance, thing = Simulate(views=views, image_scale=0.5), SceneChance(seed, 0), asset_of()
+    placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
+    studio = build_studio(simulate, board, placed, plan_capture(simulate), chance)
+    poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
+    path.mkdir(parents=True, exist_ok=True)
+    for number, T in enumerate(poses):
+        more = (replace(o, T_world_shape=studio.T_world_board @ o.T_world_shape) for o in beside(number))
+        write_view(path, photograph(replace(studio, things=(*studio.things, *more)), number, T)[0])
+    write_description(path, CaptureFile(name="x"), CaptureCamera(studio.rig.color, np.zeros(8)), given or board)
+    return poses
+
+
+# ---------------------------------------------------------------------------------------------- another board
+
+
+def made(kind, size, dictionary="DICT_4X4_100", marker_m=0.045, pitch_m=0.06):
+    return KINDS[kind](BoardSizes(*size, marker_m, pitch_m, dictionary))
+
+
+GRID = made("grid", (9, 6))
+OTHERS = {
+    "grid, and photographs of ChArUco": (GRID, ("charuco", (9, 6))),
+    "ChArUco, and photographs of a grid": (made("charuco", (9, 6)), ("grid", (9, 6))),
+    "ChArUco of another pattern": (made("charuco", (10, 6)), ("charuco_old", (10, 6))),
+    "another dictionary": (GRID, ("charuco", (9, 6), "DICT_5X5_50")),
+    "other numbers": (GRID, ("grid", (8, 7))),
+    "other numbers of squares": (made("charuco", (9, 6)), ("charuco", (8, 7))),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if n < 2 else pytest.mark.minute) for n, name in enumerate(OTHERS)]
+)
+def test_a_board_that_is_not_board_jsons_is_named_and_the_command_that_is_printed_makes_the_capture_right(
+    name, tmp_path
+):
+    given, true = OTHERS[name]
+    poses = photographed(tmp_path, made(*true), given)
+    with pytest.raises(CaptureError) as refused:
+        process_folder(tmp_path, Captures())
+    command = re.search(r"move it away, and `\S*verso (capture board [^`]+)`", str(refused.value))
+    assert command and "--kind " + true[0] in command[1] and "{}x{}".format(*true[1]) in command[1]
+    assert "mirrored" not in str(refused.value) and "blurred" not in str(refused.value)
+    (tmp_path / "board.json").unlink()
+    assert main(shlex.split(command[1])) == 0
+    used = process_folder(tmp_path, Captures()).estimates.estimate.used
+    assert len(used) == len(poses) and max(errors(v.T_board_cam, poses[v.number])[0] for v in used) < 1.0
