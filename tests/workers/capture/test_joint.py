@@ -17,13 +17,14 @@ from tests.workers.capture.drawn import (
     with_pixels,
 )
 from workers.capture.poses.corners import CornerTerm
-from workers.capture.poses.estimates import estimate_joint, object_groups
+from workers.capture.poses.estimates import estimate_joint
 from workers.capture.poses.joint import (
     INFLATION_OF_FEW,
     BoardTerm,
     ObjectTerm,
     inflation,
 )
+from workers.capture.poses.moments import object_groups
 from workers.capture.poses.observation import Patches
 from workers.capture.poses.terms import (
     Shared,
