@@ -20,6 +20,7 @@ from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
 from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, observe_view
+from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.solve_board import other_board
 from workers.capture.results import own_files
@@ -195,6 +196,7 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     evidence = _observe(given, spec, clock)
     if not any(seen.markers or seen.manual_T_board_cam is not None for seen in evidence.observations):
         raise CaptureError("markers", _no_markers(given.folder))
+    check_moments(evidence)
     check_depth(evidence)
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):

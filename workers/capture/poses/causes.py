@@ -34,8 +34,9 @@ ALIKE_PX = 0.01
 """By so much markers may be displaced alike in all views, by what is printed beside them: no explanation is believed for it."""
 FITS = 1.5
 """An explanation leaves at most so many times the noise of a corner; else something else bends them."""
-EXPLAINED = 0.2
-"""What explains a smaller share of the misfit is no finding: noise of a lens or of hidden markers is alike nearby."""
+EXPLAINED = 0.03
+"""What explains a smaller share of the misfit by each number of a view is no finding: noise of a lens or of hidden markers is
+alike nearby."""
 SWEPT = 0.005
 """Sigma of the motion of a hand while an image is read, metres and radians: 0.15 m/s and 9 degrees/s for 1/30 s. A step across
 the rows and a turn that undoes it look alike on a board: of the two, the markers tell only the sum."""
@@ -105,9 +106,13 @@ def changed_camera(camera: CaptureCamera, chosen: tuple[int, ...], by: Array) ->
     )
 
 
+FOCUS = 0.005
+"""Sigma of the focal length from view to view, a share: autofocus and stabilisation change it by about so much."""
+
+
 def _focus(seen: Seen) -> Fields:
     expected = seen.term.focal * seen.term.rays + seen.term.values(seen.poses, seen.shared)[..., 0]
-    return Fields.of(None, expected[..., None])
+    return Fields.of(None, expected[..., None], FOCUS)
 
 
 def _rolling(seen: Seen) -> Fields:
@@ -259,7 +264,7 @@ def find_doubt(
         begin = {WHOLE: start.without_lens(), best.explanation.numbers: about, (): start}
         tried = [_try(explanation, begin.get(explanation.numbers, start)) for explanation in EXPLANATIONS]
         before, variance, usual = sigma_px, left, tried[0]
-        best = min(tried, key=lambda t: t.fitted.cost / variance + t.count * np.log(count))
+        best = min(tried, key=lambda t: t.fitted.cost / variance + t.fitted.occam + t.count * np.log(count))
         if best is usual:
             break
         about = dataclasses.replace(best.seen, poses=best.fitted.poses, shared=best.fitted.shared)
@@ -268,7 +273,7 @@ def find_doubt(
         return _doubt(best, usual, start, fixed, variance, begun.poses, spec)
     gain = usual.fitted.cost - best.fitted.cost
     alike = 0.25 * count * (ALIKE_PX / start.term.sigma_px[0]) ** 2  # two of a marker's eight are its place
-    wanted = EXPLAINED * usual.fitted.cost
+    wanted = EXPLAINED * best.fitted.own.shape[1] * usual.fitted.cost
     if best.fitted.alike.size:
         wanted = best.count * np.log(count) * variance * max(1.0, _scatter(best, variance)) + alike
     return None if best is usual or gain < wanted else _doubt(best, usual, start, fixed, variance, begun.poses, spec)
@@ -282,7 +287,7 @@ def _try(explanation: Explanation, start: Seen) -> _Tried:
     """The explanation at its least cost; one of the camera is fitted anew about the camera that it says."""
     seen, fields = start, explanation.fields(start)
     fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
-    count = int(fields.alike.shape[2] + fields.of_view.shape[2] * len(seen.poses))
+    count = fields.alike.shape[2]
     for _ in range(CAMERAS if explanation.numbers else 0):
         before, part, rays = fitted.cost, 1.0, np.full(1, np.nan)
         for _ in range(HALVINGS):

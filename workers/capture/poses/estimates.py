@@ -11,7 +11,7 @@ from schemas.job.captures import Estimation
 from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
-from workers.capture.poses.moments import object_groups
+from workers.capture.poses.moments import Moment, find_moment, object_groups
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
 from workers.capture.poses.terms import (
     NAMES,
@@ -117,7 +117,9 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     joint = solve_jointly(problem, evidence.spec)
     pixels = np.concatenate([o.corners.pixels for o in problem.observations])
     doubt = find_doubt(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
-    groups = _groups(*_explained(problem, joint, doubt, evidence.spec), list(range(len(problem.index))))
+    explained = _explained(problem, joint, doubt, evidence.spec)
+    moment = None if explained[1].board is None else find_moment(explained[1].board, explained[1].by_board)
+    groups = _groups(*explained, moment, list(range(len(problem.index))))
     if len(groups) > 1:
         elsewhere = {number for group in groups[1:] for number in group}
         still = tuple(
@@ -126,12 +128,11 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
         )
         problem = dataclasses.replace(problem, observations=still)
         joint = solve_jointly(problem, evidence.spec)
-    estimate = _result(problem, joint, doubt, evidence)
+    estimate = _result(problem, joint, doubt, moment, evidence)
     if len(groups) > 1:
         numbers = [[problem.observations[n].number for n in group] for group in groups]
-        estimate = _mark_moved(
-            estimate, numbers, len(_groups(*_explained(problem, joint, doubt, evidence.spec), groups[0])) == 1
-        )
+        settled = _groups(*_explained(problem, joint, doubt, evidence.spec), moment, groups[0])
+        estimate = _mark_moved(estimate, numbers, len(settled) == 1)
     return dataclasses.replace(estimate, camera=doubt.camera if doubt is not None and doubt.is_known else None)
 
 
@@ -191,7 +192,9 @@ def _explained(
     return dataclasses.replace(other, fixed=problem.fixed), solve_jointly(other, spec), covariance
 
 
-def _groups(problem: Views, joint: Joint, covariance: Array | None, among: list[int]) -> list[list[int]]:
+def _groups(
+    problem: Views, joint: Joint, covariance: Array | None, moment: Moment | None, among: list[int]
+) -> list[list[int]]:
     """The views among these by where the object stands; poses that were given by hand are nobody's to doubt."""
     if problem.fixed.any():
         return [among]
@@ -202,11 +205,16 @@ def _groups(problem: Views, joint: Joint, covariance: Array | None, among: list[
     covariance = solution.of_views() if covariance is None else covariance
     place, turn = (np.trace(covariance[:, block, block], axis1=1, axis2=2) for block in (slice(3), slice(3, 6)))
     unsure_m = np.sqrt(place + (solution.poses[:, :3, 3] ** 2).sum(axis=1) * turn)
-    groups = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
+    poses = solution.poses
+    if moment is not None:
+        poses, unsure_m = moment.T_board_depth @ poses, np.hypot(unsure_m, moment.unsure_m)
+    groups = object_groups(seen, poses[among], solution.shared, sigma_m, unsure_m[among])
     return [[among[n] for n in group] for group in groups]
 
 
-def _result(problem: Views, joint: Joint, doubt: Doubt | None, evidence: Evidence) -> CaptureEstimate:
+def _result(
+    problem: Views, joint: Joint, doubt: Doubt | None, moment: Moment | None, evidence: Evidence
+) -> CaptureEstimate:
     """`doubt`: what the poses may need, which makes all but given ones less certain."""
     solution = joint.solution
     sigma = np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
@@ -222,8 +230,9 @@ def _result(problem: Views, joint: Joint, doubt: Doubt | None, evidence: Evidenc
             view = dataclasses.replace(view, covariance=covariance)
         views[problem.index[place]] = view
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
-    cause = doubt.note if doubt is not None and doubt.note else scale_note(joint, sigma, evidence)
-    notes = tuple(note for note in (cause, *noise_notes(joint, problem)) if note)
+    causes = [cause.note for cause in (doubt, moment) if cause is not None and cause.note]
+    causes = causes or [scale_note(joint, sigma, evidence)]
+    notes = tuple(note for note in (*causes, ruler_note(joint, evidence), *noise_notes(joint, problem)) if note)
     ordered = tuple(views[index] for index in sorted(views))
     scale, steps = solution.shared.print_scale, solution.iterations
     return CaptureEstimate("joint", ordered, correction, scale, steps, solution.converged, notes)
@@ -287,6 +296,23 @@ def scale_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
         f"{start}. Which is right cannot be identified from the capture alone; {'the print' if by_print else 'depth'} was "
         f"believed. Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as "
         "measured_ruler_m"
+    )
+
+
+UNMEASURED = 0.005
+"""Printers scale to the page, and paper stretches, by about this share."""
+
+
+def ruler_note(joint: Joint, evidence: Evidence) -> str:
+    """What lengths are worth where nobody measured the board; empty where somebody did, or depth is metric truth."""
+    board = evidence.board
+    if board.measured_ruler_m is not None or evidence.spec.trust == "depth":
+        return ""
+    distance_m = float(np.median(np.linalg.norm(joint.solution.poses[:, :3, 3], axis=1)))
+    return (
+        f"the board's ruler was not measured: all lengths are known to about {UNMEASURED:.1%}, "
+        f"{1000 * UNMEASURED * distance_m:.0f} mm at these distances, beside what sigma_mm says. Measure it "
+        f"({1000 * board.ruler_m:g} mm) and write measured_ruler_m into board.json"
     )
 
 

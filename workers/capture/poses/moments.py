@@ -1,20 +1,105 @@
 """What stood still: depth beside the colour of its view, and the object on the board from view to view."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from schemas.base import Array
-from workers.capture.poses.joint import gather
+from schemas.errors import CaptureError
+from workers.capture.poses.joint import BoardTerm, gather
+from workers.capture.poses.markers import Evidence
 from workers.capture.poses.observation import Observation
-from workers.capture.poses.terms import SIGNIFICANT, Shared
-from workers.geometry.frames import invert, transform
+from workers.capture.poses.terms import MAD, SIGNIFICANT, Shared, Solution, robust
+from workers.geometry.frames import invert, pose, transform
+
+# ---------------------------------------------------------------------------------------------- depth beside colour
+
+PLANE, FEWEST_PATCHES = 3, 8
+"""A view's depth lies beside the board by a height and two slopes, which so many patches tell."""
+APART_M, APART_RAD = 0.0015, 0.002
+"""Root mean squares over the views of less are what sensors err by themselves."""
+LEFT = 0.3
+"""What planes leave of the squares of heights, where depth is of another moment: errors of a sensor bend planes."""
+STEPS = 4
+ANOTHER_MM, NEARER = 10.0, 0.3
+"""Depth farther off the board than this is a neighbouring view's, where it lies off it by at most this share in that view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """Where depth saw the board: T_board_depth [V, 4, 4] takes depth's places on the board to colour's; sigma across, metres."""
+
+    T_board_depth: Array
+    unsure_m: float
+    note: str
+
+
+def find_moment(term: BoardTerm, solution: Solution) -> Moment | None:
+    """By how much each view's depth lies beside the board as its colour has it; None where they are of one moment.
+
+    Each view's heights over the board are fitted by a plane; what a depth camera errs by in all views is in the solution.
+    """
+    views, shared = len(solution.poses), solution.shared
+    p = np.einsum("pij,pj->pi", solution.poses[term.view, :3, :3], shared.corrected(term.patches))
+    p += solution.poses[term.view, :3, 3]
+    planes, left, total = np.zeros((views, PLANE)), np.zeros(len(p)), p[:, 2] / term.growth
+    for number in range(views):
+        here = term.view == number
+        if here.sum() < FEWEST_PATCHES:
+            continue
+        A, weight = np.column_stack([np.ones(here.sum()), p[here, :2]]), 1.0 / term.growth[here] ** 2
+        for _ in range(STEPS):
+            planes[number] = np.linalg.lstsq(A * np.sqrt(weight)[:, None], p[here, 2] * np.sqrt(weight), rcond=None)[0]
+            left[here] = (p[here, 2] - A @ planes[number]) / term.growth[here]
+            spread = max(MAD * float(np.median(np.abs(left[here]))), 1e-6)
+            weight = robust((left[here] / spread) ** 2, term.growth[here] ** -2.0)[0]
+    height_m, slope = np.sqrt((planes[:, 0] ** 2).mean()), np.sqrt((planes[:, 1:] ** 2).sum(axis=1).mean())
+    if height_m < APART_M or slope < APART_RAD or np.median(left**2) > LEFT**2 * np.median(total**2):
+        return None
+    turns = Rotation.from_rotvec(np.column_stack([-planes[:, 2], planes[:, 1], np.zeros(views)])).as_matrix()
+    beside = np.stack([pose(R, np.array([0, 0, -h])) for R, h in zip(turns, planes[:, 0], strict=True)])
+    note = (
+        "depth and colour are not of one moment: from view to view depth lies otherwise off the board, by "
+        f"{1000 * height_m:.1f} mm and {np.degrees(slope):.1f} degrees: hold the camera still for each view"
+    )
+    return Moment(beside, float(height_m), note)
+
+
+def check_moments(evidence: Evidence) -> None:
+    """Raises CaptureError where the depth of several views is that of the view before or after."""
+    fits = {
+        seen.number: view.fit.T_board_cam
+        for seen, view in zip(evidence.observations, evidence.markers, strict=True)
+        if view.fit
+    }
+    numbers, pairs, off_board = sorted(fits), [], 0
+    by_number = {seen.number: seen.board_patches for seen in evidence.observations}
+    for place, number in enumerate(numbers):
+        patches = by_number[number]
+        if len(patches) < FEWEST_PATCHES:
+            continue
+        near = [number, *{numbers[place - 1], numbers[(place + 1) % len(numbers)]} - {number}]
+        off_mm = [1000 * float(np.median(np.abs(transform(fits[n], patches.ray_z)[:, 2]))) for n in near]
+        if off_mm[0] > ANOTHER_MM:
+            off_board += 1
+            nearest = int(np.argmin(off_mm))
+            if off_mm[nearest] < min(ANOTHER_MM, NEARER * off_mm[0]):
+                pairs.append(f"depth_{number:05d} is of view {near[nearest]}")
+    if len(pairs) > 1 and 2 * len(pairs) > off_board:
+        raise CaptureError(
+            "depth", f"colour and depth are not of one moment: {', '.join(pairs)}: name each pair by one number"
+        )
+
 
 # ---------------------------------------------------------------------------------------------- where the object stood
 
 WITHIN_RAD = 0.008
 """A point is compared with the patch of another view whose middle is at most so far from its direction: within the patch."""
+ASIDE = 16
+"""So many patches around a point are looked at, where a pose is so unsure that it may take it aside."""
 GRAZING = 0.15
 """A patch whose plane a ray meets at a smaller cosine does not tell a depth there."""
 SEEN_THROUGH_M = 0.004
@@ -86,13 +171,20 @@ def _compare(
                 continue
             p = transform(invert(poses[other]), on_board)
             p = p[p[:, 2] > NEAREST_M]
-            distance, nearest = tree.query(p[:, :2] / p[:, 2:])
-            plane, ray = normals[other][nearest], p / p[:, 2:]
-            along = (plane * ray).sum(axis=1)
-            met = (distance < WITHIN_RAD) & (np.abs(along) > GRAZING)
-            beyond = (plane * points[other][nearest]).sum(axis=1)[met] / along[met] - p[met, 2]
-            sigma = np.hypot(sigma_m * p[met, 2] ** 2, np.hypot(unsure_m[number], unsure_m[other]))
+            ray, unsure = p / p[:, 2:], np.hypot(unsure_m[number], unsure_m[other])
+            distance, nearest = tree.query(ray[:, :2], k=range(1, min(ASIDE, tree.n) + 1))
+            # A pose that is unsure may take a point past the edge of what it lies on: all that it may meet must be nearer.
+            near = distance < SIGNIFICANT * unsure / p[:, 2:]
+            near[:, 0] |= distance[:, 0] < WITHIN_RAD
+            plane = normals[other][np.minimum(nearest, tree.n - 1)]
+            along = np.einsum("pki,pi->pk", plane, ray)
+            near &= np.abs(along) > GRAZING
+            at = points[other][np.minimum(nearest, tree.n - 1)]
+            beyond = (plane * at).sum(axis=2) / np.where(near, along, 1.0) - p[:, 2:]
+            sigma = np.hypot(sigma_m * p[:, 2:] ** 2, unsure / np.where(near, np.abs(along), 1.0))
             limit = SEEN_THROUGH_M + SIGNIFICANT * sigma
-            counts[:, number, other] = (np.abs(beyond) <= limit).sum(), (beyond > limit).sum()
+            agrees = (near & (np.abs(beyond) <= limit)).any(axis=1)
+            through = near.any(axis=1) & (~near | (beyond > limit)).all(axis=1)
+            counts[:, number, other] = agrees.sum(), through.sum()
     agree, through = counts + counts.transpose(0, 2, 1)
     return agree, through
