@@ -4,18 +4,22 @@
 computed, not drawn: by OpenCV's projections and by planes, from parameters that are drawn anew for each capture.
 """
 
+import argparse
 import dataclasses
+from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureCamera, CaptureEstimate
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Estimation
-from tests.workers.capture.drawn import BOX, KINECT, LENS, PINHOLE, hand_held, project
+from tests.workers.capture.drawn import BOX, KINECT, LENS, PINHOLE, errors, hand_held, project
 from workers.capture.board import marker_corners
 from workers.capture.poses.estimates import estimate_joint
 from workers.capture.poses.markers import Evidence, fit_markers
@@ -51,7 +55,7 @@ class Flaw:
 def directions(rng: Random, count: int = 1) -> Array:
     """[count, 3] unit vectors."""
     v = rng.standard_normal((count, 3))
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
+    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
 
 
 def numbers(camera: CaptureCamera, **changed: float) -> CaptureCamera:
@@ -239,7 +243,7 @@ def surface(rng: Random) -> tuple[Array, Array]:
     return np.concatenate(points), np.concatenate(normals)
 
 
-def hidden(points: Array, T: Pose, T_object: Pose) -> Array:
+def hidden(points: Array, T: Pose, T_object: Pose) -> NDArray[np.bool_]:
     """[P] bool: points on the board that the box hides from a camera at T, or stands on."""
     eye, p = transform(invert(T_object), T[None, :3, 3])[0], transform(invert(T_object), points)
     with np.errstate(divide="ignore"):
@@ -247,10 +251,11 @@ def hidden(points: Array, T: Pose, T_object: Pose) -> Array:
     return np.asarray(np.minimum(low, high).max(axis=1) < np.minimum(np.maximum(low, high).min(axis=1), 1.0 + 1e-6))
 
 
-def simulate(cause: str, seed: int) -> tuple[list[Pose], Evidence]:
-    """(true T_board_cam, what is seen) of a capture with this cause; the parameters are the seed's."""
+def simulate(cause: str, seed: int, camera: CaptureCamera | None = None) -> tuple[list[Pose], Evidence]:
+    """(true T_board_cam, what is seen) of a capture with this cause, read with a camera; the parameters are the seed's."""
     rng = np.random.default_rng([seed, list(CAUSES).index(cause)])
     flaw, truth = CAUSES[cause][0](rng), hand_held(rng, int(rng.integers(8, 15)))
+    flaw = flaw if camera is None else dataclasses.replace(flaw, given=camera)
     corner_px, nominal = float(rng.uniform(0.03, 0.15)), marker_corners(flaw.board)
     seen = []
     for number, T in enumerate(truth):
@@ -285,3 +290,93 @@ def messages(evidence: Evidence) -> tuple[str, CaptureEstimate | None]:
         return " ".join(name for name, words in SAID.items() if words in str(error)), None
     said = [name for name, words in SAID.items() if any(words in note for note in estimate.notes)]
     return " ".join(said), estimate
+
+
+def median_mm(estimate: CaptureEstimate, truth: list[Pose]) -> tuple[float, float]:
+    """(error, sigma) of the positions of cameras, medians."""
+    views = [view for view in estimate.views if view.T_board_cam is not None and view.covariance is not None]
+    off = [errors(view.T_board_cam, truth[view.number])[0] for view in views]
+    return float(np.median(off)), float(np.median([1000 * np.sqrt(np.trace(v.covariance[:3, :3])) for v in views]))
+
+
+COVERED, WORSE, WORSE_MM = 2.0, 1.1, 0.05
+"""What is not named is right where poses are off by at most so many sigmas. A camera that is taken may not make them worse by
+more than this factor and this much."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one capture: what is said, in words of `SAID`; whether that is its cause, and whether it is covered if nothing is.
+
+    worse: the camera that `--calibrate` takes brings the poses farther from the truth.
+    """
+
+    said: str
+    named: bool
+    covered: bool
+    worse: bool
+
+    @property
+    def right(self) -> bool:
+        """Whether it is named, or nothing wrong is said and the sigma covers it."""
+        return self.named or self.covered
+
+
+def judge(cause: str, seed: int) -> Outcome:
+    """Simulates a capture and judges what is said of it."""
+    truth, evidence = simulate(cause, seed)
+    words, estimate = messages(evidence)
+    expected, said = set(CAUSES[cause][1].split()), set(words.split())
+    usual = {"ruler", "scale"} - expected  # said beside all else, and true
+    named = expected == said - usual or (
+        cause == "print scale" and bool(expected & said) and said <= {"ruler", "scale"}
+    )
+    if estimate is None:
+        return Outcome(words, named, False, False)
+    off, sigma = median_mm(estimate, truth)
+    covered = said <= usual and off < COVERED * sigma and not expected & {"moved", "moment", "swapped", "ruler"}
+    worse = False
+    if said & {"camera", "lens", "alike", "none"}:
+        spec = evidence.spec.model_copy(update={"calibrate": True})
+        camera = estimate_joint(dataclasses.replace(evidence, spec=spec)).camera
+        if camera is not None:
+            after = median_mm(estimate_joint(simulate(cause, seed, camera)[1]), truth)[0]
+            worse = after > WORSE * off + WORSE_MM
+    return Outcome(words, named, covered, worse)
+
+
+def confusion(captures: int, causes: list[str], workers: int = 1) -> dict[str, list[Outcome]]:
+    """The outcomes of so many captures of each cause."""
+    tasks = [(cause, seed) for cause in causes for seed in range(captures)]
+    with ProcessPoolExecutor(workers) as pool:
+        outcomes = list(pool.map(judge, *zip(*tasks, strict=True), chunksize=4))
+    return {cause: outcomes[n * captures : (n + 1) * captures] for n, cause in enumerate(causes)}
+
+
+def table(outcomes: dict[str, list[Outcome]]) -> str:
+    """The table of docs/captures.md: of each cause the shares named, and covered, and what else is said."""
+    lines = ["| cause | named | covered | else said |", "|---|---|---|---|"]
+    for cause, each in outcomes.items():
+        other = Counter(o.said.replace("ruler", "").strip() or "nothing" for o in each if not o.right)
+        words = ", ".join(f"{name} {count}" for name, count in other.most_common())
+        shares = [
+            100 * sum(values) / len(each)
+            for values in ((o.named for o in each), (o.covered and not o.named for o in each))
+        ]
+        lines.append(
+            f"| {cause} | {shares[0]:.0f} % | {shares[1]:.0f} % | {words}{' WORSE' * any(o.worse for o in each)} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--captures", type=int, default=50)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--cause", action="append", choices=list(CAUSES))
+    arguments = parser.parse_args()
+    print(table(confusion(arguments.captures, arguments.cause or list(CAUSES), arguments.workers)))
+
+
+if __name__ == "__main__":
+    main()

@@ -145,8 +145,12 @@ class Explanation:
     numbers: tuple[int, ...] = ()
 
 
-CAMERA_FITS_NOT = "camera.json does not fit: the markers say {numbers}, which moves the poses by {by}. "
-TAKE = "Calibrate the camera at this size of image, or use --calibrate (estimation.calibrate), which takes what the markers say"
+CAMERA_FITS_NOT = (
+    "camera.json does not fit: the markers say {numbers}, which moves the poses by {by}. {half}Calibrate the camera at this size "
+    "of image{take}"
+)
+TAKE = ", or use --calibrate (estimation.calibrate), which takes what the markers say"
+"""Said of a camera that is known so well that it brings the poses nearer to the truth."""
 LENS = (
     "camera.json does not fit the markers, and no other focal length, principal point or k1 does, but another lens, which moves "
     "the poses by {by}: see that `distortion` has all numbers of the calibration (k4, k5, k6 too) and that it is no fisheye, or "
@@ -154,9 +158,9 @@ LENS = (
 )
 EXPLANATIONS = (
     Explanation("none", lambda seen: Fields.of(np.zeros((len(seen.pixels), 2, 0))), ""),
-    Explanation("centre", lambda seen: _numbers(seen, CENTRE), CAMERA_FITS_NOT + "{half}" + TAKE, CENTRE),
-    Explanation("camera", lambda seen: _numbers(seen, PINHOLE), CAMERA_FITS_NOT + TAKE, PINHOLE),
-    Explanation("lens k1", lambda seen: _numbers(seen, BENT), CAMERA_FITS_NOT + TAKE, BENT),
+    Explanation("centre", lambda seen: _numbers(seen, CENTRE), CAMERA_FITS_NOT, CENTRE),
+    Explanation("camera", lambda seen: _numbers(seen, PINHOLE), CAMERA_FITS_NOT, PINHOLE),
+    Explanation("lens k1", lambda seen: _numbers(seen, BENT), CAMERA_FITS_NOT, BENT),
     Explanation("lens", lambda seen: _numbers(seen, WHOLE), LENS, WHOLE),
     Explanation(
         "focus",
@@ -347,12 +351,11 @@ def _doubt(
     material = (
         max(float(np.median(shift_m / np.linalg.norm(begun[:, :3, 3], axis=1))), float(np.median(turn))) >= MATERIAL
     )
-    note = ""
-    if material and fits:
+    note, px = "", float(start.term.sigma_px[0])
+    if fits:
         by = f"{1000 * np.median(shift_m):.1f} mm, {np.degrees(np.median(turn)):.2f} degrees"
-        note = LENS.format(by=by) if explanation.numbers == WHOLE else _words(best, start, variance, by, is_known)
+        note = _words(best, start, variance, by, is_known, material)
     elif material:
-        px = float(start.term.sigma_px[0])
         note = NONE_FITS.format(off=px * off, times=off, name=explanation.name, left=px * left)
     camera = best.seen.camera if explanation.numbers else start.camera
     return Doubt(
@@ -360,26 +363,27 @@ def _doubt(
     )
 
 
-def _words(best: _Tried, start: Seen, variance: float, by: str, is_known: bool) -> str:
-    """What an explanation that fits says; by: how far it moves the poses."""
+def _words(best: _Tried, start: Seen, variance: float, by: str, is_known: bool, material: bool) -> str:
+    """What an explanation that fits says; by: how far it moves the poses. Numbers of a camera are said however little that is."""
     fitted, numbers, words = best.fitted, best.explanation.numbers, best.explanation.words
-    if not numbers:
+    if numbers in ((), WHOLE):
         of_view = np.abs(fitted.own - np.median(fitted.own)) if fitted.own.size else np.zeros(1)
         alike = fitted.alike if len(fitted.alike) else np.zeros(1)
         reach_m = 0.5 * np.ptp(start.term.board, axis=0).max()
         sag, stretch = 1000 * np.abs(alike).max() * reach_m**2, alike[0]
-        return words.format(by=by, spread=of_view.max(), sag=sag, stretch=stretch)
+        return words.format(by=by, spread=of_view.max(), sag=sag, stretch=stretch) if material else ""
     k, of = best.seen.camera.intrinsics, start.camera.intrinsics
     change = np.array([k.fx / of.fx - 1, k.fy / of.fy - 1, (k.cx - of.cx) / of.fx, (k.cy - of.cy) / of.fy])
     index, sigma = [n for n in numbers if n < len(PINHOLE)], np.sqrt(variance * np.diag(fitted.alike_covariance))
     sure = np.append(np.zeros(len(PINHOLE), np.bool_), len(numbers) > len(PINHOLE))
     sure[index] = np.abs(change[index]) > SIGNIFICANT * sigma[: len(index)]
     sure[:2] = sure[:2].any()
-    if not (is_known and sure.any()):
-        return ALIKE_VIEWS
+    if not sure.any():
+        return ALIKE_VIEWS if material else ""
     shift = np.array([k.cx - of.cx, k.cy - of.cy])
     half = HALF if (np.abs(np.abs(shift) - 0.5) < 0.15).all() and shift.prod() > 0 else ""
-    return words.format(numbers=compare_cameras(best.seen.camera, start.camera, sure), by=by, half=half)
+    said = compare_cameras(best.seen.camera, start.camera, sure)
+    return words.format(numbers=said, by=by, half=half, take=TAKE if is_known else "")
 
 
 def compare_cameras(camera: CaptureCamera, given: CaptureCamera, chosen: NDArray[np.bool_] | None = None) -> str:

@@ -19,6 +19,7 @@ from workers.capture.poses.terms import (
     PRINT_SCALE,
     SHARED,
     SIGNIFICANT,
+    Shared,
     correct_depth,
     cross_matrix,
     motion_between,
@@ -105,6 +106,8 @@ MIN_PATCHES = 4
 """So many patches of the board tell its tilt."""
 SCALES_DIFFER = 0.01
 """Print and depth disagree: smaller differences may be errors of depth that change with distance, within specification."""
+UNMEASURED = 0.005
+"""Printers scale to the page, and paper stretches, by about this share."""
 
 
 def estimate_joint(evidence: Evidence) -> CaptureEstimate:
@@ -205,10 +208,11 @@ def _groups(
     covariance = solution.of_views() if covariance is None else covariance
     place, turn = (np.trace(covariance[:, block, block], axis1=1, axis2=2) for block in (slice(3), slice(3, 6)))
     unsure_m = np.sqrt(place + (solution.poses[:, :3, 3] ** 2).sum(axis=1) * turn)
-    poses = solution.poses
+    poses, shared = solution.poses, solution.shared
     if moment is not None:
+        shared = Shared()
         poses, unsure_m = moment.T_board_depth @ poses, np.hypot(unsure_m, moment.unsure_m)
-    groups = object_groups(seen, poses[among], solution.shared, sigma_m, unsure_m[among])
+    groups = object_groups(seen, poses[among], shared, sigma_m, unsure_m[among])
     return [[among[n] for n in group] for group in groups]
 
 
@@ -231,8 +235,8 @@ def _result(
         views[problem.index[place]] = view
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
     causes = [cause.note for cause in (doubt, moment) if cause is not None and cause.note]
-    causes = causes or [scale_note(joint, sigma, evidence)]
-    notes = tuple(note for note in (*causes, ruler_note(joint, evidence), *noise_notes(joint, problem)) if note)
+    causes = causes or [scale_note(joint, sigma, evidence) or ruler_note(joint, evidence)]
+    notes = tuple(note for note in (*causes, *noise_notes(joint, problem)) if note)
     ordered = tuple(views[index] for index in sorted(views))
     scale, steps = solution.shared.print_scale, solution.iterations
     return CaptureEstimate("joint", ordered, correction, scale, steps, solution.converged, notes)
@@ -284,7 +288,8 @@ def scale_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
     index = NAMES.index("scale") if by_print else PRINT_SCALE
     # The scale of depth turns a measured length into a true one; the print's does so for a length of board.json.
     excess = (1.0 / shared.scale if by_print else shared.print_scale) - 1.0
-    if joint.prior[index] == 0 or abs(excess) < max(SCALES_DIFFER, SIGNIFICANT * sigma[index]):
+    least = SCALES_DIFFER if board.measured_ruler_m is not None else UNMEASURED
+    if joint.prior[index] == 0 or abs(excess) < max(least, SIGNIFICANT * sigma[index]):
         return ""
     start = (
         "print and depth disagree about the scale: by depth the print is "
@@ -297,10 +302,6 @@ def scale_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
         f"believed. Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as "
         "measured_ruler_m"
     )
-
-
-UNMEASURED = 0.005
-"""Printers scale to the page, and paper stretches, by about this share."""
 
 
 def ruler_note(joint: Joint, evidence: Evidence) -> str:

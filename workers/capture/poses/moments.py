@@ -22,7 +22,7 @@ PLANE, FEWEST_PATCHES = 3, 8
 APART_M, APART_RAD = 0.0015, 0.002
 """Root mean squares over the views of less are what sensors err by themselves."""
 LEFT = 0.3
-"""What planes leave of the squares of heights, where depth is of another moment: errors of a sensor bend planes."""
+"""What planes leave of heights, where depth is of another moment, at most: errors of a sensor bend planes."""
 STEPS = 4
 ANOTHER_MM, NEARER = 10.0, 0.3
 """Depth farther off the board than this is a neighbouring view's, where it lies off it by at most this share in that view."""
@@ -40,32 +40,45 @@ class Moment:
 def find_moment(term: BoardTerm, solution: Solution) -> Moment | None:
     """By how much each view's depth lies beside the board as its colour has it; None where they are of one moment.
 
-    Each view's heights over the board are fitted by a plane; what a depth camera errs by in all views is in the solution.
+    What a depth camera errs by in all views is in the solution, and tells nothing of moments; where they differ, it is no more
+    than their mean, and depth is taken as it was measured.
     """
-    views, shared = len(solution.poses), solution.shared
-    p = np.einsum("pij,pj->pi", solution.poses[term.view, :3, :3], shared.corrected(term.patches))
-    p += solution.poses[term.view, :3, 3]
-    planes, left, total = np.zeros((views, PLANE)), np.zeros(len(p)), p[:, 2] / term.growth
-    for number in range(views):
-        here = term.view == number
-        if here.sum() < FEWEST_PATCHES:
-            continue
-        A, weight = np.column_stack([np.ones(here.sum()), p[here, :2]]), 1.0 / term.growth[here] ** 2
-        for _ in range(STEPS):
-            planes[number] = np.linalg.lstsq(A * np.sqrt(weight)[:, None], p[here, 2] * np.sqrt(weight), rcond=None)[0]
-            left[here] = (p[here, 2] - A @ planes[number]) / term.growth[here]
-            spread = max(MAD * float(np.median(np.abs(left[here]))), 1e-6)
-            weight = robust((left[here] / spread) ** 2, term.growth[here] ** -2.0)[0]
+    planes, left = _fit_planes(term, solution.poses, solution.shared)
     height_m, slope = np.sqrt((planes[:, 0] ** 2).mean()), np.sqrt((planes[:, 1:] ** 2).sum(axis=1).mean())
-    if height_m < APART_M or slope < APART_RAD or np.median(left**2) > LEFT**2 * np.median(total**2):
+    if height_m < APART_M or slope < APART_RAD or left > LEFT:
         return None
-    turns = Rotation.from_rotvec(np.column_stack([-planes[:, 2], planes[:, 1], np.zeros(views)])).as_matrix()
-    beside = np.stack([pose(R, np.array([0, 0, -h])) for R, h in zip(turns, planes[:, 0], strict=True)])
     note = (
         "depth and colour are not of one moment: from view to view depth lies otherwise off the board, by "
         f"{1000 * height_m:.1f} mm and {np.degrees(slope):.1f} degrees: hold the camera still for each view"
     )
-    return Moment(beside, float(height_m), note)
+    planes, _ = _fit_planes(term, solution.poses, Shared())
+    turns = Rotation.from_rotvec(np.column_stack([-planes[:, 2], planes[:, 1], np.zeros(len(planes))])).as_matrix()
+    beside = np.stack([pose(R, np.array([0, 0, -h])) for R, h in zip(turns, planes[:, 0], strict=True)])
+    # Across the board nothing tells depth's place: it is off by as much as along it, and by turns at the camera's distance.
+    distance_m = np.median(np.linalg.norm(solution.poses[:, :3, 3], axis=1))
+    aside_m = np.hypot(np.sqrt((planes[:, 0] ** 2).mean()), slope / np.sqrt(2) * distance_m)
+    return Moment(beside, float(aside_m), note)
+
+
+def _fit_planes(term: BoardTerm, poses: Array, shared: Shared) -> tuple[Array, float]:
+    """(height, metres, and slopes along x and y of depth over the board in each view [V, 3], and what share they leave).
+
+    The planes are robust; the share is of medians, over all patches.
+    """
+    p = np.einsum("pij,pj->pi", poses[term.view, :3, :3], shared.corrected(term.patches)) + poses[term.view, :3, 3]
+    planes, left = np.zeros((len(poses), PLANE)), p[:, 2] / term.growth
+    for number in range(len(poses)):
+        here = term.view == number
+        if here.sum() < FEWEST_PATCHES:
+            continue
+        growth, A, height = term.growth[here], np.column_stack([np.ones(here.sum()), p[here, :2]]), p[here, 2]
+        weight = 1.0 / growth**2
+        for _ in range(STEPS):
+            planes[number] = np.linalg.lstsq(A * np.sqrt(weight)[:, None], height * np.sqrt(weight), rcond=None)[0]
+            left[here] = (height - A @ planes[number]) / growth
+            spread = max(MAD * float(np.median(np.abs(left[here]))), 1e-6)
+            weight = robust((left[here] / spread) ** 2, growth**-2.0)[0]
+    return planes, float(np.median(np.abs(left)) / np.median(np.abs(p[:, 2] / term.growth)))
 
 
 def check_moments(evidence: Evidence) -> None:
