@@ -48,7 +48,7 @@ _IMPORT = re.compile(rf"^(\s*)(from|import) ({'|'.join(OURS)})\b", re.MULTILINE)
 def file_of(module: str) -> Path | None:
     """The file of a module of ours; None where it is none, or not a module but a name in one."""
     base = _folder(module)
-    return next((one for one in (base.with_suffix(".py"), base / "__init__.py") if one.is_file()), None)
+    return next((file for file in (base.with_suffix(".py"), base / "__init__.py") if file.is_file()), None)
 
 
 def imports_of(path: Path) -> Iterator[str]:
@@ -64,7 +64,7 @@ def imports_of(path: Path) -> Iterator[str]:
                 names = [alias.name for alias in child.names]
             elif isinstance(child, ast.ImportFrom):
                 below = [f"{child.module}.{alias.name}" for alias in child.names]
-                names = [one if file_of(one) else str(child.module) for one in below]
+                names = [name if file_of(name) else str(child.module) for name in below]
             else:
                 names = []
                 yield from walk(child, loaded and not isinstance(child, ast.FunctionDef | ast.Lambda))

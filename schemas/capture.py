@@ -108,7 +108,7 @@ class Detection:
     ids [M] int64, ascending, unique; corners_px [M, 4, 2] float64, as stored (not undistorted), pixel centres at +0.5, in
     the order top left, top right, bottom right, bottom left of the printed marker. `dropped` says in words what was found and
     not used (a marker twice, an id that is not on the board). chess [K] int64: which corners of the board's chessboard were
-    found, and chess_px [K, 2] where; none on other boards.
+    found, and chess_px [K, 2] where; none on other boards. `others`: those of further prints of the board in view.
     """
 
     number: int
@@ -117,6 +117,7 @@ class Detection:
     dropped: tuple[str, ...] = ()
     chess: NDArray[np.int64] = field(default_factory=lambda: frozen_array([], np.int64))
     chess_px: Array = field(default_factory=lambda: frozen_array(np.zeros((0, 2))))
+    others: "tuple[Detection, ...]" = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -185,9 +185,10 @@ def describe_seconds(seconds: float) -> str:
     return f"{float(f'{value:.2g}') if value < 100.0 else round(value):g} {name}"
 
 
-def plural(count: int, one: str, many: str | None = None) -> str:
-    """A number with its noun: "1 scene", "1,200 scenes"."""
-    return f"{count:,} {one if count == 1 else many or f'{one}s'}"
+def plural(count: int, noun: str) -> str:
+    """A number with its noun: "1 scene", "1,200 scenes", "2 meshes", "2 categories"."""
+    ends = ("y", "ies") if noun.endswith("y") else ("", "es") if noun.endswith("sh") else ("", "s")
+    return f"{count:,} {noun if count == 1 else noun.removesuffix(ends[0]) + ends[1]}"
 
 
 def number(value: float) -> str:

@@ -161,7 +161,7 @@ def find_shapes(dataset: Dataset) -> Predictor:
         for region in regions_of(pair):
             mask = silhouette(pair, region)
             known = masks.get(pair.input.regions[region]["category"]) or list(chain(*masks.values()))
-            _, pose_id, other = max(known, key=lambda one: (occupancy.iou(one[0], mask), -one[1]))
+            _, pose_id, other = max(known, key=lambda row: (occupancy.iou(row[0], mask), -row[1]))
             shapes[region] = mesh_of(dataset.pair(pose_id), other)
         volumes = {region: inside(pair.samples(region)["volume_points"], mesh) for region, mesh in shapes.items()}
         return Prediction(shapes=shapes, volumes=volumes)
@@ -363,7 +363,7 @@ def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterato
                 f"{folder} misses {plural(count, 'item')} of test scenes: predict every one, if only as empty"
             )
         figures = summarise(items)["metrics"]
-        for metric in (one for one in METRICS if one in figures and figures[one]["items"]):
+        for metric in (name for name in METRICS if name in figures and figures[name]["items"]):
             # Five digits are more than an interval leaves meaning to
             words = {key: "" if value is None else f"{value:.5g}" for key, value in figures[metric].items()}
             yield {"level": level, "metric": metric, **words}

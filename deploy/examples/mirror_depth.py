@@ -84,19 +84,19 @@ def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT) -> Example | Non
     depth, rgb = view.depth_m(), view.rgb()
     here = view.segment() == region
     T = np.linalg.inv(mirror.T_world_cam) @ view.T_world_cam
-    own = transform(T, unproject(view, depth, here))
-    if len(own) < 20:
+    cloud = transform(T, unproject(view, depth, here))
+    if len(cloud) < 20:
         return None
-    corner = crop_corner(mirror, own)
+    corner = crop_corner(mirror, cloud)
     if corner is None:
         return None
     up = mirror.T_world_cam[2, :3]
-    turned = half_turn(own, up)
-    middle = float(np.median(own[:, 2]))
+    turned = half_turn(cloud, up)
+    middle = float(np.median(cloud[:, 2]))
     background, gap = put_planes(pair, mirror, corner)
-    seen, other = (close_holes(splat(mirror, cloud, corner)) for cloud in (own, turned))
+    seen, other = (close_holes(splat(mirror, points, corner)) for points in (cloud, turned))
     baseline = nearest(seen, background)
-    color = splat_values(mirror, own, rgb[here & (depth > 0)], corner)
+    color = splat_values(mirror, cloud, rgb[here & (depth > 0)], corner)
     features = stack_features(seen, other, background, color, gap, middle)
     window = np.s_[corner[0] : corner[0] + CROP[0], corner[1] : corner[1] + CROP[1]]
     truth, mask = mirror.depth_m()[window], mirror.segment()[window] == region
@@ -221,7 +221,7 @@ def half_turn(points: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[n
 
 def stack_features(seen: Image, other: Image, background: Image, color: Image, gap: Image, middle: float) -> Image:
     """[CHANNELS, H, W]: depths relative to `middle`, which pixels have them, colour, and the place in the crop."""
-    relative = [np.where(one > 0, (one - middle) / SCALE_M, 0) for one in (seen, other)]
+    relative = [np.where(depth > 0, (depth - middle) / SCALE_M, 0) for depth in (seen, other)]
     plane = np.clip((background - middle) / SCALE_M, -5, 5)
     rows, columns = np.meshgrid(np.linspace(-1, 1, CROP[0]), np.linspace(-1, 1, CROP[1]), indexing="ij")
     maps = [*relative, seen > 0, other > 0, plane, gap - 1, rows, columns, *np.moveaxis(color, -1, 0)]

@@ -68,8 +68,8 @@ def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT, uniform: bool = 
     points = transform(T_net_world @ pair.T_world[region], stored)
     front = np.where(mask, close_holes(np.where(mask, depth, np.float32(0))), np.float32(0))
     T_cam_net = np.asarray(np.linalg.inv(T_net_world @ view.T_world_cam), np.float64)
-    shadows = [shadow_of(view, front, transform(T_cam_net, one)) for one in (points, half_turn(points, seen))]
-    shadow, other = ((one[:, 0] > 0) & (points[:, 2] > 0) for one in shadows)
+    shadows = [shadow_of(view, front, transform(T_cam_net, places)) for places in (points, half_turn(points, seen))]
+    shadow, other = ((behind[:, 0] > 0) & (points[:, 2] > 0) for behind in shadows)
     return Example(
         pick(seen, SEEN, np.random.default_rng(pair.pose_id)).astype(np.float32),
         np.concatenate([points, *shadows], axis=1).astype(np.float32),

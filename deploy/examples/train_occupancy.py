@@ -47,7 +47,7 @@ class OccupancyNet(nn.Module):
 def layers(*sizes: int) -> nn.Sequential:
     """Linear layers of these sizes, with ReLU between them."""
     linear = [nn.Linear(a, b) for a, b in pairwise(sizes)]
-    return nn.Sequential(linear[0], *(layer for one in linear[1:] for layer in (nn.ReLU(), one)))
+    return nn.Sequential(linear[0], *(layer for following in linear[1:] for layer in (nn.ReLU(), following)))
 
 
 def loss_of(net: OccupancyNet, batch: dict[str, Tensor]) -> Tensor:
@@ -56,8 +56,8 @@ def loss_of(net: OccupancyNet, batch: dict[str, Tensor]) -> Tensor:
     side = torch.ones(len(batch["seen"]), 1, 1)
     side[torch.rand(len(side)) < 0.5] = -1
     seen, queries = (
-        torch.cat([one[..., :1], one[..., 1:2] * side, one[..., 2:]], 2)
-        for one in (batch["seen"], batch["queries"][:, some])
+        torch.cat([points[..., :1], points[..., 1:2] * side, points[..., 2:]], 2)
+        for points in (batch["seen"], batch["queries"][:, some])
     )
     return functional.binary_cross_entropy_with_logits(net(seen, queries), batch["inside"][:, some].float())
 
@@ -66,7 +66,7 @@ def load(place: str, split: Split = "train") -> dict[str, Tensor]:
     """All pairs of a split in memory: seen, queries and inside as `occupancy.Example` tells them."""
     examples = filter(None, map(make_example, pairs_of_split(open_dataset(place), split)))
     names = ("seen", "queries", "inside")
-    return stack([{name: torch.from_numpy(getattr(one, name)) for name in names} for one in examples])
+    return stack([{name: torch.from_numpy(getattr(example, name)) for name in names} for example in examples])
 
 
 @torch.no_grad()
@@ -99,8 +99,8 @@ def main() -> None:
     scores = evaluate(net, options.place)
     keep(net, scores, options)
     print(f"{'IoU':12}{''.join(f'{group:>8}' for group in scores['network'])}")
-    for name, one in scores.items():
-        print(f"{name:12}{''.join(f'{value:8.3f}' for value in one.values())}")
+    for name, means in scores.items():
+        print(f"{name:12}{''.join(f'{value:8.3f}' for value in means.values())}")
     print(json.dumps(scores))
 
 

@@ -34,13 +34,13 @@ class Category:
 BUILT_IN: Mapping[str, Category] = {
     row.name: row
     for row in (
-        Category("bottle", 0, "bottle:make_bottle", "02876657"),
+        Category("bottle", 0, "closed_vessels:make_bottle", "02876657"),
         Category("camera", 1, "camera:make_camera", "02942699"),
-        Category("can", 2, "can:make_can", "02946921"),
-        Category("jar", 3, "jar:make_jar", "03593526"),
+        Category("can", 2, "closed_vessels:make_can", "02946921"),
+        Category("jar", 3, "open_vessels:make_jar", "03593526"),
         Category("laptop", 4, "laptop:make_laptop", "03642806"),
-        Category("mug", 5, "crockery:make_mug", "03797390"),
-        Category("bowl", 6, "crockery:make_bowl", "02880940"),
+        Category("mug", 5, "open_vessels:make_mug", "03797390"),
+        Category("bowl", 6, "open_vessels:make_bowl", "02880940"),
         Category("box", 7, "box:make_box", None),
         Category(TABLE, 8, "table:make_table", "04379243"),
         Category("tray", 9, "table:make_tray", None),

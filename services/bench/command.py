@@ -124,18 +124,18 @@ def measure_scaling(
     }
 
 
-def gain_of(one: Sequence[Lap], several: Sequence[Lap]) -> dict[str, Any]:
-    """The gain of several at once over one, from laps in pairs; a lap lasts from the first start to the last end.
+def gain_of(single: Sequence[Lap], several: Sequence[Lap]) -> dict[str, Any]:
+    """The gain of several at once over a single one, from laps in pairs; a lap lasts from the first start to the last end.
 
     speedup: ratio of the paces; inflation: ratio of the processor time a scene, the cost of sharing caches, memory and clock,
     without waiting.
     """
     return {
         "scenes": several[0].scenes,
-        "one_scenes_per_s": median(1.0 / by_clock(lap) for lap in one),
+        "one_scenes_per_s": median(1.0 / by_clock(lap) for lap in single),
         "all_scenes_per_s": median(1.0 / by_clock(lap) for lap in several),
-        "speedup": slope_ratio(one, several),
-        "inflation": slope_ratio(several, one, by_processor),
+        "speedup": slope_ratio(single, several),
+        "inflation": slope_ratio(several, single, by_processor),
     }
 
 

@@ -27,7 +27,7 @@ from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.make_scene import Scene, make_scene
 from workers.shard.run_shard import run_ranges
 from workers.store.commit import committed_files, read_record
-from workers.store.file_system import sync_tree
+from workers.store.file_system import OpenTree
 from workers.store.images import decode_png, encode_png
 from workers.store.local import LocalStore
 
@@ -160,7 +160,7 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
         for start in range(0, scenes, size):
             span = bench.next_span(min(size, scenes - start))
             # What the other sides wrote: ours would wait for it, because its commits flush the file system.
-            sync_tree(folder)
+            os.sync()
             ours.append(bench.run(span))
             # The input of the next side is made between the clocks.
             files, made = bench.files(span), make_in_memory(bench.context, span)
@@ -186,10 +186,14 @@ def run_lower_bound(renderer: Renderer, scenes: Sequence[Scene], files: Mapping[
     for pixels in images:
         encode_png(pixels)
     encoded = time.perf_counter()
+    folder.mkdir(parents=True)
+    tree = OpenTree(folder)
     for path, data in files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(data)
-    sync_tree(folder)
+        with open(folder / path, "wb") as file:
+            file.write(data)
+            tree.flush_file(file)
+    tree.flush(folder.parent)
     written = time.perf_counter()
     stages = {"draw": draw, "encode": encoded - begun, "write": written - encoded}
     return Lap(len(scenes), sum(stages.values()), draw_cpu + time.process_time() - cpu, stages, upload)

@@ -66,8 +66,7 @@ def _ray() -> Finding:
 def _gpus() -> Finding:
     """EGL's devices, and which of them this process takes."""
     try:
-        from workers.render.raster.context import choose
-        from workers.render.raster.devices import describe, list_devices, visible_gpus
+        from workers.render.raster.context import choose, describe, list_devices, visible_gpus
 
         devices, choice = list_devices(), choose()
     except MachineError as error:

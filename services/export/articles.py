@@ -150,6 +150,8 @@ BACKGROUND: Final = 255
 _IMAGES = "images.csv"
 _OF_VIEWS = ("width", "height", "fx", "fy", "cx_opencv", "cy_opencv")
 _STORED_AXES = [0, 2, 1]
+_STEPS = np.iinfo(np.uint16).max // np.iinfo(np.uint8).max
+"""Of stored coordinates in one of 8 bits."""
 
 
 class Nocs(Writer):
@@ -179,20 +181,20 @@ class Nocs(Writer):
         rgb, depth, region = pair.image(role, "rgb"), pair.depth(role, MM_PER_M), pair.pixels(role, "region")
         codes = pair.pixels(role, "coordinates")
         assert rgb is not None and depth is not None and region is not None and codes is not None
-        meta = "".join(
-            f"{region_id - REGION_FIRST_OBJECT + 1} {self._class(category)} {_synset(category)} {escaped(name)}\n"
-            for region_id, (category, name) in scene.instances.items()
-        )
-        files = {"color.png": rgb, "coord.png": encode_png(coordinates_of(codes)), "depth.png": depth}
-        for name, data in {**files, "mask.png": encode_png(mask_of(region)), "meta.txt": meta.encode()}.items():
+        meta, classes = "", self.kept["classes"]
+        for region_id, (category, name) in scene.instances.items():
+            number, own_class = region_id - REGION_FIRST_OBJECT + 1, classes.setdefault(category, len(classes) + 1)
+            meta += f"{number} {own_class} {_synset(category)} {escaped(name)}\n"
+        coordinates = np.rint(codes[..., _STORED_AXES] / _STEPS).astype(np.uint8)
+        # Objects count from 1.
+        numbers = np.where(region < REGION_FIRST_OBJECT, BACKGROUND, region - (REGION_FIRST_OBJECT - 1))
+        files = {"color.png": rgb, "coord.png": encode_png(coordinates), "depth.png": depth}
+        files |= {"mask.png": encode_png(numbers.astype(np.uint8)), "meta.txt": meta.encode()}
+        for name, data in files.items():
             self.folder.put(f"{path}_{name}", data)
         columns = (view[name] for name in _OF_VIEWS)
         self.folder.append_row(_IMAGES, (path, scene.scene_id, view["pose_id"], role, *columns))
         self.count("images", scene.split)
-
-    def _class(self, category: str) -> int:
-        number: int = self.kept["classes"].setdefault(category, len(self.kept["classes"]) + 1)
-        return number
 
     def _write_model(self, scene: ExportScene, category: str, instance_id: str) -> None:
         """bbox.txt, the size of the object's box, and model.obj where the shape is stored or here."""
@@ -217,18 +219,6 @@ class Nocs(Writer):
             "depth": "millimetres, z along the optical axis, 0 is no depth",
             "intrinsics": f"{_IMAGES}, pixel centres on integers; those loaders have fx = 577.5 written into them",
         }
-
-
-def coordinates_of(codes: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """[H, W, 3] `coordinates` of the dataset as this layout stores them."""
-    share = np.iinfo(np.uint16).max // np.iinfo(np.uint8).max
-    return np.rint(codes[..., _STORED_AXES] / share).astype(np.uint8)
-
-
-def mask_of(region: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[H, W]: the number of each object, from 1, and `BACKGROUND`."""
-    first = REGION_FIRST_OBJECT
-    return np.where(region >= first, region - np.uint8(first - 1), BACKGROUND).astype(np.uint8)
 
 
 def obj_lines(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> Iterator[str]:

@@ -129,7 +129,9 @@ class Bop(Writer):
                 return NO_SHAPE
             name = f"{number:06d}_{len(shot.poses):06d}.png"
             shot.files[f"mask/{name}"], shot.files[f"mask_visib/{name}"] = encode_mask(whole.mask), encode_mask(visible)
-            shot.poses.append(_pose(self._numbers[label["region_id"]], label))
+            R, t = (T := read_matrix(label["T_cam_obj"]))[:3, :3], T[:3, 3]
+            pose = {"cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": (_MM * t).tolist()}
+            shot.poses.append({**pose, "obj_id": self._numbers[label["region_id"]]})
             shot.infos.append(_info(whole, visible, pixels))
         return shot
 
@@ -186,12 +188,6 @@ def _sensor(view: Row) -> dict[str, Any]:
     """camera.json: the sensor of the first image."""
     names = {"width": "width", "height": "height", "fx": "fx", "fy": "fy", "cx": "cx_opencv", "cy": "cy_opencv"}
     return {**{name: view[column] for name, column in names.items()}, "depth_scale": _MM / view["depth_units_per_m"]}
-
-
-def _pose(number: int, label: Row) -> Row:
-    """An entry of scene_gt.json."""
-    T = read_matrix(label["T_cam_obj"])
-    return {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (_MM * T[:3, 3]).tolist(), "obj_id": number}
 
 
 def _info(whole: Silhouette, visible: NDArray[np.bool_], depth: NDArray) -> Row:

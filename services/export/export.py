@@ -4,7 +4,7 @@ import argparse
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError, OutputError, command_line, did_you_mean, plural
 from services.export.folder import ExportFolder
-from services.export.formats import Choice, Chooser, ExportRequest, Writer
+from services.export.formats import Choice, ExportRequest, Writer, choose_scenes
 from services.export.source import iter_records, scenes_of, splits_of
 from services.export.table import FORMATS
 from services.job.record import JobRecord, read_success, require_dataset, require_job
@@ -54,23 +54,23 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
         raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
     record = require_job(request.store)
     FORMATS[request.format].load().check(request.format, record.job)
-    chooser = Chooser(request.choice)
     folder = ExportFolder(request.target)
     plan = _plan(request, record)
     if (done := folder.finished()) is not None:
         folder.refuse_other(done, plan)
         return ExportResult(done, 0)
+    chosen = choose_scenes(request.store, request.choice)
     if not folder.work.exists():
-        _refuse_empty(request, chooser)
+        _refuse_empty(request, chosen)
     with folder.claimed(plan) as progress:
         codes = _snapshot(request, folder, fresh=progress is None)
         begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
         writer = FORMATS[request.format].load()(request, record, folder, begun["writer"])
         with closing(writer):
-            return _Export(writer, codes, begun).run(chooser, report)
+            return _Export(writer, codes, begun).run(chosen, report)
 
 
-def _refuse_empty(request: ExportRequest, chooser: Chooser) -> None:
+def _refuse_empty(request: ExportRequest, chosen: Collection[int]) -> None:
     """Raises InputError where no object has a category that is named, or no scene is chosen: before anything is written."""
     store, choice = request.store, request.choice
     for option, names, table in (
@@ -83,7 +83,7 @@ def _refuse_empty(request: ExportRequest, chooser: Chooser) -> None:
         if unknown := sorted(set(names) - set(there)):
             known = f"{did_you_mean(unknown[0], there)}Its are {', '.join(there)}"
             raise InputError(f"{option} {unknown[0]}: {store.name} has no such object; {known}")
-    if not any(chooser.choose(read_stored(store, records)) for records in iter_records(store, list_codes(store))):
+    if not chosen:
         listed = command_line("query", store.name, "select scene_id, category from scenes")
         raise InputError(f"no scene of {store.name} is what was asked for: `{listed}` lists what is there")
 
@@ -99,11 +99,11 @@ class _Export:
         if begun["writer"] is None:
             self._folder.append(LEFT_OUT, b"scene_id,pose_id,reason\n")
 
-    def run(self, chooser: Chooser, report: Report) -> ExportResult:
+    def run(self, chosen: Collection[int], report: Report) -> ExportResult:
         """Every chosen scene from the checkpoint on, then the manifest."""
         before = self._counts["pairs"]
         if not self._finished:
-            self._write_scenes(chooser, report)
+            self._write_scenes(chosen, report)
             self._writer.finish()
             self._finished = True
             self._checkpoint(self._next_scene)
@@ -120,15 +120,16 @@ class _Export:
         self._folder.finish(manifest)
         return ExportResult(manifest, self._counts["pairs"] - before)
 
-    def _write_scenes(self, chooser: Chooser, report: Report) -> None:
+    def _write_scenes(self, chosen: Collection[int], report: Report) -> None:
         store, job, choice = self._writer.request.store, self._writer.record.job, self._writer.request.choice
         splits = splits_of(store, self._codes, job.assets.split, choice.held_out, choice.split == "category")
         for records in iter_records(store, self._codes):
             if records[0].span.stop <= self._next_scene:
                 continue
             stored = read_stored(store, records)
-            chosen = [scene for scene in chooser.choose(stored) if scene >= self._next_scene]
-            for scene in scenes_of(store, stored, chosen, splits):
+            made = (row["scene_id"] for row in stored.rows["scenes"])
+            here = [scene_id for scene_id in made if scene_id in chosen and scene_id >= self._next_scene]
+            for scene in scenes_of(store, stored, here, splits):
                 left_out = self._writer.add(scene)
                 pairs = len(scene.pairs) - len(left_out)
                 self._counts.update(scenes=int(pairs > 0), pairs=pairs, pairs_left_out=len(left_out))

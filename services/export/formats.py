@@ -10,27 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal
 
-import duckdb
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
 from schemas.base import Frozen
-from schemas.dataset.layout import asset_path
-from schemas.dataset.tables import SCHEMAS
+from schemas.dataset.layout import MAX_SCENE, asset_path
 from schemas.errors import CorruptError, InputError
 from schemas.job.job import Job
 from services.export.folder import ExportFolder, Register
 from services.export.shapes import Shapes
 from services.export.source import ExportPair, ExportScene
 from services.job.record import JobRecord
-from services.read.dataset_reader import StoredRange
-from services.read.query import LOCKED
+from services.read.query import query
 from services.read.scene_geometry import Sources
-from workers.store.manifest import table_of_rows
 from workers.store.store import Store
-
-_TABLES = ("scenes", "views", "objects", "assets")
 
 
 class Choice(Frozen):
@@ -52,42 +46,24 @@ class Choice(Frozen):
 _EXAMPLE: Final = "it is an SQL condition on the columns of scenes, such as 'support_margin_mm > 30'"
 
 
-class Chooser:
-    """Chooses scenes range by range."""
+def choose_scenes(store: Store, choice: Choice) -> frozenset[int]:
+    """The ids of the chosen scenes. Raises InputError where the condition is no SQL that the tables can answer."""
+    last = MAX_SCENE if choice.last_scene is None else choice.last_scene
+    conditions = [f"scene_id between {choice.first_scene or 0} and {last}"]
+    if choice.categories:
+        conditions.append(f"category in ({', '.join(map(_quoted, choice.categories))})")
+    if choice.where is not None:
+        conditions.append(f"({choice.where}\n)")
+    try:
+        ids = query(store, f"select scene_id from scenes where {' and '.join(conditions)}").column(0)
+    except InputError as error:
+        raise InputError(f"--where {choice.where!r} cannot be asked: {error}; {_EXAMPLE}") from error
+    return frozenset(ids.to_pylist())
 
-    def __init__(self, choice: Choice) -> None:
-        """Raises InputError where the condition is no SQL that these tables can answer."""
-        self._choice = choice
-        self._db = duckdb.connect(":memory:", config={**LOCKED, "threads": "1"})
-        if choice.where is not None:
-            self._ask({table: SCHEMAS[table].empty_table() for table in _TABLES})
 
-    def choose(self, stored: StoredRange) -> Sequence[int]:
-        """The ids of the chosen scenes of a range, in order."""
-        choice, rows = self._choice, stored.rows
-        low, high = choice.first_scene or 0, choice.last_scene
-        ids = [
-            int(row["scene_id"])
-            for row in rows["scenes"]
-            if (not choice.categories or row["category"] in choice.categories)
-            and low <= row["scene_id"]
-            and (high is None or row["scene_id"] <= high)
-        ]
-        if choice.where is None or not ids:
-            return ids
-        fit = self._ask({table: table_of_rows(table, rows[table]).select(SCHEMAS[table].names) for table in _TABLES})
-        return [scene_id for scene_id in ids if scene_id in fit]
-
-    def _ask(self, tables: dict) -> set[int]:
-        """The ids of the scenes in `tables` that the condition holds for."""
-        for name, table in tables.items():
-            self._db.register(name, table)
-        try:
-            rows = self._db.execute(f"SELECT scene_id FROM scenes WHERE ({self._choice.where}\n)").fetchall()
-        except duckdb.Error as error:
-            line = str(error).splitlines()[0]
-            raise InputError(f"--where {self._choice.where!r} cannot be asked: {line}; {_EXAMPLE}") from error
-        return {scene_id for (scene_id,) in rows}
+def _quoted(text: str) -> str:
+    escaped = text.replace("'", "''")
+    return f"'{escaped}'"
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,19 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from schemas.errors import AssetSourceError, InputError, MachineError, MeshError, OutputError, command_line, plain_line
+from schemas.errors import (
+    AssetSourceError,
+    InputError,
+    MachineError,
+    MeshError,
+    OutputError,
+    command_line,
+    plain_line,
+    plural,
+)
 from schemas.job.assets import TABLE, Assets, LibrarySource, MeshLimits, is_usable
 from schemas.job.physics import Physics
-from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_table, plural
+from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_table
 from services.job.bounded_yaml import parse_yaml
 from services.job.job_file import MOST_KEYS, validate_job
 from services.run.parts import Cut, cut_shapes

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.base import frozen_array
+from schemas.errors import plural
 from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
@@ -75,13 +76,6 @@ def fold(text: str, most: float | None, measure: Callable[[str], float] = len) -
         lines.append(text[:cut].rstrip())
         text = text[cut:].lstrip(" ")
     return [*lines, text] if text or not lines else lines
-
-
-def plural(count: int, word: str) -> str:
-    """`1 mesh`, `2 meshes`, `2 categories`."""
-    if count != 1:
-        word = f"{word[:-1]}ies" if word.endswith("y") else f"{word}es" if word.endswith("sh") else f"{word}s"
-    return f"{count} {word}"
 
 
 def describe_row(row: Row) -> tuple[str, str, str, str]:

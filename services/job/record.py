@@ -32,9 +32,6 @@ HEADER = """\
 SEAL = "seal: "
 """Begins the last line of job.yaml."""
 
-MAX_BYTES = 1 << 20
-"""Larger than any job: what is larger was not written by a run."""
-
 REMEDY = "restore it from a copy"
 
 
@@ -105,8 +102,6 @@ def read_job(store: Store) -> JobRecord | None:
 
 def decode_job(data: bytes, name: str) -> JobRecord:
     """The job in the bytes of a job.yaml, whatever its seal says. Raises CorruptError naming the file, with one line."""
-    if len(data) > MAX_BYTES:
-        raise CorruptError(f"{name} has {len(data)} bytes, and a job has less than {MAX_BYTES}: {REMEDY}")
     try:
         tree = parse_yaml(data.decode())
         job, inputs = validate_job(tree["job"], name), tuple(tree.get("inputs", ()))

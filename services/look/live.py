@@ -238,9 +238,6 @@ class Follower:
 
     def _read_sections(self) -> tuple[Section, ...] | None:
         """The sections of a report; None where a file is being moved or merged just now."""
-        try:
-            with explain_damage(self._store):
-                page = page_of(read_report(self._store, self._scenes), self.shelf.put)
-        except VersoError:
-            return None
-        return tuple(page.sections)
+        with suppress(VersoError), explain_damage(self._store):
+            return tuple(page_of(read_report(self._store, self._scenes), self.shelf.put).sections)
+        return None

@@ -180,11 +180,13 @@ def read_report(store: Store, scenes: int) -> Report:
 def page_of(report: Report, address: Address) -> Page:
     """The page of a report, with its pictures at these addresses."""
     figures, scenes, job = report.figures, report.scenes, report.record.job
-    failed = sum(failure.scenes for failure in figures.failures)
+    failed, shown, there = sum(failure.scenes for failure in figures.failures), len(scenes), figures.scenes
+    more = f" More: {command_line('report', report.place, '--scenes', there)}" if shown < there else ""
+    chosen = f'<p class="note">{shown} of {plural(there, "scene")}, chosen evenly from each category.{escape(more)}</p>'
     sections = (
         Section("overview", "Overview", overview_html(figures, job, failed, report.table.splits)),
         Section("scenes", "All scenes", scene_table_html(report.table, report.place)),
-        Section("pictures", "Pictures", sheets_html(scenes, address) + _of_all(report)),
+        Section("pictures", "Pictures", sheets_html(scenes, address) + chosen),
         Section("compare", "Compare", compare_html(scenes)),
         Section("space", "In space", space_html(report.spaces, pack_spaces(report.spaces))),
         Section("figures", "Figures", charts_html(figures, report.depth)),
@@ -195,13 +197,6 @@ def page_of(report: Report, address: Address) -> Page:
     state = f"finished, digest {report.digest[:12]}" if report.digest else "not finished"
     footer = f"Job {report.record.digest[:12]}. Made by verso report; this page fetches nothing."
     return Page(job.name, f"{job.scenes:,} {what} asked, seed {job.seed}, {state}", sections, footer)
-
-
-def _of_all(report: Report) -> str:
-    """Of how many scenes there are pictures, and how to see more."""
-    shown, there = len(report.scenes), report.figures.scenes
-    more = f" More: {command_line('report', report.place, '--scenes', there)}" if shown < there else ""
-    return f'<p class="note">{shown} of {plural(there, "scene")}, chosen evenly from each category.{escape(more)}</p>'
 
 
 def write_report(store: Store, scenes: int, target: Path) -> tuple[int, Report]:

@@ -50,7 +50,7 @@ def overview_html(
         ("scenes", f"{figures.scenes:,}", f"of {job.scenes:,} asked"),
         ("failed", f"{failed:,}", f"{number(round(100 * failed / max(failed + figures.scenes, 1), 2))} % of those tried"),
         ("pairs of views", f"{figures.pairs:,}", plural(figures.views, 'view')),
-        ("objects", f"{figures.instances:,}", f"different ones in {plural(len(figures.by_category), 'category', 'categories')}"),
+        ("objects", f"{figures.instances:,}", f"different ones in {plural(len(figures.by_category), 'category')}"),
         ("images", f"{figures.files:,}", size(figures.bytes / 1e3)),
         ("time", describe_seconds(figures.seconds), f"{milliseconds(1e3 * figures.seconds / max(figures.scenes, 1))} a scene"),
     ]  # fmt: skip

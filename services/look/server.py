@@ -52,30 +52,29 @@ class Gate:
     """Name of the cookie that holds the token."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What to do with a request: `status` 200 to answer it, 303 to go on without the token in the address."""
+def judge(gate: Gate, method: str, target: str, headers: Mapping[str, str]) -> tuple[int, str]:
+    """(status, path that is asked for) of a request; header names in lower case.
 
-    status: int
-    path: str = "/"
-
-
-def judge(gate: Gate, method: str, target: str, headers: Mapping[str, str]) -> Verdict:
-    """200, 303, 401 without the token, 403 for a foreign host name, 405 for what is not reading; header names in lower case."""
+    200 to answer it, 303 to go on without the token in the address, 401 without the token, 403 for a foreign host name, 405
+    for what is not reading.
+    """
     if method not in ("GET", "HEAD"):
-        return Verdict(405)
+        return 405, "/"
     if not is_host_known(headers.get("host", ""), gate.names):
-        return Verdict(403)
+        return 403, "/"
     parts = urlsplit(target)
     given = parse_qs(parts.query).get("token")
     if gate.token is None:
-        return Verdict(200, parts.path)
+        return 200, parts.path
     if given is not None:
-        return Verdict(303 if is_same(given[0], gate.token) else 401, parts.path)
+        return 303 if is_same(given[0], gate.token) else 401, parts.path
     scheme, _, bearer = headers.get("authorization", "").partition(" ")
     offered = [bearer.strip()] if scheme.lower() == "bearer" else []
-    offered += _cookies(headers.get("cookie", ""), gate.cookie)
-    return Verdict(200 if any(is_same(one, gate.token) for one in offered) else 401, parts.path)
+    cookies: SimpleCookie = SimpleCookie()
+    with contextlib.suppress(CookieError):
+        cookies.load(headers.get("cookie", ""))
+    offered += [cookies[gate.cookie].value] if gate.cookie in cookies else []
+    return 200 if any(is_same(token, gate.token) for token in offered) else 401, parts.path
 
 
 def is_same(offered: str, token: str) -> bool:
@@ -85,9 +84,13 @@ def is_same(offered: str, token: str) -> bool:
 
 
 def is_host_known(host: str, names: Iterable[str]) -> bool:
-    """Whether a Host header is an address or one of the names, at any port."""
-    name = _name_of(host)
-    return bool(name) and (is_address(name) or name in names)
+    """Whether a Host header is an address or one of the names, in small or capital letters and at any port."""
+    try:
+        parts = urlsplit(f"//{host}")
+        name, _ = (parts.hostname or "").rstrip("."), parts.port
+    except ValueError:  # brackets or a port that are none
+        return False
+    return parts.netloc == host and "@" not in host and (is_address(name) or name in names)
 
 
 def is_loopback(host: str) -> bool:
@@ -100,23 +103,6 @@ def is_address(name: str) -> bool:
     with contextlib.suppress(ValueError):
         return bool(ipaddress.ip_address(name))
     return False
-
-
-def _name_of(host: str) -> str:
-    """The name or address in a Host header, in lower case; empty where it is none."""
-    try:
-        parts = urlsplit(f"//{host}")
-        name, _ = parts.hostname or "", parts.port
-    except ValueError:  # brackets or a port that are none
-        return ""
-    return name.rstrip(".") if parts.netloc == host and "@" not in host else ""
-
-
-def _cookies(header: str, name: str) -> list[str]:
-    cookie: SimpleCookie = SimpleCookie()
-    with contextlib.suppress(CookieError):
-        cookie.load(header)
-    return [cookie[name].value] if name in cookie else []
 
 
 MOST_REQUESTS = 64
@@ -284,19 +270,19 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self) -> None:
         try:
             headers = {name.lower(): value for name, value in self.headers.items()}
-            verdict = judge(self.server.gate, self.command, self.path, headers)
+            status, path = judge(self.server.gate, self.command, self.path, headers)
         except ValueError:  # an address that is none
             return self._send(404, "text/plain", REMEDIES[404].encode())
-        if verdict.status == 303:
+        if status == 303:
             cookie = f"{self.server.gate.cookie}={self.server.gate.token}; Path=/; HttpOnly; SameSite=Lax"
             return self._send(303, "text/plain", b"", {"Location": "/", "Set-Cookie": cookie})
-        page = self._find(verdict.path) if verdict.status == 200 else None
+        page = self._find(path) if status == 200 else None
         if page is None:
-            status = 404 if verdict.status == 200 else verdict.status
+            status = 404 if status == 200 else status
             more = {"Allow": "GET, HEAD"} if status == 405 else {}
             return self._send(status, "text/plain", f"{status}: {REMEDIES[status]}\n".encode(), more)
         kind, data = page
-        kept = "private, max-age=86400, immutable" if verdict.path.startswith("/picture/") else "no-store"
+        kept = "private, max-age=86400, immutable" if path.startswith("/picture/") else "no-store"
         return self._send(200, kind, data, {"Cache-Control": kept})
 
     def _find(self, path: str) -> tuple[str, bytes] | None:

@@ -38,10 +38,9 @@ from services.job.record import read_success
 from services.merge.reading import RangeRows, SharedRows, check_published, merge_folder, read_ranges, stored_sizes
 from services.merge.tables import MergedTable, MergeResult, PoseFiles
 from workers.store.attempt import sweep
-from workers.store.canonical import dataset_digest
 from workers.store.commit import commits_digest
 from workers.store.file_system import sha256_of
-from workers.store.manifest import PARQUET_OPTIONS, join_rows
+from workers.store.manifest import PARQUET_OPTIONS, dataset_digest, join_rows
 from workers.store.store import Entry, Store, map_ahead, stat_all
 
 RANGES_PER_BLOCK = 128

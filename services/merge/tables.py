@@ -34,9 +34,8 @@ from schemas.job.captures import Captures
 from schemas.job.job import Job
 from schemas.scene.view import ROLES
 from services.job.record import JobRecord
-from workers.store.canonical import TableDigest
 from workers.store.commit import is_sealed, seal
-from workers.store.manifest import PARQUET_OPTIONS, row_keys
+from workers.store.manifest import PARQUET_OPTIONS, TableDigest, row_keys
 from workers.store.store import Store
 
 if TYPE_CHECKING:

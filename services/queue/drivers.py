@@ -300,11 +300,11 @@ def own_ray(queue: str, say: Callable[[str], None]) -> Iterator[OwnDrivers]:
             yield drivers
 
 
-def _refuse_second(own: Path) -> None:
+def _refuse_second(mine: Path) -> None:
     """Raises RunError where the queue of another process has a Ray of its own here: both would use every core."""
     for folder in living_folders():
         with contextlib.suppress(OSError, ValueError):
-            if folder != own:
+            if folder != mine:
                 other = json.loads((folder / FOLDER / NOTE).read_bytes())
                 raise RunError(
                     f"process {other['pid']} works here with a Ray of its own, for the queue {other['queue']}: submit jobs there "

@@ -170,14 +170,17 @@ class Queue:
 
     def read(self, job: str) -> JobView:
         """A job as it is now. Raises InputError where there is none, CorruptError where it cannot be read."""
+        key = request_path(job)
         try:
-            request = self._request(job)
+            if job not in self._requests:
+                self._requests[job] = _decode(JobRequest, _read_entry(self.store, key), f"{self.name}/{key}")
         except FileNotFoundError:
             raise InputError(
                 f"{self.name} has no job {plain_line(job)}: `verso jobs` lists those that there are"
             ) from None
+        request = self._requests[job]
         if request.id != job:
-            raise CorruptError(f"{self.name}/{request_path(job)} is the request of another job, {request.id}")
+            raise CorruptError(f"{self.name}/{key} is the request of another job, {request.id}")
         log = self._logs.setdefault(job, _JobEvents(self.store, events_folder(job)))
         return fold(request, self._decoded(job, log.read()))
 
@@ -234,12 +237,6 @@ class Queue:
     def put_share(self, running: int) -> None:
         """Tells the drivers how many jobs share the cluster."""
         self.store.put(SHARE_FILE, json.dumps({"running": running}).encode(), durable=False)
-
-    def _request(self, job: str) -> JobRequest:
-        if job not in self._requests:
-            key = request_path(job)
-            self._requests[job] = _decode(JobRequest, _read_entry(self.store, key), f"{self.name}/{key}")
-        return self._requests[job]
 
     def _decoded(self, job: str, events: Sequence[bytes]) -> list[JobEvent]:
         """A job's events. Raises CorruptError naming one that this program did not write."""

@@ -15,8 +15,7 @@ from scipy.stats import t as student_t
 
 from schemas.base import Pose
 from schemas.dataset.codec import Row
-from schemas.dataset.layout import FINGERPRINT_FILE, is_shape, stored_images, stored_roles
-from schemas.dataset.shard import Fingerprint
+from schemas.dataset.layout import is_shape, stored_images, stored_roles
 from schemas.errors import CorruptError, InputError, SceneError, command_line, plural
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Placed, PosedScene, SceneOutput
@@ -26,7 +25,7 @@ from services.job.record import read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
 from services.read.independent.derive import Kind, StoredPair, check_forces
 from services.read.independent.poses import check_merged, check_pair, list_underived
-from services.read.replay import compare_files, compare_rows, open_context
+from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import edge_distance_px
@@ -37,7 +36,6 @@ from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.rows import record_scene
-from workers.shard.fingerprint import take_fingerprint
 from workers.store.commit import committed_files
 from workers.store.store import Store
 
@@ -292,9 +290,8 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
             f"`{command_line('replay', store.name)} CAPTURE` makes one again and compares every byte"
         )
     context = open_context(record)
-    theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     tallies = {effect.name: Tally(effect.kind) for effect in EFFECTS if effect.kind != "asked"}
-    audited = Audit(take_fingerprint(context.renderer, context.job.render.tier) == theirs, effects=tallies)
+    audited = Audit(is_same_stack(store, context), effects=tallies)
     for scene_id in choose_scenes(store, count, record.job.seed):
         _audit_scene(context, store, scene_id, audited)
         progress(audited)

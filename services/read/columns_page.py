@@ -29,16 +29,8 @@ Frames:
 def list_columns(table: str | None) -> list[dict[str, Any]]:
     """Every column of one table, or of all, for programs. Raises InputError for a table that is not."""
     return [
-        {
-            "table": name,
-            "path": column.path,
-            "type": column.type,
-            "nullable": column.nullable,
-            "captures_only": column.path.partition(".")[0] == "capture",
-            "meaning": column.meaning,
-            "unit": column.unit,
-            "frame": column.frame,
-        }
+        {"table": name, "captures_only": column.path.partition(".")[0] == "capture"}
+        | {key: getattr(column, key) for key in ("path", "type", "nullable", "meaning", "unit", "frame")}
         for name in _chosen(table)
         for column in COLUMNS[name]
     ]

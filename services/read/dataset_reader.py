@@ -88,18 +88,12 @@ def choose_scenes(store: Store, count: int, seed: int) -> list[int]:
     before = np.append(0, np.cumsum(ranges[:, 1] - ranges[:, 0]))
     at = np.searchsorted(ranges[:, 0], failed, side="right") - 1
     made_before = before[at] + failed - ranges[at, 0] - np.arange(len(failed))  # [F] of each scene that failed
-    chosen = choose_evenly(int(before[-1]) - len(failed), count, seed)
-    place = chosen + np.searchsorted(made_before, chosen, side="right")
+    total = int(before[-1]) - len(failed)
+    first = float(np.random.default_rng(seed).random())
+    steps = ((np.arange(count) + first) * total / count).astype(np.int64) if count < total else np.arange(total)
+    place = steps + np.searchsorted(made_before, steps, side="right")
     at = np.searchsorted(before, place, side="right") - 1
     return [int(scene) for scene in ranges[at, 0] + place - before[at]]
-
-
-def choose_evenly(total: int, count: int, seed: int) -> NDArray[np.int64]:
-    """`count` of the numbers below `total`, or all of them, in even steps; the seed sets the first."""
-    if count >= total:
-        return np.arange(total)
-    first = float(np.random.default_rng(seed).random())
-    return np.array([int((i + first) * total / count) for i in range(count)], np.int64)
 
 
 def find_scene(store: Store, scene_id: int) -> StoredRange:
@@ -192,19 +186,12 @@ def decode_samples(data: bytes, name: str) -> dict[str, NDArray]:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             if (unpacked := sum(member.file_size for member in file.infolist())) > len(data):
                 raise ValueError(f"its {len(data):,} bytes would unpack to {unpacked:,}")
-            arrays = {item.filename.removesuffix(".npy"): _decode_array(file.read(item)) for item in file.infolist()}
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = dict(file)
         _check_samples(arrays)
     except Exception as error:  # zipfile and numpy raise errors of many kinds for a damaged file
         raise CorruptError(f"{name} cannot be read: {error}; `verso verify OUT` says what to do") from error
     return arrays
-
-
-def _decode_array(data: bytes) -> NDArray:
-    """The array of a .npy file of plain numbers. Its header is not believed: so many bytes have to follow."""
-    stream = io.BytesIO(data)
-    np.lib.format.read_magic(stream)
-    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape).copy()
 
 
 def _check_samples(arrays: Mapping[str, NDArray]) -> None:

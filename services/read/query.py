@@ -4,9 +4,9 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import IO, Literal
+from typing import IO, BinaryIO, Literal, TextIO, cast
 
 import duckdb
 import pyarrow as pa
@@ -122,8 +122,6 @@ _ALL_COLUMNS = 100_000
 _ROW_GROUP_BYTES = 4 << 20
 """Bytes in memory of a row group of the Parquet format."""
 
-Record = tuple[object, ...]
-
 
 def write_rows(rows: pa.RecordBatchReader, style: Format, sink: IO[bytes], wide: int | None = None) -> None:
     """Writes the rows in one of four formats, a batch in memory at a time.
@@ -139,8 +137,11 @@ def write_rows(rows: pa.RecordBatchReader, style: Format, sink: IO[bytes], wide:
             for group in _row_groups(rows):
                 writer.write_table(group)
         return
-    for text in (_json if style == "json" else _csv)(rows.schema, _records(rows)):
-        sink.write(text.encode())
+    text = io.TextIOWrapper(cast(BinaryIO, sink), "utf-8", newline="")
+    try:
+        (_write_json if style == "json" else _write_csv)(rows, text)
+    finally:
+        text.detach()  # else it would close the sink
 
 
 def _row_groups(rows: pa.RecordBatchReader) -> Iterator[pa.Table]:
@@ -148,14 +149,14 @@ def _row_groups(rows: pa.RecordBatchReader) -> Iterator[pa.Table]:
     kept: list[pa.RecordBatch] = []
     for batch in rows:
         kept.append(batch)
-        if sum(one.nbytes for one in kept) >= _ROW_GROUP_BYTES:
+        if sum(rows.nbytes for rows in kept) >= _ROW_GROUP_BYTES:
             yield pa.Table.from_batches(kept)
             kept = []
     if kept:
         yield pa.Table.from_batches(kept)
 
 
-def _records(rows: pa.RecordBatchReader) -> Iterator[Record]:
+def _records(rows: pa.RecordBatchReader) -> Iterator[tuple[object, ...]]:
     for batch in rows:
         yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
 
@@ -166,31 +167,25 @@ def _cell(value: object) -> str:
     return json.dumps(value, default=str) if isinstance(value, list | dict | bool) else str(value)
 
 
-def _json(schema: pa.Schema, records: Iterable[Record]) -> Iterator[str]:
+def _write_json(rows: pa.RecordBatchReader, text: TextIO) -> None:
     before = "["
-    for record in records:
-        yield before + json.dumps(dict(zip(schema.names, record, strict=True)), default=str)
+    for record in _records(rows):
+        text.write(before + json.dumps(dict(zip(rows.schema.names, record, strict=True)), default=str))
         before = ", "
-    yield "]\n" if before != "[" else "[]\n"
+    text.write("]\n" if before != "[" else "[]\n")
 
 
-def _csv(schema: pa.Schema, records: Iterable[Record]) -> Iterator[str]:
-    text = io.StringIO()
+def _write_csv(rows: pa.RecordBatchReader, text: TextIO) -> None:
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(schema.names)
-    for record in records:
-        writer.writerow(map(_cell, record))
-        yield text.getvalue()
-        text.seek(0)
-        text.truncate()
-    yield text.getvalue()
+    writer.writerow(rows.schema.names)
+    writer.writerows(map(_cell, record) for record in _records(rows))
 
 
 def _box(rows: pa.RecordBatchReader, wide: int | None) -> str:
     kept: list[pa.RecordBatch] = []
     for batch in rows:
         kept.append(batch)
-        if sum(one.num_rows for one in kept) > _SHOWN_OF:
+        if sum(rows.num_rows for rows in kept) > _SHOWN_OF:
             break
     shown = io.StringIO()
     with duckdb.connect(":memory:") as connection, redirect_stdout(shown):

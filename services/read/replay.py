@@ -60,8 +60,7 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
             f"{store.name}/{JOB_FILE} is not the job that scene {scene_id} was made from: restore it from a copy"
         )
     context = open_context(record)
-    theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    same_stack = take_fingerprint(context.renderer, context.job.drawn.tier) == theirs
+    same_stack = is_same_stack(store, context)
     output = run_scene(context, scene_id, Stopwatch())
     differences = compare_files(store, stored, output, same_stack)
     if same_stack:
@@ -76,6 +75,12 @@ def open_context(record: JobRecord) -> WorkerContext:
         changed = record.describe_change(tuple(listing.sha256 for listing in catalogue.captures))
         raise MachineError(f"{changed} (from {record.folder}) do not hold what they held when this job was run")
     return open_worker(record.job, catalogue)
+
+
+def is_same_stack(store: Store, context: WorkerContext) -> bool:
+    """Whether the stack of a dataset's first worker is this one."""
+    theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
+    return take_fingerprint(context.renderer, context.job.drawn.tier) == theirs
 
 
 def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:

@@ -164,7 +164,11 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
         reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
-        spans, terms = _spans(job, success, verdict), Terms()
+        # The scenes that must be there: by job.yaml, or by `_SUCCESS` where job.yaml is damaged.
+        asked = (job.record.job.first_scene, job.record.job.stop_scene) if job.record else None
+        range_size = job.record.job.range_size if job.record else 16
+        altered = success.asked if success.asked and not job.whole else asked
+        spans, terms = Spans(altered, range_size, success.data is not None, verdict), Terms()
         (folder / "merged").mkdir()
         with contextlib.closing(Merging(folder / "merged")) as merging:
             _read_ranges(reading, spans, terms, merging, progress)
@@ -178,15 +182,6 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
         pairs = job.record.job.pairs_per_scene if job.record else 1
         tell_strays(store, Known(index, success.data is None, tuple(lost), 2 * pairs), verdict)
     return verdict
-
-
-def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
-    """The scenes that must be there: by job.yaml, or by `_SUCCESS` where job.yaml is damaged."""
-    asked = (job.record.job.first_scene, job.record.job.stop_scene) if job.record else None
-    if success.asked and not job.whole:
-        asked = success.asked
-    range_size = job.record.job.range_size if job.record else 16
-    return Spans(asked, range_size, success.data is not None, verdict)
 
 
 def _read_ranges(

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from schemas.base import Array, Pose
+from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
@@ -175,18 +175,10 @@ class Truth:
     def shape(self, region: int, frame: PredictedFrame) -> Mesh:
         """The object's surface, one vertex at a place, in a frame, metres."""
         mesh = self.pair.mesh(region, welded=True)
-        vertices = transform(self.T_frame_world(region, frame), np.asarray(mesh.vertices))
+        poses = {"object": self.pair.T_world[region], "camera": self.view.T_world_cam, "world": np.eye(4)}
+        T_world_frame = poses.get(frame, self.pair.input.T_world_cam)
+        vertices = transform(invert(T_world_frame), np.asarray(mesh.vertices))
         return Mesh(vertices, np.asarray(mesh.faces, np.int32))
-
-    def T_frame_world(self, region: int, frame: PredictedFrame) -> Pose:
-        """[4, 4]."""
-        if frame == "world":
-            return np.eye(4)
-        return invert(
-            {"object": self.pair.T_world[region], "input": self.pair.input.T_world_cam}.get(
-                frame, self.view.T_world_cam
-            )
-        )
 
     def prepare(self, kind: str, region: int, asked: Asked) -> Any:
         """What an item is held against. Raises InputError where the dataset does not store it."""

@@ -67,7 +67,9 @@ def test_a_failed_write_that_another_program_was_told_of_stops_the_commit(tmp_pa
     with pytest.raises(OSError, match="Input"):
         errors.syncfs(other)
     os.close(other)
-    file_system.sync_tree(tmp_path / "out")  # a descriptor that is opened now hears nothing
+    file_system.sync_folders(
+        tmp_path / "out", [f"{n}" for n in range(9)]
+    )  # a descriptor that is opened now hears nothing
     attempt.add_scene(small_scene(1))
     with pytest.raises(MachineError, match="the disk reports an input/output error; check it before going on"):
         attempt.commit()

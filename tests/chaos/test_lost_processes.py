@@ -32,11 +32,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def disturbed(tmp_path: Path, disturb, **settings) -> EndedRun:
-    (tmp_path / "small.yaml").write_text(json.dumps(JOB))
-    return disturb_at_first_commit(tmp_path / "small.yaml", tmp_path / "out", disturb, **settings)
-
-
 def line_of(run: EndedRun) -> str:
     """What it told beside its progress, all of it in one line of ours."""
     assert run.code == 1, run.told
@@ -70,6 +65,7 @@ WAYS = {
 )
 def test_a_lost_process_or_a_signal_is_one_line_and_leaves_nothing(tmp_path, folder, way):
     disturb, words = WAYS[way]
-    line = line_of(disturbed(tmp_path, disturb))
+    (tmp_path / "small.yaml").write_text(json.dumps(JOB))
+    line = line_of(disturb_at_first_commit(tmp_path / "small.yaml", tmp_path / "out", disturb))
     assert line.startswith("verso: ") and words in line and KEPT in line
     assert list(folder.iterdir()) == []

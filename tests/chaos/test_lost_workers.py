@@ -4,33 +4,24 @@ import random
 import subprocess
 import sys
 import time
-from typing import cast
 
 import pytest
 from obstore.store import MemoryStore
 
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import FENCED, STAGING, staging_path
-from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError
-from services.job.job_file import validate_job
 from services.merge.merge import merge
-from services.run import coordinator as module
-from services.run.coordinator import Coordinator, Limits
-from services.run.progress import Tally
 from services.run.range_planner import plan_ranges
-from services.run.ray_cluster import Slots
-from services.run.worker_entry import Pattern, WorkerTerms
 from tests.kit.faults import REQUESTS, requests
+from tests.kit.made_up_runs import LABEL, coordinator_of
 from tests.made_up_scenes import attempt_at, small_scene, terms
-from workers.assets.catalogue import Catalogue
 from workers.store.attempt import Attempt, attempts_at, begin_attempt, sweep
 from workers.store.commit import read_record
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
-LABEL = "ours"
 TAR = terms(layout="tar", range_size=2)
 
 WORKER = """
@@ -57,21 +48,6 @@ for start in range(0, 2 * int(sys.argv[2]), 2):
 """
 
 
-@pytest.fixture
-def coordinator_of(monkeypatch):
-    """A coordinator of a store, without Ray, that knows attempts with `LABEL` as its own."""
-    monkeypatch.setattr(module.ray, "put", lambda value: value)
-
-    def make(store) -> Coordinator:
-        order = ShardOrder.of(store.name, validate_job({"name": "chaos", "scenes": 2}, "test"), "j" * 64)
-        pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
-        coordinator = Coordinator(store, pattern, Limits(Slots(1, 1), 3, 0), Tally(asked=2))
-        coordinator._order = order.model_copy(update={"label": LABEL})
-        return coordinator
-
-    return make
-
-
 def files_are_whole(store, record) -> bool:
     """Whether every file that the record names is published, or staged where publishing finds it."""
     folders = ("", *(f"{staging_path(record.span.start, record.attempt)}{end}/" for end in ("", FENCED)))
@@ -80,11 +56,11 @@ def files_are_whole(store, record) -> bool:
 
 @pytest.mark.parametrize("trials", [20, pytest.param(300, marks=pytest.mark.slow)])
 def test_a_worker_that_lives_and_commits_while_it_is_given_up_keeps_its_files(
-    trials, tmp_path, coordinator_of, record_figure, unflushed
+    trials, tmp_path, monkeypatch, record_figure, unflushed
 ):
     store = LocalStore(tmp_path)
     store.prepare()
-    coordinator = coordinator_of(store)
+    coordinator = coordinator_of(store, monkeypatch)
     chance = random.Random(1)
     command = [sys.executable, "-c", WORKER, str(tmp_path), str(trials), LABEL]
     committed = lost = 0
@@ -118,7 +94,7 @@ def test_a_worker_that_lives_and_commits_while_it_is_given_up_keeps_its_files(
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["some", "every"])
 @pytest.mark.parametrize("gives_up", ["the coordinator", "the next run's sweep"])
 def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run_can_finish(
-    gives_up, every, coordinator_of
+    gives_up, every, monkeypatch
 ):
     store = fresh_bucket()
     attempt = whole_attempt(store)
@@ -133,7 +109,7 @@ def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run
 
         def give_up(store=store):
             if gives_up == "the coordinator":
-                coordinator_of(store)._find_evidence([Span(start=0, stop=2)])
+                coordinator_of(store, monkeypatch)._find_evidence([Span(start=0, stop=2)])
             else:
                 sweep(store, fenced=None)
 
@@ -151,12 +127,12 @@ def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run
 
 
 @pytest.mark.parametrize("kind", ["disk", "bucket"])
-def test_the_scene_in_progress_is_evidence_while_the_range_before_it_is_committed(kind, coordinator_of, tmp_path):
+def test_the_scene_in_progress_is_evidence_while_the_range_before_it_is_committed(kind, monkeypatch, tmp_path):
     store = LocalStore(tmp_path) if kind == "disk" else fresh_bucket()
     store.prepare()
     whole_attempt(store).end_scenes()
     begin_attempt(store, Span(start=2, stop=4), TAR, LABEL).begin_scene(3)
-    coordinator, left = coordinator_of(store), [Span(start=start, stop=start + 2) for start in (0, 2, 4)]
+    coordinator, left = coordinator_of(store, monkeypatch), [Span(start=start, stop=start + 2) for start in (0, 2, 4)]
     assert coordinator._find_evidence(left) == (left[1], 3, False)
     assert not [name for start in (0, 2) for name in attempts_at(store, start)], "both attempts are given up"
     assert coordinator._find_evidence(left) == (left[0], None, False)

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-import uuid
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.killed_runs import ROOT, processes_with
+from tests.kit.killed_runs import marked, processes_with
 
 pytestmark = pytest.mark.ray
 
@@ -57,23 +56,10 @@ class Run:
 @contextlib.contextmanager
 def running(job: Path, out: Path) -> Iterator[Run]:
     """A run on two workers; what is left of it in the end is killed."""
-    mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
     command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--workers", "2"]
-    with open(out.with_suffix(".txt"), "ab") as said:
-        process = subprocess.Popen(
-            command,
-            cwd=ROOT,
-            env={**os.environ, **dict([mark.split("=")])},
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-            start_new_session=True,
-        )
-    try:
-        yield Run(process, mark)
-    finally:
-        process.kill()
-        process.wait()
-        send_to([left.pid for left in processes_with(mark)], signal.SIGKILL)
+    settings = {"stdout": subprocess.DEVNULL, "start_new_session": True}
+    with open(out.with_suffix(".txt"), "ab") as said, marked(command, stderr=said, **settings) as run:
+        yield Run(*run)
 
 
 def decided(out: Path) -> dict[str, tuple[int, int]]:

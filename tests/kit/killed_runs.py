@@ -71,46 +71,63 @@ class EndedRun:
     left: list[str]
 
 
-def disturb_at_first_commit(
-    job: Path, out: Path, disturb: Callable[[int, int], object], timeout_s: float = 90, patience_s: float = 0.0
-) -> EndedRun:
-    """A run on one worker in a terminal of its own; once something is committed, `disturb(pid, terminal)` is called.
-
-    What it left is looked for when it has ended, and again until nothing is left or the patience ends.
-    """
+@contextlib.contextmanager
+def marked(command: list[str], **settings: Any) -> Iterator[tuple[subprocess.Popen, str]]:
+    """A process, and the mark in its environment by which what it started is known; what is left in the end is killed."""
     mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
+    process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, **dict([mark.split("=")])}, **settings)
+    try:
+        yield process, mark
+    finally:
+        process.kill()
+        process.wait()
+        for left in processes_with(mark):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(left.pid, signal.SIGKILL)
+
+
+def disturb_at_first_commit(job: Path, out: Path, disturb: Callable[[int, int], object]) -> EndedRun:
+    """A run on one worker in a terminal of its own; once something is committed, `disturb(pid, terminal)` is called."""
     command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--shard-size", "4"]
     terminal, users_end = pty.openpty()
-    run = subprocess.Popen(
-        [sys.executable, "-c", IN_TERMINAL, *command, "--workers", "1"],
-        cwd=ROOT,
-        env={**os.environ, **dict([mark.split("=")])},
-        stdin=users_end,
-        stdout=users_end,
-        stderr=users_end,
-    )
-    os.close(users_end)
     said: list[bytes] = []
     reader = threading.Thread(target=_read_terminal, args=(terminal, said))
-    reader.start()
-    try:
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), users_end)
+    with marked([sys.executable, "-c", IN_TERMINAL, *command, "--workers", "1"], **streams) as (run, mark):
+        os.close(users_end)
+        reader.start()
         deadline = time.monotonic() + 120
         while not list(out.glob("manifest/_commits/*.json")) and run.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
         disturb(run.pid, terminal)
-        run.wait(timeout_s)
-    finally:
-        run.kill()
-        run.wait()
-        patient = time.monotonic() + patience_s
-        while (left := processes_with(mark)) and time.monotonic() < patient:
-            time.sleep(0.05)
-        for process in left:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
-        reader.join(10)
-        os.close(terminal)
-    return EndedRun(run.returncode, b"".join(said).decode(errors="replace"), [process.name for process in left])
+        run.wait(90)
+        left = [process.name for process in processes_with(mark)]
+    reader.join(10)
+    os.close(terminal)
+    return EndedRun(run.returncode, b"".join(said).decode(errors="replace"), left)
+
+
+HOLD = """
+import sys, time
+from services.run.lock import hold_lock
+from workers.store.local import LocalStore
+with hold_lock(LocalStore(sys.argv[1])):
+    print(flush=True)
+    time.sleep(600)
+"""
+
+
+@contextlib.contextmanager
+def holding(folder: Path) -> Iterator[subprocess.Popen]:
+    """A process that holds the lock of an output folder; killed in the end."""
+    command = [sys.executable, "-c", HOLD, str(folder)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 PATIENCE_S = 180.0

@@ -4,20 +4,32 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
+
+import pytest
 
 from schemas.dataset.commit import CommitTerms
 from schemas.dataset.layout import STAGING
+from schemas.dataset.shard import ShardOrder
 from schemas.scene.scene import SceneOutput
+from services.job.job_file import validate_job
 from services.merge.merge import merge
 from services.merge.tables import MergeResult
+from services.run import coordinator
+from services.run.coordinator import Coordinator, Limits
 from services.run.lock import Lock
+from services.run.progress import Tally
 from services.run.range_planner import plan_ranges, plan_retries
+from services.run.ray_cluster import Slots
+from services.run.worker_entry import Pattern, WorkerTerms
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene, terms
+from workers.assets.catalogue import Catalogue
 from workers.store.attempt import sweep
 from workers.store.ledger import list_commits
 from workers.store.store import Store
 
 FIRST, STOP, RANGE = 4, 7, 2
+LABEL = "ours"
 
 
 def settings_of(layout: str) -> CommitTerms:
@@ -55,6 +67,18 @@ def half_merged(store: Store, layout: str = "files") -> None:
     merge(store, 0, 2)
     attempt_at(store, 0, 2, settings, small_scene, retry=1, scenes=(1,)).commit()
     attempt_at(store, 2, 4, settings, small_scene).commit()
+
+
+def coordinator_of(
+    store: Store, patch: pytest.MonkeyPatch, slots: Slots | None = None, attempts: int = 3
+) -> Coordinator:
+    """A coordinator without Ray, that knows attempts with `LABEL` as its own and bears no failed scene."""
+    patch.setattr(coordinator.ray, "put", lambda value: value)
+    order = ShardOrder.of(store.name, validate_job({"name": "made-up", "scenes": 8}, "test"), "j" * 64)
+    pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
+    made = Coordinator(store, pattern, Limits(slots or Slots(1, 1), attempts, 0), Tally(asked=8))
+    made._order = order.model_copy(update={"label": LABEL})
+    return made
 
 
 def contents_of(path: Path) -> str:

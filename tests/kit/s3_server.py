@@ -1,6 +1,5 @@
 """The part of the S3 protocol that a dataset uses, served from memory on this machine; it can be made to fail."""
 
-import contextlib
 import hashlib
 import random
 import socket
@@ -221,28 +220,21 @@ class _Server(ThreadingHTTPServer):
 
 
 @contextmanager
-def s3_endpoint(bucket: Bucket, silence_s: float = 3.0) -> Iterator[str]:
-    """The address of a server that holds `bucket`; a fault of silence lasts so long."""
-    handler = type("Handler", (_Handler,), {"bucket": bucket, "silence_s": silence_s})
+def s3_server(bucket: Bucket, timeout_s: float = 30.0) -> Iterator[S3Store]:
+    """A client of a server that holds `bucket`; it waits so long for an answer, and a fault of silence is longer."""
+    handler = type("Handler", (_Handler,), {"bucket": bucket, "silence_s": timeout_s + 0.5})
     server = _Server(("127.0.0.1", 0), handler)
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
     try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
-
-
-@contextmanager
-def s3_server(bucket: Bucket, timeout_s: float = 30.0) -> Iterator[S3Store]:
-    """A client of a server that holds `bucket`; it waits so long for an answer."""
-    with contextlib.ExitStack() as stack:
         yield S3Store(
             "bucket",
-            endpoint=stack.enter_context(s3_endpoint(bucket, timeout_s + 0.5)),
+            endpoint=f"http://127.0.0.1:{server.server_port}",
             region="us-east-1",
             skip_signature=True,
             client_options={"allow_http": True, "timeout": f"{timeout_s}s"},
         )
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()

@@ -6,6 +6,8 @@ refinements leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there.
 0.23 px to a free homography against 0.28, once the side of the printed marker is free, as AprilTag's corners say as well.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +16,9 @@ from schemas.base import Array
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
 from workers.capture.board import LARGEST, PREDEFINED, Geometry, board_geometry, id_words, smallest_dictionary
+from workers.geometry.camera import first_poses, spread_evenly
 from workers.geometry.colour import SRGB_STEPS
+from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import project_points, rays_of_pixels
 
 SAMPLES = 24
@@ -151,18 +155,87 @@ SEVERAL = 4
 
 
 def detect_markers(
-    rgb: NDArray[np.uint8], board: Board, dictionary: "cv2.aruco.Dictionary", number: int = 0
+    rgb: NDArray[np.uint8], board: Board, dictionary: "cv2.aruco.Dictionary", camera: CaptureCamera, number: int = 0
 ) -> Detection:
-    """The board's markers in an image [H, W, 3]; ids that are not on the board, or that are seen twice, are dropped."""
+    """The board's markers in an image [H, W, 3]. Where several prints of the board are in view each has its own, `others`.
+
+    Ids that are not on the board are dropped, and markers seen twice where they do not tell two prints apart.
+    """
     geometry = board_geometry(board)
     gray, quads, ids = _find_quads(rgb, dictionary, board.border_bits)
-    kept, dropped = _usable(ids, geometry.ids)
-    corners = refine_corners(gray, quads[kept], dictionary.markerSize + 2 * board.border_bits)
-    chess, chess_px = _find_chess(gray, geometry, ids[kept], corners)
-    for pixels in (corners, chess_px):
-        pixels += 0.5
-        pixels.setflags(write=False)
-    return Detection(number, ids[kept], corners, dropped, chess, chess_px)
+    values, counts = np.unique(ids, return_counts=True)
+    known = np.isin(values, geometry.ids)
+    dropped = [f"marker {n} is not on the board ({id_words(geometry.ids)})" for n in values[~known]]
+    dropped += [f"marker {n} was seen {count} times" for n, count in zip(values, counts, strict=True) if count > 1]
+    kept = np.flatnonzero(np.isin(ids, values[known]))
+    kept = kept[np.argsort(ids[kept], kind="stable")]
+    ids, corners = ids[kept], refine_corners(gray, quads[kept], dictionary.markerSize + 2 * board.border_bits)
+    prints = [np.flatnonzero(np.isin(ids, values[counts == 1]))]
+    if len(prints[0]) < len(ids):
+        prints = split_prints(ids, corners + 0.5, geometry, camera) or prints
+    made = []
+    for chosen in prints:
+        chess, chess_px = _find_chess(gray, geometry, ids[chosen], corners[chosen])
+        marks = [corners[chosen] + 0.5, chess_px + 0.5]
+        for pixels in marks:
+            pixels.setflags(write=False)
+        made.append(Detection(number, ids[chosen], marks[0], tuple(dropped), chess, marks[1]))
+    return replace(made[0], others=tuple(made[1:]))
+
+
+LEAST_PRINT = 4
+"""Markers that tell a print."""
+SEEDS = 24
+"""Pairs of markers from which a print is begun."""
+BESIDE_SIDES = 0.5
+"""A marker belongs to a print whose pose puts it at most so many of its sides away."""
+EXPLAINED = 0.8
+"""Share of all markers that prints of one board explain: what lies otherwise is another board."""
+
+
+def split_prints(
+    ids: NDArray[np.int64], corners_px: Array, geometry: Geometry, camera: CaptureCamera
+) -> list[NDArray[np.intp]]:
+    """Which of markers [M], with corners [M, 4, 2] at +0.5, are on each print of a board in view, most first; ids may repeat.
+
+    A print is what one pose explains. Empty where prints of this board do not explain the markers.
+    """
+    rays = rays_of_pixels(corners_px.reshape(-1, 2), camera.intrinsics, camera.lens).reshape(-1, 4, 2)
+    places, middles = geometry.corners[geometry.index(ids)], corners_px.mean(axis=1)
+    sides = np.linalg.norm(np.roll(corners_px, -1, axis=1) - corners_px, axis=2).mean(axis=1)
+    left, prints = np.flatnonzero(np.isfinite(rays).all(axis=(1, 2))), []
+
+    def on_print(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Of those that are left what lies where a pose by the chosen has it, each id once; the better of its poses."""
+        best = chosen[:0]
+        for T in first_poses(places[chosen].reshape(-1, 3), rays[chosen].reshape(-1, 2)):
+            seen = project_points(
+                transform(invert(T), places[left].reshape(-1, 3)), camera.intrinsics, camera.lens
+            ).reshape(-1, 4, 2)
+            off = np.linalg.norm(seen - corners_px[left], axis=2).max(axis=1) / sides[left]
+            near = np.argsort(off, kind="stable")[: int((off < BESIDE_SIDES).sum())]
+            once = near[np.unique(ids[left[near]], return_index=True)[1]]
+            best = max(best, left[once], key=len) if T[2, 3] > 0 else best
+        return best
+
+    while len(left) >= LEAST_PRINT:
+        best = left[:0]
+        for seed in left[spread_evenly(len(left), SEEDS)]:
+            others = left[ids[left] != ids[seed]]
+            nearest = others[np.argsort(np.linalg.norm(middles[others] - middles[seed], axis=1), kind="stable")[:1]]
+            chosen = np.append(nearest, seed)
+            for _ in range(GROWTH):
+                chosen = on_print(chosen) if len(chosen) > 1 else chosen
+            best = max(best, chosen, key=len)
+        if len(best) < LEAST_PRINT:
+            break
+        prints.append(best)
+        left = np.setdiff1d(left, best)
+    return prints if sum(map(len, prints)) >= EXPLAINED * len(ids) else []
+
+
+GROWTH = 3
+"""A print grows from the markers nearest to the pair by fitting its pose so many times."""
 
 
 def find_markers(
@@ -295,17 +368,3 @@ def _detector(
     settings.minMarkerPerimeterRate = min_perimeter
     settings.markerBorderBits = border_bits
     return cv2.aruco.ArucoDetector(dictionary, settings)
-
-
-def _usable(ids: NDArray[np.int64], on_board: NDArray[np.int64]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
-    """(indices of the ids that are used, by ascending id; what is dropped, in words)."""
-    values, counts = np.unique(ids, return_counts=True)
-    known = np.isin(values, on_board)
-    dropped = [f"marker {value} is not on the board ({id_words(on_board)})" for value in values[~known]]
-    dropped += [
-        f"marker {value} was seen {count} times"
-        for value, count in zip(values[known], counts[known], strict=True)
-        if count > 1
-    ]
-    kept = np.flatnonzero(np.isin(ids, values[known & (counts == 1)]))
-    return kept[np.argsort(ids[kept], kind="stable")], tuple(dropped)

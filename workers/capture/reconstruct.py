@@ -19,7 +19,7 @@ from workers.capture.detect import detect_markers
 from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
-from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, observe_view
+from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, observe_view
 from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.solve_board import other_board
@@ -204,7 +204,8 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
         with stages.stage(name):
             made = MAKE[name](evidence)
         by_name[name] = replace(made, seconds=stages.seconds)
-    by_name[spec.estimate] = _corrected(by_name[spec.estimate], evidence)
+    corrected = _corrected(by_name[spec.estimate], evidence)
+    by_name[spec.estimate] = replace(corrected, notes=(*evidence.notes, *corrected.notes))
     if not by_name[spec.estimate].used:
         raise CaptureError("poses", _no_pose(by_name[spec.estimate], given.folder))
     return Estimates(spec.estimate, by_name, clock.seconds)
@@ -230,17 +231,17 @@ def _observe(given: Given, spec: Estimation, clock: Stopwatch) -> Evidence:
     folder = given.folder
     setup = Setup(folder.camera, folder.board, spec)
     dictionary = open_dictionary(folder.board, folder.path)
-    observations, poses = [], []
+    views = []
     for number in folder.numbers:
         with clock.stage("read"):
             view = read_view(folder, number)
         with clock.stage("detect"):
-            detection = detect_markers(view.rgb, folder.board, dictionary, number)
+            detection = detect_markers(view.rgb, folder.board, dictionary, folder.camera, number)
         with clock.stage("sample"):
-            observation, pose = observe_view(detection, view.depth, setup)
-        observations.append(_with_given_pose(observation, pose, given))
-        poses.append(pose)
-    return Evidence.of(setup, observations, poses)
+            views.append([observe_view(seen, view.depth, setup) for seen in (detection, *detection.others)])
+    chosen, notes = choose_prints(views)
+    observations = [_with_given_pose(observation, pose, given) for observation, pose in chosen]
+    return Evidence.of(setup, observations, [pose for _, pose in chosen], notes)
 
 
 def _with_given_pose(seen: Observation, markers: MarkerPose, given: Given) -> Observation:

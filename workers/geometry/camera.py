@@ -1,8 +1,9 @@
-"""The pinhole camera: its pose and frustum, projection of points, unprojection of pixels, and a choice among many views."""
+"""The pinhole camera: its pose and frustum, projection of points and poses from them, and a choice among many views."""
 
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -96,7 +97,7 @@ def is_outside_views(points: Array, cameras: Sequence[Camera]) -> bool:
     beyond one of them, or below every camera while the whole image looks up. False leaves it open.
     """
     k, rotation = cameras[0].intrinsics, cameras[0].T_world_cam[:3, :3]
-    if (_corner_rays(k) @ rotation[2] > 0.0).all():
+    if (corner_rays(k) @ rotation[2] > 0.0).all():
         lowest = min(float(camera.T_world_cam[2, 3]) for camera in cameras)
         if float(points[:, 2].max()) < lowest:
             return True
@@ -114,7 +115,7 @@ def _side_normals(k: Intrinsics) -> Array:
     return np.array([[k.fx, 0.0, left], [-k.fx, 0.0, right], [0.0, k.fy, top], [0.0, -k.fy, bottom], [0.0, 0.0, 1.0]])
 
 
-def _corner_rays(k: Intrinsics) -> Array:
+def corner_rays(k: Intrinsics) -> Array:
     """[4, 3]: the rays through the image's corners, in the optical frame; every other is between them."""
     columns, rows = (-MARGIN_PX, k.width + MARGIN_PX), (-MARGIN_PX, k.height + MARGIN_PX)
     return np.array([[(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0] for v in rows for u in columns])
@@ -125,3 +126,29 @@ def spread_evenly(count: int, most: int) -> NDArray[np.int64]:
     if count <= most:
         return np.arange(count, dtype=np.int64)
     return np.linspace(0, count - 1, most).round().astype(np.int64)
+
+
+FLAT = 1e-4
+"""Points whose thickness is less than this share of their extent are a plane: a board's print is flatter than that."""
+
+
+def first_poses(points: Array, rays: Array) -> list[Pose]:
+    """T_points_cam of the one or two poses that see points [K, 3] along rays [K, 2]: a plane looks alike from both (IPPE).
+
+    Points that lie in no plane have one pose (SQPnP, Terzakis and Lourakis 2020).
+    """
+    middle = points.mean(axis=0)
+    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    flat, T_points_plane = bool(extents[2] <= FLAT * extents[0]), np.eye(4)
+    if flat and points[:, 2].any():
+        T_points_plane = pose(axes.T * np.linalg.det(axes), middle)
+    kind = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
+    return [T_points_plane @ invert(T) for T in opencv_poses(transform(invert(T_points_plane), points), rays, kind)]
+
+
+def opencv_poses(points: Array, rays: Array, kind: int) -> list[Pose]:
+    """The poses [4, 4] that take points [K, 3] to the camera that sees them along rays [K, 2], the likeliest first."""
+    count, turns, shifts, _ = cv2.solvePnPGeneric(points[:, None], rays[:, None], np.eye(3), None, flags=kind)
+    matrices = [cv2.Rodrigues(turn)[0].astype(np.float64) for turn in turns[:count]]
+    poses = [pose(R, shift.ravel().astype(np.float64)) for R, shift in zip(matrices, shifts[:count], strict=True)]
+    return [T for T in poses if np.isfinite(T).all()]

@@ -19,69 +19,12 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
-from schemas.scene.view import Camera
-from workers.geometry.camera import NEAR_M, project
+from schemas.scene.view import Camera, Intrinsics
+from workers.geometry.camera import NEAR_M, project_bounds, unproject
 from workers.geometry.distance import dot
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import face_planes
-
-
-@compiled_for("f8[::1], f8[::1], const(i4[:,::1]), i8, i8")
-def row_spans(
-    u: Array, v: Array, faces: NDArray[np.integer], width: int, height: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(first [H], end [H]): the columns of each row between the outermost edges of faces [F, 3], a pixel more on each side.
-
-    u, v [V]: image coordinates of corners, pixels. An edge counts in the rows above and below its own too; rows that no
-    edge comes near have end <= first.
-    """
-    first, end = np.full(height, width, np.int64), np.zeros(height, np.int64)
-    for f in range(len(faces)):
-        for corner in range(3):
-            a, b = faces[f, corner], faces[f, (corner + 1) % 3]
-            if v[a] > v[b]:
-                a, b = b, a
-            top, bottom = max(math.floor(v[a]) - 1.0, 0.0), min(math.ceil(v[b]) + 1.0, float(height))
-            for row in range(int(top), int(bottom)):
-                one, other = u[a], u[b]
-                if v[b] - v[a] > 1.0:  # the part of the edge in this row and the two beside it
-                    slope = (u[b] - u[a]) / (v[b] - v[a])
-                    one = u[a] + slope * (max(row - 1.0, v[a]) - v[a])
-                    other = u[a] + slope * (min(row + 2.0, v[b]) - v[a])
-                left, right = math.floor(min(one, other)) - 1.0, math.ceil(max(one, other)) + 1.0
-                first[row] = min(first[row], int(min(max(left, 0.0), float(width))))
-                end[row] = max(end[row], int(min(max(right, 0.0), float(width))))
-    return first, end
-
-
-@compiled_for("i8[::1], i8[::1], i8")
-def pixels_between(first: NDArray[np.int64], end: NDArray[np.int64], width: int) -> NDArray[np.int64]:
-    """Flat numbers, ascending, of the pixels from column `first` [H] up to and without `end` [H] of each row."""
-    pixels = np.empty(np.maximum(end - first, 0).sum(), np.int64)
-    n = 0
-    for row in range(len(first)):
-        for column in range(first[row], end[row]):
-            pixels[n] = row * width + column
-            n += 1
-    return pixels
-
-
-@compiled_for("i8[::1], i8, UniTuple(f8, 4), f8")
-def pixel_rays(
-    pixels: NDArray[np.int64], width: int, k: tuple[float, float, float, float], near_m: float
-) -> tuple[Array, Array]:
-    """(origins, directions), each [N, 3]: rays with z = 1 through the centres of pixels, from the near plane on.
-
-    k: fx, fy, cx, cy. As `unproject` has them, in the camera's frame.
-    """
-    origins, directions = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
-    for n in range(len(pixels)):
-        row, column = pixels[n] // width, pixels[n] % width
-        x, y = (column + 0.5 - k[2]) / k[0], (row + 0.5 - k[3]) / k[1]
-        directions[n, 0], directions[n, 1], directions[n, 2] = x, y, 1.0
-        origins[n, 0], origins[n, 1], origins[n, 2] = near_m * x, near_m * y, near_m
-    return origins, directions
 
 
 @compiled_for("i4[::1], Tuple((f8[:,::1], f8[::1])), f8[:,::1], f8[:,::1], f8")
@@ -107,26 +50,6 @@ def meet_planes(
             distance[n] = np.nan
             open_ended += 1
     return distance, cosine, open_ended
-
-
-@compiled_for("Tuple((f8[::1], u1[::1], f4[::1])), i8[::1], UniTuple(f8[::1], 2), i8, f8, f8")
-def keep_nearer(
-    best: tuple[Array, NDArray[np.uint8], NDArray[np.float32]],
-    rays: NDArray[np.int64],
-    found: tuple[Array, Array],
-    region_id: int,
-    apart_m: float,
-    grazing: float,
-) -> None:
-    """Writes hits that are nearer than the best by more than `apart_m` along the normal over these, in place.
-
-    best: distance, region and incidence_cos of all rays; found: distance and cosine [N] of the rays with the numbers `rays`.
-    """
-    distance, cosine = found
-    for n in range(len(rays)):
-        slant = grazing if cosine[n] < grazing else cosine[n]
-        if distance[n] + apart_m / slant < best[0][rays[n]]:
-            best[0][rays[n]], best[1][rays[n]], best[2][rays[n]] = distance[n], region_id, cosine[n]
 
 
 COPLANAR_M = 1e-6
@@ -155,6 +78,12 @@ class Hits:
     region: NDArray[np.uint8]
     incidence_cos: NDArray[np.float32]
 
+    def keep_nearer(self, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int) -> None:
+        """Writes hits of the rays with these numbers that are nearer by more than `COPLANAR_M` along the normal, in place."""
+        nearer = distance + COPLANAR_M / np.maximum(cosine, GRAZING) < self.distance[rays]
+        rays = rays[nearer]
+        self.distance[rays], self.incidence_cos[rays], self.region[rays] = distance[nearer], cosine[nearer], region_id
+
 
 def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[np.uint8], NDArray[np.float32]]:
     """The view of a camera through every pixel's centre (column + 0.5, row + 0.5).
@@ -166,12 +95,12 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
     best = _no_hits(k.height * k.width)
     for thing in sorted(things, key=attrgetter("region_id")):
         mesh = _in_camera(thing, camera)
-        pixels = _pixels_in_reach(mesh, camera)
+        rows, columns = _pixels_in_reach(mesh, k)
         caster = _Caster(mesh)
-        for some in (pixels[block] for block in _blocks(len(pixels))):
-            rays = pixel_rays(some, k.width, (k.fx, k.fy, k.cx, k.cy), NEAR_M)
-            distance, cosine = caster.cast(*rays)
-            _keep_nearer(best, some, distance + NEAR_M, cosine, thing.region_id)
+        for some in _blocks(len(rows)):
+            rays = unproject(rows[some], columns[some], np.ones(len(rows[some])), k)
+            distance, cosine = caster.cast(NEAR_M * rays, rays)
+            best.keep_nearer(rows[some] * k.width + columns[some], distance + NEAR_M, cosine, thing.region_id)
     depth, shape = np.where(np.isinf(best.distance), 0.0, best.distance), (k.height, k.width)
     return depth.reshape(shape), best.region.reshape(shape), best.incidence_cos.reshape(shape)
 
@@ -186,7 +115,7 @@ def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hi
     for thing in sorted(things, key=attrgetter("region_id")):
         caster = _Caster(Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces))
         for some in _blocks(len(origins)):
-            _keep_nearer(best, everything[some], *caster.cast(origins[some], directions[some]), thing.region_id)
+            best.keep_nearer(everything[some], *caster.cast(origins[some], directions[some]), thing.region_id)
     return best
 
 
@@ -225,18 +154,21 @@ def _no_hits(count: int) -> Hits:
     return Hits(np.full(count, np.inf), np.zeros(count, np.uint8), np.zeros(count, np.float32))
 
 
-def _pixels_in_reach(mesh: Mesh, camera: Camera) -> NDArray[np.int64]:
-    """Flat numbers of the pixels whose rays can meet a mesh in the camera's frame, ascending.
+def _pixels_in_reach(mesh: Mesh, k: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(rows, columns) of the pixels whose rays can meet a mesh in the camera's frame, row by row.
 
-    In each row those between the outermost projected edges, a pixel wider on each side; all where a corner is not beyond
-    the near plane, because it has no place in the image then.
+    Those of the box about it in the image, a pixel wider on each side; all where a corner is not beyond the near plane, where it
+    has no place in the image.
     """
-    k = camera.intrinsics
     if not len(mesh.faces):
-        return np.empty(0, np.int64)
-    if (mesh.vertices[:, 2] <= NEAR_M).any():
-        return np.arange(k.height * k.width)
-    return pixels_between(*row_spans(*project(mesh.vertices, k), mesh.faces, k.width, k.height), k.width)
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    left, top, right, bottom = np.clip(project_bounds(mesh.vertices, k, NEAR_M), -1.0, [k.width, k.height] * 2)
+    rows, columns = np.arange(k.height), np.arange(k.width)
+    rows, columns = (
+        rows[(rows >= top - 2) & (rows <= bottom + 1)],
+        columns[(columns >= left - 2) & (columns <= right + 1)],
+    )
+    return np.repeat(rows, len(columns)), np.tile(columns, len(rows))
 
 
 class _Caster:
@@ -262,12 +194,6 @@ class _Caster:
             these = np.flatnonzero(np.isnan(distance))
             distance[these] = self._scene.run(rays[0][these], rays[1][these], query="DISTANCE")
         return distance, cosine
-
-
-def _keep_nearer(best: Hits, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int) -> None:
-    """Writes into `best` the hits that are nearer than its own by more than `COPLANAR_M` along the normal."""
-    so_far = best.distance, best.region, best.incidence_cos
-    keep_nearer(so_far, rays, (distance, cosine), region_id, COPLANAR_M, GRAZING)
 
 
 def _edges(mesh: Mesh, outline_only: bool) -> NDArray[np.int64]:

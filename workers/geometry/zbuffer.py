@@ -226,17 +226,14 @@ def _count_covered(
     corners = to_grid(vertices, T.astype(np.float32), (k[0], k[1], k[2] - x0, k[3] - y0), width, height)
     covered = np.zeros((height, width), np.uint8)
     for face in range(len(faces)):
-        a, b, c = (
-            (corners[faces[face, 0], 0], corners[faces[face, 0], 1]),
-            (corners[faces[face, 1], 0], corners[faces[face, 1], 1]),
-            (corners[faces[face, 2], 0], corners[faces[face, 2], 1]),
-        )
-        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        area, a, b, c = oriented(corners, faces, face)
         # Of a closed body the faces towards the camera cover what all of them do.
-        if area < 0:
-            _cover(covered, a, c, b)
-        elif area > 0 and not closed:
-            _cover(covered, a, b, c)
+        if area < 0 or (area > 0 and not closed):
+            first, last, upper, lower = pixel_box(a, b, c, width, height)
+            for row in range(upper, lower + 1):
+                start, stop = covered_columns(a, b, c, row, first, last)
+                if start <= stop:  # in one go: as a loop, each index is tested for counting from the end
+                    covered[row, start : stop + 1] = 1
     pixels = 0
     for row in range(height):
         for column in range(width):
@@ -277,22 +274,7 @@ Corner = tuple[int, int]
 
 
 @compiled
-def _cover(covered: NDArray[np.uint8], a: Corner, b: Corner, c: Corner) -> None:
-    """Sets the pixels [H, W] whose centres a triangle covers, row by row; its corners, clockwise, are in 1/256 pixel."""
-    first, last = max((min(a[0], b[0], c[0]) + 255) >> 8, 0), min(max(a[0], b[0], c[0]) >> 8, covered.shape[1] - 1)
-    upper, lower = max((min(a[1], b[1], c[1]) + 255) >> 8, 0), min(max(a[1], b[1], c[1]) >> 8, covered.shape[0] - 1)
-    if first > last:
-        return
-    for row in range(upper, lower + 1):
-        left, right = cut_row(a, b, row, first, last)
-        left, right = cut_row(b, c, row, left, right)
-        left, right = cut_row(c, a, row, left, right)
-        if left <= right:
-            covered[row, left : right + 1] = 1  # in one go: as a loop, each index is tested for counting from the end
-
-
-@compiled
-def cut_row(start: Corner, end: Corner, row: int, left: int, right: int) -> tuple[int, int]:
+def _cut_row(start: Corner, end: Corner, row: int, left: int, right: int) -> tuple[int, int]:
     """The pixels of a row, from `left` to `right`, whose centres lie within an edge; on the left and on top also those on it."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     # Within is where `inside` - 256 column dy > 0.
@@ -302,3 +284,31 @@ def cut_row(start: Corner, end: Corner, row: int, left: int, right: int) -> tupl
     if dy < 0 and inside <= 256 * dy * left:
         return inside // (256 * dy) + 1, right
     return left, right if dy != 0 or inside > 0 else -1
+
+
+@compiled
+def oriented(corners: NDArray[np.int64], faces: NDArray[np.int32], face: int) -> tuple[int, Corner, Corner, Corner]:
+    """(twice the area, positive where the face shows its back; its corners, clockwise)."""
+    a, b, c = (
+        (corners[faces[face, 0], 0], corners[faces[face, 0], 1]),
+        (corners[faces[face, 1], 0], corners[faces[face, 1], 1]),
+        (corners[faces[face, 2], 0], corners[faces[face, 2], 1]),
+    )
+    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    return (area, a, b, c) if area > 0 else (area, a, c, b)
+
+
+@compiled
+def pixel_box(a: Corner, b: Corner, c: Corner, width: int, height: int) -> tuple[int, int, int, int]:
+    """(first, last column, upper, lower row) of the pixel centres in the triangle's box and in the image; no rows without any."""
+    first, last = max((min(a[0], b[0], c[0]) + 255) >> 8, 0), min(max(a[0], b[0], c[0]) >> 8, width - 1)
+    upper, lower = max((min(a[1], b[1], c[1]) + 255) >> 8, 0), min(max(a[1], b[1], c[1]) >> 8, height - 1)
+    return first, last, upper, lower if first <= last else upper - 1
+
+
+@compiled
+def covered_columns(a: Corner, b: Corner, c: Corner, row: int, first: int, last: int) -> tuple[int, int]:
+    """The columns of a row whose centres a triangle covers."""
+    left, right = _cut_row(a, b, row, first, last)
+    left, right = _cut_row(b, c, row, left, right)
+    return _cut_row(c, a, row, left, right)

@@ -41,6 +41,7 @@ from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import Appearance, Light, Material, Part
 from schemas.scene.view import Camera, GBuffer, Intrinsics
+from workers.geometry.camera import NEAR_M
 from workers.geometry.colour import HOLE_ALPHA, SRGB_STEPS, decode_srgb, encode_codes, has_holes
 from workers.geometry.frames import transform
 from workers.render.raster.baking import LAMP_RAD
@@ -263,9 +264,6 @@ def _rgb(color: NDArray) -> Bsdf:
 def _floats(array: NDArray) -> NDArray[np.float32]:
     return np.ascontiguousarray(array, np.float32).ravel()
 
-
-NEAR_M = 0.05
-"""Nearer surfaces are not seen, as in the other tiers."""
 
 ROULETTE_DEPTH = 5
 """Bounces after which Russian roulette may end a path."""

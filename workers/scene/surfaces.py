@@ -18,7 +18,7 @@ from workers.geometry.camera import NEAR_M
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import face_planes
-from workers.geometry.zbuffer import Corner, cut_row, to_grid
+from workers.geometry.zbuffer import Corner, covered_columns, oriented, pixel_box, to_grid
 
 MISSED = 8.0
 """1/256 pixel: a drawn mask's pixel that no face covers has one as near as this, by a rounding."""
@@ -143,34 +143,6 @@ def all_surfaces(triangles: Triangles) -> Surfaces:
 
 
 @compiled
-def _oriented(corners: NDArray[np.int64], faces: NDArray[np.int32], face: int) -> tuple[int, Corner, Corner, Corner]:
-    """(twice the area, positive where the face shows its back; its corners, clockwise)."""
-    a, b, c = (
-        (corners[faces[face, 0], 0], corners[faces[face, 0], 1]),
-        (corners[faces[face, 1], 0], corners[faces[face, 1], 1]),
-        (corners[faces[face, 2], 0], corners[faces[face, 2], 1]),
-    )
-    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-    return (area, a, b, c) if area > 0 else (area, a, c, b)
-
-
-@compiled
-def _box(a: Corner, b: Corner, c: Corner, width: int, height: int) -> tuple[int, int, int, int]:
-    """(first, last column, upper, lower row) of the pixel centres in the triangle's box and in the image."""
-    first, last = max((min(a[0], b[0], c[0]) + 255) >> 8, 0), min(max(a[0], b[0], c[0]) >> 8, width - 1)
-    upper, lower = max((min(a[1], b[1], c[1]) + 255) >> 8, 0), min(max(a[1], b[1], c[1]) >> 8, height - 1)
-    return first, last, upper, lower
-
-
-@compiled
-def _columns(a: Corner, b: Corner, c: Corner, row: int, first: int, last: int) -> tuple[int, int]:
-    """The columns of a row whose centres a triangle covers."""
-    left, right = cut_row(a, b, row, first, last)
-    left, right = cut_row(b, c, row, left, right)
-    return cut_row(c, a, row, left, right)
-
-
-@compiled
 def _depth(
     face: int,
     column: int,
@@ -209,13 +181,13 @@ def _nearest_faces(
     height, width = region.shape
     best, depth = np.full((height, width), -1, np.int32), np.zeros((height, width))
     for face in range(len(faces)):
-        area, a, b, c = _oriented(corners, faces, face)
+        area, a, b, c = oriented(corners, faces, face)
         if area == 0 or (area > 0 and kinds[1][face]):
             continue
         kind, span = kinds[0][face], _span(points, faces, face)
-        first, last, upper, lower = _box(a, b, c, width, height)
+        first, last, upper, lower = pixel_box(a, b, c, width, height)
         for row in range(upper, lower + 1):
-            left, right = _columns(a, b, c, row, first, last)
+            left, right = covered_columns(a, b, c, row, first, last)
             for column in range(left, right + 1):
                 if region[row, column] != kind:
                     continue
@@ -255,7 +227,7 @@ def _fill_missed(
                 continue
             nearest = MISSED**2
             for face in range(len(faces)):
-                area, a, b, c = _oriented(corners, faces, face)
+                area, a, b, c = oriented(corners, faces, face)
                 if kinds[0][face] != region[row, column] or area == 0 or (area > 0 and kinds[1][face]):
                     continue
                 centre = (256 * column, 256 * row)
@@ -286,24 +258,24 @@ def _all_surfaces(
     width, height = size
     start = np.zeros(width * height + 1, np.int64)
     for face in range(len(faces)):
-        area, a, b, c = _oriented(corners, faces, face)
+        area, a, b, c = oriented(corners, faces, face)
         if area != 0:
-            first, last, upper, lower = _box(a, b, c, width, height)
+            first, last, upper, lower = pixel_box(a, b, c, width, height)
             for row in range(upper, lower + 1):
-                left, right = _columns(a, b, c, row, first, last)
+                left, right = covered_columns(a, b, c, row, first, last)
                 for column in range(left, right + 1):
                     start[row * width + column + 1] += 1
     for pixel in range(width * height):
         start[pixel + 1] += start[pixel]
     z, owner, filled = np.empty(start[-1]), np.empty(start[-1], np.int32), np.zeros(width * height, np.int32)
     for face in range(len(faces)):
-        area, a, b, c = _oriented(corners, faces, face)
+        area, a, b, c = oriented(corners, faces, face)
         if area == 0:
             continue
         span = _span(points, faces, face)
-        first, last, upper, lower = _box(a, b, c, width, height)
+        first, last, upper, lower = pixel_box(a, b, c, width, height)
         for row in range(upper, lower + 1):
-            left, right = _columns(a, b, c, row, first, last)
+            left, right = covered_columns(a, b, c, row, first, last)
             for column in range(left, right + 1):
                 pixel = row * width + column
                 depth, place = _depth(face, column, row, grid, planes, span), start[pixel] + filled[pixel]

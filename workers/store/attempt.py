@@ -194,10 +194,10 @@ class Attempt:
         """
         self.end_scenes()
         record = self._finish()
-        own = self._own_files(record)
+        written = self._files_of(record)
         if not self._put(record, job_change):
             return self._concede(record)
-        publish(self._store, record, own)
+        publish(self._store, record, written)
         return CommitResult(won=True, record=record)
 
     def abandon(self) -> None:
@@ -232,7 +232,7 @@ class Attempt:
             scenes=tuple(self._scenes),
         )
 
-    def _own_files(self, record: CommitRecord) -> list[FileEntry]:
+    def _files_of(self, record: CommitRecord) -> list[FileEntry]:
         """Every file that this attempt wrote, as `committed_files` has them. Raises ValueError naming one of another range."""
         listed = [entry for path, entry in self._files.items() if self._terms.layout == "files" or is_shape(path)]
         if (foreign := foreign_path(listed, self.span, self._terms.pairs_per_scene)) is not None:

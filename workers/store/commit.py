@@ -188,8 +188,8 @@ def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None
     except FileNotFoundError:
         return None
     record = decode_record(data, key)
-    if (own := commit_path(record.span.start, record.span.retry)) != key:
-        raise CorruptError(f"{key} holds the record of another range: {own}")
+    if (its := commit_path(record.span.start, record.span.retry)) != key:
+        raise CorruptError(f"{key} holds the record of another range: {its}")
     return record
 
 
@@ -217,14 +217,14 @@ def committed_files(store: Store, record: CommitRecord, read: ReadTable | None =
     return tuple(files[path] for path in sorted(files))
 
 
-def publish(store: Store, record: CommitRecord, own: Iterable[FileEntry] | None = None) -> None:
+def publish(store: Store, record: CommitRecord, written: Iterable[FileEntry] | None = None) -> None:
     """Moves the record's files from staging to their final places, then removes the staging. Idempotent.
 
-    `own`: all of the record's files, from who wrote them just now; others read them from its tables. Raises CorruptError
+    `written`: all of the record's files, from who wrote them just now; others read them from its tables. Raises CorruptError
     naming a file that is nowhere or has the wrong size, CommitConflict where a shape that ranges share was published with
     another size by the same stack.
     """
-    files = committed_files(store, record) if own is None else tuple(own)
+    files = committed_files(store, record) if written is None else tuple(written)
     folders = _staging_folders(record)
     for entry in files:
         final = store.size(entry.path) if is_shape(entry.path) else None
@@ -279,7 +279,7 @@ def compare_attempts(
     different += [entry.path for entry in my_files if shapes.get(entry.path, entry.sha256) != entry.sha256]
     if not different:
         return None
-    stacks = [f"{one.attempt} on fingerprint {one.terms.fingerprint}" for one in (winner, mine)]
+    stacks = [f"{made.attempt} on fingerprint {made.terms.fingerprint}" for made in (winner, mine)]
     return (
         f"two attempts made other bytes at {', '.join(different[:5])}{' and more' if len(different) > 5 else ''}: "
         f"{stacks[0]} (committed), {stacks[1]}"

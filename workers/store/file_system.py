@@ -107,21 +107,12 @@ def refuse_link_out(root: str | Path, key: str) -> None:
             )
 
 
-def sync_tree(folder: Path) -> None:
-    """Returns when every file and folder below `folder`, and its own name, are on the disk."""
-    if _trusts_syncfs(folder):
-        _syncfs_at(folder)
-    else:
-        for path in [*folder.rglob("*"), folder]:
-            sync_path(path)
-    sync_path(folder.parent)
-
-
 def sync_folders(root: Path, folders: Iterable[str]) -> None:
     """Returns when the names in `folders`, paths below `root`, are on the disk; deeper ones first."""
     ordered = sorted(folders, reverse=True)
     if len(ordered) > _FEW_FOLDERS and _trusts_syncfs(root):
-        _syncfs_at(root)
+        with _descriptor(root) as descriptor:
+            _syncfs(descriptor)
     else:
         for folder in ordered:
             sync_path(root / folder)
@@ -138,11 +129,6 @@ def _syncfs(descriptor: int) -> None:
     if ctypes.CDLL(None, use_errno=True).syncfs(descriptor) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
-
-
-def _syncfs_at(path: Path) -> None:
-    with _descriptor(path) as descriptor:
-        _syncfs(descriptor)
 
 
 def sha256_of(file: IO[bytes] | BufferedIOBase) -> str:

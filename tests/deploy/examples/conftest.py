@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from services.dataset.dataset import open_dataset
+from services.dataset.pair import Pair
 from tests.datasets import make_dataset
 from workers.store.local import LocalStore
 
@@ -26,3 +28,8 @@ def few(tmp_path_factory) -> LocalStore:
     targets = {"shape": ["volume"], "points": 4000}
     out = tmp_path_factory.mktemp("few")
     return make_dataset(out, scenes=6, categories=["mug", "box"], targets=targets, **FULL_SIZE)[0]
+
+
+@pytest.fixture(scope="package")
+def pairs(few) -> list[Pair]:
+    return list(open_dataset(few.root).pairs())

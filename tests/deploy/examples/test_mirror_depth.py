@@ -36,11 +36,6 @@ def test_no_instance_is_in_two_splits_also_where_a_scene_has_several_objects(few
 
 
 @pytest.fixture(scope="module")
-def pairs(few):
-    return list(open_dataset(few.root).pairs())
-
-
-@pytest.fixture(scope="module")
 def examples(pairs):
     return [make_example(pair) for pair in pairs]
 

@@ -4,13 +4,6 @@ import numpy as np
 import occupancy
 import pytest
 
-from services.dataset.dataset import open_dataset
-
-
-@pytest.fixture(scope="module")
-def pairs(few):
-    return list(open_dataset(few.root).pairs())
-
 
 @pytest.fixture(scope="module")
 def shapes(pairs):

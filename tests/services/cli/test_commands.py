@@ -5,7 +5,6 @@ import json
 import os
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -24,8 +23,9 @@ from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job
 from services.run.lock import read_holder
 from tests.datasets import make_dataset
-from workers.render.raster import context, devices
-from workers.render.raster.devices import GraphicsDevice
+from tests.kit.killed_runs import holding
+from workers.render.raster import context
+from workers.render.raster.context import GraphicsDevice
 from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 
@@ -33,15 +33,21 @@ ROOT = Path(__file__).resolve().parents[3]
 TABLETOP = str(ROOT / "deploy" / "jobs" / "tabletop.yaml")
 
 
-def told(capsys, *arguments: str) -> tuple[int, str]:
-    """Exit code and everything that was written."""
+def ended(capsys, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, and what was written to standard output and to standard error."""
     try:
         code = main(list(arguments))
     except SystemExit as exit_:  # argparse's own
         code = int(exit_.code or 0)
     captured = capsys.readouterr()
     assert "Traceback" not in captured.out + captured.err
-    return code, captured.out + captured.err
+    return code, captured.out, captured.err
+
+
+def told(capsys, *arguments: str) -> tuple[int, str]:
+    """Exit code and everything that was written."""
+    code, out, err = ended(capsys, *arguments)
+    return code, out + err
 
 
 def answer(capsys, *arguments: str) -> tuple[int, list[str], dict]:
@@ -194,28 +200,14 @@ def test_a_file_system_that_is_mounted_read_only_is_told_as_that(tmp_path):
     assert done.returncode == 2
 
 
-HOLD = """
-import sys, time
-from services.run.lock import hold_lock
-from workers.store.local import LocalStore
-with hold_lock(LocalStore(sys.argv[1])):
-    print(flush=True)
-    time.sleep(600)
-"""
-
-
 def test_status_tells_a_run_that_was_killed_from_one_that_runs(tmp_path, capsys):
     store, job = LocalStore(tmp_path), validate_job({"name": "small", "scenes": 8}, "test")
     store.prepare()
     store.put(JOB_FILE, encode_job(record_job(job, "c" * 64, Path())))
     terms = CommitTerms(job_digest="j" * 64, fingerprint="f" * 64, pairs_per_scene=1)
     begin_attempt(store, Span(start=0, stop=8), terms).begin_scene(3)
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE)
-    with holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
+    with holding(tmp_path) as holder:
         alive = told(capsys, "status", str(tmp_path))
-        holder.send_signal(signal.SIGKILL)
     dead = told(capsys, "status", str(tmp_path))
     assert alive[0] == dead[0] == 1
     assert "  running: range from 0, scene 3" in alive[1] and "gone" not in alive[1]
@@ -289,10 +281,9 @@ def test_every_gpu_is_listed_with_its_device_and_the_one_that_would_be_drawn_on(
         (gpus, "9", "none that may be drawn on"),
         ((), "0", "EGL lists none"),
     ):
-        for module in (devices, context):
-            monkeypatch.setattr(module, "list_devices", lambda listed=listed: listed)
+        monkeypatch.setattr(context, "list_devices", lambda listed=listed: listed)
         monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
-        monkeypatch.setattr(devices, "visible_gpus", lambda visible=visible: visible)
+        monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
         finding = doctor._gpus()
         assert words in finding.found and finding.ok == (words != "none that may be drawn on"), finding
         if software in listed:

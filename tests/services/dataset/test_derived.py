@@ -86,25 +86,6 @@ def pairs_mesh(pairs, view, number):
     return next(pair for pair, one in views_of(pairs) if one is view).mesh(number)
 
 
-def test_the_input_cloud_lands_on_the_depth_of_the_mirror_view(pairs):
-    """Interpolated bilinearly in 1/z, where both views show one smooth surface: 0.1 mm in the median (test_two_views)."""
-    for pair in pairs:
-        points = to(np.linalg.inv(pair.mirror.T_world_cam), pair.input.cloud("world", None).points)
-        points = points[pair.correspondence().visible[pair.input.depth() > 0]]
-        u, v, _ = (pair.mirror.K @ points.T) / points[:, 2]
-        i, j = np.floor(v - 0.5).astype(int), np.floor(u - 0.5).astype(int)
-        inside = (i >= 0) & (j >= 0) & (i < 479) & (j < 639)
-        i, j, u, v, points = i[inside], j[inside], u[inside], v[inside], points[inside]
-        four = np.stack([pair.mirror.depth()[i + a, j + b] / 5000.0 for a in (0, 1) for b in (0, 1)])
-        right, down = u - 0.5 - j, v - 0.5 - i
-        weight = np.stack(
-            [(a * down + (1 - a) * (1 - down)) * (b * right + (1 - b) * (1 - right)) for a in (0, 1) for b in (0, 1)]
-        )
-        smooth = (four > 0).all(axis=0) & (np.ptp(four, axis=0) < 0.02)
-        landed = 1 / (weight / np.maximum(four, 1e-9)).sum(axis=0)
-        assert smooth.sum() > 10_000 and np.median(np.abs(landed - points[:, 2])[smooth]) < 1e-4
-
-
 def test_targets_are_the_mesh_in_numbers(pairs):
     for _, view in views_of(pairs):
         segment, normals, coordinates = view.segment(), view.normals(), view.coordinates()

@@ -1,6 +1,7 @@
 """What tests of exports share: one call that exports, a picture of a folder, and the dataset as its own documents tell it."""
 
 import csv
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from services.export.export import ExportResult, export
 from services.export.formats import Choice, ExportRequest
+from services.job.record import require_job
+from workers.store.local import LocalStore
 from workers.store.store import Store
 
 
@@ -44,3 +47,11 @@ def source_poses(root: Path | None) -> dict[int, NDArray]:
 def source_rows(root: Path | None, table: str) -> list[dict[str, Any]]:
     """The rows of a merged table."""
     return ds.dataset(f"{root}/manifest/{table}", partitioning="hive").to_table().to_pylist()
+
+
+def without_sources(store: LocalStore, place: Path) -> LocalStore:
+    """A copy whose job's sources hold something else now."""
+    shutil.copytree(store.root, place)
+    job, catalogue = place / "job.yaml", require_job(store).catalogue
+    job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
+    return LocalStore(place)

@@ -122,12 +122,6 @@ class Frame:
         inside = np.stack([x * z, -y * z, -z], axis=1)
         return inside @ self.T_world_cam[:3, :3].T + self.T_world_cam[:3, 3], np.stack([rows, columns], axis=1)
 
-    def seen(self, points: NDArray) -> tuple[NDArray, NDArray]:
-        """([N, 2] row and column of the pixels of points [N, 3], their depth [N])."""
-        x, y, z = ((points - self.T_world_cam[:3, 3]) @ self.T_world_cam[:3, :3]).T
-        column, row = self.k["fl_x"] * x / -z + self.k["cx"], self.k["fl_y"] * -y / -z + self.k["cy"]
-        return np.floor(np.stack([row, column], axis=1)).astype(int), -z
-
 
 def load_frames(path: Path) -> dict[str, list[Frame]]:
     """The frames of a transforms.json for `train`, `val` and `test`."""

@@ -12,11 +12,9 @@ from scipy.spatial.distance import pdist
 from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
 from services.export.shapes import box_of, reaches_edge, whole_silhouette
-from services.job.record import require_job
 from tests.datasets import make_dataset
 from tests.services.export.bop_reader import load_model, load_shots, points_in_model, read_picture
-from tests.services.export.exported import export_to, source_image, source_rows
-from workers.store.local import LocalStore
+from tests.services.export.exported import export_to, source_image, source_rows, without_sources
 
 PLACES = {"input": 0, "aligned": 1, "mirror": 2}
 WORDS = {"input": ("RGB", "depth", "segment"), "aligned": ("RGBaligned", "depthAligned", "segmentAligned")}
@@ -180,22 +178,18 @@ def test_pairs_without_colour_and_hidden_objects_without_a_shape_are_left_out(pi
     manifest = export_to(store, tmp_path / "grey", "bop").manifest
     assert manifest["left_out"] == {"no rgb of the input view": 1}
     assert json.loads((tmp_path / "grey" / "camera.json").read_text()) == {}
-    shutil.copytree(pile.name, tmp_path / "copy")
-    shutil.rmtree(tmp_path / "copy" / "assets")
-    job, catalogue = tmp_path / "copy" / "job.yaml", require_job(pile).catalogue
-    job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
-    manifest = export_to(LocalStore(tmp_path / "copy"), tmp_path / "new", "bop").manifest
+    bare = without_sources(pile, tmp_path / "copy")
+    shutil.rmtree(bare.root / "assets")
+    manifest = export_to(bare, tmp_path / "new", "bop").manifest
     assert manifest["left_out"] == {NO_SHAPE: 1} and not (tmp_path / "new" / "train").exists()
     assert manifest["models"] == 0 and any(line.startswith("3 models") for line in manifest["not_exported"])
     assert json.loads((tmp_path / "new" / "models" / "models_info.json").read_text()) == {}
 
 
 def test_silhouettes_are_those_of_the_target_and_need_no_shape(heap, tmp_path):
-    shutil.copytree(heap.name, tmp_path / "copy")
-    shutil.rmtree(tmp_path / "copy" / "assets")
-    job, catalogue = tmp_path / "copy" / "job.yaml", require_job(heap).catalogue
-    job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
-    for name, store in (("whole", heap), ("bare", LocalStore(tmp_path / "copy"))):
+    bare = without_sources(heap, tmp_path / "copy")
+    shutil.rmtree(bare.root / "assets")
+    for name, store in (("whole", heap), ("bare", bare)):
         manifest = export_to(store, tmp_path / name, "bop").manifest
         assert (manifest["pairs"], manifest["models"]) == (1, 3 if name == "whole" else 0)
         shots, views, seen = shots_of(tmp_path / name), views_by_place(store), 0

@@ -10,9 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from services.export.graphics import NO_SOURCES
-from services.job.record import require_job
-from tests.services.export.exported import export_to, source_poses, source_rows
-from workers.store.local import LocalStore
+from tests.services.export.exported import export_to, source_poses, source_rows, without_sources
 
 
 def read_glb(path):
@@ -63,16 +61,27 @@ def exported(pile, tmp_path_factory):
     return path, manifest
 
 
-def test_every_object_stands_where_its_row_puts_it_with_y_up(pile, exported):
+def colors_of(tree):
+    """The base colours, which glTF has linear."""
+    looks = [one["pbrMetallicRoughness"] for one in tree["materials"]]
+    return np.array([look.get("baseColorFactor", [1.0] * 4) for look in looks])
+
+
+def test_every_object_stands_where_its_row_puts_it_with_y_up_in_the_colours_of_its_stored_shape(pile, exported):
     path, manifest = exported
     assert (manifest["scenes"], sum(manifest["files"].values())) == (1, 1) and type(manifest["scenes"]) is int
-    nodes = placed(read_glb(path)[0])
+    tree, compared = read_glb(path)[0], 0
+    nodes, shown = placed(tree), colors_of(tree)
     (row,) = source_rows(pile.root, "scenes")
     for body in row["bodies"]:
         own = [T for name, T in nodes.items() if name.startswith(f"{body['category']} {body['instance_id']} ")]
         assert own
+        for factor in colors_of(read_glb(pile.root / f"assets/{body['category']}/{body['instance_id']}.glb")[0]):
+            assert np.abs(shown - factor).max(axis=1).min() <= 0.5 / 255 + 1e-6
+            compared += 0.05 < factor[0] < 0.95
         for T in own:
             np.testing.assert_allclose(T, Y_UP_FROM_Z_UP @ np.reshape(body["T_world_obj"], (4, 4)), atol=1e-6)
+    assert compared and any(name.startswith("floor/") for name in nodes)
     table = next(T for name, T in nodes.items() if name.startswith("table "))
     np.testing.assert_allclose(table, Y_UP_FROM_Z_UP @ np.reshape(row["T_world_table"], (4, 4)), atol=1e-6)
 
@@ -95,10 +104,8 @@ def test_captures_have_their_board_and_scenes_with_neither_shapes_nor_sources_ar
     assert [path.name for path in paths] == ["000000.glb", "000001.glb"]
     names = placed(read_glb(paths[0])[0])
     assert any(name.startswith("board ") for name in names) and any(name.startswith("mug ") for name in names)
-    shutil.copytree(pile.name, tmp_path / "copy")
-    job, catalogue = tmp_path / "copy" / "job.yaml", require_job(pile).catalogue
-    job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
-    assert export_to(LocalStore(tmp_path / "copy"), tmp_path / "stored", "gltf").manifest["pairs"] == 1
-    shutil.rmtree(tmp_path / "copy" / "assets")
-    manifest = export_to(LocalStore(tmp_path / "copy"), tmp_path / "none", "gltf").manifest
+    stored = without_sources(pile, tmp_path / "copy")
+    assert export_to(stored, tmp_path / "stored", "gltf").manifest["pairs"] == 1
+    shutil.rmtree(stored.root / "assets")
+    manifest = export_to(stored, tmp_path / "none", "gltf").manifest
     assert (manifest["pairs"], manifest["left_out"]) == (0, {NO_SOURCES: 1})

@@ -109,27 +109,15 @@ def nerf(shaped, tmp_path_factory):
     return folder, export_to(shaped, folder, "nerf").manifest
 
 
-def test_the_depth_of_a_view_carried_into_another_meets_its_depth(nerf):
+def test_input_and_mirror_views_are_trained_on_and_the_depth_cameras_are_held_out(nerf):
     folder, manifest = nerf
     paths = sorted(folder.glob("*/*/transforms.json"))
     assert len(paths) == sum(manifest["nerf_scenes"].values()) == manifest["scenes"] == 3 and manifest["frames"] == 9
     for path in paths:
-        splits = load_frames(path)
-        (first, back), (beside,) = splits["train"], splits["test"]
-        assert [frame.path.rpartition("_")[2] for frame in (first, back, beside)] == [
-            "input.png",
-            "mirror.png",
-            "aligned.png",
-        ]
-        assert splits["val"][0].path == beside.path and first.mask is None
-        for source, target in ((first, back), (back, first), (first, beside)):
-            points, _ = source.points()
-            pixel, depth = target.seen(points)
-            height, width = target.depth_m.shape
-            inside = ((pixel >= 0) & (pixel < (height, width))).all(axis=1) & (depth > 0)
-            gap = depth[inside] - target.depth_m[tuple(pixel[inside].T)]
-            assert inside.mean() > 0.1 and np.percentile(gap, 10) > -0.02, "nothing lies before what a view sees"
-            assert np.median(np.abs(gap)) < 0.004
+        names = {key: [frame.path.rpartition("_")[2] for frame in frames] for key, frames in load_frames(path).items()}
+        beside = ["aligned.png"]
+        assert names == {"train": ["input.png", "mirror.png"], "val": beside, "test": beside}
+    first = load_frames(paths[0])["train"][0]
     assert first.T_world_cam[2, 3] > 1.5 and first.T_world_cam[2, 2] > 0, "z is up, and a camera looks along -z"
 
 

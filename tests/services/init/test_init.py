@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from schemas.errors import AssetSourceError, MachineError
+from schemas.errors import AssetSourceError, MachineError, plural
 from schemas.job.assets import MeshLimits, ProceduralSource
 from services.cli.main import main
 from services.init import command, shown
@@ -28,7 +28,6 @@ from services.init.shown import (
     draw_object,
     draw_sheet,
     draw_table,
-    plural,
 )
 from services.job.job_file import load_job
 from tests.services.init.own_meshes import cup, mixed_folder, write_mesh

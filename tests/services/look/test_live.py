@@ -31,7 +31,6 @@ from services.look.live import (
     title_of,
 )
 from services.look.pictures import picture_of_colour
-from services.look.report import Section, View, live_page
 from services.look.server import HEADERS, Gate, Place, choose_place, is_host_known, is_loopback, is_same, judge, serving
 from services.merge.merge import merge
 from services.read.status import Running, Status
@@ -95,20 +94,6 @@ def test_the_live_section_tells_done_rate_time_left_failures_and_scenes_and_is_n
     assert "<li>job.yaml is &lt;broken&gt;</li>" in html and "<img" not in html
 
 
-def test_the_page_of_a_server_names_its_files_and_tells_whether_it_is_of_another_shape_or_version():
-    sections = (Section("one", "One", "<p>1</p>"), Section("two", "Two", ""))
-    view = View("small", "38% · small", "<p>now</p>", sections, 7)
-    html = live_page(view)
-    names = ("page.css", "three.js", "page.js", "space.js", "live.js", "icon.svg")
-    assert all(f'"/{name}"' in html for name in names)
-    assert "<style" not in html and " style=" not in html and "data:" not in html
-    assert 'data-version="7" data-shape="one"' in html and "<p>now</p>" in html and 'id="two"' not in html
-    state = view.state()
-    assert (state["version"], state["shape"], state["title"], state["live"]) == (7, "one", view.title, view.live)
-    fragments = view.fragments()["sections"]
-    assert list(fragments) == ["one"] and fragments["one"].startswith('<section id="one"')
-
-
 def test_the_oldest_pictures_leave_a_full_shelf():
     pictures = [picture_of_colour(np.full((64, 64, 3), shade, np.uint8), "") for shade in (0, 90, 180)]
     shelf = PictureShelf(2 * max(len(one.data) for one in pictures))
@@ -142,38 +127,24 @@ def test_a_folder_is_followed_from_nothing_to_its_report_and_a_thread_looks_by_i
     assert follower.view.shape == "overview scenes pictures compare space figures effects failures"
 
 
-def test_a_report_is_not_made_again_while_nothing_changes_nor_at_once(shown, monkeypatch):
-    made = []
-
-    def fails(*_):
-        made.append(1)
-        raise InputError("x")
-
-    monkeypatch.setattr(module, "read_report", fails)
-    follower = Follower(shown, 2)
-    follower.look()
-    follower.report()
-    follower.report()  # too soon
-    assert len(made) == 1 and follower.view.version == 0
-    follower._not_before = 0.0
-    follower.report()  # the last try failed
-    assert len(made) == 2
-    follower._reported, follower._not_before = (4, "finished"), 0.0
-    follower.report()  # nothing changed
-    assert len(made) == 2
-
-
-def test_what_is_finished_is_told_at_once_also_after_a_report_that_took_long(shown, monkeypatch):
-    follower, sections = Follower(shown, 2), []
+def test_a_report_is_made_again_only_after_a_change_and_a_while_but_at_once_when_all_is_finished(shown, monkeypatch):
+    follower, made = Follower(shown, 2), []
     begun = Progress("making", "x", Status(96, 80, {}, 16, 3.0, digest=None, running=(), holder=None))
-    monkeypatch.setattr(follower, "_read_sections", lambda: sections.append(follower._shown.done) or ())
-    for done, phase, expected in ((80, "making", [80]), (84, "making", [80]), (88, "finished", [80, 88])):
+
+    def told(done: int, phase: str = "making", sections: tuple | None = (), waited: bool = False) -> list[int]:
+        monkeypatch.setattr(follower, "_read_sections", lambda: made.append(done) or sections)
         follower._shown = replace(begun, status=replace(begun.status, made=done), phase=phase)
+        follower._not_before *= not waited
         follower.report()
-        assert sections == expected
-    follower._shown = replace(begun, status=replace(begun.status, made=96))  # somebody extends it
-    follower.report()
-    assert sections == [80, 88] and follower._not_before > time.monotonic() + 5
+        return list(made)
+
+    assert told(80, sections=None) == [80]
+    assert told(80) == [80]  # it failed, and the next try is too soon
+    assert told(80, waited=True) == [80, 80]
+    assert told(84) == [80, 80]  # too soon
+    assert told(88, "finished") == [80, 80, 88]
+    assert told(96) == [80, 80, 88] and follower._not_before > time.monotonic() + 5  # somebody extends it
+    assert told(88, "finished", waited=True) == [80, 80, 88]  # nothing changed since it succeeded
 
 
 # ---------------------------------------------------------------------------------------------- who may read
@@ -204,8 +175,8 @@ ASKED = (
 
 def test_reading_alone_is_answered_under_the_servers_own_names_and_with_its_token(monkeypatch):
     for gate, method, target, headers, status in ASKED:
-        assert judge(gate, method, target, {**HERE, **headers}).status == status, (method, target, headers)
-    assert judge(OPEN, "GET", "/live.json?x=1", HERE).path == "/live.json"
+        assert judge(gate, method, target, {**HERE, **headers})[0] == status, (method, target, headers)
+    assert judge(OPEN, "GET", "/live.json?x=1", HERE) == (200, "/live.json")
     assert all(is_host_known(host, OPEN.names) for host in OURS)
     assert not any(is_host_known(host, OPEN.names) for host in FOREIGN)
     compared = []
@@ -265,6 +236,7 @@ def first_line(port: int, request: bytes) -> bytes:
 def test_the_page_and_all_that_it_names_are_there(port):
     answer, data = ask(port, "/")
     assert (answer.status, answer.headers["Content-Type"]) == (200, "text/html; charset=utf-8")
+    assert b"<style" not in data and b" style=" not in data and b"data:" not in data  # the policy allows none
     named = set(re.findall(r'(?:src|href)="(/[^"]*)"', data.decode()))
     assert len([path for path in named if path.startswith("/picture/")]) >= 14
     for path in sorted(named):
@@ -275,18 +247,7 @@ def test_the_page_and_all_that_it_names_are_there(port):
     state, sections = (json.loads(ask(port, f"/{name}.json")[1]) for name in ("live", "sections"))
     assert state["name"] == "small" and "Finished" in state["live"]
     assert list(sections["sections"]) == state["shape"].split()
-
-
-def test_every_answer_has_the_headers_of_safety_and_a_head_no_body(port):
-    for path, method in (("/", "GET"), ("/nothing", "GET"), ("/", "POST"), ("/page.js", "HEAD")):
-        answer, _ = ask(port, path, method)
-        assert {name: answer.headers[name] for name in HEADERS} == HEADERS
-        assert "Python" not in answer.headers["Server"]
-    policy = HEADERS["Content-Security-Policy"]
-    assert "unsafe" not in policy and "default-src 'none'" in policy
-    answer, data = ask(port, "/page.css", "HEAD")
-    assert answer.status == 200 and data == b""
-    assert answer.headers["Content-Length"] == ask(port, "/page.css")[0].headers["Content-Length"]
+    assert f'data-version="{state["version"]}" data-shape="{state["shape"]}"'.encode() in data
 
 
 NOWHERE = (
@@ -296,7 +257,12 @@ NOWHERE = (
 )
 
 
-def test_nothing_is_written_no_path_leads_to_a_file_and_a_foreign_name_reads_nothing(port):
+def test_nothing_is_written_no_path_leads_to_a_file_and_every_answer_has_the_headers_of_safety(port):
+    for path, method in (("/", "GET"), ("/nothing", "GET"), ("/", "POST"), ("/page.css", "HEAD")):
+        answer, data = ask(port, path, method)
+        assert {name: answer.headers[name] for name in HEADERS} == HEADERS and "Python" not in answer.headers["Server"]
+    assert (answer.status, data) == (200, b"") and "unsafe" not in HEADERS["Content-Security-Policy"]
+    assert answer.headers["Content-Length"] == ask(port, "/page.css")[0].headers["Content-Length"]
     for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "PROPFIND"):
         answer, _ = ask(port, "/", method)
         assert (answer.status, answer.headers["Allow"]) == (405, "GET, HEAD")

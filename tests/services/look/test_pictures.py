@@ -12,6 +12,8 @@ import trimesh
 from PIL import Image
 
 from schemas.errors import MachineError
+from schemas.scene.view import MODALITIES, Modality
+from services.dataset.dataset import open_dataset
 from services.look import clouds as module
 from services.look.clouds import Body, Cloud, Space, coarsen, pack_spaces, read_space, read_spaces
 from services.look.pictures import (
@@ -20,14 +22,19 @@ from services.look.pictures import (
     OBJECT_REGIONS,
     choose_scenes,
     depth_span,
+    picture_of_codes,
     picture_of_colour,
     picture_of_depth,
     picture_of_projection,
     picture_of_regions,
+    picture_of_silhouettes,
+    series_of,
     show_scenes,
+    view_pictures,
 )
 from services.look.sections import space_html
 from services.look.sheets import compare_html, sheets_html
+from services.read.dataset_reader import find_scene
 from tests.services.look.conftest import HOSTILE, Handmade, address, scene
 
 VIRIDIS_ENDS = ((253, 231, 37), (68, 1, 84))
@@ -78,7 +85,7 @@ def test_a_large_picture_is_shrunk_and_its_address_holds_its_bytes():
 def test_each_category_has_as_many_scenes_evenly_over_its_ids_and_at_least_one():
     def chosen(categories: list[str], scenes: int) -> list[int]:
         rows = [{"scene_id": 10 + i, "category": name} for i, name in enumerate(categories)]
-        return choose_scenes(Handmade(scenes=rows), scenes)  # type: ignore[arg-type]
+        return choose_scenes(Handmade(scenes=rows), scenes)
 
     assert chosen(["mug", "box"] * 50, 6) == [11, 59, 109, 10, 58, 108]
     rare = ["mug"] * 30 + ["box"]
@@ -121,6 +128,77 @@ def test_sheets_and_the_slider_show_each_scene_that_has_the_pictures_and_no_mark
     assert "<script" not in sheets_html(hostile, address) + compare_html(hostile)
 
 
+# ---------------------------------------------------------------------------------------------- targets
+
+LAYERS, DEPTHS = ("layer1", "layer2", "back"), ("layer1_00000", "layer2_00000", "back00000")
+
+
+@pytest.fixture(scope="module")
+def shown_targets(targets):
+    return show_scenes(targets, [0])[0][0]
+
+
+def test_sixteen_bits_are_shown_as_colours_and_a_silhouette_as_an_outline_over_what_hides_it():
+    codes = np.array([[[0, 32768, 65535], [255, 256, 0x1234]]], np.uint16)
+    assert decoded(picture_of_codes(codes, "")).tolist() == [[[0, 128, 255], [0, 1, 0x12]]]
+    masks = np.zeros((2, 60, 80), np.uint8)
+    masks[0, 20:40, 20:60] = masks[1, :30, 50:] = 255
+    seen = decoded(picture_of_silhouettes(masks, np.full((60, 80, 3), 200, np.uint8), ""))
+    for (row, column), color in (((20, 30), OBJECT_REGIONS[0]), ((30, 30), (200,) * 3), ((29, 70), OBJECT_REGIONS[1])):
+        assert np.abs(seen[row, column] - color).max() < 40  # JPEG of a line
+    assert np.abs(seen[8, 70] - 200).max() < 12 and np.abs(seen[0, 70] - 200).max() < 12  # it goes on outside the image
+
+
+def test_every_image_that_a_view_stores_has_its_picture(targets, shown_targets):
+    views, _ = next(find_scene(targets, 0).pairs(0))
+    for role in ("input", "mirror"):
+        files = [file["path"] for file in views[role]["files"]]
+        whole = [path for path in files if "/patches/" not in path]
+        own = [name for name in shown_targets.pictures if name.startswith(f"{role} ")]
+        kinds = {name.split(" ")[1] for name in own}
+        assert len([name for name in own if not name.endswith(" patch")]) == len(whole) - 1 == 13  # one amodal of two
+        assert {*("rgb", "depth", "region", "normals", "coordinates", "albedo", "amodal"), *LAYERS} < kinds
+    stem = targets.root / "mug"
+    for name, file in (("mirror normals", "normals00001"), ("input coordinates patch", "patches/coordinates00000obj0")):
+        stored = cv2.imread(str(stem / f"{file}.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+        assert stored.dtype == np.uint16 and np.array_equal(decoded(shown_targets.pictures[name]), stored >> 8)
+    depth = np.stack([cv2.imread(str(stem / f"{name}.png"), cv2.IMREAD_UNCHANGED) for name in DEPTHS]) / 5000.0
+    low, high = np.percentile(depth[depth > 0], (1, 99))
+    words = [shown_targets.pictures[f"input {kind}"].words for kind in LAYERS]
+    assert words == [f"input view, {one}, {low:.2f} to {high:.2f} m" for one in ("layer 1", "layer 2", "back")]
+
+
+def test_a_new_modality_is_painted_and_compared_by_its_row_alone(monkeypatch):
+    for new in (
+        Modality("flow", "flow", "uint16", 3, target="normals"),
+        Modality("rim", "rim", "uint16", target="albedo"),
+    ):
+        monkeypatch.setitem(MODALITIES, new.name, new)
+    flow, rim = np.full((4, 4, 3), 0x8000, np.uint16), np.full((4, 4), 5000, np.uint16)
+    pictures = view_pictures("input", {"flow": flow, "rim": rim}, 5000.0)
+    assert (decoded(pictures["input flow"]) == 128).all() and pictures[
+        "input rim"
+    ].words == "input view, rim, 1.00 to 1.00 m"
+    html = compare_html([scene(3, "box", ("input rim", "mirror rim", "input rgb"))])
+    assert re.findall(r'data-kind="([^"]*)"', html) == ["rim"]
+
+
+def test_images_of_one_target_share_a_button_and_a_slider_and_without_targets_the_page_has_neither(shown_targets):
+    assert series_of(MODALITIES)["layers"][-2:] == ("layer16", "back")
+    html = compare_html([shown_targets])
+    buttons = dict(re.findall(r'data-kind="([^"]*)" aria-pressed="\w+">([^<]*)<', html))
+    assert buttons["layer1 layer2 back"] == "layers" and buttons["normals"] == "normals" and buttons["rgb"] == "RGB"
+    assert buttons["layer1_region layer2_region back_region"] == "regions of layers"
+    assert 'id="wipe-member"' in html and 'id="wipe-close"' in html
+    sheet = sheets_html([shown_targets], address)
+    assert sorted(re.findall(r'data-name="([^"]*)"', sheet)) == sorted(shown_targets.pictures)
+    assert sheet.count('class="cells targets"') == 3 and "<details>" in sheet
+    plain = [scene(3, "box", ("input rgb", "mirror rgb", "input rgb patch", "mirror rgb patch"))]
+    html = compare_html(plain)
+    assert re.findall(r'data-kind="([^"]*)"', html) == ["rgb"]
+    assert "wipe-member" not in html and "wipe-close" not in html and "targets" not in sheets_html(plain, address)
+
+
 # ---------------------------------------------------------------------------------------------- in space
 
 
@@ -129,23 +207,19 @@ def space(shown):
     return read_space(shown, 1)
 
 
-def test_the_clouds_lie_on_the_mesh_as_a_ray_caster_finds_it_on_both_sides_of_the_object(space):
+def test_clouds_and_meshes_are_those_of_the_pair_in_the_world(shown, space):
+    (pair, *_) = open_dataset(shown.root).scene(1)
     assert [cloud.role for cloud in space.clouds] == ["input", "mirror"]
-    assert {body.kind for body in space.bodies} == {"object", "table"}
-    mesh = trimesh.util.concatenate([trimesh.Trimesh(one.vertices, one.faces, process=False) for one in space.bodies])
     for cloud in space.clouds:
-        above = cloud.points[cloud.points[:, 2] > 0.3]  # table and object: the floor has no mesh
-        eye = cloud.T_world_cam[:3, 3]
-        rays = above - eye
-        far = np.linalg.norm(rays, axis=1)
-        places = np.tile(eye, (len(rays), 1))
-        hit, of, _ = mesh.ray.intersects_location(places, rays / far[:, None], multiple_hits=False)
-        found = np.full(len(rays), np.inf)
-        found[of] = np.linalg.norm(hit - eye, axis=1)
-        assert len(above) > 500 and np.quantile(np.abs(found - far), 0.97) < 0.002
-        assert np.linalg.norm(cloud.points - space.target, axis=1).min() < 0.15
-    eyes = [cloud.T_world_cam[:2, 3] - space.target[:2] for cloud in space.clouds]
-    assert eyes[0] @ eyes[1] < 0
+        whole = pair.views[cloud.role].cloud("world", None)
+        near = np.hypot(*(whole.points - space.target)[:, :2].T) < module.REACH_M
+        assert len(cloud.points) == near.sum() > 500  # by region
+        order = [np.lexsort(points.T) for points in (cloud.points, whole.points[near])]
+        np.testing.assert_array_equal(cloud.points[order[0]], whole.points[near][order[1]])
+        np.testing.assert_array_equal(cloud.colors[order[0]], whole.colours[near][order[1]])
+    for region, kind in ((2, "table"), (3, "object")):
+        corners = np.concatenate([body.vertices for body in space.bodies if body.kind == kind])
+        np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], pair.mesh(region).bounds, atol=1e-6)
 
 
 def test_of_too_many_points_those_of_objects_stay_and_a_mesh_of_too_many_faces_keeps_its_shape(

@@ -17,7 +17,7 @@ from services.queue.queue import open_queue
 from services.run.lock import read_holder
 from tests.datasets import run_here
 from tests.kit.killed_runs import processes_with, wait_for
-from tests.kit.ray_head import ROOT, RayHead, ray_head
+from tests.kit.ray_head import ROOT, BareCluster, bare_cluster
 
 TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
 SCENES, MANY = 4, 4000
@@ -26,19 +26,23 @@ SLOWLY = [*("--set", "run.range_size=1"), *("--set", "run.shard_size=1"), *("--s
 HOSTILE = "o $(touch x) `touch x`; touch x 'y' \"z\""
 
 
-def verso(head: RayHead, *words: str, **changes: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-P", "-m", "services.cli.main", *words]
-    environment = {**head.environment, **changes}
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-
-
 @contextlib.contextmanager
-def supervisor(head: RayHead, queue: str, log: Path) -> Iterator[subprocess.Popen]:
+def supervisor(head: BareCluster, queue: str, log: Path) -> Iterator[subprocess.Popen]:
     """`verso supervise` as a process; killed with -9 in the end, if it lives."""
-    command = [sys.executable, "-P", "-m", "services.cli.main", "supervise", "--queue", queue, "--address", head.http]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "services.cli.main",
+        "supervise",
+        "--queue",
+        queue,
+        "--address",
+        head.dashboard,
+    ]
     command += ["--driver", str(log.with_name("driver"))]
     with log.open("ab") as words:
-        process = subprocess.Popen(command, cwd=ROOT, env=head.environment, stdout=words, stderr=words)
+        process = subprocess.Popen(command, cwd=ROOT, env=head.shell, stdout=words, stderr=words)
     try:
         wait_for(lambda: is_at_work(queue, process), log.read_text)
         yield process
@@ -52,7 +56,7 @@ def is_at_work(queue: str, process: subprocess.Popen) -> bool:
     return process.poll() is None and holder is not None and holder.pid == process.pid
 
 
-def kill_driver(head: RayHead, job: str) -> None:
+def kill_driver(head: BareCluster, job: str) -> None:
     """Kills the innermost process of a job's `verso drive`, the one that gives work to Ray."""
     ours = [process.pid for process in processes_with(head.mark) if f" drive {job} " in process.name]
     threads = {pid: len(list(Path(f"/proc/{pid}/task").iterdir())) for pid in ours}
@@ -88,16 +92,16 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
     (tmp_path / "driver").write_text(DRIVER.format(python=sys.executable, gate=str(gate)))
     (tmp_path / "driver").chmod(0o755)
 
-    with ray_head(2) as head:
+    with bare_cluster(dashboard=True) as head:
 
         def submit(out: str, priority: int, scenes: int) -> str:
             words = ["--out", str(tmp_path / out), "--priority", str(priority), "--scenes", str(scenes), *SLOWLY]
-            done = verso(head, "submit", str(TABLETOP), *words, VERSO_QUEUE=queue)
+            done = head.verso("submit", str(TABLETOP), *words, VERSO_QUEUE=queue)
             assert "no supervisor is running" in done.stderr
             return done.stdout.strip()
 
         def rows() -> dict[str, dict[str, Any]]:
-            told = verso(head, "jobs", "--queue", queue, "--json").stdout
+            told = head.verso("jobs", "--queue", queue, "--json").stdout
             return {row["id"]: row for row in json.loads(told.splitlines()[-1])["jobs"]}
 
         waiting, cancelled, killed = (
@@ -112,7 +116,7 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
         }
         read = open_queue(queue).read
 
-        refused = verso(head, "supervise", "--queue", queue, "--address", head.http, RAY_AUTH_TOKEN="b" * 64)
+        refused = head.verso("supervise", "--queue", queue, "--address", head.dashboard, RAY_AUTH_TOKEN="b" * 64)
         assert (refused.returncode, refused.stderr.count("\n")) == (1, 1)
         assert "RAY_AUTH_TOKEN" in refused.stderr
 
@@ -128,11 +132,11 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
             before = commits(cancelled)
             wait_for(lambda: commits(cancelled) > before, log.read_text)
             assert read(waiting).state == "queued"  # although it is the oldest
-        told = verso(head, "cancel", cancelled, "--queue", queue)
+        told = head.verso("cancel", cancelled, "--queue", queue)
         assert (told.returncode, told.stdout) == (0, f"{cancelled}: cancelling\n")
 
         with supervisor(head, queue, log) as second:
-            again = verso(head, "supervise", "--queue", queue, "--address", head.http)
+            again = head.verso("supervise", "--queue", queue, "--address", head.dashboard)
             assert again.returncode == 1 and "another supervisor works here" in again.stderr
             wait_for(lambda: all(read(job).ended for job in (killed, cancelled, waiting)), log.read_text)
             wait_for(lambda: open_queue(queue).has_log(killed, 2), log.read_text)
@@ -150,7 +154,7 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
         assert (found[killed]["digest"], found[waiting]["digest"]) == (digest, digest)
         assert (found[killed]["scenes_done"], found[waiting]["scenes_done"]) == (SCENES, SCENES)
         assert not [one for one in processes_with(head.mark) if " drive " in one.name]
-    logs = verso(head, "logs", killed, "--queue", queue, "--address", head.http)  # the cluster is gone
+    logs = head.verso("logs", killed, "--queue", queue, "--address", head.dashboard)  # the cluster is gone
     assert logs.stdout.index("--- attempt 1 ---") < logs.stdout.index("--- attempt 2 ---")
     assert f"dataset digest {digest}" in logs.stdout
     assert not list(tmp_path.rglob("x")) and not (ROOT / "x").exists()

@@ -142,7 +142,7 @@ def check_ends(world: World) -> None:
 
 def at_each_step(tmp_path, happens) -> None:
     """Plays the world once for each of its effects; `happens(world, supervisors)` at this effect; the last one looks."""
-    whole, effects, said = world_of(tmp_path / "whole"), [], []
+    whole, effects, said = world_of(tmp_path / "whole"), list[int](), list[str]()
     whole.effect = lambda: effects.append(whole.ticks)
     supervisor = whole.supervisor(said.append)
     supervisor.look()

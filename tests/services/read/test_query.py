@@ -245,14 +245,6 @@ def test_a_long_answer_leaves_in_pieces_before_it_is_whole(monkeypatch):
 
         write_rows(pa.RecordBatchReader.from_batches(schema, batches()), style, pipe)
         assert seen == sorted(seen) and seen[-1] > len(pipe.data) / 2 and pipe.largest < len(pipe.data) / 4
-        if style == "parquet":
-            read = pq.read_table(pa.BufferReader(pipe.data)).to_pylist()
-        elif style == "json":
-            read = json.loads(pipe.data)
-        else:
-            table = csv.DictReader(io.StringIO(pipe.data.decode()))
-            read = [{"n": int(row["n"]), "word": row["word"]} for row in table]
-        assert read == [{"n": n, "word": f"word {n}"} for n in range(20_000)]
 
 
 ASK = """

@@ -105,8 +105,8 @@ def test_a_file_of_samples_that_is_damaged_or_another_is_named_and_nothing_of_it
         "not a zip file": data[:-40],
         "CRC-32": data[:1000] + bytes([data[1000] ^ 1]) + data[1001:],
         "would unpack to 30,": packed.getvalue(),
-        "cannot reshape": lying.getvalue(),
-        "OBJECT": encode({**good, "scale": np.array(None)}),
+        "(EOF|Unable to allocate)": lying.getvalue(),
+        "allow_pickle=False": encode({**good, "scale": np.array(None)}),
         "has loc, not surface_points, .*, scale": encode({"loc": good["loc"]}),
         "has surface_points, .*, not .*scale": encode({name: good[name] for name in good if name != "volume_distance"}),
         f"surface_colors is .u1 .9, 3., not .u1 .{POINTS}, 3": encode(

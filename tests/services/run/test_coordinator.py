@@ -6,22 +6,18 @@ import signal
 import subprocess
 import time
 from collections import Counter
-from typing import cast
 
 import obstore.store
 import pytest
 
 from schemas.dataset.commit import Span
-from schemas.dataset.shard import Fingerprint, ShardOrder, ShardReport, SpanReport
+from schemas.dataset.shard import Fingerprint, ShardReport, SpanReport
 from schemas.errors import RunError
-from services.job.job_file import validate_job
 from services.run import coordinator as module
 from services.run.coordinator import (
     LOOK_EVERY_S,
     NODE_PATIENCE,
-    Coordinator,
     Deaths,
-    Limits,
     count_under_way,
     hosts_of,
 )
@@ -39,9 +35,9 @@ from services.run.watchdog import (
     scenes_in_progress,
     watch,
 )
-from services.run.worker_entry import Pattern, WorkerTerms
+from services.run.worker_entry import WorkerTerms
+from tests.kit.made_up_runs import coordinator_of
 from tests.made_up_scenes import small_scene, terms
-from workers.assets.catalogue import Catalogue
 from workers.store import attempt as module_store
 from workers.store.attempt import Attempt, begin_attempt
 from workers.store.local import LocalStore
@@ -91,13 +87,10 @@ def handed_out(monkeypatch, tmp_path):
             shards[name] = pickle.loads(order).spans
             return name
 
-    monkeypatch.setattr(module.ray, "put", lambda value: "catalogue")
     monkeypatch.setattr(module, "_shard_task", lambda env_vars, num_gpus: Task)
-    order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
-    pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
     slots = [1]
     looking = Slots(1, 1, lambda: Slots(slots[0], slots[0]))
-    return Coordinator(LocalStore(tmp_path), pattern, Limits(looking, 1, 0), Tally(asked=8)), shards, slots
+    return coordinator_of(LocalStore(tmp_path), monkeypatch, looking, attempts=1), shards, slots
 
 
 def test_what_a_node_that_is_to_end_gives_back_is_handed_out_again_without_counting_a_death(handed_out, monkeypatch):

@@ -14,8 +14,8 @@ from services.run.ray_cluster import RAY_PARTS, private_ray, share_gpus
 from services.run.run_job import RunRequest
 from services.run.worker_entry import enter_shard
 from tests.datasets import SMALL, overlaid, run_here
-from workers.render.raster import context, devices, gbuffer
-from workers.render.raster.devices import GraphicsDevice
+from workers.render.raster import context, gbuffer
+from workers.render.raster.context import GraphicsDevice
 
 
 def test_shards_have_parts_of_gpus_that_leave_no_core_idle_and_no_gpu_unused():
@@ -43,7 +43,7 @@ def test_shards_have_parts_of_gpus_that_leave_no_core_idle_and_no_gpu_unused():
 
 def enter_on_simulated_gpus(folder: Path, *arguments):
     """What a worker does: its list of devices is made up, and it notes which of them it drew on."""
-    egl: Any = devices.load_egl()
+    egl: Any = context.load_egl()
     (own, *_), lists = egl.query_devices(), cast(Any, context)
     egl.get_device_by_index = lambda index: own
     lists.list_devices = lambda: tuple(GraphicsDevice(2 - n, f"card{n}", True, n) for n in range(2))

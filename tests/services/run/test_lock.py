@@ -3,8 +3,6 @@
 import contextlib
 import json
 import os
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import replace
@@ -16,18 +14,10 @@ from schemas.errors import MachineError, RunError
 from services.run import lock as module
 from services.run.lock import Beat, Holder, explain_lost_folder, hold_lock, read_holder
 from tests.kit.faults import STILL, in_threads, taken_over
+from tests.kit.killed_runs import holding
 from workers.store.local import LocalStore
 
 FAST = Beat(period_s=0.05, patience=4)
-
-HOLD = """
-import sys, time
-from services.run.lock import Beat, hold_lock
-from workers.store.local import LocalStore
-with hold_lock(LocalStore(sys.argv[1]), beat=Beat(0.05, 4)):
-    print("held", flush=True)
-    time.sleep(60)
-"""
 
 
 @pytest.fixture
@@ -64,16 +54,11 @@ def test_a_lock_is_there_while_it_is_held_and_gone_afterwards_also_after_an_erro
 
 
 def test_a_second_process_is_refused_at_once_naming_the_first_and_takes_over_at_once_where_it_was_killed(store):
-    process = subprocess.Popen([sys.executable, "-c", HOLD, str(store.root)], stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout.readline() == "held\n"
+    with holding(store.root) as process:
         begun = time.monotonic()
         refusal = f"in use by process {process.pid} on .*wait until it ends or stop it"
         with pytest.raises(RunError, match=refusal), hold_lock(store, beat=Beat(period_s=30.0)):
             pass
-    finally:
-        process.kill()
-        process.communicate()
     with hold_lock(store, beat=Beat(period_s=30.0)):
         assert read_holder(store).pid == os.getpid()
     assert time.monotonic() - begun < 5

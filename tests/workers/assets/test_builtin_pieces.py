@@ -241,14 +241,6 @@ def test_a_stretched_lattice_keeps_its_points_and_lies_between_them_otherwise(sm
     assert plane[[1, 2, 9], 0] == pytest.approx([8.0 * quarter, 4.0, 4.0 - 4.0 * quarter])
 
 
-def test_noise_is_smooth_within_its_bounds_and_repeats_in_both_directions():
-    plane = materials.noise(np.random.default_rng(3), 64, 96, 4, 6)
-    assert plane.shape == (64, 96) and 0.0 <= plane.min() < 0.3 < 0.7 < plane.max() <= 1.0
-    for axis in (0, 1):
-        step = np.abs(np.diff(np.concatenate([plane, plane.take([0], axis)], axis), axis=axis))
-        assert step.max() < 0.12
-
-
 def test_every_picture_is_small_of_bytes_has_more_than_one_colour_and_comes_again():
     for draw in (
         lambda rng: materials.wood(rng, A, B, planks=4),

@@ -16,7 +16,7 @@ from shapely.geometry import Polygon
 
 from schemas.job.assets import CATEGORIES, ProceduralSource, instance_id
 from tests.workers.door.oracles import faulty_rays, hits, support_margin, welded
-from workers.assets.builtin import bottle, box, camera, can, crockery, laptop, table
+from workers.assets.builtin import box, camera, closed_vessels, laptop, open_vessels, table
 from workers.assets.builtin.make import make_asset, make_model, shape_digest
 from workers.assets.builtin.solid import Solid, union
 from workers.assets.builtin.sweeps import INSIDE, OUTSIDE
@@ -127,8 +127,8 @@ def check_bottle(solid: Solid) -> None:
     """It narrows from its body to its neck and is closed by a cap."""
     height, cap, body = (
         solid.vertices[:, 2].max(),
-        points_of(solid, bottle.CAP),
-        points_of(solid, bottle.BODY, bottle.LABEL),
+        points_of(solid, closed_vessels.CAP),
+        points_of(solid, closed_vessels.BODY, closed_vessels.LABEL),
     )
     assert cap[:, 2].max() == height and cap[:, 2].min() > 0.45 * height
     assert np.ptp(cap[:, 0]) <= np.ptp(body[:, 0]) * 1.001
@@ -167,10 +167,10 @@ def check_camera(solid: Solid) -> None:
 def check_can(solid: Solid) -> None:
     """It is round, and its lid lies below its rim unless it has a cap."""
     extent, top = np.ptp(solid.vertices, axis=0), solid.vertices[:, 2].max()
-    assert extent[0] == pytest.approx(extent[1], rel=1e-9) and (solid.surface == can.SIDE).any()
+    assert extent[0] == pytest.approx(extent[1], rel=1e-9) and (solid.surface == closed_vessels.SIDE).any()
     distances, _ = hits(solid.vertices, solid.faces, np.array([1e-4, 2e-4, 1.0]), DOWN)
     middle = 1.0 - distances[0]
-    assert middle == pytest.approx(top) if (solid.surface == can.TOP).any() else middle < top - 0.0008
+    assert middle == pytest.approx(top) if (solid.surface == closed_vessels.TOP).any() else middle < top - 0.0008
 
 
 def check_jar(solid: Solid) -> None:
@@ -196,7 +196,7 @@ def check_mug(solid: Solid) -> None:
     inner, outer = bottom(solid)
     height = solid.vertices[:, 2].max()
     assert 0.0 <= outer < 0.003 and inner < 0.15 * height
-    handle, hollow = points_of(solid, crockery.HANDLE), points_of(solid, INSIDE)
+    handle, hollow = points_of(solid, open_vessels.HANDLE), points_of(solid, INSIDE)
     for low, high in ((0.1, 0.5), (0.5, 0.9)):  # compare radii at like heights
         at = [p[(p[:, 2] >= low * height) & (p[:, 2] <= high * height)] for p in (handle, hollow)]
         if len(at[0]) and len(at[1]):

@@ -55,7 +55,7 @@ class Flaw:
 def directions(rng: Random, count: int = 1) -> Array:
     """[count, 3] unit vectors."""
     v = rng.standard_normal((count, 3))
-    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
+    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True), np.float64)
 
 
 def numbers(camera: CaptureCamera, **changed: float) -> CaptureCamera:
@@ -98,7 +98,7 @@ def fisheye(rng: Random) -> Flaw:
         i, T = camera.intrinsics, invert(T)
         K = np.array([[i.fx, 0, i.cx - 0.5], [0, i.fy, i.cy - 0.5], [0, 0, 1]])
         at, _ = cv2.fisheye.projectPoints(points.reshape(-1, 1, 3), cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], K, k)
-        return at.reshape(-1, 2) + 0.5
+        return np.asarray(at.reshape(-1, 2) + 0.5, np.float64)
 
     return Flaw(true, true, pixels=pixels)
 
@@ -190,9 +190,9 @@ CAUSES: dict[str, tuple[Callable[[Random], Flaw], str]] = {
     "rolling shutter": (rolling, "rows"),
     "bent board": (bent, "bent"),
     "stretched print": (stretched, "stretched"),
-    "print scale": (print_scale, "ruler"),
+    "print scale": (print_scale, "ruler scale"),
     "depth late": (late, "moment"),
-    "depth of the next view": (swapped, "swapped"),
+    "depth of the next view": (swapped, "moment swapped"),
     "object moved": (object_moved, "moved"),
     "object moved and principal point": (moved_and_centre, "camera moved"),
 }
@@ -294,9 +294,12 @@ def messages(evidence: Evidence) -> tuple[str, CaptureEstimate | None]:
 
 def median_mm(estimate: CaptureEstimate, truth: list[Pose]) -> tuple[float, float]:
     """(error, sigma) of the positions of cameras, medians."""
-    views = [view for view in estimate.views if view.T_board_cam is not None and view.covariance is not None]
-    off = [errors(view.T_board_cam, truth[view.number])[0] for view in views]
-    return float(np.median(off)), float(np.median([1000 * np.sqrt(np.trace(v.covariance[:3, :3])) for v in views]))
+    off, sigma = [], []
+    for view in estimate.views:
+        if view.T_board_cam is not None and view.covariance is not None:
+            off.append(errors(view.T_board_cam, truth[view.number])[0])
+            sigma.append(1000 * np.sqrt(np.trace(view.covariance[:3, :3])))
+    return float(np.median(off)), float(np.median(sigma))
 
 
 COVERED, WORSE, WORSE_MM = 2.0, 1.1, 0.05

@@ -12,6 +12,7 @@ from PIL import Image
 
 from schemas.errors import CaptureError, InputError
 from schemas.job.captures import GRID_KEYS, Board
+from tests.workers.capture.drawn import PINHOLE
 from workers.capture.board import (
     board_geometry,
     frame_in_board,
@@ -128,7 +129,7 @@ def test_kalibrs_grid_is_found_where_its_target_file_has_it(tmp_path):
     for blur_px in (0.5, 1.5):
         light = cv2.GaussianBlur(0.02 + 0.8 * (picture / 255.0), (0, 0), blur_px)
         blurred = np.rint(255 * encode_srgb(light)).astype(np.uint8)
-        found = detect_markers(np.repeat(blurred[..., None], 3, 2), board, open_dictionary(board))
+        found = detect_markers(np.repeat(blurred[..., None], 3, 2), board, open_dictionary(board), PINHOLE)
         assert found.ids.tolist() == [0, 1, 2, 3] and not found.dropped
         points = transform(T_kalibr_board, geometry.corners.reshape(-1, 3))
         expected = points[:, :2] @ from_kalibr[:, :2].T + from_kalibr[:, 2]

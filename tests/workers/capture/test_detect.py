@@ -17,7 +17,17 @@ from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Intrinsics
 from services.cli.main import main
 from tests.conftest import SHARED_DATA
-from tests.workers.capture.drawn import HALF, KINECT, errors, hand_held, photograph, printed, project, true_corners
+from tests.workers.capture.drawn import (
+    HALF,
+    KINECT,
+    PINHOLE,
+    errors,
+    hand_held,
+    photograph,
+    printed,
+    project,
+    true_corners,
+)
 from tests.workers.capture.simulated import asset_of, corner_errors_at, take_one
 from workers.capture.board import board_geometry, frame_in_board, marker_corners, open_dictionary
 from workers.capture.board_kinds import KINDS, BoardSizes
@@ -76,7 +86,7 @@ def test_corners_lie_where_a_homography_puts_them_in_a_quarter_of_a_second_at_mo
     for T in hand_held(rng, 3):
         picture = photograph(BOARD, T, KINECT, rng)
         begun = time.process_time()
-        found = detect_markers(picture, BOARD, DICTIONARY)
+        found = detect_markers(picture, BOARD, DICTIONARY, PINHOLE)
         seconds.append(time.process_time() - begun)
         assert len(found.ids) >= 33 and found.dropped == ()
         points = marker_corners(BOARD)[found.ids].reshape(-1, 3)
@@ -87,17 +97,19 @@ def test_corners_lie_where_a_homography_puts_them_in_a_quarter_of_a_second_at_mo
     assert min(seconds) < 0.25
 
 
-def test_markers_that_are_seen_twice_or_are_not_on_the_board_are_dropped():
+def test_of_a_marker_seen_twice_the_copy_in_its_place_is_kept_and_others_than_the_boards_are_dropped():
     rng = np.random.default_rng(5)
     T, twice = hand_held(rng, 1)[0], printed(BOARD).copy()
     twice[80:320, 440:680] = twice[80:320, 120:360]  # marker 0 where marker 1 was
-    found = detect_markers(photograph(BOARD, T, KINECT, rng, picture=twice), BOARD, DICTIONARY)
-    assert 0 not in found.ids and 1 not in found.ids and found.dropped == ("marker 0 was seen 2 times",)
+    found = detect_markers(photograph(BOARD, T, KINECT, rng, picture=twice), BOARD, DICTIONARY, PINHOLE)
+    assert found.ids[0] == 0 and 1 not in found.ids and found.dropped == ("marker 0 was seen 2 times",)
+    off = found.corners_px[0] - true_corners(marker_corners(BOARD)[0], T, KINECT)
+    assert np.abs(off).max() < 0.3 and not found.others
     smaller = Board(columns=7, rows=5, first_id=3)
-    found = detect_markers(photograph(BOARD, T, HALF, rng), smaller, open_dictionary(smaller))
+    found = detect_markers(photograph(BOARD, T, HALF, rng), smaller, open_dictionary(smaller), PINHOLE)
     assert found.ids.min() == 3
     assert set(found.dropped) == {f"marker {n} is not on the board (3 to 37)" for n in (0, 1, 2)}
-    found = detect_markers(np.full((540, 960, 3), 120, np.uint8), BOARD, DICTIONARY)
+    found = detect_markers(np.full((540, 960, 3), 120, np.uint8), BOARD, DICTIONARY, PINHOLE)
     assert found.ids.shape == (0,) and found.corners_px.shape == (0, 4, 2)
 
 
@@ -158,7 +170,7 @@ def simulated_views(board, seed):
     poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
     for number, T in enumerate(poses):
         rgb = encode_codes(take_light(studio, number, studio.T_world_board @ T))
-        found = detect_markers(rgb, board, open_dictionary(board), number)
+        found = detect_markers(rgb, board, open_dictionary(board), setup.camera, number)
         yield T, found, *observe_view(found, None, setup), in_sight(board, studio, T, setup.camera), setup
 
 
@@ -269,7 +281,7 @@ def estimated():
     height, width = rgb.shape[:2]
     k = Intrinsics(width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + 0.5, cy=K[1, 2] + 0.5)
     camera = CaptureCamera(k, np.concatenate([lens, np.zeros(3)]))
-    found = detect_markers(rgb, REAL, open_dictionary(REAL, FOLDER))
+    found = detect_markers(rgb, REAL, open_dictionary(REAL, FOLDER), camera)
     setup = Setup(camera, REAL, Estimation())
     seen, by_markers = observe_view(found, None, setup)
     return camera, found, estimate_markers(Evidence.of(setup, [seen], [by_markers])).views[0]

@@ -81,7 +81,7 @@ def test_depth_is_the_scenes_in_the_colour_camera(whole):
 
 def test_markers_of_an_imported_view_are_where_the_pose_puts_them(whole):
     _, folder = whole
-    found = detect_markers(read_view(folder, 1).rgb, BOARD, open_dictionary(BOARD))
+    found = detect_markers(read_view(folder, 1).rgb, BOARD, open_dictionary(BOARD), folder.camera)
     T, k = np.linalg.inv(poses(COUNT)[1]), folder.camera.intrinsics
     matrix = np.array([[k.fx, 0, k.cx_opencv], [0, k.fy, k.cy_opencv], [0, 0, 1]])
     points = marker_corners(BOARD)[found.ids].reshape(-1, 3)

@@ -9,9 +9,9 @@ import pytest
 
 from schemas.capture import CaptureCamera
 from schemas.errors import CaptureError
-from schemas.job.captures import Captures, Simulate
+from schemas.job.captures import Board, Captures, Estimation, Simulate
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from services.cli.main import main
 from tests.workers.capture.drawn import errors
 from tests.workers.capture.simulated import asset_of
@@ -19,21 +19,26 @@ from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.folder import CaptureFile, write_description, write_view
 from workers.capture.process import process_folder
 from workers.capture.simulate.simulate import photograph
-from workers.capture.simulate.studio import build_studio, place_object, plan_path
+from workers.capture.simulate.studio import board_body, build_studio, place_object, plan_path
+from workers.geometry.camera import look_at
+from workers.geometry.frames import UP, pose, rotation_about
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
 
 
-def photographed(path, board, given=None, views=3, beside=lambda number: (), seed=11):
-    """The true poses of photographs of a can on a board, which board.json gives as `given`; `beside`: what else each shows."""
+def photographed(path, board, given=None, views=3, beside=lambda number: (), more=(), seed=11):
+    """The true poses of photographs of a can on a board, which board.json gives as `given`; `beside`: what else each shows.
+
+    `more`: further poses.
+    """
     simulate, chance, thing = Simulate(views=views, image_scale=0.5), SceneChance(seed, 0), asset_of()
     placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
     studio = build_studio(simulate, board, placed, plan_capture(simulate), chance)
-    poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
+    poses = [*plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA)), *more]
     path.mkdir(parents=True, exist_ok=True)
     for number, T in enumerate(poses):
-        more = (replace(o, T_world_shape=studio.T_world_board @ o.T_world_shape) for o in beside(number))
-        write_view(path, photograph(replace(studio, things=(*studio.things, *more)), number, T)[0])
+        things = (replace(o, T_world_shape=studio.T_world_board @ o.T_world_shape) for o in beside(number))
+        write_view(path, photograph(replace(studio, things=(*studio.things, *things)), number, T)[0])
     write_description(path, CaptureFile(name="x"), CaptureCamera(studio.rig.color, np.zeros(8)), given or board)
     return poses
 
@@ -73,3 +78,46 @@ def test_a_board_that_is_not_board_jsons_is_named_and_the_command_that_is_printe
     assert main(shlex.split(command[1])) == 0
     used = process_folder(tmp_path, Captures()).estimates.estimate.used
     assert len(used) == len(poses) and max(errors(v.T_board_cam, poses[v.number])[0] for v in used) < 1.0
+
+
+# ---------------------------------------------------------------------------------------------- a second print
+
+
+def print_of(board, place_m, turn_deg=0.0, tilt_deg=0.0, size=1.0):
+    """A print of the board, `size` times as large, that lies or stands elsewhere."""
+    body = board_body(board.model_copy(update={"measured_ruler_m": size * board.ruler_m}))
+    R = rotation_about(UP, np.radians(turn_deg)) @ rotation_about(np.array([1.0, 0, 0]), np.radians(tilt_deg))
+    return Placed(REGION_TABLE, body, pose(R, np.array(place_m)))
+
+
+BESIDE = print_of(Board(), (0.5, 0.12, -0.003), 35)
+SECONDS = {
+    "beside the board": lambda n: [BESIDE],
+    "in some views, moved between two": lambda n: [[], [BESIDE], [print_of(Board(), (-0.3, 0.45, 0.0), 80)]][n % 3],
+    "half below the board": lambda n: [print_of(Board(), (0.4, 0.0, -0.004), 0)],
+    "larger": lambda n: [print_of(Board(), (0.2, 0.62, -0.003), 10, 0, 1.41)],
+    "on a screen that stands": lambda n: [print_of(Board(), (0.0, 0.4, 0.12), 0, 70, 0.5)],
+    "turned by half a turn": lambda n: [print_of(Board(), (0.0, 0.45, 0.0), 180)],
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if n == 1 else pytest.mark.minute) for n, name in enumerate(SECONDS)]
+)
+def test_of_two_prints_in_view_the_one_that_the_object_stands_on_is_the_board(name, tmp_path):
+    poses = photographed(tmp_path, Board(), views=6, beside=SECONDS[name])
+    made = process_folder(tmp_path, Captures(estimation=Estimation(compare=True)))
+    for estimate in (made.estimates.estimate, made.estimates.by_name["markers"]):
+        off = [errors(v.T_board_cam, poses[v.number])[0] for v in estimate.used]
+        assert len(off) == len(poses) and max(off) < 0.3
+    assert "a second print of the board is in view" in made.estimates.estimate.notes[0]
+
+
+def test_a_view_of_the_second_print_alone_has_no_pose(tmp_path):
+    aside = look_at(np.array([0.75, 0.3, 0.25]), np.array([0.68, 0.28, 0.0]))
+    poses = photographed(tmp_path, Board(), views=3, beside=lambda n: [BESIDE], more=[aside])
+    made = process_folder(tmp_path, Captures(estimation=Estimation(compare=True)))
+    for estimate in (made.estimates.estimate, made.estimates.by_name["markers"]):
+        assert [v.number for v in estimate.used] == [0, 1, 2]
+        assert max(errors(v.T_board_cam, poses[v.number])[0] for v in estimate.used) < 0.3
+        assert estimate.views[3].markers > 10 and "nothing stands on the one it shows" in estimate.views[3].reasons[0]

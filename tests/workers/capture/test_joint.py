@@ -24,8 +24,8 @@ from workers.capture.poses.joint import (
     ObjectTerm,
     inflation,
 )
-from workers.capture.poses.moments import object_groups
 from workers.capture.poses.observation import Patches
+from workers.capture.poses.standing import object_groups
 from workers.capture.poses.terms import (
     Shared,
     motion_between,
@@ -202,15 +202,15 @@ def test_views_are_grouped_by_where_the_object_stood(how):
         shifts = [translation(0, 0, 0), translation(0.03, 0.01, 0), translation(-0.02, 0.025, 0)]
         place = [next(n for n, group in enumerate(STOOD[how]) if number in group) for number in range(14)]
         poses = np.stack([shifts[n] @ T for n, T in zip(place, truth, strict=True)])
-        found = object_groups(evidence.observations, poses, Shared(), 0.001, np.zeros(14))
-        assert found == [list(group) for group in STOOD[how]], seed
+        found, clutter = object_groups(evidence.observations, poses, Shared(), 0.001, np.zeros(14))
+        assert not any(out.any() for out in clutter) and found == [list(group) for group in STOOD[how]], seed
 
 
 def test_views_without_depth_or_too_unsure_of_their_poses_are_not_said_to_see_another_place():
     truth, evidence = make(Virtual(views=14, k=HALF))
     seen = [observe(T, np.random.default_rng(0)) for T in truth]
-    assert object_groups(seen, truth, Shared(), 0.001, np.zeros(14)) == [list(range(14))]
+    assert object_groups(seen, truth, Shared(), 0.001, np.zeros(14))[0] == [list(range(14))]
     poses = np.stack([translation(0.01 * (n >= 7), 0, 0) @ T for n, T in enumerate(truth)])
     for unsure_m, groups in ((0.0, 2), (0.01, 1)):
         unsure = np.where(np.arange(14) >= 7, unsure_m, 0.0)
-        assert len(object_groups(evidence.observations, poses, Shared(), 0.001, unsure)) == groups
+        assert len(object_groups(evidence.observations, poses, Shared(), 0.001, unsure)[0]) == groups

@@ -24,7 +24,6 @@ from tests.workers.capture.drawn import (
 from workers.capture.board import marker_corners
 from workers.capture.poses.markers import (
     Judged,
-    first_poses,
     fit_markers,
     fit_pose,
     judge,
@@ -40,7 +39,7 @@ from workers.capture.poses.observation import (
     object_patches,
 )
 from workers.capture.poses.terms import moved
-from workers.geometry.camera import look_at
+from workers.geometry.camera import first_poses, look_at
 from workers.geometry.frames import invert, transform, translation
 
 SPEC = Estimation()
@@ -157,7 +156,8 @@ def test_one_small_marker_is_ambiguous_and_a_whole_board_is_not():
         whole.append(fit_markers(observe(T, rng), PINHOLE).is_ambiguous(0.2))
     assert np.mean(one) > 0.5 and not any(whole)
     for T in hand_held(rng, 10, distance_m=(1.2, 1.2)):  # of the two poses that look alike one is near the truth
-        starts = first_poses(observe(T, rng, ids=[17]).corners)
+        corners = observe(T, rng, ids=[17]).corners
+        starts = first_poses(corners.board, corners.rays)
         assert min(errors(start, T)[1] for start in starts) < 10  # degrees; before refinement
 
 

@@ -306,10 +306,10 @@ def test_names_are_found_by_every_tail_of_them_in_the_folders_above_and_never_ou
         ("package://pkg/my%20robot/e.stl", "my robot/e.stl"),
         ("100%20.obj", "100%20.obj"),
     ):
-        assert Source(path, root, LIMITS).find(name) == root / found
+        assert Source(path, root, LIMITS).demand(name) == root / found
     for name in ("../../../out.obj", str(tmp_path / "out.obj"), "", "x" * 9999, "a" + "/x" * 500, "gone.obj"):
         with pytest.raises(MeshError, match="is not inside"):
-            Source(path, root, LIMITS).find(name)
+            Source(path, root, LIMITS).demand(name)
 
 
 def test_mujocos_own_meshes_are_read(tmp_path):

@@ -433,6 +433,7 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "no Kd": (obj("map_Kd t.png\n"), Right()),
     "black Kd": (obj("Kd 0 0 0\nmap_Kd t.png\n"), Right(note="grey Kd")),
     "grey Kd": (obj("Kd 0.588 0.588 0.588\nmap_Kd t.png\n"), Right(note="a grey Kd of 0.588")),
+    "shininess of an MTL": (obj("Kd 1 1 1\nNs 30\nmap_Kd t.png\n"), Right(roughness=0.5)),
     "red Kd": (obj("Kd 1 0 0\nmap_Kd t.png\n"), Right(((200, 0, 0),))),
     "no material file": (obj(first="", use=""), Right((GREY,), note="t.png beside it was not used")),
     "a material file that is missing": (

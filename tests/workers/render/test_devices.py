@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from schemas.errors import MachineError
-from workers.render.raster import context, devices, gbuffer
-from workers.render.raster.context import require_device
-from workers.render.raster.devices import Choice, GraphicsDevice, choose_device, describe
+from workers.render.raster import context, gbuffer
+from workers.render.raster.context import Choice, GraphicsDevice, choose_device, describe, require_device
 
 FIRST, SECOND = "GPU-11111111-aaaa-bbbb-cccc-000000000001", "GPU-22222222-aaaa-bbbb-cccc-000000000002"
 SOFTWARE = GraphicsDevice(1, "Mesa's software")
@@ -82,20 +81,20 @@ def test_what_drivers_tell_of_their_devices_is_read(monkeypatch):
     """Of a library with two devices: an NVIDIA GPU, and one whose driver has no extension at all."""
     first, second = ctypes.c_void_p(1), ctypes.c_void_p(2)
     strings = {
-        (1, devices.EXTENSIONS): b"EGL_NV_device_cuda EGL_EXT_device_persistent_id EGL_EXT_device_drm",
-        (1, devices.DRM_FILE): b"/dev/dri/card3",
+        (1, context.EXTENSIONS): b"EGL_NV_device_cuda EGL_EXT_device_persistent_id EGL_EXT_device_drm",
+        (1, context.DRM_FILE): b"/dev/dri/card3",
     }
 
     @ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
     def ask_number(device: int, name: int, value: int) -> int:
         ctypes.c_ssize_t.from_address(value).value = 5
-        return int((device, name) == (1, devices.CUDA_DEVICE))
+        return int((device, name) == (1, context.CUDA_DEVICE))
 
     @ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_void_p, ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
     def ask_bytes(device: int, name: int, most: int, value: int, size: int) -> int:
         ctypes.memmove(value, bytes(range(16)), 16)
         ctypes.c_int.from_address(size).value = 16
-        return int((device, name, most) == (1, devices.DEVICE_UUID, 16))
+        return int((device, name, most) == (1, context.DEVICE_UUID, 16))
 
     functions = {"eglQueryDeviceAttribEXT": ask_number, "eglQueryDeviceBinaryEXT": ask_bytes}
     addresses = {name: ctypes.cast(function, ctypes.c_void_p).value for name, function in functions.items()}
@@ -105,8 +104,8 @@ def test_what_drivers_tell_of_their_devices_is_read(monkeypatch):
         _eglQueryDeviceStringEXT=lambda device, name: strings.get((device.value, name)),
         egl=SimpleNamespace(eglGetProcAddress=addresses.get),
     )
-    monkeypatch.setattr(devices, "load_egl", lambda: egl)
-    gpu, other = devices.list_devices.__wrapped__()
+    monkeypatch.setattr(context, "load_egl", lambda: egl)
+    gpu, other = context.list_devices.__wrapped__()
     assert gpu == GraphicsDevice(0, "/dev/dri/card3", True, 5, "GPU-00010203-0405-0607-0809-0a0b0c0d0e0f")
     assert describe(gpu) == f"EGL device 0 (/dev/dri/card3, CUDA 5, {gpu.uuid})"
     assert other == GraphicsDevice(1, "unnamed")
@@ -114,7 +113,7 @@ def test_what_drivers_tell_of_their_devices_is_read(monkeypatch):
 
 def test_a_context_is_opened_on_the_device_that_was_chosen_and_anew_where_that_changes(monkeypatch):
     """Of a list of two, of which the machine's own device stands second, then first."""
-    egl: Any = devices.load_egl()
+    egl: Any = context.load_egl()
     (own, *_), opened = egl.query_devices(), []
     gpus = tuple(GraphicsDevice(number, f"card{number}", True, number) for number in range(2))
 

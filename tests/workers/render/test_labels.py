@@ -15,7 +15,7 @@ from schemas.base import frozen_array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
 from schemas.scene.view import Camera, Intrinsics
-from tests.workers.render.looks import FLAT, RASTER, without
+from tests.workers.render.looks import FLAT, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     EYE,
@@ -36,13 +36,12 @@ from tests.workers.render.random_scenes import (
     stand,
 )
 from workers.geometry.camera import orbit_pose
-from workers.geometry.frames import invert, pose, transform, translation, uniform_rotation
+from workers.geometry.frames import invert, pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.geometry.zbuffer import count_covered
 from workers.render.raster.context import is_software
-from workers.render.raster.draw_calls import RenderPass
 from workers.render.raster.gbuffer import Renderer
-from workers.render.raster.ground import fills_image, find_ground, is_steep, near_window
+from workers.render.raster.ground import fills_image, find_ground
 from workers.render.raster.shaders import GRAZING
 
 FARTHEST_M = 10.0
@@ -235,27 +234,24 @@ def rays_of(T_world_cam: np.ndarray) -> np.ndarray:
     return np.stack([(x - K.cx) / K.fx, (y - K.cy) / K.fy, np.ones_like(x)], -1) @ T_world_cam[:3, :3].T
 
 
-def test_a_floor_that_fills_the_image_is_met_by_every_ray_and_one_that_is_seen_steeply_above_the_grazing_angle():
+def test_a_floor_that_fills_the_image_is_met_by_every_ray_above_the_grazing_angle():
     """True for nearly all views that meet it so, but for those at the limit; never for one that does not somewhere."""
-    rng, filling, steeply = np.random.default_rng(5), [], []
+    rng, filling = np.random.default_rng(5), []
     for turn in range(400):
         # The highest rays are level at an inclination of 0.38
         inclination = rng.uniform(-1.5, 1.5) if turn % 2 else rng.uniform(0.36, 0.42)
         eye = rng.normal(0.0, 12.0, 3) * [1, 1, 0]
         T_world_cam = orbit_pose(eye, inclination, rng.uniform(-3, 3), 3.0)
-        rays, T_cam_floor = rays_of(T_world_cam), invert(T_world_cam)
+        rays = rays_of(T_world_cam)
         away = -T_world_cam[2, 3] / rays[..., 2]
         met = T_world_cam[:2, 3] + away[..., None] * rays[..., :2]
-        every = bool((away > 0.05).all() and (abs(met) < FLOOR_HALF_M).all())
-        filling.append((every, fills_image(floor().shape, T_cam_floor, K)))
         cosine = rays[..., 2] / np.linalg.norm(rays, axis=-1)
-        every = bool((cosine > GRAZING).all() or (cosine < -GRAZING).all())
-        steeply.append((every, is_steep(floor().shape, T_cam_floor, K)))
-    for agreed in (filling, steeply):
-        every, found = np.array(agreed).T
-        assert not (found & ~every).any()
-        assert 40 < found.sum() < 360
-        assert found[1::2].sum() >= 0.9 * every[1::2].sum()
+        every = bool((away > 0.05).all() and (abs(met) < FLOOR_HALF_M).all() and (abs(cosine) > GRAZING).all())
+        filling.append((every, fills_image(floor().shape, invert(T_world_cam), K)))
+    every, found = np.array(filling).T
+    assert not (found & ~every).any()
+    assert 40 < found.sum() < 360
+    assert found[1::2].sum() >= 0.9 * every[1::2].sum()
 
 
 GPU_DIVISION = 2.0**-21
@@ -273,10 +269,9 @@ def sunken_scene(seed: int):
     return tuple(things), (*orbit_and_mirror(rng, height), below)
 
 
-@pytest.mark.parametrize("tier", ["flat", "labels alone", "raster"])
+@pytest.mark.parametrize("tier", ["flat", "labels alone"])
 def test_a_known_floor_is_seen_to_the_same_bytes(renderer, tier):
-    look = {"flat": FLAT, "labels alone": without(FLAT, "rgb"), "raster": RASTER}[tier]
-    shares, met, found = [], 0, []
+    look, met, found = {"flat": FLAT, "labels alone": without(FLAT, "rgb")}[tier], 0, []
     for seed in range(6):
         things, three = sunken_scene(seed)
         for view in three:
@@ -286,8 +281,7 @@ def test_a_known_floor_is_seen_to_the_same_bytes(renderer, tier):
                 lambda *given: found.append(find_ground(*given)) or found[-1],
             ):
                 seen = renderer.draw(things, APPEARANCE, view, *look)
-            left, top, right, bottom = found[-1].window
-            shares.append((right - left) * (bottom - top) / (view.intrinsics.width * view.intrinsics.height))
+            assert found[-1] is not None
             with mock.patch.object(workers.render.raster.gbuffer, "find_ground", return_value=None):
                 drawn = renderer.draw(things, APPEARANCE, view, *look)
             assert (seen.rgb is None and drawn.rgb is None) or seen.rgb.tobytes() == drawn.rgb.tobytes()
@@ -297,28 +291,6 @@ def test_a_known_floor_is_seen_to_the_same_bytes(renderer, tier):
             met += bool((seen.region == things[-1].region_id).any())
             assert view is not three[2] or (seen.region == 1).mean() > 0.9
     assert met >= 4, "what lies on the floor is seen in many scenes"
-    assert set(shares) == {1.0} if tier == "raster" else 0.02 < np.median(shares) < 0.6
-
-
-def test_the_window_holds_all_that_is_low(renderer):
-    """Points drawn on the surfaces of bodies that stick in a floor, also in one that is not the world's."""
-    rng, inside = np.random.default_rng(8), 0
-    for turn in range(40):
-        up_m = (0.0, 0.35)[turn % 2]
-        mesh = trimesh.creation.box(rng.uniform(0.05, 0.6, 3))
-        T = pose(uniform_rotation(rng), np.array([*rng.uniform(-0.5, 0.5, 2), up_m]))
-        view = camera(small(200, 160), orbit_pose(np.array([0.0, 0.0, up_m]), rng.uniform(0.6, 1.5), turn, 2.0))
-        k, T_cam_world = view.intrinsics, invert(view.T_world_cam)
-        passed, thing = RenderPass(APPEARANCE, k, T_cam_world, FLAT[1], True, False), Placed(3, shape_of(mesh), T)
-        ground = Placed(1, floor().shape, translation(0.0, 0.0, up_m))
-        left, top, right, bottom = near_window(ground, [thing], passed, 2, renderer._shapes.fetch)
-        points = transform(T, trimesh.sample.sample_surface(mesh, 4000, seed=turn)[0])
-        low = transform(T_cam_world, points[points[:, 2] < up_m + 1e-4])
-        u, v = k.fx * low[:, 0] / low[:, 2] + k.cx, k.fy * low[:, 1] / low[:, 2] + k.cy
-        seen = (u > 0) & (u < k.width) & (v > 0) & (v < k.height)
-        assert ((u >= left) & (u <= right) & (v >= top) & (v <= bottom))[seen].all()
-        inside += seen.sum()
-    assert inside > 10_000
 
 
 @pytest.mark.parametrize("inclination", [-0.9, 0.05, 0.3, 0.9])

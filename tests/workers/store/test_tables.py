@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError
 from tests.made_up_scenes import failed_scene, made_scene
-from workers.store.canonical import TableDigest, dataset_digest
 from workers.store.manifest import (
+    TableDigest,
+    dataset_digest,
     decode_table,
     encode_table,
     scene_digest,
@@ -135,7 +136,7 @@ def values_of(kind, nullable):
 
 
 def plain_column(kind: pa.DataType, values: list) -> bytes:
-    """A second, plain implementation of what canonical.py's first paragraph promises, from Python values."""
+    """A second, plain implementation of what the head of workers/store/manifest.py promises, from Python values."""
     present, lengths, data, children = b"".join(bytes([value is not None]) for value in values), b"", b"", []
     if pa.types.is_struct(kind):
         for field in fields_of(kind):

@@ -221,13 +221,9 @@ class Doubt:
             return patches
         pixels = project_points(patches.ray, given.intrinsics, given.lens)
         rays = rays_of_pixels(pixels, self.camera.intrinsics, self.camera.lens)
-        seen = np.isfinite(rays).all(axis=1)
-        ray, normal, sigma_m = (
-            np.column_stack([rays, np.ones(len(rays))])[seen],
-            patches.normal[seen],
-            patches.sigma_m[seen],
-        )
-        return Patches(ray * patches.ray_z[seen, 2:], ray, normal, sigma_m)
+        rays = np.where(np.isfinite(rays), rays, patches.ray[:, :2])
+        ray = np.column_stack([rays, np.ones(len(rays))])
+        return dataclasses.replace(patches, ray_z=ray * patches.ray_z[:, 2:], ray=ray)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
@@ -11,8 +12,9 @@ from schemas.job.captures import Estimation
 from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
-from workers.capture.poses.moments import Moment, find_moment, object_groups
-from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
+from workers.capture.poses.moments import Moment, find_moment
+from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation
+from workers.capture.poses.standing import object_groups
 from workers.capture.poses.terms import (
     NAMES,
     POSE,
@@ -122,19 +124,16 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     doubt = find_doubt(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
     explained = _explained(problem, joint, doubt, evidence.spec)
     moment = None if explained[1].board is None else find_moment(explained[1].board, explained[1].by_board)
-    groups = _groups(*explained, moment, list(range(len(problem.index))))
-    if len(groups) > 1:
-        elsewhere = {number for group in groups[1:] for number in group}
-        still = tuple(
-            dataclasses.replace(o, object_patches=no_patches()) if n in elsewhere else o
-            for n, o in enumerate(problem.observations)
-        )
-        problem = dataclasses.replace(problem, observations=still)
+    groups, clutter = _groups(*explained, moment, list(range(len(problem.index))))
+    clutter |= {n: np.ones(len(problem.observations[n].object_patches), bool) for group in groups[1:] for n in group}
+    if clutter:
+        still = [o.without(clutter[n]) if n in clutter else o for n, o in enumerate(problem.observations)]
+        problem = dataclasses.replace(problem, observations=tuple(still))
         joint = solve_jointly(problem, evidence.spec)
     estimate = _result(problem, joint, doubt, moment, evidence)
     if len(groups) > 1:
         numbers = [[problem.observations[n].number for n in group] for group in groups]
-        settled = _groups(*_explained(problem, joint, doubt, evidence.spec), moment, groups[0])
+        settled, _ = _groups(*_explained(problem, joint, doubt, evidence.spec), moment, groups[0])
         estimate = _mark_moved(estimate, numbers, len(settled) == 1)
     return dataclasses.replace(estimate, camera=doubt.camera if doubt is not None and doubt.is_known else None)
 
@@ -197,10 +196,13 @@ def _explained(
 
 def _groups(
     problem: Views, joint: Joint, covariance: Array | None, moment: Moment | None, among: list[int]
-) -> list[list[int]]:
-    """The views among these by where the object stands; poses that were given by hand are nobody's to doubt."""
+) -> tuple[list[list[int]], dict[int, NDArray[np.bool_]]]:
+    """(the views among these by where the object stands; which patches are clutter, of views that have any).
+
+    Poses that were given by hand are nobody's to doubt.
+    """
     if problem.fixed.any():
-        return [among]
+        return [among], {}
     term = joint.surface
     sigma_m = 0.0 if term is None else float(np.median(term.sigma_m / term.growth))
     # An object that moved pulls the poses after it: those by the board alone do not know of it.
@@ -212,8 +214,10 @@ def _groups(
     if moment is not None:
         shared = Shared()
         poses, unsure_m = moment.T_board_depth @ poses, np.hypot(unsure_m, moment.unsure_m)
-    groups = object_groups(seen, poses[among], shared, sigma_m, unsure_m[among])
-    return [[among[n] for n in group] for group in groups]
+    groups, clutter = object_groups(seen, poses[among], shared, sigma_m, unsure_m[among])
+    return [[among[n] for n in group] for group in groups], {
+        among[n]: out for n, out in enumerate(clutter) if out.any()
+    }
 
 
 def _result(

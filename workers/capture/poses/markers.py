@@ -5,7 +5,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -27,6 +26,7 @@ from workers.capture.poses.observation import (
     pixels_of_points,
 )
 from workers.capture.poses.terms import MAD, POSE, SHARED, Problem, Shared, minimise
+from workers.geometry.camera import first_poses
 from workers.geometry.frames import angle_between, invert, pose, transform
 from workers.geometry.pixels import rays_of_pixels
 
@@ -103,7 +103,7 @@ def fit_markers(observation: Observation, camera: CaptureCamera) -> MarkerPose:
     corners = observation.corners
     if not observation.markers:
         return MarkerPose(None, reason="no markers of the board found")
-    fits = [fit_pose(start, corners, camera) for start in first_poses(corners)]
+    fits = [fit_pose(start, corners, camera) for start in first_poses(corners.board, corners.rays)]
     above = [fit for fit in fits if np.isfinite(fit.T_board_cam).all() and fit.T_board_cam[2, 3] > 0]
     if not above:
         why = "the markers are seen from below the board: it is mirrored, or not the board of board.json"
@@ -111,33 +111,6 @@ def fit_markers(observation: Observation, camera: CaptureCamera) -> MarkerPose:
     best, *others = sorted(above, key=lambda fit: fit.cost)
     R = best.T_board_cam[:3, :3]
     return MarkerPose(best, next((f for f in others if angle_between(R, f.T_board_cam[:3, :3]) > SAME_RAD), None))
-
-
-FLAT = 1e-4
-"""Points whose thickness is less than this share of their extent are a plane: a board's print is flatter than that."""
-
-
-def first_poses(corners: Corners) -> list[Pose]:
-    """T_board_cam of the one or two poses from which a plane looks alike (Collins and Bartoli 2014).
-
-    Points that lie in no plane have one pose (SQPnP, Terzakis and Lourakis 2020).
-    """
-    middle = corners.board.mean(axis=0)
-    _, extents, axes = np.linalg.svd(corners.board - middle, full_matrices=False)
-    flat, T_board_plane = bool(extents[2] <= FLAT * extents[0]), np.eye(4)
-    if flat and corners.board[:, 2].any():
-        T_board_plane = pose(axes.T * np.linalg.det(axes), middle)
-    points = transform(invert(T_board_plane), corners.board)
-    kind = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
-    return [T_board_plane @ invert(T) for T in opencv_poses(points, corners.rays, kind)]
-
-
-def opencv_poses(points: Array, rays: Array, kind: int) -> list[Pose]:
-    """The poses [4, 4] that take points [K, 3] to the camera that sees them along rays [K, 2], the likeliest first."""
-    count, turns, shifts, _ = cv2.solvePnPGeneric(points[:, None], rays[:, None], np.eye(3), None, flags=kind)
-    matrices = [cv2.Rodrigues(turn)[0].astype(np.float64) for turn in turns[:count]]
-    poses = [pose(R, shift.ravel().astype(np.float64)) for R, shift in zip(matrices, shifts[:count], strict=True)]
-    return [T for T in poses if np.isfinite(T).all()]
 
 
 TURNED = 25.0
@@ -187,19 +160,22 @@ def measured_corner_px(markers: Sequence[MarkerPose], spec: Estimation) -> float
 class Evidence(Setup):
     """What is known of a capture, and of its views in order of number: what they show, their poses from markers.
 
-    corner_px: measured sigma of a corner.
+    corner_px: measured sigma of a corner. `notes` for the user.
     """
 
     observations: tuple[Observation, ...]
     markers: tuple[MarkerPose, ...]
     corner_px: float
+    notes: tuple[str, ...] = ()
 
     @staticmethod
-    def of(setup: Setup, observations: list[Observation], markers: list[MarkerPose]) -> "Evidence":
+    def of(
+        setup: Setup, observations: list[Observation], markers: list[MarkerPose], notes: tuple[str, ...] = ()
+    ) -> "Evidence":
         """With the sigma of a corner measured over all views."""
         corner_px = measured_corner_px(markers, setup.spec)
         markers = refuse_turned(observations, markers, setup.camera, corner_px)
-        return Evidence(setup.camera, setup.board, setup.spec, tuple(observations), tuple(markers), corner_px)
+        return Evidence(setup.camera, setup.board, setup.spec, tuple(observations), tuple(markers), corner_px, notes)
 
 
 def observe_view(
@@ -216,6 +192,63 @@ def observe_view(
         on_object = object_patches(depth, view.fit.T_board_cam, on_board, setup)
     corners = dataclasses.replace(seen.corners, depth_m=corner_depth)
     return Observation(detection.number, corners, on_board, on_object), view
+
+
+SAME_PLACE_M = 0.05
+"""Two prints that lie to one another as in another view do so to this."""
+OF_ITS_SIZE = 1.1
+"""By depth a print is not so many times as large or small as board.json says."""
+BARE = 0.1
+"""The object covers this share of what it usually does with patches, where it stands on the print that a view shows."""
+
+View = tuple[Observation, MarkerPose]
+
+
+def choose_prints(views: Sequence[Sequence[View]]) -> tuple[list[View], tuple[str, ...]]:
+    """(of the prints of the board in each view the one that the object stands on, notes).
+
+    Prints that lie to one another alike in several views are judged by all of these together, in views without depth by the
+    number of their markers. A view that shows one bare print may show the other, and then has no pose.
+    """
+    several = [view for view in views if len(view) > 1]
+    if not several:
+        return [view[0] for view in views], ()
+    pairs = [
+        (_beside(a, b), _stands_on(a) - _stands_on(b)) for view in several for a in view for b in view if a is not b
+    ]
+    beside, better = np.array([place for place, _ in pairs]), np.array([score for _, score in pairs])
+
+    def score(candidate: View, view: Sequence[View]) -> float:
+        places = [_beside(candidate, other) for other in view if other is not candidate]
+        return sum(float(better[_norm(beside - place) < SAME_PLACE_M].sum()) for place in places)
+
+    chosen = [max(view, key=lambda one: (score(one, view), _stands_on(one))) for view in views]
+    usual = np.median([len(pick[0].object_patches) for pick, view in zip(chosen, views, strict=True) if len(view) > 1])
+    reason = "it shows one print of the board, and a second is in view elsewhere: nothing stands on the one it shows"
+    for n, (pick, view) in enumerate(zip(chosen, views, strict=True)):
+        if len(view) == 1 and pick[1].fit is not None and len(pick[0].object_patches) < BARE * usual:
+            chosen[n] = pick[0], MarkerPose(None, reason=reason)
+    numbers = ", ".join(str(view[0][0].number) for view in several)
+    where = "poses are those of the print that the object stands on; take the other one away"
+    return chosen, (f"a second print of the board is in view ({numbers}): {where}",)
+
+
+def _beside(view: View, other: View) -> Array:
+    """[3]: where the origin of another print lies, by the poses of both; nan where one has none."""
+    if view[1].fit is None or other[1].fit is None:
+        return np.full(3, np.nan)
+    return (view[1].fit.T_board_cam @ invert(other[1].fit.T_board_cam))[:3, 3]
+
+
+def _stands_on(view: View) -> float:
+    """How much of an object stands on a print as large as depth has it; next to nothing of it is its number of markers."""
+    seen, markers = view
+    if markers.fit is None:
+        return -1.0
+    corners, count = seen.corners, len(seen.object_patches)
+    true_z = transform(invert(markers.fit.T_board_cam), corners.board)[:, 2]
+    ratio = float(np.median((corners.depth_m / true_z)[corners.depth_m > 0])) if corners.depth_m.any() else 1.0
+    return count * float(1 / OF_ITS_SIZE < ratio < OF_ITS_SIZE) + 1e-3 * seen.markers
 
 
 MANY = 40

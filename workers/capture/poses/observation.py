@@ -4,7 +4,7 @@ A piece of plane has an inverse depth that is affine in the ray (x, y): 1 / z = 
 along (a, b, c). So one robust linear fit gives the piece's middle, its normal and its noise.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,9 @@ class Patches:
     def __len__(self) -> int:
         return len(self.ray_z)
 
+    def __getitem__(self, kept: NDArray[np.generic]) -> "Patches":
+        return Patches(self.ray_z[kept], self.ray[kept], self.normal[kept], self.sigma_m[kept])
+
 
 def no_patches() -> Patches:
     """None at all."""
@@ -80,6 +83,10 @@ class Observation:
     def markers(self) -> int:
         """How many markers were found."""
         return int((self.corners.markers >= 0).sum()) // 4
+
+    def without(self, clutter: NDArray[np.bool_]) -> "Observation":
+        """The view without these of the object's patches [P]."""
+        return replace(self, object_patches=self.object_patches[~clutter])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +191,7 @@ def fit_patches(rays: Array, z: Array) -> Patches:
     ray_z = (basis * (z * used)[..., None]).sum(axis=1) / total[:, None]
     normal = -plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
     good = (used.sum(axis=1) >= MIN_SAMPLES) & (ray_z[:, 2] > 0)
-    return Patches(ray_z[good], ray[good], normal[good], sigma[good])
+    return Patches(ray_z, ray, normal, sigma)[good]
 
 
 def depth_at(depth: NDArray[np.uint16], pixels: Array, units_per_m: float) -> Array:
@@ -238,8 +245,7 @@ def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patch
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     patches = sample_patches(depth, blocks[:, None] + offsets, camera)
     keep = np.flatnonzero(_on_object(patches, patches.ray_z @ normal - distance, T_board_cam, setup))
-    keep = keep[spread_evenly(len(keep), MOST)]
-    return Patches(patches.ray_z[keep], patches.ray[keep], patches.normal[keep], patches.sigma_m[keep])
+    return patches[keep[spread_evenly(len(keep), MOST)]]
 
 
 def _blocks_over_board(T_board_cam: Pose, board: Board, camera: CaptureCamera, side: int) -> NDArray[np.int64]:

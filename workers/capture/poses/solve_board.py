@@ -21,9 +21,8 @@ from workers.capture.board_kinds import KIND_WORDS, board_of_markers, recognise_
 from workers.capture.detect import find_markers, other_dictionary, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
-from workers.capture.poses.markers import opencv_poses
 from workers.capture.poses.terms import cross_matrix, moved
-from workers.geometry.camera import spread_evenly
+from workers.geometry.camera import opencv_poses, spread_evenly
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import rays_of_pixels
 

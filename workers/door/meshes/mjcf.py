@@ -76,7 +76,7 @@ def _include(source: Source, element: Node, depth: int) -> None:
         raise MeshError("unreadable", f"{source.path} has more than {MOST_ABOVE} bodies inside one another")
     for number, child in reversed(list(enumerate(element))):
         if child.tag == "include":
-            path = source.find(child.get("file", ""))
+            path = source.demand(child.get("file", ""))
             if path in (*source.files, source.path.resolve()):
                 raise MeshError("unreadable", f"{source.path} includes {path.name} twice")
             source.files[path] = None

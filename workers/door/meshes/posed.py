@@ -1,8 +1,9 @@
 """Edge: files that pose meshes and simple bodies, parsed with the standard library: their XML, and what of them is seen."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part
-from workers.door.meshes.caps import LONGEST_NAME, check_nodes, find_inside
+from workers.door.meshes.caps import LONGEST_NAME, FolderResolver, check_nodes, find_inside
 from workers.door.meshes.mesh import DEFAULT
 from workers.door.opening import as_utf8, read_bytes
 from workers.geometry.frames import pose, rotation_about
@@ -54,18 +55,13 @@ class Model:
     meshes: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A file that poses others, and the folder below which all that it names must lie.
+class Source(FolderResolver):
+    """A file that poses others; all that it names must lie below `root`. files: what it reads beside meshes and pictures."""
 
-    files, notes: what else it reads beside meshes and pictures, and what is to be said of it, filled while it is read.
-    """
-
-    path: Path
-    root: Path
-    limits: MeshLimits
-    files: dict[Path, None] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    def __init__(self, path: Path, root: Path, limits: MeshLimits) -> None:
+        super().__init__(path, root, limits)
+        self.path = path
+        self.files: dict[Path, None] = {}
 
     def parse(self, path: Path, tags: Sequence[str], kind: str) -> ElementTree.Element:
         """The root element of this file, or of one that it includes; MeshError `missing`, `too_large` or as `parse_tree`."""
@@ -77,15 +73,23 @@ class Source:
             check_nodes(path, sum(1 for _ in root.iter(what)), many, self.limits)
         return root
 
-    def find(self, name: str) -> Path:
-        """The file inside `root` that a name means; MeshError `missing`.
+    def find(self, name: str) -> Path | None:
+        """The file inside `root` that a name means; None where there is none.
 
         `package://`, `model://` and folders that are not there are passed over: every tail of the name is looked for, the
         longest first, in the file's own folder and in those above it up to `root`; as it stands, and then with `%20` for a space.
         """
-        if (path := find_inside(self.root.resolve(), *self.places(name))) is not None:
-            return path
-        raise MeshError("missing", f"{self.path} names {name!r:.200}, which is not inside {self.root}")
+        return find_inside(self.root, *self.places(name))
+
+    def demand(self, name: str) -> Path:
+        """As `find`; MeshError `missing`."""
+        if (path := self.find(name)) is None:
+            raise MeshError("missing", f"{self.path} names {name!r:.200}, which is not inside {self.root}")
+        return path
+
+    def find_all(self, names: Iterable[str]) -> list[Path]:
+        """The files of those names that mean some, each once."""
+        return list(dict.fromkeys(path for name in names if (path := self.find(name)) is not None))
 
     def places(self, name: str) -> Iterator[Path]:
         """Where what a name means may lie, in that order."""
@@ -159,10 +163,23 @@ def wrap_body(part: Part) -> Part:
     return replace(part, vertices=vertices, faces=frozen_array(faces, np.int32), uv=frozen_array(uv.reshape(-1, 2)))
 
 
-def read_body(path: Path, element: ElementTree.Element, size_of: Callable[[str], str | None]) -> Part:
-    """The body of a <box>, <sphere> ..., whose sizes `size_of` tells by their names; MeshError `unreadable`."""
-    sizes = [numbers(path, size_of(name), count, positive=True) for name, count in _SIZES.get(element.tag, ())]
-    return make_body(path, element.tag, np.concatenate(sizes or [np.zeros(0)]))
+def read_geometry(
+    path: Path, visual: ElementTree.Element, T: Pose, stated: Callable[..., str | None], file: str
+) -> Visual | None:
+    """What a visual of a URDF or SDF shows, its own frame at T; None for what has no end, or is nothing. MeshError `unreadable`.
+
+    stated: how an element states a value by its name; file: the name of a mesh's file.
+    """
+    for kind in visual.iterfind("geometry/*"):
+        value_of = partial(stated, kind)
+        if kind.tag == "mesh":
+            scale = scaled(path, numbers(path, value_of("scale", "1 1 1"), 3))
+            return Visual(T @ scale, (value_of(file) or "").strip())
+        if kind.tag in ("plane", "empty"):
+            return None
+        sizes = [numbers(path, value_of(name), count, positive=True) for name, count in _SIZES.get(kind.tag, ())]
+        return Visual(T, body=make_body(path, kind.tag, np.concatenate(sizes or [np.zeros(0)])))
+    return None
 
 
 _SIZES = {

@@ -1,8 +1,7 @@
 """Edge: what is seen of a URDF, SDF or MJCF from outside as one shape; and the readers of URDF and SDF."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from os.path import relpath
@@ -10,13 +9,12 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.door.meshes.caps import Budget, FolderResolver, check_counts, check_nodes, find_inside
+from workers.door.meshes.caps import check_counts, check_nodes, find_inside
 from workers.door.meshes.formats import load_shape, with_jpeg
 from workers.door.meshes.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
 from workers.door.meshes.mjcf import read_mjcf
@@ -27,8 +25,7 @@ from workers.door.meshes.posed import (
     Source,
     Visual,
     numbers,
-    read_body,
-    scaled,
+    read_geometry,
     turned,
     wrap_body,
 )
@@ -53,63 +50,48 @@ def list_seen(path: Path, root: Path, limits: MeshLimits) -> tuple[list[Path], l
     source, model = read_model(path, root, limits)
     names = dict.fromkeys(visual.mesh for visual in model.visuals if visual.mesh is not None)
     pictures = dict.fromkeys(visual.texture for visual in model.visuals if visual.texture is not None)
-    return list(dict.fromkeys(map(source.find, names))), [*source.files, *_found(pictures, source)]
+    return list(dict.fromkeys(map(source.demand, names))), [*source.files, *source.find_all(pictures)]
 
 
 def list_named(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
     """The meshes of all that is seen or collides, of those inside `root`, and the files that it includes."""
     source = Source(path, root, limits)
-    return [*_found(POSED[path.suffix.lower()](source).meshes, source), *source.files]
-
-
-def _found(names: Iterable[str], source: Source) -> list[Path]:
-    found = []
-    for name in names:
-        with suppress(MeshError):
-            found.append(source.find(name))
-    return list(dict.fromkeys(found))
+    return [*source.find_all(POSED[path.suffix.lower()](source).meshes), *source.files]
 
 
 def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     """All that is seen, joints at zero, in the frame of the first root, metres; MeshError as `load_shape`."""
-    (source, model), budget = read_model(path, root, limits), Budget(limits)
-    resolver = FolderResolver(path, root, limits, budget)
-    parts, notes, vertices, faces = list[Part](), source.notes, 0, 0
+    source, model = read_model(path, root, limits)
+    parts, vertices, faces = list[Part](), 0, 0
 
     @cache
     def load(name: str) -> LoadedMesh:
-        return load_shape(source.find(name), limits, root, budget)
-
-    @cache
-    def picture(name: str) -> NDArray[np.uint8] | None:
-        try:
-            return resolver.picture(relpath(source.find(name), path.parent))
-        except MeshError:
-            resolver.note(name, "is missing")
-            return None
+        return load_shape(source.demand(name), limits, root, source.budget)
 
     for visual in model.visuals:
         body = wrap_body(visual.body) if visual.body is not None and visual.texture is not None else visual.body
         loaded = load(visual.mesh or "") if body is None else LoadedMesh(Shape((body,)), ())
-        notes += loaded.notes
+        source.notes += loaded.notes
         for part in transform_shape(loaded.shape, visual.T).parts:
             check_coordinates(path, part.vertices)
-            dressed = with_jpeg(_dressed(part, visual, picture, notes), resolver)
+            dressed = with_jpeg(_dressed(part, visual, source), source)
             parts.append(replace(dressed, name=f"part{len(parts)}"))
             vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
         check_nodes(path, len(parts), "parts", limits)
         check_counts(path, vertices, faces, limits)
-    return LoadedMesh(Shape(tuple(parts)), tuple(dict.fromkeys([*notes, *resolver.notes])))
+    return LoadedMesh(Shape(tuple(parts)), tuple(dict.fromkeys(source.notes)))
 
 
-def _dressed(part: Part, visual: Visual, picture: Callable[[str], NDArray[np.uint8] | None], notes: list[str]) -> Part:
+def _dressed(part: Part, visual: Visual, source: Source) -> Part:
     """The part in the colour and picture that the file gives it."""
     own = part.material is not DEFAULT or part.colors is not None
     if (visual.colour is None and visual.texture is None) or (own and not visual.dresses):
         return part
-    texture = None if visual.texture is None else picture(visual.texture)
+    texture = None if visual.texture is None else source.picture(visual.texture)
     if texture is not None and part.uv is None:
-        notes.append(f"{visual.texture:.200} needs texture coordinates, which the mesh has not: plain base colour used")
+        source.notes.append(
+            f"{visual.texture:.200} needs texture coordinates, which the mesh has not: plain base colour used"
+        )
         texture = None
     if visual.colour is None and texture is None:
         return part
@@ -128,8 +110,12 @@ def read_urdf(source: Source) -> Model:
             look = (None, None) if material is None else _look(path, material)
             if material is not None and look[0] is None and look[1] is None:
                 look = looks.get(material.get("name", ""), look)
-            one = _geometry(path, visual, T_root_link @ _origin(path, visual))
-            visuals.append(replace(one, colour=look[0], texture=look[1]))
+            shown = read_geometry(
+                path, visual, T_root_link @ _origin(path, visual), ElementTree.Element.get, "filename"
+            )
+            if shown is None:
+                raise MeshError("unreadable", f"{path} has a visual without geometry, or with one that has no end")
+            visuals.append(replace(shown, colour=look[0], texture=look[1]))
     names = (mesh.get("filename", "") for mesh in robot.iterfind("link/*/geometry/mesh"))
     return Model(tuple(visuals), tuple(dict.fromkeys(names)))
 
@@ -162,15 +148,6 @@ def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTre
     return placed
 
 
-def _geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual:
-    """What a visual shows, its own frame at T."""
-    for kind in visual.iterfind("geometry/*"):
-        if kind.tag == "mesh":
-            return Visual(T @ scaled(path, numbers(path, kind.get("scale", "1 1 1"), 3)), kind.get("filename", ""))
-        return Visual(T, body=read_body(path, kind, kind.get))
-    raise MeshError("unreadable", f"{path} has a visual without geometry")
-
-
 def _origin(path: Path, element: ElementTree.Element) -> Pose:
     """[4, 4] of an <origin>."""
     origin = element.find("origin")
@@ -196,20 +173,22 @@ def _of_model(source: Source, model: ElementTree.Element, T_above: Pose, depth: 
     T = T_above @ _sdf_pose(path, model)
     for link in model.iterfind("link"):
         for visual in link.iterfind("visual"):
-            one = _sdf_geometry(path, visual, T @ _sdf_pose(path, link) @ _sdf_pose(path, visual))
+            T_visual = T @ _sdf_pose(path, link) @ _sdf_pose(path, visual)
+            shown = read_geometry(path, visual, T_visual, ElementTree.Element.findtext, "uri")
             script = visual.find("material/script")
-            if one is not None and script is not None and (look := _read_script(source, script)) is not None:
-                yield replace(one, colour=look[0], texture=look[1], dresses=True)
-            elif one is not None:
-                diffuse, albedo = visual.findtext("material/diffuse"), visual.findtext("material/pbr/metal/albedo_map")
-                rgba = (
-                    None
-                    if diffuse is None
-                    else np.clip([*numbers(path, diffuse, len(diffuse.split())), 1.0][:4], 0.0, 1.0)
-                )
-                yield replace(one, colour=rgba, texture=albedo and albedo.strip())
+            if shown is not None and script is not None and (look := _read_script(source, script)) is not None:
+                yield replace(shown, colour=look[0], texture=look[1], dresses=True)
+            elif shown is not None:
+                albedo = visual.findtext("material/pbr/metal/albedo_map")
+                colour = _colour(path, visual.findtext("material/diffuse"))
+                yield replace(shown, colour=colour, texture=albedo and albedo.strip())
     for inner in model.iterfind("model"):
         yield from _of_model(source, inner, T, depth + 1)
+
+
+def _colour(path: Path, text: str | None) -> Array | None:
+    """[4] of three numbers or four, the last alpha, in [0, 1]; None of no text. MeshError `unreadable`."""
+    return None if text is None else np.clip([*numbers(path, text, len(text.split())), 1.0][:4], 0.0, 1.0)
 
 
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
@@ -222,10 +201,10 @@ def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | N
 
     After the manual of Ogre 1.9, "Material Scripts"; what a material has of another (`:`) is not read.
     """
-    name, root = (script.findtext("name") or "").strip(), source.root.resolve()
+    name = (script.findtext("name") or "").strip()
     places = [place for uri in script.iterfind("uri") for place in source.places(uri.text or "")]
     listed = [file for place in places for file in (sorted(place.glob("*.material")) if place.is_dir() else [place])]
-    for file in dict.fromkeys(path for one in listed if (path := find_inside(root, one)) is not None):
+    for file in dict.fromkeys(path for one in listed if (path := find_inside(source.root, one)) is not None):
         text = _COMMENT.sub("", as_utf8(read_bytes(file, MAX_XML_BYTES, MeshError))[0].decode("utf-8", "replace"))
         head = re.search(
             rf"^\s*material\s+\"?{re.escape(name)}\"?\s*(?::[^{{]*)?{{(?P<rest>.*)", text, re.MULTILINE | re.DOTALL
@@ -236,23 +215,13 @@ def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | N
         inside = re.split(r"^\s*material\s", head["rest"], maxsplit=1, flags=re.MULTILINE)[0]
         diffuse, picture = _DIFFUSE.search(inside), _TEXTURE.search(inside)
         if diffuse is not None or picture is not None:
-            colour = None if diffuse is None else np.clip([*map(float, diffuse[1].split()), 1.0][:4], 0.0, 1.0)
+            colour = _colour(file, diffuse and diffuse[1])
             if picture is None:
                 return colour, None
             near = [folder / picture[1] for folder in (*places, file.parent, file.parent.with_name("textures"))]
-            there = find_inside(root, *near)
+            there = find_inside(source.root, *near)
             return colour, picture[1] if there is None else relpath(there, source.path.parent)
     source.notes.append(f"the material script {name:.80} is not had, or has no colour: plain base colour used")
-    return None
-
-
-def _sdf_geometry(path: Path, visual: ElementTree.Element, T: Pose) -> Visual | None:
-    """What a visual shows; None for a plane without end."""
-    for kind in visual.iterfind("geometry/*"):
-        if kind.tag == "mesh":
-            scale = scaled(path, numbers(path, kind.findtext("scale", "1 1 1"), 3))
-            return Visual(T @ scale, (kind.findtext("uri") or "").strip())
-        return None if kind.tag in ("plane", "empty") else Visual(T, body=read_body(path, kind, kind.findtext))
     return None
 
 

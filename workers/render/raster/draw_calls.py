@@ -17,13 +17,11 @@ from schemas.base import Array, Pose
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE, Appearance, Shape
 from schemas.scene.view import Intrinsics
+from workers.geometry.camera import NEAR_M
 from workers.geometry.frames import transform
 from workers.render.raster.batches import Cover, is_matte, seen_ranges, texture_of
 from workers.render.raster.buffers import Uploaded, UploadedShape
 from workers.render.raster.shaders import MAX_LIGHTS, Variant
-
-NEAR_M = 0.05
-"""Surfaces nearer than this, along the optical axis, are not seen. There is no far plane."""
 
 LEVEL_UNIT, SHADOW_UNIT = 1, 2
 """Texture units of the light maps; unit 0 is the albedo's."""
@@ -64,8 +62,19 @@ class Program:
         """Draw with this program from now on."""
         self._gl.glUseProgram(self._name)
 
-    def set_view(self, k: Intrinsics, clip_from_cam: NDArray[np.floating]) -> None:
-        """Set the camera's intrinsics, also as the matrix that `clip_from_cam` makes of them."""
+    def set_view(self, k: Intrinsics) -> None:
+        """Set the camera's intrinsics, also as the matrix from the optical frame to clip space with x right and y *down*.
+
+        Window x = (x_clip / w + 1) * width / 2 = fx * X / Z + cx, and likewise y. z_clip = 2 near - Z is at most w = Z
+        exactly where Z >= near, and always above -w; window depth is near / Z, which falls with distance. There is no far
+        plane.
+        """
+        clip_from_cam = [
+            [2.0 * k.fx / k.width, 0.0, 2.0 * k.cx / k.width - 1.0, 0.0],
+            [0.0, 2.0 * k.fy / k.height, 2.0 * k.cy / k.height - 1.0, 0.0],
+            [0.0, 0.0, -1.0, 2.0 * NEAR_M],
+            [0.0, 0.0, 1.0, 0.0],
+        ]
         self._gl.glUniformMatrix4fv(self._location("clip_from_cam"), 1, True, clip_from_cam)
         self._gl.glUniform4f(self._location("view"), k.cx, k.cy, 1.0 / k.fx, 1.0 / k.fy)
 
@@ -116,15 +125,6 @@ class Program:
         return self._locations.get(name, -1)
 
 
-def place_lights(appearance: Appearance, T_cam_world: Pose, raster: bool) -> PlacedLights:
-    """The lights of a scene as a camera sees them, for programs of tier raster or flat. Raises as `light_slots`."""
-    count = light_slots(appearance, raster)
-    towards, color = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-    for i, light in enumerate(appearance.lights):
-        towards[i], color[i] = T_cam_world[:3, :3] @ light.direction, light.color
-    return PlacedLights(appearance.ambient, towards, color)
-
-
 def light_slots(appearance: Appearance, raster: bool) -> int:
     """Number of lights that the program has: one, two for tier flat, three or `MAX_LIGHTS`, unused ones dark.
 
@@ -135,22 +135,6 @@ def light_slots(appearance: Appearance, raster: bool) -> int:
         if len(appearance.lights) <= slots:
             return slots
     raise ValueError(f"{len(appearance.lights)} lights: the renderer takes at most {MAX_LIGHTS}")
-
-
-def clip_from_cam(k: Intrinsics) -> Pose:
-    """[4, 4] float64: optical frame to clip space with x right and y *down*; there is no far plane.
-
-    Window x = (x_clip / w + 1) * width / 2 = fx * X / Z + cx, and likewise y. z_clip = 2 near - Z is at most w = Z exactly
-    where Z >= near, and always above -w; window depth is near / Z, which falls with distance.
-    """
-    return np.array(
-        [
-            [2.0 * k.fx / k.width, 0.0, 2.0 * k.cx / k.width - 1.0, 0.0],
-            [0.0, 2.0 * k.fy / k.height, 2.0 * k.cy / k.height - 1.0, 0.0],
-            [0.0, 0.0, -1.0, 2.0 * NEAR_M],
-            [0.0, 0.0, 1.0, 0.0],
-        ]
-    )
 
 
 def _link(gl: ModuleType, vertex: str, fragment: str) -> int:
@@ -203,14 +187,13 @@ class RenderPass:
     """Whether clear texels are cut out; in a pass for colour alone."""
 
     @cached_property
-    def clip_from_cam(self) -> NDArray[np.float32]:
-        """[4, 4]: from the optical frame to clip space."""
-        return clip_from_cam(self.k).astype(np.float32)
-
-    @cached_property
     def lights(self) -> PlacedLights:
         """The lights as the camera sees them. Raises ValueError where there are too many."""
-        return place_lights(self.appearance, self.T_cam_world, self.raster)
+        count = light_slots(self.appearance, self.raster)
+        towards, color = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+        for i, light in enumerate(self.appearance.lights):
+            towards[i], color[i] = self.T_cam_world[:3, :3] @ light.direction, light.color
+        return PlacedLights(self.appearance.ambient, towards, color)
 
     def shift(self, x_px: float, y_px: float) -> "RenderPass":
         """The same with every pixel's centre moved by (x_px, y_px)."""
