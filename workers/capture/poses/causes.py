@@ -268,15 +268,20 @@ def find_doubt(
         if best is usual:
             break
         about = dataclasses.replace(best.seen, poses=best.fitted.poses, shared=best.fitted.shared)
+    # What fewer numbers say is sure only where more numbers leave it so: views that are alike tell none from another.
+    bent = next(t for t in tried if t.explanation.numbers == BENT)
+    wide = bent if 0 < len(best.explanation.numbers) < len(BENT) else best
     if best is usual and spec.calibrate:
-        best = next(t for t in tried if t.explanation.numbers == WHOLE)
-        return _doubt(best, usual, start, fixed, variance, begun.poses, spec)
+        best = wide = next(t for t in tried if t.explanation.numbers == WHOLE)
+        return _doubt(best, wide, usual, start, fixed, variance, begun.poses, spec)
     gain = usual.fitted.cost - best.fitted.cost
     alike = 0.25 * count * (ALIKE_PX / start.term.sigma_px[0]) ** 2  # two of a marker's eight are its place
     wanted = EXPLAINED * best.fitted.own.shape[1] * usual.fitted.cost
     if best.fitted.alike.size:
         wanted = best.count * np.log(count) * variance * max(1.0, _scatter(best, variance)) + alike
-    return None if best is usual or gain < wanted else _doubt(best, usual, start, fixed, variance, begun.poses, spec)
+    return (
+        None if best is usual or gain < wanted else _doubt(best, wide, usual, start, fixed, variance, begun.poses, spec)
+    )
 
 
 CAMERAS, HALVINGS = 6, 4
@@ -328,7 +333,14 @@ WEAK = 1e-3
 
 
 def _doubt(
-    best: _Tried, usual: _Tried, start: Seen, fixed: NDArray[np.bool_], variance: float, begun: Array, spec: Estimation
+    best: _Tried,
+    wide: _Tried,
+    usual: _Tried,
+    start: Seen,
+    fixed: NDArray[np.bool_],
+    variance: float,
+    begun: Array,
+    spec: Estimation,
 ) -> Doubt:
     """The best explanation, its words, and whether its camera is known; variance: of rows that have no more than noise."""
     fitted, explanation = best.fitted, best.explanation
@@ -336,7 +348,7 @@ def _doubt(
     motion[fixed] = 0.0
     noise = variance * len(fitted.rows.residual)
     shift_m, turn = (np.linalg.norm(motion[:, part], axis=1) for part in (slice(3), slice(3, 6)))
-    unsure_m = np.sqrt(variance * np.trace(fitted.covariance[:, :3, :3], axis1=1, axis2=2))
+    unsure_m = np.sqrt(variance * np.trace(wide.fitted.covariance[:, :3, :3], axis1=1, axis2=2))
     off, left = (float(np.sqrt(tried.fitted.cost / noise)) for tried in (usual, best))
     fits = left <= FITS
     is_known = (
@@ -350,7 +362,7 @@ def _doubt(
     note, px = "", float(start.term.sigma_px[0])
     if fits:
         by = f"{1000 * np.median(shift_m):.1f} mm, {np.degrees(np.median(turn)):.2f} degrees"
-        note = _words(best, start, variance, by, is_known, material)
+        note = _words(best, wide, start, variance, by, is_known, material)
     elif material:
         note = NONE_FITS.format(off=px * off, times=off, name=explanation.name, left=px * left)
     camera = best.seen.camera if explanation.numbers else start.camera
@@ -359,7 +371,7 @@ def _doubt(
     )
 
 
-def _words(best: _Tried, start: Seen, variance: float, by: str, is_known: bool, material: bool) -> str:
+def _words(best: _Tried, wide: _Tried, start: Seen, variance: float, by: str, is_known: bool, material: bool) -> str:
     """What an explanation that fits says; by: how far it moves the poses. Numbers of a camera are said however little that is."""
     fitted, numbers, words = best.fitted, best.explanation.numbers, best.explanation.words
     if numbers in ((), WHOLE):
@@ -370,9 +382,9 @@ def _words(best: _Tried, start: Seen, variance: float, by: str, is_known: bool, 
         return words.format(by=by, spread=of_view.max(), sag=sag, stretch=stretch) if material else ""
     k, of = best.seen.camera.intrinsics, start.camera.intrinsics
     change = np.array([k.fx / of.fx - 1, k.fy / of.fy - 1, (k.cx - of.cx) / of.fx, (k.cy - of.cy) / of.fy])
-    index, sigma = [n for n in numbers if n < len(PINHOLE)], np.sqrt(variance * np.diag(fitted.alike_covariance))
+    index, sigma = [n for n in numbers if n < len(PINHOLE)], np.sqrt(variance * np.diag(wide.fitted.alike_covariance))
     sure = np.append(np.zeros(len(PINHOLE), np.bool_), len(numbers) > len(PINHOLE))
-    sure[index] = np.abs(change[index]) > SIGNIFICANT * sigma[: len(index)]
+    sure[index] = np.abs(change[index]) > SIGNIFICANT * sigma[index]
     sure[:2] = sure[:2].any()
     if not sure.any():
         return ALIKE_VIEWS if material else ""
