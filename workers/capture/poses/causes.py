@@ -273,15 +273,13 @@ def find_doubt(
     wide = bent if 0 < len(best.explanation.numbers) < len(BENT) else best
     if best is usual and spec.calibrate:
         best = wide = next(t for t in tried if t.explanation.numbers == WHOLE)
-        return _doubt(best, wide, usual, start, fixed, variance, begun.poses, spec)
+        return _doubt(best, wide, usual, start, fixed, variance, spec)
     gain = usual.fitted.cost - best.fitted.cost
     alike = 0.25 * count * (ALIKE_PX / start.term.sigma_px[0]) ** 2  # two of a marker's eight are its place
     wanted = EXPLAINED * best.fitted.own.shape[1] * usual.fitted.cost
     if best.fitted.alike.size:
         wanted = best.count * np.log(count) * variance * max(1.0, _scatter(best, variance)) + alike
-    return (
-        None if best is usual or gain < wanted else _doubt(best, wide, usual, start, fixed, variance, begun.poses, spec)
-    )
+    return None if best is usual or gain < wanted else _doubt(best, wide, usual, start, fixed, variance, spec)
 
 
 CAMERAS, HALVINGS = 6, 4
@@ -333,18 +331,11 @@ WEAK = 1e-3
 
 
 def _doubt(
-    best: _Tried,
-    wide: _Tried,
-    usual: _Tried,
-    start: Seen,
-    fixed: NDArray[np.bool_],
-    variance: float,
-    begun: Array,
-    spec: Estimation,
+    best: _Tried, wide: _Tried, usual: _Tried, start: Seen, fixed: NDArray[np.bool_], variance: float, spec: Estimation
 ) -> Doubt:
     """The best explanation, its words, and whether its camera is known; variance: of rows that have no more than noise."""
     fitted, explanation = best.fitted, best.explanation
-    motion = np.stack([motion_between(a, b) for a, b in zip(begun, fitted.poses, strict=True)])
+    motion = np.stack([motion_between(a, b) for a, b in zip(start.poses, fitted.poses, strict=True)])
     motion[fixed] = 0.0
     noise = variance * len(fitted.rows.residual)
     shift_m, turn = (np.linalg.norm(motion[:, part], axis=1) for part in (slice(3), slice(3, 6)))
@@ -357,7 +348,8 @@ def _doubt(
     if explanation.numbers == WHOLE:
         is_known = is_known and spec.calibrate
     material = (
-        max(float(np.median(shift_m / np.linalg.norm(begun[:, :3, 3], axis=1))), float(np.median(turn))) >= MATERIAL
+        max(float(np.median(shift_m / np.linalg.norm(start.poses[:, :3, 3], axis=1))), float(np.median(turn)))
+        >= MATERIAL
     )
     note, px = "", float(start.term.sigma_px[0])
     if fits:
