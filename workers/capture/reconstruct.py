@@ -17,9 +17,10 @@ from schemas.scene.shape import Mesh
 from workers.capture.board import frame_in_board, open_dictionary
 from workers.capture.detect import detect_markers
 from workers.capture.folder import CaptureFolder, read_pose, read_view
-from workers.capture.poses.corners import compare_cameras
+from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
 from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, observe_view
+from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.solve_board import other_board
 from workers.capture.results import own_files
@@ -73,11 +74,17 @@ def given_files(folder: CaptureFolder, spec: Estimation | None = None) -> Given:
     given = Given(folder, own_files(folder.path))
     if spec is None or not spec.calibrate:
         return given
-    camera = estimate_joint(_observe(given, spec, processor_clock())).camera
-    if camera is None:
-        return given
-    note = f"the camera is the markers' in place of camera.json's: {compare_cameras(camera, folder.camera)}"
-    return replace(given, folder=replace(folder, camera=camera), notes=(note,))
+    for _ in range(CALIBRATIONS):
+        camera = estimate_joint(_observe(given, spec, processor_clock())).camera
+        if camera is None:
+            break
+        note = f"the camera is the markers' in place of camera.json's: {compare_cameras(camera, folder.camera)}"
+        given = replace(given, folder=replace(folder, camera=camera), notes=(note,))
+    return given
+
+
+CALIBRATIONS = 3
+"""How often the markers' camera is found: corners are refined by the camera before, whose lens bends their edges."""
 
 
 def corrections_of(given: Given, estimates: Estimates) -> dict[int, tuple[Pose, Pose]]:
@@ -187,6 +194,7 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     evidence = _observe(given, spec, clock)
     if not any(seen.markers or seen.manual_T_board_cam is not None for seen in evidence.observations):
         raise CaptureError("markers", _no_markers(given.folder))
+    check_moments(evidence)
     check_depth(evidence)
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):

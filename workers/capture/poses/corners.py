@@ -1,4 +1,4 @@
-"""Corners of all views: their rows, the noise of each mode of a marker, and what corners say of the shutter and the camera."""
+"""Corners of all views: their rows, and the noise of each mode of a marker."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,14 +7,12 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as variance_ratio
 
-from schemas.base import Array, frozen_array
+from schemas.base import Array
 from schemas.capture import CaptureCamera
 from schemas.job.captures import Estimation
 from workers.capture.poses.observation import Corners
 from workers.capture.poses.terms import (
-    CAMERA,
     GROW_M,
     GROW_PX,
     GROWTH_M,
@@ -23,19 +21,15 @@ from workers.capture.poses.terms import (
     POSE,
     PRINT_SCALE,
     SHARED,
-    SIGNIFICANT,
-    Problem,
     Rows,
     Shared,
-    Solution,
     cross_matrix,
     median_of_chi_square,
-    minimise,
-    motion_between,
+    moved,
     pose_halves,
     robust,
 )
-from workers.geometry.pixels import rays_of_pixels
+from workers.geometry.frames import add_up
 
 MODES = (2, 1, 5)
 """How many of the eight coordinates of a marker's corners are its place, the growth of its sides, and the rest: its shape."""
@@ -43,24 +37,6 @@ FLOOR_PX = 0.02
 """No corner is taken to be better than this."""
 PRIOR_RESIDUALS = 2
 """The expected sigma of a corner counts as much as so many measured residuals."""
-MATERIAL = 5e-4
-"""What moves a pose by more than this share of its distance is told: a calibration is no better."""
-LEVEL = 1e-3
-"""Level of the F tests by which markers ask for another camera than camera.json's: one capture in a thousand is wronged."""
-SWEPT = 0.005
-"""Sigma of the motion of a hand while an image is read, metres and radians: 0.15 m/s and 9 degrees/s for 1/30 s. A step across
-the rows and a turn that undoes it look alike on a board: of the two, the markers tell only the sum."""
-EXPLAINED = 0.2
-"""Motion that explains a smaller share of the misfit is no finding: noise of a lens or of hidden markers is alike nearby."""
-
-
-@dataclass(frozen=True, eq=False)
-class Doubt:
-    """What the poses may need: motion [V, 6] with its covariance [V, 6, 6], and why in words; empty where it is too little."""
-
-    motion: Array
-    covariance: Array
-    note: str
 
 
 def corner_sigma(variance: float, free: float, spec: Estimation) -> float:
@@ -76,7 +52,6 @@ class CornerTerm:
     square [K]: which are of a marker; the others, of a chessboard, have no side that grows. sigma_px [4]: of a marker's place,
     growth and shape, as `MODES` has them, and of a corner that is no marker's. What a camera does to edges changes the size of
     markers, and slopes of refined edges their shape, more than either moves them: weighed alike, both would move the camera.
-    With `seen` (their pixels [K, 2], centres at +0.5, and the camera of the rays) its intrinsics can be estimated as well.
     """
 
     view: NDArray[np.int64]
@@ -85,7 +60,6 @@ class CornerTerm:
     focal: Array
     sigma_px: Array
     square: NDArray[np.bool_]
-    seen: tuple[Array, CaptureCamera] | None = None
 
     @staticmethod
     def of(corners: Sequence[Corners], camera: CaptureCamera, sigma_px: Array) -> "CornerTerm":
@@ -109,33 +83,35 @@ class CornerTerm:
 
     def rows(self, poses: Array, shared: Shared) -> Rows:
         """Two rows a corner: each mode of a marker over its sigma, as one symmetric matrix, so that a row stays a corner's."""
+        return self.white_rows(self.values(poses, shared))
+
+    def values(self, poses: Array, shared: Shared) -> Array:
+        """[K, 2, 1 + 6 + S] pixels: from where each corner was seen to where it should be, and the derivatives of that."""
         R, t = poses[self.view, :3, :3], poses[self.view, :3, 3]
         outwards = self.outwards
         p = np.einsum("kji,kj->ki", R, shared.print_scale * self.board + shared.growth_m * outwards - t)
         z = np.maximum(p[:, 2], 1e-3)
         at = p[:, :2] / z[:, None]
-        rays, by_camera = self._rays(shared)
-        focal = self.focal * (1.0 + np.array(shared.camera[:2]))  # else a longer one would make noise smaller
         by_point = np.concatenate([np.broadcast_to(np.eye(2), (len(p), 2, 2)), -at[..., None]], axis=2)
-        by_point = by_point * (focal / z[:, None])[..., None]
+        by_point = by_point * (self.focal / z[:, None])[..., None]
         values = np.zeros((len(p), 2, 1 + POSE + SHARED))
         residual, by_pose, by_shared = values[..., 0], values[..., 1 : 1 + POSE], values[..., 1 + POSE :]
-        residual[:] = focal * (at - rays) + shared.growth_px * self.grown
+        residual[:] = self.focal * (at - self.rays) + shared.growth_px * self.grown
         by_pose[:] = np.concatenate([-by_point, by_point @ cross_matrix(p)], axis=2)  # p changes by -dt - dr x p
         by_shared[:, :, PRINT_SCALE] = np.einsum("kij,klj,kl->ki", by_point, R, self.board)
         by_shared[:, :, GROWTH_M] = np.einsum("kij,klj,kl->ki", by_point, R, outwards)
         by_shared[:, :, GROWTH_PX] = self.grown
-        by_shared[:, :, CAMERA] = -focal[:, None] * by_camera
-        by_shared[:, :, CAMERA][:, [0, 1], [0, 1]] += self.focal * (at - rays)
+        return values
+
+    def white_rows(self, values: Array, shared: int = SHARED) -> Rows:
+        """Rows of values [K, 2, 1 + N + S]: residual, N derivatives by what a view has, S by what is shared."""
         white = values / self.sigma_px[3]
         place, growth, shape = (part / sigma for part, sigma in zip(self.modes(values), self.sigma_px, strict=False))
         white[self.square] = (place + growth + shape).reshape(-1, *values.shape[1:])
         weight, cost = robust((white[..., 0] ** 2).sum(axis=1))
-        flat = white.reshape(-1, white.shape[2])
-        by_view = flat[:, None, 1 : 1 + POSE]
-        return Rows(
-            flat[:, 0], np.repeat(self.view, 2)[:, None], by_view, flat[:, 1 + POSE :], np.repeat(weight, 2), cost
-        )
+        flat, last = white.reshape(-1, white.shape[2]), white.shape[2] - shared
+        view = np.repeat(self.view, 2)[:, None]
+        return Rows(flat[:, 0], view, flat[:, None, 1:last], flat[:, last:], np.repeat(weight, 2), cost)
 
     def modes(self, values: Array) -> tuple[Array, Array, Array]:
         """(place, growth, shape), each [M, 4, 2, D]: orthogonal parts of values [K, 2, D] of the corners of M markers."""
@@ -147,16 +123,15 @@ class CornerTerm:
         grown = np.einsum("mij,mijd->md", growth, quads)[:, None, None] * growth[..., None]
         return place, grown, quads - place - grown
 
-    def measured(self, poses: Array, shared: Shared, spec: Estimation) -> "CornerTerm":
+    def measured(self, rows: Rows, spec: Estimation) -> "CornerTerm":
         """The term with sigma_px as its residuals have it.
 
-        The variance of each mode is its median square over that of chi-square, over the share of its coordinates that the
-        poses leave (restricted maximum likelihood; the median resists what hides markers).
+        The variance of each mode is its median square over that of chi-square, over the share of its coordinates that
+        what a view has of its own leaves (restricted maximum likelihood; the median resists what hides markers).
         """
-        rows, sigma_px = self.rows(poses, shared), self.sigma_px.copy()
-        by_pose = rows.by_view[:, 0] * np.sqrt(rows.weight)[:, None]
-        taken = np.einsum("nj,njk->nk", by_pose, pose_halves(rows, len(poses))[rows.view[:, 0]])
-        values = np.concatenate([rows.residual[:, None], taken], axis=1).reshape(-1, 2, 1 + POSE)
+        sigma_px, by_view = self.sigma_px.copy(), rows.by_view[:, 0] * np.sqrt(rows.weight)[:, None]
+        taken = np.einsum("nj,njk->nk", by_view, pose_halves(rows, int(self.view.max()) + 1)[rows.view[:, 0]])
+        values = np.concatenate([rows.residual[:, None], taken], axis=1).reshape(len(self.board), 2, -1)
         parts = [*self.modes(values), values[~self.square][:, None]]
         for mode, (part, degrees) in enumerate(zip(parts, (*MODES, 2), strict=True)):
             squares = (part**2).sum(axis=(1, 2))
@@ -176,25 +151,6 @@ class CornerTerm:
                 ratio[number] = (MAD * float(np.median(of_view))) ** 2 * len(of_view) / (len(of_view) - POSE)
         return np.maximum(ratio, 1.0)
 
-    def _rays(self, shared: Shared) -> tuple[Array, Array]:
-        """([K, 2] rays, [K, 2, 5] their derivatives by the numbers of the camera; 0 where those are not estimated)."""
-        if self.seen is None:
-            return self.rays, np.zeros((len(self.rays), 2, len(shared.camera)))
-        pixels, camera = self.seen
-        now = np.array(shared.camera)
-
-        def rays(numbers: Array) -> Array:
-            changed = corrected_camera(camera, numbers)
-            return rays_of_pixels(pixels, changed.intrinsics, changed.lens)
-
-        steps = DIFFERENCE * np.eye(len(now))
-        by = [(rays(now + step) - rays(now - step)) / (2 * DIFFERENCE) for step in steps]
-        return rays(now), np.stack(by, axis=2)
-
-
-DIFFERENCE = 1e-5
-"""Step of the numbers of a camera by which rays are differentiated: rays are exact to 1e-11."""
-
 
 def outward_motion(corners: Array, square: NDArray[np.bool_]) -> Array:
     """[K, D]: how corners [K, D] of quads, of which each is in a plane, move where each side of a quad gets longer by 1.
@@ -212,155 +168,145 @@ def outward_motion(corners: Array, square: NDArray[np.bool_]) -> Array:
     return motion
 
 
-def find_rolling(term: CornerTerm, solution: Solution, height: int) -> Doubt | None:
-    """What a rolling shutter does to each pose; None where corners do not ask for it, or it moves the poses by too little.
+# ---------------------------------------------------------------------------------------------- what displaces corners
 
-    Each view may have moved evenly from its first row to its last of `height`, which one step of Gauss and Newton finds
-    beside its pose. All corners count alike: what rows do to markers is noise to their modes. An F test over all views.
-    """
-    poses = solution.poses
-    rows = dataclasses.replace(term, sigma_px=np.full(4, term.sigma_px[0])).rows(poses, solution.shared)
-    share, prior = np.repeat(term.focal[1] * term.rays[:, 1] / height, 2), np.diag(np.repeat([0.0, SWEPT**-2], POSE))
-    motion, covariance, gain, left = np.zeros((len(poses), POSE)), np.zeros((len(poses), POSE, POSE)), 0.0, 0.0
-    for number in range(len(poses)):
-        J, residual, _ = rows.of_view(number)
-        both = np.concatenate([J, share[rows.view[:, 0] == number, None] * J], axis=1)
-        inverse = np.linalg.pinv(both.T @ both + prior, hermitian=True)
-        step = -inverse @ (both.T @ residual)
-        motion[number], covariance[number] = step[:POSE], inverse[:POSE, :POSE]
-        gain, left = gain - float(step @ (both.T @ residual)), left + float(residual @ residual)
-    degrees = POSE * len(poses), len(rows.residual) - 2 * POSE * len(poses)
-    shift_m = np.linalg.norm(motion[:, :3], axis=1)
-    if min(degrees) <= 0 or float(np.median(shift_m / np.linalg.norm(poses[:, :3, 3], axis=1))) < MATERIAL:
-        return None
-    variance = (left - gain) / degrees[1]
-    if gain <= EXPLAINED * left or variance_ratio.sf(gain / (degrees[0] * variance), *degrees) >= LEVEL:
-        return None
-    note = (
-        "the corners lie as if the camera moved while the rows of an image were read, which moves the poses by "
-        f"{1000 * float(np.median(shift_m)):.1f} mm: hold it still for each photograph, or use a global shutter"
-    )
-    return Doubt(motion, variance * covariance, note)
-
-
-# ---------------------------------------------------------------------------------------------- the camera
-
-FREE = np.array([0.1, 0.1, 0.1, 0.1, 1.0])
-"""Sigma of fx, fy, cx, cy (shares of the focal length) and k1 beforehand: wide, so that only what is not seen stays put."""
-ALIKE_PX = 0.01
-"""By so much markers may be displaced alike in all views, by what is printed beside them: no camera is blamed for it."""
-WEAK = 1e-3
-"""Of what one view tells of the camera, directions with less than this share of the strongest are left aside."""
-
-
-FITS_NOT = (
-    "camera.json does not fit: the markers say {numbers}, which moves the poses by {by}. Calibrate the camera at this size of "
-    "image, or use --calibrate (estimation.calibrate), which takes what the markers say"
-)
-FITS_NO_MODEL = (
-    "camera.json does not fit the markers, and no other focal length, principal point or k1 does: see that `distortion` has all "
-    "numbers of the calibration (k4, k5, k6 too), or calibrate the camera at this size of image with a lens of eight numbers"
-)
-FITS_NONE = (
-    "camera.json does not fit the markers, and the views are too few or too alike to say which of its numbers is wrong: "
-    "calibrate the camera at this size of image, or take views from more sides"
-)
-
-
-UNEXPLAINED = 2.0
-"""Where markers are off their place by more than so many times the noise of their shape, this camera does not explain it."""
+LOOSE = 0.1
+"""Sigma of numbers of a camera, shares of its focal length, and of a stretch: wide, so that only what is not seen stays."""
+STEPS, NOISE_STEPS, SETTLED, REGULAR, HELD = 8, 3, 1e-6, 1e-2, 1e12
 
 
 @dataclass(frozen=True, eq=False)
-class CameraFit(Doubt):
-    """The camera by the markers of all views; significant: they ask for another than camera.json's.
+class Fields:
+    """How corners [K] move in the image, pixels, by each number of an explanation.
 
-    is_known: markers then lie where they should but for the noise of corners, and the poses are nearer to the truth with this
-    camera, by its own uncertainty.
+    alike [K, 2, A]: by those that all views share; of_view [K, 2, N]: by those that each view has of its own; sigma [A + N]: of
+    each number beforehand.
     """
 
-    camera: CaptureCamera
-    significant: bool
-    is_known: bool
+    alike: Array
+    of_view: Array
+    sigma: Array
+
+    @staticmethod
+    def of(alike: Array | None, of_view: Array | None = None, sigma: float | Array = LOOSE) -> "Fields":
+        """Of either kind or both."""
+        some = alike if alike is not None else of_view
+        assert some is not None
+        none = np.zeros((*some.shape[:2], 0))
+        alike, of_view = none if alike is None else alike, none if of_view is None else of_view
+        return Fields(alike, of_view, np.broadcast_to(sigma, alike.shape[2] + of_view.shape[2]))
 
 
-def corrected_camera(camera: CaptureCamera, numbers: Sequence[float] | Array) -> CaptureCamera:
-    """The camera after the corrections (fx, fy, cx, cy, k1) of `Shared`."""
-    k, (fx, fy, cx, cy, k1) = camera.intrinsics, (float(number) for number in numbers)
-    update = {"fx": k.fx * (1 + fx), "fy": k.fy * (1 + fy), "cx": k.cx + k.fx * cx, "cy": k.cy + k.fy * cy}
-    lens = frozen_array(camera.lens + k1 * np.eye(8)[0])
-    return dataclasses.replace(camera, intrinsics=k.model_copy(update=update), lens=lens)
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An explanation at its least cost: poses [V, 4, 4], growth of squares, its numbers, and the rows there.
 
-
-def fit_camera(
-    held: CornerTerm, seen: tuple[Array, CaptureCamera], fixed: NDArray[np.bool_], begun: Solution, spec: Estimation
-) -> CameraFit | None:
-    """The camera by the corners of all views, begun at their poses; None where there are fewer corners than unknowns.
-
-    An F test of the robust cost with and without another camera. What corners of one view have in common (blur, a bent board)
-    looks like another camera: where the views' own gradients scatter by more than independent corners make them, that is the
-    noise, with as many degrees of freedom as views and numbers have.
+    covariance [V, 6, 6] of the poses and alike_covariance [A, A], where rows have unit variance. `occam`: what the numbers of
+    the views cost by Laplace's approximation of the evidence: their squares, and how much narrower they are than beforehand.
     """
-    size, count = len(FREE), len(begun.poses)
-    loose = np.zeros(count, bool)  # a pose that was given by hand is no measure of the camera
-    prior = np.concatenate([np.zeros(GROWTH_M), [GROW_M, GROW_PX], FREE])
-    corners, most = dataclasses.replace(held, seen=seen), spec.max_iterations
-    free = minimise(Problem([corners], prior, loose), begun.poses, begun.shared, most)
-    # A wrong camera makes corners look noisy: what is an outlier is known once it is right.
-    corners = corners.measured(free.poses, free.shared, spec)
-    free = minimise(Problem([corners], prior, loose), free.poses, free.shared, most)
-    without, no_camera = dataclasses.replace(corners, seen=None), np.arange(SHARED) < CAMERA.start
-    usual = minimise(Problem([without], prior * no_camera, loose), begun.poses, begun.shared, most)
-    rows = corners.rows(free.poses, free.shared)
-    degrees = len(rows.residual) - POSE * count - size - 2
-    if degrees < size or count < 2:
-        return None
-    variance = rows.cost / degrees
-    covariance = variance * free.covariance()
-    alike = 0.25 * len(rows.residual) * (ALIKE_PX / corners.sigma_px[0]) ** 2  # two of a marker's eight are its place
-    noise = size * variance * max(1.0, _scatter(rows, count, variance)) + alike
-    ratio = (without.rows(usual.poses, usual.shared).cost - rows.cost) / noise
-    significant = bool(variance_ratio.sf(ratio, size, size * (count - 1)) < LEVEL)
-    motion = np.stack([motion_between(a, b) for a, b in zip(begun.poses, free.poses, strict=True)])
-    motion[fixed] = 0.0
-    of_camera, by_camera = covariance[-size:, -size:], covariance[:-SHARED, -size:].reshape(count, POSE, size)
-    of_poses = np.einsum("vij,jk,vlk->vil", by_camera, np.linalg.inv(of_camera), by_camera)
-    shift_m, unsure_m = np.linalg.norm(motion[:, :3], axis=1), np.sqrt(np.trace(of_poses[:, :3, :3], axis1=1, axis2=2))
-    camera, note = corrected_camera(seen[1], free.shared.camera), ""
-    explains = bool(corners.sigma_px[0] <= UNEXPLAINED * corners.sigma_px[2])
-    sure = np.abs(free.shared.camera) > SIGNIFICANT * np.sqrt(np.diag(of_camera))
-    numbers = compare_cameras(camera, seen[1], sure)
-    material = float(np.max(shift_m / np.linalg.norm(begun.poses[:, :3, 3], axis=1))) >= MATERIAL
-    if significant and not explains:
-        note = FITS_NO_MODEL * material
-    elif significant and (material or (numbers and explains)):
-        by = f"{1000 * float(np.median(shift_m)):.1f} mm"
-        note = FITS_NOT.format(numbers=numbers, by=by) if numbers else FITS_NONE
-    is_known = significant and explains and bool(np.median(shift_m) > np.median(unsure_m))
-    return CameraFit(motion, of_poses, note, camera, significant, is_known)
+
+    poses: Array
+    shared: Shared
+    alike: Array
+    own: Array
+    rows: Rows
+    covariance: Array
+    alike_covariance: Array
+    occam: float
+
+    @property
+    def cost(self) -> float:
+        """Robust sum of squares, in sigma of a corner squared."""
+        return self.rows.cost
 
 
-def _scatter(rows: Rows, views: int, variance: float) -> float:
-    """Mean, over the views, of what their gradients by the camera come to over what independent corners make them."""
-    ratios = []
+def fit_fields(
+    term: CornerTerm, fields: Fields, poses: Array, shared: Shared, hold: float = 0.0, steps: int = STEPS
+) -> Fitted:
+    """The poses and numbers of least robust cost, by Gauss and Newton, each view's own unknowns eliminated in turn.
+
+    hold: by how much a pose resists, where a view's fields can do all that it does, which takes few steps.
+    """
+    views, (A, N) = len(poses), (fields.alike.shape[2], fields.of_view.shape[2])
+    alike, own = np.zeros(A), np.zeros((views, N))
+    prior = np.concatenate([[GROW_M, GROW_PX], fields.sigma[:A]]) ** -2.0
+    own_prior = np.concatenate([np.full(POSE, hold), fields.sigma[A:] ** -2.0])
+    best: Fitted | None = None
+    for _ in range(steps):
+        values = term.values(poses, shared)
+        values[..., 0] += fields.alike @ alike + np.einsum("kcn,kn->kc", fields.of_view, own[term.view])
+        order = (values[..., : 1 + POSE], fields.of_view, values[..., 1 + POSE :], fields.alike)
+        rows = term.white_rows(np.concatenate(order, axis=2), SHARED + A)
+        matrix, gradient = np.diag(prior), prior * np.concatenate([[shared.growth_m, shared.growth_px], alike])
+        parts = []
+        for number in range(views):
+            J, residual, by = rows.of_view(number)
+            by = by[:, GROWTH_M:]
+            inverse = np.linalg.inv(J.T @ J + np.diag(own_prior + REGULAR))
+            g = J.T @ residual + own_prior * np.concatenate([np.zeros(POSE), own[number]])
+            cross = by.T @ J
+            matrix = matrix + by.T @ by - cross @ inverse @ cross.T
+            gradient = gradient + by.T @ residual - cross @ inverse @ g
+            parts.append((inverse, g, cross))
+        covariance = np.linalg.pinv(matrix, hermitian=True)
+        of_poses: Array = np.stack(
+            [i[:POSE, :POSE] + (i @ c.T @ covariance @ c @ i)[:POSE, :POSE] for i, _, c in parts]
+        )
+        narrower = add_up(
+            -np.linalg.slogdet(i[POSE:, POSE:])[1] + 2.0 * np.log(fields.sigma[A:]).sum() for i, _, _ in parts
+        )
+        occam = narrower + float((own**2 * own_prior[POSE:]).sum())
+        now = Fitted(poses, shared, alike, own, rows, of_poses, np.asarray(covariance[2:, 2:], np.float64), occam)
+        if best is None or now.cost < best.cost:
+            best = now
+        step = -covariance @ gradient
+        of_views = np.stack([-i @ (g + c.T @ step) for i, g, c in parts])
+        if max(np.abs(step).max(), np.abs(of_views).max()) < SETTLED:
+            break
+        poses, own, alike = moved(poses, of_views[:, :POSE]), own + of_views[:, POSE:], alike + step[2:]
+        growth = shared.growth_m + float(step[0]), shared.growth_px + float(step[1])
+        shared = dataclasses.replace(shared, growth_m=growth[0], growth_px=growth[1])
+    assert best is not None
+    return best
+
+
+DEGREES = {24: 5, 18: 4, 14: 3, 0: 2}
+"""The degree of the smooth field of a view by how many markers it has at least."""
+
+
+def _smooth(term: CornerTerm, views: int) -> Fields:
+    """A polynomial over the image in each view, whose degree is that which its markers bear."""
+    view, rays = term.view, term.rays
+    size = (max(DEGREES.values()) + 1) * (max(DEGREES.values()) + 2) // 2
+    of_view = np.zeros((len(view), 2, 2 * size))
     for number in range(views):
-        J, residual, by = rows.of_view(number)
-        if len(J) <= POSE:
+        here = view == number
+        if not here.any():
             continue
-        by = by[:, CAMERA] - J @ np.linalg.pinv(J.T @ J, hermitian=True) @ (
-            J.T @ by[:, CAMERA]
-        )  # what no pose takes up
-        strength, directions = np.linalg.eigh(by.T @ by)
-        kept = strength > WEAK * strength[-1]
-        along = directions[:, kept].T @ (by.T @ residual)
-        ratios.append(float((along**2 / strength[kept]).mean()) / variance)
-    return float(np.mean(ratios)) if ratios else 1.0
+        p = rays[here] - rays[here].mean(axis=0)
+        p = p / np.maximum(np.abs(p).max(axis=0), 1e-9)
+        degree = next(d for markers, d in DEGREES.items() if here.sum() >= 4 * markers)
+        powers = [p[:, 0] ** i * p[:, 1] ** (d - i) for d in range(degree + 1) for i in range(d + 1)]
+        for n, power in enumerate(powers):
+            of_view[here, 0, 2 * n] = of_view[here, 1, 2 * n + 1] = power
+    return Fields.of(None, of_view, sigma=100.0)
 
 
-def compare_cameras(camera: CaptureCamera, given: CaptureCamera, chosen: NDArray[np.bool_] | None = None) -> str:
-    """Numbers of two cameras in words, as camera.json has them with pixel_centre 0: all five, or those chosen."""
-    k, of = camera.intrinsics, given.intrinsics
-    pairs = [(k.fx, of.fx), (k.fy, of.fy), (k.cx_opencv, of.cx_opencv), (k.cy_opencv, of.cy_opencv)]
-    words = [f"{name} = {a:.1f} ({b:.1f} given)" for name, (a, b) in zip(("fx", "fy", "cx", "cy"), pairs, strict=True)]
-    words.append(f"k1 = {camera.lens[0]:.4f} ({given.lens[0]:.4f} given)")
-    return ", ".join(word for n, word in enumerate(words) if chosen is None or chosen[n])
+def measure_noise(term: CornerTerm, poses: Array, shared: Shared, spec: Estimation) -> tuple[Array, float | None]:
+    """(sigma_px [4] of what a smooth field in each view leaves of the corners, the variance left by it); None of too few."""
+    fields = _smooth(term, len(poses))
+    for _ in range(3):
+        smooth = fit_fields(term, fields, poses, shared, HELD, NOISE_STEPS)
+        before, term, shared = term, term.measured(smooth.rows, spec), smooth.shared
+    columns = int((np.abs(fields.of_view).max(axis=(0, 1)) > 0).sum())
+    count = len(smooth.rows.residual)
+    free = count - columns * len(poses)
+    variance = smooth.cost / free if free >= count // 4 else None
+    sigma_px = before.sigma_px.copy()
+    if (most := PLACE * sigma_px[2]) < sigma_px[0]:
+        sigma_px[0], variance = most, variance and min(variance, 1.0)
+    return sigma_px, variance
+
+
+PLACE = 3.0
+"""A marker's place is at most so many times noisier than its shape, which no camera bends much."""

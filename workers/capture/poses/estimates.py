@@ -8,17 +8,20 @@ from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.capture import CLUTTERED, CaptureEstimate, DepthCorrection, ViewEstimate
-from workers.capture.poses.corners import Doubt, find_rolling, fit_camera
+from schemas.job.captures import Estimation
+from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
+from workers.capture.poses.moments import Moment, find_moment
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
-from workers.capture.poses.standing import SEEN_THROUGH_M, object_groups
+from workers.capture.poses.standing import object_groups
 from workers.capture.poses.terms import (
     NAMES,
     POSE,
     PRINT_SCALE,
     SHARED,
     SIGNIFICANT,
+    Shared,
     correct_depth,
     cross_matrix,
     motion_between,
@@ -105,6 +108,8 @@ MIN_PATCHES = 4
 """So many patches of the board tell its tilt."""
 SCALES_DIFFER = 0.01
 """Print and depth disagree: smaller differences may be errors of depth that change with distance, within specification."""
+UNMEASURED = 0.005
+"""Printers scale to the page, and paper stretches, by about this share."""
 
 
 def estimate_joint(evidence: Evidence) -> CaptureEstimate:
@@ -116,28 +121,22 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     problem = measure_corners(problem, evidence.spec)
     joint = solve_jointly(problem, evidence.spec)
     pixels = np.concatenate([o.corners.pixels for o in problem.observations])
-    camera = fit_camera(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
-    doubt: Doubt | None = camera if camera is not None and camera.note else None
-    doubt = doubt or find_rolling(problem.corner_term(), joint.solution, problem.camera.intrinsics.height)
-    everyone = list(range(len(problem.index)))
-    # Poses that are off by more than an object is said to have moved see it elsewhere although it rests.
-    off_m = 0.0 if doubt is None else float(np.linalg.norm(doubt.motion[:, :3], axis=1).max())
-    groups, clutter = [everyone], dict[int, NDArray[np.bool_]]()
-    if off_m <= SEEN_THROUGH_M / SIGNIFICANT:
-        groups, clutter = _groups(problem, joint, everyone)
+    doubt = find_doubt(problem.corner_term(), (pixels, problem.camera), problem.fixed, joint.solution, evidence.spec)
+    explained = _explained(problem, joint, doubt, evidence.spec)
+    moment = None if explained[1].board is None else find_moment(explained[1].board, explained[1].by_board)
+    groups, clutter = _groups(*explained, moment, list(range(len(problem.index))))
     if clutter or len(groups) > 1:
         still = [o.without(clutter[n]) if n in clutter else o for n, o in enumerate(problem.observations)]
         for n in (n for group in groups[1:] for n in group):
             still[n] = dataclasses.replace(still[n], object_patches=no_patches())
         problem = dataclasses.replace(problem, observations=tuple(still))
         joint = solve_jointly(problem, evidence.spec)
-    if doubt is None and camera is not None and (camera.significant or evidence.spec.calibrate):
-        doubt = camera
-    estimate = _result(problem, joint, doubt, evidence)
+    estimate = _result(problem, joint, doubt, moment, evidence)
     if len(groups) > 1:
         numbers = [[problem.observations[n].number for n in group] for group in groups]
-        estimate = _mark_moved(estimate, numbers, len(_groups(problem, joint, groups[0])[0]) == 1)
-    return dataclasses.replace(estimate, camera=camera.camera if camera is not None and camera.is_known else None)
+        settled, _ = _groups(*_explained(problem, joint, doubt, evidence.spec), moment, groups[0])
+        estimate = _mark_moved(estimate, numbers, len(settled) == 1)
+    return dataclasses.replace(estimate, camera=doubt.camera if doubt is not None and doubt.is_known else None)
 
 
 def _pose_problem(evidence: Evidence) -> Views | None:
@@ -173,7 +172,32 @@ def _tilt_misfit(seen: Observation, T: Pose) -> float:
     return float((np.minimum(np.abs(height - np.median(height)) / sigma, 5.0) ** 2).sum())
 
 
-def _groups(problem: Views, joint: Joint, among: list[int]) -> tuple[list[list[int]], dict[int, NDArray[np.bool_]]]:
+def _explained(
+    problem: Views, joint: Joint, doubt: Doubt | None, spec: Estimation
+) -> tuple[Views, Joint, Array | None]:
+    """The problem and its solution as the explanation of the corners has them, which moves poses and depth; its covariance."""
+    if doubt is None:
+        return problem, joint, None
+    camera, fixed = problem.camera, np.ones_like(problem.fixed)
+    reread = [
+        dataclasses.replace(
+            o,
+            board_patches=doubt.reread(o.board_patches, camera),
+            object_patches=doubt.reread(o.object_patches, camera),
+        )
+        for o in problem.observations
+    ]
+    poses = np.where(problem.fixed[:, None, None], problem.poses, doubt.poses)
+    other = dataclasses.replace(problem, observations=tuple(reread), poses=poses, fixed=fixed)
+    covariance = doubt.covariance
+    if not doubt.fits:
+        covariance = covariance + doubt.motion[:, :, None] * doubt.motion[:, None]
+    return dataclasses.replace(other, fixed=problem.fixed), solve_jointly(other, spec), covariance
+
+
+def _groups(
+    problem: Views, joint: Joint, covariance: Array | None, moment: Moment | None, among: list[int]
+) -> tuple[list[list[int]], dict[int, NDArray[np.bool_]]]:
     """(the views among these by where the object stands; which patches are clutter, of views that have any).
 
     Poses that were given by hand are nobody's to doubt.
@@ -184,16 +208,22 @@ def _groups(problem: Views, joint: Joint, among: list[int]) -> tuple[list[list[i
     sigma_m = 0.0 if term is None else float(np.median(term.sigma_m / term.growth))
     # An object that moved pulls the poses after it: those by the board alone do not know of it.
     solution, seen = joint.by_board, [problem.observations[n] for n in among]
-    covariance = solution.of_views()
+    covariance = solution.of_views() if covariance is None else covariance
     place, turn = (np.trace(covariance[:, block, block], axis1=1, axis2=2) for block in (slice(3), slice(3, 6)))
     unsure_m = np.sqrt(place + (solution.poses[:, :3, 3] ** 2).sum(axis=1) * turn)
-    groups, clutter = object_groups(seen, solution.poses[among], solution.shared, sigma_m, unsure_m[among])
+    poses, shared = solution.poses, solution.shared
+    if moment is not None:
+        shared = Shared()
+        poses, unsure_m = moment.T_board_depth @ poses, np.hypot(unsure_m, moment.unsure_m)
+    groups, clutter = object_groups(seen, poses[among], shared, sigma_m, unsure_m[among])
     return [[among[n] for n in group] for group in groups], {
         among[n]: out for n, out in enumerate(clutter) if out.any()
     }
 
 
-def _result(problem: Views, joint: Joint, doubt: Doubt | None, evidence: Evidence) -> CaptureEstimate:
+def _result(
+    problem: Views, joint: Joint, doubt: Doubt | None, moment: Moment | None, evidence: Evidence
+) -> CaptureEstimate:
     """`doubt`: what the poses may need, which makes all but given ones less certain."""
     solution = joint.solution
     sigma = np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
@@ -209,12 +239,13 @@ def _result(problem: Views, joint: Joint, doubt: Doubt | None, evidence: Evidenc
             view = dataclasses.replace(view, covariance=covariance)
         views[problem.index[place]] = view
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
-    cause = doubt.note if doubt is not None and doubt.note else scale_note(joint, sigma, evidence)
+    causes = [cause.note for cause in (doubt, moment) if cause is not None and cause.note]
+    causes = causes or [scale_note(joint, sigma, evidence) or ruler_note(joint, evidence)]
     cluttered = ", ".join(str(o.number) for o in problem.observations if o.is_cluttered)
     clutter = (
         f"what one view alone has on the board, such as a hand, is left out: views {cluttered}" if cluttered else ""
     )
-    notes = tuple(note for note in (clutter, cause, *noise_notes(joint, problem)) if note)
+    notes = tuple(note for note in (clutter, *causes, *noise_notes(joint, problem)) if note)
     ordered = tuple(views[index] for index in sorted(views))
     scale, steps = solution.shared.print_scale, solution.iterations
     return CaptureEstimate("joint", ordered, correction, scale, steps, solution.converged, notes)
@@ -266,7 +297,8 @@ def scale_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
     index = NAMES.index("scale") if by_print else PRINT_SCALE
     # The scale of depth turns a measured length into a true one; the print's does so for a length of board.json.
     excess = (1.0 / shared.scale if by_print else shared.print_scale) - 1.0
-    if joint.prior[index] == 0 or abs(excess) < max(SCALES_DIFFER, SIGNIFICANT * sigma[index]):
+    least = SCALES_DIFFER if board.measured_ruler_m is not None else UNMEASURED
+    if joint.prior[index] == 0 or abs(excess) < max(least, SIGNIFICANT * sigma[index]):
         return ""
     start = (
         "print and depth disagree about the scale: by depth the print is "
@@ -278,6 +310,19 @@ def scale_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
         f"{start}. Which is right cannot be identified from the capture alone; {'the print' if by_print else 'depth'} was "
         f"believed. Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as "
         "measured_ruler_m"
+    )
+
+
+def ruler_note(joint: Joint, evidence: Evidence) -> str:
+    """What lengths are worth where nobody measured the board; empty where somebody did, or depth is metric truth."""
+    board = evidence.board
+    if board.measured_ruler_m is not None or evidence.spec.trust == "depth":
+        return ""
+    distance_m = float(np.median(np.linalg.norm(joint.solution.poses[:, :3, 3], axis=1)))
+    return (
+        f"the board's ruler was not measured: all lengths are known to about {UNMEASURED:.1%}, "
+        f"{1000 * UNMEASURED * distance_m:.0f} mm at these distances, beside what sigma_mm says. Measure it "
+        f"({1000 * board.ruler_m:g} mm) and write measured_ruler_m into board.json"
     )
 
 

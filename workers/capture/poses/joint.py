@@ -246,7 +246,7 @@ def measure_corners(views: Views, spec: Estimation) -> Views:
     for _ in range(NOISE_ROUNDS):
         solution = minimise(Problem([corners], prior, np.zeros_like(views.fixed)), poses, shared, spec.max_iterations)
         poses, shared = solution.poses, solution.shared
-        corners = corners.measured(poses, shared, spec)
+        corners = corners.measured(corners.rows(poses, shared), spec)
     halves = pose_halves(corners.rows(poses, shared), len(poses))
     poses = np.where(views.fixed[:, None, None], views.poses, poses)
     covariance = halves @ halves.transpose(0, 2, 1)

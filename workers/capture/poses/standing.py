@@ -16,6 +16,8 @@ from workers.geometry.frames import invert, transform
 
 WITHIN_RAD = 0.008
 """A point is compared with the patch of another view whose middle is at most so far from its direction: within the patch."""
+ASIDE = 16
+"""So many patches around a point are looked at, where a pose is so unsure that it may take it aside."""
 GRAZING = 0.15
 """A patch whose plane a ray meets at a smaller cosine does not tell a depth there."""
 SEEN_THROUGH_M = 0.004
@@ -137,12 +139,17 @@ def _compare(
             p = transform(invert(poses[other]), place)
             front = np.flatnonzero(p[:, 2] > NEAREST_M)
             p = p[front]
-            distance, nearest = tree.query(p[:, :2] / p[:, 2:])
-            plane, ray = normals[other][nearest], p / p[:, 2:]
-            along = (plane * ray).sum(axis=1)
-            met = (distance < WITHIN_RAD) & (np.abs(along) > GRAZING)
-            beyond = (plane * points[other][nearest]).sum(axis=1)[met] / along[met] - p[met, 2]
-            sigma = np.hypot(sigma_m * p[met, 2] ** 2, np.hypot(unsure_m[number], unsure_m[other]))
+            ray, unsure = p / p[:, 2:], np.hypot(unsure_m[number], unsure_m[other])
+            distance, nearest = tree.query(ray[:, :2], k=range(1, min(ASIDE, tree.n) + 1))
+            # A pose that is unsure may take a point past the edge of what it lies on: all that it may meet must be nearer.
+            near, nearest = distance < SIGNIFICANT * unsure / p[:, 2:], np.minimum(nearest, tree.n - 1)
+            near[:, 0] |= distance[:, 0] < WITHIN_RAD
+            along = np.einsum("pki,pi->pk", normals[other][nearest], ray)
+            near &= np.abs(along) > GRAZING
+            along = np.where(near, along, 1.0)
+            beyond = (normals[other][nearest] * points[other][nearest]).sum(axis=2) / along - p[:, 2:]
+            sigma = np.hypot(sigma_m * p[:, 2:] ** 2, unsure / np.abs(along))
             limit = SEEN_THROUGH_M + SIGNIFICANT * sigma
-            views[number][:, front[met], other] = np.abs(beyond) <= limit, beyond > limit
+            views[number][0, front, other] = (near & (np.abs(beyond) <= limit)).any(axis=1)
+            views[number][1, front, other] = near.any(axis=1) & (~near | (beyond > limit)).all(axis=1)
     return on_board, views

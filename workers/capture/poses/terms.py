@@ -45,17 +45,14 @@ def motion_between(T: Pose, other: Pose) -> Array:
 NAMES = (
     *("offset_m", "scale", "shift_x_m", "shift_y_m", "shift_z_m", "turn_x_rad", "turn_y_rad", "turn_z_rad"),
     *("print_scale", "growth_m", "growth_px"),
-    *("fx", "fy", "cx", "cy", "k1"),
 )
-"""The shared parameters in the order in which they stand in every array of S = 16 numbers.
+"""The shared parameters in the order in which they stand in every array of S = 11 numbers.
 
-A printed square may look larger than it is: by `growth_m` where ink spreads, by `growth_px` where the camera sharpens. The last
-five correct camera.json: all but k1 are shares of its fx and fy.
+A printed square may look larger than it is: by `growth_m` where ink spreads, by `growth_px` where the camera sharpens.
 """
 DEPTH_SCALE = NAMES.index("scale")
 PRINT_SCALE = NAMES.index("print_scale")
 GROWTH_M, GROWTH_PX = NAMES.index("growth_m"), NAMES.index("growth_px")
-CAMERA = slice(NAMES.index("fx"), NAMES.index("k1") + 1)
 POSE, SHARED = 6, len(NAMES)
 
 OFFSET_M = 0.011
@@ -89,7 +86,6 @@ class Shared:
     print_scale: float = 1.0
     growth_m: float = 0.0
     growth_px: float = 0.0
-    camera: tuple[float, ...] = (0.0,) * 5
 
     def corrected(self, patches: Patches) -> Array:
         """[P, 3] metres, camera axes: the middles of patches after the correction."""
@@ -111,23 +107,23 @@ class Shared:
         """The parameters after a step [S]."""
         U, _, V = np.linalg.svd(Rotation.from_rotvec(step[5:8]).as_matrix() @ self.T_cam_depth[:3, :3])
         T = frozen_array(pose(U @ V, self.T_cam_depth[:3, 3] + step[2:5]))
-        plain = np.array([self.offset_m, self.scale, self.print_scale, self.growth_m, self.growth_px, *self.camera])
+        plain = np.array([self.offset_m, self.scale, self.print_scale, self.growth_m, self.growth_px])
         plain = plain + step[[0, 1, *range(8, SHARED)]]
-        offset_m, scale, print_scale, growth_m, growth_px, *camera = plain.tolist()
-        return Shared(offset_m, scale, T, print_scale, growth_m, growth_px, tuple(camera))
+        offset_m, scale, print_scale, growth_m, growth_px = plain.tolist()
+        return Shared(offset_m, scale, T, print_scale, growth_m, growth_px)
 
     def deviation(self) -> Array:
         """[S]: how far each parameter is from its expected value."""
         turn = Rotation.from_matrix(self.T_cam_depth[:3, :3]).as_rotvec()
         parts = [self.offset_m, self.scale - 1, *self.T_cam_depth[:3, 3], *turn, self.print_scale - 1]
-        return np.array([*parts, self.growth_m, self.growth_px, *self.camera], dtype=np.float64)
+        return np.array([*parts, self.growth_m, self.growth_px], dtype=np.float64)
 
 
 def prior_sigma(spec: Estimation, has_depth: bool) -> Array:
     """[S]: how far each parameter may be from its expected value, one sigma; 0 for those that are not estimated."""
     scale, print_ = (SCALE_BY_PRINT, 0.0) if spec.trust == "print" else (SCALE, PRINT)
     of_depth = np.array([OFFSET_M, scale, *[SHIFT_M] * 3, *[TURN_RAD] * 3, print_]) * has_depth
-    return np.concatenate([of_depth, [GROW_M, GROW_PX], np.zeros(CAMERA.stop - CAMERA.start)])
+    return np.concatenate([of_depth, [GROW_M, GROW_PX]])
 
 
 def correct_depth(shared: Shared, sigma: Array, prior: Array) -> DepthCorrection:
@@ -205,8 +201,9 @@ def median_of_chi_square(degrees: int) -> float:
 
 
 def pose_halves(rows: Rows, views: int) -> Array:
-    """[V, 6, 6]: H with H H^T the covariance of each view's pose by its rows alone, with all that is shared held."""
-    halves = np.zeros((views, POSE, POSE))
+    """[V, N, N]: H with H H^T the covariance of what each view has of its own by its rows alone, with all that is shared held."""
+    size = rows.by_view.shape[2]
+    halves = np.zeros((views, size, size))
     for number in range(views):
         J = rows.of_view(number)[0]
         strength, directions = np.linalg.eigh(J.T @ J)

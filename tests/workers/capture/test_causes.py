@@ -1,0 +1,22 @@
+"""Each thing that is wrong with a capture is named, or its poses are right, or their sigma covers it."""
+
+import pytest
+
+from tests.workers.capture.confusion import CAUSES, confusion, judge, table
+
+SHARE = 0.9
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_a_cause_is_named_or_covered_and_no_camera_that_is_taken_makes_it_worse(cause):
+    outcome = judge(cause, 0)
+    assert outcome.right and not outcome.worse, outcome.said
+
+
+@pytest.mark.slow
+def test_of_fifty_captures_of_each_cause_nine_in_ten_are_right_and_none_is_made_worse(record_figure):
+    outcomes = confusion(50, list(CAUSES))
+    for cause, each in outcomes.items():
+        share = sum(outcome.right for outcome in each) / len(each)
+        record_figure(f"captures, {cause}, right", "share", share, SHARE)
+        assert share >= SHARE and not any(outcome.worse for outcome in each), table(outcomes)
