@@ -86,19 +86,20 @@ def solve_board(folder: CaptureFolder, side_m: float, dictionary: str, border_bi
 
 def other_board(folder: CaptureFolder) -> str:
     """What the photographs show in place of board.json's board, with the command that describes it; or nothing."""
-    board, words, name = folder.board, "", smallest_dictionary(folder.board.dictionary, LARGEST)
+    board, name = folder.board, smallest_dictionary(folder.board.dictionary, LARGEST)
     if name not in PREDEFINED:
-        return words
+        return ""
     seen = _see(folder, open_dictionary(Board(dictionary=name)), board.border_bits, LOOKED_AT)
-    if max(map(len, seen.values())) < FEW_MARKERS:
-        words, name = other_dictionary(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
-        if not name:
-            return words
-        seen = _see(folder, open_dictionary(Board(dictionary=name)), board.border_bits, LOOKED_AT)
-        words += ": correct board.json"
-    recognised = recognise_board(list(seen.values()), board, name)
+    several = max(map(len, seen.values())) >= FEW_MARKERS
+    recognised = recognise_board(list(seen.values()), board, name) if several else None
     if recognised is None:
-        return words
+        words, other = other_dictionary(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
+        if not other or (several and other == name):  # mirrored markers are misread as others of their family
+            return "" if other else words
+        seen = _see(folder, open_dictionary(Board(dictionary=other)), board.border_bits, LOOKED_AT)
+        recognised = recognise_board(list(seen.values()), board, other)
+        if recognised is None:
+            return f"{words}: correct board.json"
     kind, sizes = recognised
     words = f"{kind.replace('charuco', 'ChArUco')} board of {sizes.columns} x {sizes.rows} of {sizes.dictionary}"
     options = ["--kind", kind, "--size", f"{sizes.columns}x{sizes.rows}", "--dictionary", sizes.dictionary]
