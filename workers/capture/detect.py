@@ -199,6 +199,8 @@ BESIDE_SIDES = 0.5
 """A marker belongs to a print whose pose puts it at most so many of its sides away."""
 EXPLAINED = 0.8
 """Share of all markers that prints of one board explain: what lies otherwise is another board."""
+GROWTH = 3
+"""A print grows from the markers nearest to the pair by fitting its pose so many times."""
 
 
 def split_prints(
@@ -240,10 +242,6 @@ def split_prints(
         prints.append(best)
         left = np.setdiff1d(left, best)
     return prints if sum(map(len, prints)) >= EXPLAINED * len(ids) else []
-
-
-GROWTH = 3
-"""A print grows from the markers nearest to the pair by fitting its pose so many times."""
 
 
 def find_markers(
