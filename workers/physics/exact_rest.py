@@ -72,6 +72,11 @@ SAME_CONTACT_M = 5e-3
 """Distance up to which a contact of a step may be that of the step before. A wrong guess costs time alone."""
 
 
+FLUSH_M = 1e-6
+"""Overlap that may stay where contacts jam: sides of two bodies that are flush lie nanometres beyond one another, either way, and
+no motion takes both apart."""
+
+
 class JammedError(Exception):
     """No small motion takes all bodies out of one another."""
 
@@ -91,8 +96,8 @@ def step(
     motion d at every contact: the convex relaxation of Coulomb's law by Anitescu (2006, "Optimization-based simulation of
     nonsmooth rigid multibody dynamics"). A least-distance problem, solved by DAQP (Arnstrom et al. 2022, "A dual active-set
     solver for embedded quadratic programming"). Its multipliers are the contact forces; where nothing moves they balance the
-    weights, which is static equilibrium. before: a step of the same bodies shortly before, by which it is solved ten times
-    sooner. Raises JammedError.
+    weights, which is static equilibrium. Where no motion satisfies all, overlap of up to `FLUSH_M` may stay. before: a step of
+    the same bodies shortly before, by which it is solved ten times sooner. Raises JammedError.
     """
     # The inverse of the square root of each tensor of inertia
     roots = [(axes / np.sqrt(moments)) @ axes.T for moments, axes in (np.linalg.eigh(body.tensor) for body in bodies)]
@@ -107,10 +112,14 @@ def step(
     free[:, :3] = root_masses[:, None] * fall / fall_m
     # Lengths in units of `fall_m`, so that all numbers are near 1
     needed = -np.repeat(contacts.gaps / fall_m, len(arms_m)) - matrix @ free.ravel()
-    if before is None or not len(matrix):
-        away, multipliers = _least_distance(matrix, needed)
-    else:
-        away, multipliers = _least_distance_from(matrix, needed, before.likely(contacts, len(arms_m)))
+    likely = None if before is None or not len(matrix) else before.likely(contacts, len(arms_m))
+    try:
+        away, multipliers = _least_distance(matrix, needed, likely)
+    except JammedError:
+        flush_m = np.where((contacts.gaps < 0.0) & (contacts.gaps >= -FLUSH_M), contacts.gaps, 0.0)
+        if not flush_m.any():
+            raise
+        away, multipliers = _least_distance(matrix, needed + np.repeat(flush_m / fall_m, len(arms_m)), likely)
     multipliers = multipliers.reshape(edges.shape[:2])
     forces = gravity_m_s2 * (np.maximum(0.0, -multipliers)[..., None] * edges).sum(axis=1)
     moved = (free + away.reshape(free.shape)) * fall_m
@@ -118,34 +127,19 @@ def step(
     return Motion(moved[:, :3] / root_masses[:, None], turns, forces, contacts, multipliers)
 
 
-def _least_distance(matrix: Array, least: Array, start: Array | None = None) -> tuple[Array, Array]:
+def _least_distance(matrix: Array, least: Array, likely: Array | None = None) -> tuple[Array, Array]:
     """(x [n], multipliers [m] <= 0): the least x with `matrix @ x >= least`, which is `-matrix.T @ multipliers`.
 
-    start [m]: multipliers to begin from. Raises JammedError where no x is.
+    By the rows alone of multipliers that are `likely` [contacts, edges], if given, and such as prove to be missing: DAQP looks
+    at all rows in every iteration, and a heap of 25 has seven thousand. Of each contact the edge is added that is worst.
+    Raises JammedError where no x is.
     """
-    count, size = matrix.shape
-    if count == 0:
-        return np.zeros(size), np.zeros(0)
-    bounds = np.full(count, UNBOUNDED), least, np.zeros(count, dtype=np.int32)
-    given = np.eye(size), np.zeros(size), matrix, *bounds
-    x, _, flag, details = daqp.solve(*given, primal_tol=EXACT, dual_tol=EXACT, dual_start=start)
-    if flag != OPTIMAL and start is not None:
-        return _least_distance(matrix, least)
-    if flag != OPTIMAL:
-        raise JammedError
-    return x, details["lam"]
-
-
-def _least_distance_from(matrix: Array, least: Array, likely: Array) -> tuple[Array, Array]:
-    """The same from the rows of multipliers that are likely [contacts, edges] alone, and such as prove to be missing.
-
-    DAQP looks at all rows in every iteration, and a heap of 25 has seven thousand. Of each contact the edge is added that is
-    worst.
-    """
+    if likely is None:
+        return _solve(matrix, least)
     rows, multipliers, x = likely.ravel() != 0.0, likely.flatten(), np.zeros(matrix.shape[1])
     while True:
         if rows.any():
-            x, multipliers[rows] = _least_distance(matrix[rows], least[rows], multipliers[rows])
+            x, multipliers[rows] = _solve(matrix[rows], least[rows], multipliers[rows])
         short = least - matrix @ x
         short[rows] = -np.inf
         worst = short.reshape(likely.shape).argmax(axis=1) + likely.shape[1] * np.arange(len(likely))
@@ -153,6 +147,21 @@ def _least_distance_from(matrix: Array, least: Array, likely: Array) -> tuple[Ar
         if not len(missing):
             return x, multipliers
         rows[missing] = True
+
+
+def _solve(matrix: Array, least: Array, start: Array | None = None) -> tuple[Array, Array]:
+    """The same of all rows, by DAQP, which begins at the multipliers `start` [m] and where that fails without."""
+    count, size = matrix.shape
+    if count == 0:
+        return np.zeros(size), np.zeros(0)
+    bounds = np.full(count, UNBOUNDED), least, np.zeros(count, dtype=np.int32)
+    given = np.eye(size), np.zeros(size), matrix, *bounds
+    x, _, flag, details = daqp.solve(*given, primal_tol=EXACT, dual_tol=EXACT, dual_start=start)
+    if flag == OPTIMAL:
+        return x, details["lam"]
+    if start is None:
+        raise JammedError
+    return _solve(matrix, least)
 
 
 def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array, arms_m: Array) -> Array:
