@@ -121,7 +121,7 @@ equilibrium_residual | double, scenes | 1 | - | {balance}
 settle_s | double, scenes | s | - | Simulated time until rest; the longest of all objects.
 raycast_checked | bool | - | - | Whether every view was checked against the ray caster.
 settings_digest | string | - | - | SHA-256 of the settings and sources that shape a scene.
-bodies | list of struct, scenes | - | - | Every object of the scene.
+bodies | list of struct, scenes | - | - | Every object; above stand names and pose of the first, the worst figures of all.
 bodies[].region_id | int64 | id | - | {region}
 bodies[].category | string | - | - | {category}
 bodies[].instance_id | string | - | - | {instance}

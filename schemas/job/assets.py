@@ -186,7 +186,7 @@ class LibrarySource(Frozen):
     """A library, or a folder of meshes, URDFs or ShapeNetCore models, relative to the job file; `pybullet_data`: the meshes
     inside that package."""
     diagonal_m: Positive | None = None
-    """Bounding-box diagonal that every object is resized to; without it each keeps its own size."""
+    """Bounding-box diagonal of every object; without it each keeps its own size."""
     copy_assets: bool = False
     """Whether the shapes may be written into the dataset."""
 
@@ -198,11 +198,11 @@ class SplitShares(Frozen):
     """Shares of instances (not of scenes) in train, val and test."""
 
     train: Share = 0.8
-    """Share for training."""
+    """Share of train."""
     val: Share = 0.1
-    """Share for validation."""
+    """Share of val."""
     test: Share = 0.1
-    """Share for testing."""
+    """Share of test."""
 
     @model_validator(mode="after")
     def _sums_to_one(self) -> "SplitShares":

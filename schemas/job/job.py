@@ -29,9 +29,9 @@ class Check(Frozen):
     """What is checked before a scene is committed."""
 
     raycast_share: Share = 0.01
-    """Share of scenes whose depth and masks are compared with a ray caster, and whose objects are released again."""
+    """Share of scenes whose depth and masks are compared with a ray caster, and whose objects are let go again."""
     mirror_agreement_mm: Positive = 1.0
-    """Largest median difference between input depth carried into the mirror view and the mirror depth."""
+    """Largest median difference of input depth carried into the mirror view from mirror depth."""
 
 
 class Output(Frozen):
@@ -186,7 +186,7 @@ class Job(Frozen):
     check: Check = Check()
     """What is checked before a scene is committed."""
     captures: Captures | None = None
-    """Captures of objects on a marker board in place of scenes; nothing: scenes."""
+    """Captures of objects on a marker board in place of scenes."""
     output: Output = Output()
     """How files are laid out."""
     run: Run = Run()

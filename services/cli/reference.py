@@ -58,15 +58,13 @@ EXIT_CODES = (
 HEAD = """# Commands
 
 `./verso COMMAND --help` explains every option (installed: `verso`). `--json` ends standard output with one JSON object.
-Messages go to standard error. `VERSO_PYTHON` names `.venv`'s Python.
-
-| exit code | meaning |
-|---|---|"""
+Messages go to standard error. Exit codes:
+"""
 
 
 def commands_page() -> str:
     """docs/commands.md."""
-    codes = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES]
+    codes = [f"- {code}: {meaning}" for code, meaning in EXIT_CODES]
     return "\n".join([HEAD, *codes, *_describe(COMMANDS, "")]) + "\n"
 
 
