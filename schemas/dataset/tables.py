@@ -90,8 +90,16 @@ _SHARED = {
     "balance": "Share of its weight that the contact forces cannot balance.",
     "centre": "Principal point, where the centre of the first pixel is at 0.5.",
     "centre_opencv": "Principal point, where the centre of the first pixel is at 0, as in OpenCV.",
-    "by_row": "; 4 x 4, row by row.",
+    "by_row": "; 4 x 4, by rows.",
     "share_seen": "unoccluded and also outside the frame",
+    "markers": "Markers that are seen; in `scenes` in all used photographs.",
+    "corners_before": "Median distance of corners, estimate from markers alone.",
+    "corners": "Median distance of corners, estimate that was taken.",
+    "board_depth": "Median distance of board points, measured by depth, from the board's plane.",
+    "pose_mm": "Error of the camera's position against truth, in `scenes` the median; null where there is none.",
+    "pose_deg": "Error of its direction against truth, likewise.",
+    "measured": "Share of a mirror view that is measured and not filled; in `scenes` the median.",
+    "depth_median": "Median error of the depth that other views give for a photograph; in `scenes` the median of all.",
 }
 """Meanings, and parts of some, that several columns have: `{name}` in the table below."""
 
@@ -148,10 +156,10 @@ capture.name | string | - | - | Name of its folder.
 capture.estimate | string | - | - | Which estimate of the camera poses was taken: markers, article or joint.
 capture.input_sha256 | string? | - | - | SHA-256 of its input files; null where it was simulated.
 capture.views | int64 | count | - | Photographs that are used.
-capture.markers | int64 | count | - | Markers that were found, over the used photographs.
-capture.reprojection_before_px | double? | px | - | Median distance of corners, estimate from markers alone.
-capture.reprojection_px | double? | px | - | Median distance of corners, estimate that was taken.
-capture.depth_mm | double? | mm | - | Median distance of board points, measured by depth, from the board's plane.
+capture.markers | int64 | count | - | {markers}
+capture.reprojection_before_px | double? | px | - | {corners_before}
+capture.reprojection_px | double? | px | - | {corners}
+capture.depth_mm | double? | mm | - | {board_depth}
 capture.depth_offset_m | double | m | - | Constant error of depth that was found.
 capture.depth_scale | double | 1 | - | Factor of depth that was found.
 capture.print_scale | double | 1 | - | Size of the printed board over its nominal size.
@@ -161,18 +169,18 @@ capture.undistorted | bool | - | - | Whether the lens' distortion was taken out 
 capture.converged | bool | - | - | Whether the estimate converged.
 capture.iterations | int64 | count | - | Steps of the estimate.
 capture.cloud_points | int64 | count | - | Points of the merged cloud.
-capture.measured_share | double? | 1 | - | Median over the mirror views of the share that is measured and not filled.
+capture.measured_share | double? | 1 | - | {measured}
 capture.left_out | list of struct | - | - | Photographs that are not used.
 capture.left_out[].number | int64 | id | - | Number in the photograph's name.
 capture.left_out[].status | string | - | - | Short word for why.
 capture.left_out[].why | string | - | - | Why, in words.
 capture.notes | list of string | - | - | What else is worth knowing of the capture.
-capture.pose_mm | double? | mm | - | Median error of camera positions against truth; null where there is none.
-capture.pose_deg | double? | deg | - | Median error of camera directions against truth.
+capture.pose_mm | double? | mm | - | {pose_mm}
+capture.pose_deg | double? | deg | - | {pose_deg}
 capture.cloud_median_mm | double? | mm | - | Median distance of the cloud from the true surface.
 capture.cloud_p95_mm | double? | mm | - | 95th percentile of that distance.
 capture.completeness | double? | 1 | - | Share of the true surface that the cloud covers.
-capture.depth_median_mm | double? | mm | - | Median over the views of the error of the depth that the other views give.
+capture.depth_median_mm | double? | mm | - | {depth_median}
 """,
     "views": """
 pose_id | int64 | id | - | {pose_id}
@@ -207,14 +215,14 @@ projected_hidden_share | double? | 1 | - | Share of the filled pixels that show 
 patch_object_fraction | double? | 1 | - | {patch}
 capture | struct, captures | - | - | The photograph.
 capture.number | int64 | id | - | Number in the photograph's name.
-capture.markers | int64 | count | - | Markers that were found in it.
-capture.reprojection_before_px | double? | px | - | Median distance of its corners, estimate from markers alone.
-capture.reprojection_px | double? | px | - | Median distance of its corners, estimate that was taken.
-capture.depth_mm | double? | mm | - | Median distance of board points in its depth from the board's plane.
-capture.pose_mm | double? | mm | - | Error of its position against truth; null where there is none.
-capture.pose_deg | double? | deg | - | Error of its direction against truth.
-capture.measured_share | double? | 1 | - | Of mirror views: share that is measured and not filled.
-capture.depth_median_mm | double? | mm | - | Of input views: error of the depth that the other views give for it.
+capture.markers | int64 | count | - | {markers}
+capture.reprojection_before_px | double? | px | - | {corners_before}
+capture.reprojection_px | double? | px | - | {corners}
+capture.depth_mm | double? | mm | - | {board_depth}
+capture.pose_mm | double? | mm | - | {pose_mm}
+capture.pose_deg | double? | deg | - | {pose_deg}
+capture.measured_share | double? | 1 | - | {measured}
+capture.depth_median_mm | double? | mm | - | {depth_median}
 capture.sources | list of int64? | id | - | Of mirror views: numbers of the photographs that it is made of.
 """,
     "objects": """

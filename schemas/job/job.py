@@ -61,7 +61,7 @@ class Run(Frozen):
     workers_per_gpu: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Workers that share a GPU. None: as few as leave no core idle."""
     fingerprint: Literal["strict", "record"] = "strict"
-    """`strict` refuses workers whose stack makes other bytes; `record` stores which made what."""
+    """`strict` refuses workers whose stack makes other bytes; `record` stores which stack made what."""
 
 
 MOST = 16
@@ -164,9 +164,9 @@ class Job(Frozen):
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
     """Input and mirror poses of each scene, or views of a capture that are stored at most (default 64)."""
     objects_per_scene: ObjectCount = ONE_OBJECT
-    """Number of objects on the table; a range is drawn from evenly. The first gives the scene's category."""
+    """Objects on the table; a range is drawn from evenly. The first gives the scene's category."""
     categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
-    """Weights of the categories that the sources offer; a list of names means equal weights."""
+    """Weights of the categories that the sources offer; a list gives equal weights."""
     assets: Assets = Assets()
     """Where shapes come from."""
     start: Start = Start()

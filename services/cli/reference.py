@@ -84,9 +84,8 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
 JOB_HEAD = """\
 # Keys of a job file
 
-Written from `schemas/job/` by `python -m services.cli.reference job`. Every key but `name` has a default. A key that is not in
-this list is refused, and so is a value that is not allowed. Any key can be changed on the command line: `--set
-physics.step_hz=480`. After each key: what is allowed; the default. `null` stands for nothing.
+Written from `schemas/job/` by `python -m services.cli.reference job`. After each key: what is allowed; the default, `null` for
+nothing. Other keys and values are refused. `--set physics.step_hz=480` changes a key on the command line.
 
 """
 

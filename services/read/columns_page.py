@@ -73,7 +73,7 @@ def _alike(column: Column) -> Column:
 def write_page() -> str:
     """The text of docs/columns.md."""
     lines = [HEADER + "\n".join(f"- **{name}**: {text}" for name, text in FRAMES.items())]
-    first: dict[tuple[str, str], str] = {}
+    first: dict[Column, str] = {}
     for table in TABLES:
         lines += [
             "",
@@ -84,7 +84,7 @@ def write_page() -> str:
         ]
         new, again = dict[Column, list[str]](), dict[str, list[str]]()
         for column in COLUMNS[table]:
-            other = first.setdefault((column.path, column.meaning), table)
+            other = first.setdefault(column, table)
             # what is inside a marked column has no mark, and joins the column of the same meaning that has one
             same = next((kept for kept in new if _alike(kept) == _alike(column)), column)
             place = new.setdefault(same, []) if other == table else again.setdefault(f"as in {other}:", [])
