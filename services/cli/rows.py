@@ -355,6 +355,7 @@ COMMANDS: Final[dict[str, Command]] = {
         path("--out", "DIR", "where the score goes (default: PREDICTIONS/score)", dest="score"),
         choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
         choice("--align", ("none", "scale", "similarity"), "of depth and shapes with the truth", default="none"),
+        choice("--split", ("all", "train", "val", "test"), "scenes whose objects all are of it", default="all"),
         flag("--flip", "FLIP of RGB as well (0.7 s an image; needs verso extra study)"),
         SCORES,
         handler="score.command:main",

@@ -28,7 +28,7 @@ from services.run.progress import finish
 from services.score.items import Asked
 from services.score.predictions import find_predictions
 from services.score.run import ITEMS_FILE, describe_refused, score_dataset
-from services.score.summary import HEADLINES, Figure, compare, summarise, values_of
+from services.score.summary import HEADLINES, Figure, compare, items_of, summarise, values_of
 from workers.store.local import open_store
 
 SUMMARY_FILE, PAGE_FILE = "summary.json", "index.html"
@@ -38,7 +38,10 @@ SCORE_VERSION = 1
 
 
 def main(options: argparse.Namespace) -> int:
-    """0 where nothing was refused. Raises InputError where there is nothing to score, CorruptError where OUT is damaged."""
+    """0 where all of the split is predicted.
+
+    Raises InputError where there is nothing to score, CorruptError where OUT is damaged.
+    """
     store = require_dataset(open_store(options.out))
     if options.compare is not None:
         return _compare(options)
@@ -47,7 +50,7 @@ def main(options: argparse.Namespace) -> int:
             "name the folder of predictions: verso score OUT PREDICTIONS, or --compare A B for two that are scored"
         )
     given = find_predictions(options.predictions)
-    asked = Asked(given.kinds, options.frame, align=options.align, flip=options.flip)
+    asked = Asked(given.kinds, options.frame, align=options.align, split=options.split, flip=options.flip)
     target = options.score or options.predictions / "score"
     with explain_damage(store):
         path = score_dataset(store, given, asked, target)
@@ -62,17 +65,23 @@ def main(options: argparse.Namespace) -> int:
         summary = {**head, **asdict(asked), **summarise(table)}
         _write(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
         troubles = describe_refused(path)
-        _write(target / PAGE_FILE, page_of(summary, table, troubles))
+        _write(target / PAGE_FILE, page_of(summary, items_of(table), troubles))
     for line in troubles:
         print(f"verso: {line}", file=sys.stderr)
     for name, figure in summary["metrics"].items():
         if name in HEADLINES and figure["items"]:
             ends, items = interval(name, figure), plural(figure["items"], "item")
-            print(f"{name:28}{in_words(name, figure['value']):>12}  {ends:28}{items}")
+            print(f"{name:28}{in_words(name, figure['value']):>12}  {ends:28}{items}, {covered(figure)}")
     print(answer_of(summary))
     print(f"page: {target / PAGE_FILE}")
-    answer = {name: summary[name] for name in ("items", "missing", "refused", "metrics")}
-    return finish(options, not summary["refused"], **answer, page=str(target / PAGE_FILE))
+    answer = {name: summary[name] for name in ("items", "missing", "refused", "unknown", "metrics")}
+    return finish(options, is_whole(summary), **answer, page=str(target / PAGE_FILE))
+
+
+def is_whole(summary: Mapping[str, Any]) -> bool:
+    """Whether all that there is to predict is predicted, and nothing else is there."""
+    headlines = (figure["coverage"] for name, figure in summary["metrics"].items() if name in HEADLINES)
+    return not summary["unknown"] and all(share in (None, 1.0) for share in headlines)
 
 
 def _compare(options: argparse.Namespace) -> int:
@@ -88,7 +97,7 @@ def _compare(options: argparse.Namespace) -> int:
     for name, row in metrics.items():
         if name not in HEADLINES:
             continue
-        verdict = better[row["better"]]
+        verdict = better[row["better"]] if row["coverage"] == 1.0 else f"no verdict below full {covered(row)}"
         print(
             f"{name:28}{in_words(name, row['a']):>12}{in_words(name, row['b']):>12}  b - a: {interval(name, row):28}{verdict}"
         )
@@ -110,14 +119,15 @@ def _write(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-_SHOWN: Final = ("depth_mae_m", "rgb_psnr_db", "shape_chamfer_l1_m", "volume_iou", "pose_add_m")
+_SHOWN: Final = ("depth_auc_50mm", "depth_mae_m", "rgb_ncc", "shape_chamfer_l1_m", "volume_iou", "pose_add_m")
 """The metric of each kind that is told first."""
 
 _CHARTS: Final = (
     ("Depth of the object", {"seen": "depth_mae_seen_m", "hidden": "depth_mae_hidden_m"}),
     ("Depth within 2 mm", {"": "depth_within_2mm"}),
-    ("PSNR", {"": "rgb_psnr_db"}),
-    ("SSIM", {"": "rgb_ssim"}),
+    ("Cross-correlation of the object's colours", {"": "rgb_ncc"}),
+    ("PSNR of the object", {"": "rgb_psnr_db"}),
+    ("SSIM of the object", {"": "rgb_ssim"}),
     ("Chamfer distance", {"": "shape_chamfer_l1_m"}),
     ("F-score at 2 mm", {"": "shape_fscore_2mm"}),
     ("IoU", {"": "shape_iou"}),
@@ -144,6 +154,12 @@ def interval(name: str, figure: Figure) -> str:
     return "" if figure["low"] is None else f"{in_words(name, figure['low'])} to {in_words(name, figure['high'])}"
 
 
+def covered(figure: Figure) -> str:
+    """`coverage 97.3 %`; never 100 where anything is left out."""
+    share = figure["coverage"] or 0.0
+    return f"coverage {100.0 if share == 1.0 else min(100.0 * share, 99.99):.4g} %"
+
+
 def words(name: str) -> str:
     """The name of a metric for readers: `depth mae hidden`."""
     return name.removesuffix("_m").removesuffix("_deg").removesuffix("_db").replace("_", " ")
@@ -156,7 +172,8 @@ def answer_of(summary: Mapping[str, Any]) -> str:
     for name in (*_SHOWN, "depth_mae_hidden_m"):
         if figure := summary["metrics"].get(name):
             ends = interval(name, figure)
-            lines.append(f"{words(name)} {in_words(name, figure['value'])}{ends and f' ({ends})'}")
+            left_out = "" if figure["coverage"] == 1.0 else f", {covered(figure)}"
+            lines.append(f"{words(name)} {in_words(name, figure['value'])}{ends and f' ({ends})'}{left_out}")
     return ". ".join([*lines, f"{plural(summary['items'], 'item')}: {numbers}"]) + "."
 
 
@@ -165,7 +182,8 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
     items = "".join(f"<li>{escape(line)}</li>" for line in troubles)
     answer = f'<p class="lead">{escape(answer_of(summary))}</p><ul class="troubles">{items}</ul>'
     note = (
-        "Means over items, 95 % intervals by a bootstrap over scenes. Refused items count as worst, missing ones not. "
+        "Means over all items of the split, 95 % intervals by a bootstrap over scenes. What is missing, refused or a hole counts "
+        "as worst. "
         "Seen and hidden: the object's pixels whose surface the input view sees, and does not."
     )
     sections = [
@@ -190,12 +208,14 @@ def _metrics(metrics: Mapping[str, Figure]) -> str:
             in_words(name, one["value"]),
             interval(name, one) or "–",
             str(one["items"]),
+            covered(one).removeprefix("coverage "),
+            in_words(name, one["worst"]),
         )
         for name, one in metrics.items()
         if one["items"]
     ]
     first, rest = rows[: sum(name in HEADLINES for name in metrics)], rows[sum(name in HEADLINES for name in metrics) :]
-    head = ("metric", "mean", "95 % interval", "items")
+    head = ("metric", "mean", "95 % interval", "items", "coverage", "at worst")
     more = (
         f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
         if rest

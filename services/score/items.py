@@ -1,14 +1,15 @@
 """The items of a pair: what is true, what is predicted, whether it can be scored, and its scores. A row for each item.
 
-An item is a kind of prediction, a pose id and, for shapes, volumes and poses, a region. Every pair has an item of every kind
-that is predicted at all. Its status is `ok`, `missing`, or `refused` with a reason. Columns of metrics are named
-kind_metric_unit, for parts of an image kind_metric_part_unit: `depth_mae_m` is that of the object, `depth_mae_hidden_m` of
-the part of it that the input view does not see.
+An item is a kind of prediction, a pose id and, for shapes, volumes and poses, a region. Every pair of the split has an item of
+every kind that is predicted at all. Its status is `ok`, `missing`, or `refused` with a reason. A prediction that is no item has
+`outside`, of another split, or `unknown`. Columns of metrics are named kind_metric_unit, for parts of an image
+kind_metric_part_unit: `depth_mae_m` is that of the object, `depth_mae_hidden_m` of the part of it that the input view does not
+see.
 
 Parts of the mirror view: `object`, all pixels of objects; `seen` and `hidden`, those of them whose surface the input view
-sees and does not (services/dataset/pair.py); `boundary`, within two pixels of an object's outline; `scene`, all
-with truth. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they would
-drown it.
+sees and does not (services/dataset/pair.py); `boundary`, within two pixels of an object's outline; `scene`, all with
+depth; `image`, all. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they
+would drown it.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,6 +25,7 @@ from scipy import ndimage
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
+from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.dataset.pair import Pair, carry
 from services.dataset.view import View
@@ -33,12 +35,18 @@ from services.score.predictions import Key, read_array, read_image, read_pose, r
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
+Split = Literal["all", "train", "val", "test"]
+"""Which scenes are scored: all, or those whose objects all are of instances of one split."""
+
 PredictedFrame = Literal["object", "camera", "input", "world"]
 FRAMES: Final[tuple[PredictedFrame, ...]] = get_args(PredictedFrame)
 """The frame of predicted shapes: the object's, the mirror camera's, the input camera's, the world's."""
 
 SEEN_TOLERANCE_M: Final = 0.001
 """How far behind the input view's surface a point may lie that it sees: as `Pair.correspondence`."""
+
+COLOURED: Final = ("object", "hidden", "boundary")
+"""The parts on which RGB is scored, beside the whole image: there the table and the floor count most."""
 
 BOUNDARY_PX: Final = 2
 LEAST_PIXELS: Final = 50
@@ -66,29 +74,33 @@ class Asked:
     """Points drawn on a surface."""
     seed: int = 0
     align: Alignment = "none"
+    split: Split = "all"
     flip: bool = False
     """Whether FLIP is among the metrics of RGB: it takes 0.7 s an image of 640 x 480."""
 
 
 def column(kind: str, name: str) -> str:
     """The column of a metric as the scoring functions name it: ("depth", "hidden.mae_m") is `depth_mae_hidden_m`."""
-    if kind != "depth":
+    if kind not in ("depth", "rgb"):
         return f"{kind}_{name.replace('.', '_')}"
     part, _, metric = name.partition(".")
     infix = "" if part == "object" else f"_{part}"
-    return f"depth_{metric.removesuffix('_m')}{infix}_m" if metric.endswith("_m") else f"depth_{metric}{infix}"
+    unit = next((unit for unit in ("_m", "_db") if metric.endswith(unit)), "")
+    return f"{kind}_{metric.removesuffix(unit)}{infix}{unit}"
 
 
 def score_pair(
-    pair: Pair, folder: Path, predicted: Mapping[Key, tuple[str, ...]], asked: Asked, blame: str = ""
+    pair: Pair, folder: Path, predicted: Mapping[Key, tuple[str, ...]], asked: Asked, job: Job, blame: str = ""
 ) -> list[Row]:
-    """A row for each item of a pair; with `blame`, why its predictions are refused unread.
+    """A row for each item of a pair of the dataset of `job`; with `blame`, why its predictions are refused unread.
 
     Raises InputError where the dataset has no mirror view, CorruptError where it is damaged.
     """
     if pair.mirror is None:
         raise InputError("the dataset has no mirror view to score: its job's cameras.mirror.enabled is false")
-    truth, rows = Truth(pair, pair.mirror), []
+    truth, rows = Truth(pair, pair.mirror, job.images.depth_range_m.high), []
+    splits = {job.assets.split.of(body["instance_id"]) for body in pair.scene["bodies"] or [pair.scene]}
+    split = splits.pop() if len(splits) == 1 else "mixed"
     for kind in asked.kinds:
         for region in [0] if kind in ("depth", "rgb") else truth.regions:
             label = pair.mirror.regions.get(region or REGION_FIRST_OBJECT)
@@ -96,13 +108,19 @@ def score_pair(
                 "kind": kind,
                 "pose_id": pair.mirror.pose_id,
                 "scene_id": pair.scene_id,
+                "split": split,
                 "category": label["category"] if label else pair.category,
                 "instance": label["instance_id"] if label else pair.instance_id,
                 "region": region,
                 "visible_fraction": pair.input.visible_fraction,
                 "diagonal_m": truth.diagonal_m(region or REGION_FIRST_OBJECT),
+                "farthest_m": truth.farthest_m,
             }
             names = predicted.get((kind, pair.mirror.pose_id, region), ())
+            if asked.split not in ("all", split):
+                rows += [row | {"status": "outside"}] if names else []
+                continue
+            row |= {column(kind, f"{part}.pixels"): count for part, count in truth.pixels(kind).items()}
             if names and blame:
                 rows.append(row | {"status": "refused", "reason": blame})
             else:
@@ -129,10 +147,13 @@ def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folde
 
 
 class Truth:
-    """What is true of a pair; images are decoded once, and only when asked for. Raises CorruptError where they are damaged."""
+    """What is true of a pair; images are decoded once, and only when asked for. Raises CorruptError where they are damaged.
 
-    def __init__(self, pair: Pair, mirror: View) -> None:
-        self.pair, self.view = pair, mirror
+    farthest_m: the end of the depths that the dataset stores, so that no error of depth need be larger.
+    """
+
+    def __init__(self, pair: Pair, mirror: View, farthest_m: float) -> None:
+        self.pair, self.view, self.farthest_m = pair, mirror, farthest_m
         self.regions = [region for region in sorted(pair.T_world) if region >= REGION_FIRST_OBJECT]
 
     def diagonal_m(self, region: int) -> float:
@@ -172,6 +193,12 @@ class Truth:
             "boundary": _outline(self.segment),
         }
 
+    def pixels(self, kind: str) -> Mapping[str, int]:
+        """How many pixels each part has that predictions of a kind are held against: without any it has no metrics."""
+        if kind == "depth":
+            return {name: int(np.count_nonzero(part & (self.units > 0))) for name, part in self.parts.items()}
+        return {name: int(np.count_nonzero(self.parts[name])) for name in COLOURED} if kind == "rgb" else {}
+
     def shape(self, region: int, frame: PredictedFrame) -> Mesh:
         """The object's surface, one vertex at a place, in a frame, metres."""
         mesh = self.pair.mesh(region, welded=True)
@@ -185,7 +212,7 @@ class Truth:
         if kind == "depth":
             return self.depth_m, self.parts
         if kind == "rgb":
-            return self.view.rgb()
+            return self.view.rgb(), {name: self.parts[name] for name in COLOURED}
         if kind == "volume":
             stored = self.pair.samples(region)
             if "volume_distance" not in stored and "volume_occupancy" not in stored:
@@ -223,7 +250,7 @@ def _score_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: As
     true_m, parts = prepared
     predicted_m = read_image(path, true_m.shape, truth.view.depth_units_per_m)
     check_depth(predicted_m, true_m, truth.view.depth_units_per_m if asked.align == "none" else None)
-    return score_depth(align_depth(predicted_m, true_m, asked.align), true_m, parts), None
+    return score_depth(align_depth(predicted_m, true_m, asked.align), true_m, parts, truth.farthest_m), None
 
 
 def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) -> None:
@@ -252,7 +279,8 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) ->
 
 
 def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
-    return score_colour(read_image(path, prepared.shape), prepared, flip=asked.flip), None
+    true, parts = prepared
+    return score_colour(read_image(path, true.shape), true, parts, flip=asked.flip), None
 
 
 def _score_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:

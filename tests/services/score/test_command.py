@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import itertools
 import json
 import os
 import re
@@ -18,6 +19,7 @@ import trimesh
 from services.cli.main import main
 from services.dataset.dataset import open_dataset
 from services.score import run as module
+from services.score.summary import HEADLINES, is_better_high
 from workers.pool import Ended
 
 PAIRS = 8
@@ -58,10 +60,11 @@ def test_truth_is_perfect_and_its_page_needs_no_network(files, truth, tmp_path, 
     assert (status, answer["items"], answer["missing"], answer["refused"]) == (0, 3 * PAIRS, 0, 0)
     value = {name: one["value"] for name, one in answer["metrics"].items()}
     assert value["depth_mae_m"] == value["depth_mae_hidden_m"] == value["depth_mae_scene_m"] == 0.0
-    assert value["depth_within_2mm"] == value["rgb_ssim"] == value["shape_fscore_2mm"] == 1.0
+    assert value["depth_within_2mm"] == value["rgb_ssim"] == value["rgb_ncc"] == value["shape_fscore_2mm"] == 1.0
     assert value["shape_iou"] == pytest.approx(1.0, abs=1e-6) and value["shape_chamfer_l1_m"] < 1e-6
     page = (tmp_path / "index.html").read_text()
     assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page
+    assert all(one["coverage"] == 1.0 for one in answer["metrics"].values() if one["items"])
     rows = pq.read_table(tmp_path / "items.parquet").to_pylist()
     assert len(rows) == 3 * PAIRS and {row["status"] for row in rows} == {"ok"}
 
@@ -161,15 +164,17 @@ def test_each_fault_is_an_item_with_its_reason_and_counts_as_worst(files, truth,
     (folder / "poses.csv").write_text(f"scene_id,im_id,obj_id,R,t\n1,{10**30},3,1 0 0 0 1 0 0 0 1,0 0 1000\n")
     status, answer, said = score(capsys, files.root, folder, "--out", tmp_path / "score")
     rows = pq.read_table(tmp_path / "score" / "items.parquet").to_pylist()
-    refused = {(row["kind"], row["pose_id"]): row["reason"] for row in rows if row["status"] == "refused"}
+    refused = {(row["kind"], row["pose_id"]): row["reason"] for row in rows if row["status"] in ("refused", "unknown")}
     for key, told in expected.items():
         assert re.search(told, refused.pop(key)), key
     others = {("depth", 90001): "another dataset", ("depth", None): "no pose id", ("pose", None): "line 2 of poses.csv"}
     assert set(refused) == set(others) and all(others[key] in why for key, why in refused.items())
-    assert (status, answer["refused"], answer["missing"]) == (1, len(FAULTS) + 3, 1 + PAIRS)
+    assert (status, answer["refused"], answer["unknown"]) == (1, len(FAULTS), 3)
+    assert answer["missing"] == 1 + PAIRS  # of poses there is none of the dataset
     assert "missing" in said and answer["metrics"]["depth_mae_m"]["value"] > 0.0
-    share = pytest.approx(1 / (PAIRS + 2))  # of eight, one of another dataset, and one without an id
-    assert answer["metrics"]["depth_within_2mm"]["value"] == share
+    within = answer["metrics"]["depth_within_2mm"]
+    assert within["value"] == within["coverage"] == pytest.approx(1 / PAIRS)  # the others count as worst
+    assert answer["metrics"]["pose_rotation_deg"]["value"] == 180.0
 
 
 def test_an_item_that_ends_its_process_is_refused_and_the_others_are_scored(
@@ -199,14 +204,7 @@ def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp
     assert answers[1]["metrics"]["depth_mae_m"]["low"] < 0.00435 < answers[1]["metrics"]["depth_mae_m"]["high"]
     summary = json.loads((far / "score" / "summary.json").read_text())
     assert len(summary["by"]["category"]) > 1
-    for groups in filter(
-        None, summary["by"].values()
-    ):  # each item is in one group of a kind, and their means are the whole's
-        depth = [group["depth_mae_m"] for group in groups.values() if group["depth_mae_m"]["items"]]
-        total = sum(part["value"] * part["items"] for part in depth)
-        whole = summary["metrics"]["depth_mae_m"]
-        assert sum(part["items"] for part in depth) == whole["items"]
-        assert total / whole["items"] == pytest.approx(whole["value"])
+    require_groups_that_add_up(summary)
     scaled = write_truth(files, tmp_path / "scaled", lambda depth_m, _: 3.0 * depth_m)
     answer = score(capsys, files.root, scaled, "--align", "scale")[1]
     assert answer["refused"] == 0 and answer["metrics"]["depth_mae_scene_m"]["value"] < 1e-9
@@ -224,16 +222,99 @@ def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp
     assert score(capsys, files.root, near)[1]["metrics"]["depth_mae_m"]["value"] > 0.002
 
 
+def require_groups_that_add_up(summary):
+    """Each item is in one group of a kind, and their means are the whole's."""
+    for groups, name in itertools.product(filter(None, summary["by"].values()), HEADLINES):
+        whole = summary["metrics"].get(name, {"items": 0})
+        parts = [group[name] for group in groups.values() if whole["items"] and group[name]["items"]]
+        assert sum(part["items"] for part in parts) == whole["items"]
+        for key in ("value", "coverage", "worst"):
+            total = sum(part[key] * part["items"] for part in parts)
+            assert not parts or total / whole["items"] == pytest.approx(whole[key])
+
+
+def test_who_does_not_predict_comes_last_and_no_verdict_is_given(files, truth, tmp_path, capsys):
+    """One right pixel an image, one item, and none that can be read, beside a full guess that is 30 mm off."""
+
+    def one_pixel(depth_m, number):
+        pixel = np.zeros_like(depth_m)
+        first = tuple(np.argwhere(depth_m > 0.0)[len(depth_m) // 2])
+        pixel[first] = depth_m[first]
+        return pixel
+
+    guess = write_truth(files, tmp_path / "guess", lambda depth_m, _: depth_m + 0.02 * (np.arange(160) % 4) * (depth_m > 0.0))
+    pixel = write_truth(files, tmp_path / "pixel", one_pixel)
+    single, torn = (shutil.copytree(truth, tmp_path / name) for name in ("single", "torn"))
+    for path in [*single.glob("*/*"), *torn.glob("*/*")]:
+        if torn in path.parents:
+            path.write_bytes(b"torn")
+        elif not path.stem.endswith("00001"):
+            path.unlink()
+    assert score(capsys, files.root, guess)[0] == 0
+    worst = {}
+    for folder in (pixel, single, torn):
+        status, answer, _ = score(capsys, files.root, folder)
+        assert status == 1
+        require_groups_that_add_up(json.loads((folder / "score" / "summary.json").read_text()))
+        for name, one in score(capsys, files.root, "--compare", folder, guess)[1]["metrics"].items():
+            if name.startswith("depth") and name in HEADLINES:
+                assert one["better"] is None and one["coverage"] < 0.2
+                assert (one["a"] < one["b"]) == is_better_high(name) or one["a"] == one["b"], (folder, name)
+        worst = answer["metrics"]
+    assert all(worst[name]["value"] == worst[name]["worst"] for name in HEADLINES if name in worst)
+    assert worst["depth_mae_m"]["value"] == 8.0 and worst["rgb_ncc"]["value"] == worst["rgb_ncc"]["coverage"] == 0.0
+
+
+def test_an_object_of_one_colour_has_no_score_that_the_table_gives_it(files, truth, tmp_path, capsys):
+    grey = tmp_path / "grey"
+    (grey / "rgb").mkdir(parents=True)
+    for pair in open_dataset(str(files.root)).pairs():
+        image = pair.mirror.rgb()[..., ::-1].copy()
+        image[pair.mirror.segment() >= 3] = 128
+        cv2.imwrite(str(grey / "rgb" / f"{pair.mirror.pose_id:05d}.png"), image)
+    value = {name: one["value"] for name, one in score(capsys, files.root, grey)[1]["metrics"].items()}
+    assert value["rgb_ncc"] == value["rgb_ncc_hidden"] == 0.0
+    assert (
+        value["rgb_psnr_db"] < value["rgb_psnr_image_db"] - 10.0 and value["rgb_ssim"] < 0.7 < value["rgb_ssim_image"]
+    )
+
+
+def test_a_split_is_scored_alone_and_is_proposed_where_nothing_else_is_predicted(files, truth, tmp_path, capsys):
+    rows = pq.read_table(score_file(files, truth, tmp_path / "all", capsys)).to_pylist()
+    split = max({row["split"] for row in rows} - {"mixed"}, key=[row["split"] for row in rows].count)
+    chosen = {row["pose_id"] for row in rows if row["split"] == split}
+    assert len(chosen) < PAIRS
+    status, answer, said = score(capsys, files.root, truth, "--out", tmp_path / "a", "--split", split)
+    assert (status, answer["items"]) == (0, 3 * len(chosen)) and f"{3 * (PAIRS - len(chosen))} predictions of" in said
+    part = shutil.copytree(truth, tmp_path / "part")
+    for path in part.glob("*/*"):
+        if int(path.stem) not in chosen:
+            path.unlink()
+    status, answer, said = score(capsys, files.root, part)
+    assert (status, answer["missing"]) == (1, 3 * (PAIRS - len(chosen))) and f"--split {split}" in said
+    assert score(capsys, files.root, part, "--split", split)[0] == 0
+    assert main(["score", str(files.root), "--compare", str(part), str(tmp_path / "all")]) == 2
+    assert "the same --split" in capsys.readouterr().err
+
+
+def score_file(files, folder, out, capsys):
+    score(capsys, files.root, folder, "--out", out)
+    return out / "items.parquet"
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ([], "name the folder of predictions"),
         (["nothing"], "has no predictions"),
+        (["others"], r"whose names are like depth/00001, depth/00003, depth/00005"),
         (["--compare", "nothing", "nothing"], "has no score"),
     ],
 )
 def test_what_cannot_be_scored_is_told(files, words, told, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "nothing").mkdir()
+    (tmp_path / "others" / "depth").mkdir(parents=True)
+    (tmp_path / "others" / "depth" / "90001.npy").write_bytes(b"")
     assert main(["score", str(files.root), *words]) == 2
     assert told in capsys.readouterr().err
