@@ -249,14 +249,16 @@ Scored = tuple[Mapping[str, float | None], str | None]
 def _score_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
     true_m, parts = prepared
     predicted_m = read_image(path, true_m.shape, truth.view.depth_units_per_m)
-    check_depth(predicted_m, true_m, truth.view.depth_units_per_m if asked.align == "none" else None)
+    units_per_m = truth.view.depth_units_per_m if asked.align == "none" else None
+    check_depth(predicted_m, true_m, units_per_m, parts["object"])
     return score_depth(align_depth(predicted_m, true_m, asked.align), true_m, parts, truth.farthest_m), None
 
 
-def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) -> None:
+def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None, mask: NDArray[np.bool_]) -> None:
     """Raises InputError where depth [H, W] is in another unit than metres, or inverted: it is said and not mended.
 
-    units_per_m: of stored images; None where depth is aligned, so that its unit does not matter.
+    units_per_m: of stored images; None where depth is aligned, so that its unit does not matter. mask [H, W]: objects, where
+    inverted depth is inverted as well, and a poor guess of what is about them need not be.
     """
     every = max(1, true_m.size // JUDGED_PIXELS)  # a step that shares no factor with the width, to reach all columns
     while np.gcd(every, true_m.shape[1]) > 1:
@@ -266,7 +268,9 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) ->
     if np.count_nonzero(both) < LEAST_PIXELS:
         return
     predicted, true = predicted[both], true[both]
-    if (likeness := correlation(predicted, true)) < INVERTED:  # before the unit: disparity may look like another one
+    both = mask & (predicted_m > 0.0) & (true_m > 0.0)
+    likeness = max(correlation(predicted, true), correlation(predicted_m[both], true_m[both]) if both.any() else -1.0)
+    if likeness < INVERTED:  # before the unit: disparity may look like another one
         raise InputError(f"depth is inverted: its correlation with the truth is {likeness:.2f}")
     if units_per_m is None:
         return

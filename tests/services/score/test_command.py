@@ -242,7 +242,9 @@ def test_who_does_not_predict_comes_last_and_no_verdict_is_given(files, truth, t
         pixel[first] = depth_m[first]
         return pixel
 
-    guess = write_truth(files, tmp_path / "guess", lambda depth_m, _: depth_m + 0.02 * (np.arange(160) % 4) * (depth_m > 0.0))
+    guess = write_truth(
+        files, tmp_path / "guess", lambda depth_m, _: depth_m + 0.02 * (np.arange(160) % 4) * (depth_m > 0.0)
+    )
     pixel = write_truth(files, tmp_path / "pixel", one_pixel)
     single, torn = (shutil.copytree(truth, tmp_path / name) for name in ("single", "torn"))
     for path in [*single.glob("*/*"), *torn.glob("*/*")]:

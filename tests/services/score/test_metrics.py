@@ -13,6 +13,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from schemas.errors import InputError
 from schemas.scene.shape import Mesh
 from services.score.images import align_depth, score_colour, score_depth
+from services.score.items import check_depth
 from services.score.pose import check_distance, score_pose, score_volume, symmetries_of
 from services.score.shape import align_shape, score_shape
 from workers.geometry.frames import transform
@@ -447,6 +448,15 @@ def test_what_cannot_be_scored_is_nan_or_none_and_counts_of_misses_stay():
     assert math.isnan(score_pose(T, behind, points, [], K)["mspd_px"])
     blank = score_pose(T, T, points[:0], [], K)
     assert blank.pop("rotation_deg") == blank.pop("translation_m") == 0.0 and np.isnan(list(blank.values())).all()
+
+
+def test_depth_is_inverted_only_where_that_of_the_object_is_too():
+    true = np.random.default_rng(13).uniform(1.0, 3.0, (20, 30))
+    mask = np.zeros(true.shape, np.bool_)
+    mask[5:15, 5:15] = True
+    with pytest.raises(InputError, match="inverted"):
+        check_depth(1.0 / true, true, None, mask)
+    check_depth(np.where(mask, true, 1.0 / true), true, None, mask)  # of what is about the object nothing is known
 
 
 def test_distances_of_another_unit_or_sign_and_logits_are_told_and_a_poor_guess_is_not():
