@@ -21,6 +21,7 @@ MESHES = path("folder", "FOLDER")
 PREDICTIONS = path(
     "predictions", "PREDICTIONS", "depth/ID.png|npy, rgb/ID.png, shape/ID.glb, ..., poses.csv", nargs="?"
 )
+VOLUMES = ("occupancy", "logits", "sdf", "sdf-positive-inside")
 SCORES = path("--compare", "DIR", "which of two scores is better, A B", nargs=2)
 THERE: Final = (OUT, FOLDER, MESHES, PREDICTIONS, SCORES)
 """Arguments that name folders which have to be there."""
@@ -355,6 +356,9 @@ COMMANDS: Final[dict[str, Command]] = {
         path("--out", "DIR", "where the score goes (default: PREDICTIONS/score)", dest="score"),
         choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
         choice("--align", ("none", "scale", "similarity"), "of depth and shapes with the truth", default="none"),
+        choice(
+            "--volume", ("told", *VOLUMES), "what values at volume points are (default: by the values)", default="told"
+        ),
         choice("--split", ("all", "train", "val", "test"), "scenes whose objects all are of it", default="all"),
         flag("--flip", "FLIP of RGB as well (0.7 s an image; needs verso extra study)"),
         SCORES,

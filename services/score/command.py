@@ -50,7 +50,9 @@ def main(options: argparse.Namespace) -> int:
             "name the folder of predictions: verso score OUT PREDICTIONS, or --compare A B for two that are scored"
         )
     given = find_predictions(options.predictions)
-    asked = Asked(given.kinds, options.frame, align=options.align, split=options.split, flip=options.flip)
+    asked = Asked(
+        given.kinds, options.frame, align=options.align, split=options.split, volume=options.volume, flip=options.flip
+    )
     target = options.score or options.predictions / "score"
     with explain_damage(store):
         path = score_dataset(store, given, asked, target)

@@ -21,6 +21,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import expit
 
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
@@ -37,6 +38,9 @@ from workers.geometry.frames import invert, transform
 
 Split = Literal["all", "train", "val", "test"]
 """Which scenes are scored: all, or those whose objects all are of instances of one split."""
+
+Volume = Literal["told", "occupancy", "logits", "sdf", "sdf-positive-inside"]
+"""What predicted values at a volume's points are; `told`: occupancy from 0 to 1, or distance, by the values themselves."""
 
 PredictedFrame = Literal["object", "camera", "input", "world"]
 FRAMES: Final[tuple[PredictedFrame, ...]] = get_args(PredictedFrame)
@@ -75,6 +79,7 @@ class Asked:
     seed: int = 0
     align: Alignment = "none"
     split: Split = "all"
+    volume: Volume = "told"
     flip: bool = False
     """Whether FLIP is among the metrics of RGB: it takes 0.7 s an image of 640 x 480."""
 
@@ -318,12 +323,18 @@ def check_box(points: Array, true: Array, true_in: Callable[[PredictedFrame], Ar
 
 
 def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
-    """Values from 0 to 1 are occupancy, values of which some are negative signed distance, metres, negative inside."""
+    """Where `--volume` does not say, values from 0 to 1 are occupancy, of which some are negative distance, negative inside."""
     count = len(prepared["volume_points"])
     predicted = read_array(path, (count,))
     if not np.isfinite(predicted).all():
         raise InputError("the array has values that are not finite")
-    is_distance = bool((predicted < 0.0).any())
+    is_distance = asked.volume.startswith("sdf")
+    if asked.volume == "told":
+        is_distance = bool((predicted < 0.0).any())
+    elif asked.volume == "logits":
+        predicted = expit(predicted)
+    elif asked.volume == "sdf-positive-inside":
+        predicted = -predicted
     name = "volume_distance" if is_distance else "volume_occupancy"
     if not is_distance and (predicted.max() > 1.0 or name not in prepared):
         raise InputError(

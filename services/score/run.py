@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import platform
+import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -24,14 +25,17 @@ from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.errors import InputError, MachineError, VersoError, needs_making, plural
 from schemas.job.job import Job
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import Role
 from services.dataset.dataset import iter_pairs
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
+from services.read.dataset_reader import region_names
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.score.images import require_flip
 from services.score.items import Asked, score_pair
-from services.score.predictions import Key, Predictions, digest_of
+from services.score.predictions import Key, Predictions, by_export_ids, digest_of
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -106,6 +110,12 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
             import services.score.shape  # noqa: F401
     if asked.flip and "rgb" in asked.kinds:
         require_flip()
+    if "pose" in asked.kinds:
+        role: Role = "input" if asked.frame == "input" else "mirror"
+        pairs = require_job(store).job.pairs_per_scene
+        predictions = by_export_ids(predictions, pairs, _scenes(store), role)
+        if predictions.by_export:
+            print("verso: poses.csv is read by the ids of an export (scene_id, im_id, obj_id)", file=sys.stderr)
     todo, scored = list(_ranges(store, predictions, asked)), list[_Range]()
     poses = {pose for item in todo for pose in item.poses}
     if not any(pose in poses for _, pose, _ in predictions.names):
@@ -132,6 +142,14 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
     strays = _table([*_strays(predictions, unknown, store.name)])
     _write_items((*tables, strays), metrics, out / ITEMS_FILE)
     return out / ITEMS_FILE
+
+
+def _scenes(store: Store) -> Iterator[tuple[int, list[str]]]:
+    """Each scene's id, and the instances of its objects by region."""
+    for records in iter_committed(store):
+        for scene in range_rows(store, records, "scenes").to_pylist():
+            names = region_names(scene)
+            yield scene["scene_id"], [names[region][1] for region in sorted(names) if region >= REGION_FIRST_OBJECT]
 
 
 def _ranges(store: Store, predictions: Predictions, asked: Asked) -> Iterator[_Range]:

@@ -299,6 +299,36 @@ def test_a_split_is_scored_alone_and_is_proposed_where_nothing_else_is_predicted
     assert "the same --split" in capsys.readouterr().err
 
 
+def test_poses_are_read_by_the_ids_of_the_export_that_they_answer_or_by_ours(files, tmp_path, capsys):
+    assert main(["export", str(files.root), str(tmp_path / "bop"), "--format", "bop"]) == 0
+    lines = ["scene_id,im_id,obj_id,score,R,t,time"]
+    for path in (tmp_path / "bop").glob("*/*/scene_gt.json"):
+        for image, poses in json.loads(path.read_text()).items():
+            for pose in poses:
+                R, t = (" ".join(map(str, pose[name])) for name in ("cam_R_m2c", "cam_t_m2c"))
+                lines.append(f"{int(path.parent.name)},{image},{pose['obj_id']},1.0,{R},{t},-1")
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    theirs.mkdir()
+    (theirs / "poses.csv").write_text("\n".join(lines))
+    for more in ([], ["--frame", "input"]):
+        status, answer, said = score(capsys, files.root, theirs, *more)
+        assert (status, answer["missing"]) == (0, 0) and "by the ids of an export" in said
+        assert answer["metrics"]["pose_mssd_m"]["value"] < 1e-9
+    (theirs / "poses.csv").write_text("\n".join([*lines, lines[-1].replace(lines[-1].split(",")[2], "999", 1)]))
+    status, answer, said = score(capsys, files.root, theirs)
+    assert (status, answer["unknown"], answer["missing"]) == (1, 1, 0) and "obj_id" in said
+    ours.mkdir()
+    lines = ["scene_id,im_id,obj_id,R,t"]
+    for pair in open_dataset(str(files.root)).pairs():
+        T = np.linalg.inv(pair.mirror.T_world_cam) @ pair.T_world[3]
+        R, t = (" ".join(map(str, part.ravel())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
+        lines.append(f"{pair.scene_id},{pair.mirror.pose_id},3,{R},{t}")
+    (ours / "poses.csv").write_text("\n".join(lines))
+    status, answer, said = score(capsys, files.root, ours)
+    assert (status, answer["missing"]) == (0, 0) and "export" not in said
+    assert answer["metrics"]["pose_mssd_m"]["value"] < 1e-9
+
+
 def score_file(files, folder, out, capsys):
     score(capsys, files.root, folder, "--out", out)
     return out / "items.parquet"

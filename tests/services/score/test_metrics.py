@@ -13,7 +13,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from schemas.errors import InputError
 from schemas.scene.shape import Mesh
 from services.score.images import align_depth, score_colour, score_depth
-from services.score.items import check_depth
+from services.score.items import Asked, check_depth
+from services.score.items import _score_volume as score_volume_file
 from services.score.pose import check_distance, score_pose, score_volume, symmetries_of
 from services.score.shape import align_shape, score_shape
 from workers.geometry.frames import transform
@@ -457,6 +458,17 @@ def test_depth_is_inverted_only_where_that_of_the_object_is_too():
     with pytest.raises(InputError, match="inverted"):
         check_depth(1.0 / true, true, None, mask)
     check_depth(np.where(mask, true, 1.0 / true), true, None, mask)  # of what is about the object nothing is known
+
+
+@pytest.mark.parametrize("volume", ["told", "occupancy", "logits", "sdf", "sdf-positive-inside"])
+def test_values_of_a_volume_are_what_the_command_says(volume, tmp_path):
+    true = np.random.default_rng(14).normal(size=500) * 0.02
+    stored = {"volume_points": np.zeros((500, 3)), "volume_distance": true, "volume_occupancy": true < 0.0}
+    values = {"logits": -500.0 * true, "sdf-positive-inside": -true, "occupancy": true < 0.0}
+    np.save(tmp_path / "1.npy", values.get(volume, true))
+    scores, _ = score_volume_file(tmp_path / "1.npy", 3, stored, None, Asked(("volume",), volume=volume))
+    assert scores["iou"] == scores["accuracy"] == 1.0
+    assert scores["distance_mae_m"] == (None if volume in ("logits", "occupancy") else pytest.approx(0.0))
 
 
 def test_distances_of_another_unit_or_sign_and_logits_are_told_and_a_poor_guess_is_not():
