@@ -154,27 +154,32 @@ def score_depth(
     """
     predicted, true = (np.ascontiguousarray(image, np.float64) for image in (predicted_m, true_m))
     known = (true > 0.0) & (true < np.inf)
-    values = _metrics_of(predicted[known], true[known], worst_m)
     scores: dict[str, float] = {}
     for name, part in parts.items():
-        row = values[:, part[known]].sum(axis=1)
-        row[:-1] /= row[-1] or np.nan
-        row[1] = np.sqrt(row[1])
-        scores |= {f"{name}.{metric}": float(value) for metric, value in zip(METRICS, row, strict=True)}
+        at = np.flatnonzero(part & known)
+        values = _metrics_of(predicted.ravel()[at], true.ravel()[at], worst_m)
+        scores |= {f"{name}.{metric}": value for metric, value in zip(METRICS, values, strict=True)}
     return scores
 
 
-def _metrics_of(d: Array, t: Array, worst_m: float) -> Array:
-    """[METRICS, N] of predicted and true depth [N], where there is truth: what each pixel adds to each of the sums."""
+def _metrics_of(d: Array, t: Array, worst_m: float) -> list[float]:
+    """`METRICS` of predicted and true depth [N], where there is truth."""
+    count = len(t)
+    if not count:
+        return [*[math.nan] * (len(METRICS) - 1), 0.0]
     hit = (d > 0.0) & (d < np.inf)
-    safe = np.where(hit, d, t)
-    larger, smaller = np.maximum(safe, t), np.minimum(safe, t)
-    error = np.where(hit, np.minimum(larger - smaller, worst_m), worst_m)
-    shares = [error <= limit_m + SLACK_M for limit_m in (0.001, 0.002, 0.005, 0.01)]
-    shares += [larger < 1.25**power * smaller - SLACK_M for power in (1, 2, 3)]
-    curve = np.maximum(1.0 - error / AUC_M, 0.0) * hit
-    relative = np.where(hit, np.minimum((larger - smaller) / t, 1.0), 1.0)
-    return np.stack([error, error**2, relative, curve, *(share & hit for share in shares), ~hit, np.ones(len(t))])
+    all_hit = bool(hit.all())
+    larger, smaller = np.maximum(d, t), np.minimum(d, t)
+    if not all_hit:  # a hole is as far off as any, and beyond all ratios
+        larger[~hit], smaller[~hit] = np.inf, 0.0
+    apart = larger - smaller
+    error = np.minimum(apart, worst_m)
+    near = error[error < AUC_M]
+    means = [error.mean(), math.sqrt(error @ error / count), np.minimum(apart / t, 1.0).mean()]
+    means.append((len(near) - near.sum() / AUC_M) / count)
+    means += [np.count_nonzero(apart <= limit_m + SLACK_M) / count for limit_m in (0.001, 0.002, 0.005, 0.01)]
+    means += [np.count_nonzero(larger < 1.25**power * smaller - SLACK_M) / count for power in (1, 2, 3)]
+    return [*map(float, means), 0.0 if all_hit else 1.0 - np.count_nonzero(hit) / count, float(count)]
 
 
 def align_depth(predicted_m: Array, true_m: Array, how: Alignment) -> Array:
