@@ -378,7 +378,7 @@ def sense_input(pair: Pair, job: Job) -> Pair:
 def score(dataset: Dataset, folder: Path) -> pa.Table:
     """The items of predictions, as `verso score` writes them."""
     given, store = find_predictions(folder), open_store(dataset.place)
-    return pq.read_table(score_dataset(store, given, Asked(given.kinds), folder / "score"))
+    return pq.read_table(score_dataset(store, given, Asked(given.kinds, split="test"), folder / "score"))
 
 
 def run(name: str, dataset: Dataset, out: Path) -> list[dict[str, Any]]:
@@ -414,7 +414,8 @@ def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterato
         figures = summarise(items)["metrics"]
         for metric in (name for name in METRICS if name in figures and figures[name]["items"]):
             # Five digits are more than an interval leaves meaning to
-            words = {key: "" if value is None else f"{value:.5g}" for key, value in figures[metric].items()}
+            values = {key: figures[metric][key] for key in ("value", "low", "high", "items")}
+            words = {key: "" if value is None else f"{value:.5g}" for key, value in values.items()}
             yield {"level": level, "metric": metric, **words}
 
 
