@@ -121,8 +121,16 @@ def _write(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-_SHOWN: Final = ("depth_auc_50mm", "depth_mae_m", "rgb_ncc", "shape_chamfer_l1_m", "volume_iou", "pose_add_m")
-"""The metric of each kind that is told first."""
+_SHOWN: Final = (
+    "depth_auc_50mm",
+    "depth_mae_m",
+    "rgb_ncc",
+    "shape_chamfer_l1_m",
+    "volume_iou",
+    "pose_add_m",
+    "depth_mae_hidden_m",
+)
+"""The metrics of each kind that are told first."""
 
 _CHARTS: Final = (
     ("Depth of the object", {"seen": "depth_mae_seen_m", "hidden": "depth_mae_hidden_m"}),
@@ -171,7 +179,7 @@ def answer_of(summary: Mapping[str, Any]) -> str:
     """One line with the first metric of every kind, and the numbers of items."""
     numbers = ", ".join(f"{summary[word]} {word}" for word in ("scored", "missing", "refused"))
     lines = []
-    for name in (*_SHOWN, "depth_mae_hidden_m"):
+    for name in _SHOWN:
         if figure := summary["metrics"].get(name):
             ends = interval(name, figure)
             left_out = "" if figure["coverage"] == 1.0 else f", {covered(figure)}"
@@ -204,30 +212,26 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
 
 
 def _metrics(metrics: Mapping[str, Figure]) -> str:
-    rows = [
-        (
+    rows = {
+        name: (
             f"{words(name)}<small><code>{name}</code></small>",
             in_words(name, one["value"]),
-            interval(name, one) or "–",
-            str(one["items"]),
             covered(one).removeprefix("coverage "),
+            interval(name, one) or "–",
             in_words(name, one["worst"]),
+            str(one["items"]),
         )
         for name, one in metrics.items()
         if one["items"]
-    ]
-    first, rest = rows[: sum(name in HEADLINES for name in metrics)], rows[sum(name in HEADLINES for name in metrics) :]
-    head = ("metric", "mean", "95 % interval", "items", "coverage", "at worst")
-    more = (
-        f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
-        if rest
-        else ""
-    )
-    return table_html(head, first) + more
+    }
+    head = ("metric", "mean", "coverage", "95 % interval", "at worst", "items")
+    first, rest = ([row for name, row in rows.items() if (name in HEADLINES) == told] for told in (True, False))
+    more = f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
+    return table_html(head, first) + more * bool(rest)
 
 
 def _group(title: str, groups: Mapping[str, Mapping[str, Figure]]) -> str:
-    names = [name for name in HEADLINES if any(group.get(name, {}).get("items") for group in groups.values())][:6]
+    names = [name for name in _SHOWN if any(group.get(name, {}).get("items") for group in groups.values())]
     rows = [
         (
             escape(word),
