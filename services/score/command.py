@@ -7,6 +7,7 @@ import argparse
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -33,7 +34,7 @@ from workers.store.local import open_store
 
 SUMMARY_FILE, PAGE_FILE = "summary.json", "index.html"
 
-SCORE_VERSION = 1
+SCORE_VERSION = 2
 """The version of the format of summary.json."""
 
 
@@ -65,9 +66,9 @@ def main(options: argparse.Namespace) -> int:
             "predictions": str(given.folder),
         }
         summary = {**head, **asdict(asked), **summarise(table)}
-        _write(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
+        write_text(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
         troubles = describe_refused(path)
-        _write(target / PAGE_FILE, page_of(summary, items_of(table), troubles))
+        write_text(target / PAGE_FILE, page_of(summary, items_of(table), troubles))
     for line in troubles:
         print(f"verso: {line}", file=sys.stderr)
     for name, figure in summary["metrics"].items():
@@ -80,6 +81,30 @@ def main(options: argparse.Namespace) -> int:
     return finish(options, is_whole(summary), **answer, page=str(target / PAGE_FILE))
 
 
+def check(options: argparse.Namespace) -> int:
+    """Says by kind how many items are there and can be read, and what cannot and why; 0 where all of the split can be scored."""
+    store = require_dataset(open_store(options.out))
+    given = find_predictions(options.predictions)
+    asked = Asked(given.kinds, options.frame, split=options.split, volume=options.volume, check=True)
+    with explain_damage(store), tempfile.TemporaryDirectory() as scratch:
+        path = score_dataset(store, given, asked, Path(scratch))
+        summary, troubles = summarise(pq.read_table(path)), describe_refused(path)
+    for line in troubles:
+        print(f"verso: {line}", file=sys.stderr)
+    holes = summary["metrics"].get("depth_holes", {"coverage": 1.0})
+    for kind, counts in summary["kinds"].items():
+        left_out = f", {covered(holes)}" if kind == "depth" else ""
+        print(
+            f"{kind:8}{', '.join(f'{count} {word}' for word, count in counts.items())}{left_out}".replace(
+                "scored", "there"
+            )
+        )
+    whole = holes["coverage"] == 1.0 and not any(summary[word] for word in ("missing", "refused", "unknown"))
+    return finish(
+        options, whole, **{word: summary[word] for word in ("items", "missing", "refused", "unknown", "kinds")}
+    )
+
+
 def is_whole(summary: Mapping[str, Any]) -> bool:
     """Whether all that there is to predict is predicted, and nothing else is there."""
     headlines = (figure["coverage"] for name, figure in summary["metrics"].items() if name in HEADLINES)
@@ -88,12 +113,8 @@ def is_whole(summary: Mapping[str, Any]) -> bool:
 
 def _compare(options: argparse.Namespace) -> int:
     """Prints which of two scores is better by each metric, with a paired interval."""
-    (a, one), (b, other) = (_read_score(options.out, path) for path in options.compare)
-    if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != options.out:
-        raise InputError(f"{options.compare[0]} and {options.compare[1]} are scores of different datasets")
-    if one["align"] != other["align"]:
-        how = f"with --align {one['align']} and {other['align']}"
-        raise InputError(f"{options.compare[0]} and {options.compare[1]} were scored {how}: score both alike")
+    (a, one), (b, other) = (read_score(options.out, path) for path in options.compare)
+    require_alike(options.out, str(options.compare[0]), one, str(options.compare[1]), other)
     metrics = compare(a, b)
     better = {"a": f"{options.compare[0]} is better", "b": f"{options.compare[1]} is better", None: "not decided"}
     for name, row in metrics.items():
@@ -106,22 +127,35 @@ def _compare(options: argparse.Namespace) -> int:
     return finish(options, True, a=str(options.compare[0]), b=str(options.compare[1]), metrics=metrics)
 
 
-def _read_score(out: str, path: Path) -> tuple[pa.Table, dict[str, Any]]:
+def require_alike(out: str, a: str, one: Mapping[str, Any], b: str, other: Mapping[str, Any]) -> None:
+    """Raises InputError where two summaries are of different datasets, alignments, frames or splits."""
+    if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != out:
+        raise InputError(f"{a} and {b} are scores of different datasets")
+    for key in ("align", "split"):
+        if one[key] != other[key]:
+            raise InputError(f"{a} and {b} were scored with --{key} {one[key]} and {other[key]}: score both alike")
+
+
+def read_score(out: str, path: Path) -> tuple[pa.Table, dict[str, Any]]:
     """The items and the summary of a folder of predictions or of its score. Raises InputError where it is not scored."""
     for folder in (path, path / "score"):
         if (folder / ITEMS_FILE).is_file() and (folder / SUMMARY_FILE).is_file():
-            return pq.read_table(folder / ITEMS_FILE), json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+            summary = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+            if summary["verso_score"] == SCORE_VERSION:
+                return pq.read_table(folder / ITEMS_FILE), summary
+            again = command_line("score", out, path)
+            raise InputError(f"{folder} was scored by the rules of another version: score it again with {again}")
     raise InputError(f"{path} has no score: make one with {command_line('score', out, path)}")
 
 
-def _write(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Whole or not at all."""
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)
 
 
-_SHOWN: Final = (
+SHOWN: Final = (
     "depth_auc_50mm",
     "depth_mae_m",
     "rgb_ncc",
@@ -179,7 +213,7 @@ def answer_of(summary: Mapping[str, Any]) -> str:
     """One line with the first metric of every kind, and the numbers of items."""
     numbers = ", ".join(f"{summary[word]} {word}" for word in ("scored", "missing", "refused"))
     lines = []
-    for name in _SHOWN:
+    for name in SHOWN:
         if figure := summary["metrics"].get(name):
             ends = interval(name, figure)
             left_out = "" if figure["coverage"] == 1.0 else f", {covered(figure)}"
@@ -231,7 +265,7 @@ def _metrics(metrics: Mapping[str, Figure]) -> str:
 
 
 def _group(title: str, groups: Mapping[str, Mapping[str, Figure]]) -> str:
-    names = [name for name in _SHOWN if any(group.get(name, {}).get("items") for group in groups.values())]
+    names = [name for name in SHOWN if any(group.get(name, {}).get("items") for group in groups.values())]
     rows = [
         (
             escape(word),

@@ -80,6 +80,8 @@ class Asked:
     align: Alignment = "none"
     split: Split = "all"
     volume: Volume = "told"
+    check: bool = False
+    """Whether predictions are read and held against units, sizes and places alone, and not scored but for holes."""
     flip: bool = False
     """Whether FLIP is among the metrics of RGB: it takes 0.7 s an image of 640 x 480."""
 
@@ -143,9 +145,9 @@ def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folde
             where = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
             raise InputError(f"the id is there {len(names)} times: {where}")
         with as_refusal(f"{kind} {names[0]}"):
-            scores, note = _SCORERS[kind](
-                folder / kind / names[0] if kind != "pose" else names[0], region, prepared, truth, asked
-            )
+            prediction = folder / kind / names[0] if kind != "pose" else names[0]
+            scorer = _READERS[kind](prediction, region, prepared, truth, asked)
+            scores, note = scorer() if kind == "depth" or not asked.check else ({}, None)
     except VersoError as error:
         return {"status": "refused", "reason": str(error).replace(f"{folder}/", "")}
     return {"status": "ok", "reason": note} | {column(kind, name): value for name, value in scores.items()}
@@ -247,16 +249,19 @@ def _outline(segment: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 # ---------------------------------------------------------------------------------------------- one item of each kind
 
-Scored = tuple[Mapping[str, float | None], str | None]
-"""Metrics by name, and a note."""
+Scorer = Callable[[], tuple[Mapping[str, float | None], str | None]]
+"""Makes the metrics by name, and a note, of a prediction that is read."""
 
 
-def _score_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     true_m, parts = prepared
     predicted_m = read_image(path, true_m.shape, truth.view.depth_units_per_m)
     units_per_m = truth.view.depth_units_per_m if asked.align == "none" else None
     check_depth(predicted_m, true_m, units_per_m, parts["object"])
-    return score_depth(align_depth(predicted_m, true_m, asked.align), true_m, parts, truth.farthest_m), None
+    if asked.check:
+        parts = {"object": parts["object"]}
+    aligned_m = align_depth(predicted_m, true_m, asked.align)
+    return lambda: (score_depth(aligned_m, true_m, parts, truth.farthest_m), None)
 
 
 def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None, mask: NDArray[np.bool_]) -> None:
@@ -287,21 +292,26 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None, ma
             raise InputError(f"depth is {ratio:.4g} times the truth: it seems to be {unit}; write {remedy}")
 
 
-def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     true, parts = prepared
-    return score_colour(read_image(path, true.shape), true, parts, flip=asked.flip), None
+    predicted = read_image(path, true.shape)
+    return lambda: (score_colour(predicted, true, parts, flip=asked.flip), None)
 
 
-def _score_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     from services.score.shape import align_shape, score_shape  # loads what makes data
 
     predicted = read_shape(path)
     predicted, _ = align_shape(predicted, prepared, asked.align, asked.seed)
     points = predicted.vertices if isinstance(predicted, Mesh) else predicted
     check_box(points, prepared.vertices, lambda frame: truth.shape(region, frame).vertices)
-    scores = score_shape(predicted, prepared, truth.diagonal_m(region), asked.samples, asked.seed)
-    open_mesh = isinstance(predicted, Mesh) and scores.get("iou") is None
-    return scores, "the mesh has no volume: its IoU counts as 0" if open_mesh else None
+
+    def score() -> tuple[Mapping[str, float | None], str | None]:
+        scores = score_shape(predicted, prepared, truth.diagonal_m(region), asked.samples, asked.seed)
+        open_mesh = isinstance(predicted, Mesh) and scores.get("iou") is None
+        return scores, "the mesh has no volume: its IoU counts as 0" if open_mesh else None
+
+    return score
 
 
 def check_box(points: Array, true: Array, true_in: Callable[[PredictedFrame], Array]) -> None:
@@ -322,7 +332,7 @@ def check_box(points: Array, true: Array, true_in: Callable[[PredictedFrame], Ar
         raise InputError(f"the box is {np.linalg.norm(centre - true_centre):.3g} m from the true one{remedy}")
 
 
-def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     """Where `--volume` does not say, values from 0 to 1 are occupancy, of which some are negative distance, negative inside."""
     count = len(prepared["volume_points"])
     predicted = read_array(path, (count,))
@@ -345,23 +355,23 @@ def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: A
     true = prepared[name].astype(np.float64)
     if is_distance:
         check_distance(predicted, true)
-    return score_volume(predicted, true, is_distance), None
+    return lambda: (score_volume(predicted, true, is_distance), None)
 
 
-def _score_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     view = truth.pair.input if asked.frame == "input" else truth.view
     T_true = read_matrix(view.regions[region]["T_cam_obj"])
     T = read_pose(text)
     off_m, away_m = float(np.linalg.norm(T[:3, 3])), float(np.linalg.norm(T_true[:3, 3]))
     if not 1e-2 < off_m / away_m < 1e2:
         raise InputError(f"t is {off_m / away_m:.4g} times as far as the object: BOP's csv has millimetres")
-    return score_pose(T, T_true, prepared.vertices, symmetries_of(prepared), view.K), None
+    return lambda: (score_pose(T, T_true, prepared.vertices, symmetries_of(prepared), view.K), None)
 
 
-_SCORERS: Final[Mapping[str, Any]] = {
-    "depth": _score_depth,
-    "rgb": _score_rgb,
-    "shape": _score_shape,
-    "volume": _score_volume,
-    "pose": _score_pose,
+_READERS: Final[Mapping[str, Any]] = {
+    "depth": _read_depth,
+    "rgb": _read_rgb,
+    "shape": _read_shape,
+    "volume": _read_volume,
+    "pose": _read_pose,
 }

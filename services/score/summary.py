@@ -146,7 +146,7 @@ def summarise(table: pa.Table) -> dict[str, Any]:
         name: np.asarray(pc.equal(table["category"], name).fill_null(False).to_numpy(), np.bool_)
         for name in sorted(filter(None, pc.unique(table["category"]).to_pylist()))
     }
-    scenes, groups = _scenes(table), {"category": categories, "visible_fraction": _quarters(table)}
+    scenes, groups = scenes_of(table), {"category": categories, "visible_fraction": _quarters(table)}
     statuses = [_equal(table, "status", word) for word in ("ok", "missing", "refused")]
 
     def told(chosen: Any, places: list[int]) -> dict[str, Figure]:
@@ -219,7 +219,7 @@ def compare(a: pa.Table, b: pa.Table) -> dict[str, Any]:
     a, b = (each.filter(pc.is_in(each["kind"], kinds)) for each in tables)
     if a.select(ITEM) != b.select(ITEM):
         raise InputError("the two scores are not of the same items: score both with the same --split")
-    scenes, answer = _scenes(a), dict[str, Any]()
+    scenes, answer = scenes_of(a), dict[str, Any]()
     for name in sorted({*metrics_of(a)} & {*metrics_of(b)}, key=metrics_of(a).index):
         (mine, _, covered), (theirs, _, also_covered) = (_counted(each, name) for each in (a, b))
         one, other, apart = figures(np.column_stack([mine, theirs, theirs - mine]), scenes)
@@ -246,7 +246,7 @@ def _equal(table: pa.Table, name: str, word: str) -> NDArray[np.bool_]:
     return np.asarray(pc.equal(table[name], word).to_numpy(), np.bool_)
 
 
-def _scenes(table: pa.Table) -> NDArray[np.int64]:
+def scenes_of(table: pa.Table) -> NDArray[np.int64]:
     """[N] numbers of scenes from 0 up; items without a scene are one together."""
     return np.unique(_numbers(table, "scene_id"), return_inverse=True)[1].reshape(-1)
 

@@ -19,6 +19,7 @@ import trimesh
 from services.cli.main import main
 from services.dataset.dataset import open_dataset
 from services.score import run as module
+from services.score.leaderboard import holm
 from services.score.summary import HEADLINES, is_better_high
 from workers.pool import Ended
 
@@ -267,6 +268,60 @@ def test_who_does_not_predict_comes_last_and_no_verdict_is_given(files, truth, t
     assert worst["depth_mae_m"]["value"] == 8.0 and worst["rgb_ncc"]["value"] == worst["rgb_ncc"]["coverage"] == 0.0
 
 
+def test_a_leaderboard_says_who_is_surely_better_and_compares_nobody_who_leaves_something_out(
+    files, truth, tmp_path, capsys
+):
+    def depth_of(name, change):
+        folder = write_truth(files, tmp_path / name, change)
+        for kind in ("rgb", "shape"):
+            shutil.rmtree(folder / kind)
+        return folder
+
+    near = depth_of("near", lambda depth_m, _: depth_m + 0.001 * (depth_m > 0))
+    far = depth_of("far", lambda depth_m, _: depth_m + 0.006 * (depth_m > 0))
+    alike = depth_of("alike", lambda depth_m, number: depth_m + (0.001 + 0.0002 * (-1) ** number) * (depth_m > 0))
+    part = depth_of("part", lambda depth_m, _: depth_m)
+    min((part / "depth").iterdir()).unlink()
+    runs = [near, far, alike, part]
+    for folder in runs:
+        score(capsys, files.root, folder)
+    status, answer, _ = score(capsys, "merge", files.root, near, far, part, "--out", tmp_path / "board")
+    assert (status, answer["runs"]) == (1, ["near", "far", "part"])
+    better = {(one["a"], one["b"]): one["better"] for one in answer["verdicts"] if one["metric"] == "depth_mae_m"}
+    assert better == {("near", "far"): "near"}
+    page, latex = ((tmp_path / "board" / f"leaderboard.{kind}").read_text() for kind in ("md", "tex"))
+    assert "near is better than far" in page and "part is not compared" in page and r"87.5 \%" in latex
+    rows = pq.read_table(tmp_path / "board" / "leaderboard.parquet").to_pylist()
+    assert {row["run"] for row in rows if row["category"]} == set(answer["runs"])
+    status, answer, _ = score(capsys, "merge", files.root, near, alike, "--out", tmp_path / "two")
+    assert status == 0 and {one["better"] for one in answer["verdicts"]} == {None}
+    summary = far / "score" / "summary.json"
+    summary.write_text(summary.read_text().replace('"verso_score": 2', '"verso_score": 1'))
+    assert main(["score", "merge", str(files.root), str(near), str(far), "--out", str(tmp_path / "old")]) == 2
+    assert "rules of another version" in capsys.readouterr().err
+
+
+def test_p_values_are_corrected_as_holm_published():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.8]) == [1.0, 1.0] and holm([]) == []
+
+
+def test_predictions_are_checked_without_a_score(files, truth, tmp_path, capsys):
+    status, answer, _ = score(capsys, "check", files.root, truth)
+    assert (status, answer["items"], answer["missing"]) == (0, 3 * PAIRS, 0)
+    spoilt = shutil.copytree(truth, tmp_path / "spoilt")
+    first, second, *_ = sorted((spoilt / "depth").iterdir())
+    np.save(first, 1e3 * np.load(first))
+    np.save(second, 0.0 * np.load(second))
+    min((spoilt / "rgb").iterdir()).unlink()
+    status, answer, said = score(capsys, "check", files.root, spoilt)
+    assert (status, answer["refused"], answer["missing"]) == (1, 1, 1) and "millimetres" in said
+    assert main(["score", "check", str(files.root), str(spoilt)]) == 1
+    told = capsys.readouterr().out
+    assert f"depth   {PAIRS - 1} there, 0 missing, 1 refused, coverage 75 %" in told
+    assert {path.name for path in spoilt.iterdir()} == {"depth", "rgb", "shape"}
+
+
 def test_an_object_of_one_colour_has_no_score_that_the_table_gives_it(files, truth, tmp_path, capsys):
     grey = tmp_path / "grey"
     (grey / "rgb").mkdir(parents=True)
@@ -296,7 +351,7 @@ def test_a_split_is_scored_alone_and_is_proposed_where_nothing_else_is_predicted
     assert (status, answer["missing"]) == (1, 3 * (PAIRS - len(chosen))) and f"--split {split}" in said
     assert score(capsys, files.root, part, "--split", split)[0] == 0
     assert main(["score", str(files.root), "--compare", str(part), str(tmp_path / "all")]) == 2
-    assert "the same --split" in capsys.readouterr().err
+    assert f"--split {split} and all" in capsys.readouterr().err
 
 
 def test_poses_are_read_by_the_ids_of_the_export_that_they_answer_or_by_ours(files, tmp_path, capsys):

@@ -14,7 +14,7 @@ from schemas.errors import InputError
 from schemas.scene.shape import Mesh
 from services.score.images import align_depth, score_colour, score_depth
 from services.score.items import Asked, check_depth
-from services.score.items import _score_volume as score_volume_file
+from services.score.items import _read_volume as read_volume
 from services.score.pose import check_distance, score_pose, score_volume, symmetries_of
 from services.score.shape import align_shape, score_shape
 from workers.geometry.frames import transform
@@ -466,7 +466,7 @@ def test_values_of_a_volume_are_what_the_command_says(volume, tmp_path):
     stored = {"volume_points": np.zeros((500, 3)), "volume_distance": true, "volume_occupancy": true < 0.0}
     values = {"logits": -500.0 * true, "sdf-positive-inside": -true, "occupancy": true < 0.0}
     np.save(tmp_path / "1.npy", values.get(volume, true))
-    scores, _ = score_volume_file(tmp_path / "1.npy", 3, stored, None, Asked(("volume",), volume=volume))
+    scores, _ = read_volume(tmp_path / "1.npy", 3, stored, None, Asked(("volume",), volume=volume))()
     assert scores["iou"] == scores["accuracy"] == 1.0
     assert scores["distance_mae_m"] == (None if volume in ("logits", "occupancy") else pytest.approx(0.0))
 
