@@ -27,7 +27,7 @@ from schemas.errors import InputError, MachineError, VersoError, needs_making, p
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
-from services.dataset.dataset import iter_pairs
+from services.dataset.dataset import RangeRows, pairs_of
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
 from services.read.dataset_reader import region_names
@@ -209,9 +209,9 @@ def _files(place: str) -> tuple[StoredFiles, Job]:
 
 def _rows(item: _Range) -> list[Row]:
     files, job = _files(item.place)
-    pairs = iter_pairs(lambda table: range_rows(files.store, item.records, table), RangeFiles(files, item.records))
+    stored = RangeRows.of(lambda table: range_rows(files.store, item.records, table))
     rows: list[Row] = []
-    for pair in pairs:
+    for pair in pairs_of(stored, RangeFiles(files, item.records)):
         if pair.mirror is None or pair.mirror.pose_id in item.poses:
             rows += score_pair(pair, item.folder, item.predicted, item.asked, job, item.blame)
     return rows
