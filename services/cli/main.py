@@ -30,8 +30,6 @@ def main(argv: list[str] | None = None) -> int:
         enter_stack_environment()
         speak_as_typed()
         argv = sys.argv[1:]
-    if (words := " ".join(argv[:2])) in COMMANDS:  # a command of two words, whose first is one too
-        argv = [words, *argv[2:]]
     options = build_parser(typed_program() if from_shell else "verso").parse_args(argv)
     if from_shell and options.starts_ray(options):
         return supervise(partial(_run, options), options.kept, quiet=options.quiet, answers=options.json)
