@@ -90,7 +90,6 @@ _SHARED = {
     "balance": "Share of its weight that the contact forces cannot balance.",
     "centre": "Principal point, where the centre of the first pixel is at 0.5.",
     "centre_opencv": "Principal point, where the centre of the first pixel is at 0, as in OpenCV.",
-    "by_row": "; 4 x 4, by rows.",
     "share_seen": "unoccluded and also outside the frame",
     "markers": "Markers that are seen; in `scenes` in all used photographs.",
     "corners_before": "Median distance of corners, estimate from markers alone.",
@@ -111,8 +110,8 @@ instance_id | string | - | - | {instance}
 source | string | - | - | {source}
 table_id | string | - | - | The table's shape: the key of `assets`.
 object_scale | double | 1 | - | {scale}
-T_world_obj | double[16] | m | world, object | Pose of the first object at rest{by_row}
-T_world_table | double[16] | m | world, object | Pose of the table{by_row}
+T_world_obj | double[16] | m | world, object | Pose of the first object at rest.
+T_world_table | double[16] | m | world, object | Pose of the table.
 pose | string, scenes | - | - | How the objects started: upright, tumbled or placed.
 redraws | int64 | count | - | How often the start position was drawn again before one was valid.
 effects | list of string | - | - | Names of the effects that ran.
@@ -135,7 +134,7 @@ bodies[].category | string | - | - | {category}
 bodies[].instance_id | string | - | - | {instance}
 bodies[].source | string | - | - | {source}
 bodies[].object_scale | double | 1 | - | {scale}
-bodies[].T_world_obj | double[16] | m | world, object | Pose at rest{by_row}
+bodies[].T_world_obj | double[16] | m | world, object | Pose at rest.
 bodies[].redraws | int64 | count | - | How often its start position was drawn again.
 bodies[].penetration_mm | double | mm | - | {overlap}
 bodies[].hover_gap_mm | double | mm | - | {gap}
@@ -188,7 +187,7 @@ parent_id | int64 | id | - | The pair: the pose id of its input view.
 role | string | - | - | {role}
 scene_id | int64 | id | - | {scene_id}
 category | string | - | - | {category}
-T_world_cam | double[16] | m | world, camera | Pose of the camera{by_row}
+T_world_cam | double[16] | m | world, camera | Pose of the camera.
 inclination_rad | double | rad | world | Angle of the optical axis below the horizontal.
 yaw_rad | double | rad | world | Direction from the scene to the camera about the vertical axis, from the x axis.
 width | int64 | px | - | Columns of the image.
@@ -234,7 +233,7 @@ category | string | - | - | {category}
 instance_id | string | - | - | {instance}
 u | int64 | px | image | Column of the object's origin; -1 outside the image or behind the camera.
 v | int64 | px | image | Row of the object's origin; -1 outside the image or behind the camera.
-T_cam_obj | double[16] | m | camera, object | Pose{by_row}
+T_cam_obj | double[16] | m | camera, object | Pose.
 bbox_xywh | int64[4] | px | image | Bounding box of its pixels: left, top, width, height.
 pixels | int64 | count | - | Pixels of it that are seen.
 visible_fraction | double | 1 | - | Share that is seen of its own pixels, {share_seen}.
@@ -255,7 +254,7 @@ sha256 | string | - | - | SHA-256 of the source file, or of the generated arrays
 extents_m | double[3] | m | object | Size of the bounding box along the axes.
 volume_m3 | double? | m3 | - | Volume; null where the mesh is open.
 watertight | bool | - | - | Whether the mesh bounds a volume.
-T_source_to_object | double[16] | m | object, source | Takes scaled source coordinates to object coordinates{by_row}
+T_source_to_object | double[16] | m | object, source | Takes scaled source coordinates to object coordinates.
 scale | double | 1 | - | {scale}
 split | string | - | - | train, val or test, by the instance's id: no shape is in two.
 notes | list of string? | - | - | What was repaired or left out.

@@ -184,8 +184,8 @@ class LibrarySource(Frozen):
     weight: Weight = 1.0
     """Share among the sources that offer a scene's category."""
     folder: Folder
-    """A library, or a folder of meshes, URDFs or ShapeNetCore models, relative to the job file; `pybullet_data`: the meshes
-    inside that package."""
+    """A library, or a folder of meshes, URDFs or ShapeNetCore models, relative to the job file; `pybullet_data`: the meshes of
+    that package."""
     diagonal_m: Positive | None = None
     """Bounding-box diagonal of every object; without it each keeps its own size."""
     copy_assets: bool = False
@@ -257,7 +257,7 @@ class Assets(Frozen):
     density_kg_m3: Positive = 600.0
     """Density of a watertight solid."""
     shell_kg_m2: Positive = 3.0
-    """Surface density of a mesh that is not watertight: its mass is that of a thin shell."""
+    """Surface density of a mesh that is not watertight, a thin shell."""
 
     @field_validator("objects")
     @classmethod

@@ -60,9 +60,9 @@ class Grid(Frozen):
     rows: Annotated[int, Field(ge=1, le=100)] = 5
     """Rows of markers."""
     marker_m: Annotated[float, Field(gt=0, le=10)] = 0.06
-    """Side of a marker, its black border included, metres."""
+    """Side of a marker with its black border."""
     gap_m: Annotated[float, Field(gt=0, le=10)] = 0.02
-    """Between two markers, metres."""
+    """Between two markers."""
     width_m: Annotated[float, Field(gt=0, le=100)] = 0.60
     """Width of the whole board about the origin."""
     height_m: Annotated[float, Field(gt=0, le=100)] = 0.40
@@ -174,7 +174,7 @@ class KinectDepthNoise(Frozen):
     times: NonNegative = 1.0
     """Factor on every random error of the preset."""
     bias_m: float = 0.0
-    """Further systematic error, metres."""
+    """Further systematic error."""
 
 
 class ToneCurve(Frozen):

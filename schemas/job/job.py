@@ -154,15 +154,15 @@ class Job(Frozen):
     name: Annotated[str, Field(max_length=1000), AfterValidator(_usable)]
     """Names the dataset; the default output folder is data/<name>."""
     preset: PresetName = "balanced"
-    """Defaults of keys that are not given, by kind of job; docs/measured.md has what they cost."""
+    """Defaults of other keys, by kind of job; docs/measured.md has what they cost."""
     seed: Seed = 0
     """Seed of all that is random in a scene."""
     scenes: PositiveInt = 64
-    """Number of scenes or captures; more than before extends a dataset. Default with captures.folders: their number."""
+    """Scenes or captures; more than before extend a dataset. Default with captures.folders: their number."""
     first_scene: NonNegativeInt = 0
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Input and mirror poses of each scene, or views of a capture that are stored at most (default 64)."""
+    """Pairs of each scene, or views of a capture that are stored at most (default 64)."""
     objects_per_scene: ObjectCount = ONE_OBJECT
     """Objects on the table; a range is drawn from evenly. The first gives the scene's category."""
     categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)

@@ -202,13 +202,13 @@ class DepthNoise(Frozen):
     """
 
     axial_m: NonNegative = 0.0
-    """Standard deviation along the optical axis at distance 0, metres [assumed]."""
+    """Standard deviation along the optical axis at distance 0 [assumed]."""
     axial_per_m: NonNegative = 17e-3 / 3.86**2
     """The standard deviation grows by this times z squared."""
     grazing_deg: Annotated[float, Field(gt=0, le=90)] = 80.0
     """Pixels beyond this angle of incidence have no depth [assumed]."""
     offset_m: float = 0.0
-    """Systematic error, metres. 0: the specification bounds it by 11 mm, and leaves its sign open."""
+    """Systematic error. 0: the specification bounds it by 11 mm, and leaves its sign open."""
     offset_share: Annotated[float, Field(gt=-1, lt=1)] = 0.0
     """Systematic error as a share of the distance; the specification bounds it by 0.001."""
     lateral_px: NonNegative = 0.4

@@ -171,10 +171,10 @@ def job_page() -> str:
     """docs/job.md: every key of a job file with its type, default and meaning, from the models."""
     rows: dict[str, list[str]] = {}
     for path, field, before in list_keys():
-        meaning = " ".join(
-            [*(field.description or "").split(), *([f"Its keys are those of `{before}`."] if before else ())]
-        )
-        allowed = "" if (default := _default(field)) == "below" else f" ({describe_allowed(field)}; {default})"
+        meaning = " ".join([*(field.description or "").split(), *([f"Keys as in `{before}`."] if before else ())])
+        default = _default(field)
+        allowed = describe_allowed(field).removesuffix(" or `null`" if default == "`null`" else "")
+        allowed = "" if default == "below" else f" ({allowed}; {default})"
         rows.setdefault(f"{allowed}: {meaning}\n", []).append(f"`{path}`")
     return JOB_HEAD + "".join(f"- {', '.join(paths)}{row}" for row, paths in rows.items())
 

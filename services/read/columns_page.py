@@ -16,7 +16,7 @@ HEADER = """\
 Written from `schemas/dataset/` by `python -m services.read.columns_page`. `./verso columns TABLE` prints the same.
 
 After a column's name: its type, unit and frame. `1` is a pure number, `id` and `count` are whole numbers. `T_a_b` takes
-coordinates in frame b to frame a: 16 doubles, row by row. `name[]` stands for the items of a list. A column marked "scenes" or
+coordinates in frame b to frame a, 4 x 4. `name[]` stands for the items of a list. A column marked "scenes" or
 "captures" is null in datasets of the other kind, with all that is inside it; one marked "targets" where the job asks for none.
 
 Frames:
@@ -60,7 +60,8 @@ def describe_columns(table: str | None) -> list[str]:
 
 def _facts(column: Column) -> str:
     """Type, unit and frame in a few words."""
-    words = [f"{column.type}{' or null' if column.null else ''}", column.unit]
+    by_rows = " by rows" if column.type == "double[16]" else ""
+    words = [f"{column.type}{by_rows}{' or null' if column.null else ''}", column.unit]
     words += [f"{' from '.join(column.frame.split(', '))}" if column.frame else ""]
     return ", ".join(word for word in [*words, "" if column.of == "both" else column.of] if word)
 

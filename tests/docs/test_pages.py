@@ -166,8 +166,8 @@ def test_every_link_leads_to_a_file_and_a_heading_and_every_command_is_one_that_
 
 def test_the_queues_page_has_its_states_and_pauses():
     page = (ROOT / "docs" / "queue.md").read_text()
-    table = page.partition("## States")[2].partition("##")[0]
-    assert re.findall(r"^\| (\w+) \|", table, re.MULTILINE)[1:] == list(get_args(JobState))
+    listed = page.partition("## States")[2].partition("##")[0]
+    assert re.findall(r"^- \*\*(\w+)\*\*: ", listed, re.MULTILINE) == list(get_args(JobState))
     assert f"rests for {', then '.join(f'{pause:g} s' for pause in PAUSES_S)}," in page
     assert RESTARTS == 3 and "three times at most" in page
 
