@@ -58,6 +58,12 @@ def test_no_process_of_a_worker_has_a_capability_or_is_root(cluster):
     assert [line.split()[0] for line in others] == ["/sbin/docker-init"]
 
 
+def test_the_root_file_system_cannot_be_written(cluster):
+    for place in ("/opt/verso/schemas", "/usr", "/var/tmp", "/run/verso"):
+        done = docker("exec", cluster.container("worker"), "touch", f"{place}/x")
+        assert "Read-only file system" in done.stderr, place
+
+
 def test_containers_are_healthy_and_say_when_they_are_not(cluster):
     must(cluster("up", "-d", "--scale", "worker=3", "head", "worker", VERSO_WORKER_CPUS="1"))  # one was stopped
     names = [cluster.container("head"), *(cluster.container("worker", number) for number in (1, 2, 3))]
@@ -94,6 +100,27 @@ def test_no_port_can_be_reached_from_outside(cluster):
         assert not _answers(head, port, bridge)
 
 
+def test_a_container_of_another_network_cannot_reach_it(cluster):
+    head = must(docker("exec", cluster.container("head"), "hostname", "-i")).strip()
+    other = f"{cluster.project}-other"
+    must(docker("network", "create", "--internal", other))  # its packets stay on this machine
+    try:
+        looks = ("run", "--rm", "--network", other, "--entrypoint", "python", IMAGE, "-c", _looks(head, PORTS))
+        assert json.loads(must(docker(*looks))) == []
+    finally:
+        docker("network", "rm", other)
+
+
+def test_a_container_of_it_reaches_neither_this_machine_nor_others(cluster):
+    here = _this_machine()
+    with socket.create_server(("0.0.0.0", 0)) as server:
+        port = server.getsockname()[1]
+        looks = _looks(here, (port,))
+        # From Docker's usual network it can be reached: the look can tell.
+        assert json.loads(must(docker("run", "--rm", "--entrypoint", "python", IMAGE, "-c", looks))) == [port]
+        assert json.loads(must(docker("exec", cluster.container("worker"), "python", "-c", looks))) == []
+
+
 def test_a_worker_that_is_killed_costs_no_byte(cluster, expected_digest):
     out = cluster.checkout / "data" / "killed"
     second = cluster.container("worker", 2)
@@ -123,6 +150,16 @@ def _commands(container: str, other_than: str) -> list[str]:
 
 def _health(container: str) -> str:
     return must(docker("inspect", "--format", "{{.State.Health.Status}}", container)).strip()
+
+
+def _this_machine() -> str:
+    """Address of this machine on Docker's usual network: the way out of a container there.
+
+    Docker's own `network inspect` has no gateway before the engine's second start.
+    """
+    asks = "import socket, struct; print([socket.inet_ntoa(struct.pack('<L', int(row[2], 16))) for row in"
+    asks += " map(str.split, open('/proc/net/route').readlines()[1:]) if row[1] == '00000000'][0])"
+    return must(docker("run", "--rm", "--entrypoint", "python", IMAGE, "-c", asks)).strip()
 
 
 def _looks(host: str, ports: tuple[int, ...]) -> str:
