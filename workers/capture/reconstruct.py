@@ -5,12 +5,12 @@ What the user wrote into the folder wins over every estimate.
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from schemas.base import Pose
-from schemas.capture import CaptureEstimate, Estimates, Reconstruction
+from schemas.capture import CapturedView, CaptureEstimate, Estimates, Reconstruction
 from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Captures, Estimate, Estimation, Fusion
 from schemas.scene.shape import Mesh
@@ -47,6 +47,8 @@ class Given:
     ours: frozenset[str]
     notes: tuple[str, ...] = ()
     """What was changed before anything was estimated."""
+    views: dict[int, CapturedView] = field(init=False, default_factory=dict)
+    """Images that were read for their markers and are not posed yet, without masks; merging holds as many."""
 
     def pose(self, prefix: str, number: int) -> Pose | None:
         """[4, 4] of the user's file `prefix`_00000.txt in our board frame, None where there is none or it is ours.
@@ -123,7 +125,9 @@ def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedVie
     view = next(view for view in estimate.views if view.number == number)
     if view.T_board_cam is None:
         raise CaptureError("no_pose", f"view {number} has no pose: {'; '.join(view.reasons)}")
-    stored = read_view(given.folder, number, given.has_mask(number))
+    stored, masked = given.views.pop(number, None), given.has_mask(number)
+    if stored is None or masked:
+        stored = read_view(given.folder, number, masked)
     return pose_view(stored, given.folder.camera, view.T_board_cam, estimate.depth)
 
 
@@ -134,6 +138,7 @@ def read_used(given: Given, estimate: CaptureEstimate) -> Iterator[PosedView]:
             posed = read_posed(given, estimate, view.number)
             if posed.depth_m.any():
                 yield posed
+    given.views.clear()
 
 
 def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: Stopwatch) -> Merged:
@@ -225,14 +230,15 @@ def _corrected(estimate: CaptureEstimate, evidence: Evidence) -> CaptureEstimate
 
 
 def _observe(given: Given, spec: Estimation, clock: Stopwatch) -> Evidence:
-    """What is seen in each view, in order of number; no two views' images are held at once."""
+    """What is seen in each view, in order of number."""
     folder = given.folder
     setup = Setup(folder.camera, folder.board, spec)
     dictionary = open_dictionary(folder.board, folder.path)
     views = []
     for number in folder.numbers:
         with clock.stage("read"):
-            view = read_view(folder, number, masked=False)
+            view = given.views.get(number) or read_view(folder, number, masked=False)
+            given.views[number] = view
         with clock.stage("detect"):
             detection = detect_markers(view.rgb, folder.board, dictionary, folder.camera, number)
         with clock.stage("sample"):
