@@ -62,7 +62,7 @@ from workers.capture.results import (
 )
 from workers.capture.surface.object_mask import Ground, down_to_board, silhouette
 from workers.capture.surface.posed_view import PosedView, distort_mask
-from workers.capture.surface.synthesize import Source, choose_sources, move_depth, prepare_source, synthesize_view
+from workers.capture.surface.synthesize import Source, choose_sources, color_depth, prepare_source, synthesize_view
 from workers.capture.surface.tsdf import fit_depth
 from workers.geometry.pixels import round_depth
 from workers.scene.context import Stopwatch
@@ -76,6 +76,7 @@ SCHEMA = pa.schema(
     [
         *(("number", pa.int64()), ("estimate", pa.string()), ("chosen", pa.bool_()), ("status", pa.string())),
         ("reasons", pa.list_(pa.string())),
+        ("cluttered", pa.bool_()),
         *((name, SCHEMAS["views"].field(name).type) for name in _CAMERA),
         ("markers", pa.int64()),
         *((name, pa.float64()) for name in _RESIDUALS),
@@ -115,7 +116,12 @@ def pose_table(estimates: Estimates, camera: CaptureCamera) -> bytes:
 def _pose_row(view: ViewEstimate, before: ViewEstimate | None, camera: CaptureCamera) -> Row:
     pose = np.eye(4) if view.T_board_cam is None else view.T_board_cam
     row = {**camera_columns(Camera(camera.intrinsics, pose)), **residual_columns(view, before)}
-    row |= {"status": view.status, "reasons": view.reasons, "depth_before_mm": before.depth_mm if before else None}
+    row |= {
+        "status": view.status,
+        "reasons": view.reasons,
+        "cluttered": view.is_cluttered,
+        "depth_before_mm": before.depth_mm if before else None,
+    }
     if view.T_board_cam is None:
         row["T_world_cam"] = None
     if view.covariance is not None:
@@ -143,6 +149,7 @@ def read_poses(path: Path) -> tuple[ViewEstimate, ...]:
             reprojection_px=row["reprojection_px"],
             depth_mm=row["depth_mm"],
             reasons=tuple(row["reasons"]),
+            is_cluttered=bool(row["cluttered"]),
         )
         for row in rows
         if row["chosen"]
@@ -190,8 +197,8 @@ def _view_files(given: Given, estimates: Estimates, body: Mesh) -> dict[str, byt
         files[f"board_{number:05d}.txt"] = pose_text(board).encode()
         files[f"correction_{number:05d}.txt"] = pose_text(correction).encode()
         if not given.has_mask(number):
-            cluttered = estimates.estimate.is_cluttered(number) and given.folder.file("depth", number) is not None
-            depth_m = read_posed(given, estimates.estimate, number).depth_m if cluttered else None
+            hides = estimates.estimate.view(number).is_cluttered
+            depth_m = color_depth(read_posed(given, estimates.estimate, number)) if hides else None
             mask = silhouette(body, Camera(camera.intrinsics, correction @ board), depth_m)
             files[f"mask_{number:05d}.png"] = encode_mask(distort_mask(mask, camera))
     return files
@@ -261,13 +268,12 @@ class CaptureViews:
     def images(self, number: int) -> PosedImages:
         """A captured view: its picture without the lens, its depth in the same camera, the object's mask.
 
-        Depth is what was measured, corrected. Where the correction moves the depth camera, depth is drawn anew from there.
+        Depth is what was measured, corrected; what hides the object of a cluttered view is no part of its mask.
         """
         view = self.posed(number)
-        depth_m, hides = view.depth_m, self.estimate.is_cluttered(number)
-        mask = silhouette(self.body, view.camera, depth_m if hides else None) if view.mask is None else view.mask
-        if not np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
-            depth_m = move_depth(depth_m, view.depth_camera, view.camera)
+        depth_m, mask = color_depth(view), view.mask
+        if mask is None:
+            mask = silhouette(self.body, view.camera, depth_m if self.estimate.view(number).is_cluttered else None)
         return PosedImages(number, view.camera, view.rgb, depth_m.astype(np.float64), mask)
 
     def synthesize(self, camera: Camera, without: int | None = None) -> SynthesizedView:

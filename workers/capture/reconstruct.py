@@ -19,10 +19,10 @@ from workers.capture.detect import detect_markers
 from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
-from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, observe_view
+from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, fits_board, observe_view
 from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Observation, Setup
-from workers.capture.poses.solve_board import other_board
+from workers.capture.poses.solve_board import FEW_MARKERS, other_board
 from workers.capture.results import own_files
 from workers.capture.surface.coverage import describe_grazing
 from workers.capture.surface.fusion import fuse_views
@@ -122,7 +122,7 @@ class Merged:
 
 def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedView:
     """One view with its pose in an estimate; the mask is the user's. Raises CaptureError where it has no pose or no depth."""
-    view = next(view for view in estimate.views if view.number == number)
+    view = estimate.view(number)
     if view.T_board_cam is None:
         raise CaptureError("no_pose", f"view {number} has no pose: {'; '.join(view.reasons)}")
     stored, masked = given.views.pop(number, None), given.has_mask(number)
@@ -210,7 +210,7 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     corrected = _corrected(by_name[spec.estimate], evidence)
     by_name[spec.estimate] = replace(corrected, notes=(*evidence.notes, *corrected.notes))
     if not by_name[spec.estimate].used:
-        raise CaptureError("poses", _no_pose(by_name[spec.estimate], given.folder))
+        raise CaptureError("poses", _no_pose(by_name[spec.estimate], evidence, given.folder))
     return Estimates(spec.estimate, by_name, clock.seconds)
 
 
@@ -237,7 +237,7 @@ def _observe(given: Given, spec: Estimation, clock: Stopwatch) -> Evidence:
     views = []
     for number in folder.numbers:
         with clock.stage("read"):
-            view = given.views.get(number) or read_view(folder, number, masked=False)
+            view = given.views.get(number) or read_view(folder, number, False)
             given.views[number] = view
         with clock.stage("detect"):
             detection = detect_markers(view.rgb, folder.board, dictionary, folder.camera, number)
@@ -270,10 +270,14 @@ def _no_markers(folder: CaptureFolder) -> str:
     return f"{what}; {other_board(folder) or 'check that they are sharp, and not over-exposed'}"
 
 
-def _no_pose(estimate: CaptureEstimate, folder: CaptureFolder) -> str:
+def _no_pose(estimate: CaptureEstimate, evidence: Evidence, folder: CaptureFolder) -> str:
     first = next((f"view {view.number}: {'; '.join(view.reasons)}" for view in estimate.views if view.reasons), "")
+    fits = any(
+        seen.markers >= FEW_MARKERS and view.fit is not None and fits_board(seen, view.fit.T_board_cam, folder.camera)
+        for seen, view in zip(evidence.observations, evidence.markers, strict=True)
+    )
     what = f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}"
-    return f"{what}; {other_board(folder) or first}"
+    return f"{what}; {first if fits else other_board(folder) or first}"
 
 
 def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tuple[Estimates, Merged]:
