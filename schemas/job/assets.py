@@ -1,5 +1,6 @@
 """The `assets` branch of a job, the names of categories, and patterns of file names."""
 
+import hashlib
 import itertools
 import math
 import unicodedata
@@ -210,6 +211,11 @@ class SplitShares(Frozen):
         if not math.isclose(total, 1.0, abs_tol=1e-9):
             raise ValueError(f"train + val + test is {total:g}, and must be 1")
         return self
+
+    def of(self, instance: str) -> str:
+        """`train`, `val` or `test` by the hash of the instance's id: all scenes of an instance fall into one split."""
+        place = int.from_bytes(hashlib.sha256(instance.encode()).digest()[:8], "big") / 2.0**64
+        return "train" if place < self.train else "val" if place < self.train + self.val else "test"
 
 
 class MeshLimits(Frozen):
