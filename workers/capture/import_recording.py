@@ -327,4 +327,4 @@ def _view(recording: Recorded, number: int, color: RecordedFrame, depth: Recorde
     else:
         depth_m = register_depth(depth_m, camera, common.intrinsics, common.lens)
     rgb = change_camera(rgb, k, common.intrinsics, between=True)
-    return CapturedView(number, rgb, stored_depth(depth_m, common), None)
+    return CapturedView(number, rgb, stored_depth(depth_m, common.depth_units_per_m), None)

@@ -3,7 +3,7 @@
 import io
 import json
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -38,6 +38,7 @@ from workers.capture.folder import (
     describe_camera,
     open_folder,
     pose_text,
+    stored_depth,
     write_pose,
 )
 from workers.capture.reconstruct import (
@@ -64,7 +65,6 @@ from workers.capture.surface.object_mask import Ground, down_to_board, silhouett
 from workers.capture.surface.posed_view import PosedView, distort_mask
 from workers.capture.surface.synthesize import Source, choose_sources, color_depth, prepare_source, synthesize_view
 from workers.capture.surface.tsdf import fit_depth
-from workers.geometry.pixels import round_depth
 from workers.scene.context import Stopwatch
 from workers.scene.pairs import front_distance, place_mirror_camera
 from workers.store.images import encode_mask, encode_png
@@ -330,45 +330,44 @@ def read_result(path: Path) -> CaptureViews:
     return CaptureViews(given_files(folder), captures, estimate, surface, body)
 
 
-FARTHEST_UNITS = 65_535.0
-
-
-def write_synthesized(result: CaptureViews, T_board_cam: Pose, out: Path, number: int = 0) -> dict[str, Any]:
+def write_synthesized(result: CaptureViews, T_board_cam: Pose, out: Path) -> dict[str, Any]:
     """The view from one pose. Returns what is said of it; raises CaptureError where nothing is seen from there."""
     camera = Camera(result.folder.camera.intrinsics, frozen_array(T_board_cam))
-    return _finish(result, out, [_write(result, result.synthesize(camera), camera, out, number)])[0]
+    return _write_views(result, out, [(0, camera, result.synthesize(camera), {})])[0]
 
 
 def write_mirrors(result: CaptureViews, out: Path) -> list[dict[str, Any]]:
     """The mirror view of every used view, with the number of that view; views that see nothing of the object have none."""
-    made = []
-    for view in result.estimate.used:
-        with suppress(ViewError, CaptureError):
-            camera, d_z, shown = result.mirror(view.number)
-            made.append(_write(result, shown, camera, out, view.number) | {"d_z_m": d_z})
-    return _finish(result, out, made)
+
+    def mirrors() -> Iterator[Written]:
+        for view in result.estimate.used:
+            with suppress(ViewError, CaptureError):
+                camera, d_z, shown = result.mirror(view.number)
+                yield view.number, camera, shown, {"d_z_m": d_z}
+
+    return _write_views(result, out, mirrors())
 
 
-def _write(result: CaptureViews, view: SynthesizedView, camera: Camera, out: Path, number: int) -> dict[str, Any]:
+Written = tuple[int, Camera, SynthesizedView, dict[str, Any]]
+"""A view's number, its camera, what it shows, and what else is said of it."""
+
+
+def _write_views(result: CaptureViews, out: Path, views: Iterable[Written]) -> list[dict[str, Any]]:
+    """The files of views, made one by one, and views.json: the pinhole camera, pixel centres at 0.5, and what is said of each."""
     if out.resolve() == result.folder.path.resolve():
         raise OutputError(f"{out} is the capture itself: name another folder")
-    out.mkdir(parents=True, exist_ok=True)
-    units = result.folder.camera.depth_units_per_m
-    depth = round_depth(view.depth_m, 0.0, FARTHEST_UNITS / units, units)
-    files = {"rgb": encode_png(view.rgb), "depth": encode_png(depth)}
-    files |= {"mask": encode_mask(view.mask), "measured": encode_mask(view.measured)}
-    for kind, data in files.items():
-        (out / f"{kind}_{number:05d}.png").write_bytes(data)
-    write_pose(out / f"board_{number:05d}.txt", camera.T_world_cam)
-    return {"name": f"{number:05d}", "measured_share": view.measured_share, "sources": list(view.sources)}
-
-
-def _finish(result: CaptureViews, out: Path, made: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """views.json: the pinhole camera, pixel centres at 0.5, and what is said of each view."""
-    if made:
-        k = result.folder.camera.intrinsics
-        camera = {**k.model_dump(), "pixel_centre": "0.5", "depth_units_per_m": result.folder.camera.depth_units_per_m}
-        (out / "views.json").write_text(
-            json.dumps({"camera": camera, "views": made}, indent=1) + "\n", encoding="utf-8"
-        )
-    return made
+    units, said = result.folder.camera.depth_units_per_m, []
+    for number, camera, view, more in views:
+        out.mkdir(parents=True, exist_ok=True)
+        files = {"rgb": encode_png(view.rgb), "depth": encode_png(stored_depth(view.depth_m, units))}
+        files |= {"mask": encode_mask(view.mask), "measured": encode_mask(view.measured)}
+        for kind, data in files.items():
+            (out / f"{kind}_{number:05d}.png").write_bytes(data)
+        write_pose(out / f"board_{number:05d}.txt", camera.T_world_cam)
+        share = {"measured_share": view.measured_share, "sources": list(view.sources)}
+        said.append({"name": f"{number:05d}"} | share | more)
+    if said:
+        pinhole = result.folder.camera.intrinsics.model_dump()
+        described = {"camera": {**pinhole, "pixel_centre": "0.5", "depth_units_per_m": units}, "views": said}
+        (out / "views.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
+    return said

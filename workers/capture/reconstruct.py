@@ -23,7 +23,7 @@ from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, cho
 from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.solve_board import FEW_MARKERS, other_board
-from workers.capture.results import own_files
+from workers.capture.results import written_files
 from workers.capture.surface.coverage import describe_grazing
 from workers.capture.surface.fusion import fuse_views
 from workers.capture.surface.object_mask import ObjectRegion, down_to_board, find_object
@@ -73,7 +73,7 @@ def given_files(folder: CaptureFolder, spec: Estimation | None = None) -> Given:
 
     Raises CaptureError where process.json or an image cannot be read.
     """
-    given = Given(folder, own_files(folder.path))
+    given = Given(folder, written_files(folder.path))
     if spec is None or not spec.calibrate:
         return given
     for _ in range(CALIBRATIONS):

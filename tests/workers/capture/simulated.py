@@ -27,10 +27,11 @@ from tests.workers.capture.drawn import project
 from workers.assets.builtin.make import make_asset
 from workers.capture.board import marker_corners
 from workers.capture.detect import refine_corners
-from workers.capture.folder import CaptureFolder, open_folder, read_truth
+from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.process import ProcessedFolder, process_folder
 from workers.capture.simulate.simulate import photograph, simulate_capture
 from workers.capture.simulate.studio import build_studio, place_object, plan_path
+from workers.capture.truth import read_truth
 from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture

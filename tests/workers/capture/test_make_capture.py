@@ -22,7 +22,7 @@ from tests.workers.capture.simulated import box, copy_of
 from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb, read_shape
 from workers.capture import make_capture
-from workers.capture.folder import open_folder, read_truth, write_pose
+from workers.capture.folder import open_folder, write_pose
 from workers.capture.make_capture import (
     board_asset,
     image_effects,
@@ -41,6 +41,7 @@ from workers.capture.rows import (
     make_capture_pair,
     record_capture,
 )
+from workers.capture.truth import read_truth
 from workers.geometry.camera import look_at
 from workers.geometry.frames import invert, translation
 from workers.geometry.projection import Bounds, Seen, compare_covisible

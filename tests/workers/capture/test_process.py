@@ -23,7 +23,7 @@ from tests.workers.capture.drawn import KINECT, draw_view, errors, median_errors
 from tests.workers.capture.simulated import CAPTURES, VIEWS, asset_of, box, copy_of, made, processed, true_estimates
 from workers.capture import reconstruct as captures
 from workers.capture.board import frame_in_board
-from workers.capture.folder import open_folder, pose_text, read_pose, read_truth, read_view, write_pose, write_view
+from workers.capture.folder import open_folder, pose_text, read_pose, read_view, write_pose, write_view
 from workers.capture.process import (
     pose_table,
     process_folder,
@@ -51,6 +51,7 @@ from workers.capture.simulate import simulate
 from workers.capture.simulate.simulate import develop
 from workers.capture.simulate.studio import place_object, plan_path
 from workers.capture.surface.posed_view import placed
+from workers.capture.truth import read_truth
 from workers.geometry.colour import decode_codes
 from workers.geometry.frames import half_turn, invert, pose, rotation_about, transform, translation
 from workers.geometry.raycast import cast_view

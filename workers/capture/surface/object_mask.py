@@ -189,7 +189,8 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
         )
     floor_m = min(max(FLOOR_M, 4.0 * spread), clearance)
     floor = _floor(footprint, known & (above > floor_m) & ~stands, known & (above <= floor_m))
-    cells = _grow(footprint) | floor
+    # Three cells around, for what hangs over and for the error of the rim.
+    cells = ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3) | floor
     low, high = _box(cells, -half, plane[2], _top_m(tall_bins, footprint))
     return ObjectRegion(plane, clearance, low, high, spread, cells, -half, floor, floor_m, tuple(notes))
 
@@ -273,7 +274,10 @@ def _board_plane(xy: Array, height: Array) -> tuple[tuple[float, float, float], 
             "no_depth", "no depth image shows the board's surface within 30 mm of the plane of its markers"
         )
     design = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    solution = np.array([0.0, 0.0, _mode(height)])
+    ordered = np.sort(height)
+    # From the middle of the fullest window of 4 mm, the lowest where several are: the board is the largest level thing.
+    counts = np.searchsorted(ordered, ordered + 0.004, side="right") - np.arange(len(ordered))
+    solution = np.array([0.0, 0.0, ordered[int(np.argmax(counts))] + 0.002])
     limit = 0.006
     for _ in range(8):
         residual = height - design @ solution
@@ -284,13 +288,6 @@ def _board_plane(xy: Array, height: Array) -> tuple[tuple[float, float, float], 
         spread = 1.4826 * float(np.median(np.abs(height - design @ solution)[inliers])) if inliers.any() else limit
         limit = min(max(5.0 * spread, 0.0015), 0.006)
     return (float(solution[0]), float(solution[1]), float(solution[2])), spread
-
-
-def _mode(height: Array) -> float:
-    """The middle of the fullest window of 4 mm, the lowest where several are: the board is the largest level thing."""
-    ordered = np.sort(height)
-    counts = np.searchsorted(ordered, ordered + 0.004, side="right") - np.arange(len(ordered))
-    return float(ordered[int(np.argmax(counts))]) + 0.002
 
 
 def _largest(high: NDArray[np.bool_], above: Array) -> tuple[NDArray[np.bool_] | None, int]:
@@ -313,11 +310,6 @@ def _floor(footprint: NDArray[np.bool_], raised: NDArray[np.bool_], board: NDArr
     apart = ~ndimage.binary_dilation(board, around)
     part = ndimage.binary_propagation(footprint, around, mask=footprint | raised) & ~footprint
     return np.asarray(ndimage.binary_dilation(part & apart, around, iterations=FLOOR_REACH_CELLS) & apart)
-
-
-def _grow(footprint: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The footprint and three cells around it, for what hangs over and for the error of its rim."""
-    return np.asarray(ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3))
 
 
 def _top_m(tall_bins: NDArray[np.int32], footprint: NDArray[np.bool_]) -> float:

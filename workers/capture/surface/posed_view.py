@@ -1,4 +1,4 @@
-"""A view with its pose and without its lens, and which points of a surface cameras see past the surface itself."""
+"""A view with its pose and without its lens, and how squarely cameras see points of a surface past the surface itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -120,18 +120,6 @@ def sample_pixels(
 
 UNSEEN = -2.0
 """Stands for the cosine of a point that is not in the image."""
-
-
-def visible_points(
-    mesh: Mesh,
-    points: Array,
-    normals: Array,
-    cameras: Sequence[Camera],
-    clear_m: float = CLEAR_M,
-    least_cos: float = 0.0,
-) -> NDArray[np.bool_]:
-    """[N] bool: points [N, 3] that a camera sees past the mesh, as `best_cosine` has it."""
-    return best_cosine(Caster(mesh), points, normals, cameras, clear_m, least_cos) > UNSEEN
 
 
 def best_cosine(
