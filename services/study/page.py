@@ -214,7 +214,7 @@ def draw_tradeoff(study: Study) -> bytes:
     legend: dict[str, Any] = {}
     for place, name in enumerate(panels, start=1):
         axes = picture.add_subplot(len(panels), 1, place)
-        axes.set_title(question_of(study.rows, name), loc="left", x=-0.14, fontsize=9.5)
+        axes.set_title(question_of(study.rows, name), loc="left", x=-0.12, fontsize=9.5)
         _draw_panel(axes, moving[name], name, looks)
         handles, labels = axes.get_legend_handles_labels()
         legend |= dict(zip(labels, handles, strict=True))
@@ -276,12 +276,14 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str,
         axes.plot(*place[row.setting.name], ls="", **mark)
         if row.setting.kind == "preset" or (row in best and row.setting.kind == "single"):
             text = row.setting.parts[0][1][:26]
-            beside = (6.0, 3.0 if row.setting.kind == "preset" else -11.0)  # those of one place stay apart
-            axes.annotate(text, place[row.setting.name], beside, textcoords="offset points", zorder=6)
+            # Those of one place stay apart, and off what lies beside it.
+            beside, ha = ((0.0, -17.0), "center") if row.setting.kind == "preset" else ((6.0, 4.0), "left")
+            axes.annotate(text, place[row.setting.name], beside, textcoords="offset points", ha=ha, zorder=6)
     if best:
         corners = pts_to_poststep(*zip(*(place[row.setting.name] for row in best), strict=True))
         axes.plot(*corners, color="#222222", lw=1.3, zorder=2, label="front: none is cheaper and better")
     axes.set_xscale("log")
+    axes.margins(y=0.15)  # room for words
     axes.set_yscale("log" if least > 0.0 else "linear")
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":

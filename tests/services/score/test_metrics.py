@@ -17,6 +17,7 @@ from services.score.items import Asked, check_depth
 from services.score.items import _read_volume as read_volume
 from services.score.pose import check_distance, score_pose, score_volume, symmetries_of
 from services.score.shape import align_shape, score_shape
+from tests.kit.contacts import mesh_of
 from workers.geometry.frames import transform
 
 CASES = 100
@@ -29,11 +30,6 @@ K = np.array([[525.0, 0.0, 320.0], [0.0, 520.0, 240.0], [0.0, 0.0, 1.0]])
 
 def agree(ours, theirs):
     assert ours == pytest.approx(theirs, rel=EXACT, abs=1e-12, nan_ok=True)
-
-
-def mesh_of(shape, T=None):
-    moved = np.asarray(shape.vertices) if T is None else trimesh.transform_points(shape.vertices, T)
-    return Mesh(np.ascontiguousarray(moved, np.float64), np.array(shape.faces, np.int32))
 
 
 def rigid(rng, turn_rad, shift_m):
