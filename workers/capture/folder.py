@@ -182,11 +182,6 @@ def read_board(path: Path) -> Board:
     return read_json(path, Board)
 
 
-def read_camera_file(path: Path) -> CameraFile:
-    """What a camera.json says, wherever it is. Raises CaptureError that names the file."""
-    return read_json(path, CameraFile)
-
-
 def read_view(folder: CaptureFolder, number: int, masked: bool = True) -> CapturedView:
     """One view's images, with its mask if wanted. Raises CaptureError where one cannot be read or has the wrong size."""
     common, path = folder.camera.intrinsics, folder.file("camera", number)

@@ -198,7 +198,9 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     clock = processor_clock()
     evidence = _observe(given, spec, clock)
     if not any(seen.markers or seen.manual_T_board_cam is not None for seen in evidence.observations):
-        raise CaptureError("markers", _no_markers(given.folder))
+        what = f"no marker of {given.folder.board.dictionary} was found in any of {len(given.folder.numbers)} views"
+        remedy = other_board(given.folder) or "check that they are sharp, and not over-exposed"
+        raise CaptureError("markers", f"{given.folder.path}: {what}; {remedy}")
     check_moments(evidence)
     check_depth(evidence)
     by_name: dict[Estimate, CaptureEstimate] = {}
@@ -263,11 +265,6 @@ def _with_given_pose(seen: Observation, markers: MarkerPose, given: Given) -> Ob
     elif markers.fit is not None or T is None:
         return seen
     return replace(seen, manual_T_board_cam=T, given_by=f"the pose of {name} is kept as it was given")
-
-
-def _no_markers(folder: CaptureFolder) -> str:
-    what = f"{folder.path}: no marker of {folder.board.dictionary} was found in any of {len(folder.numbers)} views"
-    return f"{what}; {other_board(folder) or 'check that they are sharp, and not over-exposed'}"
 
 
 def _no_pose(estimate: CaptureEstimate, evidence: Evidence, folder: CaptureFolder) -> str:

@@ -161,7 +161,7 @@ def _list_inputs(path: Path) -> list[Path]:
 def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:
     """The job's catalogue; with folders of captures its digest covers every input file of theirs.
 
-    `watch` is told now and then how far it is. Raises AssetSourceError where a folder cannot be used.
+    `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
     if job.captures is None or not job.captures.folders:
@@ -169,17 +169,13 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     listings, folders = [], job.captures.folders
     for number, name in enumerate(folders):
         watch("captures", number, len(folders))
-        listings.append(_list_capture((job_folder / Path(name).expanduser()).resolve(), f"captures.folders.{number}"))
+        folder, key = (job_folder / Path(name).expanduser()).resolve(), f"captures.folders.{number}"
+        if not folder.is_dir():
+            raise AssetSourceError(f"{key}: {folder}: there is no such folder")
+        try:
+            listings.append(CaptureListing(folder, digest_inputs(folder)))
+        except CaptureError as error:
+            raise AssetSourceError(f"{key}: {error.detail}") from error
     watch("captures", len(folders), len(folders))
     whole = "\n".join([catalogue.digest, *(listing.sha256 for listing in listings)])
     return replace(catalogue, captures=tuple(listings), digest=hashlib.sha256(whole.encode()).hexdigest())
-
-
-def _list_capture(folder: Path, key: str) -> CaptureListing:
-    """A folder and the digest of its input files. Raises AssetSourceError that names the key of the job file."""
-    if not folder.is_dir():
-        raise AssetSourceError(f"{key}: {folder}: there is no such folder")
-    try:
-        return CaptureListing(folder, digest_inputs(folder))
-    except CaptureError as error:
-        raise AssetSourceError(f"{key}: {error.detail}") from error
