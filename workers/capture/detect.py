@@ -20,13 +20,10 @@ from workers.capture.board import (
     PREDEFINED,
     Geometry,
     board_geometry,
-    first_poses,
     id_words,
     smallest_dictionary,
 )
-from workers.geometry.camera import spread_evenly
 from workers.geometry.colour import SRGB_STEPS
-from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import project_points, rays_of_pixels
 
 SAMPLES = 24
@@ -193,14 +190,12 @@ def detect_markers(
 
 LEAST_PRINT = 4
 """Markers that tell a print."""
-SEEDS = 24
-"""Pairs of markers from which a print is begun."""
 BESIDE_SIDES = 0.5
-"""A marker belongs to a print whose pose puts it at most so many of its sides away."""
+"""A marker belongs to a print whose pose puts its corners at most so many of a usual marker's sides away."""
 EXPLAINED = 0.8
 """Share of all markers that prints of one board explain: what lies otherwise is another board."""
-GROWTH = 3
-"""A print grows from the markers nearest to the pair by fitting its pose so many times."""
+DRAWS = 1000
+"""Random poses by three corners, and a fourth, of which the one that explains most is a print's (RANSAC, from a fixed seed)."""
 
 
 def split_prints(
@@ -211,36 +206,25 @@ def split_prints(
     A print is what one pose explains. Empty where prints of this board do not explain the markers.
     """
     rays = rays_of_pixels(corners_px.reshape(-1, 2), camera.intrinsics, camera.lens).reshape(-1, 4, 2)
-    places, middles = geometry.corners[geometry.index(ids)], corners_px.mean(axis=1)
-    sides = np.linalg.norm(np.roll(corners_px, -1, axis=1) - corners_px, axis=2).mean(axis=1)
+    places, sides = geometry.corners[geometry.index(ids)], np.linalg.norm(rays[:, 1] - rays[:, 0], axis=1)
     left, prints = np.flatnonzero(np.isfinite(rays).all(axis=(1, 2))), []
-
-    def on_print(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Of those that are left what lies where a pose by the chosen has it, each id once; the better of its poses."""
-        best = chosen[:0]
-        for T in first_poses(places[chosen].reshape(-1, 3), rays[chosen].reshape(-1, 2)):
-            seen = project_points(
-                transform(invert(T), places[left].reshape(-1, 3)), camera.intrinsics, camera.lens
-            ).reshape(-1, 4, 2)
-            off = np.linalg.norm(seen - corners_px[left], axis=2).max(axis=1) / sides[left]
-            near = np.argsort(off, kind="stable")[: int((off < BESIDE_SIDES).sum())]
-            once = near[np.unique(ids[left[near]], return_index=True)[1]]
-            best = max(best, left[once], key=len) if T[2, 3] > 0 else best
-        return best
-
     while len(left) >= LEAST_PRINT:
-        best = left[:0]
-        for seed in left[spread_evenly(len(left), SEEDS)]:
-            others = left[ids[left] != ids[seed]]
-            nearest = others[np.argsort(np.linalg.norm(middles[others] - middles[seed], axis=1), kind="stable")[:1]]
-            chosen = np.append(nearest, seed)
-            for _ in range(GROWTH):
-                chosen = on_print(chosen) if len(chosen) > 1 else chosen
-            best = max(best, chosen, key=len)
-        if len(best) < LEAST_PRINT:
+        explained = cv2.solvePnPRansac(
+            places[left].reshape(-1, 3),
+            rays[left].reshape(-1, 2),
+            np.eye(3),
+            None,
+            iterationsCount=DRAWS,
+            reprojectionError=BESIDE_SIDES * float(np.median(sides[left])),
+            confidence=0.9999,
+            flags=cv2.SOLVEPNP_AP3P,
+        )[3]
+        corners = np.zeros(0, np.int64) if explained is None else explained.ravel()
+        of_print = left[np.bincount(corners // 4, minlength=len(left)) == 4]
+        if len(of_print) < LEAST_PRINT:
             break
-        prints.append(best)
-        left = np.setdiff1d(left, best)
+        prints.append(of_print)
+        left = np.setdiff1d(left, of_print)
     return prints if sum(map(len, prints)) >= EXPLAINED * len(ids) else []
 
 

@@ -20,9 +20,9 @@ from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
 from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, observe_view
-from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.solve_board import other_board
+from workers.capture.poses.standing import check_moments
 from workers.capture.results import own_files
 from workers.capture.surface.coverage import describe_grazing
 from workers.capture.surface.fusion import fuse_views

@@ -23,8 +23,8 @@ from tests.workers.capture.drawn import BOX, KINECT, LENS, PINHOLE, errors, hand
 from workers.capture.board import marker_corners
 from workers.capture.poses.estimates import estimate_joint
 from workers.capture.poses.markers import Evidence, fit_markers
-from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Corners, Observation, Patches, Setup
+from workers.capture.poses.standing import check_moments
 from workers.capture.poses.terms import moved
 from workers.geometry.frames import invert, pose, rotation_about, transform
 from workers.geometry.pixels import project_points, rays_of_pixels

@@ -12,9 +12,8 @@ from schemas.job.captures import Estimation
 from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
-from workers.capture.poses.moments import Moment, find_moment
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
-from workers.capture.poses.standing import object_groups
+from workers.capture.poses.standing import Moment, find_moment, object_groups
 from workers.capture.poses.terms import (
     NAMES,
     POSE,
