@@ -6,6 +6,7 @@ refinements leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there.
 0.23 px to a free homography against 0.28, once the side of the printed marker is free, as AprilTag's corners say as well.
 """
 
+import itertools
 from dataclasses import replace
 
 import cv2
@@ -154,9 +155,8 @@ def unbend_corners(corners_px: Array, camera: CaptureCamera) -> Array:
 
 MIN_PERIMETER = 0.01
 """Smallest perimeter of a marker over the larger side of the image: 19 px of 1920, below which bits cannot be read."""
-CLEAR_PERIMETER = 0.06
 SEVERAL = 4
-"""Another dictionary is named for so many markers of at least this size: fewer may be chance."""
+"""Another dictionary is named for so many markers: fewer may be chance."""
 
 
 def detect_markers(
@@ -243,7 +243,7 @@ def _find_quads(
 ) -> tuple[NDArray[np.uint8], Array, NDArray[np.int64]]:
     """(grey image, [N, 4, 2] corners as OpenCV has them, pixel centres at integers, [N] ids)."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
-    quads, ids, _ = _detector(dictionary, border_bits=border_bits).detectMarkers(gray)
+    quads, ids, _ = _detector(dictionary, border_bits).detectMarkers(gray)
     return gray, np.array(quads, np.float64).reshape(-1, 4, 2), np.array([] if ids is None else ids, np.int64).ravel()
 
 
@@ -330,31 +330,29 @@ def _is_corner(light: NDArray[np.float32], pair: Array, points: Array) -> bool:
     return free_px >= MIN_HALF_PX and off_px < free_px and apart > max(CONTRAST * float(np.ptp(seen)), DARK)
 
 
-def other_dictionary(rgb: NDArray[np.uint8]) -> tuple[str, str]:
-    """(what the image holds in place of the board's markers, in words, the largest dictionary of their family); or nothing.
+def other_dictionary(rgb: NDArray[np.uint8]) -> tuple[str, str, int]:
+    """(what markers the image holds, in words; the largest dictionary of their family; bits of their border); or nothing.
 
-    Markers may be mirrored, and have no dictionary then. Takes a second or so: for the message about a capture in which no
-    marker was found.
+    Mirrored markers have no dictionary. Takes a second or two: for the message about a capture without a usable pose.
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    best, most = ("", ""), SEVERAL - 1
-    for picture, how in ((gray, ""), (np.ascontiguousarray(gray[:, ::-1]), ", mirrored")):
-        for name in PREDEFINED:
-            if name != smallest_dictionary(name, LARGEST) or name != name.upper():
-                continue  # the first markers of the dictionary of 1000, or a second name
-            dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-            _, ids, _ = _detector(dictionary, CLEAR_PERIMETER).detectMarkers(picture)
-            if ids is not None and len(ids) > most:
-                smallest, most = smallest_dictionary(name, int(np.median(ids))), len(ids)  # a few ids may be misread
-                best = f"the image holds {most} markers of {smallest}{how}", "" if how else name
+    best, most = ("", "", 1), SEVERAL - 1
+    pictures = ((gray, ""), (np.ascontiguousarray(gray[:, ::-1]), ", mirrored"))
+    names = {name.upper(): name for name in PREDEFINED}.values()  # some have two
+    for name, (picture, how), border_bits in itertools.product(names, pictures, (1, 2)):
+        if name != smallest_dictionary(name, LARGEST) or (border_bits > 1 and "APRILTAG" not in name):
+            continue  # the first markers of the dictionary of 1000; two bits are Kalibr's
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        _, ids, _ = _detector(dictionary, border_bits).detectMarkers(picture)
+        if ids is not None and len(ids) > most:
+            smallest, most = smallest_dictionary(name, int(np.median(ids))), len(ids)  # a few ids may be misread
+            best = f"the image holds {most} markers of {smallest}{how}", "" if how else name, border_bits
     return best
 
 
-def _detector(
-    dictionary: "cv2.aruco.Dictionary", min_perimeter: float = MIN_PERIMETER, border_bits: int = 1
-) -> "cv2.aruco.ArucoDetector":
+def _detector(dictionary: "cv2.aruco.Dictionary", border_bits: int) -> "cv2.aruco.ArucoDetector":
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    settings.minMarkerPerimeterRate = min_perimeter
+    settings.minMarkerPerimeterRate = MIN_PERIMETER
     settings.markerBorderBits = border_bits
     return cv2.aruco.ArucoDetector(dictionary, settings)
