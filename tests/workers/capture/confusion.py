@@ -311,13 +311,14 @@ more than this factor and this much."""
 class Outcome:
     """Of one capture: what is said, in words of `SAID`; whether that is its cause, and whether it is covered if nothing is.
 
-    worse: the camera that `--calibrate` takes brings the poses farther from the truth.
+    worse: the camera that `--calibrate` takes brings the poses farther from the truth. sigmas: by how many cameras are off.
     """
 
     said: str
     named: bool
     covered: bool
     worse: bool
+    sigmas: float
 
     @property
     def right(self) -> bool:
@@ -330,12 +331,10 @@ def judge(cause: str, seed: int) -> Outcome:
     truth, evidence = simulate(cause, seed)
     words, estimate = messages(evidence)
     expected, said = set(CAUSES[cause][1].split()), set(words.split())
-    usual = {"ruler", "scale"} - expected  # said beside all else, and true
-    named = expected == said - usual or (
-        cause == "print scale" and bool(expected & said) and said <= {"ruler", "scale"}
-    )
+    usual = {"ruler"} - expected  # said beside the object, and true
+    named = expected == said - usual or (cause == "print scale" and len(said) == 1 and said < expected)
     if estimate is None:
-        return Outcome(words, named, False, False)
+        return Outcome(words, named, False, False, 0.0)
     off, sigma = median_mm(estimate, truth)
     covered = said <= usual and off < COVERED * sigma and not expected & {"moved", "moment", "swapped", "ruler"}
     worse = False
@@ -345,7 +344,7 @@ def judge(cause: str, seed: int) -> Outcome:
         if camera is not None:
             after = median_mm(estimate_joint(simulate(cause, seed, camera)[1]), truth)[0]
             worse = after > WORSE * off + WORSE_MM
-    return Outcome(words, named, covered, worse)
+    return Outcome(words, named, covered, worse, off / sigma)
 
 
 def confusion(captures: int, causes: list[str], workers: int = 1) -> dict[str, list[Outcome]]:

@@ -30,7 +30,7 @@ from workers.capture.detect import refine_corners
 from workers.capture.folder import CaptureFolder, open_folder, read_truth
 from workers.capture.process import ProcessedFolder, process_folder
 from workers.capture.simulate.simulate import photograph, simulate_capture
-from workers.capture.simulate.studio import build_studio, place_object, plan_path
+from workers.capture.simulate.studio import Studio, build_studio, place_object, plan_path
 from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
@@ -73,12 +73,18 @@ def take_one(seed=11, **settings) -> tuple[CapturedView, CaptureCamera, Pose]:
 
 @functools.cache
 def _taken(settings: str, seed: int) -> tuple[CapturedView, CaptureCamera, Pose]:
-    simulate, chance, asset = Simulate.model_validate_json(settings), SceneChance(seed, 0), asset_of()
-    thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
-    studio = build_studio(simulate, Board(), thing, plan_capture(simulate), chance)
-    (T_board_cam, *_) = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
+    simulate = Simulate.model_validate_json(settings)
+    studio, _, (T_board_cam, *_) = studio_of(Board(), simulate, seed)
     view, _ = photograph(studio, 0, T_board_cam)
     return view, CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion)), T_board_cam
+
+
+def studio_of(board: Board, simulate: Simulate, seed: int = 11) -> tuple[Studio, Placed, list[Pose]]:
+    """(what is photographed: a can on a board; the can in the board frame; the path's poses)."""
+    chance, asset = SceneChance(seed, 0), asset_of()
+    thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
+    studio = build_studio(simulate, board, thing, plan_capture(simulate), chance)
+    return studio, thing, plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
 
 
 def corner_errors(view, camera, T, board=None):

@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from schemas.capture import CaptureCamera, CapturedView
 from schemas.job.captures import Board, Estimation, Simulate
-from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Intrinsics
 from services.cli.main import main
 from tests.conftest import SHARED_DATA
@@ -28,7 +26,7 @@ from tests.workers.capture.drawn import (
     project,
     true_corners,
 )
-from tests.workers.capture.simulated import asset_of, corner_errors_at, take_one
+from tests.workers.capture.simulated import corner_errors_at, studio_of, take_one
 from workers.capture.board import board_geometry, frame_in_board, marker_corners, open_dictionary
 from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.detect import detect_markers, refine_corners, unbend_corners
@@ -37,11 +35,9 @@ from workers.capture.poses.estimates import estimate_markers
 from workers.capture.poses.markers import Evidence, observe_view
 from workers.capture.poses.observation import Setup, pixels_of_points
 from workers.capture.simulate.simulate import HAND_DEG_S, HAND_M_S, mark_object, take_light
-from workers.capture.simulate.studio import build_studio, place_object, plan_path
 from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import pose, rotation_about, transform
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.effects import plan_capture
 
 BOARD = Board()
 DICTIONARY = open_dictionary(BOARD)
@@ -163,11 +159,8 @@ def in_sight(board, studio, T, camera):
 
 def simulated_views(board, seed):
     """(pose, what was found, pose from markers, corners of the chessboard in sight, set-up) of three photographs of a can."""
-    simulate, chance, thing = Simulate(views=3), SceneChance(seed, 0), asset_of()
-    placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
-    studio = build_studio(simulate, board, placed, plan_capture(simulate), chance)
+    studio, _, poses = studio_of(board, Simulate(views=3), seed)
     setup = Setup(CaptureCamera(studio.rig.color, np.zeros(8)), board, Estimation())
-    poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
     for number, T in enumerate(poses):
         rgb = encode_codes(take_light(studio, number, studio.T_world_board @ T))
         found = detect_markers(rgb, board, open_dictionary(board), setup.camera, number)
@@ -206,14 +199,13 @@ def test_poses_from_any_board_are_a_tenth_of_a_millimetre_off(kind, record_figur
 @pytest.mark.parametrize("seed", [11, 14])
 def test_places_of_tags_that_nobody_measured_are_found_from_photographs(seed, tmp_path, capsys):
     """Beside the places that the simulator drew them at, moved and turned as a whole; and each refusal names its remedy."""
-    board, simulate, chance, thing = scattered(), Simulate(views=8, rgb_noise={}), SceneChance(seed, 0), asset_of()
-    placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
-    studio = build_studio(simulate, board, placed, plan_capture(simulate), chance)
+    board = scattered()
+    studio, _, poses = studio_of(board, Simulate(views=8, rgb_noise={}), seed)
     camera = CaptureCamera(studio.rig.color, np.zeros(8))
     write_description(tmp_path, CaptureFile(name="x"), camera, board)
     true_file = tmp_path / "board.json"
     true_file.rename(tmp_path / "true.json")
-    for number, T in enumerate(plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))):
+    for number, T in enumerate(poses):
         rgb = encode_codes(take_light(studio, number, studio.T_world_board @ T))
         write_view(tmp_path, CapturedView(number, rgb, None, None))
     words = ["capture", "board", str(true_file), "--solve", str(tmp_path)]

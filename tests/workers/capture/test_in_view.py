@@ -15,29 +15,18 @@ from schemas.capture import CaptureCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Captures, Estimation, Simulate
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Material, Part, Shape
+from schemas.scene.shape import REGION_TABLE, Material, Part, Shape
 from services.cli.main import main
 from tests.conftest import SHARED_DATA
 from tests.workers.capture.drawn import errors
-from tests.workers.capture.simulated import asset_of
+from tests.workers.capture.simulated import studio_of
 from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.folder import CaptureFile, open_folder, read_view, write_description, write_view
 from workers.capture.process import process_folder
 from workers.capture.simulate.simulate import mark_object, photograph
-from workers.capture.simulate.studio import board_body, build_studio, place_object, plan_path
+from workers.capture.simulate.studio import board_body
 from workers.geometry.camera import look_at
 from workers.geometry.frames import UP, pose, rotation_about, transform
-from workers.scene.chance import SceneChance, Stream
-from workers.scene.effects import plan_capture
-
-
-def studio_of(board, views, seed=11):
-    """(what is photographed: a can on a board; its mesh in the board frame; the path's poses)."""
-    simulate, chance, thing = Simulate(views=views, image_scale=0.5), SceneChance(seed, 0), asset_of()
-    placed = Placed(REGION_FIRST_OBJECT, thing.shape, place_object(thing, chance.stream(Stream.START)))
-    poses = plan_path(simulate, placed.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
-    mesh = trimesh.Trimesh(transform(placed.T_world_shape, thing.shape.vertices), thing.shape.faces)
-    return build_studio(simulate, board, placed, plan_capture(simulate), chance), mesh, poses
 
 
 def with_things(studio, things):
@@ -51,7 +40,7 @@ def photographed(path, board, given=None, views=3, beside=lambda number: (), mor
 
     `more`: further poses.
     """
-    studio, _, poses = studio_of(board, views)
+    studio, _, poses = studio_of(board, Simulate(views=views, image_scale=0.5))
     poses = [*poses, *more]
     path.mkdir(parents=True, exist_ok=True)
     for number, T in enumerate(poses):
@@ -181,7 +170,8 @@ def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(n
     assert (
         cluttered and cluttered <= set(HANDS[name]) and any("alone has on the board" in note for note in estimate.notes)
     )
-    studio, mesh, _ = studio_of(Board(), 8)
+    studio, can, _ = studio_of(Board(), Simulate(views=8, image_scale=0.5))
+    mesh = trimesh.Trimesh(transform(can.T_world_shape, can.shape.vertices), can.shape.faces)
     true = mesh.sample(50_000, seed=0)
     assert (
         cKDTree(true).query(points)[0].max() < 0.006

@@ -202,14 +202,13 @@ HALF = "Both are half a pixel off: is pixel_centre right? "
 class Doubt:
     """What the poses may need: motion [V, 6] to the poses [V, 4, 4] that explain the corners, with its covariance [V, 6, 6].
 
-    Why, by name and in words, empty where it is too little; whether it leaves no more than the noise; the camera that explains
-    the corners, and whether it is so well known that it brings the poses nearer to the truth.
+    Why, in words, empty where it is too little; whether it leaves no more than the noise; the camera that explains the corners,
+    and whether it is so well known that it brings the poses nearer to the truth.
     """
 
     poses: Array
     motion: Array
     covariance: Array
-    name: str
     note: str
     fits: bool
     camera: CaptureCamera
@@ -354,9 +353,7 @@ def _doubt(
     elif material:
         note = NONE_FITS.format(off=px * off, times=off, name=explanation.name, left=px * left)
     camera = best.seen.camera if explanation.numbers else start.camera
-    return Doubt(
-        fitted.poses, motion, max(variance, 1.0) * fitted.covariance, explanation.name, note, fits, camera, is_known
-    )
+    return Doubt(fitted.poses, motion, max(variance, 1.0) * fitted.covariance, note, fits, camera, is_known)
 
 
 def _words(best: _Tried, wide: _Tried, start: Seen, variance: float, by: str, is_known: bool, material: bool) -> str:
