@@ -39,10 +39,6 @@ def matrix_of(*keys: int) -> list[float]:
     return [*numbers_of(*keys).normal(size=12).tolist(), -0.0, 0.0, 0.0, 1.0]
 
 
-def file_row(file: EncodedFile) -> dict[str, object]:
-    return {"path": file.path, "bytes": len(file.data), "sha256": file.sha256}
-
-
 def with_shapes(output: SceneOutput, change: Callable[[bytes], bytes]) -> SceneOutput:
     """The scene with other bytes in its shapes."""
     files = (
@@ -66,7 +62,8 @@ def made_scene(scene_id: int, salt: str = "", images=PLAIN, shapes: bool = True)
             path = name(category, image.content, file_pose_id(image.role, pose_id))
             file = encoded_file(path, bytes_of(path + salt, 100 + scene_id % 7))
             files.append(file)
-            by_role.setdefault(image.role, []).append(file_row(file))
+            row = {"path": file.path, "bytes": len(file.data), "sha256": file.sha256}
+            by_role.setdefault(image.role, []).append(row)
     instance, table = f"{category}-{scene_id % 3}", "table-0"
     if shapes:
         files.append(encoded_file(asset_path(category, instance), bytes_of(instance, 300)))

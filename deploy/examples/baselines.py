@@ -53,10 +53,14 @@ from workers.store.images import encode_png
 from workers.store.local import open_store
 
 METRICS: Final = {
+    "depth_auc_50mm": "depth, AUC",
+    "depth_auc_50mm_hidden": "hidden, AUC",
+    "depth_within_2mm": "in 2 mm",
+    "depth_within_10mm": "in 10 mm",
     "depth_mae_m": "depth, mm",
     "depth_mae_hidden_m": "hidden, mm",
-    "depth_within_2mm": "in 2 mm",
     "depth_holes": "holes",
+    "rgb_ncc": "NCC",
     "rgb_psnr_db": "PSNR, dB",
     "rgb_ssim": "SSIM",
     "shape_chamfer_l1_m": "Chamfer, mm",
@@ -144,8 +148,51 @@ def project_and_fill(pair: Pair) -> Prediction:
     """The same, a hole with what the nearest pixel that is none has."""
     projected = project_input(pair)
     assert projected.depth_m is not None and projected.rgb is not None
-    rows, columns = ndimage.distance_transform_edt(projected.depth_m == 0, return_distances=False, return_indices=True)
-    return Prediction(projected.depth_m[rows, columns], projected.rgb[rows, columns])
+    filled = nearest_pixels(projected.depth_m)
+    return Prediction(projected.depth_m[filled], projected.rgb[filled])
+
+
+def nearest_pixels(depth_m: NDArray) -> tuple[NDArray, NDArray]:
+    """(row, column), each [H, W], of the nearest pixel that has depth."""
+    rows, columns = ndimage.distance_transform_edt(depth_m == 0, return_distances=False, return_indices=True)
+    return rows, columns
+
+
+def stand_plate(pair: Pair) -> Prediction:
+    """A plate across the optical axis for each object, at the median depth of its seen points; a pixel has the nearest one's."""
+    return spread(
+        pair, lambda points: np.column_stack([points[:, :2] / points[:, 2:], np.ones(len(points))]) * middle(points)
+    )
+
+
+def middle(points: NDArray) -> float:
+    """The median depth of points [N, 3], metres."""
+    return float(np.median(points[:, 2]))
+
+
+def turn_half(pair: Pair) -> Prediction:
+    """The seen points of each object turned by half a turn (mirror_depth.py); a pixel has the nearest one's depth."""
+    assert pair.mirror is not None
+    up = pair.mirror.T_world_cam[2, :3]
+    return spread(pair, lambda points: mirror_depth.half_turn(points, up))
+
+
+def spread(pair: Pair, guess: Callable[[NDArray], NDArray]) -> Prediction:
+    """The nearest depth of what is guessed of each object from its seen points, both [N, 3] in the mirror camera's frame."""
+    view, mirror = pair.input, pair.mirror
+    assert mirror is not None
+    T, depth_m = np.linalg.inv(mirror.T_world_cam) @ view.T_world_cam, np.full(mirror.depth().shape, np.inf)
+    for region in regions_of(pair):
+        points = mirror_depth.unproject(view, view.depth_m(), view.segment() == region)
+        if len(points):
+            points = guess(mirror_depth.transform(T, points))
+            at = np.stack(mirror_depth.pixels_of(mirror, points))
+            here = (at >= 0).all(axis=0) & (at < np.array(depth_m.shape)[:, None]).all(axis=0)
+            np.minimum.at(depth_m, tuple(at[:, here]), points[here, 2])
+    if not np.isfinite(depth_m).any():  # no object is seen
+        return project_and_fill(pair)
+    depth_m[np.isinf(depth_m)] = 0.0
+    return Prediction(depth_m[nearest_pixels(depth_m)])
 
 
 def find_shapes(dataset: Dataset) -> Predictor:
@@ -248,6 +295,8 @@ BASELINES: Final[Mapping[str, Callable[[Dataset], Predictor]]] = {
     "input copied": lambda dataset: copy_input,
     "projected": lambda dataset: project_input,
     "projected and filled": lambda dataset: project_and_fill,
+    "flat plate": lambda dataset: stand_plate,
+    "half turn": lambda dataset: turn_half,
     "nearest training shape": find_shapes,
     "mirror-depth network": train_depth,
     "occupancy network": train_volume,
@@ -329,7 +378,7 @@ def sense_input(pair: Pair, job: Job) -> Pair:
 def score(dataset: Dataset, folder: Path) -> pa.Table:
     """The items of predictions, as `verso score` writes them."""
     given, store = find_predictions(folder), open_store(dataset.place)
-    return pq.read_table(score_dataset(store, given, Asked(given.kinds), folder / "score"))
+    return pq.read_table(score_dataset(store, given, Asked(given.kinds, split="test"), folder / "score"))
 
 
 def run(name: str, dataset: Dataset, out: Path) -> list[dict[str, Any]]:
@@ -365,7 +414,8 @@ def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterato
         figures = summarise(items)["metrics"]
         for metric in (name for name in METRICS if name in figures and figures[name]["items"]):
             # Five digits are more than an interval leaves meaning to
-            words = {key: "" if value is None else f"{value:.5g}" for key, value in figures[metric].items()}
+            values = {key: figures[metric][key] for key in ("value", "low", "high", "items")}
+            words = {key: "" if value is None else f"{value:.5g}" for key, value in values.items()}
             yield {"level": level, "metric": metric, **words}
 
 

@@ -72,7 +72,10 @@ class Blame(Frozen):
 
 
 class JobChange(Frozen):
-    """A job.yaml to be replaced just before the first commit of an extension: until then, what is there holds."""
+    """A job.yaml to be written: of an extension just before its first commit, until which what is there holds.
+
+    `before` is empty for a new folder: its first worker writes job.yaml once it has seen that scenes can be framed.
+    """
 
     before: str
     after: str

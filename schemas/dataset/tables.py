@@ -90,8 +90,15 @@ _SHARED = {
     "balance": "Share of its weight that the contact forces cannot balance.",
     "centre": "Principal point, where the centre of the first pixel is at 0.5.",
     "centre_opencv": "Principal point, where the centre of the first pixel is at 0, as in OpenCV.",
-    "by_row": "; 4 x 4, row by row.",
     "share_seen": "unoccluded and also outside the frame",
+    "markers": "Markers that are seen; in `scenes` in all used photographs.",
+    "corners_before": "Median distance of corners, estimate from markers alone.",
+    "corners": "Median distance of corners, estimate that was taken.",
+    "board_depth": "Median distance of board points, measured by depth, from the board's plane.",
+    "pose_mm": "Error of the camera's position against truth, in `scenes` the median; null where there is none.",
+    "pose_deg": "Error of its direction against truth, likewise.",
+    "measured": "Share of a mirror view that is measured and not filled; in `scenes` the median.",
+    "depth_median": "Median error of the depth that other views give for a photograph; in `scenes` the median of all.",
 }
 """Meanings, and parts of some, that several columns have: `{name}` in the table below."""
 
@@ -103,8 +110,8 @@ instance_id | string | - | - | {instance}
 source | string | - | - | {source}
 table_id | string | - | - | The table's shape: the key of `assets`.
 object_scale | double | 1 | - | {scale}
-T_world_obj | double[16] | m | world, object | Pose of the first object at rest{by_row}
-T_world_table | double[16] | m | world, object | Pose of the table{by_row}
+T_world_obj | double[16] | m | world, object | Pose of the first object at rest.
+T_world_table | double[16] | m | world, object | Pose of the table.
 pose | string, scenes | - | - | How the objects started: upright, tumbled or placed.
 redraws | int64 | count | - | How often the start position was drawn again before one was valid.
 effects | list of string | - | - | Names of the effects that ran.
@@ -121,13 +128,13 @@ equilibrium_residual | double, scenes | 1 | - | {balance}
 settle_s | double, scenes | s | - | Simulated time until rest; the longest of all objects.
 raycast_checked | bool | - | - | Whether every view was checked against the ray caster.
 settings_digest | string | - | - | SHA-256 of the settings and sources that shape a scene.
-bodies | list of struct, scenes | - | - | Every object of the scene.
+bodies | list of struct, scenes | - | - | Every object; above stand names and pose of the first, the worst figures of all.
 bodies[].region_id | int64 | id | - | {region}
 bodies[].category | string | - | - | {category}
 bodies[].instance_id | string | - | - | {instance}
 bodies[].source | string | - | - | {source}
 bodies[].object_scale | double | 1 | - | {scale}
-bodies[].T_world_obj | double[16] | m | world, object | Pose at rest{by_row}
+bodies[].T_world_obj | double[16] | m | world, object | Pose at rest.
 bodies[].redraws | int64 | count | - | How often its start position was drawn again.
 bodies[].penetration_mm | double | mm | - | {overlap}
 bodies[].hover_gap_mm | double | mm | - | {gap}
@@ -148,10 +155,10 @@ capture.name | string | - | - | Name of its folder.
 capture.estimate | string | - | - | Which estimate of the camera poses was taken: markers, article or joint.
 capture.input_sha256 | string? | - | - | SHA-256 of its input files; null where it was simulated.
 capture.views | int64 | count | - | Photographs that are used.
-capture.markers | int64 | count | - | Markers that were found, over the used photographs.
-capture.reprojection_before_px | double? | px | - | Median distance of corners, estimate from markers alone.
-capture.reprojection_px | double? | px | - | Median distance of corners, estimate that was taken.
-capture.depth_mm | double? | mm | - | Median distance of board points, measured by depth, from the board's plane.
+capture.markers | int64 | count | - | {markers}
+capture.reprojection_before_px | double? | px | - | {corners_before}
+capture.reprojection_px | double? | px | - | {corners}
+capture.depth_mm | double? | mm | - | {board_depth}
 capture.depth_offset_m | double | m | - | Constant error of depth that was found.
 capture.depth_scale | double | 1 | - | Factor of depth that was found.
 capture.print_scale | double | 1 | - | Size of the printed board over its nominal size.
@@ -161,18 +168,18 @@ capture.undistorted | bool | - | - | Whether the lens' distortion was taken out 
 capture.converged | bool | - | - | Whether the estimate converged.
 capture.iterations | int64 | count | - | Steps of the estimate.
 capture.cloud_points | int64 | count | - | Points of the merged cloud.
-capture.measured_share | double? | 1 | - | Median over the mirror views of the share that is measured and not filled.
+capture.measured_share | double? | 1 | - | {measured}
 capture.left_out | list of struct | - | - | Photographs that are not used.
 capture.left_out[].number | int64 | id | - | Number in the photograph's name.
 capture.left_out[].status | string | - | - | Short word for why.
 capture.left_out[].why | string | - | - | Why, in words.
 capture.notes | list of string | - | - | What else is worth knowing of the capture.
-capture.pose_mm | double? | mm | - | Median error of camera positions against truth; null where there is none.
-capture.pose_deg | double? | deg | - | Median error of camera directions against truth.
+capture.pose_mm | double? | mm | - | {pose_mm}
+capture.pose_deg | double? | deg | - | {pose_deg}
 capture.cloud_median_mm | double? | mm | - | Median distance of the cloud from the true surface.
 capture.cloud_p95_mm | double? | mm | - | 95th percentile of that distance.
 capture.completeness | double? | 1 | - | Share of the true surface that the cloud covers.
-capture.depth_median_mm | double? | mm | - | Median over the views of the error of the depth that the other views give.
+capture.depth_median_mm | double? | mm | - | {depth_median}
 """,
     "views": """
 pose_id | int64 | id | - | {pose_id}
@@ -180,7 +187,7 @@ parent_id | int64 | id | - | The pair: the pose id of its input view.
 role | string | - | - | {role}
 scene_id | int64 | id | - | {scene_id}
 category | string | - | - | {category}
-T_world_cam | double[16] | m | world, camera | Pose of the camera{by_row}
+T_world_cam | double[16] | m | world, camera | Pose of the camera.
 inclination_rad | double | rad | world | Angle of the optical axis below the horizontal.
 yaw_rad | double | rad | world | Direction from the scene to the camera about the vertical axis, from the x axis.
 width | int64 | px | - | Columns of the image.
@@ -207,14 +214,14 @@ projected_hidden_share | double? | 1 | - | Share of the filled pixels that show 
 patch_object_fraction | double? | 1 | - | {patch}
 capture | struct, captures | - | - | The photograph.
 capture.number | int64 | id | - | Number in the photograph's name.
-capture.markers | int64 | count | - | Markers that were found in it.
-capture.reprojection_before_px | double? | px | - | Median distance of its corners, estimate from markers alone.
-capture.reprojection_px | double? | px | - | Median distance of its corners, estimate that was taken.
-capture.depth_mm | double? | mm | - | Median distance of board points in its depth from the board's plane.
-capture.pose_mm | double? | mm | - | Error of its position against truth; null where there is none.
-capture.pose_deg | double? | deg | - | Error of its direction against truth.
-capture.measured_share | double? | 1 | - | Of mirror views: share that is measured and not filled.
-capture.depth_median_mm | double? | mm | - | Of input views: error of the depth that the other views give for it.
+capture.markers | int64 | count | - | {markers}
+capture.reprojection_before_px | double? | px | - | {corners_before}
+capture.reprojection_px | double? | px | - | {corners}
+capture.depth_mm | double? | mm | - | {board_depth}
+capture.pose_mm | double? | mm | - | {pose_mm}
+capture.pose_deg | double? | deg | - | {pose_deg}
+capture.measured_share | double? | 1 | - | {measured}
+capture.depth_median_mm | double? | mm | - | {depth_median}
 capture.sources | list of int64? | id | - | Of mirror views: numbers of the photographs that it is made of.
 """,
     "objects": """
@@ -226,7 +233,7 @@ category | string | - | - | {category}
 instance_id | string | - | - | {instance}
 u | int64 | px | image | Column of the object's origin; -1 outside the image or behind the camera.
 v | int64 | px | image | Row of the object's origin; -1 outside the image or behind the camera.
-T_cam_obj | double[16] | m | camera, object | Pose{by_row}
+T_cam_obj | double[16] | m | camera, object | Pose.
 bbox_xywh | int64[4] | px | image | Bounding box of its pixels: left, top, width, height.
 pixels | int64 | count | - | Pixels of it that are seen.
 visible_fraction | double | 1 | - | Share that is seen of its own pixels, {share_seen}.
@@ -247,7 +254,7 @@ sha256 | string | - | - | SHA-256 of the source file, or of the generated arrays
 extents_m | double[3] | m | object | Size of the bounding box along the axes.
 volume_m3 | double? | m3 | - | Volume; null where the mesh is open.
 watertight | bool | - | - | Whether the mesh bounds a volume.
-T_source_to_object | double[16] | m | object, source | Takes scaled source coordinates to object coordinates{by_row}
+T_source_to_object | double[16] | m | object, source | Takes scaled source coordinates to object coordinates.
 scale | double | 1 | - | {scale}
 split | string | - | - | train, val or test, by the instance's id: no shape is in two.
 notes | list of string? | - | - | What was repaired or left out.

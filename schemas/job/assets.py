@@ -1,5 +1,6 @@
 """The `assets` branch of a job, the names of categories, and patterns of file names."""
 
+import hashlib
 import itertools
 import math
 import unicodedata
@@ -183,10 +184,10 @@ class LibrarySource(Frozen):
     weight: Weight = 1.0
     """Share among the sources that offer a scene's category."""
     folder: Folder
-    """A library, or a folder of meshes, URDFs or ShapeNetCore models, relative to the job file; `pybullet_data`: the meshes
-    inside that package."""
+    """A library, or a folder of meshes, URDFs or ShapeNetCore models, relative to the job file; `pybullet_data`: the meshes of
+    that package."""
     diagonal_m: Positive | None = None
-    """Bounding-box diagonal that every object is resized to; without it each keeps its own size."""
+    """Bounding-box diagonal of every object; without it each keeps its own size."""
     copy_assets: bool = False
     """Whether the shapes may be written into the dataset."""
 
@@ -198,11 +199,11 @@ class SplitShares(Frozen):
     """Shares of instances (not of scenes) in train, val and test."""
 
     train: Share = 0.8
-    """Share for training."""
+    """Share of train."""
     val: Share = 0.1
-    """Share for validation."""
+    """Share of val."""
     test: Share = 0.1
-    """Share for testing."""
+    """Share of test."""
 
     @model_validator(mode="after")
     def _sums_to_one(self) -> "SplitShares":
@@ -210,6 +211,11 @@ class SplitShares(Frozen):
         if not math.isclose(total, 1.0, abs_tol=1e-9):
             raise ValueError(f"train + val + test is {total:g}, and must be 1")
         return self
+
+    def of(self, instance: str) -> str:
+        """`train`, `val` or `test` by the hash of the instance's id: all scenes of an instance fall into one split."""
+        place = int.from_bytes(hashlib.sha256(instance.encode()).digest()[:8], "big") / 2.0**64
+        return "train" if place < self.train else "val" if place < self.train + self.val else "test"
 
 
 class MeshLimits(Frozen):
@@ -251,7 +257,7 @@ class Assets(Frozen):
     density_kg_m3: Positive = 600.0
     """Density of a watertight solid."""
     shell_kg_m2: Positive = 3.0
-    """Surface density of a mesh that is not watertight: its mass is that of a thin shell."""
+    """Surface density of a mesh that is not watertight, a thin shell."""
 
     @field_validator("objects")
     @classmethod

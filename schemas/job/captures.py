@@ -60,9 +60,9 @@ class Grid(Frozen):
     rows: Annotated[int, Field(ge=1, le=100)] = 5
     """Rows of markers."""
     marker_m: Annotated[float, Field(gt=0, le=10)] = 0.06
-    """Side of a marker, its black border included, metres."""
+    """Side of a marker with its black border."""
     gap_m: Annotated[float, Field(gt=0, le=10)] = 0.02
-    """Between two markers, metres."""
+    """Between two markers."""
     width_m: Annotated[float, Field(gt=0, le=100)] = 0.60
     """Width of the whole board about the origin."""
     height_m: Annotated[float, Field(gt=0, le=100)] = 0.40
@@ -174,7 +174,7 @@ class KinectDepthNoise(Frozen):
     times: NonNegative = 1.0
     """Factor on every random error of the preset."""
     bias_m: float = 0.0
-    """Further systematic error, metres."""
+    """Further systematic error."""
 
 
 class ToneCurve(Frozen):
@@ -192,9 +192,9 @@ class RegistrationError(Frozen):
     shift_m: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
         default_factory=lambda: [0.010, 0.0, 0.0]
     )
-    """Error of the assumed place along the axes of the colour camera."""
+    """Of the assumed place, along the axes of the colour camera."""
     turn_deg: float = 0.0
-    """Error of the assumed orientation, about the vertical axis of the colour camera."""
+    """Of the assumed orientation, about the vertical axis of the colour camera."""
 
 
 class Simulate(Frozen):
@@ -211,7 +211,7 @@ class Simulate(Frozen):
     tier: Literal["raster", "pathtraced"] = "raster"
     """How RGB is made."""
     depth_noise: KinectDepthNoise | None = None
-    """Noise of the Azure Kinect's depth; nothing: exact depth."""
+    """Noise of the Azure Kinect's depth."""
     rgb_noise: RgbNoise | None = None
     """Shot noise and read noise of RGB."""
     motion_blur: Positive | None = None
@@ -221,15 +221,15 @@ class Simulate(Frozen):
     exposure: Exposure | None = None
     """Exposure of every view."""
     tone_curve: ToneCurve | None = None
-    """Tone curve of the camera; nothing: sRGB."""
+    """Tone curve of the camera in place of sRGB."""
     sharpen: NonNegative | None = None
-    """Share of the difference from the image blurred by a pixel that the camera adds to encoded values, such as 1."""
+    """Share, such as 1, of the difference from the image blurred by a pixel that the camera adds to encoded values."""
     jpeg: Annotated[int, Field(ge=1, le=100)] | None = None
-    """Quality, as in libjpeg, of the JPEG files that photographs were, such as 85; what they decode to is stored."""
+    """Quality, as in libjpeg, such as 85, of JPEG files; what they decode to is stored."""
     distortion: Distortion | None = None
-    """Lens of the colour camera; nothing: a pinhole."""
+    """Lens of the colour camera."""
     hidden_markers: Share | None = None
-    """Share of the markers that patches of paper cover in part, such as 0.15."""
+    """Share, such as 0.15, of the markers that paper covers in part."""
     print_scale: Annotated[float, Field(gt=0.5, lt=2)] | None = None
     """True size of the print over its nominal size."""
     registration_error: RegistrationError | None = None
@@ -240,9 +240,9 @@ class Estimation(Frozen):
     """How the camera poses are estimated."""
 
     estimate: Estimate = "joint"
-    """Which estimate the cloud and the dataset are made with; all three are reported."""
+    """Estimate that the cloud and the dataset are made with."""
     compare: bool = True
-    """Compute the other two as well."""
+    """Whether the other two are made and reported as well."""
     max_iterations: PositiveInt = 100
     """Most iterations of `article` and of `joint`."""
     corner_px: Positive = 0.2
@@ -250,7 +250,7 @@ class Estimation(Frozen):
     calibrate: bool = False
     """Take the camera from the markers of all views where camera.json does not fit them."""
     trust: Literal["print", "depth"] = "print"
-    """What is metric truth where the print and the depth disagree about the scale."""
+    """What is metric truth where print and depth disagree about the scale."""
 
 
 class Fusion(Frozen):
@@ -268,14 +268,14 @@ class Synthesis(Frozen):
     """How views from other poses are made."""
 
     views: PositiveInt = 6
-    """Captured views that are merged: those with the nearest optical axes."""
+    """Captured views that are merged: those of the nearest optical axes."""
 
 
 class Captures(Frozen):
     """Captures in place of scenes."""
 
     folders: Annotated[list[Folder], Field(max_length=10_000)] = Field(default_factory=list)
-    """Folders of photographs, one a capture, in order; relative to the job file. None: virtual captures with known truth."""
+    """Folders of captures, in order, relative to the job file. None: virtual captures with known truth."""
     board: Grid = Grid()
     """The marker board of virtual captures; a folder has its own board.json."""
     simulate: Simulate = Simulate()

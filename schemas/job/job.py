@@ -29,9 +29,9 @@ class Check(Frozen):
     """What is checked before a scene is committed."""
 
     raycast_share: Share = 0.01
-    """Share of scenes whose depth and masks are compared with a ray caster, and whose objects are released again."""
+    """Share of scenes whose depth and masks are compared with a ray caster, and whose objects are let go again."""
     mirror_agreement_mm: Positive = 1.0
-    """Largest median difference between input depth carried into the mirror view and the mirror depth."""
+    """Largest median difference of input depth carried into the mirror view from mirror depth."""
 
 
 class Output(Frozen):
@@ -61,7 +61,7 @@ class Run(Frozen):
     workers_per_gpu: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Workers that share a GPU. None: as few as leave no core idle."""
     fingerprint: Literal["strict", "record"] = "strict"
-    """`strict` refuses workers whose stack makes other bytes; `record` stores which made what."""
+    """`strict` refuses workers whose stack makes other bytes; `record` stores which stack made what."""
 
 
 MOST = 16
@@ -154,19 +154,19 @@ class Job(Frozen):
     name: Annotated[str, Field(max_length=1000), AfterValidator(_usable)]
     """Names the dataset; the default output folder is data/<name>."""
     preset: PresetName = "balanced"
-    """Defaults of keys that are not given, by kind of job; docs/measured.md has what they cost."""
+    """Defaults of other keys, by kind of job; docs/measured.md has what they cost."""
     seed: Seed = 0
     """Seed of all that is random in a scene."""
     scenes: PositiveInt = 64
-    """Number of scenes or captures; more than before extends a dataset. Default with captures.folders: their number."""
+    """Scenes or captures; more than before extend a dataset. Default with captures.folders: their number."""
     first_scene: NonNegativeInt = 0
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Input and mirror poses of each scene, or views of a capture that are stored at most (default 64)."""
+    """Pairs of each scene, or views of a capture that are stored at most (default 64)."""
     objects_per_scene: ObjectCount = ONE_OBJECT
-    """Number of objects on the table; a range is drawn from evenly. The first gives the scene's category."""
+    """Objects on the table; a range is drawn from evenly. The first gives the scene's category."""
     categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
-    """Weights of the categories that the sources offer; a list of names means equal weights."""
+    """Weights of the categories that the sources offer; a list gives equal weights."""
     assets: Assets = Assets()
     """Where shapes come from."""
     start: Start = Start()
@@ -186,7 +186,7 @@ class Job(Frozen):
     check: Check = Check()
     """What is checked before a scene is committed."""
     captures: Captures | None = None
-    """Captures of objects on a marker board in place of scenes; nothing: scenes."""
+    """Captures of objects on a marker board in place of scenes."""
     output: Output = Output()
     """How files are laid out."""
     run: Run = Run()

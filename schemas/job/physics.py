@@ -42,9 +42,9 @@ class Start(Frozen):
     pile_offset_m: Interval = Range(-0.03, 0.03)
     """Offset of each further object of a pile from the first, along x and y."""
     clearance_m: Interval = Range(0.005, 0.05)
-    """Height of the lowest point above what is below it, at the start of a drop."""
+    """Height of the lowest point above what is below it when a drop starts."""
     if_lost: Literal["redraw", "remove", "fail"] = "redraw"
-    """An object that leaves the table, or finds no balance: dropped again from a new start, removed, or a failure."""
+    """An object that leaves the table or finds no balance is dropped again from a new start, removed, or a failure."""
 
 
 Collision = Literal["planned", "box", "hull", "parts"]
@@ -83,16 +83,16 @@ class Physics(Frozen):
     rest: Rest = Rest()
     """When an object counts as resting."""
     friction: Annotated[float, Field(ge=0, le=5)] = 0.7
-    """Friction of each body; contact friction is the product of the two."""
+    """Of each body; a contact's is the product of the two."""
     rolling_friction: Annotated[float, Field(ge=0, le=0.01)] = 0.0005
-    """Rolling friction of each body, metres: Bullet's torque is twice this, times `friction`, times the contact force."""
+    """Of each body, metres: Bullet's torque is twice this, times `friction`, times the contact force."""
     spinning_friction: NonNegative = 0.0005
-    """Spinning friction of each body, metres: the same torque about the contact's normal."""
+    """Of each body, metres: the same torque about the contact's normal."""
     restitution: Share = 0.0
-    """Restitution of each body; contact restitution is the product of the two."""
+    """Of each body; a contact's is the product of the two."""
     collision: Collision = "planned"
-    """Shape of an object in the simulator. planned: its hull while it moves over the table's flat top alone, else its convex
-    parts; box: its bounding box."""
+    """Shape of an object in the simulator. planned: its hull where it moves over a flat table top alone, else its convex parts;
+    box: its bounding box."""
     concavity: Annotated[float, Field(ge=0.01, le=1)] = 0.05
     """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2."""
     exact_rest: bool = True

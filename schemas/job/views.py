@@ -46,8 +46,8 @@ class Orbit(Frozen):
     yaw_rad: Interval = Range(-math.pi, math.pi)
     """Direction from the table to the camera."""
     radius_m: Framed = 2.5
-    """Distance from the centre of the table top. `6%`, or `fit`, which is the same: as near to the middle of the objects at rest
-    as they cover that share of the picture, none is cut off, and all are in the range of depth."""
+    """Distance from the centre of the table top. `6%`, or `fit` for the same: as near to the middle of the objects at rest as
+    they cover that share of the picture, none is cut off, and all are in the range of depth."""
 
     @property
     def share(self) -> float | None:
@@ -91,12 +91,11 @@ class Mirror(Frozen):
     """The camera on the other side [A, C]."""
 
     enabled: bool = True
-    """Whether there are mirror views; without them camPoses.csv has one row a pair, with an even id."""
+    """Whether there are mirror views; without them camPoses.csv has the even ids alone."""
     T_z_m: Behind = 1.3
-    """Distance of the mirror camera from its pivot, the point it looks at. `fit`: 1.5 d_z, from where a framed object looks
-    a little smaller."""
+    """Distance of the mirror camera from its pivot, the point it looks at. `fit`: 1.5 d_z."""
     percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
-    """d_z, the distance to the object's front surface, is this percentile of the object's stored input depth; 0: the nearest."""
+    """d_z, the distance to the object's front, is this percentile of its stored input depth; 0: the nearest."""
 
     def distance_m(self, d_z_m: float) -> float:
         """T_z, metres, for a pivot d_z_m ahead of the input camera."""
@@ -157,8 +156,7 @@ class Images(Frozen):
     projection: Projection = Projection()
     """How the input cloud is carried into the mirror view."""
     png_level: Annotated[int, Field(ge=0, le=9)] = 1
-    """Compression level of the PNG files. At 2 a scene's images are a quarter smaller and take 12 ms more, at 6 a third and 70
-    ms."""
+    """Compression level of PNG files. At 2 a scene's images are a quarter smaller and take 12 ms more, at 6 a third and 70 ms."""
 
     @model_validator(mode="after")
     def _fits_16_bits(self) -> "Images":
@@ -180,14 +178,14 @@ class Render(Frozen):
     rgb: bool = True
     """Whether there are RGB images; without them no colour is computed."""
     tier: Tier = "raster"
-    """raster: textures, a key light with soft shadows, contact shadows, smooth edges; flat: albedo and two lights, in less
-    than half the time; pathtraced: global illumination, glass and metal by Mitsuba, in seconds an image."""
+    """raster: textures, soft shadows of a key light, contact shadows, smooth edges; flat: albedo and two lights, in less than
+    half the time; pathtraced: global illumination, glass and metal by Mitsuba, in seconds an image."""
     samples: Literal[1, 4] = 1
-    """Colour samples in a pixel at an edge, for tier raster: 1 smooths edges by their neighbours, 4 takes twice the time."""
+    """Colour samples of a pixel at an edge, for tier raster: 1 smooths by neighbours, 4 takes twice the time."""
     path_samples: Annotated[int, Field(ge=1, le=65_536)] = 16
     """Paths through each pixel, for tier pathtraced; rounded up to a grid of nearly equal sides."""
     path_bounces: Annotated[int, Field(ge=1, le=64)] = 8
-    """Largest number of scatterings and glass crossings of a path, for tier pathtraced."""
+    """Most scatterings and glass crossings of a path, for tier pathtraced."""
 
 
 class DepthNoise(Frozen):
@@ -204,13 +202,13 @@ class DepthNoise(Frozen):
     """
 
     axial_m: NonNegative = 0.0
-    """Standard deviation along the optical axis at distance 0, metres [assumed]."""
+    """Standard deviation along the optical axis at distance 0 [assumed]."""
     axial_per_m: NonNegative = 17e-3 / 3.86**2
     """The standard deviation grows by this times z squared."""
     grazing_deg: Annotated[float, Field(gt=0, le=90)] = 80.0
     """Pixels beyond this angle of incidence have no depth [assumed]."""
     offset_m: float = 0.0
-    """Systematic error, metres. 0: the specification bounds it by 11 mm, and leaves its sign open."""
+    """Systematic error. 0: the specification bounds it by 11 mm, and leaves its sign open."""
     offset_share: Annotated[float, Field(gt=-1, lt=1)] = 0.0
     """Systematic error as a share of the distance; the specification bounds it by 0.001."""
     lateral_px: NonNegative = 0.4
@@ -247,7 +245,7 @@ class RgbNoise(Frozen):
     """Shot noise and read noise of the RGB sensor, in linear light; both numbers are of an assumed small sensor."""
 
     full_well_e: Positive = 4000.0
-    """Electrons at full white: the variance of the shot noise is the mean over this, in units of white."""
+    """Electrons at full white: the variance of shot noise is the mean over this, in units of white."""
     read_noise_e: NonNegative = 3.0
     """Standard deviation of the read noise, electrons."""
 
@@ -290,9 +288,9 @@ class Targets(Frozen):
     views: tuple[ViewTarget, ...] = ()
     """Image targets of input, aligned and mirror views: normals, coordinates, albedo, amodal, layers."""
     smooth: bool = False
-    """Whether `normals` are shading normals, interpolated between vertices, in place of those of the faces."""
+    """Whether `normals` are interpolated between vertices (shading normals), not those of the faces."""
     layers: Annotated[int, Field(ge=1, le=MOST_LAYERS)] = 4
-    """Surfaces along a pixel's ray that `layers` stores, from the front, beside the last one."""
+    """Surfaces that `layers` stores along a pixel's ray, from the front, beside the last one."""
     shape: tuple[ShapeTarget, ...] = ()
     """Samples of each shape in assets/<category>/<instance>.npz: surface, volume."""
     points: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000

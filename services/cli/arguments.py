@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import sys
 import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,7 +23,14 @@ class Parser(argparse.ArgumentParser):
     """A parser whose errors are short, hold no control characters, and name the nearest word that it knows."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Refuses what is too much here, with the usage of the command that it was typed for."""
+        """Refuses what is too much here, with the usage of the command that it was typed for.
+
+        A command may have two words of which the first is one too: `score` and `score merge`.
+        """
+        args = sys.argv[1:] if args is None else list(args)
+        names = [name for action in self._actions if isinstance(action.choices, Mapping) for name in action.choices]
+        if (words := " ".join(args[:2])) in names:
+            args[:2] = [words]
         parsed, extras = super().parse_known_args(args, namespace)
         if extras:
             near = did_you_mean(extras[0].partition("=")[0], self._option_string_actions).strip()

@@ -58,15 +58,13 @@ EXIT_CODES = (
 HEAD = """# Commands
 
 `./verso COMMAND --help` explains every option (installed: `verso`). `--json` ends standard output with one JSON object.
-Messages go to standard error. `VERSO_PYTHON` names `.venv`'s Python.
-
-| exit code | meaning |
-|---|---|"""
+Messages go to standard error. Exit codes:
+"""
 
 
 def commands_page() -> str:
     """docs/commands.md."""
-    codes = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES]
+    codes = [f"- {code}: {meaning}" for code, meaning in EXIT_CODES]
     return "\n".join([HEAD, *codes, *_describe(COMMANDS, "")]) + "\n"
 
 
@@ -86,9 +84,8 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
 JOB_HEAD = """\
 # Keys of a job file
 
-Written from `schemas/job/` by `python -m services.cli.reference job`. Every key but `name` has a default. A key that is not in
-this list is refused, and so is a value that is not allowed. Any key can be changed on the command line: `--set
-physics.step_hz=480`. After each key: what is allowed; the default. `null` stands for nothing.
+Written from `schemas/job/` by `python -m services.cli.reference job`. After each key: what is allowed; the default, `null` for
+nothing. Other keys and values are refused. `--set physics.step_hz=480` changes a key on the command line.
 
 """
 
@@ -174,10 +171,10 @@ def job_page() -> str:
     """docs/job.md: every key of a job file with its type, default and meaning, from the models."""
     rows: dict[str, list[str]] = {}
     for path, field, before in list_keys():
-        meaning = " ".join(
-            [*(field.description or "").split(), *([f"Its keys are those of `{before}`."] if before else ())]
-        )
-        allowed = "" if (default := _default(field)) == "below" else f" ({describe_allowed(field)}; {default})"
+        meaning = " ".join([*(field.description or "").split(), *([f"Keys as in `{before}`."] if before else ())])
+        default = _default(field)
+        allowed = describe_allowed(field).removesuffix(" or `null`" if default == "`null`" else "")
+        allowed = "" if default == "below" else f" ({allowed}; {default})"
         rows.setdefault(f"{allowed}: {meaning}\n", []).append(f"`{path}`")
     return JOB_HEAD + "".join(f"- {', '.join(paths)}{row}" for row, paths in rows.items())
 

@@ -21,6 +21,14 @@ MESHES = path("folder", "FOLDER")
 PREDICTIONS = path(
     "predictions", "PREDICTIONS", "depth/ID.png|npy, rgb/ID.png, shape/ID.glb, ..., poses.csv", nargs="?"
 )
+READ_AS = (
+    choice("--split", ("all", "train", "val", "test"), "scenes whose objects all are of it", default="all"),
+    choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
+    choice(
+        "--volume", ("told", "occupancy", "logits", "sdf", "sdf-positive-inside"), "what values are", default="told"
+    ),
+)
+"""Of predictions: which, and how they are read."""
 SCORES = path("--compare", "DIR", "which of two scores is better, A B", nargs=2)
 THERE: Final = (OUT, FOLDER, MESHES, PREDICTIONS, SCORES)
 """Arguments that name folders which have to be there."""
@@ -353,12 +361,28 @@ COMMANDS: Final[dict[str, Command]] = {
         OUT,
         PREDICTIONS,
         path("--out", "DIR", "where the score goes (default: PREDICTIONS/score)", dest="score"),
-        choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
         choice("--align", ("none", "scale", "similarity"), "of depth and shapes with the truth", default="none"),
+        *READ_AS,
         flag("--flip", "FLIP of RGB as well (0.7 s an image; needs verso extra study)"),
         SCORES,
         handler="score.command:main",
         kept="what is scored is kept",
+    ),
+    "score check": command(
+        "say whether predictions are whole and can be read, without scoring them",
+        "data/tabletop predictions",
+        OUT,
+        path("predictions", "PREDICTIONS"),
+        *READ_AS,
+        handler="score.command:check",
+    ),
+    "score merge": command(
+        "make a leaderboard of scores: a table, and who is surely better than whom",
+        "data/tabletop predictions/a predictions/b --out data/leaderboard",
+        OUT,
+        path("runs", "RUN", "folders of predictions that are scored, or of their scores", nargs="+"),
+        path("--out", "DIR", "folder of leaderboard.parquet, .md and .tex", dest="target", required=True),
+        handler="score.leaderboard:main",
     ),
     "export": command(
         "write the dataset in a layout that other people's loaders read",

@@ -10,7 +10,6 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
+from cachetools import LRUCache
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
@@ -133,8 +133,8 @@ def _structs(table: pa.Table, key: str, values: pa.ChunkedArray) -> pa.ChunkedAr
     return table.to_struct_array().take(pc.index_in(values, table[key]))
 
 
-KEPT_RANGES = 8
-"""Ranges whose rows are kept for reading pairs in any order."""
+KEPT_BYTES = 256 << 20
+"""Rows of ranges that are kept for reading pairs in any order."""
 
 Records = Sequence[CommitRecord]
 
@@ -157,8 +157,8 @@ class Dataset:
         self.place = store.name
         self.job: Job = record.job
         """The job that made it, every default filled in."""
-        self._range_of: Callable[[int], Records] = lru_cache(KEPT_RANGES)(partial(find_records, store))
-        """The records of the range that holds a scene."""
+        self._kept: LRUCache[int, _Range] = LRUCache(KEPT_BYTES, lambda kept: kept.rows.nbytes)
+        """The last ranges that were asked for a scene, by their first one."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return open_dataset, (self.place,)
@@ -203,7 +203,8 @@ class Dataset:
     def _pairs(self, where: pc.Expression | None, part: tuple[int, int]) -> Iterator[Pair]:
         for number, records in enumerate(iter_committed(self._store)):
             if number % part[1] == part[0]:
-                yield from self._read_pairs(records, where)
+                kept = self._open_range(records)
+                yield from pairs_of(kept.rows, kept.files, where)
 
     def pair(self, pose_id: int) -> Pair:
         """The pair with this id of its input view or of its mirror view. Raises InputError where it is not stored."""
@@ -217,22 +218,54 @@ class Dataset:
 
     def scene(self, scene_id: int) -> tuple[Pair, ...]:
         """The pairs of one scene; none of a scene that failed. Raises InputError where it is not stored."""
-        return tuple(self._read_pairs(self._range_of(scene_id), pc.field("scene_id") == scene_id))
+        chosen = next((start for start, kept in self._kept.items() if scene_id in kept.span), None)
+        kept = self._open_range(find_records(self._store, scene_id)) if chosen is None else self._kept[chosen]
+        self._kept[kept.span.start] = kept
+        return tuple(pairs_of(kept.rows, kept.files, pc.field("scene_id") == scene_id))
 
-    def _read_pairs(self, records: Records, where: pc.Expression | None) -> Iterator[Pair]:
-        return iter_pairs(
-            lambda table: range_rows(self._store, records, table), RangeFiles(self._files, records), where
-        )
+    def _open_range(self, records: Records) -> "_Range":
+        rows = RangeRows.of(lambda table: range_rows(self._store, records, table))
+        span = range(records[0].span.start, records[0].span.stop)
+        return _Range(span, rows, RangeFiles(self._files, records))
 
 
-def iter_pairs(rows: Callable[[str], pa.Table], files: Files, where: pc.Expression | None = None) -> Iterator[Pair]:
-    """The pairs of some scenes for which `where` is true, by pose id; `rows` returns the scenes' rows of a table."""
-    table = choose_pairs(pair_table({name: rows(name) for name in PAIR_TABLES}), where)
+@dataclass(frozen=True)
+class RangeRows:
+    """The rows of some scenes: `pair_table`, and those of `objects` and `assets`."""
+
+    pairs: pa.Table
+    objects: pa.Table
+    assets: pa.Table
+
+    @classmethod
+    def of(cls, rows: Callable[[str], pa.Table]) -> "RangeRows":
+        """`rows` returns the scenes' rows of a table."""
+        tables = {name: rows(name) for name in PAIR_TABLES}
+        return cls(pair_table(tables), rows("objects"), tables["assets"])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return int(self.pairs.nbytes + self.objects.nbytes + self.assets.nbytes)
+
+
+@dataclass(frozen=True)
+class _Range:
+    """A committed range: its scenes, rows and files."""
+
+    span: range
+    rows: RangeRows
+    files: RangeFiles
+
+
+def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) -> Iterator[Pair]:
+    """The pairs of some scenes for which `where` is true, by pose id."""
+    table = choose_pairs(rows.pairs, where)
     if not table.num_rows:
         return
-    objects, labels = rows("objects"), defaultdict[tuple[int, str], list[Row]](list)
+    objects, labels = rows.objects, defaultdict[tuple[int, str], list[Row]](list)
     chosen = objects.filter(pc.is_in(objects.column("scene_id"), table.column("scene_id").combine_chunks()))
-    shapes = rows("assets")
+    shapes = rows.assets
     named = shapes.filter(pc.is_in(shapes.column("instance_id"), chosen.column("instance_id").combine_chunks()))
     assets = {row["instance_id"]: row for row in named.to_pylist()}
     for row in chosen.to_pylist():
@@ -261,7 +294,7 @@ def make_scene(
     for row in output.rows.get("failures", ()):
         raise SceneError(str(row["reason"]), f"scene {scene_id} cannot be made ({row['stage']}): {row['detail']}")
     files = _MadeFiles(output, record_job(parsed, catalogue.digest, folder))
-    return tuple(iter_pairs(lambda table: table_of_rows(table, output.rows[table]), files))
+    return tuple(pairs_of(RangeRows.of(lambda table: table_of_rows(table, output.rows[table])), files))
 
 
 def _parse(job: str | Path | Mapping[str, Any] | Job, changes: Sequence[str]) -> tuple[Job, Path]:

@@ -142,7 +142,9 @@ def require_dataset(store: Store) -> Store:
     if store.root is not None:
         require_folder(store.root)
     if store.size(JOB_FILE) is None:
-        raise OutputError(f"{store.name} holds no {JOB_FILE}: it is not an output folder of `verso run`")
+        begun = store.size(LOCK_FILE) is not None
+        why = "a run is just beginning there, ask again" if begun else "it is not an output folder of `verso run`"
+        raise OutputError(f"{store.name} holds no {JOB_FILE}: {why}")
     return store
 
 

@@ -1,6 +1,7 @@
 """Writes docs/columns.md and what `verso columns` prints: every column of every table, from the table of columns."""
 
 import textwrap
+from dataclasses import replace
 from typing import Any
 
 from schemas.dataset.tables import COLUMNS, FRAMES, SORT_KEYS, TABLES, Column
@@ -12,14 +13,11 @@ WIDTH = 100
 HEADER = """\
 # Columns of the tables
 
-Written from `schemas/dataset/` by `python -m services.read.columns_page`; a test holds the two together. `./verso columns TABLE`
-prints the same.
+Written from `schemas/dataset/` by `python -m services.read.columns_page`. `./verso columns TABLE` prints the same.
 
-A column name ends in its unit where it has one: `_m` metres, `_mm` millimetres, `_rad` radians, `_deg` degrees, `_s` seconds.
-Below, `1` is a pure number, `id` and `count` are whole numbers. `T_a_b` takes coordinates in frame b to coordinates in frame a:
-16 doubles, row by row; its frames stand after the unit. `name[]` stands for the items of a list.
-Columns marked "captures" are null in datasets of scenes, those marked "scenes" in datasets of captures,
-those marked "targets" where the job does not ask for the target.
+After a column's name: its type, unit and frame. `1` is a pure number, `id` and `count` are whole numbers. `T_a_b` takes
+coordinates in frame b to frame a, 4 x 4. `name[]` stands for the items of a list. A column marked "scenes" or
+"captures" is null in datasets of the other kind, with all that is inside it; one marked "targets" where the job asks for none.
 
 Frames:
 
@@ -62,30 +60,37 @@ def describe_columns(table: str | None) -> list[str]:
 
 def _facts(column: Column) -> str:
     """Type, unit and frame in a few words."""
-    words = [f"{column.type}{' or null' if column.null else ''}", column.unit]
+    by_rows = " by rows" if column.type == "double[16]" else ""
+    words = [f"{column.type}{by_rows}{' or null' if column.null else ''}", column.unit]
     words += [f"{' from '.join(column.frame.split(', '))}" if column.frame else ""]
     return ", ".join(word for word in [*words, "" if column.of == "both" else column.of] if word)
+
+
+def _alike(column: Column) -> Column:
+    """What columns that share a line of the page agree in."""
+    return replace(column, path="", of="both")
 
 
 def write_page() -> str:
     """The text of docs/columns.md."""
     lines = [HEADER + "\n".join(f"- **{name}**: {text}" for name, text in FRAMES.items())]
-    first: dict[tuple[str, str], str] = {}
+    first: dict[Column, str] = {}
     for table in TABLES:
         lines += [
             "",
             f"## {table}",
             "",
-            f"{TABLES[table]} Key: {', '.join(f'`{one}`' for one in SORT_KEYS[table])}.",
+            f"{TABLES[table]} Key: {', '.join(f'`{key}`' for key in SORT_KEYS[table])}.",
             "",
         ]
-        new, again = dict[str, list[str]](), dict[str, list[str]]()
+        new, again = dict[Column, list[str]](), dict[str, list[str]]()
         for column in COLUMNS[table]:
-            meaning = f"({_facts(column)}): {column.meaning}"
-            other = first.setdefault((column.path, meaning), table)
-            place = new.setdefault(meaning, []) if other == table else again.setdefault(f"as in {other}:", [])
+            other = first.setdefault(column, table)
+            # what is inside a marked column has no mark, and joins the column of the same meaning that has one
+            same = next((kept for kept in new if _alike(kept) == _alike(column)), column)
+            place = new.setdefault(same, []) if other == table else again.setdefault(f"as in {other}:", [])
             place.append(f"`{column.path}`")
-        lines += [f"- {', '.join(paths)} {meaning}" for meaning, paths in new.items()]
+        lines += [f"- {', '.join(paths)} ({_facts(column)}): {column.meaning}" for column, paths in new.items()]
         lines += [f"- {where} {', '.join(paths)}" for where, paths in again.items()]
     return "\n".join(lines) + "\n"
 

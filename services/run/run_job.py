@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -11,14 +12,13 @@ from pathlib import Path
 from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.dataset.shard import JobChange, ShardOrder
-from schemas.errors import FingerprintError, OutputError, describe_seconds, plural
+from schemas.errors import FingerprintError, InputError, OutputError, describe_seconds, plural
 from schemas.job.job import Job
 from services.job.job_file import describe_idle
-from services.job.record import JobRecord, encode_job, record_job, refuse_foreign
+from services.job.record import OWN, JobRecord, encode_job, record_job, refuse_foreign
 from services.merge.merge import merge
 from services.merge.tables import MergeResult, describe_sources, write_card
 from services.run.coordinator import Coordinator, Limits
-from services.run.framing import require_framed
 from services.run.lock import Lock, explain_lost_folder, hold_lock, read_holder, shows_life
 from services.run.machine import usable_cores
 from services.run.parts import find_parts
@@ -29,6 +29,7 @@ from services.run.worker_entry import Pattern, terms_of_driver
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
 from workers.render.tiers import require_tier
+from workers.shard.framing import require_framed
 from workers.source import are_kept
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
@@ -71,9 +72,9 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     begun, made_now = time.monotonic(), 0
     catalogue, store = open_inputs(request.job, request.job_folder, request.out, request.address)
     refuse_foreign(store)
-    store.prepare()
     meter = Meter(request.job.name)
     with (
+        _leave_no_trace(store),
         explain_lost_folder(store.root),
         hold_lock(store) as lock,
         event_log(store.root),
@@ -99,12 +100,27 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     return RunResult(merged, time.monotonic() - begun, made_now)
 
 
+@contextlib.contextmanager
+def _leave_no_trace(store: Store) -> Iterator[None]:
+    """Makes the output folder; where the block refuses the job before job.yaml is there, a folder is left as it was."""
+    was_there = store.root is None or store.root.exists()
+    store.prepare()
+    try:
+        yield
+    except InputError:
+        if store.root is not None and store.size(JOB_FILE) is None:
+            for name in OWN & set(store.names("")):
+                shutil.rmtree(store.root / name, ignore_errors=True)
+            if not was_there:
+                store.root.rmdir()
+        raise
+
+
 def open_inputs(job: Job, job_folder: Path, out: str, address: str | None = None) -> tuple[Catalogue, Store]:
     """The job's catalogue and its output folder, which need not be there yet; says which files are left out or doubtful.
 
-    Raises what can be known before anything is written: a tier that cannot draw here, a cluster that does not answer, and
-    of a new folder scenes that cannot be planned or framed. Shows how many files are listed and checked, which takes long
-    where there are many new ones.
+    Raises what can be known before anything is written: a tier that cannot draw here, a cluster that does not answer. Shows
+    how many files are listed and checked, which takes long where there are many new ones.
     """
     lines = describe_idle(job)
     require_answer(address)
@@ -112,8 +128,6 @@ def open_inputs(job: Job, job_folder: Path, out: str, address: str | None = None
         require_tier(job.drawn)
         catalogue = open_sources(job, job_folder, watch)
         store = open_store(out)
-    if store.size(JOB_FILE) is None:
-        require_framed(job, catalogue)
     for line in (*lines, *catalogue.describe_left_out(), *catalogue.describe_doubts()):
         print(f"verso: {line}", file=sys.stderr)
     find_parts(job, catalogue)
@@ -127,14 +141,11 @@ def record_inputs(job: Job, job_folder: Path, catalogue: Catalogue, store: Store
 
 
 def order_pattern(store: Store, record: JobRecord, ledger: Ledger) -> ShardOrder:
-    """The pattern of all orders. A new folder gets its job.yaml at once, a finished one a moment before a new commit."""
+    """The pattern of all orders. Workers write job.yaml where it is new or changes."""
     order = ShardOrder.of(store.name, record.job, record.digest)
     text = encode_job(record)
-    change = None
-    if store.size(JOB_FILE) is None:
-        store.put(JOB_FILE, text)
-    elif (before := store.read(JOB_FILE)) != text:
-        change = JobChange(before=before.decode(), after=text.decode())
+    before = b"" if store.size(JOB_FILE) is None else store.read(JOB_FILE)
+    change = None if before == text else JobChange(before=before.decode(), after=text.decode())
     if not ledger.rows.num_rows and not ledger.lost:
         store.remove(FINGERPRINT_FILE)  # of a run that never made anything
     terms = order.terms.model_copy(update={"fingerprint": _committed_stack(store, record.job, ledger)})
@@ -216,6 +227,8 @@ def describe_plan(request: RunRequest) -> list[str]:
     _require_writable(store)
     refuse_foreign(store)
     job = record_inputs(request.job, request.job_folder, catalogue, store).job
+    if store.size(JOB_FILE) is None:
+        require_framed(job, catalogue)
     ledger = list_commits(store)
     left = plan_spans(job, ledger, request.retry_failed).scenes
     shards = job.run.shard_size or f"up to {MAX_SHARD}"

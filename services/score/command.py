@@ -7,6 +7,7 @@ import argparse
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -28,17 +29,20 @@ from services.run.progress import finish
 from services.score.items import Asked
 from services.score.predictions import find_predictions
 from services.score.run import ITEMS_FILE, describe_refused, score_dataset
-from services.score.summary import HEADLINES, Figure, compare, summarise, values_of
+from services.score.summary import HEADLINES, Figure, compare, items_of, summarise, values_of
 from workers.store.local import open_store
 
 SUMMARY_FILE, PAGE_FILE = "summary.json", "index.html"
 
-SCORE_VERSION = 1
+SCORE_VERSION = 2
 """The version of the format of summary.json."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """0 where nothing was refused. Raises InputError where there is nothing to score, CorruptError where OUT is damaged."""
+    """0 where all of the split is predicted.
+
+    Raises InputError where there is nothing to score, CorruptError where OUT is damaged.
+    """
     store = require_dataset(open_store(options.out))
     if options.compare is not None:
         return _compare(options)
@@ -47,7 +51,9 @@ def main(options: argparse.Namespace) -> int:
             "name the folder of predictions: verso score OUT PREDICTIONS, or --compare A B for two that are scored"
         )
     given = find_predictions(options.predictions)
-    asked = Asked(given.kinds, options.frame, align=options.align, flip=options.flip)
+    asked = Asked(
+        given.kinds, options.frame, align=options.align, split=options.split, volume=options.volume, flip=options.flip
+    )
     target = options.score or options.predictions / "score"
     with explain_damage(store):
         path = score_dataset(store, given, asked, target)
@@ -60,64 +66,112 @@ def main(options: argparse.Namespace) -> int:
             "predictions": str(given.folder),
         }
         summary = {**head, **asdict(asked), **summarise(table)}
-        _write(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
+        write_text(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
         troubles = describe_refused(path)
-        _write(target / PAGE_FILE, page_of(summary, table, troubles))
+        write_text(target / PAGE_FILE, page_of(summary, items_of(table), troubles))
     for line in troubles:
         print(f"verso: {line}", file=sys.stderr)
     for name, figure in summary["metrics"].items():
         if name in HEADLINES and figure["items"]:
             ends, items = interval(name, figure), plural(figure["items"], "item")
-            print(f"{name:28}{in_words(name, figure['value']):>12}  {ends:28}{items}")
+            print(f"{name:28}{in_words(name, figure['value']):>12}  {ends:28}{items}, {covered(figure)}")
     print(answer_of(summary))
     print(f"page: {target / PAGE_FILE}")
-    answer = {name: summary[name] for name in ("items", "missing", "refused", "metrics")}
-    return finish(options, not summary["refused"], **answer, page=str(target / PAGE_FILE))
+    answer = {name: summary[name] for name in ("items", "missing", "refused", "unknown", "metrics")}
+    return finish(options, is_whole(summary), **answer, page=str(target / PAGE_FILE))
+
+
+def check(options: argparse.Namespace) -> int:
+    """Says by kind how many items are there and can be read, and what cannot and why; 0 where all of the split can be scored."""
+    store = require_dataset(open_store(options.out))
+    given = find_predictions(options.predictions)
+    asked = Asked(given.kinds, options.frame, split=options.split, volume=options.volume, check=True)
+    with explain_damage(store), tempfile.TemporaryDirectory() as scratch:
+        path = score_dataset(store, given, asked, Path(scratch))
+        summary, troubles = summarise(pq.read_table(path)), describe_refused(path)
+    for line in troubles:
+        print(f"verso: {line}", file=sys.stderr)
+    holes = summary["metrics"].get("depth_holes", {"coverage": 1.0})
+    for kind, counts in summary["kinds"].items():
+        left_out = f", {covered(holes)}" if kind == "depth" else ""
+        print(
+            f"{kind:8}{', '.join(f'{count} {word}' for word, count in counts.items())}{left_out}".replace(
+                "scored", "there"
+            )
+        )
+    whole = holes["coverage"] == 1.0 and not any(summary[word] for word in ("missing", "refused", "unknown"))
+    return finish(
+        options, whole, **{word: summary[word] for word in ("items", "missing", "refused", "unknown", "kinds")}
+    )
+
+
+def is_whole(summary: Mapping[str, Any]) -> bool:
+    """Whether all that there is to predict is predicted, and nothing else is there."""
+    headlines = (figure["coverage"] for name, figure in summary["metrics"].items() if name in HEADLINES)
+    return not summary["unknown"] and all(share in (None, 1.0) for share in headlines)
 
 
 def _compare(options: argparse.Namespace) -> int:
     """Prints which of two scores is better by each metric, with a paired interval."""
-    (a, one), (b, other) = (_read_score(options.out, path) for path in options.compare)
-    if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != options.out:
-        raise InputError(f"{options.compare[0]} and {options.compare[1]} are scores of different datasets")
-    if one["align"] != other["align"]:
-        how = f"with --align {one['align']} and {other['align']}"
-        raise InputError(f"{options.compare[0]} and {options.compare[1]} were scored {how}: score both alike")
+    (a, one), (b, other) = (read_score(options.out, path) for path in options.compare)
+    require_alike(options.out, str(options.compare[0]), one, str(options.compare[1]), other)
     metrics = compare(a, b)
     better = {"a": f"{options.compare[0]} is better", "b": f"{options.compare[1]} is better", None: "not decided"}
     for name, row in metrics.items():
         if name not in HEADLINES:
             continue
-        verdict = better[row["better"]]
+        verdict = better[row["better"]] if row["coverage"] == 1.0 else f"no verdict below full {covered(row)}"
         print(
             f"{name:28}{in_words(name, row['a']):>12}{in_words(name, row['b']):>12}  b - a: {interval(name, row):28}{verdict}"
         )
     return finish(options, True, a=str(options.compare[0]), b=str(options.compare[1]), metrics=metrics)
 
 
-def _read_score(out: str, path: Path) -> tuple[pa.Table, dict[str, Any]]:
+def require_alike(out: str, a: str, one: Mapping[str, Any], b: str, other: Mapping[str, Any]) -> None:
+    """Raises InputError where two summaries are of different datasets, alignments, frames or splits."""
+    if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != out:
+        raise InputError(f"{a} and {b} are scores of different datasets")
+    for key in ("align", "split"):
+        if one[key] != other[key]:
+            raise InputError(f"{a} and {b} were scored with --{key} {one[key]} and {other[key]}: score both alike")
+
+
+def read_score(out: str, path: Path) -> tuple[pa.Table, dict[str, Any]]:
     """The items and the summary of a folder of predictions or of its score. Raises InputError where it is not scored."""
     for folder in (path, path / "score"):
         if (folder / ITEMS_FILE).is_file() and (folder / SUMMARY_FILE).is_file():
-            return pq.read_table(folder / ITEMS_FILE), json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+            summary = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+            if summary["verso_score"] == SCORE_VERSION:
+                return pq.read_table(folder / ITEMS_FILE), summary
+            again = command_line("score", out, path)
+            raise InputError(f"{folder} was scored by the rules of another version: score it again with {again}")
     raise InputError(f"{path} has no score: make one with {command_line('score', out, path)}")
 
 
-def _write(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Whole or not at all."""
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)
 
 
-_SHOWN: Final = ("depth_mae_m", "rgb_psnr_db", "shape_chamfer_l1_m", "volume_iou", "pose_add_m")
-"""The metric of each kind that is told first."""
+SHOWN: Final = (
+    "depth_auc_50mm",
+    "depth_mae_m",
+    "rgb_ncc",
+    "shape_chamfer_l1_m",
+    "volume_iou",
+    "pose_add_m",
+    "depth_mae_hidden_m",
+)
+"""The metrics of each kind that are told first."""
 
 _CHARTS: Final = (
     ("Depth of the object", {"seen": "depth_mae_seen_m", "hidden": "depth_mae_hidden_m"}),
     ("Depth within 2 mm", {"": "depth_within_2mm"}),
-    ("PSNR", {"": "rgb_psnr_db"}),
-    ("SSIM", {"": "rgb_ssim"}),
+    ("Cross-correlation of the object's colours", {"": "rgb_ncc"}),
+    ("PSNR of the object", {"": "rgb_psnr_db"}),
+    ("SSIM of the object", {"": "rgb_ssim"}),
     ("Chamfer distance", {"": "shape_chamfer_l1_m"}),
     ("F-score at 2 mm", {"": "shape_fscore_2mm"}),
     ("IoU", {"": "shape_iou"}),
@@ -144,6 +198,12 @@ def interval(name: str, figure: Figure) -> str:
     return "" if figure["low"] is None else f"{in_words(name, figure['low'])} to {in_words(name, figure['high'])}"
 
 
+def covered(figure: Figure) -> str:
+    """`coverage 97.3 %`; never 100 where anything is left out."""
+    share = figure["coverage"] or 0.0
+    return f"coverage {100.0 if share == 1.0 else min(100.0 * share, 99.99):.4g} %"
+
+
 def words(name: str) -> str:
     """The name of a metric for readers: `depth mae hidden`."""
     return name.removesuffix("_m").removesuffix("_deg").removesuffix("_db").replace("_", " ")
@@ -153,10 +213,11 @@ def answer_of(summary: Mapping[str, Any]) -> str:
     """One line with the first metric of every kind, and the numbers of items."""
     numbers = ", ".join(f"{summary[word]} {word}" for word in ("scored", "missing", "refused"))
     lines = []
-    for name in (*_SHOWN, "depth_mae_hidden_m"):
+    for name in SHOWN:
         if figure := summary["metrics"].get(name):
             ends = interval(name, figure)
-            lines.append(f"{words(name)} {in_words(name, figure['value'])}{ends and f' ({ends})'}")
+            left_out = "" if figure["coverage"] == 1.0 else f", {covered(figure)}"
+            lines.append(f"{words(name)} {in_words(name, figure['value'])}{ends and f' ({ends})'}{left_out}")
     return ". ".join([*lines, f"{plural(summary['items'], 'item')}: {numbers}"]) + "."
 
 
@@ -165,7 +226,8 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
     items = "".join(f"<li>{escape(line)}</li>" for line in troubles)
     answer = f'<p class="lead">{escape(answer_of(summary))}</p><ul class="troubles">{items}</ul>'
     note = (
-        "Means over items, 95 % intervals by a bootstrap over scenes. Refused items count as worst, missing ones not. "
+        "Means over all items of the split, 95 % intervals by a bootstrap over scenes. What is missing, refused or a hole counts "
+        "as worst. "
         "Seen and hidden: the object's pixels whose surface the input view sees, and does not."
     )
     sections = [
@@ -184,28 +246,26 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
 
 
 def _metrics(metrics: Mapping[str, Figure]) -> str:
-    rows = [
-        (
+    rows = {
+        name: (
             f"{words(name)}<small><code>{name}</code></small>",
             in_words(name, one["value"]),
+            covered(one).removeprefix("coverage "),
             interval(name, one) or "–",
+            in_words(name, one["worst"]),
             str(one["items"]),
         )
         for name, one in metrics.items()
         if one["items"]
-    ]
-    first, rest = rows[: sum(name in HEADLINES for name in metrics)], rows[sum(name in HEADLINES for name in metrics) :]
-    head = ("metric", "mean", "95 % interval", "items")
-    more = (
-        f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
-        if rest
-        else ""
-    )
-    return table_html(head, first) + more
+    }
+    head = ("metric", "mean", "coverage", "95 % interval", "at worst", "items")
+    first, rest = ([row for name, row in rows.items() if (name in HEADLINES) == told] for told in (True, False))
+    more = f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
+    return table_html(head, first) + more * bool(rest)
 
 
 def _group(title: str, groups: Mapping[str, Mapping[str, Figure]]) -> str:
-    names = [name for name in HEADLINES if any(group.get(name, {}).get("items") for group in groups.values())][:6]
+    names = [name for name in SHOWN if any(group.get(name, {}).get("items") for group in groups.values())]
     rows = [
         (
             escape(word),

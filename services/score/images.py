@@ -1,4 +1,4 @@
-"""Scores of predicted images, colour and depth, and the alignment of depth. Pure.
+"""Scores of predicted images, colour and depth, on parts of the image, and the alignment of depth. Pure.
 
 True depth counts where it is positive and finite. A hole is a pixel with truth where the prediction is 0, negative or not finite.
 """
@@ -29,47 +29,71 @@ SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the full size to a 16th (Wang, Simoncelli and Bovik 2003, section 3.2)."""
 
 
-def score_colour(predicted: NDArray[np.uint8], true: NDArray[np.uint8], flip: bool = True) -> dict[str, float | None]:
-    """Likeness of sRGB images [H, W, 3] uint8 of one size.
+def score_colour(
+    predicted: NDArray[np.uint8], true: NDArray[np.uint8], parts: Mapping[str, NDArray[np.bool_]], flip: bool = True
+) -> dict[str, float | None]:
+    """Likeness of sRGB images [H, W, 3] uint8 of one size, on each part [H, W] and, as `image`, on the whole.
 
-    psnr_db: 10 log10(255^2 / mean square difference of codes), dB; inf where all are equal.
-    ssim: mean structural similarity, 1 where equal (Wang, Bovik, Sheikh and Simoncelli 2004, eq. 13 with C3 = C2 / 2): Gaussian
-    window of sigma 1.5 and 11 x 11 pixels, K1 = 0.01, K2 = 0.03, weighted moments; mean over the three channels and over the
-    windows that lie in the image.
-    ms_ssim: the same at five scales (Wang, Simoncelli and Bovik 2003, eq. 7): product of the mean contrast and structure at
-    each scale, and of luminance too at the last, to the powers `SCALES`; a scale is the means of 2 x 2 pixels of the one before,
-    an odd last row or column left out; a negative mean counts as 0.
-    flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None where `flip` is false.
+    part.ncc: normalised cross-correlation of the part's codes, the mean of each channel taken off both (Lewis 1995); 0 where one
+    of the two is of one colour, 1 where both are: unlike PSNR and SSIM it is not high of a guess without any structure.
+    part.psnr_db: 10 log10(255^2 / mean square difference of codes), dB; inf where all are equal.
+    part.ssim: mean structural similarity, 1 where equal (Wang, Bovik, Sheikh and Simoncelli 2004, eq. 13 with C3 = C2 / 2):
+    Gaussian window of sigma 1.5 and 11 x 11 pixels, K1 = 0.01, K2 = 0.03, weighted moments; mean over the three channels and
+    over the windows about the part's pixels, beyond the image's edge mirrored; of the whole, over those that lie in the image.
+    image.ms_ssim: the same at five scales (Wang, Simoncelli and Bovik 2003, eq. 7): product of the mean contrast and structure
+    at each scale, and of luminance too at the last, to the powers `SCALES`; a scale is the means of 2 x 2 pixels of the one
+    before, an odd last row or column left out; a negative mean counts as 0.
+    image.flip: mean FLIP of the whole image, 0 where equal (Andersson et al. 2020); None where `flip` is false.
 
-    nan where there is nothing to compare: no pixels (all), no whole window (ssim), none at the fifth scale (ms_ssim: images below
-    176 pixels).
+    nan where there is nothing to compare: no pixels (all), no whole window (image.ssim), none at the fifth scale (ms_ssim: images
+    below 176 pixels).
     """
     a, b = predicted.astype(np.float64), true.astype(np.float64)
-    error = float(((a - b) ** 2).mean()) if a.size else math.nan
-    ssim, ms_ssim = _similarities(a, b)
-    return {
-        "psnr_db": math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error),
-        "ssim": ssim,
-        "ms_ssim": ms_ssim,
-        "flip": None if not flip else _flip(predicted, true) if true.size else math.nan,
-    }
+    square = ((a - b) ** 2).mean(axis=2)
+    likeness, ssim, ms_ssim = _similarities(a, b)
+    scores: dict[str, float | None] = {}
+    for name, part in parts.items():
+        scores[f"{name}.ncc"] = _correlation(a[part], b[part])
+        scores[f"{name}.psnr_db"] = _psnr_db(square[part])
+        scores[f"{name}.ssim"] = float(likeness[part].mean()) if part.any() else math.nan
+    whole: dict[str, float | None] = {"psnr_db": _psnr_db(square), "ssim": ssim, "ms_ssim": ms_ssim}
+    whole["flip"] = None if not flip else _flip(predicted, true) if true.size else math.nan
+    return scores | {f"image.{name}": value for name, value in whole.items()}
 
 
-def _similarities(a: Array, b: Array) -> tuple[float, float]:
-    """(SSIM, MS-SSIM) of images [H, W, 3]."""
-    ssim, product = math.nan, 1.0
+def _correlation(a: Array, b: Array) -> float:
+    """Of colours [N, 3] of N pixels; nan of none."""
+    if not len(a):
+        return math.nan
+    a, b = (each - each.mean(axis=0) for each in (a, b))
+    norm = math.sqrt(float((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / norm if norm else float(not (a.any() or b.any()))
+
+
+def _psnr_db(square: Array) -> float:
+    """Of mean square differences, nan where there are none."""
+    error = float(square.mean()) if square.size else math.nan
+    return math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error)
+
+
+def _similarities(a: Array, b: Array) -> tuple[Array, float, float]:
+    """(SSIM of the window about each pixel [H, W], SSIM, MS-SSIM) of images [H, W, 3]."""
+    likeness, ssim, product = np.zeros(a.shape[:2]), math.nan, 1.0
     for scale, exponent in enumerate(SCALES):
         if scale:
             a, b = _halve(a), _halve(b)
+        maps = _similarity_maps(a, b)
+        if not scale:
+            likeness = (maps[0] * maps[1]).mean(axis=2)
         if min(a.shape[:2]) <= 2 * RADIUS_PX:  # no whole window
-            return ssim, math.nan
+            return likeness, ssim, math.nan
         inner = (slice(RADIUS_PX, -RADIUS_PX),) * 2
-        luminance, contrast = (each[inner] for each in _similarity_maps(a, b))
+        luminance, contrast = (each[inner] for each in maps)
         whole, part = float((luminance * contrast).mean()), float(contrast.mean())
         ssim = ssim if scale else whole
         value = part if scale < len(SCALES) - 1 else whole
         product *= max(value, 0.0) ** exponent
-    return ssim, product
+    return likeness, ssim, product
 
 
 def _similarity_maps(a: Array, b: Array) -> tuple[Array, Array]:
@@ -106,43 +130,56 @@ SLACK_M = 1e-9
 """Keeps rounding from deciding: stored depths are multiples of 0.2 mm, so errors of exactly 1 mm, which is within, are common."""
 
 METRICS = (
-    *("mae_m", "rmse_m", "abs_rel", "within_1mm", "within_2mm", "within_5mm", "within_10mm"),
+    *("mae_m", "rmse_m", "abs_rel", "auc_50mm", "within_1mm", "within_2mm", "within_5mm", "within_10mm"),
     *("delta1", "delta2", "delta3", "holes", "pixels"),
 )
 
+AUC_M = 0.05
 
-def score_depth(predicted_m: ArrayLike, true_m: ArrayLike, parts: Mapping[str, NDArray[np.bool_]]) -> dict[str, float]:
+
+def score_depth(
+    predicted_m: ArrayLike, true_m: ArrayLike, parts: Mapping[str, NDArray[np.bool_]], worst_m: float
+) -> dict[str, float]:
     """Errors of depth z [H, W], metres, on each part [H, W] of the image, as `part.metric` (Eigen et al. 2014, section 4.1).
 
     With d predicted and t true:
-    mae_m, rmse_m: mean |d - t|, root of mean (d - t)^2, metres; abs_rel: mean |d - t| / t. All without the holes.
+    mae_m, rmse_m: mean |d - t|, root of mean (d - t)^2, metres; |d - t| is at most `worst_m`, and that in a hole.
+    abs_rel: mean |d - t| / t, which is at most 1, and that in a hole.
+    auc_50mm: the mean over limits from 0 to 50 mm of the share of pixels with |d - t| below the limit.
     delta1, delta2, delta3: share with max(d / t, t / d) < 1.25, 1.25^2, 1.25^3.
     within_1mm, within_2mm, within_5mm, within_10mm: share with |d - t| at most that (Knapitsch et al. 2017, of points).
-    holes: share without prediction; these count as missed in delta and within. pixels: how many have truth.
+    holes: share without prediction; these count as missed in auc, delta and within. pixels: how many have truth.
 
-    A part without truth has nan, and 0 pixels; of one that is all holes mae_m, rmse_m and abs_rel are nan.
+    A part without truth has nan, and 0 pixels.
     """
     predicted, true = (np.ascontiguousarray(image, np.float64) for image in (predicted_m, true_m))
     known = (true > 0.0) & (true < np.inf)
-    values = _metrics_of(predicted[known], true[known])
     scores: dict[str, float] = {}
     for name, part in parts.items():
-        row = values[:, part[known]].sum(axis=1)
-        holes, pixels = row[-2:]
-        row /= np.repeat([pixels - holes or np.nan, pixels or np.nan, 1.0], [3, len(row) - 4, 1])
-        row[1] = np.sqrt(row[1])
-        scores |= {f"{name}.{metric}": float(value) for metric, value in zip(METRICS, row, strict=True)}
+        at = np.flatnonzero(part & known)
+        values = _metrics_of(predicted.ravel()[at], true.ravel()[at], worst_m)
+        scores |= {f"{name}.{metric}": value for metric, value in zip(METRICS, values, strict=True)}
     return scores
 
 
-def _metrics_of(d: Array, t: Array) -> Array:
-    """[METRICS, N] of predicted and true depth [N], where there is truth: what each pixel adds to each of the sums."""
+def _metrics_of(d: Array, t: Array, worst_m: float) -> list[float]:
+    """`METRICS` of predicted and true depth [N], where there is truth."""
+    count = len(t)
+    if not count:
+        return [*[math.nan] * (len(METRICS) - 1), 0.0]
     hit = (d > 0.0) & (d < np.inf)
-    safe = np.where(hit, d, t)
-    error, larger, smaller = np.abs(safe - t), np.maximum(safe, t), np.minimum(safe, t)
-    shares = [error <= limit_m + SLACK_M for limit_m in (0.001, 0.002, 0.005, 0.01)]
-    shares += [larger < 1.25**power * smaller - SLACK_M for power in (1, 2, 3)]
-    return np.stack([error, error**2, error / t, *(share & hit for share in shares), ~hit, np.ones(len(t))])
+    all_hit = bool(hit.all())
+    larger, smaller = np.maximum(d, t), np.minimum(d, t)
+    if not all_hit:  # a hole is as far off as any, and beyond all ratios
+        larger[~hit], smaller[~hit] = np.inf, 0.0
+    apart = larger - smaller
+    error = np.minimum(apart, worst_m)
+    near = error[error < AUC_M]
+    means = [error.mean(), math.sqrt(error @ error / count), np.minimum(apart / t, 1.0).mean()]
+    means.append((len(near) - near.sum() / AUC_M) / count)
+    means += [np.count_nonzero(apart <= limit_m + SLACK_M) / count for limit_m in (0.001, 0.002, 0.005, 0.01)]
+    means += [np.count_nonzero(larger < 1.25**power * smaller - SLACK_M) / count for power in (1, 2, 3)]
+    return [*map(float, means), 0.0 if all_hit else 1.0 - np.count_nonzero(hit) / count, float(count)]
 
 
 def align_depth(predicted_m: Array, true_m: Array, how: Alignment) -> Array:

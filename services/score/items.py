@@ -1,14 +1,15 @@
 """The items of a pair: what is true, what is predicted, whether it can be scored, and its scores. A row for each item.
 
-An item is a kind of prediction, a pose id and, for shapes, volumes and poses, a region. Every pair has an item of every kind
-that is predicted at all. Its status is `ok`, `missing`, or `refused` with a reason. Columns of metrics are named
-kind_metric_unit, for parts of an image kind_metric_part_unit: `depth_mae_m` is that of the object, `depth_mae_hidden_m` of
-the part of it that the input view does not see.
+An item is a kind of prediction, a pose id and, for shapes, volumes and poses, a region. Every pair of the split has an item of
+every kind that is predicted at all. Its status is `ok`, `missing`, or `refused` with a reason. A prediction that is no item has
+`outside`, of another split, or `unknown`. Columns of metrics are named kind_metric_unit, for parts of an image
+kind_metric_part_unit: `depth_mae_m` is that of the object, `depth_mae_hidden_m` of the part of it that the input view does not
+see.
 
 Parts of the mirror view: `object`, all pixels of objects; `seen` and `hidden`, those of them whose surface the input view
-sees and does not (services/dataset/pair.py); `boundary`, within two pixels of an object's outline; `scene`, all
-with truth. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they would
-drown it.
+sees and does not (services/dataset/pair.py); `boundary`, within two pixels of an object's outline; `scene`, all with
+depth; `image`, all. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they
+would drown it.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,10 +21,12 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import expit
 
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
+from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.dataset.pair import Pair, carry
 from services.dataset.view import View
@@ -33,12 +36,21 @@ from services.score.predictions import Key, read_array, read_image, read_pose, r
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
+Split = Literal["all", "train", "val", "test"]
+"""Which scenes are scored: all, or those whose objects all are of instances of one split."""
+
+Volume = Literal["told", "occupancy", "logits", "sdf", "sdf-positive-inside"]
+"""What predicted values at a volume's points are; `told`: occupancy from 0 to 1, or distance, by the values themselves."""
+
 PredictedFrame = Literal["object", "camera", "input", "world"]
 FRAMES: Final[tuple[PredictedFrame, ...]] = get_args(PredictedFrame)
 """The frame of predicted shapes: the object's, the mirror camera's, the input camera's, the world's."""
 
 SEEN_TOLERANCE_M: Final = 0.001
 """How far behind the input view's surface a point may lie that it sees: as `Pair.correspondence`."""
+
+COLOURED: Final = ("object", "hidden", "boundary")
+"""The parts on which RGB is scored, beside the whole image: there the table and the floor count most."""
 
 BOUNDARY_PX: Final = 2
 LEAST_PIXELS: Final = 50
@@ -66,29 +78,36 @@ class Asked:
     """Points drawn on a surface."""
     seed: int = 0
     align: Alignment = "none"
+    split: Split = "all"
+    volume: Volume = "told"
+    check: bool = False
+    """Whether predictions are read and held against units, sizes and places alone, and not scored but for holes."""
     flip: bool = False
     """Whether FLIP is among the metrics of RGB: it takes 0.7 s an image of 640 x 480."""
 
 
 def column(kind: str, name: str) -> str:
     """The column of a metric as the scoring functions name it: ("depth", "hidden.mae_m") is `depth_mae_hidden_m`."""
-    if kind != "depth":
+    if kind not in ("depth", "rgb"):
         return f"{kind}_{name.replace('.', '_')}"
     part, _, metric = name.partition(".")
     infix = "" if part == "object" else f"_{part}"
-    return f"depth_{metric.removesuffix('_m')}{infix}_m" if metric.endswith("_m") else f"depth_{metric}{infix}"
+    unit = next((unit for unit in ("_m", "_db") if metric.endswith(unit)), "")
+    return f"{kind}_{metric.removesuffix(unit)}{infix}{unit}"
 
 
 def score_pair(
-    pair: Pair, folder: Path, predicted: Mapping[Key, tuple[str, ...]], asked: Asked, blame: str = ""
+    pair: Pair, folder: Path, predicted: Mapping[Key, tuple[str, ...]], asked: Asked, job: Job, blame: str = ""
 ) -> list[Row]:
-    """A row for each item of a pair; with `blame`, why its predictions are refused unread.
+    """A row for each item of a pair of the dataset of `job`; with `blame`, why its predictions are refused unread.
 
     Raises InputError where the dataset has no mirror view, CorruptError where it is damaged.
     """
     if pair.mirror is None:
         raise InputError("the dataset has no mirror view to score: its job's cameras.mirror.enabled is false")
-    truth, rows = Truth(pair, pair.mirror), []
+    truth, rows = Truth(pair, pair.mirror, job.images.depth_range_m.high), []
+    splits = {job.assets.split.of(body["instance_id"]) for body in pair.scene["bodies"] or [pair.scene]}
+    split = splits.pop() if len(splits) == 1 else "mixed"
     for kind in asked.kinds:
         for region in [0] if kind in ("depth", "rgb") else truth.regions:
             label = pair.mirror.regions.get(region or REGION_FIRST_OBJECT)
@@ -96,13 +115,19 @@ def score_pair(
                 "kind": kind,
                 "pose_id": pair.mirror.pose_id,
                 "scene_id": pair.scene_id,
+                "split": split,
                 "category": label["category"] if label else pair.category,
                 "instance": label["instance_id"] if label else pair.instance_id,
                 "region": region,
                 "visible_fraction": pair.input.visible_fraction,
                 "diagonal_m": truth.diagonal_m(region or REGION_FIRST_OBJECT),
+                "farthest_m": truth.farthest_m,
             }
             names = predicted.get((kind, pair.mirror.pose_id, region), ())
+            if asked.split not in ("all", split):
+                rows += [row | {"status": "outside"}] if names else []
+                continue
+            row |= {column(kind, f"{part}.pixels"): count for part, count in truth.pixels(kind).items()}
             if names and blame:
                 rows.append(row | {"status": "refused", "reason": blame})
             else:
@@ -120,19 +145,22 @@ def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folde
             where = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
             raise InputError(f"the id is there {len(names)} times: {where}")
         with as_refusal(f"{kind} {names[0]}"):
-            scores, note = _SCORERS[kind](
-                folder / kind / names[0] if kind != "pose" else names[0], region, prepared, truth, asked
-            )
+            prediction = folder / kind / names[0] if kind != "pose" else names[0]
+            scorer = _READERS[kind](prediction, region, prepared, truth, asked)
+            scores, note = scorer() if kind == "depth" or not asked.check else ({}, None)
     except VersoError as error:
         return {"status": "refused", "reason": str(error).replace(f"{folder}/", "")}
     return {"status": "ok", "reason": note} | {column(kind, name): value for name, value in scores.items()}
 
 
 class Truth:
-    """What is true of a pair; images are decoded once, and only when asked for. Raises CorruptError where they are damaged."""
+    """What is true of a pair; images are decoded once, and only when asked for. Raises CorruptError where they are damaged.
 
-    def __init__(self, pair: Pair, mirror: View) -> None:
-        self.pair, self.view = pair, mirror
+    farthest_m: the end of the depths that the dataset stores, so that no error of depth need be larger.
+    """
+
+    def __init__(self, pair: Pair, mirror: View, farthest_m: float) -> None:
+        self.pair, self.view, self.farthest_m = pair, mirror, farthest_m
         self.regions = [region for region in sorted(pair.T_world) if region >= REGION_FIRST_OBJECT]
 
     def diagonal_m(self, region: int) -> float:
@@ -172,6 +200,12 @@ class Truth:
             "boundary": _outline(self.segment),
         }
 
+    def pixels(self, kind: str) -> Mapping[str, int]:
+        """How many pixels each part has that predictions of a kind are held against: without any it has no metrics."""
+        if kind == "depth":
+            return {name: int(np.count_nonzero(part & (self.units > 0))) for name, part in self.parts.items()}
+        return {name: int(np.count_nonzero(self.parts[name])) for name in COLOURED} if kind == "rgb" else {}
+
     def shape(self, region: int, frame: PredictedFrame) -> Mesh:
         """The object's surface, one vertex at a place, in a frame, metres."""
         mesh = self.pair.mesh(region, welded=True)
@@ -185,7 +219,7 @@ class Truth:
         if kind == "depth":
             return self.depth_m, self.parts
         if kind == "rgb":
-            return self.view.rgb()
+            return self.view.rgb(), {name: self.parts[name] for name in COLOURED}
         if kind == "volume":
             stored = self.pair.samples(region)
             if "volume_distance" not in stored and "volume_occupancy" not in stored:
@@ -215,21 +249,26 @@ def _outline(segment: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 # ---------------------------------------------------------------------------------------------- one item of each kind
 
-Scored = tuple[Mapping[str, float | None], str | None]
-"""Metrics by name, and a note."""
+Scorer = Callable[[], tuple[Mapping[str, float | None], str | None]]
+"""Makes the metrics by name, and a note, of a prediction that is read."""
 
 
-def _score_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_depth(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     true_m, parts = prepared
     predicted_m = read_image(path, true_m.shape, truth.view.depth_units_per_m)
-    check_depth(predicted_m, true_m, truth.view.depth_units_per_m if asked.align == "none" else None)
-    return score_depth(align_depth(predicted_m, true_m, asked.align), true_m, parts), None
+    units_per_m = truth.view.depth_units_per_m if asked.align == "none" else None
+    check_depth(predicted_m, true_m, units_per_m, parts["object"])
+    if asked.check:
+        parts = {"object": parts["object"]}
+    aligned_m = align_depth(predicted_m, true_m, asked.align)
+    return lambda: (score_depth(aligned_m, true_m, parts, truth.farthest_m), None)
 
 
-def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) -> None:
+def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None, mask: NDArray[np.bool_]) -> None:
     """Raises InputError where depth [H, W] is in another unit than metres, or inverted: it is said and not mended.
 
-    units_per_m: of stored images; None where depth is aligned, so that its unit does not matter.
+    units_per_m: of stored images; None where depth is aligned, so that its unit does not matter. mask [H, W]: objects, where
+    inverted depth is inverted as well, and a poor guess of what is about them need not be.
     """
     every = max(1, true_m.size // JUDGED_PIXELS)  # a step that shares no factor with the width, to reach all columns
     while np.gcd(every, true_m.shape[1]) > 1:
@@ -239,7 +278,9 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) ->
     if np.count_nonzero(both) < LEAST_PIXELS:
         return
     predicted, true = predicted[both], true[both]
-    if (likeness := correlation(predicted, true)) < INVERTED:  # before the unit: disparity may look like another one
+    both = mask & (predicted_m > 0.0) & (true_m > 0.0)
+    likeness = max(correlation(predicted, true), correlation(predicted_m[both], true_m[both]) if both.any() else -1.0)
+    if likeness < INVERTED:  # before the unit: disparity may look like another one
         raise InputError(f"depth is inverted: its correlation with the truth is {likeness:.2f}")
     if units_per_m is None:
         return
@@ -251,20 +292,26 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None) ->
             raise InputError(f"depth is {ratio:.4g} times the truth: it seems to be {unit}; write {remedy}")
 
 
-def _score_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
-    return score_colour(read_image(path, prepared.shape), prepared, flip=asked.flip), None
+def _read_rgb(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
+    true, parts = prepared
+    predicted = read_image(path, true.shape)
+    return lambda: (score_colour(predicted, true, parts, flip=asked.flip), None)
 
 
-def _score_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_shape(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     from services.score.shape import align_shape, score_shape  # loads what makes data
 
     predicted = read_shape(path)
     predicted, _ = align_shape(predicted, prepared, asked.align, asked.seed)
     points = predicted.vertices if isinstance(predicted, Mesh) else predicted
     check_box(points, prepared.vertices, lambda frame: truth.shape(region, frame).vertices)
-    scores = score_shape(predicted, prepared, truth.diagonal_m(region), asked.samples, asked.seed)
-    open_mesh = isinstance(predicted, Mesh) and scores.get("iou") is None
-    return scores, "the mesh has no volume: its IoU counts as 0" if open_mesh else None
+
+    def score() -> tuple[Mapping[str, float | None], str | None]:
+        scores = score_shape(predicted, prepared, truth.diagonal_m(region), asked.samples, asked.seed)
+        open_mesh = isinstance(predicted, Mesh) and scores.get("iou") is None
+        return scores, "the mesh has no volume: its IoU counts as 0" if open_mesh else None
+
+    return score
 
 
 def check_box(points: Array, true: Array, true_in: Callable[[PredictedFrame], Array]) -> None:
@@ -285,13 +332,19 @@ def check_box(points: Array, true: Array, true_in: Callable[[PredictedFrame], Ar
         raise InputError(f"the box is {np.linalg.norm(centre - true_centre):.3g} m from the true one{remedy}")
 
 
-def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
-    """Values from 0 to 1 are occupancy, values of which some are negative signed distance, metres, negative inside."""
+def _read_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
+    """Where `--volume` does not say, values from 0 to 1 are occupancy, of which some are negative distance, negative inside."""
     count = len(prepared["volume_points"])
     predicted = read_array(path, (count,))
     if not np.isfinite(predicted).all():
         raise InputError("the array has values that are not finite")
-    is_distance = bool((predicted < 0.0).any())
+    is_distance = asked.volume.startswith("sdf")
+    if asked.volume == "told":
+        is_distance = bool((predicted < 0.0).any())
+    elif asked.volume == "logits":
+        predicted = expit(predicted)
+    elif asked.volume == "sdf-positive-inside":
+        predicted = -predicted
     name = "volume_distance" if is_distance else "volume_occupancy"
     if not is_distance and (predicted.max() > 1.0 or name not in prepared):
         raise InputError(
@@ -302,23 +355,23 @@ def _score_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: A
     true = prepared[name].astype(np.float64)
     if is_distance:
         check_distance(predicted, true)
-    return score_volume(predicted, true, is_distance), None
+    return lambda: (score_volume(predicted, true, is_distance), None)
 
 
-def _score_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scored:
+def _read_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked) -> Scorer:
     view = truth.pair.input if asked.frame == "input" else truth.view
     T_true = read_matrix(view.regions[region]["T_cam_obj"])
     T = read_pose(text)
     off_m, away_m = float(np.linalg.norm(T[:3, 3])), float(np.linalg.norm(T_true[:3, 3]))
     if not 1e-2 < off_m / away_m < 1e2:
         raise InputError(f"t is {off_m / away_m:.4g} times as far as the object: BOP's csv has millimetres")
-    return score_pose(T, T_true, prepared.vertices, symmetries_of(prepared), view.K), None
+    return lambda: (score_pose(T, T_true, prepared.vertices, symmetries_of(prepared), view.K), None)
 
 
-_SCORERS: Final[Mapping[str, Any]] = {
-    "depth": _score_depth,
-    "rgb": _score_rgb,
-    "shape": _score_shape,
-    "volume": _score_volume,
-    "pose": _score_pose,
+_READERS: Final[Mapping[str, Any]] = {
+    "depth": _read_depth,
+    "rgb": _read_rgb,
+    "shape": _read_shape,
+    "volume": _read_volume,
+    "pose": _read_pose,
 }

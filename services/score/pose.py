@@ -167,11 +167,14 @@ def check_distance(predicted: Array, true: Array) -> None:
         raise InputError(f"distances reach {np.abs(predicted).max():.3g}: they seem to be in millimetres; write metres")
     if times > 10.0:
         raise InputError(
-            f"values reach {np.abs(predicted).max():.3g}, {times:.3g} times the largest distance: they seem to be logits; write "
-            "occupancy from 0 to 1, or distance in metres"
+            f"values reach {np.abs(predicted).max():.3g}, {times:.3g} times the largest distance: they seem to be logits: "
+            "score them with --volume logits, or write occupancy from 0 to 1, or distance in metres"
         )
     if correlation(predicted, true) < INVERTED:
-        raise InputError("the distances have the other sign: they are negative inside, positive outside")
+        raise InputError(
+            "the distances have the other sign, positive inside: score them with --volume sdf-positive-inside, or write "
+            "them negative inside"
+        )
 
 
 def correlation(a: Array, b: Array) -> float:

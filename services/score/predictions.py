@@ -2,7 +2,8 @@
 
     depth/<id>.png (16 bits, units as stored) or .npy (metres)     rgb/<id>.png (8 bits)
     shape/<id>.glb, .ply, .obj (mesh or cloud), .npz (`points` [N, 3])   volume/<id>.npy (a value a stored volume point)
-    poses.csv as BOP has it: im_id is the pose id, obj_id the region, t in millimetres
+    poses.csv as BOP has it, t in millimetres: im_id is the pose id, obj_id the region; or the three ids are those of `verso
+    export --format bop` of the whole dataset
 
 The id is the pose id of the mirror view, as in the names of stored files; leading zeros may be left out. `00001obj1.glb` is
 of the second object of a scene, as with stored files.
@@ -15,7 +16,7 @@ import os
 import re
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -27,6 +28,7 @@ from schemas.base import Array, Pose
 from schemas.errors import InputError, plain_line
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
+from schemas.scene.view import DRAWN_ROLES, Role
 from services.score.pose import is_rigid
 from workers.door.opening import as_refusal, read_bytes
 from workers.store.images import decode_png
@@ -65,6 +67,8 @@ class Predictions:
     folder: Path
     names: Mapping[Key, tuple[str, ...]]
     strays: tuple[tuple[str, str], ...]
+    by_export: bool = False
+    """Whether poses.csv is read by the ids of an export."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -100,6 +104,46 @@ def find_predictions(folder: Path) -> Predictions:
     return Predictions(folder, {key: tuple(names[key]) for key in sorted(names)}, tuple(strays))
 
 
+def by_export_ids(
+    given: Predictions, pairs: int, scenes: Iterable[tuple[int, Sequence[str]]], role: Role
+) -> Predictions:
+    """The predictions with poses.csv read by the ids of `verso export --format bop`, if more of its lines name an item so.
+
+    There an image is numbered in its scene, and an instance by its first appearance; `role` is that of the view which poses are
+    scored of, lines of other views are left out. scenes: each scene's id and the instances of its regions, from the first on, in
+    the order of ids.
+    """
+    lines = [(key, text) for key, texts in given.names.items() if key[0] == "pose" for text in texts]
+    numbers, items, native = dict[str, int](), dict[tuple[int, int], list[int]](), set[Key]()
+    for scene_id, instances in scenes:
+        for place, instance in enumerate(instances):
+            number = numbers.setdefault(instance, len(numbers) + 1)
+            items.setdefault((scene_id, number), []).append(REGION_FIRST_OBJECT + place)
+            native |= {("pose", 2 * (pairs * scene_id + k) + 1, REGION_FIRST_OBJECT + place) for k in range(pairs)}
+    names, strays, meant = defaultdict[Key, list[str]](list), list(given.strays), 0
+    for (_, image, number), text in lines:
+        word = text.partition("|")[0].strip()
+        numbered = int(word) if _NUMBER.fullmatch(word) else -1
+        regions = items.get((numbered, number))
+        pair, place = divmod(image, len(DRAWN_ROLES))
+        if regions is None or pair >= pairs:
+            strays.append(
+                (
+                    "pose",
+                    f"scene_id {plain_line(word)}, im_id {image}, obj_id {number} of {POSES_FILE} is no object of an image",
+                )
+            )
+            continue
+        meant += 1
+        if DRAWN_ROLES[place] == role:
+            keys = [("pose", 2 * (pairs * numbered + pair) + 1, region) for region in regions]
+            names[next((key for key in keys if key not in names), keys[0])].append(text)
+    if meant <= sum(key in native for key, _ in lines):
+        return given
+    others = {key: texts for key, texts in given.names.items() if key[0] != "pose"}
+    return Predictions(given.folder, others | {key: tuple(names[key]) for key in sorted(names)}, tuple(strays), True)
+
+
 def digest_of(folder: Path, key: Key, name: str) -> str:
     """SHA-256 of a prediction, hex: of a file's bytes, or of a line; empty of a file that is refused unread."""
     try:
@@ -121,7 +165,7 @@ def _read_poses(path: Path, strays: list[tuple[str, str]]) -> Iterator[tuple[Key
         if not all(ids):
             strays.append(("pose", f"line {line} of {POSES_FILE} has no whole im_id and obj_id"))
             continue
-        yield ("pose", int(row["im_id"]), int(row["obj_id"])), f"{row['R']}|{row['t']}"
+        yield ("pose", int(row["im_id"]), int(row["obj_id"])), f"{row['scene_id']}|{row['R']}|{row['t']}"
 
 
 def read_image(path: Path, shape: tuple[int, ...], depth_units_per_m: float = 0.0) -> NDArray:
@@ -200,7 +244,7 @@ def _read_points(path: Path, data: bytes) -> Array:
 def read_pose(text: str) -> Pose:
     """[4, 4] object to camera, metres, of R (nine numbers, row-wise) and t (millimetres). Raises InputError."""
     try:
-        R, t = (np.array(part.split(), np.float64) for part in text.split("|"))
+        R, t = (np.array(part.split(), np.float64) for part in text.split("|")[1:])
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R.reshape(3, 3), t.reshape(3) / 1e3
     except ValueError as error:

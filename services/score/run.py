@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import platform
+import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -22,15 +23,19 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.errors import MachineError, VersoError, needs_making, plural
-from services.dataset.dataset import iter_pairs
+from schemas.errors import InputError, MachineError, VersoError, needs_making, plural
+from schemas.job.job import Job
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import Role
+from services.dataset.dataset import RangeRows, pairs_of
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
+from services.read.dataset_reader import region_names
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.score.images import require_flip
 from services.score.items import Asked, score_pair
-from services.score.predictions import Key, Predictions, digest_of
+from services.score.predictions import Key, Predictions, by_export_ids, digest_of
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -46,11 +51,13 @@ FACTS: Final = pa.schema(
         ("kind", pa.string()),
         ("pose_id", pa.int64()),
         ("scene_id", pa.int64()),
+        ("split", pa.string()),
         ("category", pa.string()),
         ("instance", pa.string()),
         ("region", pa.int64()),
         ("visible_fraction", pa.float64()),
         ("diagonal_m", pa.float64()),
+        ("farthest_m", pa.float64()),
         ("status", pa.string()),
         ("reason", pa.string()),
     ]
@@ -103,8 +110,18 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
             import services.score.shape  # noqa: F401
     if asked.flip and "rgb" in asked.kinds:
         require_flip()
-    out.mkdir(parents=True, exist_ok=True)
+    if "pose" in asked.kinds:
+        role: Role = "input" if asked.frame == "input" else "mirror"
+        pairs = require_job(store).job.pairs_per_scene
+        predictions = by_export_ids(predictions, pairs, _scenes(store), role)
+        if predictions.by_export:
+            print("verso: poses.csv is read by the ids of an export (scene_id, im_id, obj_id)", file=sys.stderr)
     todo, scored = list(_ranges(store, predictions, asked)), list[_Range]()
+    poses = {pose for item in todo for pose in item.poses}
+    if not any(pose in poses for _, pose, _ in predictions.names):
+        examples = ", ".join(f"{kind}/{pose:05d}" for kind in predictions.kinds[:1] for pose in sorted(poses)[:3])
+        raise InputError(f"{predictions.folder} has no item of {store.name}, whose names are like {examples}")
+    out.mkdir(parents=True, exist_ok=True)
     unknown, metrics = set(predictions.names), set[str]()
     with closing(ProgressLine(len(todo), "score", "range")) as line:
         while todo:
@@ -125,6 +142,14 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
     strays = _table([*_strays(predictions, unknown, store.name)])
     _write_items((*tables, strays), metrics, out / ITEMS_FILE)
     return out / ITEMS_FILE
+
+
+def _scenes(store: Store) -> Iterator[tuple[int, list[str]]]:
+    """Each scene's id, and the instances of its objects by region."""
+    for records in iter_committed(store):
+        for scene in range_rows(store, records, "scenes").to_pylist():
+            names = region_names(scene)
+            yield scene["scene_id"], [names[region][1] for region in sorted(names) if region >= REGION_FIRST_OBJECT]
 
 
 def _ranges(store: Store, predictions: Predictions, asked: Asked) -> Iterator[_Range]:
@@ -175,19 +200,20 @@ def _table_of(item: _Range, answer: bytes) -> pa.Table:
 
 
 @cache
-def _files(place: str) -> StoredFiles:
-    """Of a dataset, kept by the process: shapes are read once."""
+def _files(place: str) -> tuple[StoredFiles, Job]:
+    """Of a dataset, and its job, kept by the process: shapes are read once."""
     store = open_store(place)
-    return StoredFiles(store, require_job(store))
+    record = require_job(store)
+    return StoredFiles(store, record), record.job
 
 
 def _rows(item: _Range) -> list[Row]:
-    files = _files(item.place)
-    pairs = iter_pairs(lambda table: range_rows(files.store, item.records, table), RangeFiles(files, item.records))
+    files, job = _files(item.place)
+    stored = RangeRows.of(lambda table: range_rows(files.store, item.records, table))
     rows: list[Row] = []
-    for pair in pairs:
+    for pair in pairs_of(stored, RangeFiles(files, item.records)):
         if pair.mirror is None or pair.mirror.pose_id in item.poses:
-            rows += score_pair(pair, item.folder, item.predicted, item.asked, item.blame)
+            rows += score_pair(pair, item.folder, item.predicted, item.asked, job, item.blame)
     return rows
 
 
@@ -209,27 +235,32 @@ def _write_items(tables: Iterable[pa.Table], metrics: Collection[str], target: P
 
 
 def _strays(predictions: Predictions, unknown: Collection[Key], place: str) -> Iterator[Row]:
-    """A refused row for each prediction that no pair of the dataset has."""
+    """A row for each prediction that no pair of the dataset has."""
     for kind, pose_id, region in sorted(unknown):
         why = f"{place} has no such item {pose_id}: the id is of another dataset"
         if pose_id % 2 == 0:
             why = f"{pose_id} is the id of an input pose: predictions have that of the mirror pose, {pose_id + 1}"
-        yield {"kind": kind, "pose_id": pose_id, "region": region, "status": "refused", "reason": why}
+        yield {"kind": kind, "pose_id": pose_id, "region": region, "status": "unknown", "reason": why}
     for kind, why in predictions.strays:
-        yield {"kind": kind, "status": "refused", "reason": why}
+        yield {"kind": kind, "status": "unknown", "reason": why}
 
 
 def describe_refused(path: Path, most: int = 10) -> list[str]:
-    """A line for each refused item of items.parquet, and then for the missing ones by kind; the first ones alone."""
-    names = ["kind", "pose_id", "status", "reason"]
-    rows = pq.read_table(path, columns=names, filters=[("status", "!=", "ok")]).to_pylist()
-    refused = [row for row in rows if row["status"] == "refused"]
+    """A line for each refused or unknown item of items.parquet, and then for the missing ones by kind; the first ones alone."""
+    names = ["kind", "pose_id", "split", "status", "reason"]
+    rows = pq.read_table(path, columns=names).to_pylist()
+    refused = [row for row in rows if row["status"] in ("refused", "unknown")]
     lines = []
     for row in refused[:most]:
         pose = "" if row["pose_id"] is None else f" {row['pose_id']:05d}"
         lines.append(f"{row['kind']}{pose} refused: {row['reason']}")
     if len(refused) > most:
         lines.append(f"and {plural(len(refused) - most, 'more item')} refused")
+    splits, others = ({row["split"] for row in rows if row["status"] == status} for status in ("ok", "missing"))
+    if len(splits) == 1 and others - splits and splits <= {"train", "val", "test"}:
+        lines.append(f"all that is predicted is of one split: score that alone with --split {splits.pop()}")
+    if outside := sum(row["status"] == "outside" for row in rows):
+        lines.append(f"{plural(outside, 'prediction')} of other splits not scored")
     missing = defaultdict[str, list[str]](list)
     for row in rows:
         if row["status"] == "missing":

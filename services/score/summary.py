@@ -1,10 +1,10 @@
 """What the items say together: means with intervals, and two predictions compared. Pure.
 
-A mean is over the items of a kind that are scored or refused; missing ones are counted and not in it. A refused item, and
-one that predicts nothing where there is truth, counts as worst: 0 for likenesses and shares of good points; for errors the
-largest of all scored items, and no less than the object's diagonal (or its square), 180 degrees, 100 pixels, or 1 for what
-has no unit. Intervals are 95 % of the bootstrap over scenes, because the items of a scene are not independent (Efron and
-Tibshirani 1993, section 8); they are null for a single scene.
+A mean is over all items of a kind whose truth has something to predict: what is missing, refused or left out counts as worst, and
+no value counts as worse than that. Worst is 0 for likenesses and shares of good points; for errors of depth the end of the depths
+that the dataset stores, for other lengths the object's diagonal (or its square), 180 degrees, 100 pixels, or 1 for what has no
+unit. Intervals are 95 % of the bootstrap over scenes, because the items of a scene are not independent (Efron and Tibshirani
+1993, section 8); they are null for a single scene. Coverage is the share of what there is to predict that is predicted.
 """
 
 import re
@@ -18,35 +18,54 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from schemas.base import Array
+from schemas.errors import InputError
 from services.score.predictions import KINDS
 
 HEADLINES: Final = (
-    *("depth_mae_m", "depth_mae_seen_m", "depth_mae_hidden_m", "depth_mae_boundary_m", "depth_mae_scene_m"),
-    *("depth_within_2mm", "depth_within_2mm_hidden", "depth_holes", "rgb_psnr_db", "rgb_ssim", "rgb_flip"),
+    *("depth_auc_50mm", "depth_within_2mm", "depth_within_5mm", "depth_within_10mm", "depth_auc_50mm_hidden"),
+    *("depth_within_2mm_hidden", "depth_mae_m", "depth_mae_seen_m", "depth_mae_hidden_m", "depth_mae_boundary_m"),
+    *("depth_mae_scene_m", "depth_holes", "rgb_ncc", "rgb_psnr_db", "rgb_ssim"),
+    *("rgb_ncc_hidden", "rgb_psnr_hidden_db", "rgb_ssim_hidden", "rgb_ncc_boundary"),
+    *("rgb_psnr_boundary_db", "rgb_ssim_boundary", "rgb_psnr_image_db", "rgb_ssim_image", "rgb_flip_image"),
     *("shape_chamfer_l1_m", "shape_fscore_2mm", "shape_normal_consistency", "shape_iou"),
     *("volume_iou", "volume_distance_mae_m", "pose_add_m", "pose_add_s_m", "pose_rotation_deg", "pose_translation_m"),
 )
 """The metrics that are told first."""
 
+ALWAYS: Final = tuple(
+    name
+    for name in HEADLINES
+    if name not in ("rgb_flip_image", "shape_normal_consistency", "shape_iou", "volume_distance_mae_m")
+)
+"""What every prediction has. Another metric is left out where no item has it: FLIP where it is not asked for; a cloud has no
+volume, and occupancy is no distance."""
+
 _BETTER_HIGH = re.compile(
-    r"_(psnr_db|ssim|ms_ssim|delta\d|within_\d+mm|fscore_\w+|iou|normal_consistency)(_[a-z]+)?$|^volume_accuracy$"
+    r"_(ncc|psnr|ssim|ms_ssim|delta\d|auc_50mm|within_\d+mm|fscore_\w+|iou|normal_consistency)(_[a-z]+)?(_db)?$|^volume_accuracy$"
 )
 _NO_SCORE = re.compile(r"^pose_id$|_pixels(_[a-z]+)?$|_sampling$")
 
 PSNR_DB: Final = 100.0
 """PSNR of equal images, which has no finite value."""
 
+ITEM: Final = ["kind", "pose_id", "region"]
+"""The columns that name an item."""
+
 RESAMPLES: Final = 1000
 INTERVAL: Final = (2.5, 97.5)
 SEED: Final = 43
 
 Figure = Mapping[str, float | int | None]
-"""value, low, high and items; value is null where no item has one."""
+"""value, low, high, items, coverage, and worst: the mean of what would count for items that are missing. Value is null where no
+item has one."""
 
 
 def metrics_of(table: pa.Table) -> list[str]:
-    """The columns that are scores, headlines first."""
-    names = [name for name in table.column_names if name.partition("_")[0] in KINDS and not _NO_SCORE.search(name)]
+    """The columns that are scores, headlines first; those of every kind that is predicted also where all of it is refused."""
+    columns = [name for name in table.column_names if name.partition("_")[0] in KINDS and not _NO_SCORE.search(name)]
+    kinds = set(items_of(table)["kind"].to_pylist())
+    always = [name for name in ALWAYS if name.partition("_")[0] in kinds]
+    names = dict.fromkeys([*columns, *always])
     return sorted(names, key=lambda name: (HEADLINES.index(name) if name in HEADLINES else len(HEADLINES), name))
 
 
@@ -55,60 +74,91 @@ def is_better_high(name: str) -> bool:
     return _BETTER_HIGH.search(name) is not None
 
 
+def items_of(table: pa.Table) -> pa.Table:
+    """The items of the split, without predictions that are none."""
+    return table.filter(pc.is_in(table["status"], pa.array(["ok", "missing", "refused"])))
+
+
 def values_of(table: pa.Table, name: str) -> Array:
     """[N] float64: the metric of every item as it counts, nan where it does not."""
-    values = _numbers(table, name)
-    own = _equal(table, "kind", name.partition("_")[0])
-    ok, refused = own & _equal(table, "status", "ok"), own & _equal(table, "status", "refused")
-    if name.endswith("psnr_db"):
-        values = np.minimum(values, PSNR_DB)
-    empty = ok & ~np.isfinite(values) & _has_truth(table, name, values)
-    values[empty | refused] = _worst(table, name, values[ok & np.isfinite(values)])[empty | refused]
-    values[~own | ~(ok | refused)] = np.nan
-    values[ok & ~empty & ~np.isfinite(values)] = np.nan
-    return values
+    return _counted(table, name)[0]
 
 
-def _has_truth(table: pa.Table, name: str, values: Array) -> NDArray[np.bool_]:
-    """[N]: where a scored item without a value predicts nothing, and not: has nothing to be held against."""
-    if not name.startswith("depth_"):
-        without_volume = pc.is_valid(table["reason"]).to_numpy() if name == "shape_iou" else False
-        return np.isinf(values) | without_volume
-    part = next((one for one in ("scene", "seen", "hidden", "boundary") if f"_{one}" in name), "")
-    return _numbers(table, f"depth_pixels{part and '_'}{part}") > 0.0
+def _counted(table: pa.Table, name: str) -> tuple[Array, Array, Array]:
+    """(values as they count, what counts as worst, coverage), each [N], nan of items of other kinds and without truth.
+
+    nan of all where no item has the metric.
+    """
+    kind, raw = name.partition("_")[0], _numbers(table, name)
+    if name.partition("_psnr")[1]:
+        raw = np.minimum(raw, PSNR_DB)
+    given, worst = np.isfinite(raw), _worst(table, name)
+    part = _part(name)
+    has = _equal(table, "kind", kind)
+    if kind in ("depth", "rgb") and part != "image":
+        has &= _numbers(table, f"{kind}_pixels{part and '_'}{part}") > 0.0
+    if name not in ALWAYS:
+        has &= given.any()
+    values = np.where(given, raw, worst)
+    values = np.maximum(values, worst) if is_better_high(name) else np.minimum(values, worst)
+    covered = given.astype(np.float64)
+    if kind == "depth":
+        covered *= 1.0 - np.nan_to_num(_numbers(table, f"depth_holes{part and '_'}{part}"), nan=1.0)
+    return tuple(np.where(has, each, np.nan) for each in (values, worst, covered))  # type: ignore[return-value]
 
 
-def _worst(table: pa.Table, name: str, scored: Array) -> Array:
-    """[N]: what counts for an item that is refused."""
+def _part(name: str) -> str:
+    """The part of an image that a metric is of; empty for the object."""
+    word = name.removesuffix("_m").removesuffix("_db").rpartition("_")[2]
+    return word if word in ("scene", "seen", "hidden", "boundary", "image") else ""
+
+
+def _worst(table: pa.Table, name: str) -> Array:
+    """[N]: what counts for an item that is missing."""
     if is_better_high(name):
         return np.zeros(table.num_rows)
-    diagonal = _numbers(table, "diagonal_m")
-    known = diagonal[np.isfinite(diagonal)]
-    diagonal = np.where(np.isfinite(diagonal), diagonal, known.max() if len(known) else 0.0)
-    least = {
-        "_m": diagonal,
-        "_m2": diagonal**2,
-        "_deg": np.full(len(diagonal), 180.0),
-        "_px": np.full(len(diagonal), 100.0),
+    length_m = _numbers(table, "farthest_m" if name.startswith("depth_") else "diagonal_m")
+    known = length_m[np.isfinite(length_m)]
+    length_m = np.where(np.isfinite(length_m), length_m, known.max() if len(known) else 1.0)
+    of_unit = {
+        "_m": length_m,
+        "_m2": length_m**2,
+        "_deg": np.full_like(length_m, 180.0),
+        "_px": np.full_like(length_m, 100.0),
     }
-    unit = next((one for one in least if name.endswith(one)), "")
-    return np.maximum(least.get(unit, np.ones(len(diagonal))), scored.max() if len(scored) else 0.0)
+    return next((of_unit[unit] for unit in of_unit if name.endswith(unit)), np.ones_like(length_m))
 
 
 def summarise(table: pa.Table) -> dict[str, Any]:
-    """Counts, also by kind; `metrics` of all items; `by` category and quarter of the visible fraction, the headlines alone."""
+    """Counts, also by kind; `metrics` of all items; `by` category and quarter of the visible fraction, the headlines alone.
+
+    The groups of a kind have the same items together as the whole has, and count them alike.
+    """
+    whole, table = table, items_of(table)
     names = metrics_of(table)
     shown = [place for place, name in enumerate(names) if name in HEADLINES]
-    values = np.stack([values_of(table, name) for name in names], axis=1) if names else np.zeros((table.num_rows, 0))
+    counted = [_counted(table, name) for name in names]
+    values, worst, covered = (
+        np.stack(columns, axis=1) if names else np.zeros((table.num_rows, 0))
+        for columns in (zip(*counted, strict=True) if names else ([],) * 3)
+    )
     categories = {
         name: np.asarray(pc.equal(table["category"], name).fill_null(False).to_numpy(), np.bool_)
         for name in sorted(filter(None, pc.unique(table["category"]).to_pylist()))
     }
-    scenes, groups = _scenes(table), {"category": categories, "visible_fraction": _quarters(table)}
+    scenes, groups = scenes_of(table), {"category": categories, "visible_fraction": _quarters(table)}
     statuses = [_equal(table, "status", word) for word in ("ok", "missing", "refused")]
+
+    def told(chosen: Any, places: list[int]) -> dict[str, Figure]:
+        return {
+            names[place]: {**figure, "coverage": _mean(covered[chosen, place]), "worst": _mean(worst[chosen, place])}
+            for place, figure in zip(places, figures(values[chosen][:, places], scenes[chosen]), strict=True)
+        }
+
     return {
         "items": table.num_rows,
         **dict(zip(("scored", "missing", "refused"), (int(one.sum()) for one in statuses), strict=True)),
+        **{word: int(_equal(whole, "status", word).sum()) for word in ("unknown", "outside")},
         "kinds": {
             kind: {
                 word: int((_equal(table, "kind", kind) & mask).sum())
@@ -116,17 +166,15 @@ def summarise(table: pa.Table) -> dict[str, Any]:
             }
             for kind in pc.unique(table["kind"]).to_pylist()
         },
-        "metrics": dict(zip(names, figures(values, scenes), strict=True)),
-        "by": {
-            group: {
-                word: dict(
-                    zip([names[place] for place in shown], figures(values[mask][:, shown], scenes[mask]), strict=True)
-                )
-                for word, mask in masks.items()
-            }
-            for group, masks in groups.items()
-        },
+        "metrics": told(np.ones(table.num_rows, np.bool_), list(range(len(names)))),
+        "by": {group: {word: told(mask, shown) for word, mask in masks.items()} for group, masks in groups.items()},
     }
+
+
+def _mean(values: Array) -> float | None:
+    """Of what is no nan; None where nothing is."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else None
 
 
 def figures(values: Array, scenes: NDArray[np.int64]) -> list[Figure]:
@@ -161,28 +209,28 @@ def _figure(value: float, means: Array, items: int, scenes: int) -> Figure:
 
 
 def compare(a: pa.Table, b: pa.Table) -> dict[str, Any]:
-    """By metric: `a`, `b`, `difference` b - a with its paired interval over the items that neither misses, and the `better`."""
-    both = pa.concat_tables([a, b], promote_options="default")
-    names, place = metrics_of(both), dict[tuple[Any, ...], list[int]]()
-    for number, row in enumerate(both.select(["kind", "pose_id", "region"]).to_pylist()):
-        place.setdefault(tuple(row.values()), []).append(number)
-    pairs = np.array([rows for rows in place.values() if len(rows) == 2 and rows[0] < a.num_rows <= rows[1]]).reshape(
-        -1, 2
-    )
-    scenes = _scenes(both)[pairs[:, 0]]
-    answer: dict[str, Any] = {}
-    for name in names:
-        values = values_of(both, name)[pairs]
-        values[~np.isfinite(values).all(axis=1)] = np.nan
-        columns = np.column_stack([values, values[:, 1] - values[:, 0]])
-        mine, theirs, apart = figures(columns, scenes)
+    """By metric of kinds that both predict: `a`, `b`, `difference` b - a with its paired interval over all items, the `better`.
+
+    None is the better where either leaves anything out: `coverage` is the lesser of the two. Raises InputError where the two
+    have other items.
+    """
+    tables = [items_of(each).sort_by([(name, "ascending") for name in ITEM]) for each in (a, b)]
+    kinds = pa.array(sorted(set.intersection(*(set(each["kind"].to_pylist()) for each in tables))), pa.string())
+    a, b = (each.filter(pc.is_in(each["kind"], kinds)) for each in tables)
+    if a.select(ITEM) != b.select(ITEM):
+        raise InputError("the two scores are not of the same items: score both with the same --split")
+    scenes, answer = scenes_of(a), dict[str, Any]()
+    for name in sorted({*metrics_of(a)} & {*metrics_of(b)}, key=metrics_of(a).index):
+        (mine, _, covered), (theirs, _, also_covered) = (_counted(each, name) for each in (a, b))
+        one, other, apart = figures(np.column_stack([mine, theirs, theirs - mine]), scenes)
         if apart["value"] is None:
             continue
+        coverage = min(_mean(covered) or 0.0, _mean(also_covered) or 0.0)
         better, low, high = None, apart["low"], apart["high"]
-        if low is not None and high is not None and (low > 0.0 or high < 0.0):
+        if coverage == 1.0 and low is not None and high is not None and (low > 0.0 or high < 0.0):
             better = "b" if (low > 0.0) == is_better_high(name) else "a"
-        answer[name] = {"a": mine["value"], "b": theirs["value"], "difference": apart["value"]} | {
-            "low": low, "high": high, "items": apart["items"], "better": better
+        answer[name] = {"a": one["value"], "b": other["value"], "difference": apart["value"]} | {
+            "low": low, "high": high, "items": apart["items"], "coverage": coverage, "better": better
         }  # fmt: skip
     return answer
 
@@ -198,7 +246,7 @@ def _equal(table: pa.Table, name: str, word: str) -> NDArray[np.bool_]:
     return np.asarray(pc.equal(table[name], word).to_numpy(), np.bool_)
 
 
-def _scenes(table: pa.Table) -> NDArray[np.int64]:
+def scenes_of(table: pa.Table) -> NDArray[np.int64]:
     """[N] numbers of scenes from 0 up; items without a scene are one together."""
     return np.unique(_numbers(table, "scene_id"), return_inverse=True)[1].reshape(-1)
 

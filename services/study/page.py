@@ -179,9 +179,9 @@ def _figure(name: str, row: Row, own: Row, is_best: bool) -> str:
     return f'<td class="{side}{" front" * is_best}">{mark}{value}<small>{ends}</small></td>'
 
 
-PANELS, WIDE_IN, MOVED, REACH = 4, 5.2, 0.05, 4.0
-"""The most panels of a picture; changes up to this share of the job's own error are negligible too; and an interval is cut
-where it reaches beyond this many times its middle, which would otherwise fill the axis."""
+PANELS, WIDE_IN, MOVED, REACH, FLOOR = 4, 5.2, 0.05, 4.0, 1e-3
+"""The most panels of a picture; changes up to this share of the job's own error are negligible too; an interval is cut where it
+reaches beyond this many times its middle, and what is below this share of the negligible stands there: either fills the axis."""
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#6F6800")
 """Okabe and Ito's palette for colour-blind readers, the yellow darker so that it is seen on white."""
@@ -203,7 +203,8 @@ def draw_tradeoff(study: Study) -> bytes:
     """
     every = {name: moving_rows(study.rows, name) for name in ERRORS}
     moving = {name: rows for name, rows in every.items() if any(row.setting.kind == "single" for row in rows)}
-    by_group = [[name for name in moving if ERRORS[name].group == group] for group in GROUPS]
+    told = {name for name, rows in moving.items() if sum(tells(row, name) for row in rows) > 1} or moving
+    by_group = [[name for name in moving if name in told and ERRORS[name].group == group] for group in GROUPS]
     panels = [name for rank in zip_longest(*by_group) for name in rank if name is not None][:PANELS]
     picture = Picture((WIDE_IN, max(1, len(panels)) * 3.6 + 1.6), dpi=150, layout="constrained")
     title = f"{study.job[:40]}: {milliseconds(own_row(study.rows).ms)} a scene\n{sample(study)}"
@@ -213,7 +214,7 @@ def draw_tradeoff(study: Study) -> bytes:
     legend: dict[str, Any] = {}
     for place, name in enumerate(panels, start=1):
         axes = picture.add_subplot(len(panels), 1, place)
-        axes.set_title(question_of(study.rows, name), loc="left", x=-0.14, fontsize=9.5)
+        axes.set_title(question_of(study.rows, name), loc="left", x=-0.12, fontsize=9.5)
         _draw_panel(axes, moving[name], name, looks)
         handles, labels = axes.get_legend_handles_labels()
         legend |= dict(zip(labels, handles, strict=True))
@@ -233,12 +234,15 @@ def question_of(rows: Sequence[Row], error: str) -> str:
     own, words = own_row(rows), f"{short(error)}: what does less cost?"
     if not tells(own, error):
         return words
+    value, negligible = own.errors[error].value, ERRORS[error].negligible
+    if value <= negligible:
+        return f"{words}\nNothing to gain: the job's is at most {amount(error, max(value, FLOOR * negligible))}, as good as none."
     able = [row for row in rows if row is not own and tells(row, error)]
     better = [row for row in able if row.errors[error].high < own.errors[error].low]
     if not better:
         return f"{words}\nNothing that was measured is surely better than the job."
     row = min(better, key=lambda row: (len(row.setting.parts), row.ratio, row.setting.name))
-    less = 1.0 - row.errors[error].value / own.errors[error].value
+    less = 1.0 - row.errors[error].value / value
     span = f"{number(row.ratio_least)} to {number(row.ratio_most)}"
     return f"{words}\n{row.setting.name[:30]}: {less:.0%} less, {times(row.ratio)} the time ({span})"
 
@@ -256,7 +260,8 @@ def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
 def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str, Sequence[str]]) -> None:
     """Points by knob with their intervals and, beside those of the front and the presets, their values; and the front."""
     best = front(rows, error)
-    place = {row.setting.name: (row.ms, shown(error, row.errors[error].value)) for row in rows}
+    least = FLOOR * ERRORS[error].negligible if any(row.errors[error].value > 0.0 for row in rows) else 0.0
+    place = {row.setting.name: (row.ms, shown(error, max(least, row.errors[error].value))) for row in rows}
     for row in rows:
         mark, figure = dict(MARKS[row.setting.kind]), row.errors[error]
         if row.setting.kind == "single":
@@ -265,22 +270,21 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], error: str, looks: Mapping[str,
         if not tells(row, error):
             mark |= {"alpha": 0.4}  # fewer than `FEWEST_SCENES` scenes, whose interval says nothing
         else:
-            low, high = max(figure.low, figure.value / REACH), min(figure.most, figure.value * REACH)
+            ends = max(figure.low, figure.value / REACH), min(figure.most, figure.value * REACH)
+            low, high = (max(least, end) for end in ends)
             axes.vlines(row.ms, shown(error, low), shown(error, high), color=mark["color"], lw=0.8, alpha=0.5)
         axes.plot(*place[row.setting.name], ls="", **mark)
         if row.setting.kind == "preset" or (row in best and row.setting.kind == "single"):
             text = row.setting.parts[0][1][:26]
-            beside = (6.0, 3.0 if row.setting.kind == "preset" else -11.0)  # those of one place stay apart
-            axes.annotate(text, place[row.setting.name], beside, textcoords="offset points", zorder=6)
+            # Those of one place stay apart, and off what lies beside it.
+            beside, ha = ((0.0, -17.0), "center") if row.setting.kind == "preset" else ((6.0, 4.0), "left")
+            axes.annotate(text, place[row.setting.name], beside, textcoords="offset points", ha=ha, zorder=6)
     if best:
         corners = pts_to_poststep(*zip(*(place[row.setting.name] for row in best), strict=True))
         axes.plot(*corners, color="#222222", lw=1.3, zorder=2, label="front: none is cheaper and better")
-    values = [value for _, value in place.values()]
     axes.set_xscale("log")
-    if min(values) > 0.0:
-        axes.set_yscale("log")
-    else:  # linear from 0 to the least value above 0
-        axes.set_yscale("symlog", linthresh=min((value for value in values if value > 0.0), default=1.0))
+    axes.margins(y=0.15)  # room for words
+    axes.set_yscale("log" if least > 0.0 else "linear")
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
             low, high = axis.get_view_interval()

@@ -58,10 +58,14 @@ def test_the_probe_over_http_is_answered_without_the_token(pods, asker, asked):
     assert "raylet: success" in answer
 
 
-def test_a_job_without_the_token_is_refused(pods):
+def test_a_job_without_the_token_is_refused_and_does_not_run(pods, token):
     refused = _submit("wrong", "without-token", f"touch {pods}/ran")
     assert refused.returncode != 0
     assert "token" in (refused.stdout + refused.stderr).lower()
+    asks = ("ray", "job", "list", "--address", f"http://{HEAD}:8265")
+    listing = must(docker("exec", "-e", f"RAY_AUTH_TOKEN={token}", HEAD, *asks))
+    assert "without-token" not in listing
+    assert not (pods / "ran").exists()
 
 
 def test_a_job_that_is_submitted_as_kuberay_does_it_makes_the_same_bytes(pods, token, expected_digest):
@@ -69,13 +73,6 @@ def test_a_job_that_is_submitted_as_kuberay_does_it_makes_the_same_bytes(pods, t
     done = _submit(token, "verso", f"{entrypoint} --shard-size 1 --set run.range_size=2")
     assert "succeeded" in must(done)
     assert digest_of(pods / "tabletop") == expected_digest
-
-
-def test_jobs_that_were_refused_did_not_run(pods, token):
-    asks = ("ray", "job", "list", "--address", f"http://{HEAD}:8265")
-    listing = must(docker("exec", "-e", f"RAY_AUTH_TOKEN={token}", HEAD, *asks))
-    assert "without-token" not in listing
-    assert not (pods / "ran").exists()
 
 
 def test_the_hook_before_sigterm_ends_the_node(pods):

@@ -1,4 +1,4 @@
-"""The wheel that only reads: what it holds, that it is enough to read with, and that both wheels are the same each time."""
+"""The wheel that only reads: what it holds, that it is enough for reading and its pages, and that both are the same each time."""
 
 import json
 import os
@@ -17,40 +17,29 @@ from schemas.dataset.codec import read_matrix
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.dataset.dataset import open_dataset
 from tests.datasets import make_dataset
+from tests.docs.test_pages import READERS, blocks
+from tests.services.export.conftest import SHAPED, with_samples
 from workers.store.images import encode_png
 
 ROOT = Path(__file__).parents[2]
-IMPORTED_AS = {
-    "annotated-types": "annotated_types",
-    "pillow": "PIL",
-    "pyyaml": "yaml",
-    "zlib-ng": "zlib_ng",
-}
-
+IMPORTED_AS = {"annotated-types": "annotated_types", "pillow": "PIL", "pyyaml": "yaml", "zlib-ng": "zlib_ng"}
 
 HEAVY = {
-    "ray",
-    "pybullet",
-    "OpenGL",
-    "pyrender",
-    "numba",
-    "llvmlite",
-    "manifold3d",
-    "embreex",
-    "av",
-    "skimage",
-    "shapely",
-    "rtree",
-}
-HEAVY |= {
-    "mapbox_earcut",
-    "daqp",
-    "reportlab",
-    "rosbags",
-    "prometheus_client",
-    "networkx",
-    "pyglet",
-    "cv2",
+    *(
+        "ray",
+        "pybullet",
+        "OpenGL",
+        "pyrender",
+        "numba",
+        "llvmlite",
+        "manifold3d",
+        "embreex",
+        "av",
+        "skimage",
+        "shapely",
+        "rtree",
+    ),
+    *("mapbox_earcut", "daqp", "reportlab", "rosbags", "prometheus_client", "networkx", "pyglet", "cv2"),
 }
 """What only making needs."""
 
@@ -70,7 +59,7 @@ def dataset(tmp_path_factory):
 def test_reading_loads_what_the_wheel_names_and_nothing_that_makes_data():
     modules, others = wheels.reading_modules()
     named = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]["reading"]
-    names = {one.split(">")[0] for one in named}
+    names = {package.split(">")[0] for package in named}
     assert others == {IMPORTED_AS.get(name, name) for name in names}
     rooms = {".".join(name.split(".")[:2]) for name in modules}
     assert not rooms & {"workers.physics", "workers.render", "workers.capture", "workers.shard", "services.queue"}
@@ -169,6 +158,49 @@ def test_every_command_of_reading_works_from_the_wheel_and_the_others_say_what_t
     told = ends[len(commands) - 1][1]
     assert json.loads(told.splitlines()[-1])["pairs"] == 0 and "deriving labels again needs what makes data" in told
     assert all("install verso-data" in err for _, _, err in ends[len(commands) :]), ends
+
+
+# ------------------------------------------------------------------------------------------------ pages as typed
+
+PACKAGES = {"reader": ("verso_read", "verso.services"), "data": ("verso_data", "services")}
+"""By installation the wheel, and the package of the command line."""
+
+
+def environment_of(installation: str, built: Path, folder: Path) -> dict[str, str]:
+    """The variables of a shell in which an installation's `python` and `verso` are the first ones on the path."""
+    (wheel, services), site, programs = PACKAGES[installation], folder / "site", folder / "bin"
+    with zipfile.ZipFile(next(built.glob(f"{wheel}-*.whl"))) as packed:
+        packed.extractall(site)
+    missing = [*sorted(HEAVY), *wheels.OURS] if installation == "reader" else []
+    (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({missing}))\n")
+    programs.mkdir()
+    start = f"import sys; from {services}.cli.main import main; sys.exit(main())"
+    for name, words in {"python": sys.executable, "verso": f"{sys.executable} -P -c '{start}'"}.items():
+        (programs / name).write_text(f'#!/bin/sh\nexec {words} "$@"\n')
+        (programs / name).chmod(0o755)
+    places = {"PATH": f"{programs}:{os.environ['PATH']}", "PYTHONPATH": str(site), "HF_HOME": str(folder / "hf")}
+    return {**os.environ, **places, "HF_HUB_OFFLINE": "1"}
+
+
+@pytest.mark.minute
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("page", "installation"), [*((page, "reader") for page in READERS), ("docs/reading.md", "data")]
+)
+def test_blocks_of_pages_run_as_typed_from_a_wheel_outside_of_any_checkout(page, installation, built, tmp_path):
+    """Python's blocks in one process."""
+    if installation == "reader":
+        make_dataset(tmp_path / "data/tabletop", scenes=6, categories=["mug", "can"])
+    if page == "docs/export.md":
+        with_samples(make_dataset(tmp_path / "data/targets", **SHAPED)[0])
+    typed = [(language, text) for language, where, text in blocks(page) if where == installation and language]
+    python = "\n".join(text for language, text in typed if language == "python")
+    environ = environment_of(installation, built, tmp_path)
+    sessions = [["bash", "-ec", text] for language, text in typed if language == "sh"]
+    for command in (*sessions, ["python", "-W", "ignore", "-c", python]):
+        done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, f"{page}\n{command[-1]}\n{done.stderr[-2000:]}"
+    assert len(typed) == 1 if installation == "data" else len(typed) >= 4
 
 
 @pytest.mark.minute

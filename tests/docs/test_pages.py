@@ -14,7 +14,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import get_args
@@ -87,7 +87,7 @@ PAGES = {
 }
 
 READERS = ("docs/export.md", "docs/reading.md")
-"""Pages that are typed where verso-read is installed, but for blocks that name another installation (test_installations.py)."""
+"""Pages that are typed where verso-read is installed, but for blocks of another one (tests/deploy/test_wheels.py)."""
 
 _BLOCK = re.compile(r"^ *```(\w*) ?(\w*)\n(.*?)^ *```$|((?:^ {4,}[^\n]*\n)+)", re.MULTILINE | re.DOTALL)
 _COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\./verso|verso|docker|kubectl|\.venv/bin/\w+|export) ?")
@@ -96,24 +96,26 @@ _COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\./verso|verso|docker|kubectl|\.venv/bin
 def blocks(page: str) -> Iterator[tuple[str, str, str]]:
     """(language, installation, text) of every block of a page: ```sh checkout; without a word the page's own."""
     usual = "reader" if page in READERS else "checkout"
-    for language, installation, fenced, indented in _BLOCK.findall((ROOT / page).read_text()):
-        yield language, installation or usual, textwrap.dedent(fenced or indented)
+    for language, installation, text in blocks_in((ROOT / page).read_text()):
+        yield language, installation or usual, text
 
 
-def steps_of(page: str, installation: str) -> Iterator[tuple[str, str]]:
-    """(language, what to run) of the blocks for an installation."""
-    for language, where, text in blocks(page):
-        if where == installation:
-            yield from steps(f"```{language}\n{text}```\n")
+def blocks_in(text: str) -> Iterator[tuple[str, str, str]]:
+    for language, installation, fenced, indented in _BLOCK.findall(text):
+        yield language, installation, textwrap.dedent(fenced or indented)
 
 
 def steps(text: str) -> Iterator[tuple[str, str]]:
     """(language, what to run) of every block of a page: Python as a whole, of others each command."""
-    for language, _, fenced, indented in _BLOCK.findall(text):
+    return steps_of(blocks_in(text))
+
+
+def steps_of(chosen: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str]]:
+    for language, _, text in chosen:
         if language == "python":
-            yield "python", fenced
+            yield "python", text
             continue
-        lines = (fenced or indented).replace("\\\n", " ").splitlines()
+        lines = text.replace("\\\n", " ").splitlines()
         while lines:
             line = lines.pop(0).strip()
             while line.count('"') % 2 and lines:
@@ -164,8 +166,8 @@ def test_every_link_leads_to_a_file_and_a_heading_and_every_command_is_one_that_
 
 def test_the_queues_page_has_its_states_and_pauses():
     page = (ROOT / "docs" / "queue.md").read_text()
-    table = page.partition("## States")[2].partition("##")[0]
-    assert re.findall(r"^\| (\w+) \|", table, re.MULTILINE)[1:] == list(get_args(JobState))
+    listed = page.partition("## States")[2].partition("##")[0]
+    assert re.findall(r"^- \*\*(\w+)\*\*: ", listed, re.MULTILINE) == list(get_args(JobState))
     assert f"rests for {', then '.join(f'{pause:g} s' for pause in PAUSES_S)}," in page
     assert RESTARTS == 3 and "three times at most" in page
 
@@ -210,9 +212,8 @@ def type_it(line: str, root: Path, timeout: float = 900) -> str:
 def type_for_a_while(line: str, root: Path) -> None:
     """Starts a command, gives it time to say something, and interrupts it: it must end without a word of Python's."""
     run = ["bash", "-c", f"exec {line}"]
-    hears = partial(
-        signal.signal, signal.SIGINT, signal.default_int_handler
-    )  # also where these tests run in the background
+    # Also where these tests run in the background.
+    hears = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     out, err = subprocess.PIPE, subprocess.STDOUT
     with subprocess.Popen(run, cwd=root, preexec_fn=hears, stdout=out, stderr=err, text=True) as process:
         try:
@@ -256,7 +257,7 @@ def test_a_page_runs_from_top_to_bottom(page, first, tmp_path, monkeypatch):
         write_realsense(made_on_charuco(tmp_path / "shots"), root / "recording.bag")
     names: dict = {}
     job = "j0a1b2c3d"
-    for language, line in steps_of(page, "checkout"):
+    for language, line in steps_of(block for block in blocks(page) if block[1] == "checkout"):
         if language == "python":
             if all(map(importlib.util.find_spec, re.findall(r"^import (\w+)$", line, re.MULTILINE))):
                 exec(compile(line, page, "exec"), names)

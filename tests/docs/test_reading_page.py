@@ -1,7 +1,6 @@
 """Every block of README.md and docs/reading.md runs as it is printed, and answers what plain files say."""
 
 import json
-import re
 import shlex
 import shutil
 from pathlib import Path
@@ -13,20 +12,19 @@ import pytest
 
 from services.cli.main import main
 from tests.datasets import make_dataset
+from tests.docs.test_pages import ROOT, blocks
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 
-
-def blocks_of(page: Path, language: str) -> list[str]:
+def blocks_of(page: str, wanted: str) -> list[str]:
     """The fenced blocks of a page in one language, in order."""
-    return re.findall(rf"^```{language}(?: data)?\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    return [text for language, _, text in blocks(page) if language == wanted]
 
 
-def run_blocks(page: Path) -> dict:
+def run_blocks(page: str) -> dict:
     """Runs the Python blocks of a page one after the other, in one namespace, which comes back."""
     names: dict = {}
     for number, block in enumerate(blocks_of(page, "python")):
-        exec(compile(block, f"{page.name}, block {number + 1}", "exec"), names)
+        exec(compile(block, f"{page}, block {number + 1}", "exec"), names)
     return names
 
 
@@ -34,7 +32,7 @@ def run_blocks(page: Path) -> dict:
 def here(tmp_path_factory) -> Path:
     """A folder with the dataset and the job that the page names."""
     root = tmp_path_factory.mktemp("here")
-    shutil.copytree(DOCS.parent / "deploy/jobs", root / "deploy/jobs")
+    shutil.copytree(ROOT / "deploy/jobs", root / "deploy/jobs")
     make_dataset(root / "data/tabletop", scenes=6, categories=["mug", "can"])
     return root
 
@@ -51,18 +49,18 @@ def check_images_of_mugs(names):
 
 def test_the_readme_reads_every_mug_and_can_be_read_in_a_few_minutes(here, monkeypatch):
     monkeypatch.chdir(here)
-    check_images_of_mugs(run_blocks(DOCS.parent / "README.md"))
-    assert len((DOCS.parent / "README.md").read_text().splitlines()) <= 120
+    check_images_of_mugs(run_blocks("README.md"))
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
 
 
 def test_the_python_of_the_page_answers(here, monkeypatch, capsys):
     monkeypatch.chdir(here)
-    page = DOCS / "reading.md"
-    assert len(blocks_of(page, "python")) > 5
-    names = run_blocks(page)
+    names = run_blocks("docs/reading.md")
     assert names["made"].scene_id == 17
     printed = capsys.readouterr().out.splitlines()
     assert sum("(120, 160, 3)" in line for line in printed) == 6
+    chosen = [line for line in printed if line.startswith(("mug-", "can-"))]  # by the filter of `pairs`
+    assert 0 < len(chosen) < 6 and all(line.startswith("mug-") for line in chosen)
     assert "Columns of a pair" in printed[-1]
     assert 0 < names["rows"].num_rows <= 6
     dat = [line.split() for line in Path("data/tabletop/objects.dat").read_text().splitlines()]
@@ -77,7 +75,7 @@ def test_the_python_of_the_page_answers(here, monkeypatch, capsys):
 def test_the_commands_of_the_page_answer(here, monkeypatch, capfdbinary):
     monkeypatch.chdir(here)
     answers = []
-    for line in "".join(blocks_of(DOCS / "reading.md", "sh")).splitlines():
+    for line in "".join(blocks_of("docs/reading.md", "sh")).splitlines():
         program, *words = shlex.split(line)
         assert program == "verso"
         if ">" in words and not words[-1].isdigit():
@@ -92,15 +90,3 @@ def test_the_commands_of_the_page_answer(here, monkeypatch, capfdbinary):
     (here / "views.parquet").write_bytes(parquet)
     assert pq.read_table(here / "views.parquet").num_rows == 24
     assert b"T_world_cam" in columns
-
-
-def test_the_filter_of_the_page_chooses_some_and_not_all(here, monkeypatch, capsys):
-    monkeypatch.chdir(here)
-    names: dict = {}
-    blocks = blocks_of(DOCS / "reading.md", "python")
-    exec(next(block for block in blocks if "verso.open" in block), names)
-    capsys.readouterr()
-    (filtering,) = [block for block in blocks if "textured" in block]
-    exec(filtering, names)
-    chosen = capsys.readouterr().out.splitlines()
-    assert 0 < len(chosen) < 6 and all(line.startswith("mug-") for line in chosen)

@@ -123,9 +123,11 @@ class Disk:
             for change in self._kept(folder, loss, kept):
                 _apply(names, change)
             for name, node in sorted(names.items()):
-                left[prefix + name] = None if isinstance(node, Folder) else _bytes_left(node, loss)
                 if isinstance(node, Folder):
+                    left[prefix + name] = None
                     visit(node, f"{prefix}{name}/")
+                else:
+                    left[prefix + name] = node.data if node.data == node.flushed else loss.bytes_of(node)
 
         kept: dict[int, bool] = {}
         visit(self.root, "")
@@ -218,10 +220,6 @@ def _apply(names: dict[str, File | Folder], change: Change) -> None:
         names.pop(change.name, None)
     else:
         names[change.name] = change.node
-
-
-def _bytes_left(file: File, loss: Loss) -> bytes:
-    return file.data if file.data == file.flushed else loss.bytes_of(file)
 
 
 def _read_tree(folder: Path) -> Folder:

@@ -1,6 +1,6 @@
 """Digests of many encoded images, to compare between processes, processors and contents of leftover memory.
 
-`python -m tests.kit.encoded_digests SOURCES.npy DIGESTS.npy IMAGES [backward]` loads the encoder and nothing else of the project.
+`python -m tests.kit.encoded_digests SOURCES.npz DIGESTS.npy IMAGES [backward]` loads the encoder and nothing else of the project.
 """
 
 import hashlib
@@ -95,24 +95,9 @@ def _dirty_memory(rng: np.random.Generator) -> None:
     del pieces
 
 
-def save_sources(path: Path, images: Sequence[NDArray]) -> None:
-    """Writes images of any kind into one file."""
-    with open(path, "wb") as file:
-        for image in images:
-            np.save(file, image)
-
-
-def load_sources(path: Path) -> list[NDArray]:
-    """The images that `save_sources` wrote."""
-    images = []
-    with open(path, "rb") as file:
-        while file.peek(1):
-            images.append(np.load(file))
-    return images
-
-
 if __name__ == "__main__":
     sources, out, images, *backward = sys.argv[1:]
     numbers = list(range(int(images)))
-    found = dict(digests(load_sources(Path(sources)), numbers[::-1] if backward else numbers, seed=len(backward)))
+    images_of_file = list(np.load(sources).values())
+    found = dict(digests(images_of_file, numbers[::-1] if backward else numbers, seed=len(backward)))
     np.save(out, np.frombuffer(b"".join(found[number] for number in numbers), np.uint8).reshape(-1, DIGEST))

@@ -158,16 +158,13 @@ def kill_processes(title: str, number: int) -> Callable[[int, int], None]:
     """Sends a signal to those below the run whose command line begins with, or whose program ends in, `title`."""
 
     def disturb(pid: int, terminal: int) -> None:
-        matching = [process for process in descendants(pid) if _is_called(title, _command_line(process.pid))]
+        lines = {process: _command_line(process.pid) for process in descendants(pid)}
+        matching = [p for p, line in lines.items() if line.startswith(title) or line.partition(" ")[0].endswith(title)]
         assert matching, title
         for process in matching:
             send(process, number)
 
     return disturb
-
-
-def _is_called(title: str, line: str) -> bool:
-    return line.startswith(title) or line.partition(" ")[0].endswith(title)
 
 
 def processes_with(mark: str) -> list[Process]:

@@ -169,15 +169,11 @@ def _rows(failed: bool) -> dict[str, pa.Table]:
             for region, category in ((2, "table"), (3, CATEGORY))
         ]
     for table in TABLES:
+        own = {"scene_id": _hidden(-1), **({} if table in ("objects", "assets") else {"category": CATEGORY})}
         for row in rows[table]:
-            row.update({name: value for name, value in _own(table).items() if name in row})
+            row.update({name: value for name, value in own.items() if name in row})
     tables = {table: sorted_rows(table, table_of_rows(table, rows[table])) for table in TABLES}
     return tables | {"assets": with_shape_files(tables["assets"], {})}
-
-
-def _own(table: str) -> dict[str, object]:
-    category = {} if table in ("objects", "assets") else {"category": CATEGORY}
-    return {"scene_id": _hidden(-1), **category}
 
 
 def _file(number: int) -> dict[str, object]:

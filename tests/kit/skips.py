@@ -43,16 +43,13 @@ class Skips:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
+        strange = f"skipped although {EXPECTED.name} does not expect it", self.unexpected()
         told = (("skipped", self._skips), ("known failures", self._known))
-        for title, counts in [*((title, Counter(reasons.values())) for title, reasons in told), _strange(self)]:
+        for title, counts in [*((title, Counter(reasons.values())) for title, reasons in told), strange]:
             if counts:
                 terminalreporter.write_line(f"{title}, and why:")
             for reason, number in counts.most_common():
                 terminalreporter.write_line(f"  {number:>4} x {reason}")
-
-
-def _strange(skips: Skips) -> tuple[str, Counter[str]]:
-    return f"skipped although {EXPECTED.name} does not expect it", skips.unexpected()
 
 
 def _reason(report: pytest.TestReport | pytest.CollectReport) -> str:

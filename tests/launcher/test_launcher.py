@@ -6,7 +6,7 @@ import tomllib
 
 import pytest
 
-from tests.launcher.checkout import LOCKS, ROOT, locked, project
+from tests.launcher.conftest import LOCKS, ROOT, locked, project
 
 # ------------------------------------------------------------------------------------------------ its ordinary course
 

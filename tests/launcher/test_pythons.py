@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.launcher.checkout import ROOT, Checkout, locked, project
+from tests.launcher.conftest import ROOT, Checkout, locked, project
 
 LOCK = """\
 numpy==2 \\

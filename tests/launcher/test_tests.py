@@ -10,7 +10,7 @@ import pytest
 
 from tests.conftest import changed, why_skip
 from tests.kit.skips import Skips
-from tests.launcher.checkout import ROOT
+from tests.launcher.conftest import ROOT
 
 PYTEST = "pytest|-n|auto|--dist=loadfile|--no-loadscope-reorder|"
 STYLE = ["ruff check .", "ruff format --check .", "mypy", "layers"]

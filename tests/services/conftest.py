@@ -12,6 +12,13 @@ __all__ = ["unflushed"]
 TWO_PAIRS = {"scenes": 4, "pairs_per_scene": 2, "categories": ["box", "can"], "run": {"range_size": 2}, "seed": 3}
 
 
+@pytest.fixture
+def store(tmp_path, unflushed) -> LocalStore:
+    store = LocalStore(tmp_path)
+    store.prepare()
+    return store
+
+
 @pytest.fixture(scope="session")
 def files(tmp_path_factory) -> LocalStore:
     """Two ranges of two scenes of two pairs, finished, a file for each image."""

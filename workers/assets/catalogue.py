@@ -25,7 +25,6 @@ from schemas.job.assets import (
     Assets,
     LibrarySource,
     ProceduralSource,
-    SplitShares,
     instance_id,
 )
 from schemas.job.job import differing_keys
@@ -250,12 +249,6 @@ def _digest(
     scalars = differing_keys(assets, {"objects", "tables"})
     whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": scalars}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
-
-
-def split_of(instance: str, shares: SplitShares) -> str:
-    """`train`, `val` or `test` by the hash of the instance's id: all scenes of an instance fall into one split."""
-    place = int.from_bytes(hashlib.sha256(instance.encode()).digest()[:8], "big") / 2.0**64
-    return "train" if place < shares.train else "val" if place < shares.train + shares.val else "test"
 
 
 MAX_CACHED_INSTANCES = 10_000

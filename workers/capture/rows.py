@@ -17,7 +17,6 @@ from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, EncodedFile, Placed, SceneOutput, encoded_file
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE, Asset
 from schemas.scene.view import Camera, Pair, Role, View
-from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.capture.process import residual_columns
 from workers.geometry.pixels import quantise_depth
@@ -197,7 +196,7 @@ def record_capture(
     with watch.stage("encode"):
         path = asset_path(thing.asset.category, thing.asset.instance_id)
         files.append(encoded_file(path, asset_glb(thing.asset, encode_png)))
-    split = split_of(done.name, job.assets.split)  # of the object: no capture of it may fall into another
+    split = job.assets.split.of(done.name)  # of the object: no capture of it may fall into another
     rows = {
         "scenes": [scene_row(context, thing, done, origin, shares, left_out)],
         "views": views,

@@ -16,7 +16,6 @@ from schemas.job.views import Images, Patch, Targets
 from schemas.scene.scene import EncodedFile, Placed, SceneOutput, encoded_file
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Shape
 from schemas.scene.view import MODALITIES, ObjectLabel, Pair, PixelKind, View, crop_box
-from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.assets.samples import draw_samples, encode_samples
 from workers.geometry.camera import inclination, yaw
@@ -264,7 +263,7 @@ def asset_row(asset: Asset, job: Job, samples: StoredSamples = NO_SAMPLES) -> Ro
         **{name: getattr(asset, name) for name in ASSET_COLUMNS},
         "extents_m": [float(x) for x in asset.extents_m],
         "T_source_to_object": matrix_column(asset.T_source_to_object),
-        "split": split_of(asset.instance_id, job.assets.split),
+        "split": job.assets.split.of(asset.instance_id),
         "notes": [*asset.notes, *samples.notes],
         "samples": samples.column,
     }

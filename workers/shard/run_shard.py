@@ -24,7 +24,7 @@ from typing import IO
 
 import workers.assets.builtin.make  # noqa: F401  so that its loops are compiled with the others
 from schemas.dataset.commit import Span, summarize
-from schemas.dataset.layout import FINGERPRINT_FILE, LOG_FOLDER, staging_path
+from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, LOG_FOLDER, staging_path
 from schemas.dataset.shard import Blame, Fingerprint, JobChange, ShardOrder, ShardReport, SpanReport
 from schemas.errors import FingerprintError, SceneError, VersoError
 from schemas.job.captures import UNNAMED
@@ -41,6 +41,7 @@ from workers.scene.make_scene import make_scene
 from workers.scene.plan import choose_assets, choose_category
 from workers.scene.rows import failed_scene, record_scene, timing_row
 from workers.shard.fingerprint import take_fingerprint
+from workers.shard.framing import require_framed
 from workers.store.attempt import TIMED_OUT, Attempt, begin_attempt
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -95,15 +96,19 @@ def keep_traceback(store: Store, scene_id: int, error: BaseException) -> str:
 def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], bool] = lambda: False) -> ShardReport:
     """Make and commit every range of the order; once `is_over`, no further one is begun, and the report has fewer.
 
-    A scene that cannot be made is a row; errors of the stack propagate.
+    A scene that cannot be made is a row; errors of the stack propagate. Raises InputError before it writes anything where
+    the folder is new and no scene can be framed.
     """
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.drawn)
+    store = open_store(order.out)
+    if order.job_change is not None and store.size(JOB_FILE) is None:
+        require_framed(order.job, catalogue)
+        store.put(JOB_FILE, order.job_change.after.encode())
     compile_planned()
     context = open_worker(order.job, catalogue)
     note = require_device(context.renderer.name, order.job.run.device, context.renderer.choice)
     fingerprint = _fingerprint(context.renderer, order.job.drawn.tier)
-    store = open_store(order.out)
     _join_stack(store, fingerprint, order)
     order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})
     total = Stopwatch()

@@ -4,6 +4,8 @@ import numpy as np
 import occupancy
 import pytest
 
+from tests.deploy.examples.conftest import is_behind
+
 
 @pytest.fixture(scope="module")
 def shapes(pairs):
@@ -31,11 +33,7 @@ def test_a_sample_in_the_frame_of_the_network_is_inside_where_the_resting_mesh_i
 
 def test_the_shadow_is_what_a_ray_from_the_camera_meets_behind_the_object_and_a_box_lies_in_it(shapes):
     for pair, one in shapes:
-        world, eye = in_world(pair, one.queries[:, :3].astype(float))[:400], pair.input.T_world_cam[:3, 3]
-        mesh, first = pair.mesh(), np.full(len(world), np.inf)
-        places, at, _ = mesh.ray.intersects_location(np.tile(eye, (len(world), 1)), world - eye, multiple_hits=False)
-        first[at] = np.linalg.norm(places - eye, axis=1)
-        hidden = (first < np.linalg.norm(world - eye, axis=1)) & (one.queries[:400, 2] > 0)
+        hidden = is_behind(pair, in_world(pair, one.queries[:400, :3].astype(float))) & (one.queries[:400, 2] > 0)
         assert (hidden == one.shadow[:400]).mean() > 0.9
         assert (one.turned <= one.shadow).all() and one.turned.any() and (one.turned < one.shadow).any()
         if pair.category == "box":
@@ -57,6 +55,5 @@ def test_iou_is_one_for_the_truth_and_falls_when_answers_are_shuffled(shapes):
         share = one.inside.mean()
         assert occupancy.iou(one.inside, one.inside) == 1 and occupancy.iou(every, one.inside) == share
         shuffled = np.random.default_rng(1).permutation(one.inside)
-        assert occupancy.iou(shuffled, one.inside) == pytest.approx(
-            share / (2 - share), abs=0.04
-        )  # of independent draws
+        independent = share / (2 - share)
+        assert occupancy.iou(shuffled, one.inside) == pytest.approx(independent, abs=0.04)

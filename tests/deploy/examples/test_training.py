@@ -96,27 +96,22 @@ def python(*arguments: str) -> str:
 
 
 @pytest.mark.minute
-def test_a_loader_stacks_the_split_a_network_learns_from_it_and_the_script_prints_all_scores(few, tmp_path):
-    python("-c", CHECKS, few.name)
-    script, kept = str(EXAMPLES / "train_mirror_depth.py"), tmp_path / "kept"
-    *lines, last = python(script, few.name, "--epochs", "1", "--out", str(kept)).splitlines()
-    assert sorted(path.name for path in kept.iterdir()) == ["network.pt"]
-    load = "import sys, torch; from train_mirror_depth import Net; Net().load_state_dict(torch.load(sys.argv[1])['weights'])"
-    python("-c", load, str(kept / "network.pt"))
-    assert list(json.loads(last)) == ["network", "baseline", "half turn", "planes alone"]
-    assert any("unseen" in line for line in lines)
-
-
-@pytest.mark.minute
-def test_the_occupancy_network_learns_volumes_and_no_shuffled_ones_and_the_script_prints_all_scores(few, tmp_path):
-    python("-c", VOLUMES, few.name)
-    script = str(EXAMPLES / "train_occupancy.py")
-    *_, last = python(script, few.name, "--epochs", "1", "--out", str(tmp_path)).splitlines()
-    assert list(json.loads(last)) == ["network", "half turn", "shadow"]
-    load = (
-        "import sys, torch, train_occupancy as t; t.OccupancyNet().load_state_dict(torch.load(sys.argv[1])['weights'])"
-    )
-    python("-c", load, str(tmp_path / "network.pt"))
+@pytest.mark.parametrize(
+    ("checks", "module", "network", "scored"),
+    [
+        (CHECKS, "train_mirror_depth", "Net", ["network", "baseline", "half turn", "planes alone"]),
+        (VOLUMES, "train_occupancy", "OccupancyNet", ["network", "half turn", "shadow"]),
+    ],
+)
+def test_a_network_learns_and_the_script_prints_all_scores_and_keeps_it(checks, module, network, scored, few, tmp_path):
+    python("-c", checks, few.name)
+    *_, last = python(
+        str(EXAMPLES / f"{module}.py"), few.name, "--epochs", "1", "--out", str(tmp_path / "kept")
+    ).splitlines()
+    assert list(json.loads(last)) == scored
+    assert [path.name for path in (tmp_path / "kept").iterdir()] == ["network.pt"]
+    load = f"import sys, torch, {module} as t; t.{network}().load_state_dict(torch.load(sys.argv[1])['weights'])"
+    python("-c", load, str(tmp_path / "kept/network.pt"))
 
 
 @pytest.mark.slow

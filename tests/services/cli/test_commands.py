@@ -116,23 +116,14 @@ def test_bad_input_is_told_by_key_value_and_remedy(capsys, tmp_path, monkeypatch
     assert answer(capsys, "run", "nowhere.yaml")[2]["kind"] == "JobError"
 
 
-READERS = (
-    *(["status", "*"], ["verify", "*"], ["query", "*", "select 1"], ["replay", "*", "3"], ["report", "*"]),
-    *(
-        ["export", "*", "new", "--format", "bop"],
-        ["score", "*", "."],
-        ["score", ".", "*"],
-        ["init", "*", "--out", "new"],
-    ),
-    ["score", ".", "--compare", "*", "*"],
-    *(["capture", "process", "*"], ["capture", "synthesize", "*", "--mirror"], ["capture", "evaluate", "*"]),
-)
+READERS = "status *|verify *|query * 'select 1'|replay * 3|report *|export * new --format bop|score * .|score . *"
+READERS += "|init * --out new|score . --compare * *|capture process *|capture synthesize * --mirror|capture evaluate *"
 
 
 def test_a_missing_folder_is_told_alike_by_all_that_read_one_and_nothing_is_written(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my data").mkdir()
-    for words in READERS:
+    for words in map(shlex.split, READERS.split("|")):
         code, text = told(capsys, *("my dta" if word == "*" else word for word in words))
         assert (code, text) == (2, "verso: my dta: there is no such folder; did you mean 'my data'?\n"), words
     assert [path.name for path in tmp_path.iterdir()] == ["my data"]
@@ -157,12 +148,12 @@ def test_a_remedy_can_be_pasted_into_a_shell(made, capsys, tmp_path):
     assert shlex.split(text.partition("`")[2].partition("`")[0]) == ["verso", "status", f"{tmp_path}/my data"]
 
 
-def test_a_folder_without_a_usable_mesh_is_refused_with_what_was_found(capsys, tmp_path):
+def test_a_folder_without_a_usable_mesh_is_refused_with_what_is_in_it(capsys, tmp_path):
     (tmp_path / "broken.obj").write_text("f 1 2 3\n")
     source = f"assets.objects.0={{source: library, folder: {tmp_path}}}"
     asked = ["run", TABLETOP, "--set", source, "--set", "categories=[broken]", "--out", str(tmp_path / "out")]
     code, text = told(capsys, *asked)
-    assert code == 2 and (str(tmp_path) in text or "broken" in text)
+    assert code == 2 and f"none of 1 meshes for 'broken' in {tmp_path} can be used: broken.obj (index_out" in text
     assert not (tmp_path / "out").exists()
 
 
@@ -234,12 +225,8 @@ def test_what_the_commands_say_of_a_finished_dataset(made, capsys):
     assert "2 scenes, labels of 2 pairs derived again: nothing off" in lines[0]
     assert lines[1].startswith("labels of 1 pair of 1 scene derived from the article's definitions, and ")
     assert "their rest from contact forces: nothing off" in lines[1]
-    assert told(capsys, "query", made.name, "select scene_id from scenes order by 1", "--format", "csv")[1].split()[
-        1:
-    ] == [
-        "0",
-        "1",
-    ]
+    rows = told(capsys, "query", made.name, "select scene_id from scenes order by 1", "--format", "csv")[1]
+    assert rows.split() == ["scene_id", "0", "1"]
     assert answer(capsys, "replay", made.name, "1")[2]["differences"] == []
     tree = answer(capsys, "report", made.name, "--scenes", "1")[2]
     page = Path(f"{made.name}-report.html")
@@ -282,7 +269,6 @@ def test_every_gpu_is_listed_with_its_device_and_the_one_that_would_be_drawn_on(
         ((), "0", "EGL lists none"),
     ):
         monkeypatch.setattr(context, "list_devices", lambda listed=listed: listed)
-        monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
         monkeypatch.setattr(context, "visible_gpus", lambda visible=visible: visible)
         finding = doctor._gpus()
         assert words in finding.found and finding.ok == (words != "none that may be drawn on"), finding

@@ -62,14 +62,14 @@ def things_of(pair) -> list[Placed]:
 
 
 def test_a_cloud_lies_on_the_mesh_in_every_frame(pairs):
-    for _, view in views_of(pairs):
+    for pair, view in views_of(pairs):
         for number in objects_of(view):
             clouds = {frame: view.cloud(frame, number) for frame in ("object", "camera", "world")}
             own, camera, world = clouds.values()
             assert np.array_equal(view.segment()[tuple(own.pixels.T)], np.full(len(own.points), number))
             assert np.array_equal(own.colours, view.rgb()[tuple(own.pixels.T)])
             some = slice(None, None, max(1, len(own.points) // 300))
-            for cloud, mesh in ((camera, view.mesh(number)), (world, pairs_mesh(pairs, view, number))):
+            for cloud, mesh in ((camera, view.mesh(number)), (world, pair.mesh(number))):
                 assert off_surface(mesh, cloud.points[some])[0].max(initial=0) < 1.3 * UNIT_M
             T_cam_obj = next(one.T_cam_obj for one in view.objects if one.region_id == number)
             assert np.allclose(to(T_cam_obj, own.points), camera.points, atol=1e-12)
@@ -80,10 +80,6 @@ def test_a_cloud_lies_on_the_mesh_in_every_frame(pairs):
         everything = view.cloud("camera", None)
         assert len(everything.points) == (view.depth() > 0).sum()
         assert len(view.cloud("world", 1).points) and np.abs(view.cloud("world", 1).points[:, 2]).max() < 2 * UNIT_M
-
-
-def pairs_mesh(pairs, view, number):
-    return next(pair for pair, one in views_of(pairs) if one is view).mesh(number)
 
 
 def test_targets_are_the_mesh_in_numbers(pairs):

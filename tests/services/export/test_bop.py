@@ -13,6 +13,7 @@ from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
 from services.export.shapes import box_of, reaches_edge, whole_silhouette
 from tests.datasets import make_dataset
+from tests.kit.shapes import shape_of
 from tests.services.export.bop_reader import load_model, load_shots, points_in_model, read_picture
 from tests.services.export.exported import export_to, source_image, source_rows, without_sources
 
@@ -216,10 +217,6 @@ def test_silhouettes_are_those_of_the_target_and_need_no_shape(heap, tmp_path):
 # ------------------------------------------------------------------------------------------------ models
 
 
-def plain_shape(mesh):
-    return Shape((Part("plain", np.array(mesh.vertices), np.array(mesh.faces, np.int32)),))
-
-
 def test_a_shape_without_normals_gets_those_of_its_faces_and_a_flat_one_has_a_diameter(tmp_path):
     box = trimesh.creation.box((0.1, 0.2, 0.2))
     assert model_info(1000.0 * box.vertices)["diameter"] == pytest.approx(300.0)
@@ -229,7 +226,7 @@ def test_a_shape_without_normals_gets_those_of_its_faces_and_a_flat_one_has_a_di
         assert model_info(cloud)["diameter"] == pytest.approx(pdist(cloud).max(), rel=1e-12)
     ball = trimesh.creation.icosphere(4, 30.0)
     assert model_info(ball.vertices)["diameter"] == pytest.approx(pdist(ball.vertices).max(), rel=1e-12)
-    (tmp_path / "box.ply").write_bytes(b"".join(ply_lines(plain_shape(box))))
+    (tmp_path / "box.ply").write_bytes(b"".join(ply_lines(shape_of(box))))
     model = load_model(tmp_path / "box.ply")
     np.testing.assert_allclose(model.vertices, 1000.0 * box.vertices, atol=1e-6)
     np.testing.assert_allclose(model.normals, box.vertex_normals, atol=1e-5)

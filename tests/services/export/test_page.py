@@ -11,7 +11,9 @@ from services.export.table import FORMATS
 from tests.services.export.exported import contents
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "export.md").read_text()
-COMMANDS = [shlex.split(line)[1:] for line in PAGE.splitlines() if line.strip().startswith("verso export")]
+COMMANDS = [
+    shlex.split(line, comments=True)[1:] for line in PAGE.splitlines() if line.strip().startswith("verso export")
+]
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 

@@ -61,7 +61,10 @@ def test_a_folder_that_is_no_dataset_is_refused_unless_a_run_or_a_file_system_le
     (tmp_path / "lost+found").mkdir()
     (tmp_path / "_lock.json").write_text("{}")
     refuse_foreign(store)
-    with pytest.raises(OutputError, match="holds no job"):
+    with pytest.raises(OutputError, match=r"holds no job.yaml: a run is just beginning there"):
+        require_job(store)
+    store.remove("_lock.json")
+    with pytest.raises(OutputError, match=r"holds no job.yaml: it is not an output folder"):
         require_job(store)
     (tmp_path / "photos").mkdir()
     with pytest.raises(OutputError, match="photos, and no job"):

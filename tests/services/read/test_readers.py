@@ -40,13 +40,6 @@ def test_scenes_are_chosen_evenly_by_seed_and_failed_ones_never(tmp_path, unflus
 # ---------------------------------------------------------------------------------------------- status
 
 
-@pytest.fixture
-def store(tmp_path, unflushed):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    return store
-
-
 def test_scenes_are_counted_with_what_retries_changed(store, tmp_path):
     with pytest.raises(OutputError, match="holds no dataset"):
         read_status(LocalStore(tmp_path / "none"), 0, 4)

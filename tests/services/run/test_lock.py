@@ -20,13 +20,6 @@ from workers.store.local import LocalStore
 FAST = Beat(period_s=0.05, patience=4)
 
 
-@pytest.fixture
-def store(tmp_path):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    return store
-
-
 THEIRS = Holder(token="theirs", host="far", pid=7, machine="another", born="1")
 
 

@@ -281,14 +281,11 @@ def wait_for_workers(run: subprocess.Popen) -> set[Listener]:
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and run.poll() is None:
         listeners = listeners_of(run.pid)
-        if sum(is_worker(one) for one in listeners) >= 2:
+        names = [listener.process for listener in listeners]
+        if sum(name.startswith("ray::") and "Agent" not in name and "Env" not in name for name in names) >= 2:
             return listeners
         time.sleep(0.05)
     raise AssertionError(f"no two workers listen: {run.poll()}, {sorted(listeners_of(run.pid))}")
-
-
-def is_worker(listener: Listener) -> bool:
-    return listener.process.startswith("ray::") and "Agent" not in listener.process and "Env" not in listener.process
 
 
 def scan(run: subprocess.Popen) -> list[int]:

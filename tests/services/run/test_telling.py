@@ -26,6 +26,7 @@ from services.run.progress import Meter, ProgressLine, Tally, event_log, log_eve
 from services.run.run_job import RunRequest, describe_plan, measure_scene, open_inputs
 from tests.kit.network import free_port
 from tests.services.run.scraped import scrape
+from workers.shard.framing import require_framed
 
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = {"cameras": {"sensor": {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}}}
@@ -80,20 +81,30 @@ def test_a_job_whose_scenes_cannot_be_framed_is_refused_before_anything_is_writt
     for key, value in keys.items():
         set_key(tree, key, value)
     job.write_text(json.dumps(tree))
-    for more in ([], ["--dry-run"]):
-        assert main(["run", str(job), "--out", str(out), *more]) == 2
-        assert re.search(
-            f"job t: none of the first 3 scenes can be planned and framed: .*{message}", capsys.readouterr().err
-        )
-    assert main(["run", str(job), "--out", str(out), "--address", "127.0.0.1:1"]) == 1  # nobody answers there
+    assert main(["run", str(job), "--out", str(out), "--dry-run"]) == 2
+    assert re.search(
+        f"job t: none of the first 3 scenes can be planned and framed: .*{message}", capsys.readouterr().err
+    )
     assert not out.exists()
+
+
+def test_a_run_is_refused_by_its_first_worker_and_leaves_its_folder_as_it_was(tmp_path, capsys):
+    job, out = tmp_path / "job.yaml", tmp_path / "out"
+    job.write_text(json.dumps({"name": "t", "scenes": 3, "cameras": {"orbit": {"radius_m": 125}}}))
+    assert main(["run", str(job), "--out", str(out), "--address", "127.0.0.1:1"]) == 1  # nobody answers there
+    assert main(["run", str(job), "--out", str(out)]) == 2
+    assert "change cameras.orbit.radius_m, which is 125" in capsys.readouterr().err
+    assert not out.exists()
+    out.mkdir()
+    assert main(["run", str(job), "--out", str(out)]) == 2
+    assert not list(out.iterdir())
 
 
 def test_cameras_that_frame_their_objects_are_asked_where_they_will_stand(tmp_path):
     """Before a scene is at rest they stand at a distance that stands for one."""
     framed = {"orbit": {"radius_m": "fit"}, "mirror": {"T_z_m": "fit"}}
     asked = request(tmp_path / "new", cameras=framed, images={"depth_range_m": [1.3, 3.0]})
-    assert open_inputs(asked.job, asked.job_folder, asked.out)
+    require_framed(asked.job, open_inputs(asked.job, asked.job_folder, asked.out)[0])
 
 
 def test_a_dry_run_says_why_scenes_cannot_be_made_that_can_be_framed(tmp_path, monkeypatch):

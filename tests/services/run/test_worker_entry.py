@@ -106,14 +106,10 @@ def test_a_process_sees_its_first_cores_flags_and_the_variables_that_it_was_star
     assert "ANOTHER" not in start_environment(["ANOTHER"]), "what is set later does not count"
 
 
-def lock_in(folder: Path, token: str) -> str:
-    folder.mkdir(exist_ok=True)
-    (folder / "_lock.json").write_text(json.dumps({"token": token, "beat": 7}))
-    return str(folder / "_lock.json")
-
-
 def test_a_folder_is_the_drivers_if_its_file_holds_the_token_and_it_can_be_written(tmp_path, monkeypatch):
-    proof = lock_in(tmp_path / "out", "ours")
+    (tmp_path / "out").mkdir()
+    proof = str(tmp_path / "out" / "_lock.json")
+    Path(proof).write_text(json.dumps({"token": "ours", "beat": 7}))
     assert look_at_folder(proof, "ours", 0) == ""
     assert [path.name for path in (tmp_path / "out").rglob("*") if path.is_file()] == ["_lock.json"]
     assert look_at_folder(proof, "theirs", 0) == "it holds the lock of another run"

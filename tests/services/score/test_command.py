@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import itertools
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import zipfile
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import trimesh
@@ -18,6 +20,8 @@ import trimesh
 from services.cli.main import main
 from services.dataset.dataset import open_dataset
 from services.score import run as module
+from services.score.leaderboard import compare_all, describe_verdicts, holm
+from services.score.summary import HEADLINES, is_better_high, summarise
 from workers.pool import Ended
 
 PAIRS = 8
@@ -58,10 +62,11 @@ def test_truth_is_perfect_and_its_page_needs_no_network(files, truth, tmp_path, 
     assert (status, answer["items"], answer["missing"], answer["refused"]) == (0, 3 * PAIRS, 0, 0)
     value = {name: one["value"] for name, one in answer["metrics"].items()}
     assert value["depth_mae_m"] == value["depth_mae_hidden_m"] == value["depth_mae_scene_m"] == 0.0
-    assert value["depth_within_2mm"] == value["rgb_ssim"] == value["shape_fscore_2mm"] == 1.0
+    assert value["depth_within_2mm"] == value["rgb_ssim"] == value["rgb_ncc"] == value["shape_fscore_2mm"] == 1.0
     assert value["shape_iou"] == pytest.approx(1.0, abs=1e-6) and value["shape_chamfer_l1_m"] < 1e-6
     page = (tmp_path / "index.html").read_text()
     assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page
+    assert all(one["coverage"] == 1.0 for one in answer["metrics"].values() if one["items"])
     rows = pq.read_table(tmp_path / "items.parquet").to_pylist()
     assert len(rows) == 3 * PAIRS and {row["status"] for row in rows} == {"ok"}
 
@@ -103,10 +108,6 @@ def bomb(path):
         packed.writestr("points.npy", b"\0" * 200_000_000)
 
 
-def header_of_brackets(path):
-    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"(" * 9000)
-
-
 def twice(path):
     cv2.imwrite(str(path.with_suffix(".png")), np.zeros(np.load(path).shape, np.uint16))
 
@@ -123,7 +124,7 @@ FAULTS = [
     ("depth", ".npy", lambda path: cut(path, 500), "cannot be read"),
     ("depth", ".npy", lambda path: np.save(path, np.array([{}], dtype=object), allow_pickle=True), "allow_pickle"),
     ("depth", ".npy", twice, "there 2 times"),
-    ("depth", ".npy", header_of_brackets, "cannot be read"),
+    ("depth", ".npy", lambda path: path.write_bytes(b"\x93NUMPY\x01\x00\x28\x23" + b"(" * 9000), "cannot be read"),
     ("rgb", ".png", lambda path: cut(path, -40), "torn|damaged|cut"),
     ("rgb", ".png", lambda path: (path.unlink(), path.mkdir()), "is a folder"),
     ("rgb", ".png", become_a_pipe, "is a pipe"),
@@ -161,15 +162,17 @@ def test_each_fault_is_an_item_with_its_reason_and_counts_as_worst(files, truth,
     (folder / "poses.csv").write_text(f"scene_id,im_id,obj_id,R,t\n1,{10**30},3,1 0 0 0 1 0 0 0 1,0 0 1000\n")
     status, answer, said = score(capsys, files.root, folder, "--out", tmp_path / "score")
     rows = pq.read_table(tmp_path / "score" / "items.parquet").to_pylist()
-    refused = {(row["kind"], row["pose_id"]): row["reason"] for row in rows if row["status"] == "refused"}
+    refused = {(row["kind"], row["pose_id"]): row["reason"] for row in rows if row["status"] in ("refused", "unknown")}
     for key, told in expected.items():
         assert re.search(told, refused.pop(key)), key
     others = {("depth", 90001): "another dataset", ("depth", None): "no pose id", ("pose", None): "line 2 of poses.csv"}
     assert set(refused) == set(others) and all(others[key] in why for key, why in refused.items())
-    assert (status, answer["refused"], answer["missing"]) == (1, len(FAULTS) + 3, 1 + PAIRS)
+    assert (status, answer["refused"], answer["unknown"]) == (1, len(FAULTS), 3)
+    assert answer["missing"] == 1 + PAIRS  # of poses there is none of the dataset
     assert "missing" in said and answer["metrics"]["depth_mae_m"]["value"] > 0.0
-    share = pytest.approx(1 / (PAIRS + 2))  # of eight, one of another dataset, and one without an id
-    assert answer["metrics"]["depth_within_2mm"]["value"] == share
+    within = answer["metrics"]["depth_within_2mm"]
+    assert within["value"] == within["coverage"] == pytest.approx(1 / PAIRS)  # the others count as worst
+    assert answer["metrics"]["pose_rotation_deg"]["value"] == 180.0
 
 
 def test_an_item_that_ends_its_process_is_refused_and_the_others_are_scored(
@@ -199,14 +202,7 @@ def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp
     assert answers[1]["metrics"]["depth_mae_m"]["low"] < 0.00435 < answers[1]["metrics"]["depth_mae_m"]["high"]
     summary = json.loads((far / "score" / "summary.json").read_text())
     assert len(summary["by"]["category"]) > 1
-    for groups in filter(
-        None, summary["by"].values()
-    ):  # each item is in one group of a kind, and their means are the whole's
-        depth = [group["depth_mae_m"] for group in groups.values() if group["depth_mae_m"]["items"]]
-        total = sum(part["value"] * part["items"] for part in depth)
-        whole = summary["metrics"]["depth_mae_m"]
-        assert sum(part["items"] for part in depth) == whole["items"]
-        assert total / whole["items"] == pytest.approx(whole["value"])
+    require_groups_that_add_up(summary)
     scaled = write_truth(files, tmp_path / "scaled", lambda depth_m, _: 3.0 * depth_m)
     answer = score(capsys, files.root, scaled, "--align", "scale")[1]
     assert answer["refused"] == 0 and answer["metrics"]["depth_mae_scene_m"]["value"] < 1e-9
@@ -224,16 +220,200 @@ def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp
     assert score(capsys, files.root, near)[1]["metrics"]["depth_mae_m"]["value"] > 0.002
 
 
+def require_groups_that_add_up(summary):
+    """Each item is in one group of a kind, and their means are the whole's."""
+    for groups, name in itertools.product(filter(None, summary["by"].values()), HEADLINES):
+        whole = summary["metrics"].get(name, {"items": 0})
+        parts = [group[name] for group in groups.values() if whole["items"] and group[name]["items"]]
+        assert sum(part["items"] for part in parts) == whole["items"]
+        for key in ("value", "coverage", "worst"):
+            total = sum(part[key] * part["items"] for part in parts)
+            assert not parts or total / whole["items"] == pytest.approx(whole[key])
+
+
+def test_who_does_not_predict_comes_last_and_no_verdict_is_given(files, truth, tmp_path, capsys):
+    """One right pixel an image, one item, and none that can be read, beside a full guess that is 30 mm off."""
+
+    def one_pixel(depth_m, number):
+        pixel = np.zeros_like(depth_m)
+        first = tuple(np.argwhere(depth_m > 0.0)[len(depth_m) // 2])
+        pixel[first] = depth_m[first]
+        return pixel
+
+    guess = write_truth(
+        files, tmp_path / "guess", lambda depth_m, _: depth_m + 0.02 * (np.arange(160) % 4) * (depth_m > 0.0)
+    )
+    pixel = write_truth(files, tmp_path / "pixel", one_pixel)
+    single, torn = (shutil.copytree(truth, tmp_path / name) for name in ("single", "torn"))
+    for path in [*single.glob("*/*"), *torn.glob("*/*")]:
+        if torn in path.parents:
+            path.write_bytes(b"torn")
+        elif not path.stem.endswith("00001"):
+            path.unlink()
+    assert score(capsys, files.root, guess)[0] == 0
+    worst = {}
+    for folder in (pixel, single, torn):
+        status, answer, _ = score(capsys, files.root, folder)
+        assert status == 1
+        require_groups_that_add_up(json.loads((folder / "score" / "summary.json").read_text()))
+        for name, one in score(capsys, files.root, "--compare", folder, guess)[1]["metrics"].items():
+            if name.startswith("depth") and name in HEADLINES:
+                assert one["better"] is None and one["coverage"] < 0.2
+                assert (one["a"] < one["b"]) == is_better_high(name) or one["a"] == one["b"], (folder, name)
+        worst = answer["metrics"]
+    assert all(worst[name]["value"] == worst[name]["worst"] for name in HEADLINES if name in worst)
+    assert worst["depth_mae_m"]["value"] == 8.0 and worst["rgb_ncc"]["value"] == worst["rgb_ncc"]["coverage"] == 0.0
+
+
+def test_a_leaderboard_has_every_run_and_compares_none_that_leaves_something_out(files, truth, tmp_path, capsys):
+    def depth_of(name, change):
+        folder = write_truth(files, tmp_path / name, change)
+        for kind in ("rgb", "shape"):
+            shutil.rmtree(folder / kind)
+        return folder
+
+    near = depth_of("near", lambda depth_m, _: depth_m + 0.001 * (depth_m > 0))
+    far = depth_of("far", lambda depth_m, _: depth_m + 0.006 * (depth_m > 0))
+    part = depth_of("part", lambda depth_m, _: depth_m)
+    min((part / "depth").iterdir()).unlink()
+    for folder in (near, far, part):
+        score(capsys, files.root, folder)
+    status, answer, _ = score(capsys, "merge", files.root, near, far, part, "--out", tmp_path / "board")
+    assert (status, answer["runs"]) == (1, ["near", "far", "part"])
+    assert {(one["a"], one["b"]) for one in answer["verdicts"]} == {("near", "far")}
+    page, latex = ((tmp_path / "board" / f"leaderboard.{kind}").read_text() for kind in ("md", "tex"))
+    assert "part is not compared" in page and r"87.5 \%" in latex
+    rows = pq.read_table(tmp_path / "board" / "leaderboard.parquet").to_pylist()
+    assert {row["run"] for row in rows if row["category"]} == set(answer["runs"])
+    assert score(capsys, "merge", files.root, near, far, "--out", tmp_path / "two")[0] == 0
+    summary = far / "score" / "summary.json"
+    summary.write_text(summary.read_text().replace('"verso_score": 2', '"verso_score": 1'))
+    assert main(["score", "merge", str(files.root), str(near), str(far), "--out", str(tmp_path / "old")]) == 2
+    assert "rules of another version" in capsys.readouterr().err
+
+
+def test_who_is_better_in_twenty_scenes_is_told_and_who_is_not_is_not():
+    rng = np.random.default_rng(3)
+
+    def items(off_m):
+        facts = {"kind": "depth", "region": 0, "status": "ok", "category": "mug", "visible_fraction": 1.0}
+        facts |= {"farthest_m": 8.0, "diagonal_m": 0.25, "depth_pixels": 9.0, "depth_holes": 0.0}
+        rows = [{**facts, "scene_id": n, "pose_id": 2 * n + 1, "depth_mae_m": float(e)} for n, e in enumerate(off_m)]
+        return pa.Table.from_pylist(rows)
+
+    base = rng.uniform(0.01, 0.02, 20)
+    tables = {"a": items(base), "b": items(base + 0.001), "c": items(base + 1e-4 * (-1.0) ** np.arange(20))}
+    summaries = {name: summarise(table) for name, table in tables.items()}
+    verdicts = compare_all(tables, summaries, ["depth_mae_m"])
+    assert {(one["a"], one["b"]): one["better"] for one in verdicts} == {
+        ("a", "b"): "a",
+        ("a", "c"): None,
+        ("b", "c"): "c",
+    }
+    assert "a is better than b" in describe_verdicts(verdicts, summaries)
+
+
+def test_p_values_are_corrected_as_holm_published():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.8]) == [1.0, 1.0] and holm([]) == []
+
+
+def test_predictions_are_checked_without_a_score(files, truth, tmp_path, capsys):
+    status, answer, _ = score(capsys, "check", files.root, truth)
+    assert (status, answer["items"], answer["missing"]) == (0, 3 * PAIRS, 0)
+    spoilt = shutil.copytree(truth, tmp_path / "spoilt")
+    first, second, *_ = sorted((spoilt / "depth").iterdir())
+    np.save(first, 1e3 * np.load(first))
+    np.save(second, 0.0 * np.load(second))
+    min((spoilt / "rgb").iterdir()).unlink()
+    status, answer, said = score(capsys, "check", files.root, spoilt)
+    assert (status, answer["refused"], answer["missing"]) == (1, 1, 1) and "millimetres" in said
+    assert main(["score", "check", str(files.root), str(spoilt)]) == 1
+    told = capsys.readouterr().out
+    assert f"depth   {PAIRS - 1} there, 0 missing, 1 refused, coverage 75 %" in told
+    assert {path.name for path in spoilt.iterdir()} == {"depth", "rgb", "shape"}
+
+
+def test_an_object_of_one_colour_has_no_score_that_the_table_gives_it(files, truth, tmp_path, capsys):
+    grey = tmp_path / "grey"
+    (grey / "rgb").mkdir(parents=True)
+    for pair in open_dataset(str(files.root)).pairs():
+        image = pair.mirror.rgb()[..., ::-1].copy()
+        image[pair.mirror.segment() >= 3] = 128
+        cv2.imwrite(str(grey / "rgb" / f"{pair.mirror.pose_id:05d}.png"), image)
+    value = {name: one["value"] for name, one in score(capsys, files.root, grey)[1]["metrics"].items()}
+    assert value["rgb_ncc"] == value["rgb_ncc_hidden"] == 0.0
+    assert (
+        value["rgb_psnr_db"] < value["rgb_psnr_image_db"] - 10.0 and value["rgb_ssim"] < 0.7 < value["rgb_ssim_image"]
+    )
+
+
+def test_a_split_is_scored_alone_and_is_proposed_where_nothing_else_is_predicted(files, truth, tmp_path, capsys):
+    rows = pq.read_table(score_file(files, truth, tmp_path / "all", capsys)).to_pylist()
+    split = max({row["split"] for row in rows} - {"mixed"}, key=[row["split"] for row in rows].count)
+    chosen = {row["pose_id"] for row in rows if row["split"] == split}
+    assert len(chosen) < PAIRS
+    status, answer, said = score(capsys, files.root, truth, "--out", tmp_path / "a", "--split", split)
+    assert (status, answer["items"]) == (0, 3 * len(chosen)) and f"{3 * (PAIRS - len(chosen))} predictions of" in said
+    part = shutil.copytree(truth, tmp_path / "part")
+    for path in part.glob("*/*"):
+        if int(path.stem) not in chosen:
+            path.unlink()
+    status, answer, said = score(capsys, files.root, part)
+    assert (status, answer["missing"]) == (1, 3 * (PAIRS - len(chosen))) and f"--split {split}" in said
+    assert score(capsys, files.root, part, "--split", split)[0] == 0
+    assert main(["score", str(files.root), "--compare", str(part), str(tmp_path / "all")]) == 2
+    assert f"--split {split} and all" in capsys.readouterr().err
+
+
+def test_poses_are_read_by_the_ids_of_the_export_that_they_answer_or_by_ours(files, tmp_path, capsys):
+    assert main(["export", str(files.root), str(tmp_path / "bop"), "--format", "bop"]) == 0
+    lines = ["scene_id,im_id,obj_id,score,R,t,time"]
+    for path in (tmp_path / "bop").glob("*/*/scene_gt.json"):
+        for image, poses in json.loads(path.read_text()).items():
+            for pose in poses:
+                R, t = (" ".join(map(str, pose[name])) for name in ("cam_R_m2c", "cam_t_m2c"))
+                lines.append(f"{int(path.parent.name)},{image},{pose['obj_id']},1.0,{R},{t},-1")
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    theirs.mkdir()
+    (theirs / "poses.csv").write_text("\n".join(lines))
+    for more in ([], ["--frame", "input"]):
+        status, answer, said = score(capsys, files.root, theirs, *more)
+        assert (status, answer["missing"]) == (0, 0) and "by the ids of an export" in said
+        assert answer["metrics"]["pose_mssd_m"]["value"] < 1e-9
+    (theirs / "poses.csv").write_text("\n".join([*lines, lines[-1].replace(lines[-1].split(",")[2], "999", 1)]))
+    status, answer, said = score(capsys, files.root, theirs)
+    assert (status, answer["unknown"], answer["missing"]) == (1, 1, 0) and "obj_id" in said
+    ours.mkdir()
+    lines = ["scene_id,im_id,obj_id,R,t"]
+    for pair in open_dataset(str(files.root)).pairs():
+        T = np.linalg.inv(pair.mirror.T_world_cam) @ pair.T_world[3]
+        R, t = (" ".join(map(str, part.ravel())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
+        lines.append(f"{pair.scene_id},{pair.mirror.pose_id},3,{R},{t}")
+    (ours / "poses.csv").write_text("\n".join(lines))
+    status, answer, said = score(capsys, files.root, ours)
+    assert (status, answer["missing"]) == (0, 0) and "export" not in said
+    assert answer["metrics"]["pose_mssd_m"]["value"] < 1e-9
+
+
+def score_file(files, folder, out, capsys):
+    score(capsys, files.root, folder, "--out", out)
+    return out / "items.parquet"
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ([], "name the folder of predictions"),
         (["nothing"], "has no predictions"),
+        (["others"], r"whose names are like depth/00001, depth/00003, depth/00005"),
         (["--compare", "nothing", "nothing"], "has no score"),
     ],
 )
 def test_what_cannot_be_scored_is_told(files, words, told, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "nothing").mkdir()
+    (tmp_path / "others" / "depth").mkdir(parents=True)
+    (tmp_path / "others" / "depth" / "90001.npy").write_bytes(b"")
     assert main(["score", str(files.root), *words]) == 2
     assert told in capsys.readouterr().err

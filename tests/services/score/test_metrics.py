@@ -13,24 +13,23 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from schemas.errors import InputError
 from schemas.scene.shape import Mesh
 from services.score.images import align_depth, score_colour, score_depth
+from services.score.items import Asked, check_depth
+from services.score.items import _read_volume as read_volume
 from services.score.pose import check_distance, score_pose, score_volume, symmetries_of
 from services.score.shape import align_shape, score_shape
+from tests.kit.contacts import mesh_of
 from workers.geometry.frames import transform
 
 CASES = 100
 cases_each = pytest.mark.parametrize("cases", [25, pytest.param(CASES, marks=pytest.mark.slow)])
 """Of what agrees case by case; shares of many cases need them all."""
 EXACT = 1e-6
+WORST_M = 0.5
 K = np.array([[525.0, 0.0, 320.0], [0.0, 520.0, 240.0], [0.0, 0.0, 1.0]])
 
 
 def agree(ours, theirs):
     assert ours == pytest.approx(theirs, rel=EXACT, abs=1e-12, nan_ok=True)
-
-
-def mesh_of(shape, T=None):
-    moved = np.asarray(shape.vertices) if T is None else trimesh.transform_points(shape.vertices, T)
-    return Mesh(np.ascontiguousarray(moved, np.float64), np.array(shape.faces, np.int32))
 
 
 def rigid(rng, turn_rad, shift_m):
@@ -55,7 +54,7 @@ def test_depth_is_exact_arithmetic_in_stored_units():
         parts = {
             name: rng.random(true.shape) < share for name, share in {"object": 0.3, "scene": 1.0, "seen": 0.02}.items()
         }
-        ours = score_depth(shown, true / 5000, parts)
+        ours = score_depth(shown, true / 5000, parts, WORST_M)
         for name, part in parts.items():
             pairs = [(int(d), int(t)) for d, t in zip(predicted[part], true[part], strict=True) if t > 0]
             agree({key: value for key, value in ours.items() if key.startswith(name)}, depth_by_hand(name, pairs))
@@ -63,10 +62,13 @@ def test_depth_is_exact_arithmetic_in_stored_units():
 
 def depth_by_hand(name, pairs):
     kept = [(d, t) for d, t in pairs if d]
-    n, m, errors = len(pairs) or math.nan, len(kept) or math.nan, [abs(d - t) for d, t in kept]
-    found = {"mae_m": sum(errors) / m / 5000, "rmse_m": math.sqrt(sum(e * e for e in errors) / m) / 5000}
-    found |= {"abs_rel": sum(abs(d - t) / t for d, t in kept) / m, "holes": (n - len(kept)) / n, "pixels": len(pairs)}
+    n, worst = len(pairs) or math.nan, round(5000 * WORST_M)
+    errors = [min(abs(d - t), worst) if d else worst for d, t in pairs]
+    found = {"mae_m": sum(errors) / n / 5000, "rmse_m": math.sqrt(sum(e * e for e in errors) / n) / 5000}
+    found |= {"abs_rel": sum(min(abs(d - t) / t, 1) if d else 1 for d, t in pairs) / n}
+    found |= {"holes": (n - len(kept)) / n, "pixels": len(pairs)}
     found |= {f"within_{limit}mm": sum(e <= 5 * limit for e in errors) / n for limit in (1, 2, 5, 10)}
+    found["auc_50mm"] = sum(max(250 - e, 0) for e in errors) / 250 / n
     found |= {f"delta{k}": sum(4**k * max(each) < 5**k * min(each) for each in kept) / n for k in (1, 2, 3)}
     return {f"{name}.{metric}": value for metric, value in found.items()}
 
@@ -84,12 +86,19 @@ def test_colour_agrees_with_skimage_and_with_the_package_of_flip(cases):
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     for _ in range(cases):
         predicted, true = noisy_images(rng, 11, 60)
-        ours = score_colour(predicted, true)
-        agree(ours["psnr_db"], peak_signal_noise_ratio(true, predicted))
-        agree(ours["ssim"], structural_similarity(true, predicted, data_range=255, channel_axis=2, **window))
+        part = rng.random(true.shape[:2]) < 0.2
+        ours = score_colour(predicted, true, {"object": part, "none": part & ~part})
+        agree(ours["image.psnr_db"], peak_signal_noise_ratio(true, predicted))
+        agree(ours["object.psnr_db"], peak_signal_noise_ratio(true[part], predicted[part]))
+        ssim, likeness = structural_similarity(true, predicted, data_range=255, channel_axis=2, full=True, **window)
+        agree([ours["image.ssim"], ours["object.ssim"]], [ssim, likeness[part].mean()])
+        residuals = ((image[part] - image[part].mean(axis=0)).ravel() for image in (predicted, true))
+        agree(ours["object.ncc"], np.corrcoef(*residuals)[0, 1])
+        assert all(math.isnan(ours[f"none.{name}"]) for name in ("ncc", "psnr_db", "ssim"))
         floats = (image.astype(np.float32) / np.float32(255.0) for image in (true, predicted))
-        agree(ours["flip"], np.float64(flip_evaluator.evaluate(*floats, "LDR", applyMagma=False)[0]).mean())
-        assert math.isnan(ours["ms_ssim"]) and score_colour(predicted, true, flip=False)["flip"] is None
+        agree(ours["image.flip"], np.float64(flip_evaluator.evaluate(*floats, "LDR", applyMagma=False)[0]).mean())
+        assert math.isnan(ours["image.ms_ssim"])
+        assert score_colour(predicted, true, {}, flip=False)["image.flip"] is None
 
 
 @cases_each
@@ -97,7 +106,8 @@ def test_ms_ssim_is_the_published_product_of_five_scales(cases):
     rng = np.random.default_rng(3)
     for _ in range(cases):
         predicted, true = noisy_images(rng, 176, 200)
-        agree(score_colour(predicted, true)["ms_ssim"], ms_ssim_by_hand(predicted.astype(float), true.astype(float)))
+        ours = score_colour(predicted, true, {})["image.ms_ssim"]
+        agree(ours, ms_ssim_by_hand(predicted.astype(float), true.astype(float)))
 
 
 def ms_ssim_by_hand(a, b):
@@ -385,11 +395,13 @@ def test_a_true_shape_scores_nothing_but_full_marks(mesh):
 def test_true_images_volumes_and_poses_score_nothing_but_full_marks():
     rng = np.random.default_rng(10)
     depth, image = rng.uniform(0.5, 3.0, (180, 200)), rng.integers(0, 256, (180, 200, 3), dtype=np.uint8)
-    ours = score_depth(depth, depth, {"scene": depth > 0})
+    ours = score_depth(depth, depth, {"scene": depth > 0}, WORST_M)
     assert [ours.pop(f"scene.{name}") for name in ("mae_m", "rmse_m", "abs_rel", "holes")] == [0.0] * 4
     assert set(ours.values()) == {1.0, depth.size}
     for same in (image, image * 0, image * 0 + 255):
-        assert score_colour(same, same) == {"psnr_db": math.inf, "ssim": 1.0, "ms_ssim": 1.0, "flip": 0.0}
+        ours = score_colour(same, same, {"object": depth > 1.0})
+        assert [ours.pop(f"{part}.psnr_db") for part in ("image", "object")] == [math.inf] * 2
+        assert ours.pop("image.flip") == 0.0 and list(ours.values()) == pytest.approx([1.0] * 4, abs=1e-12)
     T = rigid(rng, 1.0, 0.1)
     T[2, 3] = 1.0
     assert max(score_pose(T, T, rng.normal(size=(9, 3)) * 0.1, [], K).values()) < 1e-9
@@ -400,14 +412,16 @@ def test_what_cannot_be_scored_is_nan_or_none_and_counts_of_misses_stay():
     none, ones = np.zeros((4, 5)), np.ones((4, 5))
     everywhere = {"scene": ones > 0, "empty": none > 0}
     for holes in (none, ones * math.nan, -ones, ones * math.inf):
-        ours = score_depth(holes, ones, everywhere)
-        assert math.isnan(ours["scene.mae_m"]) and ours["scene.holes"] == 1.0 and ours["scene.within_10mm"] == 0.0
-        blind = score_depth(ones, holes, everywhere)
+        ours = score_depth(holes, ones, everywhere, WORST_M)
+        assert ours["scene.mae_m"] == WORST_M and ours["scene.holes"] == 1.0 and ours["scene.within_10mm"] == 0.0
+        blind = score_depth(ones, holes, everywhere, WORST_M)
         for part, found in (("scene", blind), ("empty", ours)):
             values = {name: value for name, value in found.items() if name.startswith(part)}
             assert values.pop(f"{part}.pixels") == 0.0 and np.isnan(list(values.values())).all()
     image = np.zeros((20, 20, 3), np.uint8)
-    assert np.isnan(list(score_colour(image[:0], image[:0]).values())).all()
+    assert np.isnan(list(score_colour(image[:0], image[:0], {}).values())).all()
+    grey = score_colour(image + 128, image + np.arange(20, dtype=np.uint8)[:, None], {"object": image[..., 0] == 0})
+    assert grey["object.ncc"] == 0.0
     box = SHAPES["torus"]
     bad = box.vertices * np.where(np.arange(len(box.vertices)) == 3, math.nan, 1.0)[:, None]
     flat, gone = Mesh(box.vertices * 0, box.faces), Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -431,6 +445,26 @@ def test_what_cannot_be_scored_is_nan_or_none_and_counts_of_misses_stay():
     assert math.isnan(score_pose(T, behind, points, [], K)["mspd_px"])
     blank = score_pose(T, T, points[:0], [], K)
     assert blank.pop("rotation_deg") == blank.pop("translation_m") == 0.0 and np.isnan(list(blank.values())).all()
+
+
+def test_depth_is_inverted_only_where_that_of_the_object_is_too():
+    true = np.random.default_rng(13).uniform(1.0, 3.0, (20, 30))
+    mask = np.zeros(true.shape, np.bool_)
+    mask[5:15, 5:15] = True
+    with pytest.raises(InputError, match="inverted"):
+        check_depth(1.0 / true, true, None, mask)
+    check_depth(np.where(mask, true, 1.0 / true), true, None, mask)  # of what is about the object nothing is known
+
+
+@pytest.mark.parametrize("volume", ["told", "occupancy", "logits", "sdf", "sdf-positive-inside"])
+def test_values_of_a_volume_are_what_the_command_says(volume, tmp_path):
+    true = np.random.default_rng(14).normal(size=500) * 0.02
+    stored = {"volume_points": np.zeros((500, 3)), "volume_distance": true, "volume_occupancy": true < 0.0}
+    values = {"logits": -500.0 * true, "sdf-positive-inside": -true, "occupancy": true < 0.0}
+    np.save(tmp_path / "1.npy", values.get(volume, true))
+    scores, _ = read_volume(tmp_path / "1.npy", 3, stored, None, Asked(("volume",), volume=volume))()
+    assert scores["iou"] == scores["accuracy"] == 1.0
+    assert scores["distance_mae_m"] == (None if volume in ("logits", "occupancy") else pytest.approx(0.0))
 
 
 def test_distances_of_another_unit_or_sign_and_logits_are_told_and_a_poor_guess_is_not():

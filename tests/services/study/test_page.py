@@ -100,6 +100,9 @@ def test_neither_a_panel_nor_a_cell_claims_what_intervals_do_not_tell():
         "a=2: 50% less, 0.7 times the time (0.686 to 0.714)"
     )
     assert question_of([row(scenes=3, depth_mm=0.1), better], "depth_mm") == asked
+    for tiny, said in ((1e-15, "2e-5 mm"), (0.01, "0.01 mm")):  # what is as good as none is not compared
+        answer = question_of([row(depth_mm=tiny), row("a=1", 0.5, depth_mm=tiny / 3)], "depth_mm")
+        assert answer == f"{asked}\nNothing to gain: the job's is at most {said}, as good as none."
     once = dataclasses.replace(few, ratio=1.09, ratio_least=-math.inf, ratio_most=math.inf)
     cells = {cells[0]: cells for cells in Reader(page_of(study(own, once), b"")).rows if len(cells) == 6}
     assert cells["a=3"][1] == "≈ 1.09 timesof one scene" and cells["a=3"][-1] == "0.001of 3 scenes"

@@ -22,7 +22,6 @@ from workers.assets.catalogue import (
     load_asset,
     open_cache,
     open_catalogue,
-    split_of,
 )
 
 BUILT_IN = ProceduralSource(source="procedural")
@@ -143,12 +142,12 @@ def test_an_opened_catalogue_travels_small_and_loads_the_same_asset_in_another_p
 
 def test_instances_fall_into_splits_by_their_shares_and_stay_there():
     shares = SplitShares(train=0.7, val=0.2, test=0.1)
-    splits = [split_of(f"mug-0-{k:06d}", shares) for k in range(20_000)]
+    splits = [shares.of(f"mug-0-{k:06d}") for k in range(20_000)]
     # Standard deviations of the three counts: 65, 57 and 42.
     for name, expected in (("train", 14_000), ("val", 4000), ("test", 2000)):
         assert splits.count(name) == pytest.approx(expected, abs=330)
-    assert splits[123] == split_of("mug-0-000123", shares)
-    assert {split_of(f"{k}", SplitShares(train=0, val=0, test=1)) for k in range(100)} == {"test"}
+    assert splits[123] == shares.of("mug-0-000123")
+    assert {SplitShares(train=0, val=0, test=1).of(f"{k}") for k in range(100)} == {"test"}
 
 
 def make(name):

@@ -73,16 +73,12 @@ def test_a_shape_comes_back_from_its_glb_as_it_was_but_for_the_rounding_of_float
         assert (one.material.texture == two.material.texture).all()
         assert one.material.base_color == pytest.approx(two.material.base_color, abs=1e-12)
         assert np.abs(one.uv - two.uv).max() < 1e-6 and not one.vertices.flags.writeable
-    small = load(library, row, replace_settings(diagonal_m=0.05), density_kg_m3=1200.0)
+    small = load(library, row, SETTINGS.model_copy(update={"diagonal_m": 0.05}), density_kg_m3=1200.0)
     factor = 0.05 / float(np.linalg.norm(there.extents_m))
     assert float(np.linalg.norm(small.extents_m)) == pytest.approx(0.05)
     assert small.mass.mass_kg == pytest.approx(2.0 * factor**3 * there.mass.mass_kg)
     assert small.mass.inertia == pytest.approx(2.0 * factor**5 * there.mass.inertia)
     assert small.volume_m3 == pytest.approx(factor**3 * there.volume_m3)
-
-
-def replace_settings(**keys):
-    return SETTINGS.model_copy(update=keys)
 
 
 def test_what_a_person_edits_stays_when_the_folder_is_read_again_and_a_changed_source_is_noticed(tmp_path):
@@ -229,11 +225,14 @@ def test_a_table_that_makes_no_sense_is_told_in_a_line(tmp_path):
 def test_two_makers_of_a_library_a_full_disk_and_a_folder_that_changes_are_told_and_leave_nothing(
     tmp_path, monkeypatch
 ):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
     write(tmp_path / "in/mug/a.obj", TALL)
     with locked(tmp_path / "lib", wait=False), pytest.raises(InUseError, match="another `verso init`"):
         init(tmp_path / "in", tmp_path / "lib")
     with monkeypatch.context() as patch:
-        patch.setattr(table.Path, "write_bytes", _full)
+        patch.setattr(table.Path, "write_bytes", full)
         with pytest.raises(OutputError, match=r"library.parquet cannot be written: No space"):
             init(tmp_path / "in", tmp_path / "new")
         assert not (tmp_path / "new").exists()
@@ -245,10 +244,6 @@ def test_two_makers_of_a_library_a_full_disk_and_a_folder_that_changes_are_told_
     write(tmp_path / "in/mug/a.obj", CUBE)
     ((_, answer),) = make_shapes(library, library.rows)
     assert (answer.reason, answer.kind) == ("changed", "environmental") and "verso init" in answer.detail
-
-
-def _full(*_):
-    raise OSError(28, "No space left on device")
 
 
 def test_a_large_collection_is_listed_and_not_read(tmp_path, monkeypatch):

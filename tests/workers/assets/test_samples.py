@@ -76,14 +76,11 @@ def errors_of(one: Asset) -> tuple[float, float]:
     points, signed, occupied = (drawn[f"volume_{name}"][::10] for name in ("points", "distance", "occupancy"))
     assert ((signed < 0.0) == occupied).all()
     assert 0.05 < occupied[len(points) // 2 :].mean() < 0.95, "points near the surface lie on both sides"
-    exact, solid = (find(points.astype(np.float64), mesh) for find in (distances_to_mesh, inside_solid))
+    points = points.astype(np.float64)
+    exact, solid = distances_to_faces(points, mesh.triangles), inside_solid(points, mesh)
     return float(np.abs(signed - np.where(solid, -exact, exact)).max()), float(
         exact[occupied != solid].max(initial=0.0)
     )
-
-
-def distances_to_mesh(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
-    return distances_to_faces(points, mesh.triangles)
 
 
 @pytest.mark.parametrize("category", FEW)

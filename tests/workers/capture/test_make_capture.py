@@ -19,7 +19,7 @@ from schemas.scene.scene import SceneOutput
 from schemas.scene.view import Camera, Intrinsics
 from tests.captures import captures_job, exact_capture, rolled_pose, use_exact_captures, write_folder
 from tests.workers.capture.simulated import box, copy_of
-from workers.assets.catalogue import open_catalogue, split_of
+from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb, read_shape
 from workers.capture import make_capture
 from workers.capture.folder import open_folder, read_truth, write_pose
@@ -205,10 +205,8 @@ def test_quality_columns_are_those_of_the_used_views_and_errors_are_absent_witho
 def test_captures_of_one_object_are_different_assets_of_one_split(context):
     rows = [row for n in range(6) for row in rows_of(context, scene_id=n)["assets"] if row["category"] == "mug"]
     split = context.job.assets.split
-    assert len({row["instance_id"] for row in rows}) == 6 and {row["split"] for row in rows} == {
-        split_of("mug-0", split)
-    }
-    assert len({split_of(f"mug-0-{n:05d}", split) for n in range(40)}) > 1  # captures of one object would leak
+    assert len({row["instance_id"] for row in rows}) == 6 and {row["split"] for row in rows} == {split.of("mug-0")}
+    assert len({split.of(f"mug-0-{n:05d}") for n in range(40)}) > 1  # captures of one object would leak
 
 
 # ---------------------------------------------------------------------------------------------- the list of steps

@@ -221,10 +221,6 @@ def photograph(T_board_cam: np.ndarray) -> np.ndarray:
     return rgb
 
 
-def depth_bytes(T_board_cam: np.ndarray) -> bytes:
-    return np.rint(true_depth("depth", T_board_cam)[0] * 1000.0).astype(">u2").tobytes()
-
-
 def color_bytes(rgb: np.ndarray, fourcc: str) -> bytes:
     if fourcc == "MJPG":
         return cv2.imencode(".jpg", rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
@@ -245,7 +241,8 @@ def frames(count: int, fourcc: str = "MJPG") -> tuple[list[tuple[int, bytes]], l
     for i, T in enumerate(poses(count)):
         stamp = START_US + i * PERIOD_US
         color.append((stamp, color_bytes(photograph(T), fourcc)))
-        depth.append((stamp + DEPTH_DELAY_US, depth_bytes(T)))
+        depth_mm = np.rint(true_depth("depth", T)[0] * 1000.0).astype(">u2")
+        depth.append((stamp + DEPTH_DELAY_US, depth_mm.tobytes()))
     return color, depth
 
 

@@ -24,6 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from schemas.capture import DepthCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
+from tests.workers.door.oracles import write
 from tests.workers.door.recordings import recording
 from workers.capture.folder import CaptureFile, open_folder, read_view
 from workers.capture.import_recording import import_recording
@@ -52,11 +53,6 @@ def jpg(pixels):
     )[1].tobytes()
 
 
-def put(path, data):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data.encode() if isinstance(data, str) else data)
-
-
 # ---------------------------------------------------------------------------------------------- what is written
 
 
@@ -69,10 +65,10 @@ def write_tum(path, units_per_mm=5):
     for kind, late_us in (("rgb", 0), ("depth", 7_000)):
         stamps = [t + late_us for t in STAMPS_US]
         lines = [f"# {kind} images", *(f"{t / 1e6:.6f} {kind}/{t / 1e6:.6f}.png" for t in stamps)]
-        put(path / f"{kind}.txt", "\n".join(lines) + "\n")
+        write(path / f"{kind}.txt", "\n".join(lines) + "\n")
         for n, t in enumerate(stamps):
             pixels = SMOOTH[n] if kind == "rgb" else DEPTH_MM[n] * units_per_mm
-            put(path / kind / f"{t / 1e6:.6f}.png", png(pixels.repeat(TUM_STEP, axis=0).repeat(TUM_STEP, axis=1)))
+            write(path / kind / f"{t / 1e6:.6f}.png", png(pixels.repeat(TUM_STEP, axis=0).repeat(TUM_STEP, axis=1)))
     return path
 
 
@@ -80,20 +76,20 @@ def write_bop(path):
     cameras = {}
     for n in range(COUNT):
         cameras[str(n)] = {"cam_K": [FX + n, 0, CX, 0, FY + n, CY, 0, 0, 1], "depth_scale": 0.1}
-        put(path / "rgb" / f"{n:06d}.png", png(SMOOTH[n]))
-        put(path / "depth" / f"{n:06d}.png", png(DEPTH_MM[n] * 10))
-    put(path / "scene_camera.json", json.dumps(cameras))
+        write(path / "rgb" / f"{n:06d}.png", png(SMOOTH[n]))
+        write(path / "depth" / f"{n:06d}.png", png(DEPTH_MM[n] * 10))
+    write(path / "scene_camera.json", json.dumps(cameras))
     return path
 
 
 def write_open3d(path):
-    put(
+    write(
         path / "intrinsic.json",
         json.dumps({"width": W, "height": H, "intrinsic_matrix": [FX, 0, 0, 0, FY, 0, CX, CY, 1]}),
     )
     for n in range(COUNT):
-        put(path / "color" / f"{n:05d}.jpg", jpg(SMOOTH[n]))
-        put(path / "depth" / f"{n:05d}.png", png(DEPTH_MM[n]))
+        write(path / "color" / f"{n:05d}.jpg", jpg(SMOOTH[n]))
+        write(path / "depth" / f"{n:05d}.png", png(DEPTH_MM[n]))
     return path
 
 
@@ -105,6 +101,7 @@ def write_record3d(path, **changes):
     own = [[FX + n, FY + n, CX, CY] for n in range(COUNT)]
     metadata = {"w": W, "h": H, "dw": DW, "dh": DH, "fps": 30, "K": [FX, 0, 0, 0, FY, 0, CX, CY, 1]}
     metadata |= {"perFrameIntrinsicCoeffs": own, "frameTimestamps": [n / 30 for n in range(COUNT)]} | changes
+    path.mkdir(exist_ok=True)
     with zipfile.ZipFile(path / "shot.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("metadata", json.dumps(metadata))
         for n in range(COUNT):
@@ -115,29 +112,20 @@ def write_record3d(path, **changes):
 
 def write_polycam(path):
     for n in range(COUNT):
-        camera = {
-            "fx": FX + n,
-            "fy": FY + n,
-            "cx": CX,
-            "cy": CY,
-            "width": W,
-            "height": H,
-            "t_00": 1.0,
-            "blur_score": 90.0,
-        }
-        put(path / "keyframes" / "cameras" / f"{638443502 + n * 33_333}.json", json.dumps(camera))
-        put(path / "keyframes" / "images" / f"{638443502 + n * 33_333}.jpg", jpg(SMOOTH[n]))
+        camera = {"fx": FX + n, "fy": FY + n, "cx": CX, "cy": CY, "width": W, "height": H, "t_00": 1, "blur_score": 90}
+        write(path / "keyframes" / "cameras" / f"{638443502 + n * 33_333}.json", json.dumps(camera))
+        write(path / "keyframes" / "images" / f"{638443502 + n * 33_333}.jpg", jpg(SMOOTH[n]))
         small = np.rint(SMALL_M[n] * 1000).astype(np.uint16)
-        put(path / "keyframes" / "depth" / f"{638443502 + n * 33_333}.png", png(small))
+        write(path / "keyframes" / "depth" / f"{638443502 + n * 33_333}.png", png(small))
     return path
 
 
 def write_arkit(path):
     for n in range(COUNT):
         name, near = f"41069021_{305.377 + n / 30:.3f}", f"41069021_{305.376 + n / 30:.3f}"
-        put(path / "lowres_wide" / f"{name}.png", png(SMOOTH[n]))
-        put(path / "lowres_depth" / f"{name}.png", png(DEPTH_MM[n]))
-        put(path / "lowres_wide_intrinsics" / f"{near}.pincam", f"{W} {H} {FX + n} {FY + n} {CX} {CY}")
+        write(path / "lowres_wide" / f"{name}.png", png(SMOOTH[n]))
+        write(path / "lowres_depth" / f"{name}.png", png(DEPTH_MM[n]))
+        write(path / "lowres_wide_intrinsics" / f"{near}.pincam", f"{W} {H} {FX + n} {FY + n} {CX} {CY}")
     return path
 
 
@@ -183,6 +171,7 @@ def transform_message(T):
 
 
 COLOR, DEPTH = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
+INFO, IMAGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image"
 
 
 def realsense(lens=(0.0,) * 5, model="Brown Conrady"):
@@ -197,14 +186,14 @@ def recorded(pictures, unit_m, T_color_ref, **camera):
     k = {"k": camera["k"]} if "k" in camera else {}
     said = [
         ("/device_0/sensor_0/option/Depth Units/value", "std_msgs/msg/Float32", 0, struct.pack("<f", unit_m)),
-        (f"{COLOR}/info/camera_info", "sensor_msgs/msg/CameraInfo", 0, info(width, height, **camera)),
-        (f"{DEPTH}/info/camera_info", "sensor_msgs/msg/CameraInfo", 0, info(width, height, **k)),
+        (f"{COLOR}/info/camera_info", INFO, 0, info(width, height, **camera)),
+        (f"{DEPTH}/info/camera_info", INFO, 0, info(width, height, **k)),
         (f"{DEPTH}/tf/0", "geometry_msgs/msg/Transform", 0, transform_message(np.eye(4))),
         (f"{COLOR}/tf/0", "geometry_msgs/msg/Transform", 0, transform_message(T_color_ref)),
     ]
     for t, depth, rgb in pictures:
-        said.append((f"{DEPTH}/image/data", "sensor_msgs/msg/Image", t, image(t, "mono16", depth)))
-        said.append((f"{COLOR}/image/data", "sensor_msgs/msg/Image", t + 900, image(t + 900, "rgb8", rgb)))
+        said.append((f"{DEPTH}/image/data", IMAGE, t, image(t, "mono16", depth)))
+        said.append((f"{COLOR}/image/data", IMAGE, t + 900, image(t + 900, "rgb8", rgb)))
     return said
 
 
@@ -316,12 +305,7 @@ def test_every_frame_time_and_camera_is_what_was_written(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", WRITTEN)
 def test_a_recording_of_any_kind_becomes_a_folder(kind, tmp_path):
-    out = tmp_path / "capture"
-    out.mkdir()
-    made = import_recording(
-        WRITTEN[kind](tmp_path / "from" if kind != "record3d" else tmp_path), out, CaptureFile(name="x"), Board(), 9
-    )
-    folder = open_folder(out)
+    made, folder = imported(WRITTEN[kind](tmp_path / "from"), tmp_path / "capture")
     assert len(made.views) == made.frames == COUNT and folder.numbers == (0, 1, 2)
     assert (made.losses.dropped, made.losses.without_depth, made.losses.damaged, made.losses.cut) == (0, 0, 0, 0)
     for n in range(COUNT):
@@ -339,7 +323,7 @@ def imported(path, out, camera=None, **changes):
     if changes:
         camera = out.parent / f"{out.name}.json"
         spec = {"width": W, "height": H, "fx": FX, "fy": FY, "cx": CX, "cy": CY, "pixel_centre": "0"} | changes
-        put(camera, json.dumps(spec))
+        write(camera, json.dumps(spec))
     made = import_recording(path, out, CaptureFile(name="x"), Board(), 9, camera)
     return made, open_folder(out)
 
@@ -350,7 +334,7 @@ LENS = [0.1, -0.2, 1e-3, 2e-3, 0.05, 0.01, 0.02, 0.03, 1e-3, 1e-3, 1e-3, 1e-3]
 @pytest.mark.parametrize("kind", WRITTEN)
 def test_the_camera_of_a_file_takes_the_place_of_what_any_recording_says(kind, tmp_path):
     size = {"width": 640, "height": 480} if kind == "tum" else {}
-    path = WRITTEN[kind](tmp_path / "from" if kind != "record3d" else tmp_path)
+    path = WRITTEN[kind](tmp_path / "from")
     made, folder = imported(path, tmp_path / "c", **size, fx=70.0, cx=31.0, distortion=LENS[:8])
     assert (folder.stored.fx, folder.stored.cx, folder.stored.distortion) == (70.0, 31.0, LENS[:8])
     assert made.calibration == str(tmp_path / "c.json")
@@ -368,7 +352,7 @@ def test_the_camera_of_a_file_takes_the_place_of_what_any_recording_says(kind, t
 @pytest.mark.parametrize("kind", ["record3d", "polycam"])
 def test_depth_of_a_phone_is_seen_by_the_camera_of_the_file(kind, tmp_path):
     """The recording's own numbers in a file give what the recording gives."""
-    path = WRITTEN[kind](tmp_path / "from" if kind != "record3d" else tmp_path)
+    path = WRITTEN[kind](tmp_path / "from")
     keys, expected = (
         {"fx": FX + 1, "fy": FY + 1, "pixel_centre": "0.5"},
         read_view(imported(path, tmp_path / "a")[1], 1),
@@ -389,11 +373,11 @@ def test_a_folder_without_a_camera_asks_for_one_and_takes_no_one_elses(tmp_path)
         own.rename(path)
         own = path
         for file in path.glob("*/*.png"):
-            put(file, png(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[:240]))
+            write(file, png(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[:240]))
         with pytest.raises(CaptureError, match=more) as error:
             imported(path, tmp_path / f"no {name}")
         assert "--camera" in str(error.value) and "rename" not in str(error.value)
-    put(
+    write(
         own / "camera.json",
         json.dumps({"width": 640, "height": 240, "fx": 500, "fy": 500, "cx": 320, "cy": 120, "pixel_centre": "0"}),
     )
@@ -416,7 +400,7 @@ def test_folders_of_other_names_and_grey_pictures_are_read(tmp_path):
     path = write_open3d(tmp_path / "o")
     (path / "color").rename(path / "rgb")
     assert np.abs(frames_of(open_any(path))[0][2].load(False).astype(int) - SMOOTH[2]).max() <= JPEG_CODES
-    put(path / "intrinsic.json", (path / "intrinsic.json").read_text().replace('"width": 64', '"width": 32'))
+    write(path / "intrinsic.json", (path / "intrinsic.json").read_text().replace('"width": 64', '"width": 32'))
     with pytest.raises(CaptureError, match="is of 32 x 48, its images are 64 x 48: describe it in"):
         imported(path, tmp_path / "wrong")
     assert imported(path, tmp_path / "right", fx=66.0)[1].camera.intrinsics.fx == 66.0
@@ -424,7 +408,7 @@ def test_folders_of_other_names_and_grey_pictures_are_read(tmp_path):
     for file in sorted(path.glob("*/*.png")):
         folder, pixels = file.parent.name, cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         grey = pixels[..., 1] if folder == "rgb" else pixels
-        put(path / {"rgb": "gray"}.get(folder, folder) / f"{file.stem}.tif", cv2.imencode(".tif", grey)[1].tobytes())
+        write(path / {"rgb": "gray"}.get(folder, folder) / f"{file.stem}.tif", cv2.imencode(".tif", grey)[1].tobytes())
         file.unlink()
     color, depth = frames_of(open_any(path))
     assert np.array_equal(color[1].load(False), SMOOTH[1][..., 1:2].repeat(3, axis=2))
@@ -443,7 +427,7 @@ def test_depth_of_the_lowest_confidence_is_none(kind, tmp_path):
     else:
         for n, file in enumerate(sorted(path.rglob("*depth/*.png"))):
             levels = np.array([0, 127, 255] if kind == "polycam" else [0, 1, 2], np.uint8)
-            put(file.parents[1] / "confidence" / file.name, png(levels[sure[n]]))
+            write(file.parents[1] / "confidence" / file.name, png(levels[sure[n]]))
     for n, frame in enumerate(frames_of(open_any(path))[1]):
         assert np.array_equal(frame.load(False), np.where(sure[n] > 0, before[n], 0.0))
 
@@ -455,14 +439,11 @@ def test_a_focal_length_that_changes_is_made_one(tmp_path):
     for n, f in enumerate(focal):
         x = (np.arange(W) - CX) / f
         ramp = np.repeat(np.clip(128 + 200 * x, 0, 255)[None, :], H, axis=0)
-        put(tmp_path / "rgb" / f"{n:06d}.png", png(np.repeat(np.rint(ramp).astype(np.uint8)[..., None], 3, axis=2)))
-        put(tmp_path / "depth" / f"{n:06d}.png", png(np.full((H, W), 1000, np.uint16)))
+        write(tmp_path / "rgb" / f"{n:06d}.png", png(np.repeat(np.rint(ramp).astype(np.uint8)[..., None], 3, axis=2)))
+        write(tmp_path / "depth" / f"{n:06d}.png", png(np.full((H, W), 1000, np.uint16)))
         cameras[str(n)] = {"cam_K": [f, 0, CX, 0, f, CY, 0, 0, 1], "depth_scale": 1.0}
-    put(tmp_path / "scene_camera.json", json.dumps(cameras))
-    out = tmp_path / "capture"
-    out.mkdir()
-    import_recording(tmp_path, out, CaptureFile(name="x"), Board(), 9)
-    folder = open_folder(out)
+    write(tmp_path / "scene_camera.json", json.dumps(cameras))
+    _, folder = imported(tmp_path, tmp_path / "capture")
     views = [read_view(folder, n).rgb[5:-5, 5:-5, 0].astype(int) for n in range(3)]
     assert folder.camera.intrinsics.fx == 63.0
     assert np.abs(views[0] - views[1]).max() <= 1 and np.abs(views[2] - views[1]).max() <= 1
@@ -493,7 +474,7 @@ def as_texts(said):
     texts = {"/device_0/sensor_0/option/Depth_Units/value": "0.000100", f"{COLOR}/image/metadata": "timestamp=1;;a"}
     for stream, T in ((COLOR, T_COLOR_REF), (DEPTH, T_DEPTH_REF)):
         texts |= {f"{stream}/camera_info": camera, f"{stream}/tf/ref_0": places(T)}
-    images = [message for message in said if message[1] == "sensor_msgs/msg/Image"]
+    images = [message for message in said if message[1] == IMAGE]
     return [(topic, "std_msgs/msg/String", 0, block(text)) for topic, text in texts.items()] + images
 
 
@@ -515,10 +496,7 @@ def test_colour_is_the_same_in_every_encoding_of_the_sdk_and_of_ros(name, tmp_pa
     codes = {"bgr8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGB2RGBA}
     packed = cv2.COLOR_RGB2YUV_YUY2 if "yuy" in name.lower() else cv2.COLOR_RGB2YUV_UYVY
     pixels = cv2.cvtColor(SMOOTH[0], codes.get(name, packed))
-    said = [
-        m if "Color" not in m[0] or m[1] != "sensor_msgs/msg/Image" else (*m[:3], image(0, name, pixels))
-        for m in realsense()
-    ]
+    said = [m if "Color" not in m[0] or m[1] != IMAGE else (*m[:3], image(0, name, pixels)) for m in realsense()]
     color, _ = frames_of(open_any(write_bag(tmp_path, said)))
     assert np.abs(color[0].load(False).astype(int) - SMOOTH[0]).mean() < (4 if name not in codes else 0.1)
 
@@ -540,19 +518,12 @@ def test_the_inverse_lens_of_a_realsense_is_where_its_sdk_projects_a_point(tmp_p
 def test_a_drivers_bag_needs_depth_registered_to_colour(tmp_path):
     def published(depth_topic):
         said = [
-            (
-                "/camera/color/camera_info",
-                "sensor_msgs/msg/CameraInfo",
-                0,
-                info(W, H, (0.1, -0.2, 1e-3, 0, 0.05), "plumb_bob"),
-            ),
-            (f"/camera/{depth_topic}/camera_info", "sensor_msgs/msg/CameraInfo", 0, info(W, H)),
+            ("/camera/color/camera_info", INFO, 0, info(W, H, (0.1, -0.2, 1e-3, 0, 0.05), "plumb_bob")),
+            (f"/camera/{depth_topic}/camera_info", INFO, 0, info(W, H)),
         ]
         for n, t in enumerate(STAMPS_US):
-            said.append(("/camera/color/image_raw", "sensor_msgs/msg/Image", t, image(t, "bgr8", SMOOTH[n][..., ::-1])))
-            said.append(
-                (f"/camera/{depth_topic}/image_raw", "sensor_msgs/msg/Image", t, image(t, "16UC1", DEPTH_MM[n]))
-            )
+            said.append(("/camera/color/image_raw", IMAGE, t, image(t, "bgr8", SMOOTH[n][..., ::-1])))
+            said.append((f"/camera/{depth_topic}/image_raw", IMAGE, t, image(t, "16UC1", DEPTH_MM[n])))
         return said
 
     recording = open_any(write_bag(tmp_path, published("aligned_depth_to_color")))
@@ -597,7 +568,7 @@ def test_what_cannot_be_read_is_named_in_one_line(tmp_path):
         ("a.bag", b"", "has no bytes"),
         ("b.mkv", recording(1).replace(b"V_MS/VFW/FOURCC", b"V_XX/XXX/XXXXXX"), "b.mkv cannot be read: "),
     ):
-        put(tmp_path / name, data)
+        write(tmp_path / name, data)
         refused(tmp_path / name, told)
     refused(tmp_path / "none", "no such file or folder")
     refused(tmp_path, "none of the formats")
@@ -606,7 +577,7 @@ def test_what_cannot_be_read_is_named_in_one_line(tmp_path):
 def test_hostile_folders_end_in_one_line(tmp_path):
     def changed(kind, name, data, told):
         path = WRITTEN[kind](tmp_path / str(len(list(tmp_path.iterdir()))))
-        put(path / name, data)
+        write(path / name, data)
         refused(path, told)
 
     K = [FX, 0, CX, 0, FY, CY, 0, 0, 1]
@@ -657,7 +628,7 @@ def test_hostile_archives_end_in_one_line(tmp_path):
         refused(write_record3d(tmp_path, **changes), told)
     whole = write_record3d(tmp_path).read_bytes()
     for data in (whole[: len(whole) // 2], whole[:100]):
-        put(tmp_path / "cut.r3d", data)
+        write(tmp_path / "cut.r3d", data)
         refused(tmp_path / "cut.r3d", "none of the formats")
     with zipfile.ZipFile(tmp_path / "bomb.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("metadata", b"0" * 300_000_000)

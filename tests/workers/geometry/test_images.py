@@ -133,16 +133,13 @@ def test_the_cosine_is_that_of_the_planes_normal_and_nan_beside_a_hole_or_anothe
     hole, other = PLANE.copy(), ONE.copy()
     hole[5, 7], other[4, 6] = 0.0, 2
     assert np.isnan(facing(hole)).all() and np.isnan(facing(PLANE, other)).all()
-
-
-def test_a_surface_faces_the_side_it_is_seen_from():
     view = plane_view("input", PLANE_HERE)
     depth, every, eye = view.depth / 5000, np.arange(view.depth.size), PLANE_HERE.position
     above, below = (
         facing_cosine(depth, view.region, every, PLANE_HERE, at)
         for at in (eye + np.array([0, 0, 3.0]), np.array([0.3, 0.2, -2.0]))
     )
-    assert np.nanmin(above) > 0.3 and np.nanmax(below) < 0
+    assert np.nanmin(above) > 0.3 and np.nanmax(below) < 0, "it faces the side that it is seen from"
 
 
 def test_a_plane_is_smooth_and_a_step_is_not():

@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.errors import SettleError
 from schemas.job.job import Job
 from schemas.job.views import Images, Patch
 from schemas.scene.view import Camera, Intrinsics, ObjectLabel, Pair, View
 from tests.effects.scenes import Made, Setting, make
 from tests.workers.render.random_scenes import built_in_assets
 from workers.scene.context import Stopwatch, open_worker
-from workers.scene.rows import encode_view, failed_scene, image_boxes, object_labels, timing_row
+from workers.scene.rows import encode_view, image_boxes, object_labels, timing_row
 from workers.store.images import decode_png
 from workers.store.manifest import table_of_rows
 
@@ -31,17 +30,6 @@ def three() -> Made:
     return make(Setting({"objects_per_scene": 3}))
 
 
-# ---------------------------------------------------------------------------------------------- steps
-
-
-def test_pose_ids_are_arithmetic_and_every_view_names_its_input():
-    made = make(Setting({"pairs_per_scene": 2}, scene_id=3))
-    ids = [[(view.role, view.pose_id, view.parent_id) for view in pair.views] for pair in made.scene.pairs]
-    assert ids == [[("input", n, n), ("aligned", n, n), ("mirror", n + 1, n), ("projected", n, n)] for n in (12, 14)], (
-        "pair k of scene 3 has the even id 2 (2 * 3 + k)"
-    )
-
-
 # ---------------------------------------------------------------------------------------------- rows
 
 
@@ -50,14 +38,6 @@ def test_a_projected_view_has_no_object_columns_and_the_table_no_patch(three):
     assert projected["object_pixels"] is projected["visible_fraction"] is projected["patch_object_fraction"] is None
     shares = [(row["region_id"] == 2, row["patch_object_fraction"]) for row in three.rows["objects"]]
     assert {share for is_table, share in shares if is_table} == {None} and any(share for _, share in shares)
-
-
-def test_a_failed_scene_is_one_row():
-    output = failed_scene(7, "mug", SettleError("left_table", "it rolled off"), attempts=2)
-    assert output.files == ()
-    (row,) = table_of_rows("failures", output.rows["failures"]).to_pylist()
-    assert (row["scene_id"], row["stage"], row["kind"], row["reason"]) == (7, "settle", "intrinsic", "left_table")
-    assert (row["detail"], row["attempts"]) == ("it rolled off", 2)
 
 
 def test_stages_and_effects_add_up_also_of_a_block_that_raises_and_a_row_has_their_seconds():

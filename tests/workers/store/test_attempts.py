@@ -11,7 +11,7 @@ from schemas.dataset.tables import TABLES
 from schemas.errors import RunError
 from schemas.scene.scene import SceneOutput, encoded_file
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms, with_shapes
-from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, retry_of_attempt
+from workers.store.attempt import attempts_at, begin_attempt, blamed_scene
 from workers.store.commit import committed_files, read_record
 from workers.store.local import LocalStage
 from workers.store.manifest import decode_table
@@ -60,13 +60,6 @@ def test_the_rows_of_a_range_are_sorted_whatever_their_order_in_a_scene(store):
     keys = list(zip(*(rows.column(name).to_pylist() for name in ("pose_id", "role", "region_id")), strict=True))
     assert keys == sorted(keys)
     assert attempt_at(store, 0, 4).commit().conflict is None
-
-
-def test_attempts_at_one_range_never_share_a_folder(store):
-    names = {begun(store).name for _ in range(20)}
-    assert len(names) == 20 and {retry_of_attempt(name) for name in names} == {0}
-    retry = begin_attempt(store, Span(start=0, stop=2, retry=3, scenes=(1,)), terms())
-    assert retry_of_attempt(retry.name) == 3 and retry_of_attempt("something") is None
 
 
 def test_a_scene_that_breaks_the_schema_or_disagrees_with_its_files_is_refused_and_writes_nothing(store):

@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import subprocess
 import tempfile
 from types import SimpleNamespace
 
@@ -23,10 +22,6 @@ from workers.store.local import LocalStore
 MANY = [f"c{number}/patches/x" for number in range(4)]
 
 
-def place_of(descriptor: int) -> str:
-    return os.readlink(f"/proc/self/fd/{descriptor}")
-
-
 def test_without_syncfs_every_folder_is_flushed_and_with_it_the_file_system_once(tmp_path, monkeypatch):
     """That each file is flushed then, too, is in tests/chaos/test_crashes.py."""
     flushed: list[str] = []
@@ -38,7 +33,7 @@ def test_without_syncfs_every_folder_is_flushed_and_with_it_the_file_system_once
     assert flushed[-1] == str(tmp_path)
     flushed.clear()
     monkeypatch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
-    monkeypatch.setattr(file_system, "_syncfs", lambda descriptor: flushed.append(place_of(descriptor)))
+    monkeypatch.setattr(file_system, "_syncfs", lambda fd: flushed.append(os.readlink(f"/proc/self/fd/{fd}")))
     LocalStore(tmp_path).sync(MANY)
     assert flushed == [str(tmp_path)]
 
@@ -77,24 +72,6 @@ def test_a_file_system_that_is_not_safe_is_refused_by_name_and_a_full_one_is_tol
         store.put_if_absent("manifest/_commits/a.json", b"x")
     with pytest.raises(FileExistsError), explain_disk_errors("a file could not be written"):
         raise FileExistsError(17, "nobody can mend this")
-
-
-@pytest.mark.root
-def test_a_real_vfat_is_refused(tmp_path):
-    image, mount = tmp_path / "image", tmp_path / "mount"
-    mount.mkdir()
-    image.write_bytes(bytes(8 << 20))
-    made = [["mkfs.vfat", str(image)], ["mount", "-o", "loop", str(image), str(mount)]]
-    try:
-        for command in made:
-            subprocess.run(command, check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError) as error:
-        pytest.skip(f"no vfat can be mounted here: {error}")
-    try:
-        with pytest.raises(OutputError, match=r"vfat.*hard link"):
-            LocalStore(mount / "out").prepare()
-    finally:
-        subprocess.run(["umount", str(mount)], check=True)
 
 
 def test_a_temporary_folder_stays_while_another_process_looks_and_goes_where_its_own_is_gone(tmp_path, monkeypatch):

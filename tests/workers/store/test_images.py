@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from schemas.errors import CorruptError
-from tests.kit.encoded_digests import digests, render, save_sources
+from tests.kit.encoded_digests import digests, render
 from workers.store.images import decode_png, encode_mask, encode_png
 
 SIDES = st.integers(1, 9)
@@ -108,8 +108,8 @@ def drawn() -> list[np.ndarray]:
 )
 @pytest.mark.timeout(3_600)
 def test_two_processes_encode_alike_in_any_order_whatever_is_left_in_memory(tmp_path, images, make):
-    sources, files = tmp_path / "sources.npy", [tmp_path / "forward.npy", tmp_path / "backward.npy"]
-    save_sources(sources, make())
+    sources, files = tmp_path / "sources.npz", [tmp_path / "forward.npy", tmp_path / "backward.npy"]
+    np.savez(sources, *make())
     for file, more in zip(files, ([], ["backward"]), strict=True):
         command = [sys.executable, "-m", "tests.kit.encoded_digests", str(sources), str(file), str(images), *more]
         # glibc fills whatever is allocated or freed, in the second process alone.

@@ -1,0 +1,196 @@
+"""Edge: `verso score merge` makes one table of several scores, and says who is surely better than whom.
+
+Runs are compared scene by scene: Wilcoxon's signed-rank test of the means over a scene's items, with Holm's correction over all
+pairs of runs and metrics (Demsar 2006, sections 3.1.3 and 3.2.2). A run that leaves anything out is in the table, and is not
+compared.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from scipy.stats import wilcoxon
+
+from schemas.base import Array
+from schemas.errors import InputError
+from services.run.progress import finish
+from services.score.command import SHOWN, covered, in_words, interval, read_score, require_alike, words, write_text
+from services.score.summary import Figure, is_better_high, items_of, scenes_of, summarise, values_of
+
+LEVEL: Final = 0.05
+"""Of the whole family of comparisons."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """0 where every run is whole. Raises InputError where runs are not scored, or not alike."""
+    scores = {_name(run, options.runs): read_score(options.out, run) for run in options.runs}
+    if len(scores) < len(options.runs):
+        raise InputError("a run is named twice")
+    (first, (_, head)), *others = scores.items()
+    for name, (_, other) in others:
+        require_alike(options.out, first, head, name, other)
+    summaries = {name: summarise(table) for name, (table, _) in scores.items()}
+    metrics = [name for name in SHOWN if any(_figure(one, name) for one in summaries.values())]
+    verdicts = compare_all({name: items_of(table) for name, (table, _) in scores.items()}, summaries, metrics)
+    options.target.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.Table.from_pylist([*_rows(summaries, metrics)]), options.target / "leaderboard.parquet")
+    tables, told = [*_markdown(summaries, metrics)], describe_verdicts(verdicts, summaries)
+    write_text(options.target / "leaderboard.md", "\n\n".join([tables[0], told, *tables[1:]]) + "\n")
+    write_text(options.target / "leaderboard.tex", "\n\n".join(_latex(summaries, metrics)) + "\n")
+    print(f"{tables[0]}\n\n{told}\n\nby category: {options.target / 'leaderboard.md'}")
+    whole = all(
+        figure["coverage"] == 1.0 for one in summaries.values() for figure in map(one["metrics"].get, metrics) if figure
+    )
+    return finish(options, whole, runs=[*summaries], verdicts=verdicts, folder=str(options.target))
+
+
+def _name(run: Path, runs: Sequence[Path]) -> str:
+    """The last parts of a run's path that tell it from the others."""
+    parts = run.parts[:-1] if run.name == "score" else run.parts
+    others = [other.parts for other in runs if other != run]
+    for count in range(1, len(parts)):
+        if all(other[-count:] != parts[-count:] for other in others):
+            return "/".join(parts[-count:])
+    return str(run)
+
+
+def _figure(summary: Mapping[str, Any], name: str) -> Figure | None:
+    figure = summary["metrics"].get(name)
+    return figure if figure and figure["items"] else None
+
+
+def compare_all(
+    tables: Mapping[str, pa.Table], summaries: Mapping[str, Any], metrics: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Each pair of whole runs by each metric: `metric`, `a`, `b`, `p` by Holm, and the `better`, None where that is not sure."""
+    verdicts: list[dict[str, Any]] = []
+    for metric in metrics:
+        whole = [
+            name for name, one in summaries.items() if (figure := _figure(one, metric)) and figure["coverage"] == 1.0
+        ]
+        means = {name: scene_means(tables[name], metric) for name in whole}
+        for a, b in combinations(whole, 2):
+            difference = means[b] - means[a]
+            difference = difference[np.isfinite(difference)]
+            p = float(wilcoxon(difference).pvalue) if difference.any() else 1.0
+            better = b if (difference.mean() > 0.0) == is_better_high(metric) else a
+            verdicts.append({"metric": metric, "a": a, "b": b, "p": p, "better": better})
+    corrected = holm([verdict["p"] for verdict in verdicts])
+    return [
+        {**verdict, "p": p, "better": verdict["better"] if p < LEVEL else None}
+        for verdict, p in zip(verdicts, corrected, strict=True)
+    ]
+
+
+def scene_means(table: pa.Table, metric: str) -> Array:
+    """[S] the mean over the items of each scene, by the order of scenes; nan of one without any."""
+    values, scenes = values_of(table, metric), scenes_of(table)
+    known = np.isfinite(values)
+    sums, counts = (np.bincount(scenes[known], weights, scenes.max() + 1) for weights in (values[known], None))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(sums / counts)
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """p-values corrected for their number (Holm 1979): the smallest times all, the next times one less, none below one before."""
+    order, corrected, last = np.argsort(values, kind="stable"), [0.0] * len(values), 0.0
+    for rank, place in enumerate(order):
+        last = max(last, min(1.0, values[place] * (len(values) - rank)))
+        corrected[place] = last
+    return corrected
+
+
+def describe_verdicts(verdicts: Sequence[Mapping[str, Any]], summaries: Mapping[str, Any]) -> str:
+    """Lines of Markdown: by metric whom each run beats surely, and which pairs are not told apart."""
+    lines = [
+        f"Wilcoxon's signed-rank test over scenes, Holm's correction over {len(verdicts)} comparisons, level {LEVEL:g}."
+    ]
+    for metric in dict.fromkeys(verdict["metric"] for verdict in verdicts):
+        each = [verdict for verdict in verdicts if verdict["metric"] == metric]
+        for run in summaries:
+            beaten = [v["b"] if run == v["a"] else v["a"] for v in each if v["better"] == run]
+            if beaten:
+                lines.append(f"- {words(metric)}: {run} is better than {', '.join(beaten)}.")
+        if same := [f"{verdict['a']} and {verdict['b']}" for verdict in each if verdict["better"] is None]:
+            lines.append(f"- {words(metric)}: not told apart: {'; '.join(same)}.")
+    for run, summary in summaries.items():
+        if part := [
+            name
+            for name, figure in summary["metrics"].items()
+            if name in SHOWN and figure["coverage"] not in (None, 1.0)
+        ]:
+            lines.append(f"- {run} is not compared by {', '.join(map(words, part))}: it leaves items or pixels out.")
+    return "\n".join(lines)
+
+
+def _rows(summaries: Mapping[str, Any], metrics: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """A row for each run, metric and category; of all categories the category is null."""
+    for run, summary in summaries.items():
+        for category, figures in ((None, summary["metrics"]), *summary["by"]["category"].items()):
+            for metric in metrics:
+                if figure := figures.get(metric):
+                    yield {"run": run, "category": category, "metric": metric, **figure}
+
+
+def _tables(summaries: Mapping[str, Any], metrics: Sequence[str]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """(title, head, rows) of all items and, by category, of the first metric that all have."""
+    yield (
+        "all",
+        ["run", *map(words, metrics), "coverage"],
+        [
+            [run, *(_cell(name, summary["metrics"].get(name)) for name in metrics), _least_coverage(summary, metrics)]
+            for run, summary in summaries.items()
+        ],
+    )
+    for metric in metrics:
+        categories = sorted({name for one in summaries.values() for name in one["by"]["category"]})
+        rows = [
+            [run, *(_cell(metric, one["by"]["category"].get(name, {}).get(metric)) for name in categories)]
+            for run, one in summaries.items()
+            if _figure(one, metric)
+        ]
+        yield words(metric), ["run", *categories], rows
+
+
+def _cell(metric: str, figure: Figure | None) -> str:
+    if not figure or not figure["items"]:
+        return ""
+    ends = interval(metric, figure)
+    return f"{in_words(metric, figure['value'])}{ends and f' ({ends})'}"
+
+
+def _least_coverage(summary: Mapping[str, Any], metrics: Sequence[str]) -> str:
+    figures = [figure for name in metrics if (figure := _figure(summary, name))]
+    return covered(min(figures, key=lambda figure: figure["coverage"] or 0.0)).removeprefix("coverage ")
+
+
+def _markdown(summaries: Mapping[str, Any], metrics: Sequence[str]) -> Iterator[str]:
+    for title, head, rows in _tables(summaries, metrics):
+        lines = [head, ["---"] * len(head), *rows]
+        yield f"**{title}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _latex(summaries: Mapping[str, Any], metrics: Sequence[str]) -> Iterator[str]:
+    for title, head, rows in _tables(summaries, metrics):
+        lines = [" & ".join(map(_escape, line)) + r" \\" for line in (head, *rows)]
+        yield "\n".join(
+            [
+                f"% {title}",
+                rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
+                lines[0],
+                r"\hline",
+                *lines[1:],
+                r"\end{tabular}",
+            ]
+        )
+
+
+def _escape(text: str) -> str:
+    for character in "%_&#":
+        text = text.replace(character, f"\\{character}")
+    return text.replace("°", r"$^\circ$").replace("²", r"$^2$")
