@@ -142,23 +142,14 @@ def bent(rng: Random) -> Flaw:
     return Flaw(LENS, LENS, printed=printed)
 
 
-def stretched(rng: Random) -> Flaw:
-    by = np.array([1 + sign(rng) * rng.uniform(0.003, 0.01), 1, 1])
+def scaled(rng: Random, least: float, most: float, along: Array) -> Flaw:
+    by = 1 + sign(rng) * rng.uniform(least, most) * along
     return Flaw(LENS, LENS, printed=lambda points: points * by)
-
-
-def print_scale(rng: Random) -> Flaw:
-    by = 1 + sign(rng) * rng.uniform(0.004, 0.012)
-    return Flaw(LENS, LENS, printed=lambda points: points * by)
-
-
-def shaken(rng: Random, shift_m: float, turn_deg: float) -> Array:
-    """[40, 6] motions of so much, in directions of their own."""
-    return np.hstack([shift_m * directions(rng, 40), np.radians(turn_deg) * directions(rng, 40)])
 
 
 def late(rng: Random) -> Flaw:
-    motion = shaken(rng, rng.uniform(0.004, 0.010), rng.uniform(0.3, 0.8))
+    shift_m, turn_rad = rng.uniform(0.004, 0.010), np.radians(rng.uniform(0.3, 0.8))
+    motion = np.hstack([shift_m * directions(rng, 40), turn_rad * directions(rng, 40)])
     return Flaw(LENS, LENS, T_depth=lambda poses, number: moved(poses[number], motion[number]))
 
 
@@ -189,8 +180,8 @@ CAUSES: dict[str, tuple[Callable[[Random], Flaw], str]] = {
     "focus by view": (focus, "focus"),
     "rolling shutter": (rolling, "rows"),
     "bent board": (bent, "bent"),
-    "stretched print": (stretched, "stretched"),
-    "print scale": (print_scale, "ruler scale"),
+    "stretched print": (lambda rng: scaled(rng, 0.003, 0.01, np.eye(3)[0]), "stretched"),
+    "print scale": (lambda rng: scaled(rng, 0.004, 0.012, np.ones(3)), "ruler scale"),
     "depth late": (late, "moment"),
     "depth of the next view": (swapped, "moment swapped"),
     "object moved": (object_moved, "moved"),

@@ -6,7 +6,7 @@ from tests.workers.capture.confusion import CAUSES, confusion, judge, table
 
 SHARE = 0.9
 SIGMAS = 1.6
-"""Cameras are off by at most so many of their sigmas, medians. Of a print's size no sigma has what nobody measured: it is said."""
+"""Cameras are off by at most so many of their sigmas, medians; what a print of unmeasured size adds is said, and in no sigma."""
 
 
 @pytest.mark.parametrize("cause", CAUSES)
