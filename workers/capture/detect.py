@@ -6,6 +6,7 @@ refinements leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there.
 0.23 px to a free homography against 0.28, once the side of the printed marker is free, as AprilTag's corners say as well.
 """
 
+import itertools
 from dataclasses import replace
 
 import cv2
@@ -20,13 +21,10 @@ from workers.capture.board import (
     PREDEFINED,
     Geometry,
     board_geometry,
-    first_poses,
     id_words,
     smallest_dictionary,
 )
-from workers.geometry.camera import spread_evenly
 from workers.geometry.colour import SRGB_STEPS
-from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import project_points, rays_of_pixels
 
 SAMPLES = 24
@@ -157,9 +155,8 @@ def unbend_corners(corners_px: Array, camera: CaptureCamera) -> Array:
 
 MIN_PERIMETER = 0.01
 """Smallest perimeter of a marker over the larger side of the image: 19 px of 1920, below which bits cannot be read."""
-CLEAR_PERIMETER = 0.06
 SEVERAL = 4
-"""Another dictionary is named for so many markers of at least this size: fewer may be chance."""
+"""Another dictionary is named for so many markers: fewer may be chance."""
 
 
 def detect_markers(
@@ -193,14 +190,12 @@ def detect_markers(
 
 LEAST_PRINT = 4
 """Markers that tell a print."""
-SEEDS = 24
-"""Pairs of markers from which a print is begun."""
 BESIDE_SIDES = 0.5
-"""A marker belongs to a print whose pose puts it at most so many of its sides away."""
+"""A marker belongs to a print whose pose puts its corners at most so many of a usual marker's sides away."""
 EXPLAINED = 0.8
 """Share of all markers that prints of one board explain: what lies otherwise is another board."""
-GROWTH = 3
-"""A print grows from the markers nearest to the pair by fitting its pose so many times."""
+DRAWS = 1000
+"""Random poses by three corners, and a fourth, of which the one that explains most is a print's (RANSAC, from a fixed seed)."""
 
 
 def split_prints(
@@ -211,36 +206,25 @@ def split_prints(
     A print is what one pose explains. Empty where prints of this board do not explain the markers.
     """
     rays = rays_of_pixels(corners_px.reshape(-1, 2), camera.intrinsics, camera.lens).reshape(-1, 4, 2)
-    places, middles = geometry.corners[geometry.index(ids)], corners_px.mean(axis=1)
-    sides = np.linalg.norm(np.roll(corners_px, -1, axis=1) - corners_px, axis=2).mean(axis=1)
+    places, sides = geometry.corners[geometry.index(ids)], np.linalg.norm(rays[:, 1] - rays[:, 0], axis=1)
     left, prints = np.flatnonzero(np.isfinite(rays).all(axis=(1, 2))), []
-
-    def on_print(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Of those that are left what lies where a pose by the chosen has it, each id once; the better of its poses."""
-        best = chosen[:0]
-        for T in first_poses(places[chosen].reshape(-1, 3), rays[chosen].reshape(-1, 2)):
-            seen = project_points(
-                transform(invert(T), places[left].reshape(-1, 3)), camera.intrinsics, camera.lens
-            ).reshape(-1, 4, 2)
-            off = np.linalg.norm(seen - corners_px[left], axis=2).max(axis=1) / sides[left]
-            near = np.argsort(off, kind="stable")[: int((off < BESIDE_SIDES).sum())]
-            once = near[np.unique(ids[left[near]], return_index=True)[1]]
-            best = max(best, left[once], key=len) if T[2, 3] > 0 else best
-        return best
-
     while len(left) >= LEAST_PRINT:
-        best = left[:0]
-        for seed in left[spread_evenly(len(left), SEEDS)]:
-            others = left[ids[left] != ids[seed]]
-            nearest = others[np.argsort(np.linalg.norm(middles[others] - middles[seed], axis=1), kind="stable")[:1]]
-            chosen = np.append(nearest, seed)
-            for _ in range(GROWTH):
-                chosen = on_print(chosen) if len(chosen) > 1 else chosen
-            best = max(best, chosen, key=len)
-        if len(best) < LEAST_PRINT:
+        explained = cv2.solvePnPRansac(
+            places[left].reshape(-1, 3),
+            rays[left].reshape(-1, 2),
+            np.eye(3),
+            None,
+            iterationsCount=DRAWS,
+            reprojectionError=BESIDE_SIDES * float(np.median(sides[left])),
+            confidence=0.9999,
+            flags=cv2.SOLVEPNP_AP3P,
+        )[3]
+        corners = np.zeros(0, np.int64) if explained is None else explained.ravel()
+        of_print = left[np.bincount(corners // 4, minlength=len(left)) == 4]
+        if len(of_print) < LEAST_PRINT:
             break
-        prints.append(best)
-        left = np.setdiff1d(left, best)
+        prints.append(of_print)
+        left = np.setdiff1d(left, of_print)
     return prints if sum(map(len, prints)) >= EXPLAINED * len(ids) else []
 
 
@@ -259,7 +243,7 @@ def _find_quads(
 ) -> tuple[NDArray[np.uint8], Array, NDArray[np.int64]]:
     """(grey image, [N, 4, 2] corners as OpenCV has them, pixel centres at integers, [N] ids)."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
-    quads, ids, _ = _detector(dictionary, border_bits=border_bits).detectMarkers(gray)
+    quads, ids, _ = _detector(dictionary, border_bits).detectMarkers(gray)
     return gray, np.array(quads, np.float64).reshape(-1, 4, 2), np.array([] if ids is None else ids, np.int64).ravel()
 
 
@@ -346,31 +330,29 @@ def _is_corner(light: NDArray[np.float32], pair: Array, points: Array) -> bool:
     return free_px >= MIN_HALF_PX and off_px < free_px and apart > max(CONTRAST * float(np.ptp(seen)), DARK)
 
 
-def other_dictionary(rgb: NDArray[np.uint8]) -> tuple[str, str]:
-    """(what the image holds in place of the board's markers, in words, the largest dictionary of their family); or nothing.
+def other_dictionary(rgb: NDArray[np.uint8]) -> tuple[str, str, int]:
+    """(what markers the image holds, in words; the largest dictionary of their family; bits of their border); or nothing.
 
-    Markers may be mirrored, and have no dictionary then. Takes a second or so: for the message about a capture in which no
-    marker was found.
+    Mirrored markers have no dictionary. Takes a second or two: for the message about a capture without a usable pose.
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    best, most = ("", ""), SEVERAL - 1
-    for picture, how in ((gray, ""), (np.ascontiguousarray(gray[:, ::-1]), ", mirrored")):
-        for name in PREDEFINED:
-            if name != smallest_dictionary(name, LARGEST) or name != name.upper():
-                continue  # the first markers of the dictionary of 1000, or a second name
-            dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-            _, ids, _ = _detector(dictionary, CLEAR_PERIMETER).detectMarkers(picture)
-            if ids is not None and len(ids) > most:
-                smallest, most = smallest_dictionary(name, int(np.median(ids))), len(ids)  # a few ids may be misread
-                best = f"the image holds {most} markers of {smallest}{how}", "" if how else name
+    best, most = ("", "", 1), SEVERAL - 1
+    pictures = ((gray, ""), (np.ascontiguousarray(gray[:, ::-1]), ", mirrored"))
+    names = {name.upper(): name for name in PREDEFINED}.values()  # some have two
+    for name, (picture, how), border_bits in itertools.product(names, pictures, (1, 2)):
+        if name != smallest_dictionary(name, LARGEST) or (border_bits > 1 and "APRILTAG" not in name):
+            continue  # the first markers of the dictionary of 1000; two bits are Kalibr's
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        _, ids, _ = _detector(dictionary, border_bits).detectMarkers(picture)
+        if ids is not None and len(ids) > most:
+            smallest, most = smallest_dictionary(name, int(np.median(ids))), len(ids)  # a few ids may be misread
+            best = f"the image holds {most} markers of {smallest}{how}", "" if how else name, border_bits
     return best
 
 
-def _detector(
-    dictionary: "cv2.aruco.Dictionary", min_perimeter: float = MIN_PERIMETER, border_bits: int = 1
-) -> "cv2.aruco.ArucoDetector":
+def _detector(dictionary: "cv2.aruco.Dictionary", border_bits: int) -> "cv2.aruco.ArucoDetector":
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    settings.minMarkerPerimeterRate = min_perimeter
+    settings.minMarkerPerimeterRate = MIN_PERIMETER
     settings.markerBorderBits = border_bits
     return cv2.aruco.ArucoDetector(dictionary, settings)

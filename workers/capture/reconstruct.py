@@ -15,14 +15,14 @@ from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Captures, Estimate, Estimation, Fusion
 from schemas.scene.shape import Mesh
 from workers.capture.board import frame_in_board, open_dictionary
-from workers.capture.detect import detect_markers
+from workers.capture.detect import SEVERAL, detect_markers
 from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
 from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, fits_board, observe_view
-from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Observation, Setup
-from workers.capture.poses.solve_board import FEW_MARKERS, other_board
+from workers.capture.poses.solve_board import other_board
+from workers.capture.poses.standing import check_moments
 from workers.capture.results import written_files
 from workers.capture.surface.coverage import describe_grazing
 from workers.capture.surface.fusion import fuse_views
@@ -270,7 +270,7 @@ def _with_given_pose(seen: Observation, markers: MarkerPose, given: Given) -> Ob
 def _no_pose(estimate: CaptureEstimate, evidence: Evidence, folder: CaptureFolder) -> str:
     first = next((f"view {view.number}: {'; '.join(view.reasons)}" for view in estimate.views if view.reasons), "")
     fits = any(
-        seen.markers >= FEW_MARKERS and view.fit is not None and fits_board(seen, view.fit.T_board_cam, folder.camera)
+        seen.markers >= SEVERAL and view.fit is not None and fits_board(seen, view.fit.T_board_cam, folder.camera)
         for seen, view in zip(evidence.observations, evidence.markers, strict=True)
     )
     what = f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}"

@@ -23,8 +23,8 @@ from tests.workers.capture.drawn import BOX, KINECT, LENS, PINHOLE, errors, hand
 from workers.capture.board import marker_corners
 from workers.capture.poses.estimates import estimate_joint
 from workers.capture.poses.markers import Evidence, fit_markers
-from workers.capture.poses.moments import check_moments
 from workers.capture.poses.observation import Corners, Observation, Patches, Setup
+from workers.capture.poses.standing import check_moments
 from workers.capture.poses.terms import moved
 from workers.geometry.frames import invert, pose, rotation_about, transform
 from workers.geometry.pixels import project_points, rays_of_pixels
@@ -142,23 +142,14 @@ def bent(rng: Random) -> Flaw:
     return Flaw(LENS, LENS, printed=printed)
 
 
-def stretched(rng: Random) -> Flaw:
-    by = np.array([1 + sign(rng) * rng.uniform(0.003, 0.01), 1, 1])
+def scaled(rng: Random, least: float, most: float, along: Array) -> Flaw:
+    by = 1 + sign(rng) * rng.uniform(least, most) * along
     return Flaw(LENS, LENS, printed=lambda points: points * by)
-
-
-def print_scale(rng: Random) -> Flaw:
-    by = 1 + sign(rng) * rng.uniform(0.004, 0.012)
-    return Flaw(LENS, LENS, printed=lambda points: points * by)
-
-
-def shaken(rng: Random, shift_m: float, turn_deg: float) -> Array:
-    """[40, 6] motions of so much, in directions of their own."""
-    return np.hstack([shift_m * directions(rng, 40), np.radians(turn_deg) * directions(rng, 40)])
 
 
 def late(rng: Random) -> Flaw:
-    motion = shaken(rng, rng.uniform(0.004, 0.010), rng.uniform(0.3, 0.8))
+    shift_m, turn_rad = rng.uniform(0.004, 0.010), np.radians(rng.uniform(0.3, 0.8))
+    motion = np.hstack([shift_m * directions(rng, 40), turn_rad * directions(rng, 40)])
     return Flaw(LENS, LENS, T_depth=lambda poses, number: moved(poses[number], motion[number]))
 
 
@@ -189,8 +180,8 @@ CAUSES: dict[str, tuple[Callable[[Random], Flaw], str]] = {
     "focus by view": (focus, "focus"),
     "rolling shutter": (rolling, "rows"),
     "bent board": (bent, "bent"),
-    "stretched print": (stretched, "stretched"),
-    "print scale": (print_scale, "ruler scale"),
+    "stretched print": (lambda rng: scaled(rng, 0.003, 0.01, np.eye(3)[0]), "stretched"),
+    "print scale": (lambda rng: scaled(rng, 0.004, 0.012, np.ones(3)), "ruler scale"),
     "depth late": (late, "moment"),
     "depth of the next view": (swapped, "moment swapped"),
     "object moved": (object_moved, "moved"),
@@ -311,13 +302,14 @@ more than this factor and this much."""
 class Outcome:
     """Of one capture: what is said, in words of `SAID`; whether that is its cause, and whether it is covered if nothing is.
 
-    worse: the camera that `--calibrate` takes brings the poses farther from the truth.
+    worse: the camera that `--calibrate` takes brings the poses farther from the truth. sigmas: by how many cameras are off.
     """
 
     said: str
     named: bool
     covered: bool
     worse: bool
+    sigmas: float
 
     @property
     def right(self) -> bool:
@@ -330,12 +322,10 @@ def judge(cause: str, seed: int) -> Outcome:
     truth, evidence = simulate(cause, seed)
     words, estimate = messages(evidence)
     expected, said = set(CAUSES[cause][1].split()), set(words.split())
-    usual = {"ruler", "scale"} - expected  # said beside all else, and true
-    named = expected == said - usual or (
-        cause == "print scale" and bool(expected & said) and said <= {"ruler", "scale"}
-    )
+    usual = {"ruler"} - expected  # said beside the object, and true
+    named = expected == said - usual or (cause == "print scale" and len(said) == 1 and said < expected)
     if estimate is None:
-        return Outcome(words, named, False, False)
+        return Outcome(words, named, False, False, 0.0)
     off, sigma = median_mm(estimate, truth)
     covered = said <= usual and off < COVERED * sigma and not expected & {"moved", "moment", "swapped", "ruler"}
     worse = False
@@ -345,7 +335,7 @@ def judge(cause: str, seed: int) -> Outcome:
         if camera is not None:
             after = median_mm(estimate_joint(simulate(cause, seed, camera)[1]), truth)[0]
             worse = after > WORSE * off + WORSE_MM
-    return Outcome(words, named, covered, worse)
+    return Outcome(words, named, covered, worse, off / sigma)
 
 
 def confusion(captures: int, causes: list[str], workers: int = 1) -> dict[str, list[Outcome]]:

@@ -35,20 +35,6 @@ from workers.capture.poses.markers import Evidence, fit_markers
 from workers.capture.poses.observation import Setup, no_patches
 from workers.capture.poses.terms import moved
 
-# ---------------------------------------------------------------------------------------------- markers
-
-
-def test_markers_give_every_view_its_pose_and_residual_or_a_reason():
-    rng = np.random.default_rng(0)
-    truth = hand_held(rng, 6)
-    found = estimate_markers(evidence_of([observe(T, rng, number=n + 3) for n, T in enumerate(truth)]))
-    assert [view.number for view in found.views] == [3, 4, 5, 6, 7, 8]
-    for view, T in zip(found.views, truth, strict=True):
-        assert view.status == "used" and view.reasons == () and errors(view.T_board_cam, T)[0] < 1.5
-        assert view.reprojection_px == pytest.approx(0.2 * np.sqrt(2 * np.log(2)), rel=0.2)  # median of a Rayleigh law
-        assert view.depth_mm is None and view.covariance.shape == (6, 6)
-
-
 # ---------------------------------------------------------------------------------------------- article
 
 
@@ -280,14 +266,6 @@ def test_a_centre_half_a_pixel_off_is_told_and_no_rolling_shutter():
     assert said and abs(float(said[1]) - KINECT.cx_opencv) < 0.2 and not any("rows" in note for note in found.notes)
 
 
-def test_a_lens_that_no_five_numbers_explain_is_named_and_its_camera_is_never_taken_or_advised():
-    rng = np.random.default_rng(1)
-    whole = dataclasses.replace(PINHOLE, lens=np.array([0.33, -2.4, 1e-3, 0, 1.4, 0.21, -2.2, 1.3]))
-    given = dataclasses.replace(whole, lens=whole.lens * (np.arange(8) < 5))
-    found = estimate_joint(seen_as(given, whole, hand_held(rng, 10), rng, 0.02))
-    assert "`distortion`" in found.notes[0] and "--calibrate" not in found.notes[0] and found.camera is None
-
-
 @pytest.mark.minute
 def test_the_right_camera_is_never_blamed_nor_any_by_views_that_cannot_tell():
     for seed in range(20):
@@ -298,27 +276,6 @@ def test_the_right_camera_is_never_blamed_nor_any_by_views_that_cannot_tell():
         alike = [moved(T0, rng.normal(0, 0.002, 6)) for T0 in hand_held(rng, 1) * 3]
         found = estimate_joint(seen_as(LONG, PINHOLE, alike, rng, 0.2))
         assert found.camera is None and not re.search("f[xy] = ", found.notes[0])
-
-
-def test_a_focal_length_is_told_before_the_print_is_blamed_for_it():
-    _, evidence = make(Virtual(views=10))
-    k = evidence.camera.intrinsics
-    given = with_numbers(evidence.camera, fx=1.03 * k.fx, fy=1.03 * k.fy)
-    squeezed = np.array([1 / 1.03, 1 / 1.03, 1.0])  # what pixels mean to the other camera
-
-    def read(seen):
-        patches = [
-            dataclasses.replace(p, ray_z=p.ray_z * squeezed, ray=p.ray * squeezed)
-            for p in (seen.board_patches, seen.object_patches)
-        ]
-        corners = dataclasses.replace(seen.corners, rays=seen.corners.rays / 1.03)
-        return dataclasses.replace(seen, corners=corners, board_patches=patches[0], object_patches=patches[1])
-
-    seen = [read(o) for o in evidence.observations]
-    setup = Setup(given, evidence.board, evidence.spec)
-    found = estimate_joint(Evidence.of(setup, seen, [fit_markers(o, given) for o in seen]))
-    assert abs(1 / found.depth.scale - 1) > 0.01 and found.notes[0].startswith("camera.json does not fit")
-    assert not any("print" in note for note in found.notes)
 
 
 def test_a_print_of_another_size_is_told_unless_scales_agree_and_the_ruler_asked_for_unless_measured():

@@ -62,6 +62,10 @@ OTHERS = {
     "ChArUco, and photographs of a grid": (made("charuco", (9, 6)), ("grid", (9, 6))),
     "ChArUco of another pattern": (made("charuco", (10, 6)), ("charuco_old", (10, 6))),
     "another dictionary": (GRID, ("charuco", (9, 6), "DICT_5X5_50")),
+    "grid, and photographs of an aprilgrid": (
+        made("grid", (6, 4), "DICT_4X4_100", 0.06, 0.078),
+        ("aprilgrid", (6, 4), "DICT_APRILTAG_36h11", 0.06, 0.078),
+    ),
     "other numbers": (GRID, ("grid", (8, 7))),
     "other numbers of squares": (made("charuco", (9, 6)), ("charuco", (8, 7))),
 }

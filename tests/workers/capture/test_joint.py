@@ -5,15 +5,12 @@ import pytest
 
 from tests.workers.capture.drawn import (
     HALF,
-    KINECT,
     LENS,
-    PINHOLE,
     Virtual,
     evidence_of,
     hand_held,
     make,
     observe,
-    project,
     with_pixels,
 )
 from workers.capture.poses.corners import CornerTerm
@@ -129,32 +126,6 @@ def test_markers_of_uneven_size_and_shape_move_no_camera_more_than_its_sigma_say
             off.append(motion_between(view.T_board_cam, T)[:3] / np.sqrt(np.diag(view.covariance)[:3]))
     assert np.mean(noise) == pytest.approx(0.05, rel=0.1)
     assert 0.8 < np.sqrt(np.mean(np.square(off))) < 1.2
-
-
-def test_rows_read_in_turn_by_a_moving_camera_are_told_and_are_in_the_sigma_and_no_others_are():
-    """Corners by OpenCV from the pose of their own row, of 20 ms from first to last, at 0.15 m/s and 8 degrees/s."""
-    off = {False: [], True: []}
-    for seed in range(4):
-        for moves, squares in off.items():
-            rng = np.random.default_rng(seed)
-            seen, truth = [], hand_held(rng, 10)
-            for number, T in enumerate(truth):
-                way, axis = (v / np.linalg.norm(v) * moves for v in rng.standard_normal((2, 3)))
-                one = observe(T, rng, number=number, corner_px=0.0)
-                pixels = one.corners.pixels
-                for _ in range(5):
-                    time_s = 0.02 * (pixels[:, 1] / KINECT.height - 0.5)
-                    poses = [moved(T, np.r_[0.15 * t * way, np.radians(8.0) * t * axis]) for t in time_s]
-                    pixels = np.stack(
-                        [project(p[None], own, PINHOLE)[0] for p, own in zip(one.corners.board, poses, strict=True)]
-                    )
-                pixels = pixels + rng.normal(0, 0.05, pixels.shape)
-                seen.append(with_pixels(one, pixels))
-            found = estimate_joint(evidence_of(seen))
-            assert any("while the rows of an image were read" in note for note in found.notes) == moves
-            for view, T in zip(found.views, truth, strict=True):
-                squares.append(motion_between(view.T_board_cam, T)[:3] ** 2 / np.diag(view.covariance)[:3])
-    assert all(0.8 < np.sqrt(np.mean(squares)) < 1.25 for squares in off.values())
 
 
 # ---------------------------------------------------------------------------------------------- noise of depth

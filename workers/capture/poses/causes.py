@@ -202,14 +202,13 @@ HALF = "Both are half a pixel off: is pixel_centre right? "
 class Doubt:
     """What the poses may need: motion [V, 6] to the poses [V, 4, 4] that explain the corners, with its covariance [V, 6, 6].
 
-    Why, by name and in words, empty where it is too little; whether it leaves no more than the noise; the camera that explains
-    the corners, and whether it is so well known that it brings the poses nearer to the truth.
+    Why, in words, empty where it is too little; whether it leaves no more than the noise; the camera that explains the corners,
+    and whether it is so well known that it brings the poses nearer to the truth.
     """
 
     poses: Array
     motion: Array
     covariance: Array
-    name: str
     note: str
     fits: bool
     camera: CaptureCamera
@@ -282,8 +281,8 @@ def find_doubt(
     return None if best is usual or gain < wanted else _doubt(best, wide, usual, start, fixed, variance, spec)
 
 
-CAMERAS, HALVINGS = 6, 4
-"""How often a camera is fitted anew about the one before, and how often its step is halved where it has no ray for a corner."""
+CAMERAS = 6
+"""How often a camera is fitted anew about the one before."""
 
 
 def _try(explanation: Explanation, start: Seen) -> _Tried:
@@ -292,20 +291,16 @@ def _try(explanation: Explanation, start: Seen) -> _Tried:
     fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
     count = fields.alike.shape[2]
     for _ in range(CAMERAS if explanation.numbers else 0):
-        before, part, rays = fitted.cost, 1.0, np.full(1, np.nan)
-        for _ in range(HALVINGS):
-            camera = changed_camera(seen.camera, explanation.numbers, part * fitted.alike)
-            rays, part = seen.rays_by(camera), 0.5 * part
-            if np.isfinite(rays).all():
-                break
-        else:
+        before, camera = fitted.cost, changed_camera(seen.camera, explanation.numbers, fitted.alike)
+        rays = seen.rays_by(camera)
+        if not np.isfinite(rays).all():
             break
         k = camera.intrinsics
         term = dataclasses.replace(seen.term, rays=rays, focal=np.array([k.fx, k.fy]))
         seen = dataclasses.replace(seen, term=term, poses=fitted.poses, shared=fitted.shared, camera=camera)
         fields = explanation.fields(seen)
         fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
-        if abs(fitted.cost - before) < 1e-3 * before and part == 0.5:
+        if abs(fitted.cost - before) < 1e-3 * before:
             break
     return _Tried(explanation, seen, fitted, count)
 
@@ -358,9 +353,7 @@ def _doubt(
     elif material:
         note = NONE_FITS.format(off=px * off, times=off, name=explanation.name, left=px * left)
     camera = best.seen.camera if explanation.numbers else start.camera
-    return Doubt(
-        fitted.poses, motion, max(variance, 1.0) * fitted.covariance, explanation.name, note, fits, camera, is_known
-    )
+    return Doubt(fitted.poses, motion, max(variance, 1.0) * fitted.covariance, note, fits, camera, is_known)
 
 
 def _words(best: _Tried, wide: _Tried, start: Seen, variance: float, by: str, is_known: bool, material: bool) -> str:

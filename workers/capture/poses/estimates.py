@@ -12,9 +12,8 @@ from schemas.job.captures import Estimation
 from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
-from workers.capture.poses.moments import Moment, find_moment
 from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
-from workers.capture.poses.standing import object_groups
+from workers.capture.poses.standing import Moment, find_moment, object_groups
 from workers.capture.poses.terms import (
     NAMES,
     POSE,
@@ -240,7 +239,7 @@ def _result(
         views[problem.index[place]] = view
     # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
     causes = [cause.note for cause in (doubt, moment) if cause is not None and cause.note]
-    causes = causes or [scale_note(joint, sigma, evidence) or ruler_note(joint, evidence)]
+    causes = causes or [print_note(joint, sigma, evidence)]
     cluttered = ", ".join(str(o.number) for o in problem.observations if o.is_cluttered)
     clutter = (
         f"what one view alone has on the board, such as a hand, is left out: views {cluttered}" if cluttered else ""
@@ -295,39 +294,31 @@ def _mark_moved(estimate: CaptureEstimate, groups: list[list[int]], settled: boo
     return dataclasses.replace(estimate, views=views, notes=(note, *estimate.notes))
 
 
-def scale_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
-    """Whether print and depth disagree about the scale, which no capture can decide; empty where they agree."""
+def print_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
+    """Whether print and depth disagree about the scale, which no capture can decide; else what lengths are worth.
+
+    Empty where somebody measured the board, or depth is metric truth, and they agree.
+    """
     shared, board, by_print = joint.solution.shared, evidence.board, evidence.spec.trust == "print"
     index = NAMES.index("scale") if by_print else PRINT_SCALE
     # The scale of depth turns a measured length into a true one; the print's does so for a length of board.json.
     excess = (1.0 / shared.scale if by_print else shared.print_scale) - 1.0
-    least = SCALES_DIFFER if board.measured_ruler_m is not None else UNMEASURED
-    if joint.prior[index] == 0 or abs(excess) < max(least, SIGNIFICANT * sigma[index]):
-        return ""
+    is_measured = board.measured_ruler_m is not None
+    measure = f"Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as measured_ruler_m"
+    least = max(SCALES_DIFFER if is_measured else UNMEASURED, SIGNIFICANT * sigma[index])
+    if joint.prior[index] == 0 or abs(excess) < least:
+        distance_m = float(np.median(np.linalg.norm(joint.solution.poses[:, :3, 3], axis=1)))
+        unsure = f"all lengths are known to about {UNMEASURED:.1%}, {1000 * UNMEASURED * distance_m:.0f} mm at these distances"
+        unsure = f"the board's ruler was not measured: {unsure}, beside what sigma_mm says. {measure}"
+        return "" if is_measured or not by_print else unsure
     start = (
         "print and depth disagree about the scale: by depth the print is "
         f"{100 * abs(excess):.1f} % {'larger' if excess > 0 else 'smaller'} than board.json says"
     )
-    if board.measured_ruler_m is not None:
+    if is_measured:
         return f"{start}, although its ruler was measured; the ruler was believed" if by_print else start
-    return (
-        f"{start}. Which is right cannot be identified from the capture alone; {'the print' if by_print else 'depth'} was "
-        f"believed. Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as "
-        "measured_ruler_m"
-    )
-
-
-def ruler_note(joint: Joint, evidence: Evidence) -> str:
-    """What lengths are worth where nobody measured the board; empty where somebody did, or depth is metric truth."""
-    board = evidence.board
-    if board.measured_ruler_m is not None or evidence.spec.trust == "depth":
-        return ""
-    distance_m = float(np.median(np.linalg.norm(joint.solution.poses[:, :3, 3], axis=1)))
-    return (
-        f"the board's ruler was not measured: all lengths are known to about {UNMEASURED:.1%}, "
-        f"{1000 * UNMEASURED * distance_m:.0f} mm at these distances, beside what sigma_mm says. Measure it "
-        f"({1000 * board.ruler_m:g} mm) and write measured_ruler_m into board.json"
-    )
+    believed = f"{'the print' if by_print else 'depth'} was believed"
+    return f"{start}. Which is right cannot be identified from the capture alone; {believed}. {measure}"
 
 
 def noise_notes(joint: Joint, views: Views) -> list[str]:

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from schemas.base import Array, Pose
 from schemas.errors import CaptureError, command_line
 from schemas.job.captures import Board
-from workers.capture.board import LARGEST, PREDEFINED, id_words, open_dictionary, opencv_poses, smallest_dictionary
+from workers.capture.board import LARGEST, id_words, open_dictionary, opencv_poses, smallest_dictionary
 from workers.capture.board_kinds import board_of_markers, recognise_board
 from workers.capture.detect import find_markers, other_dictionary, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
@@ -39,9 +39,6 @@ AMBIGUOUS_M = 0.01
 
 LOOKED_AT = 8
 """Views by which a board that is not board.json's is recognised."""
-FEW_MARKERS = 4
-"""Where no view has as many, other markers than the board's may have been found by chance."""
-
 Seen = Mapping[int, Mapping[int, Array]]
 """By view and tag: rays [4, 2] of its corners."""
 
@@ -86,27 +83,21 @@ def solve_board(folder: CaptureFolder, side_m: float, dictionary: str, border_bi
 
 def other_board(folder: CaptureFolder) -> str:
     """What the photographs show in place of board.json's board, with the command that describes it; or nothing."""
-    board, name = folder.board, smallest_dictionary(folder.board.dictionary, LARGEST)
-    if name not in PREDEFINED:
-        return ""
-    seen = _see(folder, open_dictionary(Board(dictionary=name)), board.border_bits, LOOKED_AT)
-    several = max(map(len, seen.values())) >= FEW_MARKERS
-    recognised = recognise_board(list(seen.values()), board, name) if several else None
+    board = folder.board
+    words, name, border_bits = other_dictionary(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
+    if not name:
+        return words
+    seen = _see(folder, open_dictionary(Board(dictionary=name)), border_bits, LOOKED_AT)
+    recognised = recognise_board(list(seen.values()), board, name)
     if recognised is None:
-        words, other = other_dictionary(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
-        if not other or (several and other == name):  # mirrored markers are misread as others of their family
-            return "" if other else words
-        seen = _see(folder, open_dictionary(Board(dictionary=other)), board.border_bits, LOOKED_AT)
-        recognised = recognise_board(list(seen.values()), board, other)
-        if recognised is None:
-            return f"{words}: correct board.json"
+        return "" if name == smallest_dictionary(board.dictionary, LARGEST) else f"{words}: correct board.json"
     kind, sizes = recognised
-    words = f"{kind.replace('charuco', 'ChArUco')} board of {sizes.columns} x {sizes.rows} of {sizes.dictionary}"
+    words = f"{kind.replace('charuco', 'ChArUco')}, {sizes.columns} x {sizes.rows} of {sizes.dictionary}"
     options = ["--kind", kind, "--size", f"{sizes.columns}x{sizes.rows}", "--dictionary", sizes.dictionary]
     options += ["--marker", f"{sizes.marker_m:g}", "--pitch", f"{sizes.pitch_m:g}"]
     command = command_line("capture", "board", folder.path / "board.json", *options)
     remedy = f"move it away, and `{command}` writes the right one; measure both lengths on the print"
-    return f"the photographs show a {words}, and board.json has another board: {remedy}"
+    return f"the photographs show another board than board.json has, {words}: {remedy}"
 
 
 def describe(solved: SolvedBoard) -> list[str]:

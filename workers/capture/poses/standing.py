@@ -1,6 +1,7 @@
-"""Where the object stood in each view, by depth: which views see it in one place, and what they have beside it."""
+"""Where depth saw the board and the object in each view: of which moment it is, where the object stood, what lies beside it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +10,85 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from schemas.base import Array
-from workers.capture.poses.joint import gather
+from schemas.errors import CaptureError
+from workers.capture.poses.joint import BoardTerm, gather
+from workers.capture.poses.markers import Evidence
 from workers.capture.poses.observation import Observation
-from workers.capture.poses.terms import SIGNIFICANT, Shared
+from workers.capture.poses.terms import SHARED, SIGNIFICANT, Problem, Shared, Solution, minimise
 from workers.geometry.frames import invert, transform
+
+# ---------------------------------------------------------------------------------------------- the moment of depth
+
+FEWEST_PATCHES = 8
+"""So many patches tell the plane in which depth sees the board."""
+OFF_M, OFF_RAD = 0.0015, 0.002
+"""Root mean squares over the views of less are what sensors err by themselves."""
+LEFT = 0.3
+"""What planes leave of heights, where depth is of another moment, at most: errors of a sensor bend planes."""
+MOST_STEPS = 8
+ANOTHER_MM, NEARER = 10.0, 0.3
+"""Depth farther off the board than this is a neighbouring view's, where it lies off it by at most this share in that view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """Where depth saw the board: T_board_depth [V, 4, 4] takes depth's places on the board to colour's; sigma across, metres."""
+
+    T_board_depth: Array
+    unsure_m: float
+    note: str
+
+
+def find_moment(term: BoardTerm, solution: Solution) -> Moment | None:
+    """By how much each view's depth lies beside the board as its colour has it; None where they are of one moment.
+
+    What a depth camera errs by in all views is in the solution, and tells nothing of moments; where they differ, it is no more
+    than their mean, and depth is taken as it was measured.
+    """
+    T, left = _poses_by_depth(term, solution.poses, solution.shared)
+    height_m, slope = np.sqrt((T[:, 2, 3] ** 2).mean()), np.sqrt((T[:, :2, 2] ** 2).sum(axis=1).mean())
+    if height_m < OFF_M or slope < OFF_RAD or left > LEFT:
+        return None
+    note = (
+        "depth and colour are not of one moment: from view to view depth lies otherwise off the board, by "
+        f"{1000 * height_m:.1f} mm and {np.degrees(slope):.1f} degrees: hold the camera still for each view"
+    )
+    # Across the board nothing tells depth's place: it is off by as much as along it, and by turns at the camera's distance.
+    T, _ = _poses_by_depth(term, solution.poses, Shared())
+    distance_m = np.median(np.linalg.norm(solution.poses[:, :3, 3], axis=1))
+    aside_m = np.hypot(np.sqrt((T[:, 2, 3] ** 2).mean()), slope / np.sqrt(2) * distance_m)
+    return Moment(T, float(aside_m), note)
+
+
+def _poses_by_depth(term: BoardTerm, poses: Array, shared: Shared) -> tuple[Array, float]:
+    """(T_board_depth [V, 4, 4], by the least motions that lay depth on the board; what share of its height they leave)."""
+    few = np.bincount(term.view, minlength=len(poses)) < FEWEST_PATCHES
+    placed = minimise(Problem([term], np.zeros(SHARED), few), poses, shared, MOST_STEPS).poses
+    before, after = (np.median(np.abs(term.rows(T, shared).residual)) for T in (poses, placed))
+    return placed @ np.stack([invert(T) for T in poses]), float(after / before)
+
+
+def check_moments(evidence: Evidence) -> None:
+    """Raises CaptureError where the depth of several views is that of the view before or after."""
+    views = [
+        (seen, view.fit.T_board_cam)
+        for seen, view in zip(evidence.observations, evidence.markers, strict=True)
+        if view.fit and len(seen.board_patches) >= FEWEST_PATCHES
+    ]
+    pairs, off_board = [], 0
+    for place, (seen, T) in enumerate(views):
+        near = [(seen, T), views[place - 1], views[(place + 1) % len(views)]]
+        off_mm = [1000 * float(np.median(np.abs(transform(T, seen.board_patches.ray_z)[:, 2]))) for _, T in near]
+        off_board += off_mm[0] > ANOTHER_MM
+        if off_mm[0] > ANOTHER_MM and min(off_mm) < min(ANOTHER_MM, NEARER * off_mm[0]):
+            pairs.append(f"depth_{seen.number:05d} is of view {near[int(np.argmin(off_mm))][0].number}")
+    if len(pairs) > 1 and 2 * len(pairs) > off_board:
+        raise CaptureError(
+            "depth", f"colour and depth are not of one moment: {', '.join(pairs)}: name each pair by one number"
+        )
+
+
+# ---------------------------------------------------------------------------------------------- the object
 
 WITHIN_RAD = 0.008
 """A point is compared with the patch of another view whose middle is at most so far from its direction: within the patch."""
