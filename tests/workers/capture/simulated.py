@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from schemas.base import Pose
+from schemas.base import Array, Pose
 from schemas.capture import (
     CaptureCamera,
     CapturedView,
@@ -79,8 +79,8 @@ def _taken(settings: str, seed: int) -> tuple[CapturedView, CaptureCamera, Pose]
     return view, CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion)), T_board_cam
 
 
-def studio_of(board: Board, simulate: Simulate, seed: int = 11) -> tuple[Studio, Placed, list[Pose]]:
-    """(what is photographed: a can on a board; the can in the board frame; the path's poses)."""
+def studio_of(board: Board, simulate: Simulate, seed: int = 11) -> tuple[Studio, Placed, Array]:
+    """(what is photographed: a can on a board; the can, posed in the board frame; T_board_cam [V, 4, 4] along the path)."""
     chance, asset = SceneChance(seed, 0), asset_of()
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
     studio = build_studio(simulate, board, thing, plan_capture(simulate), chance)
