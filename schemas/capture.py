@@ -163,10 +163,6 @@ class DepthCorrection:
     identified: tuple[str, ...] = ()
 
 
-CLUTTERED = "what it alone has on the board is left out"
-"""The reason that a view which is used has where things such as a hand are on the board."""
-
-
 @dataclass(frozen=True, eq=False)
 class ViewEstimate:
     """One view's pose in one estimate.
@@ -174,7 +170,8 @@ class ViewEstimate:
     T_board_cam [4, 4] takes camera coordinates to board coordinates, None where refused; covariance [6, 6] of a small motion
     (metres, then radians, camera axes) or None; reprojection_px: median over corners, of all that were found;
     depth_mm: median distance of board points measured by depth from the board's plane, after the correction, or None.
-    `reasons` says why a view is flagged or refused, with the number measured, or what is left out of one that is used.
+    `reasons` says why a view is flagged or refused, with the number measured, or what is left out of one that is used;
+    is_cluttered: things on the board, such as a hand, that other views do not show are left out of it.
     """
 
     number: int
@@ -185,6 +182,7 @@ class ViewEstimate:
     reprojection_px: float | None
     depth_mm: float | None
     reasons: tuple[str, ...] = ()
+    is_cluttered: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,9 +209,9 @@ class CaptureEstimate:
         """The views that take part in the result."""
         return tuple(view for view in self.views if view.status == "used")
 
-    def is_cluttered(self, number: int) -> bool:
-        """Whether a view shows things on the board, such as a hand, that other views do not."""
-        return any(view.number == number and CLUTTERED in view.reasons for view in self.views)
+    def view(self, number: int) -> ViewEstimate:
+        """The view of this number."""
+        return next(view for view in self.views if view.number == number)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,9 @@ from tests.datasets import overlaid
 from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset
 from workers.capture import make_capture
-from workers.capture.folder import CaptureFile, CaptureFolder, TrueObject, write_description, write_truth, write_view
+from workers.capture.folder import CaptureFile, CaptureFolder, write_description, write_view
 from workers.capture.make_capture import board_asset
+from workers.capture.truth import write_truth
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
@@ -154,4 +155,10 @@ def write_folder(path: Path, name: str, board: Board | None = None, truth: bool 
     write_view(path, CapturedView(0, grey, None, None))
     if truth:
         known = CaptureTruth(np.eye(4)[None], np.eye(4), 1.0, np.eye(4), 0.0, None)
-        write_truth(path, known, TrueObject("mug", name, b""), ("depth_noise",), {"motion_blur": "is not asked for"})
+        write_truth(
+            path,
+            known,
+            make_asset("mug", ProceduralSource(source="procedural"), 0, 1000.0),
+            ("depth_noise",),
+            {"motion_blur": "is not asked for"},
+        )

@@ -9,8 +9,9 @@ from schemas.scene.scene import EffectPlan, ScenePlan, Settled
 from services.read.audit import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop
-from workers.physics.fall import Outcome, StepSizes, Watch, fall, falls_below
+from workers.physics.fall import Outcome, StepSizes, Watch, fall
 from workers.physics.hold import moved_by, release_again
+from workers.physics.release import falls_below
 from workers.physics.rigid_body import make_body
 from workers.physics.settle import Rest, settle_scene
 from workers.scene.effects import Facts, plan_effects

@@ -140,6 +140,42 @@ def boxes_in_boxes() -> Group:
     return together(table, starts)
 
 
+SEAT_M = (0.08, 0.08, 0.006)
+"""Width, depth and thickness of a chair's seat, which is 50 mm above its feet."""
+
+
+def chair() -> Asset:
+    """A chair that stacks: its legs and its back lean outwards by 1 in 2, and are half a millimetre less than 3 mm thick.
+
+    Raised by the seat's thickness, 6 mm, each is 3 mm beside the one below: seat lies on seat.
+    """
+    (wide, deep, thick), high, lean = SEAT_M, 0.05, 0.5
+    x, y = wide / 2, deep / 2
+    parts = [[(i * x, j * y, high - k * thick) for i in (-1, 1) for j in (-1, 1) for k in (0, 1)]]
+    parts += [
+        [
+            (side * (x + lean * (high - z) - w), v, z)
+            for z in (0.0, high)
+            for w in (0.0, 0.0025)
+            for v in (end, end * 0.85)
+        ]
+        for side in (-1, 1)
+        for end in (-y, y)
+    ]
+    behind = ((y + lean * (z - high + thick) + w, z) for z in (high - thick, 0.1) for w in (-1e-4, 0.0024))
+    parts.append([(u, v, z) for v, z in behind for u in (-x, x)])
+    whole = manifold3d.Manifold.batch_boolean(
+        [manifold3d.Manifold.hull_points(np.array(part)) for part in parts], manifold3d.OpType.Add
+    ).to_mesh64()
+    return asset_of(trimesh.Trimesh(np.asarray(whole.vert_properties)[:, :3], np.asarray(whole.tri_verts)), mass_kg=0.1)
+
+
+def chairs(count: int) -> Group:
+    """Chairs, each a millimetre above where it lies on the one below."""
+    table, asset = level(), chair()
+    return together(table, [put(asset, table, 0.001 + k * (SEAT_M[2] + 0.001)) for k in range(count)])
+
+
 def lowest_within(bound_mm: float, body: int = 1, other: int = 0) -> Measure:
     """Sideways from the middle of one object's frame to the lowest point of another."""
 
@@ -278,6 +314,9 @@ HOLLOWS = (
         again="slow",
     ),
     settles("three open boxes in one another", both(lifted(0.003), tilts(0, 0, 0, bound_deg=0.1)), boxes_in_boxes),
+    settles(
+        "three chairs on one another", both(lifted(SEAT_M[2], 0.02), tilts(0, 0, 0, bound_deg=0.1)), lambda: chairs(3)
+    ),
     settles("two mugs linked by their handles", both(tilt(0.5), apart(15.0)), linked_mugs, tier="minute", again="slow"),
     settles(
         "spoon in a mug from a file",

@@ -195,13 +195,15 @@ class Words:
 class PrintLayout:
     """A sheet around the origin of the board frame: x right, y up, metres, nominal sizes.
 
-    markers [N, 4] and ruler [M, 4] float64 are black rectangles: left, bottom, right, top, which may overlap; arrow [3, 2]
-    float64 is a black triangle that points up the print.
+    Black rectangles, float64: left, bottom, right, top. markers [N, 4] do not overlap; seams [S, 4] are black of the markers
+    again, across the edges between two of those, so that no renderer of vectors shows a line there; ruler [M, 4] may overlap.
+    arrow [3, 2] float64 is a black triangle that points up the print.
     """
 
     width_m: float
     height_m: float
     markers: Array
+    seams: Array
     ruler: Array
     arrow: Array
     words: tuple[Words, ...]
@@ -213,12 +215,9 @@ def lay_out_print(board: Board) -> PrintLayout:
     Raises InputError where the ruler is longer than the sheet is high, CaptureError for a dictionary that cannot be used.
     """
     geometry = board_geometry(board.model_copy(update={"measured_ruler_m": None}))
-    black = [
-        _black_runs(*upright(cells, corners))
-        for cells, corners in zip(marker_cells(board), geometry.corners, strict=True)
-    ]
-    black += [_black_runs(*upright(np.ones((1, 1), np.bool_), corners)) for corners in geometry.squares]
-    markers = np.concatenate(black)
+    black = [*marker_cells(board), *np.ones((len(geometry.squares), 1, 1), np.bool_)]
+    placed = [upright(*pair) for pair in zip(black, [*geometry.corners, *geometry.squares], strict=True)]
+    markers, seams = (np.concatenate([_black_runs(*each, turned) for each in placed]) for turned in (False, True))
     print_width = 2.0 * float(np.abs(markers[:, [0, 2]]).max())
     width = max(board.width_m, print_width + 2 * MARGIN_M)
     height = board.height_m
@@ -232,7 +231,7 @@ def lay_out_print(board: Board) -> PrintLayout:
     arrow_y = top - board.ruler_m - 0.035
     arrow = np.array([ruler_x + 0.005, arrow_y]) + np.array([[-0.005, 0.0], [0.005, 0.0], [0.0, 0.012]])
     words = (Words(ruler_x, arrow_y - 0.006, 0.004, "TOP"), *figures, *_instructions(board, 0.5 * width, margin, top))
-    return PrintLayout(width, height, markers, ruler, arrow, words)
+    return PrintLayout(width, height, markers, seams, ruler, arrow, words)
 
 
 def marker_cells(board: Board, folder: Path | None = None) -> NDArray[np.bool_]:
@@ -259,15 +258,14 @@ def upright(cells: NDArray[np.bool_], corners: Array) -> tuple[NDArray[np.bool_]
     return np.rot90(cells, first), float(turned[0, 0]), float(turned[0, 1]), side
 
 
-def _black_runs(cells: NDArray[np.bool_], left: float, top: float, whole: float) -> Array:
-    """[N, 4]: runs of black cells along rows and along columns, so that no renderer shows a seam between two of them."""
-    side = whole / len(cells)
-    runs = []
-    for lines, turned in ((cells, False), (cells.T, True)):
-        for n, line in enumerate(lines):
-            ends = np.flatnonzero(np.diff(line, prepend=False, append=False)).reshape(-1, 2).tolist()
-            runs += [(n, start, n + 1, stop) if turned else (start, n, stop, n + 1) for start, stop in ends]
-    return np.array([[left + a * side, top - d * side, left + c * side, top - b * side] for a, b, c, d in runs])
+def _black_runs(cells: NDArray[np.bool_], left: float, top: float, whole: float, turned: bool) -> Array:
+    """[N, 4]: runs of black cells along rows, or along columns where `turned`."""
+    side, runs = whole / len(cells), []
+    for n, line in enumerate(cells.T if turned else cells):
+        for start, stop in np.flatnonzero(np.diff(line, prepend=False, append=False)).reshape(-1, 2).tolist():
+            a, b, c, d = (n, start, n + 1, stop) if turned else (start, n, stop, n + 1)
+            runs.append([left + a * side, top - d * side, left + c * side, top - b * side])
+    return np.array(runs)
 
 
 def _ruler(x: float, top: float, length_m: float) -> tuple[Array, list[Words]]:

@@ -1,9 +1,8 @@
-"""A capture's folder: its photographs, cameras and board, and the truth of a simulated one. Read and written here alone.
+"""A capture's folder: its photographs, cameras and board. Read and written here alone.
 
     camera.json  board.json  capture.json (name and category; may be missing)
     rgb_00000.png  depth_00000.png  mask_00000.png  board_00000.txt  correction_00000.txt  camera_00000.json
-    truth/       what a simulation knows, for evaluation alone: truth.json (poses, print scale, depth camera, lens, receipt
-                 of effects), mesh.glb (the true object in its own frame, metres, z up), mask_00000.png, held_out/
+    truth/       what a simulation knows (truth.py)
 
 Depth and masks may be missing, in some views or in all. camera.json has width, height, fx, fy, cx, cy, `pixel_centre`
 ("0" as in OpenCV and the Azure Kinect's calibration, or "0.5" from the image's edge), `distortion` (OpenCV's order, up
@@ -17,10 +16,9 @@ of another camera is registered.
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -28,17 +26,17 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from schemas.base import Array, Frozen, Pose, Positive, PositiveInt, Text, frozen_array
-from schemas.capture import CaptureCamera, CapturedView, CaptureTruth, DepthCamera
+from schemas.capture import CaptureCamera, CapturedView, DepthCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, BoardFrame
-from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
 from workers.door.recordings.pictures import PictureError, change_camera, decode_depth, pinhole_maps, remap
 from workers.geometry.pixels import pixel_rays
 from workers.geometry.zbuffer import register_depth
 from workers.store.images import encode_mask, encode_png
 
-CAMERA_FILE, BOARD_FILE, CAPTURE_FILE, TRUTH = "camera.json", "board.json", "capture.json", "truth"
+CAMERA_FILE, BOARD_FILE, CAPTURE_FILE = "camera.json", "board.json", "capture.json"
+Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
 Model = TypeVar("Model", bound=Frozen)
 ENDINGS = {
     "rgb": ("png", "jpg", "jpeg"),
@@ -67,9 +65,7 @@ class DepthFile(ViewFile):
     width: PositiveInt
     height: PositiveInt
     distortion: Annotated[list[float], Field(max_length=8)] = Field(default_factory=list)
-    T_color_depth: Annotated[
-        list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
-    ]
+    T_color_depth: Matrix
     """Takes coordinates of the depth camera to the colour camera's, metres."""
 
     @model_validator(mode="after")
@@ -144,9 +140,9 @@ def open_folder(path: Path, board: Board | None = None) -> CaptureFolder:
     """
     if not path.is_dir():
         raise CaptureError("missing", f"{path}: there is no such folder")
-    numbers, spec, about = _view_numbers(path), _read_json(path / CAMERA_FILE, CameraFile), path / CAPTURE_FILE
-    described = _read_json(about, CaptureFile) if about.exists() else CaptureFile(name=derive_name(path.resolve().name))
-    board = board or _read_json(path / BOARD_FILE, Board)
+    numbers, spec, about = _view_numbers(path), read_json(path / CAMERA_FILE, CameraFile), path / CAPTURE_FILE
+    described = read_json(about, CaptureFile) if about.exists() else CaptureFile(name=derive_name(path.resolve().name))
+    board = board or read_json(path / BOARD_FILE, Board)
     return CaptureFolder(path, described, camera_of(spec), board, tuple(numbers), spec)
 
 
@@ -183,18 +179,13 @@ def read_board(path: Path) -> Board:
     """The board of a board.json, wherever it is. Raises CaptureError that names the file."""
     if not path.exists():
         raise CaptureError("missing", f"{path} is not there: `verso capture board` writes one beside the print")
-    return _read_json(path, Board)
-
-
-def read_camera_file(path: Path) -> CameraFile:
-    """What a camera.json says, wherever it is. Raises CaptureError that names the file."""
-    return _read_json(path, CameraFile)
+    return read_json(path, Board)
 
 
 def read_view(folder: CaptureFolder, number: int, masked: bool = True) -> CapturedView:
     """One view's images, with its mask if wanted. Raises CaptureError where one cannot be read or has the wrong size."""
     common, path = folder.camera.intrinsics, folder.file("camera", number)
-    k = common if path is None else _intrinsics(folder.stored, _read_json(path, ViewFile))
+    k = common if path is None else _intrinsics(folder.stored, read_json(path, ViewFile))
     images = {}
     for kind, flags, ndim in (("rgb", cv2.IMREAD_COLOR_RGB, 3), ("mask", cv2.IMREAD_GRAYSCALE, 2)):
         if (path := folder.file(kind, number)) and (masked or kind != "mask"):
@@ -244,12 +235,12 @@ def _read_depth(folder: CaptureFolder, number: int, k: Intrinsics) -> NDArray[np
         depth_m = np.nan_to_num(depth_m / np.sqrt(1.0 + (rays**2).sum(axis=2)))
     if spec is not None:
         depth_m = register_depth(depth_m, camera, to.intrinsics, to.lens)
-    return stored_depth(depth_m, to)
+    return stored_depth(depth_m, to.depth_units_per_m)
 
 
-def stored_depth(depth_m: Array, camera: CaptureCamera) -> NDArray[np.uint16]:
-    """Depth [H, W] in units of the camera; what is beyond 16 bits is none."""
-    units = np.rint(depth_m * camera.depth_units_per_m)
+def stored_depth(depth_m: Array, units_per_m: float) -> NDArray[np.uint16]:
+    """[H, W]: depth [H, W], metres, in units; what is beyond 16 bits is none."""
+    units = np.rint(depth_m * units_per_m)
     return np.where(units < 65536.0, units, 0.0).astype(np.uint16)
 
 
@@ -336,7 +327,8 @@ def _intrinsics(whole: CameraFile, part: CameraFile | ViewFile) -> Intrinsics:
     return Intrinsics(width=size.width, height=size.height, **numbers)
 
 
-def _read_json(path: Path, model: type[Model]) -> Model:
+def read_json(path: Path, model: type[Model]) -> Model:
+    """A file of JSON as its model. Raises CaptureError that names file and key."""
     try:
         return model.model_validate(json.loads(path.read_bytes(), parse_constant=_refuse_constant))
     except FileNotFoundError:
@@ -368,69 +360,3 @@ def _decoded(folder: CaptureFolder, path: Path, flags: int, dtype: type, ndim: i
         wanted = f"{k.width} x {k.height} ({np.dtype(dtype)})"
         raise CaptureError("size", f"{path} is {kind}, and camera.json says {wanted}{depth}")
     return image
-
-
-TRUTH_FILE, MESH_FILE, HELD_OUT = "truth.json", "mesh.glb", "held_out"
-
-
-@dataclass(frozen=True, eq=False)
-class TrueObject:
-    """The object of a capture: its asset's names, and its mesh as the bytes of a GLB file in the object frame."""
-
-    category: str
-    instance_id: str
-    glb: bytes
-
-
-def write_truth(
-    path: Path, truth: CaptureTruth, thing: TrueObject, ran: tuple[str, ...], skipped: Mapping[str, str]
-) -> None:
-    """Writes truth.json and mesh.glb below a capture's folder; `ran` and `skipped` are the receipt of effects."""
-    record = {
-        "object": {"category": thing.category, "instance_id": thing.instance_id, "mesh": MESH_FILE},
-        "T_board_cam": [T.tolist() for T in truth.T_board_cam],
-        "T_board_obj": truth.T_board_obj.tolist(),
-        "print_scale": truth.print_scale,
-        "T_color_depth": truth.T_color_depth.tolist(),
-        "depth_bias_m": truth.depth_bias_m,
-        "lens": None if truth.lens is None else truth.lens.model_dump(),
-        "effects": list(ran),
-        "skipped": [{"effect": name, "why": why} for name, why in skipped.items()],
-    }
-    folder = path / TRUTH
-    folder.mkdir(exist_ok=True)
-    (folder / MESH_FILE).write_bytes(thing.glb)
-    (folder / TRUTH_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-
-
-def write_true_mask(path: Path, number: int, mask: NDArray[np.bool_]) -> None:
-    """Writes the object's true pixels [H, W] of one view."""
-    folder = path / TRUTH
-    folder.mkdir(exist_ok=True)
-    (folder / f"mask_{number:05d}.png").write_bytes(encode_mask(mask))
-
-
-def read_truth(path: Path) -> CaptureTruth | None:
-    """What a capture's folder says of its truth; None where it has none. Raises CaptureError where it cannot be read."""
-    file = path / TRUTH / TRUTH_FILE
-    if not file.exists():
-        return None
-    try:
-        record: dict[str, Any] = json.loads(file.read_bytes())
-        lens = record["lens"]
-        return CaptureTruth(
-            T_board_cam=frozen_array(record["T_board_cam"]).reshape(-1, 4, 4),
-            T_board_obj=frozen_array(record["T_board_obj"]).reshape(4, 4),
-            print_scale=float(record["print_scale"]),
-            T_color_depth=frozen_array(record["T_color_depth"]).reshape(4, 4),
-            depth_bias_m=float(record["depth_bias_m"]),
-            lens=None if lens is None else Distortion(**lens),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise CaptureError("unreadable", f"{file} is no truth of a simulated capture: {error!r}") from error
-
-
-def read_receipt(path: Path) -> tuple[tuple[str, ...], tuple[dict[str, str], ...]]:
-    """(names of the effects that ran, [{effect, why}] of those that did not) of a simulated capture's folder."""
-    record = json.loads((path / TRUTH / TRUTH_FILE).read_bytes())
-    return tuple(record["effects"]), tuple(record["skipped"])

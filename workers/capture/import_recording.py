@@ -22,7 +22,7 @@ from workers.capture.folder import (
     camera_of,
     describe_camera,
     is_taken_out,
-    read_camera_file,
+    read_json,
     stored_depth,
     write_description,
     write_view,
@@ -202,7 +202,7 @@ def _open(path: Path, file: Path | None) -> tuple[Recorded, CameraFile, list[str
     if opened.color is None and not file.is_file():
         how = f"describe it in a {CAMERA_FILE} (docs/captures.md has its keys) and name that by --camera"
         raise CaptureError("calibration", f"{path}: {opened.missing}: {how}, or put it into the folder")
-    spec, notes = read_camera_file(file), []
+    spec, notes = read_json(file, CameraFile), []
     if "depth_units_per_m" not in spec.model_fields_set:
         units = opened.color.depth_units_per_m if opened.color else opened.units_per_m
         spec = spec.model_copy(update={"depth_units_per_m": units})
@@ -327,4 +327,4 @@ def _view(recording: Recorded, number: int, color: RecordedFrame, depth: Recorde
     else:
         depth_m = register_depth(depth_m, camera, common.intrinsics, common.lens)
     rgb = change_camera(rgb, k, common.intrinsics, between=True)
-    return CapturedView(number, rgb, stored_depth(depth_m, common), None)
+    return CapturedView(number, rgb, stored_depth(depth_m, common.depth_units_per_m), None)

@@ -19,7 +19,7 @@ from schemas.scene.shape import Asset, Material, Part, Shape
 from workers.assets.builtin.make import shape_digest
 from workers.assets.catalogue import Catalogue, load_asset
 from workers.assets.mass import mass_properties
-from workers.capture.folder import CaptureFolder, open_folder, read_receipt, read_truth
+from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.process import CaptureViews
 from workers.capture.reconstruct import estimate_surface, given_files
 from workers.capture.results import digest_inputs
@@ -34,6 +34,7 @@ from workers.capture.rows import (
 )
 from workers.capture.score import read_whole_truth, score_capture
 from workers.capture.simulate.simulate import simulate_capture
+from workers.capture.truth import read_receipt, read_truth
 from workers.door.meshes.mesh import is_solid
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import translation

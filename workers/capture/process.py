@@ -3,7 +3,7 @@
 import io
 import json
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -38,6 +38,7 @@ from workers.capture.folder import (
     describe_camera,
     open_folder,
     pose_text,
+    stored_depth,
     write_pose,
 )
 from workers.capture.reconstruct import (
@@ -62,9 +63,8 @@ from workers.capture.results import (
 )
 from workers.capture.surface.object_mask import Ground, down_to_board, silhouette
 from workers.capture.surface.posed_view import PosedView, distort_mask
-from workers.capture.surface.synthesize import Source, choose_sources, move_depth, prepare_source, synthesize_view
+from workers.capture.surface.synthesize import Source, choose_sources, color_depth, prepare_source, synthesize_view
 from workers.capture.surface.tsdf import fit_depth
-from workers.geometry.pixels import round_depth
 from workers.scene.context import Stopwatch
 from workers.scene.pairs import front_distance, place_mirror_camera
 from workers.store.images import encode_mask, encode_png
@@ -76,6 +76,7 @@ SCHEMA = pa.schema(
     [
         *(("number", pa.int64()), ("estimate", pa.string()), ("chosen", pa.bool_()), ("status", pa.string())),
         ("reasons", pa.list_(pa.string())),
+        ("cluttered", pa.bool_()),
         *((name, SCHEMAS["views"].field(name).type) for name in _CAMERA),
         ("markers", pa.int64()),
         *((name, pa.float64()) for name in _RESIDUALS),
@@ -115,7 +116,12 @@ def pose_table(estimates: Estimates, camera: CaptureCamera) -> bytes:
 def _pose_row(view: ViewEstimate, before: ViewEstimate | None, camera: CaptureCamera) -> Row:
     pose = np.eye(4) if view.T_board_cam is None else view.T_board_cam
     row = {**camera_columns(Camera(camera.intrinsics, pose)), **residual_columns(view, before)}
-    row |= {"status": view.status, "reasons": view.reasons, "depth_before_mm": before.depth_mm if before else None}
+    row |= {
+        "status": view.status,
+        "reasons": view.reasons,
+        "cluttered": view.is_cluttered,
+        "depth_before_mm": before.depth_mm if before else None,
+    }
     if view.T_board_cam is None:
         row["T_world_cam"] = None
     if view.covariance is not None:
@@ -143,6 +149,7 @@ def read_poses(path: Path) -> tuple[ViewEstimate, ...]:
             reprojection_px=row["reprojection_px"],
             depth_mm=row["depth_mm"],
             reasons=tuple(row["reasons"]),
+            is_cluttered=bool(row["cluttered"]),
         )
         for row in rows
         if row["chosen"]
@@ -190,8 +197,8 @@ def _view_files(given: Given, estimates: Estimates, body: Mesh) -> dict[str, byt
         files[f"board_{number:05d}.txt"] = pose_text(board).encode()
         files[f"correction_{number:05d}.txt"] = pose_text(correction).encode()
         if not given.has_mask(number):
-            cluttered = estimates.estimate.is_cluttered(number) and given.folder.file("depth", number) is not None
-            depth_m = read_posed(given, estimates.estimate, number).depth_m if cluttered else None
+            hides = estimates.estimate.view(number).is_cluttered
+            depth_m = color_depth(read_posed(given, estimates.estimate, number)) if hides else None
             mask = silhouette(body, Camera(camera.intrinsics, correction @ board), depth_m)
             files[f"mask_{number:05d}.png"] = encode_mask(distort_mask(mask, camera))
     return files
@@ -261,13 +268,12 @@ class CaptureViews:
     def images(self, number: int) -> PosedImages:
         """A captured view: its picture without the lens, its depth in the same camera, the object's mask.
 
-        Depth is what was measured, corrected. Where the correction moves the depth camera, depth is drawn anew from there.
+        Depth is what was measured, corrected; what hides the object of a cluttered view is no part of its mask.
         """
         view = self.posed(number)
-        depth_m, hides = view.depth_m, self.estimate.is_cluttered(number)
-        mask = silhouette(self.body, view.camera, depth_m if hides else None) if view.mask is None else view.mask
-        if not np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
-            depth_m = move_depth(depth_m, view.depth_camera, view.camera)
+        depth_m, mask = color_depth(view), view.mask
+        if mask is None:
+            mask = silhouette(self.body, view.camera, depth_m if self.estimate.view(number).is_cluttered else None)
         return PosedImages(number, view.camera, view.rgb, depth_m.astype(np.float64), mask)
 
     def synthesize(self, camera: Camera, without: int | None = None) -> SynthesizedView:
@@ -324,45 +330,44 @@ def read_result(path: Path) -> CaptureViews:
     return CaptureViews(given_files(folder), captures, estimate, surface, body)
 
 
-FARTHEST_UNITS = 65_535.0
-
-
-def write_synthesized(result: CaptureViews, T_board_cam: Pose, out: Path, number: int = 0) -> dict[str, Any]:
+def write_synthesized(result: CaptureViews, T_board_cam: Pose, out: Path) -> dict[str, Any]:
     """The view from one pose. Returns what is said of it; raises CaptureError where nothing is seen from there."""
     camera = Camera(result.folder.camera.intrinsics, frozen_array(T_board_cam))
-    return _finish(result, out, [_write(result, result.synthesize(camera), camera, out, number)])[0]
+    return _write_views(result, out, [(0, camera, result.synthesize(camera), {})])[0]
 
 
 def write_mirrors(result: CaptureViews, out: Path) -> list[dict[str, Any]]:
     """The mirror view of every used view, with the number of that view; views that see nothing of the object have none."""
-    made = []
-    for view in result.estimate.used:
-        with suppress(ViewError, CaptureError):
-            camera, d_z, shown = result.mirror(view.number)
-            made.append(_write(result, shown, camera, out, view.number) | {"d_z_m": d_z})
-    return _finish(result, out, made)
+
+    def mirrors() -> Iterator[Written]:
+        for view in result.estimate.used:
+            with suppress(ViewError, CaptureError):
+                camera, d_z, shown = result.mirror(view.number)
+                yield view.number, camera, shown, {"d_z_m": d_z}
+
+    return _write_views(result, out, mirrors())
 
 
-def _write(result: CaptureViews, view: SynthesizedView, camera: Camera, out: Path, number: int) -> dict[str, Any]:
+Written = tuple[int, Camera, SynthesizedView, dict[str, Any]]
+"""A view's number, its camera, what it shows, and what else is said of it."""
+
+
+def _write_views(result: CaptureViews, out: Path, views: Iterable[Written]) -> list[dict[str, Any]]:
+    """The files of views, made one by one, and views.json: the pinhole camera, pixel centres at 0.5, and what is said of each."""
     if out.resolve() == result.folder.path.resolve():
         raise OutputError(f"{out} is the capture itself: name another folder")
-    out.mkdir(parents=True, exist_ok=True)
-    units = result.folder.camera.depth_units_per_m
-    depth = round_depth(view.depth_m, 0.0, FARTHEST_UNITS / units, units)
-    files = {"rgb": encode_png(view.rgb), "depth": encode_png(depth)}
-    files |= {"mask": encode_mask(view.mask), "measured": encode_mask(view.measured)}
-    for kind, data in files.items():
-        (out / f"{kind}_{number:05d}.png").write_bytes(data)
-    write_pose(out / f"board_{number:05d}.txt", camera.T_world_cam)
-    return {"name": f"{number:05d}", "measured_share": view.measured_share, "sources": list(view.sources)}
-
-
-def _finish(result: CaptureViews, out: Path, made: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """views.json: the pinhole camera, pixel centres at 0.5, and what is said of each view."""
-    if made:
-        k = result.folder.camera.intrinsics
-        camera = {**k.model_dump(), "pixel_centre": "0.5", "depth_units_per_m": result.folder.camera.depth_units_per_m}
-        (out / "views.json").write_text(
-            json.dumps({"camera": camera, "views": made}, indent=1) + "\n", encoding="utf-8"
-        )
-    return made
+    units, said = result.folder.camera.depth_units_per_m, []
+    for number, camera, view, more in views:
+        out.mkdir(parents=True, exist_ok=True)
+        files = {"rgb": encode_png(view.rgb), "depth": encode_png(stored_depth(view.depth_m, units))}
+        files |= {"mask": encode_mask(view.mask), "measured": encode_mask(view.measured)}
+        for kind, data in files.items():
+            (out / f"{kind}_{number:05d}.png").write_bytes(data)
+        write_pose(out / f"board_{number:05d}.txt", camera.T_world_cam)
+        share = {"measured_share": view.measured_share, "sources": list(view.sources)}
+        said.append({"name": f"{number:05d}"} | share | more)
+    if said:
+        pinhole = result.folder.camera.intrinsics.model_dump()
+        described = {"camera": {**pinhole, "pixel_centre": "0.5", "depth_units_per_m": units}, "views": said}
+        (out / "views.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
+    return said

@@ -5,25 +5,25 @@ What the user wrote into the folder wins over every estimate.
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from schemas.base import Pose
-from schemas.capture import CaptureEstimate, Estimates, Reconstruction
+from schemas.capture import CapturedView, CaptureEstimate, Estimates, Reconstruction
 from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Captures, Estimate, Estimation, Fusion
 from schemas.scene.shape import Mesh
 from workers.capture.board import frame_in_board, open_dictionary
-from workers.capture.detect import detect_markers
+from workers.capture.detect import SEVERAL, detect_markers
 from workers.capture.folder import CaptureFolder, read_pose, read_view
 from workers.capture.poses.causes import compare_cameras
 from workers.capture.poses.estimates import estimate_article, estimate_joint, estimate_markers
-from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, observe_view
+from workers.capture.poses.markers import Evidence, MarkerPose, check_depth, choose_prints, fits_board, observe_view
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.solve_board import other_board
 from workers.capture.poses.standing import check_moments
-from workers.capture.results import own_files
+from workers.capture.results import written_files
 from workers.capture.surface.coverage import describe_grazing
 from workers.capture.surface.fusion import fuse_views
 from workers.capture.surface.object_mask import ObjectRegion, down_to_board, find_object
@@ -47,6 +47,8 @@ class Given:
     ours: frozenset[str]
     notes: tuple[str, ...] = ()
     """What was changed before anything was estimated."""
+    views: dict[int, CapturedView] = field(init=False, default_factory=dict)
+    """Images that were read for their markers and are not posed yet, without masks; merging holds as many."""
 
     def pose(self, prefix: str, number: int) -> Pose | None:
         """[4, 4] of the user's file `prefix`_00000.txt in our board frame, None where there is none or it is ours.
@@ -71,7 +73,7 @@ def given_files(folder: CaptureFolder, spec: Estimation | None = None) -> Given:
 
     Raises CaptureError where process.json or an image cannot be read.
     """
-    given = Given(folder, own_files(folder.path))
+    given = Given(folder, written_files(folder.path))
     if spec is None or not spec.calibrate:
         return given
     for _ in range(CALIBRATIONS):
@@ -120,10 +122,12 @@ class Merged:
 
 def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedView:
     """One view with its pose in an estimate; the mask is the user's. Raises CaptureError where it has no pose or no depth."""
-    view = next(view for view in estimate.views if view.number == number)
+    view = estimate.view(number)
     if view.T_board_cam is None:
         raise CaptureError("no_pose", f"view {number} has no pose: {'; '.join(view.reasons)}")
-    stored = read_view(given.folder, number, given.has_mask(number))
+    stored, masked = given.views.pop(number, None), given.has_mask(number)
+    if stored is None or masked:
+        stored = read_view(given.folder, number, masked)
     return pose_view(stored, given.folder.camera, view.T_board_cam, estimate.depth)
 
 
@@ -134,6 +138,7 @@ def read_used(given: Given, estimate: CaptureEstimate) -> Iterator[PosedView]:
             posed = read_posed(given, estimate, view.number)
             if posed.depth_m.any():
                 yield posed
+    given.views.clear()
 
 
 def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: Stopwatch) -> Merged:
@@ -193,7 +198,9 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     clock = processor_clock()
     evidence = _observe(given, spec, clock)
     if not any(seen.markers or seen.manual_T_board_cam is not None for seen in evidence.observations):
-        raise CaptureError("markers", _no_markers(given.folder))
+        what = f"no marker of {given.folder.board.dictionary} was found in any of {len(given.folder.numbers)} views"
+        remedy = other_board(given.folder) or "check that they are sharp, and not over-exposed"
+        raise CaptureError("markers", f"{given.folder.path}: {what}; {remedy}")
     check_moments(evidence)
     check_depth(evidence)
     by_name: dict[Estimate, CaptureEstimate] = {}
@@ -205,7 +212,7 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     corrected = _corrected(by_name[spec.estimate], evidence)
     by_name[spec.estimate] = replace(corrected, notes=(*evidence.notes, *corrected.notes))
     if not by_name[spec.estimate].used:
-        raise CaptureError("poses", _no_pose(by_name[spec.estimate], given.folder))
+        raise CaptureError("poses", _no_pose(by_name[spec.estimate], evidence, given.folder))
     return Estimates(spec.estimate, by_name, clock.seconds)
 
 
@@ -225,14 +232,15 @@ def _corrected(estimate: CaptureEstimate, evidence: Evidence) -> CaptureEstimate
 
 
 def _observe(given: Given, spec: Estimation, clock: Stopwatch) -> Evidence:
-    """What is seen in each view, in order of number; no two views' images are held at once."""
+    """What is seen in each view, in order of number."""
     folder = given.folder
     setup = Setup(folder.camera, folder.board, spec)
     dictionary = open_dictionary(folder.board, folder.path)
     views = []
     for number in folder.numbers:
         with clock.stage("read"):
-            view = read_view(folder, number, masked=False)
+            view = given.views.get(number) or read_view(folder, number, False)
+            given.views[number] = view
         with clock.stage("detect"):
             detection = detect_markers(view.rgb, folder.board, dictionary, folder.camera, number)
         with clock.stage("sample"):
@@ -259,15 +267,14 @@ def _with_given_pose(seen: Observation, markers: MarkerPose, given: Given) -> Ob
     return replace(seen, manual_T_board_cam=T, given_by=f"the pose of {name} is kept as it was given")
 
 
-def _no_markers(folder: CaptureFolder) -> str:
-    what = f"{folder.path}: no marker of {folder.board.dictionary} was found in any of {len(folder.numbers)} views"
-    return f"{what}; {other_board(folder) or 'check that they are sharp, and not over-exposed'}"
-
-
-def _no_pose(estimate: CaptureEstimate, folder: CaptureFolder) -> str:
+def _no_pose(estimate: CaptureEstimate, evidence: Evidence, folder: CaptureFolder) -> str:
     first = next((f"view {view.number}: {'; '.join(view.reasons)}" for view in estimate.views if view.reasons), "")
+    fits = any(
+        seen.markers >= SEVERAL and view.fit is not None and fits_board(seen, view.fit.T_board_cam, folder.camera)
+        for seen, view in zip(evidence.observations, evidence.markers, strict=True)
+    )
     what = f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}"
-    return f"{what}; {other_board(folder) or first}"
+    return f"{what}; {first if fits else other_board(folder) or first}"
 
 
 def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tuple[Estimates, Merged]:

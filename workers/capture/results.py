@@ -24,7 +24,8 @@ from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
-from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW, TRUTH
+from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
+from workers.capture.truth import TRUTH
 from workers.door.meshes.ply import Element, encode_ply, parse_ply
 from workers.door.opening import as_refusal
 
@@ -48,7 +49,7 @@ def read_record(path: Path) -> dict[str, Any] | None:
     return record
 
 
-def own_files(path: Path) -> frozenset[str]:
+def written_files(path: Path) -> frozenset[str]:
     """Names of the folder's files that processing wrote and nobody changed."""
     record = read_record(path)
     names = record["files"] if record is not None else {}
@@ -60,7 +61,7 @@ def write_results(path: Path, files: Mapping[str, bytes], record: Mapping[str, A
 
     process.json is written before the files that it names: where the work is cut off, what is there is known as ours.
     """
-    for name in own_files(path):
+    for name in written_files(path):
         (path / name).unlink()
     users = sorted(name for name in files if (path / name).exists())
     ours = {name: data for name, data in sorted(files.items()) if name not in users}
@@ -146,7 +147,10 @@ def digest_inputs(path: Path) -> str:
 
 def _list_inputs(path: Path) -> list[Path]:
     top = [file for file in path.iterdir() if file.is_file()]
-    inputs = {file.name for file in top if _is_input(file.name)} - own_files(path)
+    described = CAMERA_FILE, BOARD_FILE, CAPTURE_FILE
+    inputs = {file.name for file in top if file.name in described or FILE_OF_VIEW.fullmatch(file.name)} - written_files(
+        path
+    )
     if BOARD_FILE in inputs:  # it may name a file of markers beside it
         named = re.search(rb'"dictionary"\s*:\s*"([^"/\\]+)"', (path / BOARD_FILE).read_bytes())
         inputs |= {named[1].decode(errors="replace")} if named else set()
@@ -154,14 +158,10 @@ def _list_inputs(path: Path) -> list[Path]:
     return sorted([*(file for file in top if file.name in inputs), *truth])
 
 
-def _is_input(name: str) -> bool:
-    return name in (CAMERA_FILE, BOARD_FILE, CAPTURE_FILE) or FILE_OF_VIEW.fullmatch(name) is not None
-
-
 def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:
     """The job's catalogue; with folders of captures its digest covers every input file of theirs.
 
-    `watch` is told now and then how far it is. Raises AssetSourceError where a folder cannot be used.
+    `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
     if job.captures is None or not job.captures.folders:
@@ -169,17 +169,13 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     listings, folders = [], job.captures.folders
     for number, name in enumerate(folders):
         watch("captures", number, len(folders))
-        listings.append(_list_capture((job_folder / Path(name).expanduser()).resolve(), f"captures.folders.{number}"))
+        folder, key = (job_folder / Path(name).expanduser()).resolve(), f"captures.folders.{number}"
+        if not folder.is_dir():
+            raise AssetSourceError(f"{key}: {folder}: there is no such folder")
+        try:
+            listings.append(CaptureListing(folder, digest_inputs(folder)))
+        except CaptureError as error:
+            raise AssetSourceError(f"{key}: {error.detail}") from error
     watch("captures", len(folders), len(folders))
     whole = "\n".join([catalogue.digest, *(listing.sha256 for listing in listings)])
     return replace(catalogue, captures=tuple(listings), digest=hashlib.sha256(whole.encode()).hexdigest())
-
-
-def _list_capture(folder: Path, key: str) -> CaptureListing:
-    """A folder and the digest of its input files. Raises AssetSourceError that names the key of the job file."""
-    if not folder.is_dir():
-        raise AssetSourceError(f"{key}: {folder}: there is no such folder")
-    try:
-        return CaptureListing(folder, digest_inputs(folder))
-    except CaptureError as error:
-        raise AssetSourceError(f"{key}: {error.detail}") from error

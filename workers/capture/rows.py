@@ -276,7 +276,7 @@ def quality_columns(
 
 def view_columns(done: ProcessedCapture, pair: CapturedPair, role: Role) -> Row:
     """The column `capture` of `views`: residuals and errors of the captured view, and of what the mirror view is made."""
-    view = next(view for view in done.estimates.estimate.views if view.number == pair.number)
+    view = done.estimates.estimate.view(pair.number)
     score = done.score.views.get(pair.number, ViewScore()) if done.score is not None else ViewScore()
     made = pair.mirror if role == "mirror" else None
     return {

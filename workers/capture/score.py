@@ -17,14 +17,15 @@ from schemas.capture import CaptureScore, Reconstruction, SynthesizedView, ViewS
 from schemas.errors import CaptureError, ViewError
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.capture.folder import MESH_FILE, TRUTH, CaptureFolder, read_truth
+from workers.capture.folder import CaptureFolder
 from workers.capture.process import CaptureViews
 from workers.capture.surface.coverage import describe_grazing, sample_surface
-from workers.capture.surface.posed_view import PosedView, facing_cosine, placed, visible_points
+from workers.capture.surface.posed_view import UNSEEN, PosedView, best_cosine, facing_cosine, placed
+from workers.capture.truth import MESH_FILE, TRUTH, read_truth
 from workers.geometry.camera import project, spread_evenly
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import UP, angle_between, invert, pose, rotation_about, transform
-from workers.geometry.raycast import cast_view
+from workers.geometry.raycast import Caster, cast_view
 
 SAMPLES = 40_000
 """Points of the true surface: their share within a distance is known to a quarter of a percent."""
@@ -254,7 +255,7 @@ def score_capture(views: CaptureViews, truth: Truth, held_out: int = HELD_OUT) -
 def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]) -> SurfaceErrors:
     """Cloud and mesh against the true surface, of which the cameras see a part."""
     samples, normals = sample_surface(true, SAMPLES)
-    visible = visible_points(true, samples, normals, cameras)
+    visible = best_cosine(Caster(true), samples, normals, cameras) > UNSEEN
     distance_m, _ = cKDTree(surface.points).query(samples)
     off, _ = distance_to_mesh(surface.points, true)
     back, _ = distance_to_mesh(samples[visible], Mesh(surface.vertices, surface.faces))
@@ -276,8 +277,8 @@ def score_measured(views: CaptureViews, truth: Truth) -> tuple[float, float]:
     """
     samples, normals = sample_surface(truth.surface, SAMPLES)
     numbers = sorted(set(views.cameras) & set(truth.T_board_cam))
-    k = views.folder.camera.intrinsics
-    visible = visible_points(truth.surface, samples, normals, [Camera(k, truth.T_board_cam[n]) for n in numbers])
+    cameras = [Camera(views.folder.camera.intrinsics, truth.T_board_cam[n]) for n in numbers]
+    visible = best_cosine(Caster(truth.surface), samples, normals, cameras) > UNSEEN
     measured = np.zeros(len(samples), np.bool_)
     for number in numbers:
         measured |= measured_points(samples, normals, views.posed(number))

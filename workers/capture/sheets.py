@@ -14,7 +14,7 @@ from reportlab.pdfgen.canvas import Canvas
 from schemas.base import Array
 from schemas.errors import InputError
 from schemas.job.captures import Board
-from workers.capture.board import PrintLayout, Words, board_geometry, lay_out_print, marker_cells, upright
+from workers.capture.board import PrintLayout, Words, lay_out_print
 
 MOST_PIXELS = 400_000_000
 """Of a picture: more would not fit into the memory of a small machine."""
@@ -30,20 +30,21 @@ def board_png(board: Board, dpi: float) -> bytes:
     if layout.width_m * layout.height_m * px_per_m**2 > MOST_PIXELS:
         raise InputError(f"a board of {layout.width_m:g} x {layout.height_m:g} m at {dpi:g} dpi has too many pixels")
     stream = io.BytesIO()
-    picture = draw_print(board, layout, px_per_m)
+    picture = draw_print(layout, px_per_m)
     Image.fromarray(picture).save(stream, "PNG", dpi=(px_per_m * 0.0254,) * 2)
     return stream.getvalue()
 
 
-def draw_print(board: Board, layout: PrintLayout, px_per_m: float) -> NDArray[np.uint8]:
+def draw_print(layout: PrintLayout, px_per_m: float) -> NDArray[np.uint8]:
     """[H, W] uint8: the printed sheet with its markers, ruler, arrow and text, upper left corner first."""
-    light = _light_of_markers(board, (layout.width_m, layout.height_m), px_per_m)
-    corner = np.array([-0.5 * layout.width_m, 0.5 * layout.height_m])
-    for left, bottom, right, top in layout.ruler:
-        across, column = _cover(np.array([left - corner[0], right - corner[0]]) * px_per_m, light.shape[1])
-        down, row = _cover(np.array([corner[1] - top, corner[1] - bottom]) * px_per_m, light.shape[0])
-        part = light[row : row + len(down), column : column + len(across)]
-        np.minimum(part, 1.0 - down @ across.T, out=part)
+    width, height = (math.ceil(size * px_per_m - 1e-6) for size in (layout.width_m, layout.height_m))
+    light, corner = np.ones((height, width)), np.array([-0.5 * layout.width_m, 0.5 * layout.height_m])
+    for of_ruler, rectangles in enumerate((layout.markers, layout.ruler)):
+        for left, bottom, right, top in rectangles:
+            across, column = _cover((left - corner[0]) * px_per_m, (right - corner[0]) * px_per_m, width)
+            down, row = _cover((corner[1] - top) * px_per_m, (corner[1] - bottom) * px_per_m, height)
+            part = light[row : row + len(down), column : column + len(across)]
+            np.minimum(part, (1.0 if of_ruler else part) - np.outer(down, across), out=part)
     picture = np.rint(255.0 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
     arrow = (layout.arrow - corner) * [px_per_m, -px_per_m] - 0.5  # OpenCV has pixel centres at whole numbers
     cv2.fillConvexPoly(picture, np.rint(arrow * 256).astype(np.int32), 0, cv2.LINE_AA, 8)
@@ -52,28 +53,11 @@ def draw_print(board: Board, layout: PrintLayout, px_per_m: float) -> NDArray[np
     return picture
 
 
-def _light_of_markers(board: Board, size_m: tuple[float, float], px_per_m: float) -> Array:
-    """[H, W] float64: the white share of each pixel of a sheet of a size, with the markers in its middle."""
-    width, height = (math.ceil(size * px_per_m - 1e-6) for size in size_m)
-    light: Array = np.ones((height, width))
-    geometry = board_geometry(board.model_copy(update={"measured_ruler_m": None}))
-    plain = np.ones((1, 1), np.bool_)
-    printed = [*zip(marker_cells(board), geometry.corners, strict=True), *((plain, quad) for quad in geometry.squares)]
-    for black, corners in printed:
-        cells, left, top, side = upright(black, corners)
-        edges = np.linspace(0.0, side, len(cells) + 1)
-        across, column = _cover((left + 0.5 * size_m[0] + edges) * px_per_m, width)
-        down, row = _cover((0.5 * size_m[1] - top + edges) * px_per_m, height)
-        light[row : row + len(down), column : column + len(across)] -= down @ cells.astype(np.float64) @ across.T
-    return light
-
-
-def _cover(edges: Array, count: int) -> tuple[Array, int]:
-    """([P, n], first pixel): the share of each of P pixels that lies between two of n + 1 rising edges, pixels."""
-    first, last = max(math.floor(edges[0]), 0), min(math.ceil(edges[-1]), count)
-    pixel = np.arange(first, last, dtype=np.float64)[:, None]
-    cover = np.minimum(pixel + 1.0, edges[None, 1:]) - np.maximum(pixel, edges[None, :-1])
-    return np.maximum(cover, 0.0), first
+def _cover(start: float, stop: float, count: int) -> tuple[Array, int]:
+    """([P], first pixel): the share of each of P pixels, of a line of `count`, that lies between two places, pixels."""
+    first, last = max(math.floor(start), 0), min(math.ceil(stop), count)
+    pixel = np.arange(first, last, dtype=np.float64)
+    return np.maximum(np.minimum(pixel + 1.0, stop) - np.maximum(pixel, start), 0.0), first
 
 
 def _write(picture: NDArray[np.uint8], words: Words, at: tuple[float, float], px_per_m: float) -> None:
@@ -195,7 +179,7 @@ def _canvas(board: Board, page: tuple[float, float]) -> tuple[io.BytesIO, Canvas
 def _draw(canvas: Canvas, layout: PrintLayout) -> None:
     """Draws the sheet with the board frame's origin at the canvas's."""
     canvas.setFillGray(0)
-    for left, bottom, right, top in np.concatenate([layout.markers, layout.ruler]) * POINTS_PER_M:
+    for left, bottom, right, top in np.concatenate([layout.markers, layout.seams, layout.ruler]) * POINTS_PER_M:
         canvas.rect(left, bottom, right - left, top - bottom, stroke=0, fill=1)
     path = canvas.beginPath()
     path.moveTo(*(layout.arrow[0] * POINTS_PER_M))

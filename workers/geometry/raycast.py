@@ -96,7 +96,7 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
     for thing in sorted(things, key=attrgetter("region_id")):
         mesh = _in_camera(thing, camera)
         rows, columns = _pixels_in_reach(mesh, k)
-        caster = _Caster(mesh)
+        caster = Caster(mesh)
         for some in _blocks(len(rows)):
             rays = unproject(rows[some], columns[some], np.ones(len(rows[some])), k)
             distance, cosine = caster.cast(NEAR_M * rays, rays)
@@ -113,7 +113,7 @@ def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hi
     best = _no_hits(len(origins))
     everything = np.arange(len(origins))
     for thing in sorted(things, key=attrgetter("region_id")):
-        caster = _Caster(Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces))
+        caster = Caster(Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces))
         for some in _blocks(len(origins)):
             best.keep_nearer(everything[some], *caster.cast(origins[some], directions[some]), thing.region_id)
     return best
@@ -171,8 +171,8 @@ def _pixels_in_reach(mesh: Mesh, k: Intrinsics) -> tuple[NDArray[np.int64], NDAr
     return np.repeat(rows, len(columns)), np.tile(columns, len(rows))
 
 
-class _Caster:
-    """A mesh in Embree's tree."""
+class Caster:
+    """A mesh in Embree's tree, for rays in the mesh's own frame."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._empty = not len(mesh.faces)  # Embree does not take empty scenes

@@ -49,13 +49,15 @@ def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Ar
 def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:
     """[N, 2]: the pairs of two lists of boxes, bounds [A, 3] and [B, 3], with at most `within` between them on each axis.
 
-    Sorted by the first box. The second list is swept along the axis on which it extends farthest.
+    Sorted by the first box. The second list is swept along the axis on which it extends farthest, cut to where the first is:
+    a box as wide as a floor would have every other one looked at.
     """
     if len(low) == 0 or len(others_low) == 0:
         return np.empty((0, 2), np.int64)
     axis = int((others_high.max(axis=0) - others_low.min(axis=0)).argmax())
-    starts = others_low[:, axis]
-    widest, order = float((others_high[:, axis] - starts).max()), np.argsort(starts, kind="stable")
+    starts = np.maximum(others_low[:, axis], low[:, axis].min() - within)
+    ends = np.minimum(others_high[:, axis], high[:, axis].max() + within)
+    widest, order = float((ends - starts).max()), np.argsort(starts, kind="stable")
     return _sweep(low, high, others_low, others_high, within, axis, widest, order, starts[order])
 
 

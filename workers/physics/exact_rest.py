@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 
 import daqp
 import numpy as np
+from scipy.spatial import cKDTree
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import MassProperties
@@ -41,12 +42,39 @@ class Motion:
     """What bodies do in a step, and the forces that make them.
 
     moves and turns [bodies, 3]: of the centres of mass, metres, and about them, radians, world; forces [contacts, 3]: on the
-    upper bodies, newtons, if nothing moves.
+    upper bodies, newtons, if nothing moves. multipliers [contacts, edges]: the same along the edges of the friction cones, as
+    DAQP has them: negative, in units of its own.
     """
 
     moves: Array
     turns: Array
     forces: Array
+    contacts: Contacts
+    multipliers: Array
+
+    def likely(self, contacts: Contacts, edge_count: int) -> Array:
+        """[contacts, edges]: the multipliers of the next step, guessed: those of the nearest contact of the same two bodies."""
+        guess = np.zeros((len(contacts.gaps), edge_count))
+        carry = self.multipliers.any(axis=1)
+        if len(guess) and carry.any() and self.multipliers.shape[1] == edge_count:
+            away, nearest = cKDTree(_marks(contacts)).query(_marks(self.contacts)[carry])
+            same = away < SAME_CONTACT_M
+            guess[nearest[same]] = self.multipliers[carry][same]
+        return guess
+
+
+def _marks(contacts: Contacts) -> Array:
+    """[N, 8]: near one another of contacts of the same bodies that are near and have like normals."""
+    return np.column_stack([contacts.points, SAME_CONTACT_M * contacts.normals, contacts.upper, contacts.lower])
+
+
+SAME_CONTACT_M = 5e-3
+"""Distance up to which a contact of a step may be that of the step before. A wrong guess costs time alone."""
+
+
+FLUSH_M = 1e-6
+"""Overlap that may stay where contacts jam: sides of two bodies that are flush lie nanometres beyond one another, either way, and
+no motion takes both apart."""
 
 
 class JammedError(Exception):
@@ -60,6 +88,7 @@ def step(
     fall: Array,
     gravity_m_s2: float,
     spinning_m: float = 0.0,
+    before: Motion | None = None,
 ) -> Motion:
     """The motion of bodies from rest in the time in which gravity alone moves them by `fall` [3], metres.
 
@@ -67,7 +96,8 @@ def step(
     motion d at every contact: the convex relaxation of Coulomb's law by Anitescu (2006, "Optimization-based simulation of
     nonsmooth rigid multibody dynamics"). A least-distance problem, solved by DAQP (Arnstrom et al. 2022, "A dual active-set
     solver for embedded quadratic programming"). Its multipliers are the contact forces; where nothing moves they balance the
-    weights, which is static equilibrium. Raises JammedError.
+    weights, which is static equilibrium. Where no motion satisfies all, overlap of up to `FLUSH_M` may stay. before: a step of
+    the same bodies shortly before, by which it is solved ten times sooner. Raises JammedError.
     """
     # The inverse of the square root of each tensor of inertia
     roots = [(axes / np.sqrt(moments)) @ axes.T for moments, axes in (np.linalg.eigh(body.tensor) for body in bodies)]
@@ -82,23 +112,56 @@ def step(
     free[:, :3] = root_masses[:, None] * fall / fall_m
     # Lengths in units of `fall_m`, so that all numbers are near 1
     needed = -np.repeat(contacts.gaps / fall_m, len(arms_m)) - matrix @ free.ravel()
-    away, multipliers = _least_distance(matrix, needed)
-    forces = gravity_m_s2 * (multipliers.reshape(*edges.shape[:2], 1) * edges).sum(axis=1)
+    likely = None if before is None or not len(matrix) else before.likely(contacts, len(arms_m))
+    try:
+        away, multipliers = _least_distance(matrix, needed, likely)
+    except JammedError:
+        flush_m = np.where((contacts.gaps < 0.0) & (contacts.gaps >= -FLUSH_M), contacts.gaps, 0.0)
+        if not flush_m.any():
+            raise
+        away, multipliers = _least_distance(matrix, needed + np.repeat(flush_m / fall_m, len(arms_m)), likely)
+    multipliers = multipliers.reshape(edges.shape[:2])
+    forces = gravity_m_s2 * (np.maximum(0.0, -multipliers)[..., None] * edges).sum(axis=1)
     moved = (free + away.reshape(free.shape)) * fall_m
     turns = np.stack([root @ each for root, each in zip(roots, moved[:, 3:], strict=True)])
-    return Motion(moved[:, :3] / root_masses[:, None], turns, forces)
+    return Motion(moved[:, :3] / root_masses[:, None], turns, forces, contacts, multipliers)
 
 
-def _least_distance(matrix: Array, least: Array) -> tuple[Array, Array]:
-    """(x [n], multipliers [m] >= 0): the least x with `matrix @ x >= least`, which is `matrix.T @ multipliers`."""
+def _least_distance(matrix: Array, least: Array, likely: Array | None = None) -> tuple[Array, Array]:
+    """(x [n], multipliers [m] <= 0): the least x with `matrix @ x >= least`, which is `-matrix.T @ multipliers`.
+
+    By the rows alone of multipliers that are `likely` [contacts, edges], if given, and such as prove to be missing: DAQP looks
+    at all rows in every iteration, and a heap of 25 has seven thousand. Of each contact the edge is added that is worst.
+    Raises JammedError where no x is.
+    """
+    if likely is None:
+        return _solve(matrix, least)
+    rows, multipliers, x = likely.ravel() != 0.0, likely.flatten(), np.zeros(matrix.shape[1])
+    while True:
+        if rows.any():
+            x, multipliers[rows] = _solve(matrix[rows], least[rows], multipliers[rows])
+        short = least - matrix @ x
+        short[rows] = -np.inf
+        worst = short.reshape(likely.shape).argmax(axis=1) + likely.shape[1] * np.arange(len(likely))
+        missing = worst[short[worst] > EXACT]
+        if not len(missing):
+            return x, multipliers
+        rows[missing] = True
+
+
+def _solve(matrix: Array, least: Array, start: Array | None = None) -> tuple[Array, Array]:
+    """The same of all rows, by DAQP, which begins at the multipliers `start` [m] and where that fails without."""
     count, size = matrix.shape
     if count == 0:
         return np.zeros(size), np.zeros(0)
     bounds = np.full(count, UNBOUNDED), least, np.zeros(count, dtype=np.int32)
-    x, _, flag, details = daqp.solve(np.eye(size), np.zeros(size), matrix, *bounds, primal_tol=EXACT, dual_tol=EXACT)
-    if flag != OPTIMAL:
+    given = np.eye(size), np.zeros(size), matrix, *bounds
+    x, _, flag, details = daqp.solve(*given, primal_tol=EXACT, dual_tol=EXACT, dual_start=start)
+    if flag == OPTIMAL:
+        return x, details["lam"]
+    if start is None:
         raise JammedError
-    return x, np.maximum(0.0, -details["lam"])
+    return _solve(matrix, least)
 
 
 def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array, arms_m: Array) -> Array:
@@ -210,7 +273,7 @@ def rest(
     surfaces, at, near = [*(thing.surface for thing in things), ground], tuple(poses), None
     reaches = np.array([np.linalg.norm(one.surface.vertices - one.mass.com, axis=1).max() for one in things])
     fall_m, longest_m, known_m, nudges, sliding = FALL_M, LONGEST_FALL_M, 0.0, 0, 0
-    pushed = np.zeros(0)
+    pushed, motion = np.zeros(0), None
     for number in range(MOST_STEPS + (MOST_SPUN if spinning_m else 0)):
         sliding += fall_m < SLIDING_FALL_M
         if sliding > most_sliding and number < MOST_STEPS:
@@ -223,9 +286,9 @@ def rest(
         given = inertias, contacts, friction
         try:
             spun_m = spinning_m if number >= MOST_STEPS else 0.0
-            motion, jammed = _step_past_seams(*given, fall_m, spun_m)
+            motion, jammed = _step_past_seams(*given, fall_m, spun_m, motion)
             if _farthest(motion, reaches) <= STILL * fall_m and nudges < MOST_NUDGES and not jammed:
-                nudge, nudges = _nudge(*given, reaches, spun_m), nudges + 1
+                nudge, nudges = _nudge(*given, reaches, spun_m, motion), nudges + 1
                 if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
                     motion, pushed = nudge, np.zeros(0)
         except JammedError:
@@ -244,7 +307,12 @@ def rest(
 
 
 def _step_past_seams(
-    bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall_m: float, spinning_m: float
+    bodies: Sequence[Inertia],
+    contacts: Contacts,
+    friction: float,
+    fall_m: float,
+    spinning_m: float,
+    before: Motion | None,
 ) -> tuple[Motion, bool]:
     """A step, and whether it left out contacts deeper than `SEAM_M`, which it does where none satisfies all. Raises JammedError.
 
@@ -252,13 +320,13 @@ def _step_past_seams(
     their facets pass. Nothing may come to rest in such a step.
     """
     try:
-        return step(bodies, contacts, friction, fall_m * DOWN, GRAVITY_M_S2, spinning_m), False
+        return step(bodies, contacts, friction, fall_m * DOWN, GRAVITY_M_S2, spinning_m, before), False
     except JammedError:
         shallow = contacts.gaps >= -SEAM_M
         if shallow.all():
             raise
         few = Contacts(*(getattr(contacts, name.name)[shallow] for name in fields(Contacts)))
-        return step(bodies, few, friction, fall_m * DOWN, GRAVITY_M_S2, spinning_m), True
+        return step(bodies, few, friction, fall_m * DOWN, GRAVITY_M_S2, spinning_m, before), True
 
 
 def _farthest(motion: Motion, reaches: Array) -> float:
@@ -276,12 +344,20 @@ def _swings_wider(before: Array, now: Array) -> bool:
     return sizes[1] > sizes[0] and float(before @ now) < -0.5 * sizes[0] * sizes[1]
 
 
-def _nudge(bodies: Sequence[Inertia], contacts: Contacts, friction: float, reaches: Array, spinning_m: float) -> Motion:
+def _nudge(
+    bodies: Sequence[Inertia],
+    contacts: Contacts,
+    friction: float,
+    reaches: Array,
+    spinning_m: float,
+    before: Motion,
+) -> Motion:
     """The farthest motion of bodies in balance on a ground that leans by `LEVEL` to one of four sides."""
     x, y = LEVEL * math.cos(ASLANT_RAD), LEVEL * math.sin(ASLANT_RAD)
     sides = np.array([[x, y, 0.0], [-y, x, 0.0], [-x, -y, 0.0], [y, -x, 0.0]])
     motions = [
-        step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2, spinning_m) for side in sides
+        step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2, spinning_m, before)
+        for side in sides
     ]
     return max(motions, key=lambda motion: _farthest(motion, reaches))
 

@@ -1,33 +1,23 @@
-"""The simulation of falling bodies until they rest: the size of its steps, and what is watched as they fall.
-
-What is watched is the bodies' energy, and the conditions that end a simulation early.
-"""
+"""The simulation of falling bodies until they rest, in steps as short as their speeds ask for, and the record of their energy."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from schemas.base import Array, Pose
 from schemas.job.physics import Physics, Rest
-from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import add_up, invert, translation
-from workers.geometry.hull import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, LEAST_BOUNCE_M_S, GroundShape, World, open_world
 from workers.physics.rigid_body import Body, BodyPose, as_pose
-from workers.physics.support import Face, find_face, inside_margin, support_height
+from workers.physics.support import Face
 
 SHARE = 1e-3
 """Bound on a rise of energy, as a share of what the drop sets free."""
 
 LIFT_M = 2e-5
 """The same as a height that the rise would lift the body by, where that is more: what Bullet leaves a shape to hover by."""
-
-SLIDE_M = 1e-7
-"""Distance that an object may still slide. Bullet's own steps at rest move it by as much."""
 
 Velocity = tuple[Sequence[float], Sequence[float]]
 """Velocity of the centre of mass, m/s, and angular velocity, rad/s, world axes."""
@@ -81,54 +71,10 @@ def energy_height_m(radii2: Sequence[float], at: BodyPose, moving: Velocity) -> 
     return height + (u * u + v * v + s * s + turning) / (2 * GRAVITY_M_S2)
 
 
-def leaves_outline(outline: Array, reach_m: float) -> StopCondition:
-    """Stop when a body of this reach may extend beyond the edge of a convex outline [N, 2].
-
-    Skips the edges while the body is nearer to the outline's middle than any edge, less the reach.
-    """
-    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
-    x, y = middle.tolist()
-    safe_m = float(inside_margin(middle[None, :], outline)[0]) - reach_m
-
-    def leaves(_: int, at: BodyPose) -> bool:
-        if math.hypot(at[0][0] - x, at[0][1] - y) < safe_m:
-            return False
-        return bool(inside_margin(np.array([at[0][:2]]), outline)[0] < reach_m)
-
-    return leaves
-
-
 def strays(middles: Array, far_m: float) -> StopCondition:
     """Stop when a centre of mass is further than this from its middle [3], or from the vertical line through it [2]."""
     at, axes = middles.tolist(), middles.shape[1]
     return lambda number, now: math.dist(now[0][:axes], at[number]) > far_m
-
-
-def falls_below(height_m: float) -> StopCondition:
-    """Stop when a centre of mass is below this height, world z."""
-    return lambda _, at: at[0][2] < height_m
-
-
-def stays_standing(start: ObjectStart, body: Body, top_m: float, friction: float) -> StandingCondition:
-    """The condition of an object over a flat top at the height `top_m`, with this coefficient of friction.
-
-    It has less energy than it takes to tip over the nearest edge of a steady face, and than friction takes up in `SLIDE_M`:
-    m g h <= friction m g s. Energy may rise in the simulation, but not by more than `LIFT_M`.
-    """
-    radii2 = [float(moment) / body.mass_kg for moment in body.moments]
-    T_body_obj = invert(body.T_obj_body)
-
-    def stands(at: BodyPose, moving: Velocity) -> Face | None:
-        energy_m = energy_height_m(radii2, at, moving)
-        if energy_m - at[0][2] > friction * SLIDE_M:
-            return None
-        face = find_face(as_pose(at) @ T_body_obj, start.hull, start.asset.mass.com)
-        if face is None:
-            return None
-        over_m = max(0.0, energy_m - top_m - face.height_m)
-        return face if over_m + LIFT_M <= math.hypot(face.height_m, face.margin_m) - face.height_m else None
-
-    return stands
 
 
 SAMPLE_STEPS = 8
@@ -144,18 +90,11 @@ CALM_M_S = 0.05
 FINEST = 16
 """Ratio of the longest step to the shortest."""
 
-DROP_SHARE = 0.002
-"""Travel per step as a share of the drop, where that is more than `physics.max_step_travel_mm`. Bounds the energy regained
-at touchdown to a thousandth of the fall's."""
-
 REACH_STEPS = 4.0
 """Travel in this many steps is the contact distance on a mesh: contacts exist before they close, and no earlier."""
 
 STANDING_SHARE = 0.2
 """Share of the rest window after which something calm is asked whether it stands."""
-
-THIN_SHARE = 0.05
-"""Upper bound on the travel per step, as a share of the thinnest object's width."""
 
 SKIPPED_TO_M = 2e-4
 """Height of the lowest point above the ground at which the simulation takes over from free fall."""
@@ -213,23 +152,6 @@ class Outcome:
     thrown_m_s: float = 0.0
     spinning: tuple[int, ...] = ()
     moves: tuple[int, float, float] = (0, 0.0, 0.0)
-
-
-def choose_steps(
-    starts: Sequence[ObjectStart], physics: Physics, effects: EffectPlan, drop_m: float, thin_share: float = THIN_SHARE
-) -> StepSizes:
-    """Step sizes from the height of the drop and the thinnest object; constant without the effect `fine_step`."""
-    if not effects.runs("fine_step"):
-        return StepSizes(physics.step_hz, math.inf)
-    thinnest_m = min(least_width_m(start.hull) for start in starts)
-    travel_m = max(physics.max_step_travel_mm / 1e3, DROP_SHARE * drop_m)
-    return StepSizes(physics.step_hz, min(travel_m, thin_share * thinnest_m))
-
-
-def free_fall_m(points: Array, table: Table, flat: bool) -> float:
-    """Metres that points [N, 3], world, fall before one can touch the flat top or the mesh; 0 with nothing below."""
-    below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
-    return max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""The release of a scene's objects in the simulator, with the effects that the plan runs, at one pace after another."""
+"""The release of a scene's objects in the simulator, with the effects that the plan runs, at one pace after another.
+
+Here too is by what the steps are chosen, and what ends a simulation early.
+"""
 
 import dataclasses
 import math
@@ -10,26 +13,27 @@ import numpy as np
 from schemas.base import Array
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, Table
-from workers.geometry.frames import transform
+from workers.geometry.frames import invert, transform
+from workers.geometry.hull import least_width_m
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.convex_parts import parts_of
 from workers.physics.fall import (
+    LIFT_M,
     LOOK_STEPS,
     SAMPLE_STEPS,
-    THIN_SHARE,
     Outcome,
+    StandingCondition,
+    StepSizes,
+    StopCondition,
+    Velocity,
     Watch,
-    choose_steps,
+    energy_height_m,
     fall,
-    falls_below,
-    free_fall_m,
-    leaves_outline,
-    stays_standing,
     strays,
 )
 from workers.physics.pour import AT_ONCE, NOTHING_MORE, Pouring
-from workers.physics.rigid_body import build_body, choose_collision_shape
-from workers.physics.support import SAME_LEVEL_M
+from workers.physics.rigid_body import Body, BodyPose, as_pose, build_body, choose_collision_shape
+from workers.physics.support import SAME_LEVEL_M, Face, find_face, inside_margin, support_height
 
 MANY, CROWD = 4, 25
 """Number of objects from which they fall as coarser convex parts, as time grows with the pairs of parts that are near. And that
@@ -45,6 +49,17 @@ LEFT_M = 0.05
 PRISM_M = 0.5
 """Height of the body that stands for a flat top with its edges: nothing passes through it in a step. It spares the second drop,
 onto the mesh, of the many that roll to an edge; a stack on it gains energy, four times the bound, and none on a slab."""
+
+
+DROP_SHARE = 0.002
+"""Travel per step as a share of the drop, where that is more than `physics.max_step_travel_mm`. Bounds the energy regained
+at touchdown to a thousandth of the fall's."""
+
+THIN_SHARE = 0.05
+"""Upper bound on the travel per step, as a share of the thinnest object's width."""
+
+SLIDE_M = 1e-7
+"""Distance that an object may still slide. Bullet's own steps at rest move it by as much."""
 
 
 @dataclass(frozen=True)
@@ -211,6 +226,23 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
     return fall(bodies, poses, ground, physics, steps, free_m, watch)
 
 
+def choose_steps(
+    starts: Sequence[ObjectStart], physics: Physics, effects: EffectPlan, drop_m: float, thin_share: float = THIN_SHARE
+) -> StepSizes:
+    """Step sizes from the height of the drop and the thinnest object; constant without the effect `fine_step`."""
+    if not effects.runs("fine_step"):
+        return StepSizes(physics.step_hz, math.inf)
+    thinnest_m = min(least_width_m(start.hull) for start in starts)
+    travel_m = max(physics.max_step_travel_mm / 1e3, DROP_SHARE * drop_m)
+    return StepSizes(physics.step_hz, min(travel_m, thin_share * thinnest_m))
+
+
+def free_fall_m(points: Array, table: Table, flat: bool) -> float:
+    """Metres that points [N, 3], world, fall before one can touch the flat top or the mesh; 0 with nothing below."""
+    below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
+    return max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
+
+
 def _parts_of_vessel(table: Table) -> list[Array]:
     """The convex parts [N, 3], world, of a built-in tray or bin, without its legs.
 
@@ -246,3 +278,47 @@ def unevenness(starts: Sequence[ObjectStart]) -> float:
     """The largest mass over the smallest."""
     masses = [start.asset.mass.mass_kg for start in starts]
     return max(masses) / min(masses)
+
+
+def leaves_outline(outline: Array, reach_m: float) -> StopCondition:
+    """Stop when a body of this reach may extend beyond the edge of a convex outline [N, 2].
+
+    Skips the edges while the body is nearer to the outline's middle than any edge, less the reach.
+    """
+    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    x, y = middle.tolist()
+    safe_m = float(inside_margin(middle[None, :], outline)[0]) - reach_m
+
+    def leaves(_: int, at: BodyPose) -> bool:
+        if math.hypot(at[0][0] - x, at[0][1] - y) < safe_m:
+            return False
+        return bool(inside_margin(np.array([at[0][:2]]), outline)[0] < reach_m)
+
+    return leaves
+
+
+def falls_below(height_m: float) -> StopCondition:
+    """Stop when a centre of mass is below this height, world z."""
+    return lambda _, at: at[0][2] < height_m
+
+
+def stays_standing(start: ObjectStart, body: Body, top_m: float, friction: float) -> StandingCondition:
+    """The condition of an object over a flat top at the height `top_m`, with this coefficient of friction.
+
+    It has less energy than it takes to tip over the nearest edge of a steady face, and than friction takes up in `SLIDE_M`:
+    m g h <= friction m g s. Energy may rise in the simulation, but not by more than `LIFT_M`.
+    """
+    radii2 = [float(moment) / body.mass_kg for moment in body.moments]
+    T_body_obj = invert(body.T_obj_body)
+
+    def stands(at: BodyPose, moving: Velocity) -> Face | None:
+        energy_m = energy_height_m(radii2, at, moving)
+        if energy_m - at[0][2] > friction * SLIDE_M:
+            return None
+        face = find_face(as_pose(at) @ T_body_obj, start.hull, start.asset.mass.com)
+        if face is None:
+            return None
+        over_m = max(0.0, energy_m - top_m - face.height_m)
+        return face if over_m + LIFT_M <= math.hypot(face.height_m, face.margin_m) - face.height_m else None
+
+    return stands

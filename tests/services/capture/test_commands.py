@@ -11,7 +11,8 @@ from services.capture import capture_job, capture_settings
 from services.cli.main import main
 from tests.workers.capture.simulated import VIEWS, box, copy_of, processed
 from tests.workers.door.recordings import recording
-from workers.capture.folder import open_folder, read_board, read_truth
+from workers.capture.folder import open_folder, read_board
+from workers.capture.truth import read_truth
 
 
 @pytest.fixture

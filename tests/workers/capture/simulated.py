@@ -27,10 +27,11 @@ from tests.workers.capture.drawn import project
 from workers.assets.builtin.make import make_asset
 from workers.capture.board import marker_corners
 from workers.capture.detect import refine_corners
-from workers.capture.folder import CaptureFolder, open_folder, read_truth
+from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.process import ProcessedFolder, process_folder
 from workers.capture.simulate.simulate import photograph, simulate_capture
 from workers.capture.simulate.studio import Studio, build_studio, place_object, plan_path
+from workers.capture.truth import read_truth
 from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
@@ -66,6 +67,14 @@ def _made(settings: str, seed: int, without: tuple[str, ...]) -> Made:
     return Made(open_folder(path), truth)
 
 
+def studio_of(simulate: Simulate, board: Board | None = None, seed: int = 11) -> tuple[Studio, Placed, Array]:
+    """(a can on a board and what photographs it, the can in the board frame, the path's poses)."""
+    chance, asset = SceneChance(seed, 0), asset_of()
+    thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
+    poses = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
+    return build_studio(simulate, board or Board(), thing, plan_capture(simulate), chance), thing, poses
+
+
 def take_one(seed=11, **settings) -> tuple[CapturedView, CaptureCamera, Pose]:
     """(view, camera, T_board_cam): the first photograph of a can, without a folder."""
     return _taken(Simulate(**settings).model_dump_json(), seed)
@@ -74,17 +83,9 @@ def take_one(seed=11, **settings) -> tuple[CapturedView, CaptureCamera, Pose]:
 @functools.cache
 def _taken(settings: str, seed: int) -> tuple[CapturedView, CaptureCamera, Pose]:
     simulate = Simulate.model_validate_json(settings)
-    studio, _, (T_board_cam, *_) = studio_of(Board(), simulate, seed)
+    studio, _, (T_board_cam, *_) = studio_of(simulate, seed=seed)
     view, _ = photograph(studio, 0, T_board_cam)
     return view, CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion)), T_board_cam
-
-
-def studio_of(board: Board, simulate: Simulate, seed: int = 11) -> tuple[Studio, Placed, Array]:
-    """(what is photographed: a can on a board; the can, posed in the board frame; T_board_cam [V, 4, 4] along the path)."""
-    chance, asset = SceneChance(seed, 0), asset_of()
-    thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
-    studio = build_studio(simulate, board, thing, plan_capture(simulate), chance)
-    return studio, thing, plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
 
 
 def corner_errors(view, camera, T, board=None):

@@ -17,7 +17,7 @@ from schemas.job.views import RgbNoise
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Mesh
 from tests.workers.capture.simulated import asset_of, made
-from workers.capture.folder import open_folder, read_truth
+from workers.capture.folder import open_folder
 from workers.capture.make_capture import process_capture
 from workers.capture.poses.terms import motion_between
 from workers.capture.process import CaptureViews
@@ -25,6 +25,7 @@ from workers.capture.reconstruct import estimate_poses, given_files, processor_c
 from workers.capture.score import compare_poses, read_whole_truth, score_measured
 from workers.capture.simulate.simulate import DEPTH_UNITS_PER_M, measure_depth, simulate_capture
 from workers.capture.simulate.studio import build_studio, place_object
+from workers.capture.truth import read_truth
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import plan_capture
 from workers.store.images import encode_png

@@ -285,7 +285,7 @@ def rectangles(page: bytes) -> np.ndarray:
 def test_the_pdf_has_the_size_of_the_board_and_its_rectangles_and_is_not_to_be_scaled():
     data, layout = board_pdf(BOARD), lay_out_print(BOARD)
     assert boxes(data) == [pytest.approx([0, 0, 0.6, 0.4], abs=1e-6)]
-    true = np.concatenate([layout.markers, layout.ruler]) + np.array([0.3, 0.2, 0.3, 0.2])
+    true = np.concatenate([layout.markers, layout.seams, layout.ruler]) + np.array([0.3, 0.2, 0.3, 0.2])
     assert rectangles(pages(data)[0]) == pytest.approx(true, abs=1e-6)
     assert b"/PrintScaling /None" in data and b"Print at 100 %" in data and b"(TOP)" in data
     assert data == board_pdf(BOARD)
@@ -306,7 +306,7 @@ def test_the_tiles_cover_the_sheet_once_and_fit_their_pages():
         for x in (tile.left, tile.right):
             assert not ((layout.markers[:, 0] < x - 1e-6) & (x + 1e-6 < layout.markers[:, 2])).any()
         for y in (tile.bottom, tile.top):
-            crossed = np.concatenate([layout.markers, layout.ruler])
+            crossed = np.concatenate([layout.markers, layout.seams, layout.ruler])
             assert not ((crossed[:, 1] < y - 1e-6) & (y + 1e-6 < crossed[:, 3])).any()
 
 
@@ -315,7 +315,7 @@ def test_the_pages_put_together_give_the_board():
     data, layout = tiled_pdf(BOARD), lay_out_print(BOARD)
     page, tiles = tile_sheet(BOARD, layout)
     assert len(pages(data)) == len(tiles) == len(boxes(data)) == 8
-    true = np.concatenate([layout.markers, layout.ruler])
+    true = np.concatenate([layout.markers, layout.seams, layout.ruler])
     for number, (content, box, tile) in enumerate(zip(pages(data), boxes(data), tiles, strict=True)):
         assert box == pytest.approx([0, 0, *page], abs=1e-6)
         clip = next(m for m in RECT.findall(content) if m[4] == b"W")  # in board coordinates: before the page's shift

@@ -16,30 +16,28 @@ from schemas.errors import CaptureError
 from schemas.job.captures import GRID_KEYS, Board
 from schemas.job.views import Distortion
 from schemas.scene.view import Intrinsics
+from tests.workers.capture.simulated import asset_of
 from workers.capture.folder import (
     CaptureFile,
-    TrueObject,
     derive_name,
     open_folder,
     read_board,
     read_pose,
-    read_truth,
     read_view,
     write_description,
     write_pose,
-    write_true_mask,
-    write_truth,
     write_view,
 )
 from workers.capture.results import (
     cloud_ply,
     digest_inputs,
     mesh_ply,
-    own_files,
     read_record,
     read_surface,
     write_results,
+    written_files,
 )
+from workers.capture.truth import read_truth, write_true_mask, write_truth
 from workers.geometry.frames import pose, uniform_rotation
 
 K = Intrinsics(width=40, height=30, fx=35.5, fy=35.25, cx=20.25, cy=15.75)
@@ -194,14 +192,14 @@ def test_poses_and_truth_are_read_back_to_the_bit_and_what_is_none_is_refused(tm
             read_pose(path)
     for lens in (None, Distortion(k1=0.1, k3=-0.02)):
         truth = CaptureTruth(np.stack(poses[:3]), poses[3], 1.02, poses[4], 0.01, lens)
-        write_truth(tmp_path, truth, TrueObject("mug", "mug-3", b"glTF"), ("rgb",), {"exposure": "is off"})
+        write_truth(tmp_path, truth, asset_of("mug"), ("rgb",), {"exposure": "is off"})
         again = read_truth(tmp_path)
         for name in ("T_board_cam", "T_board_obj", "T_color_depth"):
             assert np.array_equal(getattr(again, name), getattr(truth, name))
         assert (again.print_scale, again.depth_bias_m, again.lens) == (1.02, 0.01, lens)
     record = json.loads((tmp_path / "truth" / "truth.json").read_text())
     assert (record["effects"], record["skipped"]) == (["rgb"], [{"effect": "exposure", "why": "is off"}])
-    assert (tmp_path / "truth" / "mesh.glb").read_bytes() == b"glTF"
+    assert (tmp_path / "truth" / "mesh.glb").read_bytes().startswith(b"glTF")
     write_true_mask(tmp_path, 12, VIEW.mask)
     image = cv2.imread(str(tmp_path / "truth" / "mask_00012.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(image, np.where(VIEW.mask, 255, 0))
@@ -227,9 +225,9 @@ def test_files_that_were_changed_or_given_are_the_users_and_a_run_that_was_cut_o
     (tmp_path / "mask_00000.png").write_bytes(b"given")
     users = write_results(tmp_path, {"mask_00000.png": b"a", "mask_00001.png": b"b", "cloud.ply": b"c"}, {"note": 1})
     assert users == ["mask_00000.png"] and (tmp_path / "mask_00000.png").read_bytes() == b"given"
-    assert own_files(tmp_path) == {"mask_00001.png", "cloud.ply"}
+    assert written_files(tmp_path) == {"mask_00001.png", "cloud.ply"}
     (tmp_path / "mask_00001.png").write_bytes(b"changed")
-    assert own_files(tmp_path) == {"cloud.ply"}
+    assert written_files(tmp_path) == {"cloud.ply"}
     users = write_results(tmp_path, {"mask_00001.png": b"z"}, {})
     assert users == ["mask_00001.png"] and (tmp_path / "mask_00001.png").read_bytes() == b"changed"
     assert not (tmp_path / "cloud.ply").exists()  # ours, and not made this time
@@ -246,9 +244,9 @@ def test_files_that_were_changed_or_given_are_the_users_and_a_run_that_was_cut_o
         patch.setattr("workers.capture.results.os.replace", fail)
         with pytest.raises(OSError, match="cut off"):
             write_results(tmp_path, {"a.png": b"1", "b.png": b"2", "c.png": b"3"}, {})
-    assert own_files(tmp_path) == {"a.png"}
+    assert written_files(tmp_path) == {"a.png"}
     assert write_results(tmp_path, {"a.png": b"1", "b.png": b"2"}, {}) == []
-    assert own_files(tmp_path) == {"a.png", "b.png"}
+    assert written_files(tmp_path) == {"a.png", "b.png"}
 
 
 def test_results_that_are_missing_or_damaged_are_refused(tmp_path):

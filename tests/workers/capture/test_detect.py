@@ -159,7 +159,7 @@ def in_sight(board, studio, T, camera):
 
 def simulated_views(board, seed):
     """(pose, what was found, pose from markers, corners of the chessboard in sight, set-up) of three photographs of a can."""
-    studio, _, poses = studio_of(board, Simulate(views=3), seed)
+    studio, _, poses = studio_of(Simulate(views=3), board, seed)
     setup = Setup(CaptureCamera(studio.rig.color, np.zeros(8)), board, Estimation())
     for number, T in enumerate(poses):
         rgb = encode_codes(take_light(studio, number, studio.T_world_board @ T))
@@ -200,7 +200,7 @@ def test_poses_from_any_board_are_a_tenth_of_a_millimetre_off(kind, record_figur
 def test_places_of_tags_that_nobody_measured_are_found_from_photographs(seed, tmp_path, capsys):
     """Beside the places that the simulator drew them at, moved and turned as a whole; and each refusal names its remedy."""
     board = scattered()
-    studio, _, poses = studio_of(board, Simulate(views=8, rgb_noise={}), seed)
+    studio, _, poses = studio_of(Simulate(views=8, rgb_noise={}), board, seed)
     camera = CaptureCamera(studio.rig.color, np.zeros(8))
     write_description(tmp_path, CaptureFile(name="x"), camera, board)
     true_file = tmp_path / "board.json"

@@ -22,7 +22,7 @@ from tests.workers.capture.drawn import errors
 from tests.workers.capture.simulated import studio_of
 from workers.capture.board_kinds import KINDS, BoardSizes
 from workers.capture.folder import CaptureFile, open_folder, read_view, write_description, write_view
-from workers.capture.process import process_folder
+from workers.capture.process import process_folder, read_result
 from workers.capture.simulate.simulate import mark_object, photograph
 from workers.capture.simulate.studio import board_body
 from workers.geometry.camera import look_at
@@ -35,12 +35,12 @@ def with_things(studio, things):
     return replace(studio, things=(*studio.things, *posed))
 
 
-def photographed(path, board, given=None, views=3, beside=lambda number: (), more=()):
+def photographed(path, board, given=None, views=3, beside=lambda number: (), more=(), **effects):
     """The true poses of photographs of a can on a board, which board.json gives as `given`; `beside`: what else each shows.
 
     `more`: further poses.
     """
-    studio, _, poses = studio_of(board, Simulate(views=views, image_scale=0.5))
+    studio, _, poses = studio_of(Simulate(views=views, image_scale=0.5, **effects), board)
     poses = [*poses, *more]
     path.mkdir(parents=True, exist_ok=True)
     for number, T in enumerate(poses):
@@ -161,16 +161,17 @@ def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(n
     def beside(n):
         return [arm(*one) for one in HANDS[name].get(n, ())]
 
-    poses = photographed(tmp_path, Board(), views=8, beside=beside)
+    shifted = {"registration_error": {}} if name == "between camera and object" else {}  # depth hides other pixels
+    poses = photographed(tmp_path, Board(), views=8, beside=beside, **shifted)
     made = process_folder(tmp_path, Captures())
     estimate, points = made.estimates.estimate, made.merged.surface.points
     off = [errors(v.T_board_cam, poses[v.number])[0] for v in estimate.used]
     assert len(off) == len(poses) and max(off) < 0.4 and not any("moved" in note for note in estimate.notes)
-    cluttered = {n for n in range(8) if estimate.is_cluttered(n)}
+    cluttered = {view.number for view in estimate.views if view.is_cluttered}
     assert (
         cluttered and cluttered <= set(HANDS[name]) and any("alone has on the board" in note for note in estimate.notes)
     )
-    studio, can, _ = studio_of(Board(), Simulate(views=8, image_scale=0.5))
+    studio, can, _ = studio_of(Simulate(views=8, image_scale=0.5))
     mesh = trimesh.Trimesh(transform(can.T_world_shape, can.shape.vertices), can.shape.faces)
     true = mesh.sample(50_000, seed=0)
     assert (
@@ -180,7 +181,8 @@ def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(n
     for n in HANDS[name]:
         seen = mark_object(with_things(studio, beside(n)), studio.T_world_board @ poses[n])
         mask = read_view(open_folder(tmp_path), n).mask
-        assert (mask & seen).sum() > 0.96 * (mask | seen).sum()
+        again = read_result(tmp_path).images(n).mask
+        assert (mask & seen).sum() > 0.96 * (mask | seen).sum() and (again != mask).sum() < 0.001 * mask.sum()
 
 
 # ---------------------------------------------------------------------------------------------- by a ray caster not ours

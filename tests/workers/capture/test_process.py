@@ -18,10 +18,12 @@ from schemas.errors import CaptureError, OutputError
 from schemas.job.captures import Board, Captures, Estimation, Fusion, KinectDepthNoise, Simulate
 from schemas.scene.shape import Mesh
 from tests.conftest import SHARED_DATA
-from tests.workers.capture.drawn import KINECT, errors, median_errors, write_capture
+from tests.workers.capture import drawn as drawn_captures
+from tests.workers.capture.drawn import KINECT, draw_view, errors, median_errors, write_capture
 from tests.workers.capture.simulated import CAPTURES, VIEWS, asset_of, box, copy_of, made, processed, true_estimates
+from workers.capture import reconstruct as captures
 from workers.capture.board import frame_in_board
-from workers.capture.folder import open_folder, pose_text, read_pose, read_truth, read_view, write_pose
+from workers.capture.folder import open_folder, pose_text, read_pose, read_view, write_pose, write_view
 from workers.capture.process import (
     pose_table,
     process_folder,
@@ -49,6 +51,7 @@ from workers.capture.simulate import simulate
 from workers.capture.simulate.simulate import develop
 from workers.capture.simulate.studio import place_object, plan_path
 from workers.capture.surface.posed_view import placed
+from workers.capture.truth import read_truth
 from workers.geometry.colour import decode_codes
 from workers.geometry.frames import half_turn, invert, pose, rotation_about, transform, translation
 from workers.geometry.raycast import cast_view
@@ -302,6 +305,17 @@ def test_an_image_that_is_turned_is_refused_and_spoils_nothing_else(seed, tmp_pa
     assert len(estimate_poses(opened(path), Estimation(compare=False)).estimate.used) == VIEWS
 
 
+def test_where_markers_fit_the_board_no_other_board_is_looked_for(tmp_path, monkeypatch):
+    """Two views of an object that moved: neither is used, and looking at photographs for other boards takes seconds."""
+    truth = write_capture(tmp_path, 2)
+    monkeypatch.setattr(drawn_captures, "BOX", tuple(np.add(corner, [0.06, 0, 0]) for corner in drawn_captures.BOX))
+    write_view(tmp_path, draw_view(1, truth[1], np.random.default_rng(1)))
+    monkeypatch.setattr(captures, "other_board", lambda folder: pytest.fail("another board is looked for"))
+    with pytest.raises(CaptureError, match="the object moved on the board") as refused:
+        estimate_poses(opened(tmp_path), Estimation(compare=False))
+    assert refused.value.reason == "poses"
+
+
 @pytest.mark.shared_data
 def test_views_far_apart_of_an_object_that_never_moved_are_all_used(tmp_path):
     """The mug of ../shared/data/captures: five views, and every second photograph without depth."""
@@ -362,6 +376,14 @@ def test_a_mask_of_the_user_is_kept_and_a_view_without_a_pose_or_a_capture_witho
 
 
 # ---------------------------------------------------------------------------------------------- the processed folder
+
+
+def test_each_photograph_is_decoded_once_and_again_only_for_a_mask_of_the_user(tmp_path, monkeypatch):
+    path, read = copy_of(box(), tmp_path), []
+    shutil.copy(path / "truth" / "mask_00002.png", path / "mask_00002.png")
+    monkeypatch.setattr(captures, "read_view", lambda *which: read.append(which[1]) or read_view(*which))
+    process_folder(path, Captures(estimation=Estimation(compare=False), fusion=Fusion(voxel_m=0.004)))
+    assert sorted(read) == sorted([*range(VIEWS), 2])
 
 
 def test_every_view_has_its_files_near_the_truth_and_process_json_names_them():

@@ -22,7 +22,7 @@ from tests.workers.capture.drawn import project
 from tests.workers.capture.simulated import Made, asset_of, corner_errors, made, take_one
 from workers.assets.catalogue import open_catalogue
 from workers.capture.board import marker_corners
-from workers.capture.folder import open_folder, read_pose, read_truth, read_view
+from workers.capture.folder import open_folder, read_pose, read_view
 from workers.capture.make_capture import load_object
 from workers.capture.simulate.simulate import (
     AXIAL_M,
@@ -41,6 +41,7 @@ from workers.capture.simulate.studio import (
     plan_path,
     true_board,
 )
+from workers.capture.truth import read_truth
 from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import opencv_lens, opencv_matrix

@@ -24,12 +24,12 @@ from workers.capture.surface.coverage import describe_grazing, sample_surface
 from workers.capture.surface.posed_view import (
     UNSEEN,
     PosedView,
+    best_cosine,
     correct_depth,
     distort_mask,
     facing_cosine,
     placed,
     pose_view,
-    visible_points,
 )
 from workers.capture.surface.synthesize import (
     choose_sources,
@@ -43,7 +43,7 @@ from workers.capture.surface.tsdf import fit_depth
 from workers.geometry.camera import look_at
 from workers.geometry.frames import angle_between, invert, pose, rotation_about, transform, translation
 from workers.geometry.pixels import opencv_matrix
-from workers.geometry.raycast import cast_view
+from workers.geometry.raycast import Caster, cast_view
 
 # ---------------------------------------------------------------------------------------------- without the lens
 
@@ -102,24 +102,31 @@ def eye_at(*position):
     return Camera(EYE, frozen_array(look_at(np.array(position, dtype=float), np.zeros(3))))
 
 
+def visible(mesh, points, normals, cameras):
+    return best_cosine(Caster(mesh), points, normals, cameras) > UNSEEN
+
+
 def test_a_camera_sees_the_cap_of_a_sphere_that_faces_it_unless_another_part_hides_it():
     made = trimesh.creation.icosphere(4, 0.1)
     ball, faces = np.array(made.vertices), np.array(made.faces, np.int32)
     normals, alone = ball / 0.1, Mesh(ball, faces)
-    seen = visible_points(alone, ball, normals, [eye_at(1, 0, 0)])
+    seen = visible(alone, ball, normals, [eye_at(1, 0, 0)])
     clear = np.abs(ball[:, 0] - 0.01) > 0.003  # the cap ends where the rays touch the sphere: x = r^2 / d
     assert np.array_equal(seen[clear], (ball[:, 0] > 0.01)[clear])
-    assert visible_points(alone, ball, normals, [eye_at(1, 0, 0), eye_at(-1, 0, 0)]).sum() > 1.8 * seen.sum()
+    assert visible(alone, ball, normals, [eye_at(1, 0, 0), eye_at(-1, 0, 0)]).sum() > 1.8 * seen.sum()
+    around = [eye_at(np.cos(t), np.sin(t), 0) for t in np.arange(6)]  # on a sphere alone nothing hides the best of them
+    best = np.max([facing_cosine(ball, normals, camera) for camera in around], axis=0)
+    assert np.allclose(best_cosine(Caster(alone), ball, normals, around)[best > 0.05], best[best > 0.05])
     both = Mesh(
         np.concatenate([ball + np.array([0.5, 0, 0]), ball]),
         np.concatenate([faces, faces + len(ball)]).astype(np.int32),
     )
     front = ball[:, 0] > 0.05
-    assert not visible_points(both, ball, normals, [eye_at(1.2, 0, 0)])[front].any()
+    assert not visible(both, ball, normals, [eye_at(1.2, 0, 0)])[front].any()
     many = [eye_at(1.2, 0, 0), eye_at(0, 0, 1), eye_at(0, 1, 0.2), eye_at(1, 1, 0.1), eye_at(0, -1, 0)]
-    assert visible_points(both, ball, normals, many)[front].mean() > 0.9
-    assert not visible_points(alone, ball, normals, []).any()
-    assert len(visible_points(alone, ball[:0], normals[:0], many)) == 0
+    assert visible(both, ball, normals, many)[front].mean() > 0.9
+    assert not visible(alone, ball, normals, []).any()
+    assert len(visible(alone, ball[:0], normals[:0], many)) == 0
     points = np.array([[0.0, 0, 0], [0.0, 0, 0], [5.0, 0, 0]])
     cosine = facing_cosine(points, np.array([[0, 0, 1.0], [1.0, 0, 0], [0, 0, 1.0]]), eye_at(0.6, 0.0, 0.8))
     assert np.allclose(cosine, [0.8, 0.6, UNSEEN])
@@ -322,7 +329,7 @@ def test_samples_are_even_over_the_area_and_surface_errors_are_the_distances_tha
     errors = score_surface(found, MESH, [ABOVE])
     assert errors.cloud_median_mm == pytest.approx(2.0) and errors.cloud_p95_mm == pytest.approx(2.0)
     assert errors.surface_median_mm == pytest.approx(0.0, abs=1e-6) and errors.completeness > 0.97
-    seen = visible_points(MESH, samples, normals, [ABOVE]).mean()
+    seen = visible(MESH, samples, normals, [ABOVE]).mean()
     assert errors.visible_share == pytest.approx(seen, abs=0.01) and 0.3 < seen < 0.7
 
 

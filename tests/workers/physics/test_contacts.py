@@ -37,6 +37,7 @@ def test_the_pairs_that_are_near_are_those_of_every_box_with_every_other():
     rng = np.random.default_rng(0)
     low, others = rng.uniform(0, 1, (80, 3)), rng.uniform(0, 1, (300, 3))
     high, others_high = low + rng.uniform(0, 0.1, (80, 3)), others + rng.uniform(0, 0.2, (300, 3))
+    others[7], others_high[7] = [-9.0, -9.0, 0.4], [9.0, 9.0, 0.5]  # as wide as a floor
     found = find_near(low, high, others, others_high, 0.03)
     near = ((low[:, None] - 0.03 <= others_high) & (others - 0.03 <= high[:, None])).all(axis=2)
     assert 64 < near.sum() < 5000
@@ -244,6 +245,22 @@ def test_what_rests_is_left_to_the_bit_and_the_same_bodies_come_to_the_same_bits
     one, other = (settle([CUBE] * 2, at) for _ in range(2))
     assert [T.tobytes() for T in one.poses] == [T.tobytes() for T in other.poses]
     assert one.steps == other.steps
+
+
+@pytest.mark.parametrize("guess", ["the answer", "none", "of other contacts"])
+def test_a_step_from_likely_forces_is_optimal_whatever_they_are(guess):
+    """The conditions of Karush, Kuhn and Tucker for the least motion of 24 variables that keeps 50 contacts of 16 edges."""
+    chance, shape = np.random.default_rng(3), (50, 16)
+    normals = np.repeat(chance.normal(size=(50, 24)), 16, axis=0)
+    matrix = normals + 0.3 * chance.normal(size=(800, 24))
+    least = matrix @ chance.normal(size=24) - np.repeat(chance.exponential(0.5, 50), 16)
+    x, multipliers = exact_rest._least_distance(matrix, least)
+    rolled = {"the answer": multipliers, "none": 0.0 * multipliers, "of other contacts": np.roll(multipliers, 160)}
+    x, multipliers = exact_rest._least_distance(matrix, least, rolled[guess].reshape(shape))
+    assert np.linalg.norm(x) > 0.1 and (multipliers <= 1e-9).all()
+    assert x == pytest.approx(-matrix.T @ multipliers, abs=1e-8)
+    assert (matrix @ x >= least - 1e-8).all()
+    assert np.abs(multipliers * (matrix @ x - least)).max() < 1e-8
 
 
 def test_what_is_balanced_on_an_edge_is_not_at_rest():

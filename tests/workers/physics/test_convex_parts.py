@@ -25,9 +25,10 @@ from tests.kit.shapes import box
 from workers.assets.builtin.make import make_asset
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.hull import convex_hull, wrap
-from workers.geometry.lathe_decomposition import COARSE, partition_outlines
+from workers.geometry.lathe_decomposition import COARSE
 from workers.geometry.mesh import mesh_of as surface_of
 from workers.geometry.mesh import weld
+from workers.geometry.outlines import partition_outlines
 from workers.physics import convex_parts as module
 from workers.physics.convex_parts import decompose, parts_of
 

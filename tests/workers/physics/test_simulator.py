@@ -30,14 +30,12 @@ from workers.physics.fall import (
     LIFT_M,
     SHARE,
     SKIPPED_TO_M,
-    SLIDE_M,
     EnergyRecord,
     StepSizes,
     Watch,
     fall,
-    stays_standing,
 )
-from workers.physics.release import PACES, Drop, release
+from workers.physics.release import PACES, SLIDE_M, Drop, release, stays_standing
 from workers.physics.rigid_body import Body, body_frame, build_body, make_body, octants
 
 ROOT = Path(__file__).resolve().parents[3]

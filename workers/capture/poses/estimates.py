@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
-from schemas.capture import CLUTTERED, CaptureEstimate, DepthCorrection, ViewEstimate
+from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
 from schemas.job.captures import Estimation
 from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
@@ -250,22 +250,26 @@ def _result(
     return CaptureEstimate("joint", ordered, correction, scale, steps, solution.converged, notes)
 
 
+CLUTTERED = "what it alone has on the board is left out"
+
+
 def _joint_view(
     place: int, solved: tuple[Views, Joint, Evidence], wider: float, correction: DepthCorrection
 ) -> ViewEstimate:
     """The view at a place of the problem, judged; its covariance is at least `wider` times that of independent corners."""
     problem, joint, evidence = solved
-    block = slice(POSE * place, POSE * (place + 1))
+    block, cluttered = slice(POSE * place, POSE * (place + 1)), problem.observations[place].is_cluttered
     widening = problem.widening(place, max(evidence.corner_px, evidence.spec.corner_px))
     seen = evidence.observations[problem.index[place]]
     judgement = Judged(
         joint.solution.poses[place],
         joint.covariance[block, block] * max(wider, widening),
         ("ambiguous: a pose of another tilt fits markers and depth as well",) * problem.ambiguous[place],
-        (*(seen.given_by,) * bool(problem.fixed[place]), *(CLUTTERED,) * problem.observations[place].is_cluttered),
+        (*(seen.given_by,) * bool(problem.fixed[place]), *(CLUTTERED,) * cluttered),
         by_corners=False,
     )
     view = judge(seen, judgement, evidence, correction, joint.solution.shared.print_scale)
+    view = dataclasses.replace(view, is_cluttered=cluttered)
     if view.depth_mm is None or view.depth_mm <= OFF_BOARD_MM:
         return view
     return _flagged(view, f"depth lies {view.depth_mm:.1f} mm off the board, after the correction")

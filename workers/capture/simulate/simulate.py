@@ -27,16 +27,11 @@ from schemas.job.views import DepthNoise, Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
 from schemas.scene.view import Camera
-from workers.assets.glb import asset_glb
 from workers.capture.folder import (
-    HELD_OUT,
-    TRUTH,
     CaptureFile,
-    TrueObject,
+    stored_depth,
     write_description,
     write_pose,
-    write_true_mask,
-    write_truth,
     write_view,
 )
 from workers.capture.simulate.studio import (
@@ -47,6 +42,7 @@ from workers.capture.simulate.studio import (
     plan_path,
     scale_intrinsics,
 )
+from workers.capture.truth import HELD_OUT, TRUTH, write_true_mask, write_truth
 from workers.geometry.colour import SRGB_STEPS, encode_codes, encode_srgb
 from workers.geometry.frames import pose, rotation_about
 from workers.geometry.jit import compiled
@@ -235,13 +231,8 @@ def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[Captured
         light = expose(light, simulate.exposure, chance.sensor_stream("exposure", number))
     if simulate.rgb_noise is not None:
         light = add_noise(light, simulate.rgb_noise, chance.sensor_stream("rgb_noise", number))
-    depth = encode_depth(measure_depth(studio, number, T_world_cam), DEPTH_UNITS_PER_M)
+    depth = stored_depth(measure_depth(studio, number, T_world_cam), DEPTH_UNITS_PER_M)
     return CapturedView(number, develop(light, simulate), depth, None), mark_object(studio, T_world_cam)
-
-
-def encode_depth(depth_m: Array, units_per_m: float) -> NDArray[np.uint16]:
-    """[H, W]: depth as it is stored."""
-    return np.rint(np.clip(depth_m * units_per_m, 0.0, 65_535.0)).astype(np.uint16)
 
 
 def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
@@ -351,8 +342,7 @@ def write_held_out(studio: Studio, board: Board, target: Array, path: Path) -> N
     for number, T_board_cam in enumerate(plan_path(ideal, target, studio.chance.stream(Stream.HELD_OUT))):
         T_world_cam = studio.T_world_board @ T_board_cam
         depth_m, region = draw_labels(exact, Camera(studio.rig.color, T_world_cam))
-        depth = encode_depth(depth_m, HELD_OUT_UNITS_PER_M)
-        depth[depth == 65_535] = 0
+        depth = stored_depth(depth_m, HELD_OUT_UNITS_PER_M)
         rgb = encode_codes(take_light(exact, number, T_world_cam))
         write_view(path, CapturedView(number, rgb, depth, region == REGION_FIRST_OBJECT))
         write_pose(path / f"board_{number:05d}.txt", T_board_cam)
@@ -392,7 +382,7 @@ def simulate_capture(
         lens=simulate.distortion,
     )
     write_held_out(studio, board, target, path / TRUTH / HELD_OUT)
-    write_truth(path, truth, TrueObject(asset.category, asset.instance_id, asset_glb(asset)), plan.ran, plan.skipped)
+    write_truth(path, truth, asset, plan.ran, plan.skipped)
     about = CaptureFile(name=f"{asset.category}-{chance.scene_id:05d}", category=asset.category, licence=asset.licence)
     camera = CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion), DEPTH_UNITS_PER_M)
     write_description(path, about, camera, board)

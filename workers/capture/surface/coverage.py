@@ -8,8 +8,10 @@ import numpy as np
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
-from workers.capture.surface.posed_view import CLEAR_M, placed, visible_points
-from workers.geometry.raycast import first_hit
+from workers.assets.samples import draw_points
+from workers.capture.surface.posed_view import CLEAR_M, UNSEEN, best_cosine
+from workers.geometry.mesh import face_planes
+from workers.geometry.raycast import Caster
 
 GRAZING_DEG = 70.0
 """Angle of incidence beyond which depth has three times the noise that it has at 0, and little of it is merged."""
@@ -31,18 +33,10 @@ ELEVATIONS_DEG, SECTORS = (10, 25, 40, 55, 70, 85), 12
 
 def sample_surface(mesh: Mesh, count: int) -> tuple[Array, Array]:
     """(points, unit normals), each [N, 3]: evenly over the area, the same for the same mesh."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    across = np.cross(b - a, c - a)
-    area = np.linalg.norm(across, axis=1)
-    total = np.cumsum(area)
-    rng = np.random.default_rng(SEED)
-    # One sample in each of N equal shares of the area.
-    at = (np.arange(count) + rng.uniform(size=count)) / count * total[-1]
-    face = np.minimum(np.searchsorted(total, at, side="right"), len(area) - 1)
-    s, t = rng.uniform(size=(2, count))
-    s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)
-    points = a[face] + s[:, None] * (b - a)[face] + t[:, None] * (c - a)[face]
-    return points, across[face] / np.maximum(area[face], 1e-300)[:, None]
+    chance = np.random.default_rng(SEED).uniform(size=(3, count))
+    chance[0] = (np.arange(count) + chance[0]) / count  # one in each of N equal shares of the area
+    face, _, points = draw_points(mesh, chance)
+    return points, face_planes(mesh)[0][face]
 
 
 def describe_grazing(mesh: Mesh, cameras: Mapping[int, Camera]) -> str | None:
@@ -50,12 +44,12 @@ def describe_grazing(mesh: Mesh, cameras: Mapping[int, Camera]) -> str | None:
 
     None where that is little, or no other view would see it better. `cameras` by the number of their view, at least one.
     """
-    points, normals = sample_surface(mesh, SAMPLES)
-    views = list(cameras.values())
-    seen = visible_points(mesh, points, normals, views)
-    grazing = seen & ~visible_points(mesh, points, normals, views, least_cos=math.cos(math.radians(GRAZING_DEG)))
+    (points, normals), caster = sample_surface(mesh, SAMPLES), Caster(mesh)
+    cosine = best_cosine(caster, points, normals, list(cameras.values()))
+    seen = cosine > UNSEEN
+    grazing = seen & (cosine <= math.cos(math.radians(GRAZING_DEG)))
     least = max(LEAST_SHARE * seen.sum(), 1.0)
-    advice = _advice(mesh, (points[grazing], normals[grazing]), cameras, least) if grazing.sum() >= least else None
+    advice = _advice(caster, (points[grazing], normals[grazing]), cameras, least) if grazing.sum() >= least else None
     if advice is None:
         return None
     words = (
@@ -64,7 +58,7 @@ def describe_grazing(mesh: Mesh, cameras: Mapping[int, Camera]) -> str | None:
     return f"{words} degrees from its normal, and what goes on from there may be missing: {advice}"
 
 
-def _advice(mesh: Mesh, at: tuple[Array, Array], cameras: Mapping[int, Camera], least: float) -> str | None:
+def _advice(caster: Caster, at: tuple[Array, Array], cameras: Mapping[int, Camera], least: float) -> str | None:
     """Where other views see most of the points with normals `at` well, by height and the nearest view; None for under `least`."""
     points, normals = at
     middle, places = points.mean(axis=0), np.array([camera.position for camera in cameras.values()])
@@ -75,7 +69,7 @@ def _advice(mesh: Mesh, at: tuple[Array, Array], cameras: Mapping[int, Camera], 
     cosine = (towards * normals).sum(axis=-1) / np.linalg.norm(towards, axis=-1)
     sees = cosine > math.cos(math.radians(WELL_DEG))
     starts = np.broadcast_to(points + CLEAR_M * normals, towards.shape)[sees]
-    sees[sees] = first_hit([placed(mesh)], starts, towards[sees]).distance > 1.0
+    sees[sees] = caster.cast(starts, towards[sees])[0] > 1.0
     level = int(np.argmax(sees.sum(axis=(1, 2))))
     if sees[level].any(axis=0).sum() < least:
         return None

@@ -18,7 +18,7 @@ from schemas.job.captures import Fusion
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.surface.object_mask import ObjectRegion
-from workers.capture.surface.posed_view import NEAREST_M, PosedView, sample_pixels, visible_points
+from workers.capture.surface.posed_view import NEAREST_M, PosedView, best_cosine, sample_pixels
 from workers.capture.surface.tsdf import (
     FRONT_VOXELS,
     MOST_EDGE_DEG,
@@ -34,6 +34,7 @@ from workers.geometry.colour import SRGB_STEPS, encode_codes
 from workers.geometry.frames import UP, invert, transform
 from workers.geometry.jit import compiled
 from workers.geometry.mesh import face_areas, piece_of
+from workers.geometry.raycast import Caster
 
 UNSEEN = 128
 """The code of each channel where no view sees anything."""
@@ -290,7 +291,8 @@ def _confirm(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
     normals = normals[np.unique(mesh.faces[confirmed[mesh.faces].all(axis=1)])]
     cameras = [sight.view.depth_camera for sight in sights]
     lift_m = LIFT_VOXELS * spec.voxel_m
-    return keep_vertices(hiding, visible_points(hiding, hiding.vertices, normals, cameras, lift_m, FACING_AWAY))
+    cosine = best_cosine(Caster(hiding), hiding.vertices, normals, cameras, lift_m, FACING_AWAY)
+    return keep_vertices(hiding, cosine > FACING_AWAY)
 
 
 def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:

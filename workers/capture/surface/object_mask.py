@@ -20,6 +20,7 @@ from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera, Intrinsics
 from workers.capture.board import TOUCHING_M, board_geometry
 from workers.capture.surface.posed_view import PosedView
+from workers.geometry.jit import compiled
 from workers.geometry.mesh import edge_keys
 from workers.geometry.zbuffer import draw_depth
 
@@ -188,37 +189,58 @@ def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> Objec
         )
     floor_m = min(max(FLOOR_M, 4.0 * spread), clearance)
     floor = _floor(footprint, known & (above > floor_m) & ~stands, known & (above <= floor_m))
-    cells = _grow(footprint) | floor
+    # Three cells around, for what hangs over and for the error of the rim.
+    cells = ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3) | floor
     low, high = _box(cells, -half, plane[2], _top_m(tall_bins, footprint))
     return ObjectRegion(plane, clearance, low, high, spread, cells, -half, floor, floor_m, tuple(notes))
 
 
-def _heights(views: Sequence[PosedView], half: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _heights(views: Sequence[PosedView], half: Array) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """(low_bins, tall_bins), each [cells in x, cells in y, bins]: how often the views measured each height over a board.
 
     half [2]: half its width and height. low_bins are `BIN_M` high around its plane, tall_bins `REACH_M` from it on. With a mask,
     what is outside of it cannot be higher than the board.
     """
     cells = np.ceil(2.0 * half / CELL_M).astype(np.int64)
-    low_bins = np.zeros((cells[0], cells[1], round(2 * REACH_M / BIN_M) + 2), np.int64)
-    tall_bins = np.zeros((cells[0], cells[1], round(TALLEST_M / REACH_M)), np.int64)
+    low_bins = np.zeros((cells[0], cells[1], round(2 * REACH_M / BIN_M) + 2), np.int32)
+    tall_bins = np.zeros((cells[0], cells[1], round(TALLEST_M / REACH_M)), np.int32)
     for view in views:
         k = view.depth_camera.intrinsics
         stride = max(1, int(np.sqrt(k.width * k.height / SAMPLES)))
         at = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-        z = view.depth_m[at].astype(np.float64)
-        x, y, height = _to_board(view.depth_camera.T_world_cam, _pixel_rays(k, view.depth_m.shape, stride), z)
-        i, j = _cells_at((x, y), -half)
-        known = (z > 0.0) & (i >= 0) & (j >= 0) & (i < cells[0]) & (j < cells[1]) & (height <= TALLEST_M)
-        if view.mask is not None:
-            known &= view.mask[at] | (height <= REACH_M)
-        for bins, seen, level in (
-            (low_bins, known, np.floor((height + REACH_M) / BIN_M) + 1),
-            (tall_bins, known & (height > 0.0), height / REACH_M),
-        ):
-            level = np.clip(level, 0, bins.shape[2] - 1).astype(np.int64)
-            np.add.at(bins, (i[seen], j[seen], level[seen]), 1)
+        mask = np.ones((1, 1), np.bool_) if view.mask is None else view.mask[at]
+        pictures = view.depth_m[at], _pixel_rays(k, view.depth_m.shape, stride), mask
+        _count_heights(pictures, view.depth_camera.T_world_cam, -half, low_bins, tall_bins)
     return low_bins, tall_bins
+
+
+@compiled
+def _count_heights(
+    pictures: tuple[NDArray[np.float32], tuple[Array, Array], NDArray[np.bool_]],
+    T: Pose,
+    corner: Array,
+    low_bins: NDArray[np.int32],
+    tall_bins: NDArray[np.int32],
+) -> None:
+    """Counts the heights of a view, whose pictures are depth [h, w], the rays of its pixels, and a mask, or [1, 1] for all."""
+    depth_m, (ray_x, ray_y), mask = pictures
+    masked = mask.size > 1
+    for row in range(depth_m.shape[0]):
+        for column in range(depth_m.shape[1]):
+            z = float(depth_m[row, column])
+            x, y = ray_x[0, column] * z, ray_y[row, 0] * z
+            height = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            i = int(np.floor((T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3] - corner[0]) / CELL_M))
+            j = int(np.floor((T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3] - corner[1]) / CELL_M))
+            inside = 0 <= i < low_bins.shape[0] and 0 <= j < low_bins.shape[1]
+            if not (inside and z > 0.0 and height <= TALLEST_M):
+                continue
+            if masked and height > REACH_M and not mask[row, column]:
+                continue
+            level = int(np.floor((height + REACH_M) / BIN_M)) + 1
+            low_bins[i, j, min(max(level, 0), low_bins.shape[2] - 1)] += 1
+            if height > 0.0:
+                tall_bins[i, j, min(int(height / REACH_M), tall_bins.shape[2] - 1)] += 1
 
 
 def _stands(board: Board, corner: Array, cells: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -232,10 +254,10 @@ def _stands(board: Board, corner: Array, cells: tuple[int, ...]) -> NDArray[np.b
     return np.asarray(cv2.dilate(stands, np.ones((size, size), np.uint8)) > 0)
 
 
-def _medians(bins: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+def _medians(bins: NDArray[np.int32]) -> tuple[Array, NDArray[np.int64]]:
     """(median height [X, Y], interpolated within its bin; samples [X, Y])."""
-    total = bins.sum(axis=2)
-    below = np.cumsum(bins, axis=2)
+    below = np.cumsum(bins, axis=2, dtype=np.int32)
+    total = below[..., -1].astype(np.int64)
     at = (2 * below < total[..., None]).sum(axis=2).clip(0, bins.shape[2] - 1)
     here = np.take_along_axis(bins, at[..., None], axis=2)[..., 0]
     before = np.take_along_axis(below, at[..., None], axis=2)[..., 0] - here
@@ -252,7 +274,10 @@ def _board_plane(xy: Array, height: Array) -> tuple[tuple[float, float, float], 
             "no_depth", "no depth image shows the board's surface within 30 mm of the plane of its markers"
         )
     design = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    solution = np.array([0.0, 0.0, _mode(height)])
+    ordered = np.sort(height)
+    # From the middle of the fullest window of 4 mm, the lowest where several are: the board is the largest level thing.
+    counts = np.searchsorted(ordered, ordered + 0.004, side="right") - np.arange(len(ordered))
+    solution = np.array([0.0, 0.0, ordered[int(np.argmax(counts))] + 0.002])
     limit = 0.006
     for _ in range(8):
         residual = height - design @ solution
@@ -263,13 +288,6 @@ def _board_plane(xy: Array, height: Array) -> tuple[tuple[float, float, float], 
         spread = 1.4826 * float(np.median(np.abs(height - design @ solution)[inliers])) if inliers.any() else limit
         limit = min(max(5.0 * spread, 0.0015), 0.006)
     return (float(solution[0]), float(solution[1]), float(solution[2])), spread
-
-
-def _mode(height: Array) -> float:
-    """The middle of the fullest window of 4 mm, the lowest where several are: the board is the largest level thing."""
-    ordered = np.sort(height)
-    counts = np.searchsorted(ordered, ordered + 0.004, side="right") - np.arange(len(ordered))
-    return float(ordered[int(np.argmax(counts))]) + 0.002
 
 
 def _largest(high: NDArray[np.bool_], above: Array) -> tuple[NDArray[np.bool_] | None, int]:
@@ -294,12 +312,7 @@ def _floor(footprint: NDArray[np.bool_], raised: NDArray[np.bool_], board: NDArr
     return np.asarray(ndimage.binary_dilation(part & apart, around, iterations=FLOOR_REACH_CELLS) & apart)
 
 
-def _grow(footprint: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The footprint and three cells around it, for what hangs over and for the error of its rim."""
-    return np.asarray(ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3))
-
-
-def _top_m(tall_bins: NDArray[np.int64], footprint: NDArray[np.bool_]) -> float:
+def _top_m(tall_bins: NDArray[np.int32], footprint: NDArray[np.bool_]) -> float:
     """The height of what stands on a footprint, rounded up to `REACH_M`."""
     levels = tall_bins[footprint].sum(axis=0)
     filled = np.flatnonzero(levels > max(LEAST_SAMPLES, 2e-4 * levels.sum()))

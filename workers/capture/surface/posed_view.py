@@ -1,4 +1,4 @@
-"""A view with its pose and without its lens, and which points of a surface cameras see past the surface itself."""
+"""A view with its pose and without its lens, and how squarely cameras see points of a surface past the surface itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
 from workers.geometry.pixels import pixel_rays
 from workers.geometry.projection import in_frame
-from workers.geometry.raycast import first_hit
+from workers.geometry.raycast import Caster
 
 Depth = NDArray[np.float32]
 """[H, W] z along the optical axis, metres, 0 where there is none."""
@@ -57,7 +57,9 @@ def pose_view(view: CapturedView, camera: CaptureCamera, T_board_cam: Pose, dept
 
 def correct_depth(stored: NDArray[np.uint16], metres: float, scale: float, offset_m: float) -> Depth:
     """[H, W] float32: stored depth in metres after a correction; 0 stays 0, and what is corrected to below 0 becomes 0."""
-    return np.where(stored > 0, np.maximum(stored * metres * scale + offset_m, 0.0), 0.0).astype(np.float32)
+    of_code = np.maximum(np.arange(65_536) * metres * scale + offset_m, 0.0).astype(np.float32)
+    of_code[0] = 0.0
+    return of_code[stored]
 
 
 def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.bool_]:
@@ -120,33 +122,34 @@ UNSEEN = -2.0
 """Stands for the cosine of a point that is not in the image."""
 
 
-def visible_points(
-    mesh: Mesh,
+def best_cosine(
+    caster: Caster,
     points: Array,
     normals: Array,
     cameras: Sequence[Camera],
     clear_m: float = CLEAR_M,
     least_cos: float = 0.0,
-) -> NDArray[np.bool_]:
-    """[N] bool: points [N, 3] that a camera sees past the mesh, lifted along their unit normals by `clear_m`.
+) -> Array:
+    """[N]: how squarely points [N, 3] are seen past the caster's mesh, lifted along their unit normals by `clear_m`.
 
-    A camera counts where the cosine between the normal and the way to it is above `least_cos`: 0 for any angle from outside.
+    The largest cosine between the normal and the way to a camera that sees the point; `UNSEEN` where none does, of those whose
+    cosine is above `least_cos`: 0 for any angle from outside.
     """
-    visible = np.zeros(len(points), np.bool_)
+    best = np.full(len(points), UNSEEN)
     if not len(points) or not len(cameras):
-        return visible
+        return best
     positions, lifted = np.array([camera.position for camera in cameras]), points + clear_m * normals
     cosine = np.stack([facing_cosine(points, normals, camera) for camera in cameras])
     order = np.argsort(-cosine, axis=0, kind="stable")
-    # The ray caster builds its tree at each call: few calls, the cameras that face a point most first.
+    # Few calls, the cameras that face a point most first: those that see it are seldom asked again.
     for ranks in (order[:1], order[1:4], order[4:]):
-        point, camera = np.tile(np.flatnonzero(~visible), len(ranks)), ranks[:, ~visible].ravel()
+        hidden = np.flatnonzero(best == UNSEEN)
+        point, camera = np.tile(hidden, len(ranks)), ranks[:, hidden].ravel()
         asked = cosine[camera, point] > least_cos
         point, camera = point[asked], camera[asked]
-        if len(point):
-            hits = first_hit([placed(mesh)], lifted[point], positions[camera] - lifted[point])
-            visible[point[hits.distance > 1.0]] = True
-    return visible
+        clear = caster.cast(lifted[point], positions[camera] - lifted[point])[0] > 1.0
+        np.maximum.at(best, point[clear], cosine[camera[clear], point[clear]])
+    return best
 
 
 def facing_cosine(points: Array, normals: Array, camera: Camera) -> Array:

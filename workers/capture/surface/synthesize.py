@@ -80,6 +80,13 @@ def prepare_source(view: PosedView, fitted: FittedDepth) -> Source:
     return Source(view.number, view.depth_camera, fitted, rgb, weight.astype(np.float32))
 
 
+def color_depth(view: PosedView) -> NDArray[np.float32]:
+    """[H, W] float32: a view's depth in its colour camera, drawn anew from there where its depth camera stands elsewhere."""
+    if np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
+        return view.depth_m
+    return move_depth(view.depth_m, view.depth_camera, view.camera)
+
+
 def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> NDArray[np.float32]:
     """[H, W] float32: a depth image as another camera nearby has it, as it was measured; 0 where it shows nothing."""
     inverse = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0.0)
