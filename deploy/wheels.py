@@ -35,7 +35,8 @@ DOORS = (
         for file in sorted(_folder(room).glob("[a-z]*.py"))
     ),
     *("services.read.columns_page", "services.read.query", "services.read.status", "services.read.verify"),
-    *("services.score.command", "workers.pool", "workers.store.file_system", "workers.store.objects"),
+    *("services.score.command", "services.score.leaderboard"),
+    *("workers.pool", "workers.store.file_system", "workers.store.objects"),
 )
 """What reading begins with: tables name commands and formats, and nothing imports them. Two rooms do nothing else."""
 

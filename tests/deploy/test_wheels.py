@@ -145,7 +145,9 @@ def test_every_command_of_reading_works_from_the_wheel_and_the_others_say_what_t
     commands += [["export", out, str(tmp_path / name), "--format", name] for name in ("mirror-recon", "webdataset")]
     commands += [["report", out, "--out", str(tmp_path / "page.html")]]
     commands += [
+        ["score", "check", out, str(predictions)],
         ["score", out, str(predictions), "--out", str(tmp_path / "score"), "--json"],
+        ["score", "merge", out, str(tmp_path / "score"), "--out", str(tmp_path / "leaderboard")],
         ["verify", out, "--json"],
     ]
     refused = [["run", str(ROOT / "deploy/jobs/tabletop.yaml")], ["replay", out, "0"]]
@@ -154,7 +156,7 @@ def test_every_command_of_reading_works_from_the_wheel_and_the_others_say_what_t
     refused += [["doctor"], ["verify", out, "--audit", "1"], ["score", out, str(tmp_path / "shapes")]]
     ends = read(site, *commands, *refused)
     assert [code for code, *_ in ends] == [0] * len(commands) + [1] * len(refused), ends
-    check_score(ends[len(commands) - 2][1])
+    check_score(ends[len(commands) - 3][1])
     told = ends[len(commands) - 1][1]
     assert json.loads(told.splitlines()[-1])["pairs"] == 0 and "deriving labels again needs what makes data" in told
     assert all("install verso-data" in err for _, _, err in ends[len(commands) :]), ends

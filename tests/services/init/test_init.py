@@ -375,7 +375,7 @@ COMMANDS = [shlex.split(line)[1:] for line in LINES]
 
 
 def test_every_format_that_is_read_has_its_line():
-    rows = "".join(line.split("|")[1] for line in PAGE.splitlines() if line.startswith("| `."))
+    rows = "".join(line.partition(":")[0] for line in PAGE.splitlines() if line.startswith("- `."))
     assert set(re.findall(r"`(\.\w+)`", rows)) == set(SUFFIXES)
 
 

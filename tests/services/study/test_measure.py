@@ -31,6 +31,7 @@ def answers(scene_id: int, **start: object) -> dict[str, dict]:
     job = Job.model_validate({"name": "t", "seed": 2024, "start": start})
     context = WorkerContext(job, open_catalogue(job.assets, Path(), tuple(job.categories)), None, "")  # type: ignore[arg-type]  # draws nothing
     settings = [OWN, COARSE, BOX, *REFERENCES]
+    measure._seen.clear()  # a process has one study, but for one of tests
     return measure_rest(context, settings, scene_id)
 
 
