@@ -29,7 +29,6 @@ from services.run.worker_entry import Pattern, terms_of_driver
 from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
 from workers.render.tiers import require_tier
-from workers.shard.framing import require_framed
 from workers.source import are_kept
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
@@ -223,6 +222,8 @@ LONGEST_S = 10.0
 
 def describe_plan(request: RunRequest) -> list[str]:
     """Lines that tell what a run would do; changes nothing. Raises what the run would raise before its first scene."""
+    from workers.shard.framing import require_framed  # loads what plans scenes, which a run leaves to its workers
+
     catalogue, store = open_inputs(request.job, request.job_folder, request.out, request.address)
     _require_writable(store)
     refuse_foreign(store)

@@ -16,7 +16,6 @@ from schemas.base import Frozen, frozen_array
 from schemas.capture import CaptureTruth
 from schemas.job.views import Distortion
 from schemas.scene.shape import Asset
-from workers.assets.glb import asset_glb
 from workers.capture.folder import Matrix, read_json
 from workers.store.images import encode_mask
 
@@ -41,6 +40,8 @@ def write_truth(
     path: Path, truth: CaptureTruth, asset: Asset, ran: tuple[str, ...], skipped: Mapping[str, str]
 ) -> None:
     """Writes truth.json and mesh.glb below a capture's folder; `ran` and `skipped` are the receipt of effects."""
+    from workers.assets.glb import asset_glb  # loads trimesh, which a run that lists captures has no use for
+
     arrays = {name: getattr(truth, name).tolist() for name in ("T_board_cam", "T_board_obj", "T_color_depth")}
     record = TruthFile(
         object={"category": asset.category, "instance_id": asset.instance_id, "mesh": MESH_FILE},

@@ -21,7 +21,6 @@ from services.cli.main import main
 from services.cli.reference import describe_allowed, job_page, list_keys
 from services.job.job_file import NEEDS, allowed_keys, describe_idle, load_job, pack_job, validate_job
 from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
-from services.run import run_job
 from tests.mutations import mutated_bytes, mutated_tree
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -299,8 +298,11 @@ def peak_mb() -> float:
 
 @pytest.mark.parametrize("numbers", [range(40), pytest.param(range(100, 2100), marks=pytest.mark.slow)], ids=len)
 def test_mutated_jobs_are_jobs_or_are_refused_at_a_small_cost(numbers, tmp_path, capsys, monkeypatch):
-    for name in ("measure_scene", "require_framed"):  # this is about reading jobs
-        monkeypatch.setattr(run_job, name, lambda job, catalogue: None)
+    for name in (
+        "services.run.run_job.measure_scene",
+        "workers.shard.framing.require_framed",
+    ):  # this is about reading jobs
+        monkeypatch.setattr(name, lambda job, catalogue: None)
     path, out, outcomes = tmp_path / "job.yaml", str(tmp_path / "out"), Counter()
     main(["run", str(EXAMPLES[-1]), "--dry-run", "--out", out])  # loads what reading a job loads
     before = peak_mb()
