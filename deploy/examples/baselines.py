@@ -160,14 +160,7 @@ def nearest_pixels(depth_m: NDArray) -> tuple[NDArray, NDArray]:
 
 def stand_plate(pair: Pair) -> Prediction:
     """A plate across the optical axis for each object, at the median depth of its seen points; a pixel has the nearest one's."""
-    return spread(
-        pair, lambda points: np.column_stack([points[:, :2] / points[:, 2:], np.ones(len(points))]) * middle(points)
-    )
-
-
-def middle(points: NDArray) -> float:
-    """The median depth of points [N, 3], metres."""
-    return float(np.median(points[:, 2]))
+    return spread(pair, lambda points: points * (np.median(points[:, 2]) / points[:, 2:]))
 
 
 def turn_half(pair: Pair) -> Prediction:
@@ -182,8 +175,9 @@ def spread(pair: Pair, guess: Callable[[NDArray], NDArray]) -> Prediction:
     view, mirror = pair.input, pair.mirror
     assert mirror is not None
     T, depth_m = np.linalg.inv(mirror.T_world_cam) @ view.T_world_cam, np.full(mirror.depth().shape, np.inf)
+    seen_m, segment = view.depth_m(), view.segment()
     for region in regions_of(pair):
-        points = mirror_depth.unproject(view, view.depth_m(), view.segment() == region)
+        points = mirror_depth.unproject(view, seen_m, segment == region)
         if len(points):
             points = guess(mirror_depth.transform(T, points))
             at = np.stack(mirror_depth.pixels_of(mirror, points))

@@ -134,7 +134,7 @@ def _structs(table: pa.Table, key: str, values: pa.ChunkedArray) -> pa.ChunkedAr
 
 
 KEPT_BYTES = 256 << 20
-"""Rows of ranges that are kept for reading pairs in any order."""
+"""Rows of ranges that are kept for reading pairs in any order; the last range whatever its size."""
 
 Records = Sequence[CommitRecord]
 
@@ -148,7 +148,7 @@ def open_dataset(place: str | Path) -> "Dataset":
 
 
 class Dataset:
-    """Stored pairs and tables. Nothing is kept between calls but the last files; a process may hold many."""
+    """Stored pairs and tables. Between calls the last files, and rows of the last ranges, are kept; a process may hold many."""
 
     def __init__(self, store: Store) -> None:
         record = require_job(store)
@@ -157,8 +157,8 @@ class Dataset:
         self.place = store.name
         self.job: Job = record.job
         """The job that made it, every default filled in."""
-        self._kept: LRUCache[int, _Range] = LRUCache(KEPT_BYTES, lambda kept: kept.rows.nbytes)
-        """The last ranges that were asked for a scene, by their first one."""
+        self._kept: LRUCache[range, _Range] = LRUCache(KEPT_BYTES, lambda kept: min(kept.rows.nbytes, KEPT_BYTES))
+        """The last ranges that were asked for a scene, by their scenes."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return open_dataset, (self.place,)
@@ -203,8 +203,8 @@ class Dataset:
     def _pairs(self, where: pc.Expression | None, part: tuple[int, int]) -> Iterator[Pair]:
         for number, records in enumerate(iter_committed(self._store)):
             if number % part[1] == part[0]:
-                kept = self._open_range(records)
-                yield from pairs_of(kept.rows, kept.files, where)
+                opened = self._open_range(records)
+                yield from pairs_of(opened.rows, opened.files, where)
 
     def pair(self, pose_id: int) -> Pair:
         """The pair with this id of its input view or of its mirror view. Raises InputError where it is not stored."""
@@ -218,15 +218,17 @@ class Dataset:
 
     def scene(self, scene_id: int) -> tuple[Pair, ...]:
         """The pairs of one scene; none of a scene that failed. Raises InputError where it is not stored."""
-        chosen = next((start for start, kept in self._kept.items() if scene_id in kept.span), None)
-        kept = self._open_range(find_records(self._store, scene_id)) if chosen is None else self._kept[chosen]
-        self._kept[kept.span.start] = kept
-        return tuple(pairs_of(kept.rows, kept.files, pc.field("scene_id") == scene_id))
+        scenes = next((scenes for scenes in self._kept if scene_id in scenes), None)
+        if scenes is None:
+            records = find_records(self._store, scene_id)
+            scenes = range(records[0].span.start, records[0].span.stop)
+            self._kept[scenes] = self._open_range(records)
+        opened = self._kept[scenes]
+        return tuple(pairs_of(opened.rows, opened.files, pc.field("scene_id") == scene_id))
 
     def _open_range(self, records: Records) -> "_Range":
         rows = RangeRows.of(lambda table: range_rows(self._store, records, table))
-        span = range(records[0].span.start, records[0].span.stop)
-        return _Range(span, rows, RangeFiles(self._files, records))
+        return _Range(rows, RangeFiles(self._files, records))
 
 
 @dataclass(frozen=True)
@@ -251,9 +253,8 @@ class RangeRows:
 
 @dataclass(frozen=True)
 class _Range:
-    """A committed range: its scenes, rows and files."""
+    """A committed range: its rows and files."""
 
-    span: range
     rows: RangeRows
     files: RangeFiles
 
@@ -263,11 +264,12 @@ def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) 
     table = choose_pairs(rows.pairs, where)
     if not table.num_rows:
         return
-    objects, labels = rows.objects, defaultdict[tuple[int, str], list[Row]](list)
-    chosen = objects.filter(pc.is_in(objects.column("scene_id"), table.column("scene_id").combine_chunks()))
-    shapes = rows.assets
-    named = shapes.filter(pc.is_in(shapes.column("instance_id"), chosen.column("instance_id").combine_chunks()))
-    assets = {row["instance_id"]: row for row in named.to_pylist()}
+    chosen = rows.objects.filter(pc.is_in(rows.objects["scene_id"], table["scene_id"].combine_chunks()))
+    named = rows.assets.filter(pc.is_in(rows.assets["instance_id"], chosen["instance_id"].combine_chunks()))
+    assets, labels = (
+        {row["instance_id"]: row for row in named.to_pylist()},
+        defaultdict[tuple[int, str], list[Row]](list),
+    )
     for row in chosen.to_pylist():
         labels[row["pose_id"], row["role"]].append(row | {"asset": assets[row["instance_id"]]})
     for number in np.argsort(table.column("parent_id").to_numpy()):

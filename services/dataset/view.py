@@ -151,10 +151,8 @@ class Pixels:
         normals = codes.astype(np.float32)
         normals *= np.float32(2.0 / FULL)
         normals -= np.float32(1.0)
-        square = np.einsum("ijk,ijk->ij", normals, normals)
-        normals *= np.where(_coded(codes), 1.0 / np.sqrt(np.maximum(square, np.float32(1e-12))), np.float32(0.0))[
-            :, :, None
-        ]
+        length = np.sqrt(np.einsum("ijk,ijk->ij", normals, normals))
+        normals /= np.where(_coded(codes), length, np.float32(np.inf))[:, :, None]
         return normals
 
     def coordinates(self) -> Array:

@@ -259,7 +259,7 @@ def _metrics(metrics: Mapping[str, Figure]) -> str:
         if one["items"]
     }
     head = ("metric", "mean", "coverage", "95 % interval", "at worst", "items")
-    first, rest = ([row for name, row in rows.items() if (name in HEADLINES) == told] for told in (True, False))
+    first, rest = ([row for name, row in rows.items() if (name in HEADLINES) == is_first] for is_first in (True, False))
     more = f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
     return table_html(head, first) + more * bool(rest)
 

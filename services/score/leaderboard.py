@@ -19,7 +19,17 @@ from scipy.stats import wilcoxon
 from schemas.base import Array
 from schemas.errors import InputError
 from services.run.progress import finish
-from services.score.command import SHOWN, covered, in_words, interval, read_score, require_alike, words, write_text
+from services.score.command import (
+    SHOWN,
+    covered,
+    in_words,
+    interval,
+    is_whole,
+    read_score,
+    require_alike,
+    words,
+    write_text,
+)
 from services.score.summary import Figure, is_better_high, items_of, scenes_of, summarise, values_of
 
 LEVEL: Final = 0.05
@@ -35,18 +45,21 @@ def main(options: argparse.Namespace) -> int:
     for name, (_, other) in others:
         require_alike(options.out, first, head, name, other)
     summaries = {name: summarise(table) for name, (table, _) in scores.items()}
-    metrics = [name for name in SHOWN if any(_figure(one, name) for one in summaries.values())]
+    metrics = [name for name in SHOWN if any(_figure(summary, name) for summary in summaries.values())]
     verdicts = compare_all({name: items_of(table) for name, (table, _) in scores.items()}, summaries, metrics)
     options.target.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.Table.from_pylist([*_rows(summaries, metrics)]), options.target / "leaderboard.parquet")
-    tables, told = [*_markdown(summaries, metrics)], describe_verdicts(verdicts, summaries)
-    write_text(options.target / "leaderboard.md", "\n\n".join([tables[0], told, *tables[1:]]) + "\n")
+    tables, sentences = [*_markdown(summaries, metrics)], describe_verdicts(verdicts, summaries)
+    write_text(options.target / "leaderboard.md", "\n\n".join([tables[0], sentences, *tables[1:]]) + "\n")
     write_text(options.target / "leaderboard.tex", "\n\n".join(_latex(summaries, metrics)) + "\n")
-    print(f"{tables[0]}\n\n{told}\n\nby category: {options.target / 'leaderboard.md'}")
-    whole = all(
-        figure["coverage"] == 1.0 for one in summaries.values() for figure in map(one["metrics"].get, metrics) if figure
+    print(f"{tables[0]}\n\n{sentences}\n\nby category: {options.target / 'leaderboard.md'}")
+    return finish(
+        options,
+        all(map(is_whole, summaries.values())),
+        runs=[*summaries],
+        verdicts=verdicts,
+        folder=str(options.target),
     )
-    return finish(options, whole, runs=[*summaries], verdicts=verdicts, folder=str(options.target))
 
 
 def _name(run: Path, runs: Sequence[Path]) -> str:
@@ -71,7 +84,9 @@ def compare_all(
     verdicts: list[dict[str, Any]] = []
     for metric in metrics:
         whole = [
-            name for name, one in summaries.items() if (figure := _figure(one, metric)) and figure["coverage"] == 1.0
+            name
+            for name, summary in summaries.items()
+            if (figure := _figure(summary, metric)) and figure["coverage"] == 1.0
         ]
         means = {name: scene_means(tables[name], metric) for name in whole}
         for a, b in combinations(whole, 2):
@@ -148,11 +163,11 @@ def _tables(summaries: Mapping[str, Any], metrics: Sequence[str]) -> Iterator[tu
         ],
     )
     for metric in metrics:
-        categories = sorted({name for one in summaries.values() for name in one["by"]["category"]})
+        categories = sorted({name for summary in summaries.values() for name in summary["by"]["category"]})
         rows = [
-            [run, *(_cell(metric, one["by"]["category"].get(name, {}).get(metric)) for name in categories)]
-            for run, one in summaries.items()
-            if _figure(one, metric)
+            [run, *(_cell(metric, summary["by"]["category"].get(name, {}).get(metric)) for name in categories)]
+            for run, summary in summaries.items()
+            if _figure(summary, metric)
         ]
         yield words(metric), ["run", *categories], rows
 

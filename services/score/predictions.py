@@ -16,7 +16,7 @@ import os
 import re
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -105,21 +105,20 @@ def find_predictions(folder: Path) -> Predictions:
 
 
 def by_export_ids(
-    given: Predictions, pairs: int, scenes: Iterable[tuple[int, Sequence[str]]], role: Role
+    given: Predictions, pairs: int, scenes: Iterable[tuple[int, Mapping[int, str]]], role: Role
 ) -> Predictions:
     """The predictions with poses.csv read by the ids of `verso export --format bop`, if more of its lines name an item so.
 
     There an image is numbered in its scene, and an instance by its first appearance; `role` is that of the view which poses are
-    scored of, lines of other views are left out. scenes: each scene's id and the instances of its regions, from the first on, in
-    the order of ids.
+    scored of, lines of other views are left out. scenes: each scene's id, in order, and the instances of its objects by region.
     """
     lines = [(key, text) for key, texts in given.names.items() if key[0] == "pose" for text in texts]
     numbers, items, native = dict[str, int](), dict[tuple[int, int], list[int]](), set[Key]()
     for scene_id, instances in scenes:
-        for place, instance in enumerate(instances):
+        for region, instance in sorted(instances.items()):
             number = numbers.setdefault(instance, len(numbers) + 1)
-            items.setdefault((scene_id, number), []).append(REGION_FIRST_OBJECT + place)
-            native |= {("pose", 2 * (pairs * scene_id + k) + 1, REGION_FIRST_OBJECT + place) for k in range(pairs)}
+            items.setdefault((scene_id, number), []).append(region)
+            native |= {("pose", 2 * (pairs * scene_id + k) + 1, region) for k in range(pairs)}
     names, strays, meant = defaultdict[Key, list[str]](list), list(given.strays), 0
     for (_, image, number), text in lines:
         word = text.partition("|")[0].strip()
@@ -127,12 +126,8 @@ def by_export_ids(
         regions = items.get((numbered, number))
         pair, place = divmod(image, len(DRAWN_ROLES))
         if regions is None or pair >= pairs:
-            strays.append(
-                (
-                    "pose",
-                    f"scene_id {plain_line(word)}, im_id {image}, obj_id {number} of {POSES_FILE} is no object of an image",
-                )
-            )
+            line = f"scene_id {plain_line(word)}, im_id {image}, obj_id {number} of {POSES_FILE}"
+            strays.append(("pose", f"{line} is no object of an image"))
             continue
         meant += 1
         if DRAWN_ROLES[place] == role:

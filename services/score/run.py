@@ -30,7 +30,7 @@ from schemas.scene.view import Role
 from services.dataset.dataset import RangeRows, pairs_of
 from services.dataset.shapes import RangeFiles, StoredFiles
 from services.job.record import require_job
-from services.read.dataset_reader import region_names
+from services.read.query import query
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.score.images import require_flip
@@ -144,12 +144,16 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
     return out / ITEMS_FILE
 
 
-def _scenes(store: Store) -> Iterator[tuple[int, list[str]]]:
+_INSTANCES: Final = f"""
+select scene_id, coalesce([body.region_id for body in bodies], [{REGION_FIRST_OBJECT}]) as regions,
+  coalesce([body.instance_id for body in bodies], [instance_id]) as instances from scenes order by 1
+"""
+
+
+def _scenes(store: Store) -> Iterator[tuple[int, dict[int, str]]]:
     """Each scene's id, and the instances of its objects by region."""
-    for records in iter_committed(store):
-        for scene in range_rows(store, records, "scenes").to_pylist():
-            names = region_names(scene)
-            yield scene["scene_id"], [names[region][1] for region in sorted(names) if region >= REGION_FIRST_OBJECT]
+    for row in query(store, _INSTANCES).to_pylist():
+        yield row["scene_id"], dict(zip(row["regions"], row["instances"], strict=True))
 
 
 def _ranges(store: Store, predictions: Predictions, asked: Asked) -> Iterator[_Range]:

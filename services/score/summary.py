@@ -149,7 +149,7 @@ def summarise(table: pa.Table) -> dict[str, Any]:
     scenes, groups = scenes_of(table), {"category": categories, "visible_fraction": _quarters(table)}
     statuses = [_equal(table, "status", word) for word in ("ok", "missing", "refused")]
 
-    def told(chosen: Any, places: list[int]) -> dict[str, Figure]:
+    def figures_by_name(chosen: Any, places: list[int]) -> dict[str, Figure]:
         return {
             names[place]: {**figure, "coverage": _mean(covered[chosen, place]), "worst": _mean(worst[chosen, place])}
             for place, figure in zip(places, figures(values[chosen][:, places], scenes[chosen]), strict=True)
@@ -166,8 +166,11 @@ def summarise(table: pa.Table) -> dict[str, Any]:
             }
             for kind in pc.unique(table["kind"]).to_pylist()
         },
-        "metrics": told(np.ones(table.num_rows, np.bool_), list(range(len(names)))),
-        "by": {group: {word: told(mask, shown) for word, mask in masks.items()} for group, masks in groups.items()},
+        "metrics": figures_by_name(np.ones(table.num_rows, np.bool_), list(range(len(names)))),
+        "by": {
+            group: {word: figures_by_name(mask, shown) for word, mask in masks.items()}
+            for group, masks in groups.items()
+        },
     }
 
 

@@ -203,8 +203,8 @@ def draw_tradeoff(study: Study) -> bytes:
     """
     every = {name: moving_rows(study.rows, name) for name in ERRORS}
     moving = {name: rows for name, rows in every.items() if any(row.setting.kind == "single" for row in rows)}
-    told = {name for name, rows in moving.items() if sum(tells(row, name) for row in rows) > 1} or moving
-    by_group = [[name for name in moving if name in told and ERRORS[name].group == group] for group in GROUPS]
+    telling = {name for name, rows in moving.items() if sum(tells(row, name) for row in rows) > 1} or moving
+    by_group = [[name for name in moving if name in telling and ERRORS[name].group == group] for group in GROUPS]
     panels = [name for rank in zip_longest(*by_group) for name in rank if name is not None][:PANELS]
     picture = Picture((WIDE_IN, max(1, len(panels)) * 3.6 + 1.6), dpi=150, layout="constrained")
     title = f"{study.job[:40]}: {milliseconds(own_row(study.rows).ms)} a scene\n{sample(study)}"

@@ -101,14 +101,14 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
     """
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.drawn)
-    store = open_store(order.out)
-    if order.job_change is not None and store.size(JOB_FILE) is None:
-        require_framed(order.job, catalogue)
-        store.put(JOB_FILE, order.job_change.after.encode())
     compile_planned()
     context = open_worker(order.job, catalogue)
     note = require_device(context.renderer.name, order.job.run.device, context.renderer.choice)
     fingerprint = _fingerprint(context.renderer, order.job.drawn.tier)
+    store = open_store(order.out)
+    if order.job_change is not None and store.size(JOB_FILE) is None:
+        require_framed(order.job, catalogue)  # with loops that are compiled, which processes share among them
+        store.put(JOB_FILE, order.job_change.after.encode())
     _join_stack(store, fingerprint, order)
     order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})
     total = Stopwatch()
