@@ -230,6 +230,9 @@ class Job(Frozen):
         if self.images.projection.enabled and not self.cameras.mirror.enabled:
             remedy = "what is projected is what the mirror camera would see; set images.projection.enabled: false too"
             raise ValueError(f"images.projection.enabled is true and cameras.mirror.enabled is false: {remedy}")
+        if "covisible" in self.targets.views and not (self.cameras.mirror.enabled or self.cameras.depth.enabled):
+            remedy = "it says of other views what the input camera sees; set cameras.mirror.enabled or leave it out"
+            raise ValueError(f"targets.views asks for covisible, and there is no view beside the input's: {remedy}")
         if self.sensor.changes_rgb and not self.render.rgb:
             remedy = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
             raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {remedy}")
@@ -275,7 +278,9 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
         return "objects_per_scene must be 1: a capture is of one object"
     if job.sensor != SensorEffects():
         return "sensor has effects: leave them out, those of a virtual capture are keys of captures.simulate"
-    if unfit := [name for name in job.targets.views if name in ("albedo", "amodal")] + list(job.targets.shape):
+    if unfit := [name for name in job.targets.views if name in ("albedo", "covisible", "amodal")] + list(
+        job.targets.shape
+    ):
         why = "a capture has no shape but what its photographs saw; left are normals, coordinates and layers"
         return f"targets asks for {', '.join(unfit)}: {why}"
     return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"

@@ -275,7 +275,7 @@ class SensorEffects(Frozen):
         return any(name != "depth_noise" and effect is not None for name, effect in self)
 
 
-ViewTarget = Literal["normals", "coordinates", "albedo", "amodal", "layers"]
+ViewTarget = Literal["normals", "coordinates", "albedo", "covisible", "amodal", "layers"]
 ShapeTarget = Literal["surface", "volume"]
 
 MOST_LAYERS = 16
@@ -286,7 +286,7 @@ class Targets(Frozen):
     """Images of drawn views, and samples of shapes; none by default. Sensor effects never change them."""
 
     views: tuple[ViewTarget, ...] = ()
-    """Image targets of input, aligned and mirror views: normals, coordinates, albedo, amodal, layers."""
+    """Image targets of input, aligned and mirror views: normals, coordinates, albedo, covisible, amodal, layers."""
     smooth: bool = False
     """Whether `normals` are interpolated between vertices (shading normals), not those of the faces."""
     layers: Annotated[int, Field(ge=1, le=MOST_LAYERS)] = 4

@@ -68,6 +68,8 @@ class Modality:
     channels: int = 1
     switch: str | None = None
     """The key of the job that switches it on and off in every view; None where it is always stored."""
+    of_input: bool = True
+    """Whether the input view has such an image too."""
     projected: bool = False
     """Whether a view that is projected and not drawn has such an image too."""
     target: ViewTarget | None = None
@@ -81,7 +83,7 @@ class Modality:
 
     def word_of(self, role: ViewRole) -> str | None:
         """The word in the file's name (`RGB`, `RGBaligned`, `depthAligned`); None where such a view has no such image."""
-        if role.projected and not self.projected:
+        if (role.projected and not self.projected) or (role.name == "input" and not self.of_input):
             return None
         suffix = role.name if role.beside or role.projected else ""
         return self.word + (suffix if self.word.isupper() else suffix.capitalize())
@@ -100,6 +102,7 @@ MODALITIES: dict[PixelKind, Modality] = {
         Modality("normals", "normals", "uint16", 3, target="normals", formula="normals"),
         Modality("coordinates", "coordinates", "uint16", 3, target="coordinates", formula="coordinates"),
         Modality("albedo", "albedo", "uint8", 3, target="albedo", formula="albedo"),
+        Modality("covisible", "covisible", "uint8", of_input=False, target="covisible"),
         Modality("amodal", "amodal", "uint8", target="amodal", each=True),
         *(Modality(f"layer{n}", f"layer{n}_", "uint16", target="layers", layer=n) for n in LAYERS),
         *(Modality(f"layer{n}_region", f"layerSegment{n}_", "uint8", target="layers", layer=n) for n in LAYERS),

@@ -124,7 +124,8 @@ class Pixels:
         """
         if kind not in self._paths:
             target = MODALITIES[kind].target if kind in MODALITIES and "region" in self._paths else None
-            hint = f": a job stores it whose targets.views names {target}" if target else ""
+            others = "" if not target or MODALITIES[kind].of_input else ", of views beside the input's"
+            hint = f": a job stores it whose targets.views names {target}{others}" if target else ""
             raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}{hint}")
         path = self._paths[kind]
         return decode_png(self._files.image(path), path)
@@ -170,6 +171,11 @@ class Pixels:
     def albedo(self) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB: base colours without light and shadow."""
         return self.image("albedo")
+
+    def covisible(self) -> NDArray[np.bool_]:
+        """[H, W] bool: where the pair's input camera sees the point of an object that the pixel's centre shows."""
+        mask: NDArray[np.bool_] = self.image("covisible") > 0
+        return mask
 
     def layers(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """(depth [N, H, W] float32, metres along the optical axis, 0 for none; region [N, H, W]) of the objects' surfaces.

@@ -262,7 +262,8 @@ class ShardedWriter(Writer):
 
 _TARGETS: Final = (
     "normals 2 v / 65535 - 1, camera frame; coordinates coordinates_scale_m v / 65535 + coordinates_offset_m, object frame; "
-    "(0, 0, 0) is none; amodal an image for each object, by region, 255 where it is; layers and back as depth and region"
+    "(0, 0, 0) is none; covisible 255 where the input camera sees the point of an object that the pixel shows; "
+    "amodal an image for each object, by region, 255 where it is; layers and back as depth and region"
 )
 
 

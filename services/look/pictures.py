@@ -277,10 +277,12 @@ def _paint(
 ) -> Picture:
     """A modality's picture, as the type of its pixels says."""
     modality, pixels = MODALITIES[kind], there[kind][0]
-    if modality.each:
+    if modality.each or not modality.of_input:
         regions = np.array(_palette(), np.uint8).reshape(-1, 3)
         under = there["rgb"][0] if "rgb" in there else regions[there["region"][0]]
-        return picture_of_silhouettes(there[kind], under, words)
+        if modality.each:
+            return picture_of_silhouettes(there[kind], under, words)
+        return picture_of_projection(under, under * (pixels > 0)[..., None], words)
     if span is not None:
         return picture_of_depth(pixels / units_per_m, span, words, sharp=modality.target is not None)
     if modality.channels == 1:

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from schemas.errors import InputError, command_line, number, plural
-from services.job.record import read_success, require_dataset
+from services.job.record import read_success, require_dataset, require_job
 from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.report import Page, Section, whole_page
 from services.look.sections import table_html
@@ -65,7 +65,8 @@ def main(options: argparse.Namespace) -> int:
             "digest": digest,
             "predictions": str(given.folder),
         }
-        summary = {**head, **asdict(asked), **summarise(table)}
+        rays = "covisible" in require_job(store).job.targets.views
+        summary = {**head, "hidden_by": "rays" if rays else "image", **asdict(asked), **summarise(table)}
         write_text(target / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
         troubles = describe_refused(path)
         write_text(target / PAGE_FILE, page_of(summary, items_of(table), troubles))
@@ -77,7 +78,7 @@ def main(options: argparse.Namespace) -> int:
             print(f"{name:28}{in_words(name, figure['value']):>12}  {ends:28}{items}, {covered(figure)}")
     print(answer_of(summary))
     print(f"page: {target / PAGE_FILE}")
-    answer = {name: summary[name] for name in ("items", "missing", "refused", "unknown", "metrics")}
+    answer = {name: summary[name] for name in ("items", "missing", "refused", "unknown", "hidden_by", "metrics")}
     return finish(options, is_whole(summary), **answer, page=str(target / PAGE_FILE))
 
 
@@ -180,6 +181,11 @@ _CHARTS: Final = (
     ("Rotation", {"": "pose_rotation_deg"}),
 )
 
+_HIDDEN_BY: Final = {
+    "rays": "by rays from the input camera, the stored image covisible",
+    "image": "by the pixels of the input image, which leave some hundredths too many hidden",
+}
+
 _UNITS: Final = {"_m": (1e3, "mm"), "_m2": (1e6, "mm²"), "_deg": (1.0, "°"), "_px": (1.0, "px"), "_db": (1.0, "dB")}
 
 _STYLE: Final = "table { display: block; overflow-x: auto; margin-bottom: 2rem; }"
@@ -228,7 +234,8 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
     note = (
         "Means over all items of the split, 95 % intervals by a bootstrap over scenes. What is missing, refused or a hole counts "
         "as worst. "
-        "Seen and hidden: the object's pixels whose surface the input view sees, and does not."
+        "Seen and hidden: the object's pixels whose surface the input view sees, and does not, "
+        f"{_HIDDEN_BY[summary['hidden_by']]}."
     )
     sections = [
         Section("answer", "Answer", answer),

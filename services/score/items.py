@@ -6,10 +6,11 @@ every kind that is predicted at all. Its status is `ok`, `missing`, or `refused`
 kind_metric_part_unit: `depth_mae_m` is that of the object, `depth_mae_hidden_m` of the part of it that the input view does not
 see.
 
-Parts of the mirror view: `object`, all pixels of objects; `seen` and `hidden`, those of them whose surface the input view
-sees and does not (services/dataset/pair.py); `boundary`, within two pixels of an object's outline; `scene`, all with
-depth; `image`, all. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred, and they
-would drown it.
+Parts of the mirror view: `object`, all pixels of objects; `seen` and `hidden`, those of them with depth whose surface the input
+camera sees and does not: by the image `covisible`, which is exact, or where the job stores none by the pixels of the input view
+(services/dataset/pair.py), which hide some hundredths too many; `boundary`, within two pixels of an object's outline; `scene`,
+all with depth; `image`, all. The scene's floor and table are not in `seen` and `hidden`: an object has one pixel in a hundred,
+and they would drown it.
 """
 
 from collections.abc import Callable, Mapping
@@ -188,10 +189,13 @@ class Truth:
     def parts(self) -> Mapping[str, NDArray[np.bool_]]:
         """[H, W] bool by name, as the head of this file has them."""
         mask = self.segment >= REGION_FIRST_OBJECT
-        rows, columns = np.divmod(np.flatnonzero(mask & (self.units > 0)), mask.shape[1])
-        z_m, region = self.depth_m[rows, columns], self.segment[rows, columns]
-        seen = np.zeros(mask.shape, np.bool_)
-        seen[rows, columns] = carry(self.view, self.pair.input, rows, columns, z_m, region, SEEN_TOLERANCE_M)[1]
+        if "covisible" in self.view.images:
+            seen = self.view.covisible() & (self.units > 0)
+        else:
+            rows, columns = np.divmod(np.flatnonzero(mask & (self.units > 0)), mask.shape[1])
+            z_m, region = self.depth_m[rows, columns], self.segment[rows, columns]
+            seen = np.zeros(mask.shape, np.bool_)
+            seen[rows, columns] = carry(self.view, self.pair.input, rows, columns, z_m, region, SEEN_TOLERANCE_M)[1]
         return {
             "object": mask,
             "scene": self.units > 0,

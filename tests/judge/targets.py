@@ -108,7 +108,7 @@ def main() -> int:
     document.pop("verso", None)
     asked = list(get_args(ViewTarget))
     if captures := document.get("captures"):
-        asked = [name for name in asked if name not in ("albedo", "amodal")]
+        asked = [name for name in asked if name not in ("albedo", "covisible", "amodal")]
         captures["simulate"] |= {"views": given.views, "image_scale": given.image_scale}
     document["targets"] = {"views": asked, "smooth": given.smooth}
     if given.objects:

@@ -23,7 +23,7 @@ from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
 from workers.scene.ray_check import check_against_rays
 from workers.scene.sensor import sense_view
-from workers.scene.targets import draw_targets
+from workers.scene.targets import Sight, draw_targets
 
 
 def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
@@ -92,20 +92,20 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     job, effects, stopwatch = scene.context.job, scene.effects, scene.stopwatch
     images, bound_mm = job.images, job.check.mirror_agreement_mm
     exact_input = render_view(scene, "input", number, camera)
-    first = sense(scene, exact_input, number)
+    first, sight = sense(scene, exact_input, number), Sight(scene.posed.things, camera)
     beside = []
     for role, near in place_beside(camera, job).items():
         if not effects.runs(effect := str(VIEW_ROLES[role].effect)):
             continue
         with stopwatch.effect(effect):
-            beside.append(sense(scene, render_view(scene, role, number, near), number))
+            beside.append(sense(scene, render_view(scene, role, number, near, sight), number))
     assert first.region is not None
     pair = Pair(object_distance(first.depth, first.region, images, job.cameras.mirror), first, tuple(beside))
     if not effects.runs("mirror"):
         return pair
     with stopwatch.effect("mirror"):
         mirror_camera = place_mirror_camera(camera, pair.d_z_m, job.cameras.mirror)
-        exact_mirror = render_view(scene, "mirror", number, mirror_camera)
+        exact_mirror = render_view(scene, "mirror", number, mirror_camera, sight)
         mirror = sense(scene, exact_mirror, number)
     with stopwatch.stage("check"):
         agreement = exact_agreement = compare_views(first, mirror, images, bound_mm)
@@ -122,8 +122,11 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     return replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
 
 
-def render_view(scene: SettledScene, role: Role, number: int, camera: Camera) -> View:
-    """One rendered view: exact images in their stored encodings, and labels of the table and of every object."""
+def render_view(scene: SettledScene, role: Role, number: int, camera: Camera, sight: Sight | None = None) -> View:
+    """One rendered view: exact images in their stored encodings, and labels of the table and of every object.
+
+    `sight`: what the pair's input camera sees, for the views of others.
+    """
     job, renderer, stopwatch = scene.context.job, scene.context.renderer, scene.stopwatch
     parent_id = input_pose_id(scene.plan.scene_id, number, job.pairs_per_scene)
     pose_id = file_pose_id(role, parent_id)
@@ -137,7 +140,7 @@ def render_view(scene: SettledScene, role: Role, number: int, camera: Camera) ->
         count = partial(count_unoccluded, count_drawn=renderer.count_pixels)
         labels = label_regions(scene.plan, scene.posed, camera, buffer.region, count)
         depth = quantise_depth(buffer.depth_m, job.images)
-    further = draw_targets(scene.posed.things, camera, buffer.region, job, scene.effects, stopwatch)
+    further = draw_targets(scene.posed.things, camera, buffer.region, job, scene.effects, stopwatch, sight)
     return View(role, pose_id, parent_id, camera, buffer.rgb, depth, buffer.region, labels, further)
 
 

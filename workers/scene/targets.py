@@ -16,11 +16,12 @@ from schemas.job.views import Images, Targets
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Material, Mesh, Part, Shape
 from schemas.scene.view import FULL, LAYERS, Camera, PixelKind
-from workers.geometry.camera import unproject
+from workers.geometry.camera import NEAR_M, project, unproject
 from workers.geometry.colour import SRGB_STEPS, decode_srgb
 from workers.geometry.frames import invert, transform
 from workers.geometry.mesh import corner_weights, mix
 from workers.geometry.pixels import quantise_depth
+from workers.geometry.raycast import Caster
 from workers.scene.context import Stopwatch
 from workers.scene.painting import (
     CODES,
@@ -42,23 +43,33 @@ LINEAR = np.rint(SRGB_STEPS * FULL).astype(np.uint16)
 MOST_KEPT = 1 << 22
 """Numbers of a texture that is kept for the next view: a larger one would outlive its asset by hundreds of megabytes."""
 
-OF_NEAREST, OF_ALL = ("normals", "coordinates", "albedo"), ("layers", "amodal")
+OF_NEAREST, OF_ALL = ("normals", "coordinates", "albedo", "covisible"), ("layers", "amodal")
 """Targets of what is seen, and of everything along a pixel's ray."""
 
 
 def draw_targets(
-    things: Sequence[Placed], camera: Camera, region: NDArray[np.uint8], job: Job, effects: EffectPlan, watch: Stopwatch
+    things: Sequence[Placed],
+    camera: Camera,
+    region: NDArray[np.uint8],
+    job: Job,
+    effects: EffectPlan,
+    watch: Stopwatch,
+    sight: "Sight | None" = None,
 ) -> dict[PixelKind, NDArray]:
-    """The image targets that the plan has of a view with the mask `region` [H, W], by modality."""
+    """The image targets that the plan has of a view with the mask `region` [H, W], by modality.
+
+    `sight`: what the pair's input camera sees; None for the input view itself.
+    """
     drawn: dict[PixelKind, NDArray] = {}
     objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
-    if any(effects.runs(name) for name in OF_NEAREST):
+    of_seen = [name for name in OF_NEAREST if effects.runs(name) and (sight is not None or name != "covisible")]
+    if of_seen:
         with watch.stage("targets"):
             shown = things if effects.runs("normals") or effects.runs("albedo") else objects
             seen = Seen(shown, camera, region, drawn=job.captures is None)
-        for name in filter(effects.runs, OF_NEAREST):
+        for name in of_seen:
             with watch.stage("targets", name):
-                drawn[name] = _OF_SEEN[name](seen, job.targets)
+                drawn[name] = sight.draw(seen) if name == "covisible" and sight else _OF_SEEN[name](seen, job.targets)
     if any(effects.runs(name) for name in OF_ALL):
         with watch.stage("targets"):
             triangles = triangles_of(objects, camera)
@@ -182,6 +193,59 @@ def _values_of(part: Part) -> Array:
     if part.colors is not None:
         values[:, 2:] = SRGB_STEPS[part.colors[:, :3]]
     return values
+
+
+SAME_M = 1e-5
+"""A face whose plane lies this near to a point does not hide it: it is the point's own, or one beside it that rounding shows.
+
+Of 214,767 rays of 50 scenes none met a face from 5.6 to 22 micrometres before its point; 11 did from 0.5 to 5.6.
+"""
+
+
+class Sight:
+    """What the input camera of a pair sees, for every other view of it: the trees of things are built once, when first needed."""
+
+    def __init__(self, things: Sequence[Placed], camera: Camera) -> None:
+        self.things, self.camera = things, camera
+        self._casters: dict[int, Caster] = {}
+
+    def draw(self, seen: Seen) -> NDArray[np.uint8]:
+        """[H, W]: 255 where the input camera sees the point of an object that the pixel shows; from the same side of its face."""
+        image, k = np.zeros(seen.face.shape, np.uint8), self.camera.intrinsics
+        pixels = np.flatnonzero(np.append(seen.triangles.region, np.uint8(0))[seen.face] >= REGION_FIRST_OBJECT)
+        T_here_there = invert(seen.camera.T_world_cam) @ self.camera.T_world_cam
+        normals, offsets = (plane[seen.face.reshape(-1)[pixels]] for plane in seen.triangles.planes)
+        pixels = pixels[(normals @ T_here_there[:3, 3] - offsets) * -offsets > 0.0]
+        rows_columns = np.divmod(pixels, seen.camera.intrinsics.width)
+        points = unproject(*rows_columns, seen.z.reshape(-1)[pixels], seen.camera.intrinsics)
+        points = transform(invert(T_here_there), points)
+        ahead = points[:, 2] > NEAR_M
+        pixels, points = pixels[ahead], points[ahead]
+        u, v = project(points, k)
+        inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
+        image.reshape(-1)[pixels[inside]] = np.where(self.hides(points[inside]), 0, 255)
+        return image
+
+    def hides(self, points: Array) -> NDArray[np.bool_]:
+        """[N]: whether anything is between the input camera and points [N, 3], in its frame, metres, beyond the near plane."""
+        hidden = np.zeros(len(points), np.bool_)
+        for number in reversed(range(len(self.things))):  # objects first: they hide most
+            left = np.flatnonzero(~hidden)
+            if not len(left):
+                break
+            rays = points[left] / points[left, 2:]
+            distance, cosine = self._caster(number).cast(NEAR_M * rays, rays)
+            behind_m = np.where(cosine > 0.0, points[left, 2] - NEAR_M - distance, 0.0)
+            hidden[left] = behind_m * np.linalg.norm(rays, axis=1) * cosine > SAME_M
+        return hidden
+
+    def _caster(self, number: int) -> Caster:
+        """Of a thing in the camera's frame."""
+        if number not in self._casters:
+            thing, T_cam_world = self.things[number], invert(self.camera.T_world_cam)
+            vertices = transform(T_cam_world @ thing.T_world_shape, thing.shape.vertices)
+            self._casters[number] = Caster(Mesh(vertices, thing.shape.faces))
+        return self._casters[number]
 
 
 def whole_silhouettes(triangles: Triangles, surfaces: Surfaces, regions: Sequence[int]) -> NDArray[np.uint8]:

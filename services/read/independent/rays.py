@@ -10,9 +10,10 @@ to a projected edge may therefore lie on either side of it, and what the face ha
 
 import functools
 import io
+import itertools
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +29,9 @@ EDGE_PX = 1.0 / 128.0
 
 NEAR_M = 0.05
 """Nearer surfaces are not seen."""
+
+BEHIND_M = 1e-5
+"""A face does not hide a point that lies no farther than this behind its plane."""
 
 _COMPONENTS = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -216,6 +220,57 @@ def _projected(faces: Faces, view: Row) -> tuple[Array, Array]:
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         return edges, in_pixels(normal) / volume[:, None]
+
+
+def choices(faces: Faces, hits: Hits) -> Iterator[NDArray[np.int64]]:
+    """Numbers of the hits of one pixel that may be met together: the sure ones, and of others what closed bodies allow."""
+    region, closed = faces.region[hits.face], faces.closed[hits.face]
+    unsure = np.flatnonzero(~hits.sure)
+    for taken in itertools.product((False, True), repeat=len(unsure)):
+        there = hits.sure.copy()
+        there[unsure] = taken
+        if not (np.bincount(region[there & closed]) % 2).any():
+            yield np.flatnonzero(there)
+
+
+def on_edges(points: Array, corners: Array) -> Array:
+    """[N, 3]: the weights of the corners [N, 3, 3] of faces with which they add up to the edges' nearest points to `points`."""
+    along = np.roll(corners, -1, axis=1) - corners
+    apart = points[:, None] - corners
+    share = np.clip((apart * along).sum(axis=2) / np.maximum((along * along).sum(axis=2), 1e-300), 0.0, 1.0)
+    side = np.linalg.norm(apart - share[..., None] * along, axis=2).argmin(axis=1)
+    weights, every = np.zeros((len(points), 3)), np.arange(len(points))
+    weights[every, (side + 1) % 3] = share[every, side]
+    weights[every, side] = 1.0 - share[every, side]
+    return weights
+
+
+def seen_by(view: Row, faces: Faces, points: Array, face: NDArray[np.int64], other: Array) -> NDArray[np.int64]:
+    """[N]: 1 where a camera sees points [N, 3] of these faces [N] in its image, from the side of `other` [3]; 0 where not.
+
+    All in the camera's frame, metres. -1 where that is not sure: the answer is another one for a point moved by `EDGE_PX` in the
+    image, for half or twice `BEHIND_M`, or for a face turned by its rounding.
+    """
+    edges, planes = _projected(faces, view)
+    normals, heights = faces.plane_normals
+    here, there = (((origin - points) * normals[face]).sum(axis=1) for origin in (np.zeros(3), other))
+    slack = np.linalg.norm(points, axis=1) * 2.0 * faces.rounding_m[face] / np.maximum(heights[face], 1e-300)
+    at = points / points[:, 2:] * [view["fx"], view["fy"], 1.0] + [view["cx"], view["cy"], 0.0]
+    margin = np.minimum(at[:, :2], [view["width"], view["height"]] - at[:, :2]).min(axis=1)
+    answers = np.where((margin < 0.0) | (here * there < 0.0) | (points[:, 2] < NEAR_M), 0, 1)
+    answers[(np.abs(margin) < EDGE_PX) | (np.abs(here) < slack)] = -1
+    for n in np.flatnonzero(answers == 1):
+        inside = (edges @ at[n]).min(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = 1.0 / (planes @ at[n])
+        behind_m = np.abs(((points[n] - faces.points[:, 0]) * normals).sum(axis=1)) * (
+            (z > NEAR_M) & (z < points[n, 2])
+        )
+        if ((inside > EDGE_PX) & (behind_m > 2.0 * BEHIND_M)).any():
+            answers[n] = 0
+        elif ((inside > -EDGE_PX) & (behind_m > 0.5 * BEHIND_M)).any():
+            answers[n] = -1
+    return answers
 
 
 def _reach(faces: Faces, edges: Array, view: Row) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -1,12 +1,11 @@
 """Image targets of stored scenes by their definitions: at each pixel's centre, from the stored shapes and poses (rays.py).
 
-normals, coordinates and albedo are of the nearest surface of the thing that the mask shows; amodal and layers of all surfaces of
-objects, seen from either side. Where a centre is near a projected edge, any choice of the faces there is right in which every
-closed body is met an even number of times. The mask of a capture is a photograph's, and its object the merged mesh: where that
-has a hole, nothing is right.
+normals, coordinates and albedo are of the nearest surface of the thing that the mask shows; covisible is whether a ray from the
+input camera meets that first; amodal and layers are of all surfaces of objects, seen from either side. Where a centre is near a
+projected edge, any choice of the faces there is right in which every closed body is met an even number of times. The mask of a
+capture is a photograph's, and its object the merged mesh: where that has a hole, nothing is right.
 """
 
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -15,7 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.read.independent.derive import FIRST_OBJECT, FLOOR, TABLE, Array, Kind, Row, StoredPair, matrix
-from services.read.independent.rays import Faces, Hits, bare_faces, cast, place_shapes, read_shape
+from services.read.independent.rays import (
+    BEHIND_M,
+    Faces,
+    Hits,
+    bare_faces,
+    cast,
+    choices,
+    on_edges,
+    place_shapes,
+    read_shape,
+    seen_by,
+)
 
 STEP = 1.0 / 65_535.0
 """Of images of 16 bits."""
@@ -23,6 +33,9 @@ STEP = 1.0 / 65_535.0
 MOST_DEG, MOST_SHARE, MOST_CODES, MOST_MM = 0.02, 2e-5, 1.0, 0.02
 """Largest errors: of a normal, beyond rounding; of a coordinate, of the box's diagonal; of albedo, in codes before rounding; of a
 layer, beyond half a unit of stored depth."""
+
+COVISIBLE_PIXELS = 200
+"""Pixels at edges of a mask `covisible`, and of objects elsewhere, that are judged at most."""
 
 MOST_UNSURE = 12
 """A pixel near the edges of more faces, as at the pole of a sphere, is not judged where the exact answer is not stored."""
@@ -140,22 +153,13 @@ def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
     seen = (kind for kind in pair.kinds(view["role"]).values() if kind.formula is not None)
     findings = [_judge_seen(kind, pair, view, faces, own) for kind in seen]
     objects = hits.where(faces.region[hits.face] >= FIRST_OBJECT)
+    if "covisible" in pair.kinds(view["role"]):
+        findings.append(_judge_covisible(pair, view, faces, own))
     if "amodal" in asked:
         findings += [_judge_amodal(pair, view, faces, objects, number) for number in pair.regions]
     if "layers" in asked:
         findings.append(_judge_layers(pair, view, faces, objects))
     return findings
-
-
-def choices(faces: Faces, hits: Hits) -> Iterator[NDArray[np.int64]]:
-    """Numbers of the hits of one pixel that may be met together: the sure ones, and of others what closed bodies allow."""
-    region, closed = faces.region[hits.face], faces.closed[hits.face]
-    unsure = np.flatnonzero(~hits.sure)
-    for taken in itertools.product((False, True), repeat=len(unsure)):
-        there = hits.sure.copy()
-        there[unsure] = taken
-        if not (np.bincount(region[there & closed]) % 2).any():
-            yield np.flatnonzero(there)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,19 +246,7 @@ def _weights(view: Row, faces: Faces, hits: Hits) -> Array:
     shares = [(np.cross(v - points, w - points) * normal).sum(axis=2) for v, w in ((b, c), (c, a), (a, b))]
     weights = np.stack(shares, axis=2) / np.maximum((normal * normal).sum(axis=1), 1e-300)[:, None]
     beyond = (weights < 0.0).any(axis=2) | (weights.sum(axis=2) < 0.5)
-    weights[beyond] = _on_edges(points[beyond], corners[np.nonzero(beyond)[1]])
-    return weights
-
-
-def _on_edges(points: Array, corners: Array) -> Array:
-    """[N, 3]: the weights of the corners [N, 3, 3] of faces with which they add up to the edges' nearest points to `points`."""
-    along = np.roll(corners, -1, axis=1) - corners
-    apart = points[:, None] - corners
-    share = np.clip((apart * along).sum(axis=2) / np.maximum((along * along).sum(axis=2), 1e-300), 0.0, 1.0)
-    side = np.linalg.norm(apart - share[..., None] * along, axis=2).argmin(axis=1)
-    weights, every = np.zeros((len(points), 3)), np.arange(len(points))
-    weights[every, (side + 1) % 3] = share[every, side]
-    weights[every, side] = 1.0 - share[every, side]
+    weights[beyond] = on_edges(points[beyond], corners[np.nonzero(beyond)[1]])
     return weights
 
 
@@ -323,6 +315,28 @@ _ANSWERS: dict[str, tuple[int, str, Callable[[StoredPair, Row, Faces, Hits, NDAr
     "albedo": (FLOOR, "codes", _albedo),
 }
 """Formulas that rows of modalities name: least region that has it, the unit of its errors, and what they are."""
+
+
+def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Finding:
+    """255 where the input camera sees the point of an object, 0 elsewhere: judged at some pixels, against every face there is.
+
+    As many at edges of the mask as of objects elsewhere, evenly by number; not those near an edge in this view, see `seen_by`.
+    """
+    mask, first, around = pair.images[view["role"], "covisible"], pair.views["input"], np.ones((3, 3), np.uint8)
+    shown = pair.images[view["role"], "region"] >= FIRST_OBJECT
+    beside = shown & (cv2.dilate(mask * shown, around) != cv2.erode(np.where(shown, mask, 255), around))
+    chosen = [np.flatnonzero(some) for some in (beside, shown & ~beside)]
+    pixels = np.sort(np.concatenate([some[:: len(some) // COVISIBLE_PIXELS + 1] for some in chosen]))
+    nearest = own.where(np.searchsorted(own.pixel, pixels[np.isin(pixels, own.pixel)]))
+    nearest = nearest.where(nearest.sure & (nearest.high - nearest.low < BEHIND_M))
+    T = np.linalg.inv(matrix(first, "T_world_cam")) @ matrix(view, "T_world_cam")
+    points = (_rays(view, nearest) * nearest.z[:, None]) @ T[:3, :3].T + T[:3, 3]
+    answers = seen_by(first, faces_of(pair, first), points, nearest.face, T[:3, 3])
+    differ = (answers >= 0) & (answers * 255 != mask.reshape(-1)[nearest.pixel])
+    wrong = np.union1d(nearest.pixel[differ], np.flatnonzero((mask != 0) & ~(shown & (mask == 255))))
+    row, column = np.divmod(wrong[0], view["width"]) if len(wrong) else (-1, -1)
+    unjudged = len(pixels) - np.count_nonzero(answers >= 0)
+    return Finding("covisible", "of 255", len(pixels), 0, 0, unjudged, len(wrong), (column, row), float(len(wrong) > 0))
 
 
 def _judge_amodal(pair: StoredPair, view: Row, faces: Faces, objects: Hits, number: int) -> Finding:
