@@ -19,12 +19,13 @@ from tests.captures import captures_job, exact_capture, use_exact_captures
 from tests.datasets import SMALL, make_dataset, overlaid
 from tests.judge.targets import context_of, judge_scene, pairs_of, stored_pairs
 from workers.capture import make_capture
+from workers.geometry.frames import translation
 from workers.geometry.mesh import corner_weights
-from workers.scene import painting, rows, surfaces, targets
+from workers.scene import painting, pairs, rows, surfaces, targets
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import Laid, lay_scene, render_scene
 
-EVERY = {"views": ["normals", "coordinates", "albedo", "amodal", "layers"]}
+EVERY = {"views": ["normals", "coordinates", "albedo", "covisible", "amodal", "layers"]}
 NEAR = {
     "objects_per_scene": 3,
     "start": {"pose": "placed", "offset_m": [-0.1, 0.1]},
@@ -42,9 +43,9 @@ def job_of(changes: dict) -> str:
 def three() -> tuple[WorkerContext, Laid]:
     """Three objects at rest, before anything is drawn, for the input camera alone."""
     off = {"enabled": False}
-    context = context_of(
-        job_of(overlaid(NEAR, {"cameras": {"depth": off, "mirror": off}, "images": {"projection": off}}))
-    )
+    alone = {"cameras": {"depth": off, "mirror": off}, "images": {"projection": off}}
+    alone["targets"] = {"views": [name for name in EVERY["views"] if name != "covisible"]}
+    context = context_of(job_of(overlaid(NEAR, alone)))
     return context, lay_scene(context, 0, Stopwatch())
 
 
@@ -210,6 +211,36 @@ def test_a_wrong_target_is_found(monkeypatch, three, name):
     scene = render_scene(context, laid, Stopwatch())
     faults = [fault for pair in stored_pairs(context, scene) for fault in check_pair(pair)]
     assert any(told in fault for fault in faults), faults
+
+
+UNSEEN: tuple[Callable, ...] = (
+    lambda f: lambda things, camera: f(things[-1:], camera),
+    lambda f: lambda things, camera: f(things, Camera(camera.intrinsics, camera.T_world_cam @ translation(0.1, 0, 0))),
+)
+
+
+def test_a_covisible_mask_by_one_thing_alone_or_of_a_camera_aside_is_found_and_so_is_a_wrong_pixel(monkeypatch):
+    context = context_of(job_of(overlaid(NEAR, {"targets": {"views": ["covisible"]}})))
+    laid = lay_scene(context, 1, Stopwatch())
+    (pair,) = stored_pairs(context, render_scene(context, laid, Stopwatch()))
+    assert check_pair(pair) == []
+    assert ("input", "covisible") not in pair.images
+    image, region = (pair.images["mirror", kind] for kind in ("covisible", "region"))
+    for place, value in (((region >= 3) & (image == 255), 0), ((region >= 3) & (image == 0), 255), (region == 2, 255)):
+        where, faults = np.argwhere(place), list[str]()
+        for row, column in where[:: len(where) // 6]:
+            wrong = image.copy()
+            wrong[row, column] = value
+            changed = dataclasses.replace(pair, images=pair.images | {("mirror", "covisible"): wrong})
+            told = list(check_targets(changed, pair.views["mirror"]))
+            assert all(": 1 of " in fault and f"({column}, {row})" in fault for fault in told)
+            faults += told
+        assert len(faults) >= 4
+    for change in UNSEEN:
+        with monkeypatch.context() as patch:
+            patch.setattr(pairs, "Sight", change(targets.Sight))
+            (pair,) = stored_pairs(context, render_scene(context, laid, Stopwatch()))
+        assert any("covisible: " in fault for fault in check_pair(pair))
 
 
 def test_a_point_beyond_a_long_narrow_face_has_the_weights_of_the_nearest_point_of_its_edges():

@@ -30,6 +30,9 @@ EDGE_PX = 1.0 / 128.0
 NEAR_M = 0.05
 """Nearer surfaces are not seen."""
 
+ROUNDING_PX = 1.0 / 1024.0
+"""The same of points that are on no renderer's grid: float32 moves a corner by a tenth of that at most."""
+
 BEHIND_M = 1e-5
 """A face does not hide a point that lies no farther than this behind its plane."""
 
@@ -248,7 +251,7 @@ def on_edges(points: Array, corners: Array) -> Array:
 def seen_by(view: Row, faces: Faces, points: Array, face: NDArray[np.int64], other: Array) -> NDArray[np.int64]:
     """[N]: 1 where a camera sees points [N, 3] of these faces [N] in its image, from the side of `other` [3]; 0 where not.
 
-    All in the camera's frame, metres. -1 where that is not sure: the answer is another one for a point moved by `EDGE_PX` in the
+    All in the camera's frame, metres. -1 where that is not sure: another answer holds for a point moved by `ROUNDING_PX` in the
     image, for half or twice `BEHIND_M`, or for a face turned by its rounding.
     """
     edges, planes = _projected(faces, view)
@@ -258,17 +261,17 @@ def seen_by(view: Row, faces: Faces, points: Array, face: NDArray[np.int64], oth
     at = points / points[:, 2:] * [view["fx"], view["fy"], 1.0] + [view["cx"], view["cy"], 0.0]
     margin = np.minimum(at[:, :2], [view["width"], view["height"]] - at[:, :2]).min(axis=1)
     answers = np.where((margin < 0.0) | (here * there < 0.0) | (points[:, 2] < NEAR_M), 0, 1)
-    answers[(np.abs(margin) < EDGE_PX) | (np.abs(here) < slack)] = -1
+    answers[(np.abs(margin) < ROUNDING_PX) | (np.abs(here) < slack)] = -1
     for n in np.flatnonzero(answers == 1):
         inside = (edges @ at[n]).min(axis=1)
+        near = np.flatnonzero(inside > -ROUNDING_PX)
         with np.errstate(divide="ignore", invalid="ignore"):
-            z = 1.0 / (planes @ at[n])
-        behind_m = np.abs(((points[n] - faces.points[:, 0]) * normals).sum(axis=1)) * (
-            (z > NEAR_M) & (z < points[n, 2])
-        )
-        if ((inside > EDGE_PX) & (behind_m > 2.0 * BEHIND_M)).any():
+            z = 1.0 / (planes[near] @ at[n])
+        behind_m = np.abs(((points[n] - faces.points[near, 0]) * normals[near]).sum(axis=1))
+        before = (z > NEAR_M) & (z < points[n, 2])
+        if (before & (inside[near] > ROUNDING_PX) & (behind_m > 2.0 * BEHIND_M)).any():
             answers[n] = 0
-        elif ((inside > -EDGE_PX) & (behind_m > 0.5 * BEHIND_M)).any():
+        elif (before & (behind_m > 0.5 * BEHIND_M)).any():
             answers[n] = -1
     return answers
 

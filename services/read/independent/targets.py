@@ -34,7 +34,7 @@ MOST_DEG, MOST_SHARE, MOST_CODES, MOST_MM = 0.02, 2e-5, 1.0, 0.02
 """Largest errors: of a normal, beyond rounding; of a coordinate, of the box's diagonal; of albedo, in codes before rounding; of a
 layer, beyond half a unit of stored depth."""
 
-COVISIBLE_PIXELS = 200
+COVISIBLE_PIXELS = 1_000
 """Pixels at edges of a mask `covisible`, and of objects elsewhere, that are judged at most."""
 
 MOST_UNSURE = 12
@@ -334,8 +334,8 @@ def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Fi
     answers = seen_by(first, faces_of(pair, first), points, nearest.face, T[:3, 3])
     differ = (answers >= 0) & (answers * 255 != mask.reshape(-1)[nearest.pixel])
     wrong = np.union1d(nearest.pixel[differ], np.flatnonzero((mask != 0) & ~(shown & (mask == 255))))
-    row, column = np.divmod(wrong[0], view["width"]) if len(wrong) else (-1, -1)
-    unjudged = len(pixels) - np.count_nonzero(answers >= 0)
+    row, column = divmod(int(wrong[0]), view["width"]) if len(wrong) else (-1, -1)
+    unjudged = len(pixels) - int(np.count_nonzero(answers >= 0))
     return Finding("covisible", "of 255", len(pixels), 0, 0, unjudged, len(wrong), (column, row), float(len(wrong) > 0))
 
 

@@ -14,7 +14,7 @@ from services.dataset.pair import Pair
 from tests.kit.shapes import shape_of
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 
-TARGETS = {"views": ["normals", "coordinates", "albedo", "amodal", "layers"]}
+TARGETS = {"views": ["normals", "coordinates", "albedo", "covisible", "amodal", "layers"]}
 JOB = {"name": "derived", "seed": 2024, "targets": TARGETS, "images": {"projection": {"enabled": False}}}
 SIZES = {"objects": [{"source": "procedural", "size": "metric"}]}
 PILE = {
@@ -106,6 +106,8 @@ def test_targets_are_the_mesh_in_numbers(pairs):
             cosine = np.abs((mesh.face_normals[face] * normals[at][some]).sum(axis=1))
             assert not len(cosine) or (cosine > 0.999).mean() > 0.9  # else at an edge, where two faces are as near
             assert not (view.segment() == number)[~view.amodal(number)].any()
+            if view.role != "input":
+                assert not (view.covisible() & (segment < 3)).any() and view.covisible().any()
             assert view.amodal(number).sum() == view.regions[number]["amodal_pixels"]
 
 
@@ -251,6 +253,8 @@ def test_what_cannot_be_had_is_told_with_what_to_ask_for(files, pairs, copy):
             InputError, match=rf"no image of kind '{target}', only rgb, depth, region: .*targets\.views names {target}"
         ):
             ask()
+    with pytest.raises(InputError, match=r"targets\.views names covisible, of views beside the input's"):
+        pairs[0].input.covisible()
     (alone,) = make_scene(
         {"name": "alone", "cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}}, 0
     )

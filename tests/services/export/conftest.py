@@ -15,7 +15,7 @@ FOLDER = tempfile.TemporaryDirectory(prefix="verso-tests-hf-")
 # Read when it is imported.
 os.environ.update(HF_HUB_OFFLINE="1", HF_HUB_DISABLE_TELEMETRY="1", HF_HOME=FOLDER.name)
 
-IMAGES = {"views": ["normals", "coordinates", "albedo", "amodal", "layers"], "layers": 2}
+IMAGES = {"views": ["normals", "coordinates", "albedo", "covisible", "amodal", "layers"], "layers": 2}
 SENSOR = {"width": 320, "height": 240, "fx": 262.5, "fy": 262.5, "cx": 160.0, "cy": 120.0}
 SHAPED = {
     "scenes": 3,

@@ -153,9 +153,12 @@ def targets_of(store):
     """(kind, (role, word in the file's name, pixels)) of every image target that is stored; of `amodal` [objects, H, W]."""
     words = {"normals": "normals", "coordinates": "coordinates", "albedo": "albedo", "back": "back"}
     words |= {"back_region": "backSegment", "layer2": "layer2_", "layer2_region": "layerSegment2_", "amodal": "amodal"}
+    words |= {"covisible": "covisible"}
     (category,) = {path.parent.name for path in store.root.glob("*/RGB00000.png")}
     for role, ending, pose_id in (("input", "", 0), ("aligned", "Aligned", 0), ("mirror", "", 1)):
         for kind, word in words.items():
+            if (role, kind) == ("input", "covisible"):
+                continue
             numbers = [f"{pose_id:05d}obj{n}" for n in range(3)] if kind == "amodal" else [f"{pose_id:05d}"]
             files = [store.root / category / f"{word}{ending}{number}.png" for number in numbers]
             pixels = [decode(path.read_bytes()) for path in files]

@@ -86,5 +86,5 @@ def figures():
 def targets(tmp_path_factory) -> LocalStore:
     """A finished scene of two objects with every image target."""
     changes = {"scenes": 1, "objects_per_scene": 2, "categories": ["mug"], "start": {"offset_m": [-0.12, 0.12]}}
-    images = {"views": ["normals", "coordinates", "albedo", "amodal", "layers"], "layers": 2}
+    images = {"views": ["normals", "coordinates", "albedo", "covisible", "amodal", "layers"], "layers": 2}
     return make_dataset(tmp_path_factory.mktemp("targets"), targets=images, **changes)[0]

@@ -156,8 +156,11 @@ def test_every_image_that_a_view_stores_has_its_picture(targets, shown_targets):
         whole = [path for path in files if "/patches/" not in path]
         own = [name for name in shown_targets.pictures if name.startswith(f"{role} ")]
         kinds = {name.split(" ")[1] for name in own}
-        assert len([name for name in own if not name.endswith(" patch")]) == len(whole) - 1 == 13  # one amodal of two
+        assert (
+            len([name for name in own if not name.endswith(" patch")]) == len(whole) - 1 == 13 + (role == "mirror")
+        )  # one amodal of two
         assert {*("rgb", "depth", "region", "normals", "coordinates", "albedo", "amodal"), *LAYERS} < kinds
+        assert ("covisible" in kinds) == (role == "mirror")
     stem = targets.root / "mug"
     for name, file in (("mirror normals", "normals00001"), ("input coordinates patch", "patches/coordinates00000obj0")):
         stored = cv2.imread(str(stem / f"{file}.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]

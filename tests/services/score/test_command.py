@@ -22,6 +22,7 @@ from services.dataset.dataset import open_dataset
 from services.score import run as module
 from services.score.leaderboard import compare_all, describe_verdicts, holm
 from services.score.summary import HEADLINES, is_better_high, summarise
+from tests.datasets import make_dataset
 from workers.pool import Ended
 
 PAIRS = 8
@@ -69,6 +70,30 @@ def test_truth_is_perfect_and_its_page_needs_no_network(files, truth, tmp_path, 
     assert all(one["coverage"] == 1.0 for one in answer["metrics"].values() if one["items"])
     rows = pq.read_table(tmp_path / "items.parquet").to_pylist()
     assert len(rows) == 3 * PAIRS and {row["status"] for row in rows} == {"ok"}
+
+
+def test_hidden_pixels_are_those_of_the_stored_mask_where_there_is_one(files, truth, tmp_path, capsys):
+    """Depth is 10 mm off where the mask says that the input camera does not see: by the input image's pixels, some of both."""
+    assert score(capsys, files.root, truth, "--out", tmp_path / "plain")[1]["hidden_by"] == "image"
+    store, _ = make_dataset(tmp_path / "new", targets={"views": ["covisible"]})
+    (tmp_path / "depth").mkdir()
+    hidden = 0
+    for pair in open_dataset(str(store.root)).pairs():
+        view = pair.mirror
+        off = (view.segment() >= 3) & ~view.covisible()
+        hidden += np.count_nonzero(off)
+        depth_m = view.depth() / view.depth_units_per_m
+        np.save(tmp_path / "depth" / f"{view.pose_id:05d}.npy", depth_m + 0.01 * off)
+    _, answer, _ = score(capsys, store.root, tmp_path, "--out", tmp_path / "score")
+    value = {name: one["value"] for name, one in answer["metrics"].items()}
+    assert (answer["hidden_by"], value["depth_mae_seen_m"], round(value["depth_mae_hidden_m"], 9)) == (
+        "rays",
+        0.0,
+        0.01,
+    )
+    rows = pq.read_table(tmp_path / "score" / "items.parquet").to_pylist()
+    assert sum(row["depth_pixels_hidden"] for row in rows) == hidden > 200
+    assert "the stored image covisible" in (tmp_path / "score" / "index.html").read_text()
 
 
 def test_what_this_installation_cannot_score_is_told_before_anything_is_written(

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from schemas.base import Range
 from schemas.errors import LabelError, ViewError
@@ -20,7 +21,7 @@ from tests.kit.planes import HERE, IMAGES, THERE, K, plane_view
 from tests.kit.shapes import asset_of, box, shape_of, table
 from tests.physics.settling import settle_single
 from workers.geometry.camera import inclination, look_at, orbit_pose, unproject
-from workers.geometry.frames import UP, half_turn, pose, rotation_about, translation
+from workers.geometry.frames import UP, half_turn, invert, pose, rotation_about, transform, translation
 from workers.geometry.pixels import Extent, distort
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.scene.chance import SceneChance
@@ -41,7 +42,7 @@ from workers.scene.make_scene import pose_scene
 from workers.scene.pairs import mirror_pose, object_distance
 from workers.scene.plan import draw_scene
 from workers.scene.ray_check import STEEPEST_COS, check_against_rays, check_pair
-from workers.scene.targets import draw_targets
+from workers.scene.targets import Sight, draw_targets
 
 JOB = Job(name="t")
 X_AXIS, Y_AXIS, Z_AXIS = np.eye(3)
@@ -216,6 +217,36 @@ def test_what_reaches_behind_the_camera_is_cut_at_the_near_plane_and_has_its_nor
     plan, job = EffectPlan(("normals",), {}), Job(name="t", targets=Targets(views=("normals",)))
     drawn = draw_targets([floor], Camera(K, T_world_cam), region, job, plan, Stopwatch())["normals"][region > 0]
     assert len(drawn) > 500 and np.abs(drawn - np.rint((T_world_cam[2, :3] + 1.0) / 2.0 * 65535.0)).max() <= 1.0
+
+
+def test_the_input_camera_sees_what_no_box_is_before_inside_its_image_and_from_its_side():
+    """A post's shadow on a wall, the post's own far sides, and a sheet of no thickness: by where lines enter and leave boxes."""
+    boxes = {3: ((0.5, 0.02, 0.4), (0, 0, 0)), 4: ((0.07, 0.05, 0.2), (0.03, -0.15, 0.05))}
+    things = [Placed(region, shape_of(box(*sides, at)), np.eye(4)) for region, (sides, at) in boxes.items()]
+    corners = np.array([[-0.4, -0.1, -0.05], [-0.3, -0.1, -0.05], [-0.3, -0.1, 0.05], [-0.4, -0.1, 0.05]])
+    things.append(Placed(5, shape_of(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)), np.eye(4)))
+    view = Camera(K, look_at(np.array([-0.7, -0.6, 0.2]), np.zeros(3)))
+    for place, cx in (((0.2, -0.7, 0.3), 40.0), ((0.3, -0.7, 0.3), 100.0), ((-0.3, 0.7, 0.1), 40.0)):
+        source = Camera(
+            K.model_copy(update={"fx": 180.0, "fy": 250.0, "cx": cx}), look_at(np.array(place), np.zeros(3))
+        )
+        depth, region, _ = cast_view(things, view)
+        plan, job = EffectPlan(("covisible",), {}), Job(name="t", targets=Targets(views=("covisible",)))
+        drawn = draw_targets(things, view, region, job, plan, Stopwatch(), Sight(things, source))["covisible"]
+        rows, columns = np.nonzero(region)
+        points = transform(view.T_world_cam, unproject(rows, columns, depth[rows, columns], K))
+        x, y, z = transform(invert(source.T_world_cam), points).T
+        u, v = 180.0 * x / z + cx, 250.0 * y / z + K.cy
+        expected = (u >= 0) & (u < K.width) & (v >= 0) & (v < K.height)
+        for sides, at in boxes.values():
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ends = [(np.array(at) + sign * np.array(sides) / 2 - place) / (points - place) for sign in (-1, 1)]
+            enters, leaves = np.minimum(*ends).max(axis=1), np.maximum(*ends).min(axis=1)
+            expected &= ~((enters < 1 - 1e-9) & (leaves >= enters - 1e-9))
+        expected &= (region[rows, columns] != 5) | (place[1] < -0.1)
+        assert np.array_equal(drawn[rows, columns], 255 * expected) and not drawn[region == 0].any()
+        share = {number: expected[region[rows, columns] == number].mean() for number in (3, 4, 5)}
+        assert all(0.1 < share[number] < 0.9 for number in (3, 4)) if place[1] < 0 else share[5] == 0, share
 
 
 # ---------------------------------------------------------------------------------------------- the check by rays
