@@ -256,7 +256,7 @@ volume_m3 | double? | m3 | - | Volume; null where the mesh is open.
 watertight | bool | - | - | Whether the mesh bounds a volume.
 T_source_to_object | double[16] | m | object, source | Takes scaled source coordinates to object coordinates.
 scale | double | 1 | - | {scale}
-split | string | - | - | train, val or test, by the instance's id: no shape is in two.
+split | string | - | - | train, val, test, unseen or none, by the instance's id: no shape is in two.
 notes | list of string? | - | - | What was repaired or left out.
 samples | struct?, targets | - | - | An object's points (`targets.shape`); null without, and where `notes` says why.
 samples.path | string | - | - | Path below the dataset's folder.

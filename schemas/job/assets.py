@@ -4,8 +4,10 @@ import hashlib
 import itertools
 import math
 import unicodedata
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -195,8 +197,18 @@ class LibrarySource(Frozen):
 Source = Annotated[ProceduralSource | LibrarySource, Field(discriminator="source")]
 
 
+Split = Literal["train", "val", "test", "unseen"]
+"""What instances are for; `unseen` are those of categories that nothing is trained on."""
+
+SPLITS: tuple[str, ...] = get_args(Split)
+"""From the laxest to the strictest."""
+
+NO_SPLIT = "none"
+"""The split of an instance that `assets.split.named` does not name."""
+
+
 class SplitShares(Frozen):
-    """Shares of instances (not of scenes) in train, val and test."""
+    """Shares of instances (not of scenes) in train, val and test, or the instances themselves."""
 
     train: Share = 0.8
     """Share of train."""
@@ -204,6 +216,17 @@ class SplitShares(Frozen):
     """Share of val."""
     test: Share = 0.1
     """Share of test."""
+    named: dict[Split, tuple[str, ...]] = {}
+    """Instead of shares: the instances of train, val, test and unseen by their ids, in which * stands for anything. The objects
+    of a scene are then all of one split, and no scene has an instance that is not named."""
+
+    @field_validator("named")
+    @classmethod
+    def _named_once(cls, named: dict[Split, tuple[str, ...]]) -> dict[Split, tuple[str, ...]]:
+        names = Counter(itertools.chain.from_iterable(named.values()))
+        if twice := [name for name, count in names.items() if count > 1]:
+            raise ValueError(f"names {twice[0]} twice: an instance is in one split")
+        return named
 
     @model_validator(mode="after")
     def _sums_to_one(self) -> "SplitShares":
@@ -213,7 +236,14 @@ class SplitShares(Frozen):
         return self
 
     def of(self, instance: str) -> str:
-        """`train`, `val` or `test` by the hash of the instance's id: all scenes of an instance fall into one split."""
+        """`train`, `val` or `test` by the hash of the instance's id: all scenes of an instance fall into one split.
+
+        With `named` the split that names it, by the id itself before any pattern; `NO_SPLIT` where none does.
+        """
+        if self.named:
+            by_id = (split for split, names in self.named.items() if instance in names)
+            alike = (s for s, names in self.named.items() if any("*" in n and fnmatchcase(instance, n) for n in names))
+            return next(itertools.chain(by_id, alike), NO_SPLIT)
         place = int.from_bytes(hashlib.sha256(instance.encode()).digest()[:8], "big") / 2.0**64
         return "train" if place < self.train else "val" if place < self.train + self.val else "test"
 

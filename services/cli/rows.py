@@ -22,10 +22,11 @@ PREDICTIONS = path(
     "predictions", "PREDICTIONS", "depth/ID.png|npy, rgb/ID.png, shape/ID.glb, ..., poses.csv", nargs="?"
 )
 READ_AS = (
-    choice("--split", ("all", "train", "val", "test"), "scenes whose objects all are of it", default="all"),
+    choice("--split", ("all", "train", "val", "test", "unseen"), "scenes whose objects all are of it", default="all"),
+    choice("--level", ("all", "1", "2", "3", "4"), "scenes of a level of docs/benchmark.md", default="all"),
     choice("--frame", ("object", "camera", "input", "world"), "of shapes; `input`: of poses too", default="object"),
     choice(
-        "--volume", ("told", "occupancy", "logits", "sdf", "sdf-positive-inside"), "what values are", default="told"
+        "--volume", ("auto", "occupancy", "logits", "sdf", "sdf-positive-inside"), "what values are", default="auto"
     ),
 )
 """Of predictions: which, and how they are read."""

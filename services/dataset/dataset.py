@@ -23,7 +23,7 @@ from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError, InputError, SceneError, command_line, needs_making
-from schemas.job.assets import SplitShares
+from schemas.job.assets import NO_SPLIT, SPLITS, SplitShares
 from schemas.job.job import Job
 from schemas.job.views import Patch
 from schemas.scene.scene import SceneOutput
@@ -48,7 +48,7 @@ class Splits:
     """The splits of a dataset's instances."""
 
     by_id: Mapping[str, str]
-    """train, val or test; of instances that are not here, the column of `assets` holds."""
+    """train, val, test or unseen; of instances that are not here, the column of `assets` holds."""
     held_out: frozenset[str] = frozenset()
     """Categories that are all in test."""
 
@@ -61,7 +61,7 @@ class Splits:
 
 def strictest(splits: Iterable[str]) -> str:
     """The split of a scene whose objects are of these, so that no scene of `train` shows an object of `test`."""
-    return max(splits, key=("train", "val", "test").index)
+    return max(splits, key=(*SPLITS, NO_SPLIT).index)
 
 
 def collect_ids(batches: Iterable[Iterable[Row]]) -> dict[str, set[str] | None]:
@@ -80,8 +80,11 @@ def split_by_category(instances: Mapping[str, Collection[str] | None], shares: S
     """The split of every instance; `instances`: ids by category, as `collect_ids` has them.
 
     A category's instances stand in the order of their ids' hashes, as in `assets.split`, and are cut where the shares say;
-    as long as there are enough, train has one, then test, then val. The same ids give the same splits.
+    as long as there are enough, train has one, then test, then val. The same ids give the same splits. Those that the job
+    names are where it names them.
     """
+    if shares.named:
+        return {name: shares.of(name) for names in instances.values() for name in names or ()}
     splits: dict[str, str] = {}
     for names in instances.values():
         order = sorted(names or (), key=lambda name: hashlib.sha256(name.encode()).digest())

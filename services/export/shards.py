@@ -108,7 +108,7 @@ class _Tar:
         self._tar.close()
 
 
-SPLITS: Final = {"train": "train", "val": "validation", "test": "test"}
+SPLITS: Final = {"train": "train", "val": "validation", "test": "test", "unseen": "unseen"}
 """Ours, and Hugging Face's name for it."""
 ROW_GROUP: Final = 16
 """Pairs in a row group: some ten megabytes, which is what a reader holds."""

@@ -138,7 +138,7 @@ class ExportScene:
 
     @property
     def split(self) -> str:
-        """train, val or test: the strictest of its objects."""
+        """The strictest of its objects' splits."""
         return strictest(self.assets[name]["split"] for _, name in self.instances.values())
 
 

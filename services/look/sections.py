@@ -5,6 +5,7 @@ from functools import partial
 from html import escape
 
 from schemas.errors import command_line, describe_seconds, milliseconds, number, plural, size
+from schemas.job.assets import SPLITS
 from schemas.job.job import Job
 from services.look.charts import Chart, Histogram, amount, chart_html
 from services.look.clouds import Space
@@ -60,24 +61,22 @@ def overview_html(
     )
     most = max(figures.by_category.values(), default=1)
     frame = 'class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true"'
+    shown = (
+        [name for name in SPLITS if name != "unseen" or any(count[name] for count in splits.values())] if splits else []
+    )
+    head = "".join(f'<th scope="col">{name}</th>' for name in ("", "", "all", *shown)) if shown else ""
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td class="wide"><svg {frame}><rect class="bar" '
-        f'width="{100 * count / most:.1f}" height="8"/></svg></td><td>{count:,}</td>{_split_cells(name, splits)}</tr>'
+        f'width="{100 * count / most:.1f}" height="8"/></svg></td><td>{count:,}</td>'
+        f"{''.join(f'<td>{splits[name][split]:,}</td>' for split in shown) if splits else ''}</tr>"
         for name, count in figures.by_category.items()
     )
-    by_split = "; of train, val and test, as they are exported" if splits else ""
-    table = (
-        f'<table class="bars"><caption>Scenes by category{by_split}</caption><tbody>{rows}</tbody></table>'
-        if rows
-        else ""
-    )
+    by_split = ", and by their splits in exports" if shown else ""
+    head = f"<thead><tr>{head}</tr></thead>" if head else ""
+    table = f'<table class="bars"><caption>Scenes by category{by_split}</caption>{head}<tbody>{rows}</tbody></table>'
     sampled = "The dataset is not finished and large: the figures are of ranges chosen evenly from it."
     note = f'<p class="note">{sampled}</p>' if figures.sampled else ""
-    return f'<dl class="tiles">{tiles_html}</dl>{table}{note}'
-
-
-def _split_cells(category: str, splits: Mapping[str, Mapping[str, int]] | None) -> str:
-    return "".join(f"<td>{splits[category][name]:,}</td>" for name in ("train", "val", "test")) if splits else ""
+    return f'<dl class="tiles">{tiles_html}</dl>{table if rows else ""}{note}'
 
 
 def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:

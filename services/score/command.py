@@ -26,7 +26,7 @@ from services.look.report import Page, Section, whole_page
 from services.look.sections import table_html
 from services.read.verdict import explain_damage
 from services.run.progress import finish
-from services.score.items import Asked
+from services.score.items import LEVELS, Asked
 from services.score.predictions import find_predictions
 from services.score.run import ITEMS_FILE, describe_refused, score_dataset
 from services.score.summary import HEADLINES, Figure, compare, items_of, summarise, values_of
@@ -51,9 +51,7 @@ def main(options: argparse.Namespace) -> int:
             "name the folder of predictions: verso score OUT PREDICTIONS, or --compare A B for two that are scored"
         )
     given = find_predictions(options.predictions)
-    asked = Asked(
-        given.kinds, options.frame, align=options.align, split=options.split, volume=options.volume, flip=options.flip
-    )
+    asked = _asked(given.kinds, options, align=options.align, flip=options.flip)
     target = options.score or options.predictions / "score"
     with explain_damage(store):
         path = score_dataset(store, given, asked, target)
@@ -82,11 +80,19 @@ def main(options: argparse.Namespace) -> int:
     return finish(options, is_whole(summary), **answer, page=str(target / PAGE_FILE))
 
 
+def _asked(kinds: tuple[str, ...], options: argparse.Namespace, **more: Any) -> Asked:
+    """What both commands ask alike. Raises InputError where a level is not of the split that is named beside it."""
+    split = options.split if options.level == "all" else LEVELS[options.level][0]
+    if options.split not in ("all", split):
+        raise InputError(f"level {options.level} is of the split {split}: leave --split {options.split} out")
+    return Asked(kinds, options.frame, split=split, level=options.level, volume=options.volume, **more)
+
+
 def check(options: argparse.Namespace) -> int:
     """Says by kind how many items are there and can be read, and what cannot and why; 0 where all of the split can be scored."""
     store = require_dataset(open_store(options.out))
     given = find_predictions(options.predictions)
-    asked = Asked(given.kinds, options.frame, split=options.split, volume=options.volume, check=True)
+    asked = _asked(given.kinds, options, check=True)
     with explain_damage(store), tempfile.TemporaryDirectory() as scratch:
         path = score_dataset(store, given, asked, Path(scratch))
         summary, troubles = summarise(pq.read_table(path)), describe_refused(path)
@@ -129,10 +135,10 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def require_alike(out: str, a: str, one: Mapping[str, Any], b: str, other: Mapping[str, Any]) -> None:
-    """Raises InputError where two summaries are of different datasets, alignments, frames or splits."""
+    """Raises InputError where two summaries are of different datasets, alignments, splits or levels."""
     if one["digest"] != other["digest"] or one["dataset"] != other["dataset"] != out:
         raise InputError(f"{a} and {b} are scores of different datasets")
-    for key in ("align", "split"):
+    for key in ("align", "split", "level"):
         if one[key] != other[key]:
             raise InputError(f"{a} and {b} were scored with --{key} {one[key]} and {other[key]}: score both alike")
 

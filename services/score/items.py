@@ -27,6 +27,7 @@ from scipy.special import expit
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
+from schemas.job.assets import Split
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from services.dataset.pair import Pair, carry
@@ -37,11 +38,16 @@ from services.score.predictions import Key, read_array, read_image, read_pose, r
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
-Split = Literal["all", "train", "val", "test"]
-"""Which scenes are scored: all, or those whose objects all are of instances of one split."""
+LEVELS: Final[Mapping[str, tuple[Split, Callable[[int], bool]]]] = {
+    "1": ("test", lambda objects: objects == 1),
+    "2": ("test", lambda objects: objects > 1),
+    "3": ("test", lambda objects: True),
+    "4": ("unseen", lambda objects: True),
+}
+"""Levels of the benchmark (docs/benchmark.md): the split, and how many objects a scene has. Level 3 has a noisy input view."""
 
-Volume = Literal["told", "occupancy", "logits", "sdf", "sdf-positive-inside"]
-"""What predicted values at a volume's points are; `told`: occupancy from 0 to 1, or distance, by the values themselves."""
+Volume = Literal["auto", "occupancy", "logits", "sdf", "sdf-positive-inside"]
+"""What predicted values at a volume's points are; `auto`: occupancy from 0 to 1, or distance, by the values themselves."""
 
 PredictedFrame = Literal["object", "camera", "input", "world"]
 FRAMES: Final[tuple[PredictedFrame, ...]] = get_args(PredictedFrame)
@@ -79,8 +85,11 @@ class Asked:
     """Points drawn on a surface."""
     seed: int = 0
     align: Alignment = "none"
-    split: Split = "all"
-    volume: Volume = "told"
+    split: Split | Literal["all"] = "all"
+    """Which scenes are scored: all, or those whose objects all are of instances of one split."""
+    level: str = "all"
+    """Which of them: those of a level of `LEVELS`, whose split `split` is then."""
+    volume: Volume = "auto"
     check: bool = False
     """Whether predictions are read and held against units, sizes and places alone, and not scored but for holes."""
     flip: bool = False
@@ -107,8 +116,10 @@ def score_pair(
     if pair.mirror is None:
         raise InputError("the dataset has no mirror view to score: its job's cameras.mirror.enabled is false")
     truth, rows = Truth(pair, pair.mirror, job.images.depth_range_m.high), []
-    splits = {job.assets.split.of(body["instance_id"]) for body in pair.scene["bodies"] or [pair.scene]}
+    bodies = pair.scene["bodies"] or [pair.scene]
+    splits = {job.assets.split.of(body["instance_id"]) for body in bodies}
     split = splits.pop() if len(splits) == 1 else "mixed"
+    chosen = asked.split in ("all", split) and (asked.level == "all" or LEVELS[asked.level][1](len(bodies)))
     for kind in asked.kinds:
         for region in [0] if kind in ("depth", "rgb") else truth.regions:
             label = pair.mirror.regions.get(region or REGION_FIRST_OBJECT)
@@ -125,7 +136,7 @@ def score_pair(
                 "farthest_m": truth.farthest_m,
             }
             names = predicted.get((kind, pair.mirror.pose_id, region), ())
-            if asked.split not in ("all", split):
+            if not chosen:
                 rows += [row | {"status": "outside"}] if names else []
                 continue
             row |= {column(kind, f"{part}.pixels"): count for part, count in truth.pixels(kind).items()}
@@ -343,7 +354,7 @@ def _read_volume(path: Path, region: int, prepared: Any, truth: Truth, asked: As
     if not np.isfinite(predicted).all():
         raise InputError("the array has values that are not finite")
     is_distance = asked.volume.startswith("sdf")
-    if asked.volume == "told":
+    if asked.volume == "auto":
         is_distance = bool((predicted < 0.0).any())
     elif asked.volume == "logits":
         predicted = expit(predicted)

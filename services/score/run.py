@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.errors import InputError, MachineError, VersoError, needs_making, plural
+from schemas.job.assets import SPLITS
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
@@ -261,7 +262,7 @@ def describe_refused(path: Path, most: int = 10) -> list[str]:
     if len(refused) > most:
         lines.append(f"and {plural(len(refused) - most, 'more item')} refused")
     splits, others = ({row["split"] for row in rows if row["status"] == status} for status in ("ok", "missing"))
-    if len(splits) == 1 and others - splits and splits <= {"train", "val", "test"}:
+    if len(splits) == 1 and others - splits and splits <= {*SPLITS}:
         lines.append(f"all that is predicted is of one split: score that alone with --split {splits.pop()}")
     if outside := sum(row["status"] == "outside" for row in rows):
         lines.append(f"{plural(outside, 'prediction')} of other splits not scored")

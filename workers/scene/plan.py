@@ -11,6 +11,7 @@ import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError, ViewError
+from schemas.job.assets import NO_SPLIT, SPLITS
 from schemas.job.job import Job
 from schemas.job.physics import Start
 from schemas.job.views import Cameras
@@ -31,6 +32,9 @@ from workers.scene.pairs import place_beside
 MOST_REDRAWS = 20
 """Of a position that is not over the table or has no room, and of an object that was lost: hardly a scene needs five."""
 
+MOST_DRAWS = 1000
+"""Of an instance that is of no split, or of another than its scene's: a split of one instance in a hundred is then found."""
+
 RECESS_M = 0.05
 """Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
 
@@ -46,11 +50,26 @@ def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan
 
 
 def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[list[InstanceRef], InstanceRef]:
-    """The instances of a scene, before any is loaded: its objects in order, and its table."""
-    objects = []
+    """The instances of a scene, before any is loaded: its objects in order, and its table.
+
+    Where a job names the instances of splits, an object is drawn until it is of one, and each further object, with its category,
+    until it is of the first one's. Raises StartError where none of `MOST_DRAWS` is.
+    """
+    objects, split = list[InstanceRef](), job.assets.split
+    fit = set(SPLITS if split.named else (*SPLITS, NO_SPLIT))
     for number in range(count_objects(job, chance)):
-        category = choose_category(job, chance, number)
-        objects.append(choose_object(catalogue, category, chance.object_stream(Stream.OBJECT, number)))
+        categories, instances = (chance.object_stream(name, number) for name in (Stream.CATEGORY, Stream.OBJECT))
+        category = _draw_category(job, categories)
+        for _ in range(MOST_DRAWS):
+            ref = choose_object(catalogue, category, instances)
+            if not split.named or split.of(ref.instance_id) in fit:
+                break
+            category = _draw_category(job, categories) if number else category
+        else:
+            wanted = f"none of {MOST_DRAWS} instances that were drawn, the last of {category}, is of {', '.join(sorted(fit))}"
+            raise StartError("no_split", f"{wanted}: name more instances in assets.split.named")
+        objects.append(ref)
+        fit &= {split.of(ref.instance_id)} if split.named else fit
     return objects, choose_table(catalogue, chance.stream(Stream.TABLE))
 
 
@@ -61,12 +80,16 @@ def count_objects(job: Job, chance: SceneChance) -> int:
 
 
 def choose_category(job: Job, chance: SceneChance, number: int = 0) -> str:
-    """The category of an object by its number, by the job's weights; the first one's is the scene's."""
+    """The category that is drawn for an object by its number; the first one's is the scene's."""
+    return _draw_category(job, chance.object_stream(Stream.CATEGORY, number))
+
+
+def _draw_category(job: Job, rng: np.random.Generator) -> str:
+    """A category by the job's weights."""
     names = sorted(job.categories)
     weights = np.array([job.categories[name] for name in names])
     edges = np.cumsum(weights) / weights.sum()
-    draw = chance.object_stream(Stream.CATEGORY, number).random()
-    return names[min(int(np.searchsorted(edges, draw, side="right")), len(names) - 1)]
+    return names[min(int(np.searchsorted(edges, rng.random(), side="right")), len(names) - 1)]
 
 
 def draw_scene(job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset) -> ScenePlan:

@@ -456,7 +456,7 @@ def test_depth_is_inverted_only_where_that_of_the_object_is_too():
     check_depth(np.where(mask, true, 1.0 / true), true, None, mask)  # of what is about the object nothing is known
 
 
-@pytest.mark.parametrize("volume", ["told", "occupancy", "logits", "sdf", "sdf-positive-inside"])
+@pytest.mark.parametrize("volume", ["auto", "occupancy", "logits", "sdf", "sdf-positive-inside"])
 def test_values_of_a_volume_are_what_the_command_says(volume, tmp_path):
     true = np.random.default_rng(14).normal(size=500) * 0.02
     stored = {"volume_points": np.zeros((500, 3)), "volume_distance": true, "volume_occupancy": true < 0.0}

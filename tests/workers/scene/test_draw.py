@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,13 +17,14 @@ from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, ScenePlan
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box, table
+from workers.assets.catalogue import open_catalogue
 from workers.geometry.camera import inclination, project, yaw
 from workers.geometry.frames import invert, pose, rotation_about, transform, translation
 from workers.geometry.hull import hull_of
 from workers.physics.support import APART_M, columns_apart, place_table
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import is_raycast_scene
-from workers.scene.plan import choose_category, count_objects, draw_scene, frame_cameras, stands_on
+from workers.scene.plan import choose_assets, choose_category, count_objects, draw_scene, frame_cameras, stands_on
 
 BOX = asset_of(box(0.1, 0.08, 0.2))
 TABLE = table()
@@ -85,6 +87,33 @@ def test_categories_counts_and_checked_scenes_come_with_their_shares():
         chosen = [is_raycast_scene(check, SceneChance(5, scene)) for scene in range(3000)]
         assert is_share(np.mean(chosen), share, 3000) or all(chosen)
         assert chosen[:50] == [is_raycast_scene(check, SceneChance(5, scene)) for scene in range(50)]
+
+
+def test_a_scene_of_named_splits_has_objects_of_one_of_them_alone_and_none_without_a_name():
+    named = {"train": ["mug-0-000001", "can-0-000002"], "test": ["mug-0-000003", "can-0-000004"]}
+    named["unseen"] = ["bowl-*"]
+    objects = [{"source": "procedural", "instances": 8}]
+    drawn = {"categories": ["mug", "can", "bowl"], "objects_per_scene": [1, 3]}
+    split = job(**drawn, assets={"objects": objects, "split": {"named": named}})
+    catalogue = open_catalogue(split.assets, Path(), split.categories)
+    there, sizes = set(), set()
+    for scene in range(300):
+        chance = SceneChance(5, scene)
+        names = [ref.instance_id for ref in choose_assets(split, catalogue, chance)[0]]
+        splits = {split.assets.split.of(name) for name in names}
+        assert len(splits) == 1 and len(names) == count_objects(split, chance)
+        assert names[0].startswith(choose_category(split, chance))  # a scene is named after it before it is drawn
+        there |= splits
+        sizes |= {(len(names), *splits)}
+    assert there == {"train", "test", "unseen"} and len(sizes) == 9
+    assert split.assets.split.of("mug-0-000005") == "none"
+    few = job(**drawn, assets={"objects": objects, "split": {"named": {"train": ["mug-0-000009", "can-*", "bowl-*"]}}})
+    catalogue = open_catalogue(few.assets, Path(), few.categories)
+    mugs = next(chance for n in range(40) if choose_category(few, chance := SceneChance(5, n)) == "mug")
+    with pytest.raises(StartError, match=r"the last of mug.*assets\.split\.named"):
+        choose_assets(few, catalogue, mugs)
+    with pytest.raises(ValueError, match="names bowl-\\* twice"):
+        job(assets={"split": {"named": {"train": ["bowl-*"], "test": ["bowl-*"]}}})
 
 
 def test_more_pairs_and_objects_move_neither_the_earlier_ones_nor_cameras_table_and_look():
