@@ -43,7 +43,7 @@ def job_of(changes: dict) -> str:
 def three() -> tuple[WorkerContext, Laid]:
     """Three objects at rest, before anything is drawn, for the input camera alone."""
     off = {"enabled": False}
-    alone = {"cameras": {"depth": off, "mirror": off}, "images": {"projection": off}}
+    alone: dict = {"cameras": {"depth": off, "mirror": off}, "images": {"projection": off}}
     alone["targets"] = {"views": [name for name in EVERY["views"] if name != "covisible"]}
     context = context_of(job_of(overlaid(NEAR, alone)))
     return context, lay_scene(context, 0, Stopwatch())

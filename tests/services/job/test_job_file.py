@@ -116,6 +116,15 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("seed: 1\nseed: 2", ["line 3", "'seed'", "twice"]),
     (f"#{'x' * 400_000}", ["250000 bytes"]),
     ("cameras: {mirror: {enabled: false}}", ["set images.projection.enabled: false too"]),
+    (
+        "cameras: {mirror: {enabled: false}, depth: {enabled: false}}\nimages: {projection: {enabled: false}}\n"
+        "targets: {views: [covisible]}",
+        ["asks for covisible", "set cameras.mirror.enabled or leave it out"],
+    ),
+    (
+        "captures: {}\ncameras: {depth: {enabled: false}}\ntargets: {views: [covisible]}",
+        ["asks for covisible: a capture"],
+    ),
     ("render: {rgb: false}\nsensor: {rgb_noise: {}}", ["sensor.rgb_noise"]),
     *(  # what float32 on the GPU would make infinite
         (f"cameras: {{{branch}: {{{name}: {value}}}}}", [f"cameras.{branch}.{name}"])
