@@ -216,7 +216,7 @@ class SplitShares(Frozen):
     """Share of val."""
     test: Share = 0.1
     """Share of test."""
-    named: dict[Split, tuple[str, ...]] = {}
+    named: dict[Split, tuple[str, ...]] = Field(default_factory=dict)
     """Instead of shares: the instances of train, val, test and unseen by their ids, in which * stands for anything. The objects
     of a scene are then all of one split, and no scene has an instance that is not named."""
 
