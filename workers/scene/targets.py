@@ -198,7 +198,7 @@ def _values_of(part: Part) -> Array:
 SAME_M = 1e-5
 """A face whose plane lies this near to a point does not hide it: it is the point's own, or one beside it that rounding shows.
 
-Of 214,767 rays of 50 scenes none met a face from 5.6 to 22 micrometres before its point; 11 did from 0.5 to 5.6.
+Of 214,767 rays of 50 scenes none met a face from 5 to 20 micrometres before its point; 10 did from 0.3 to 5.
 """
 
 
@@ -223,10 +223,10 @@ class Sight:
         pixels, points = pixels[ahead], points[ahead]
         u, v = project(points, k)
         inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
-        image.reshape(-1)[pixels[inside]] = np.where(self.hides(points[inside]), 0, 255)
+        image.reshape(-1)[pixels[inside]] = np.where(self.is_hidden(points[inside]), 0, 255)
         return image
 
-    def hides(self, points: Array) -> NDArray[np.bool_]:
+    def is_hidden(self, points: Array) -> NDArray[np.bool_]:
         """[N]: whether anything is between the input camera and points [N, 3], in its frame, metres, beyond the near plane."""
         hidden = np.zeros(len(points), np.bool_)
         for number in reversed(range(len(self.things))):  # objects first: they hide most
