@@ -47,7 +47,7 @@ def check_lines(message: str, path: Path) -> None:
     for line in lines:
         assert str(path) in line and line.isprintable() and len(line) < 800 + len(str(path)), line
         for jargon in ("pattern", "dictionary", "instance of", "tuple", "discriminator", "Input", "Traceback"):
-            assert jargon not in line or "k" * 9 in line, line
+            assert jargon not in line.replace("'dictionary'", "") or "k" * 9 in line, line  # a key that a mutant moved
 
 
 # ------------------------------------------------------------------------------------------------ faults
@@ -239,7 +239,7 @@ def test_every_key_is_documented_and_the_page_is_current():
         ("assets.objects[library].diagonal_m", "number >0 or `null`"),
     ):
         assert describe_allowed(keys[key]) == words
-    assert allowed_keys(["assets", "split", "trian"]) == ["test", "train", "val"]
+    assert allowed_keys(["assets", "split", "trian"]) == ["named", "test", "train", "val"]
     assert {"diagonal_m", "folder", "instances"} <= set(allowed_keys(["assets", "objects", "0", "wieght"]))
 
 
