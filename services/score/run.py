@@ -37,6 +37,7 @@ from services.run.progress import ProgressLine
 from services.score.images import require_flip
 from services.score.items import Asked, score_pair
 from services.score.predictions import Key, Predictions, by_export_ids, digest_of
+from services.score.summary import ITEMS_FILE
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from workers.pool import Ended
 
 KEPT: Final = "_kept.answers"
-ITEMS_FILE: Final = "items.parquet"
 
 FACTS: Final = pa.schema(
     [
@@ -223,7 +223,15 @@ def _rows(item: _Range) -> list[Row]:
 
 
 def _table(rows: Sequence[Row]) -> pa.Table:
-    return pa.Table.from_pylist(rows, _schema({name for row in rows for name in row} - set(FACTS.names)))
+    """nan is null: to whoever asks of the file, both are no value."""
+    schema = _schema({name for row in rows for name in row} - set(FACTS.names))
+    return pa.table(
+        [
+            pa.array([row.get(name) for row in rows], kind, from_pandas=True)
+            for name, kind in zip(schema.names, schema.types, strict=True)
+        ],
+        schema,
+    )
 
 
 def _schema(metrics: Collection[str]) -> pa.Schema:
