@@ -28,7 +28,7 @@ from services.read.verdict import explain_damage
 from services.run.progress import finish
 from services.score.items import LEVELS, Asked
 from services.score.predictions import find_predictions
-from services.score.run import describe_refused, score_dataset
+from services.score.run import alone_in, describe_refused, score_dataset
 from services.score.summary import (
     COUNTS_SQL,
     HEADLINES,
@@ -63,10 +63,10 @@ def main(options: argparse.Namespace) -> int:
     given = find_predictions(options.predictions)
     asked = _asked(given.kinds, options, align=options.align, flip=options.flip)
     target = options.score or options.predictions / "score"
-    with explain_damage(store):
+    with explain_damage(store), alone_in(target):
+        digest = (read_success(store) or {}).get("digest")  # before: it may be extended meanwhile
         path = score_dataset(store, given, asked, target)
         table = pq.read_table(path)
-        digest = (read_success(store) or {}).get("digest")
         head = {
             "verso_score": SCORE_VERSION,
             "dataset": options.out,

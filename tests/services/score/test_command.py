@@ -1,5 +1,6 @@
 """`verso score` from the command line: truth is perfect, each fault is an item with a reason, scores are compared and kept."""
 
+import fcntl
 import html
 import importlib.util
 import io
@@ -196,6 +197,30 @@ def test_an_item_that_ends_its_process_is_refused_and_the_others_are_scored(
     monkeypatch.setattr(module, "_answers", lambda ranges, kept: ((item, Ended("killed", "killed")) for item in ranges))
     assert main(["score", str(files.root), str(truth), "--out", str(tmp_path)]) == 1
     assert "start again, what is scored is kept" in capsys.readouterr().err
+
+
+def test_two_runs_into_one_folder_and_a_dataset_that_grows_meanwhile_are_told(
+    files, truth, tmp_path, capsys, monkeypatch
+):
+    words = ["score", str(files.root), str(truth), "--out", str(tmp_path / "score")]
+    (tmp_path / "score").mkdir()
+    with open(tmp_path / "score" / module.KEPT, "ab") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert main(words) == 1
+    assert "another `verso score` writes" in capsys.readouterr().err and len([*(tmp_path / "score").iterdir()]) == 1
+    words[1], real = str(shutil.copytree(files.root, tmp_path / "grows")), module._answers
+    last = max((tmp_path / "grows" / "manifest" / "_commits").iterdir())
+    aside = last.rename(tmp_path / last.name)
+
+    def answers(ranges, kept):
+        yield from real(ranges, kept)
+        if aside.exists():
+            aside.rename(last)
+
+    monkeypatch.setattr(module, "_answers", answers)
+    assert main(words) == 1
+    assert "(2 scenes before, 4 now): score it again" in capsys.readouterr().err
+    assert not (tmp_path / "score" / "items.parquet").exists() and main(words) == 0
 
 
 def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp_path, capsys):
