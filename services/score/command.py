@@ -28,13 +28,23 @@ from services.read.verdict import explain_damage
 from services.run.progress import finish
 from services.score.items import LEVELS, Asked
 from services.score.predictions import find_predictions
-from services.score.run import ITEMS_FILE, describe_refused, score_dataset
-from services.score.summary import HEADLINES, Figure, compare, items_of, summarise, values_of
+from services.score.run import alone_in, describe_refused, score_dataset
+from services.score.summary import (
+    COUNTS_SQL,
+    HEADLINES,
+    ITEMS_FILE,
+    Figure,
+    compare,
+    items_of,
+    query_of,
+    summarise,
+    values_of,
+)
 from workers.store.local import open_store
 
 SUMMARY_FILE, PAGE_FILE = "summary.json", "index.html"
 
-SCORE_VERSION = 2
+SCORE_VERSION = 3
 """The version of the format of summary.json."""
 
 
@@ -53,10 +63,10 @@ def main(options: argparse.Namespace) -> int:
     given = find_predictions(options.predictions)
     asked = _asked(given.kinds, options, align=options.align, flip=options.flip)
     target = options.score or options.predictions / "score"
-    with explain_damage(store):
+    with explain_damage(store), alone_in(target):
+        digest = (read_success(store) or {}).get("digest")  # before: it may be extended meanwhile
         path = score_dataset(store, given, asked, target)
         table = pq.read_table(path)
-        digest = (read_success(store) or {}).get("digest")
         head = {
             "verso_score": SCORE_VERSION,
             "dataset": options.out,
@@ -194,7 +204,9 @@ _HIDDEN_BY: Final = {
 
 _UNITS: Final = {"_m": (1e3, "mm"), "_m2": (1e6, "mm²"), "_deg": (1.0, "°"), "_px": (1.0, "px"), "_db": (1.0, "dB")}
 
-_STYLE: Final = "table { display: block; overflow-x: auto; margin-bottom: 2rem; }"
+_STYLE: Final = (
+    "table, pre { display: block; overflow-x: auto; } table { margin-bottom: 1rem; } details { margin: 0 0 2rem; }"
+)
 
 
 def in_words(name: str, value: float | int | None) -> str:
@@ -241,12 +253,15 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
         "Means over all items of the split, 95 % intervals by a bootstrap over scenes. What is missing, refused or a hole counts "
         "as worst. "
         "Seen and hidden: the object's pixels whose surface the input view sees, and does not, "
-        f"{_HIDDEN_BY[summary['hidden_by']]}."
+        f"{_HIDDEN_BY[summary['hidden_by']]}. "
+        f"The queries make the numbers of each table, in metres, from {ITEMS_FILE} in the folder of this page, with DuckDB; the "
+        "intervals alone are by resampling and not by a query."
     )
+    names = table.column_names
     sections = [
-        Section("answer", "Answer", answer),
-        Section("metrics", "Metrics", f'{_metrics(summary["metrics"])}<p class="note">{note}</p>'),
-        Section("groups", "By group", "".join(_group(name, of) for name, of in summary["by"].items())),
+        Section("answer", "Answer", answer + _query_html(COUNTS_SQL)),
+        Section("metrics", "Metrics", f'{_metrics(summary["metrics"], names)}<p class="note">{note}</p>'),
+        Section("groups", "By group", "".join(_group(name, of, names) for name, of in summary["by"].items())),
         Section("distributions", "Distributions", _charts(table)),
     ]
     page = Page(
@@ -258,26 +273,33 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
     return whole_page(page, ("page.js",), _STYLE)
 
 
-def _metrics(metrics: Mapping[str, Figure]) -> str:
+def _query_html(sql: str) -> str:
+    return f"<details><summary>Query</summary><pre><code>{escape(sql)}</code></pre></details>"
+
+
+def _metrics(metrics: Mapping[str, Figure], columns: Sequence[str]) -> str:
     rows = {
         name: (
             f"{words(name)}<small><code>{name}</code></small>",
-            in_words(name, one["value"]),
-            covered(one).removeprefix("coverage "),
-            interval(name, one) or "–",
-            in_words(name, one["worst"]),
-            str(one["items"]),
+            in_words(name, figure["value"]),
+            covered(figure).removeprefix("coverage "),
+            interval(name, figure) or "–",
+            in_words(name, figure["worst"]),
+            str(figure["items"]),
         )
-        for name, one in metrics.items()
-        if one["items"]
+        for name, figure in metrics.items()
+        if figure["items"]
     }
     head = ("metric", "mean", "coverage", "95 % interval", "at worst", "items")
-    first, rest = ([row for name, row in rows.items() if (name in HEADLINES) == is_first] for is_first in (True, False))
-    more = f"<details><summary>{plural(len(rest), 'more metric')}</summary>{table_html(head, rest)}</details>"
-    return table_html(head, first) + more * bool(rest)
+    first, rest = (
+        table_html(head, [rows[name] for name in names]) + _query_html(query_of(names, columns)) if names else ""
+        for names in ([name for name in rows if (name in HEADLINES) == is_first] for is_first in (True, False))
+    )
+    count = sum(name not in HEADLINES for name in rows)
+    return first + f"<details><summary>{plural(count, 'more metric')}</summary>{rest}</details>" * bool(rest)
 
 
-def _group(title: str, groups: Mapping[str, Mapping[str, Figure]]) -> str:
+def _group(title: str, groups: Mapping[str, Mapping[str, Figure]], columns: Sequence[str]) -> str:
     names = [name for name in SHOWN if any(group.get(name, {}).get("items") for group in groups.values())]
     rows = [
         (
@@ -286,7 +308,10 @@ def _group(title: str, groups: Mapping[str, Mapping[str, Figure]]) -> str:
         )
         for word, group in groups.items()
     ]
-    return table_html((title.replace("_", " "), *map(words, names)), rows) if rows else ""
+    if not names:
+        return ""
+    table = table_html((title.replace("_", " "), *map(words, names)), rows)
+    return table + _query_html(query_of(names, columns, title))
 
 
 def _charts(table: pa.Table) -> str:

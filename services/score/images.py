@@ -6,7 +6,7 @@ True depth counts where it is positive and finite. A hole is a pixel with truth 
 import importlib.util
 import math
 from collections.abc import Mapping
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -152,34 +152,46 @@ def score_depth(
 
     A part without truth has nan, and 0 pixels.
     """
-    predicted, true = (np.ascontiguousarray(image, np.float64) for image in (predicted_m, true_m))
+    predicted, true = (np.ascontiguousarray(image, np.float64).ravel() for image in (predicted_m, true_m))
     known = (true > 0.0) & (true < np.inf)
     scores: dict[str, float] = {}
     for name, part in parts.items():
-        at = np.flatnonzero(part & known)
-        values = _metrics_of(predicted.ravel()[at], true.ravel()[at], worst_m)
-        scores |= {f"{name}.{metric}": value for metric, value in zip(METRICS, values, strict=True)}
+        at = np.flatnonzero(part.ravel() & known)
+        blocks = (at[start : start + BLOCK] for start in range(0, len(at), BLOCK))
+        sums = sum((_sums_of(predicted[block], true[block], worst_m) for block in blocks), np.zeros(len(METRICS)))
+        scores |= {f"{name}.{metric}": value for metric, value in zip(METRICS, _metrics_of(sums), strict=True)}
     return scores
 
 
-def _metrics_of(d: Array, t: Array, worst_m: float) -> list[float]:
-    """`METRICS` of predicted and true depth [N], where there is truth."""
+BLOCK: Final = 8192
+"""Pixels that are looked at together: what is made of them stays in the processor's cache, which whole images do not."""
+
+
+def _sums_of(d: Array, t: Array, worst_m: float) -> Array:
+    """The sums over pixels that `METRICS` are means of, squares in place of their root, of predicted and true depth [N]."""
     count = len(t)
-    if not count:
-        return [*[math.nan] * (len(METRICS) - 1), 0.0]
     hit = (d > 0.0) & (d < np.inf)
-    all_hit = bool(hit.all())
+    holes = count - np.count_nonzero(hit)
+    if holes:  # a hole is as far off as any, and beyond all ratios
+        d, t = d[hit], t[hit]
     larger, smaller = np.maximum(d, t), np.minimum(d, t)
-    if not all_hit:  # a hole is as far off as any, and beyond all ratios
-        larger[~hit], smaller[~hit] = np.inf, 0.0
     apart = larger - smaller
     error = np.minimum(apart, worst_m)
     near = error[error < AUC_M]
-    means = [error.mean(), math.sqrt(error @ error / count), np.minimum(apart / t, 1.0).mean()]
-    means.append((len(near) - near.sum() / AUC_M) / count)
-    means += [np.count_nonzero(apart <= limit_m + SLACK_M) / count for limit_m in (0.001, 0.002, 0.005, 0.01)]
-    means += [np.count_nonzero(larger < 1.25**power * smaller - SLACK_M) / count for power in (1, 2, 3)]
-    return [*map(float, means), 0.0 if all_hit else 1.0 - np.count_nonzero(hit) / count, float(count)]
+    sums = [error.sum() + holes * worst_m, error @ error + holes * worst_m**2, np.minimum(apart / t, 1.0).sum() + holes]
+    sums.append(len(near) - near.sum() / AUC_M)
+    sums += [np.count_nonzero(apart <= limit_m + SLACK_M) for limit_m in (0.001, 0.002, 0.005, 0.01)]
+    sums += [np.count_nonzero(larger < 1.25**power * smaller - SLACK_M) for power in (1, 2, 3)]
+    return np.array([*sums, holes, count], np.float64)
+
+
+def _metrics_of(sums: Array) -> list[float]:
+    """`METRICS` of the sums over all pixels with truth."""
+    count = float(sums[-1])
+    if not count:
+        return [*[math.nan] * (len(METRICS) - 1), 0.0]
+    mae, square, *others = (sums[:-1] / count).tolist()
+    return [mae, math.sqrt(square), *others, count]
 
 
 def align_depth(predicted_m: Array, true_m: Array, how: Alignment) -> Array:

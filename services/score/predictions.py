@@ -232,7 +232,7 @@ def _read_points(path: Path, data: bytes) -> Array:
             raise InputError(f"{path.name} unpacks to {unpacked / 1e6:.0f} MB, over {LIMITS.max_file_mb:g}")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             if "points" not in arrays:
-                raise InputError(f"{path.name} has {', '.join(arrays.files) or 'nothing'}, and no `points`")
+                raise InputError(f"{path.name} has {plain_line(', '.join(arrays.files)) or 'nothing'}, and no `points`")
             return _numbers(path, arrays["points"], None)
 
 

@@ -11,7 +11,7 @@ import platform
 import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from operator import attrgetter
@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.errors import InputError, MachineError, VersoError, needs_making, plural
+from schemas.errors import InputError, InUseError, MachineError, OutputError, RunError, VersoError, needs_making, plural
 from schemas.job.assets import SPLITS
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
@@ -37,6 +37,7 @@ from services.run.progress import ProgressLine
 from services.score.images import require_flip
 from services.score.items import Asked, score_pair
 from services.score.predictions import Key, Predictions, by_export_ids, digest_of
+from services.score.summary import ITEMS_FILE
 from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
@@ -45,7 +46,10 @@ if TYPE_CHECKING:
     from workers.pool import Ended
 
 KEPT: Final = "_kept.answers"
-ITEMS_FILE: Final = "items.parquet"
+
+MOST_MIB, MOST_CPU_S = 4096, 60.0
+"""Limits of scoring a pose: of memory, and of processor seconds. What a stranger predicts may be made to take any of both."""
+
 
 FACTS: Final = pa.schema(
     [
@@ -103,8 +107,8 @@ class _Range:
 def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Path) -> Path:
     """Scores every item, and writes OUT/items.parquet, a row an item; memory does not grow with the number of items.
 
-    Raises InputError where the dataset has not what is predicted, CorruptError where it is damaged, MachineError where a
-    process is killed.
+    Raises InputError where the dataset has not what is predicted, CorruptError where it is damaged, RunError where it is extended
+    meanwhile, MachineError where a process is killed.
     """
     if "shape" in asked.kinds:
         with needs_making("scoring shapes"):
@@ -117,7 +121,8 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
         predictions = by_export_ids(predictions, pairs, _scenes(store), role)
         if predictions.by_export:
             print("verso: poses.csv is read by the ids of an export (scene_id, im_id, obj_id)", file=sys.stderr)
-    todo, scored = list(_ranges(store, predictions, asked)), list[_Range]()
+    ranges, scored = list(_ranges(store, predictions, asked)), list[_Range]()
+    todo = ranges
     poses = {pose for item in todo for pose in item.poses}
     if not any(pose in poses for _, pose, _ in predictions.names):
         examples = ", ".join(f"{kind}/{pose:05d}" for kind in predictions.kinds[:1] for pose in sorted(poses)[:3])
@@ -138,6 +143,13 @@ def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Pat
                 scored.append(item)
                 line.show(len(scored))
             todo = again
+    before, now = [item.records for item in ranges], list(iter_committed(store))
+    if before != now:
+        counts = (sum(records[0].span.stop - records[0].span.start for records in each) for each in (before, now))
+        scenes = "{} scenes before, {} now".format(*counts)
+        raise RunError(
+            f"{store.name} has changed while it was scored ({scenes}): score it again, what is scored is kept"
+        )
     scored.sort(key=lambda item: item.poses[0])
     tables = (_table_of(item, answer) for item, answer in _answers(scored, out / KEPT) if isinstance(answer, bytes))
     strays = _table([*_strays(predictions, unknown, store.name)])
@@ -177,15 +189,49 @@ def _ranges(store: Store, predictions: Predictions, asked: Asked) -> Iterator[_R
         yield _Range(store.name, records, poses, predictions.folder, predicted, asked, digest)
 
 
-def _answers(ranges: Iterable[_Range], kept: Path) -> "Iterator[tuple[_Range, bytes | Ended]]":
+def _answers(ranges: Sequence[_Range], kept: Path) -> "Iterator[tuple[_Range, bytes | Ended]]":
     """Each range with its packed rows; away from Linux one after another, and none kept."""
     if platform.system() != "Linux":
         yield from ((item, _score_range(item)) for item in ranges)
         return
-    from workers.pool import Answers, run_pool
+    from workers.pool import Answers, Limits, run_pool
 
-    cores, answers = usable_cores(), Answers(kept)
-    yield from run_pool(_score_range, ranges, key=attrgetter("key"), kept=answers, processes=cores, quiet=False)
+    cpu_s = MOST_CPU_S * max((len(item.poses) for item in ranges), default=1)
+    limits = Limits(MOST_MIB, cpu_s, 10.0 * cpu_s)  # by the clock too: without memory, libraries may wait for ever
+    kept_answers, cores = Answers(kept), usable_cores()
+    yield from run_pool(
+        _score_range, ranges, key=attrgetter("key"), kept=kept_answers, limits=limits, processes=cores, quiet=False
+    )
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Within the block no other process scores into this folder, which is made; away from Unix any may.
+
+    Raises InUseError where one does, OutputError where the folder cannot be written.
+    """
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = open(folder / KEPT, "ab")  # noqa: SIM115 - closed below
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
+    with file:
+        try:
+            with suppress(ImportError):
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InUseError(f"another `verso score` writes {folder}: wait for it, or choose another --out") from error
+        try:
+            yield
+        except BaseException:
+            if is_new and not os.path.getsize(file.name):  # nothing stays of a score that was not begun
+                with suppress(OSError):
+                    os.unlink(file.name)
+                    folder.rmdir()
+            raise
 
 
 def _score_range(item: _Range) -> bytes:
@@ -223,7 +269,15 @@ def _rows(item: _Range) -> list[Row]:
 
 
 def _table(rows: Sequence[Row]) -> pa.Table:
-    return pa.Table.from_pylist(rows, _schema({name for row in rows for name in row} - set(FACTS.names)))
+    """nan is null: to whoever asks of the file, both are no value."""
+    schema = _schema({name for row in rows for name in row} - set(FACTS.names))
+    return pa.table(
+        [
+            pa.array([row.get(name) for row in rows], kind, from_pandas=True)
+            for name, kind in zip(schema.names, schema.types, strict=True)
+        ],
+        schema,
+    )
 
 
 def _schema(metrics: Collection[str]) -> pa.Schema:

@@ -8,10 +8,11 @@ unit. Intervals are 95 % of the bootstrap over scenes, because the items of a sc
 """
 
 import re
-from collections.abc import Mapping
-from itertools import pairwise
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -19,7 +20,10 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.errors import InputError
+from services.read.query import LOCKED
 from services.score.predictions import KINDS
+
+ITEMS_FILE: Final = "items.parquet"
 
 HEADLINES: Final = (
     *("depth_auc_50mm", "depth_within_2mm", "depth_within_5mm", "depth_within_10mm", "depth_auc_50mm_hidden"),
@@ -81,30 +85,109 @@ def items_of(table: pa.Table) -> pa.Table:
 
 def values_of(table: pa.Table, name: str) -> Array:
     """[N] float64: the metric of every item as it counts, nan where it does not."""
-    return _counted(table, name)[0]
+    return _counted(table, [name])[0][:, 0]
 
 
-def _counted(table: pa.Table, name: str) -> tuple[Array, Array, Array]:
-    """(values as they count, what counts as worst, coverage), each [N], nan of items of other kinds and without truth.
+@dataclass(frozen=True)
+class Counting:
+    """The rules of a metric as SQL over `items` of `ITEMS_SQL`: its value as it counts, the worst value, coverage, its items."""
 
-    nan of all where no item has the metric.
+    value: str
+    worst: str
+    coverage: str
+    where: str
+
+    @classmethod
+    def of(cls, name: str, columns: Collection[str]) -> "Counting":
+        """Of a metric in a table that has these columns; one that it has not is null."""
+
+        def column(word: str) -> str:
+            return word if word in columns else "null"
+
+        kind, part = name.partition("_")[0], _part(name)
+        worst = "0" if is_better_high(name) else _worst(name)
+        value = f"coalesce({column(name)}, {worst})"
+        if "_psnr" in name:
+            value = f"least({value}, {PSNR_DB:g})"
+        value = f"{'greatest' if is_better_high(name) else 'least'}({value}, {worst})"
+        coverage, where, of_part = f"({column(name)} is not null)::int", f"kind = '{kind}'", f"_{part}" * bool(part)
+        if kind == "depth":
+            coverage += f" * (1 - coalesce({column(f'depth_holes{of_part}')}, 1))"
+        if kind in ("depth", "rgb") and part != "image":
+            where += f" and {column(f'{kind}_pixels{of_part}')} > 0"
+        return cls(value, worst, coverage, where)
+
+
+ITEMS_SQL: Final = """with scored as (
+  from {source} where status in ('ok', 'missing', 'refused')
+), edges as (
+  select quantile_cont(visible_fraction, [0, 0.25, 0.5, 0.75, 1]) as edge from scored
+), items as (
+  select *, case when visible_fraction >= edge[4] and edge[4] < edge[5] then 4
+    when visible_fraction >= edge[3] and edge[3] < edge[4] then 3
+    when visible_fraction >= edge[2] and edge[2] < edge[3] then 2
+    when visible_fraction >= edge[1] and edge[1] < edge[2] then 1 end as quarter,
+    format('{{:.3g}} to {{:.3g}}', edge[quarter], edge[quarter + 1]) as visible,
+    coalesce(farthest_m, (select max(farthest_m) from scored), 1) as worst_depth_m,
+    coalesce(diagonal_m, (select max(diagonal_m) from scored), 1) as worst_length_m
+  from scored, edges
+)"""
+"""The items of the split, the quarter of the visible fraction that each is in, and the lengths that count as worst."""
+
+GROUPS: Final = {"category": "category", "visible_fraction": "visible"}
+"""The kinds of groups, and the column of `items` that names an item's group."""
+
+
+COUNTS_SQL: Final = f"select kind, status, count(*) as items from '{ITEMS_FILE}' group by all order by all"
+"""The items of every kind by status."""
+
+
+def query_of(names: Sequence[str], columns: Collection[str], group: str = "") -> str:
+    """SQL that makes value, coverage, worst and items of these metrics from items.parquet, with a kind of groups by group."""
+    rules = {name: Counting.of(name, columns) for name in names}
+    parts = [
+        f"  select '{name}' as metric, {GROUPS.get(group, 'null')} as part, {rule.value} as value,\n"
+        f"    {rule.coverage} as coverage, {rule.worst} as worst from items where {rule.where}"
+        for name, rule in rules.items()
+    ]
+    counted = "\n  union all\n".join(parts)
+    asked = "part, metric" if group else "metric"
+    return (
+        f"{ITEMS_SQL.format(source=repr(ITEMS_FILE))}, counted as (\n{counted}\n)\n"
+        f"select {asked}, avg(value) as value, avg(coverage) as coverage, avg(worst) as worst, count(*) as items\n"
+        f"from counted{' where part is not null' * bool(group)} group by {asked} order by {asked}"
+    )
+
+
+def _counted(table: pa.Table, names: Sequence[str]) -> tuple[Array, Array, Array]:
+    """(values as they count, what counts as worst, coverage), each [N, M], nan of items of other kinds and without truth.
+
+    nan of all where no item has the metric, if it is not of `ALWAYS`.
     """
-    kind, raw = name.partition("_")[0], _numbers(table, name)
-    if name.partition("_psnr")[1]:
-        raw = np.minimum(raw, PSNR_DB)
-    given, worst = np.isfinite(raw), _worst(table, name)
-    part = _part(name)
-    has = _equal(table, "kind", kind)
-    if kind in ("depth", "rgb") and part != "image":
-        has &= _numbers(table, f"{kind}_pixels{part and '_'}{part}") > 0.0
-    if name not in ALWAYS:
-        has &= given.any()
-    values = np.where(given, raw, worst)
-    values = np.maximum(values, worst) if is_better_high(name) else np.minimum(values, worst)
-    covered = given.astype(np.float64)
-    if kind == "depth":
-        covered *= 1.0 - np.nan_to_num(_numbers(table, f"depth_holes{part and '_'}{part}"), nan=1.0)
-    return tuple(np.where(has, each, np.nan) for each in (values, worst, covered))  # type: ignore[return-value]
+    columns = table.column_names
+    rules = [Counting.of(name, columns) for name in names]
+    asked = [
+        f"if({rule.where}, {expression}, null)::double as {kind}{place}"
+        for place, rule in enumerate(rules)
+        for kind, expression in (("v", rule.value), ("w", rule.worst), ("c", rule.coverage))
+    ]
+    answer = _ask(table, ", ".join(asked)) if asked else {}
+    there = [name in ALWAYS or (name in columns and table[name].null_count < table.num_rows) for name in names]
+    return tuple(  # type: ignore[return-value]
+        np.column_stack(
+            [np.where(has, answer[f"{kind}{place}"], np.nan) for place, has in enumerate(there)]
+            or [np.zeros((table.num_rows, 0))]
+        )
+        for kind in "vwc"
+    )
+
+
+def _ask(table: pa.Table, columns: str) -> dict[str, NDArray]:
+    """Columns of `items` as arrays [N], nan for null, in the order of a table's items."""
+    with duckdb.connect(":memory:", config={**LOCKED, "threads": 1}) as connection:
+        connection.register("given", table)
+        answer = connection.sql(f"{ITEMS_SQL.format(source='given')} select {columns} from items").to_arrow_table()
+    return {name: answer[name].to_numpy() for name in answer.column_names}
 
 
 def _part(name: str) -> str:
@@ -113,20 +196,11 @@ def _part(name: str) -> str:
     return word if word in ("scene", "seen", "hidden", "boundary", "image") else ""
 
 
-def _worst(table: pa.Table, name: str) -> Array:
-    """[N]: what counts for an item that is missing."""
-    if is_better_high(name):
-        return np.zeros(table.num_rows)
-    length_m = _numbers(table, "farthest_m" if name.startswith("depth_") else "diagonal_m")
-    known = length_m[np.isfinite(length_m)]
-    length_m = np.where(np.isfinite(length_m), length_m, known.max() if len(known) else 1.0)
-    of_unit = {
-        "_m": length_m,
-        "_m2": length_m**2,
-        "_deg": np.full_like(length_m, 180.0),
-        "_px": np.full_like(length_m, 100.0),
-    }
-    return next((of_unit[unit] for unit in of_unit if name.endswith(unit)), np.ones_like(length_m))
+def _worst(name: str) -> str:
+    """SQL of the error that counts for an item that is missing."""
+    length_m = "worst_depth_m" if name.startswith("depth_") else "worst_length_m"
+    of_unit = {"_m": length_m, "_m2": f"{length_m} ** 2", "_deg": "180", "_px": "100"}
+    return next((of_unit[unit] for unit in of_unit if name.endswith(unit)), "1")
 
 
 def summarise(table: pa.Table) -> dict[str, Any]:
@@ -137,16 +211,9 @@ def summarise(table: pa.Table) -> dict[str, Any]:
     whole, table = table, items_of(table)
     names = metrics_of(table)
     shown = [place for place, name in enumerate(names) if name in HEADLINES]
-    counted = [_counted(table, name) for name in names]
-    values, worst, covered = (
-        np.stack(columns, axis=1) if names else np.zeros((table.num_rows, 0))
-        for columns in (zip(*counted, strict=True) if names else ([],) * 3)
-    )
-    categories = {
-        name: np.asarray(pc.equal(table["category"], name).fill_null(False).to_numpy(), np.bool_)
-        for name in sorted(filter(None, pc.unique(table["category"]).to_pylist()))
-    }
-    scenes, groups = scenes_of(table), {"category": categories, "visible_fraction": _quarters(table)}
+    values, worst, covered = _counted(table, names)
+    groups = _groups(table)
+    scenes = scenes_of(table)
     statuses = [_equal(table, "status", word) for word in ("ok", "missing", "refused")]
 
     def figures_by_name(chosen: Any, places: list[int]) -> dict[str, Figure]:
@@ -224,7 +291,9 @@ def compare(a: pa.Table, b: pa.Table) -> dict[str, Any]:
         raise InputError("the two scores are not of the same items: score both with the same --split")
     scenes, answer = scenes_of(a), dict[str, Any]()
     for name in sorted({*metrics_of(a)} & {*metrics_of(b)}, key=metrics_of(a).index):
-        (mine, _, covered), (theirs, _, also_covered) = (_counted(each, name) for each in (a, b))
+        (mine, _, covered), (theirs, _, also_covered) = (
+            [column[:, 0] for column in _counted(each, [name])] for each in (a, b)
+        )
         one, other, apart = figures(np.column_stack([mine, theirs, theirs - mine]), scenes)
         if apart["value"] is None:
             continue
@@ -254,14 +323,12 @@ def scenes_of(table: pa.Table) -> NDArray[np.int64]:
     return np.unique(_numbers(table, "scene_id"), return_inverse=True)[1].reshape(-1)
 
 
-def _quarters(table: pa.Table) -> dict[str, NDArray[np.bool_]]:
-    """Items by quarters of the visible fraction, as far as it differs."""
-    seen = _numbers(table, "visible_fraction")
-    known = seen[np.isfinite(seen)]
-    edges = np.unique(np.percentile(known, (0, 25, 50, 75, 100))) if len(known) else np.array([])
-    quarters = {}
-    for low, high in pairwise(edges):
-        inside = (seen >= low) & ((seen < high) | (high == edges[-1]) & (seen <= high))
-        if inside.any():
-            quarters[f"{low:.3g} to {high:.3g}"] = inside
-    return quarters
+def _groups(table: pa.Table) -> dict[str, dict[str, NDArray[np.bool_]]]:
+    """The items [N] of each group by the kind of group, in order; a group of the visible fraction is a quarter of the items."""
+    answer = _ask(table, "category, visible, quarter")
+    groups = {}
+    for kind, order in {"category": "category", "visible_fraction": "quarter"}.items():
+        words = answer[GROUPS[kind]]
+        names = {(at, word) for at, word in zip(answer[order], words, strict=True) if word is not None}
+        groups[kind] = {word: words == word for _, word in sorted(names)}
+    return groups

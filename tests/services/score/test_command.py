@@ -1,5 +1,7 @@
 """`verso score` from the command line: truth is perfect, each fault is an item with a reason, scores are compared and kept."""
 
+import fcntl
+import html
 import importlib.util
 import io
 import itertools
@@ -9,8 +11,10 @@ import re
 import shutil
 import struct
 import zipfile
+from pathlib import Path
 
 import cv2
+import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -20,8 +24,9 @@ import trimesh
 from services.cli.main import main
 from services.dataset.dataset import open_dataset
 from services.score import run as module
+from services.score.command import page_of
 from services.score.leaderboard import compare_all, describe_verdicts, holm
-from services.score.summary import HEADLINES, is_better_high, summarise
+from services.score.summary import HEADLINES, is_better_high, items_of, summarise
 from tests.datasets import make_dataset
 from workers.pool import Ended
 
@@ -219,6 +224,30 @@ def test_an_item_that_ends_its_process_is_refused_and_the_others_are_scored(
     assert "start again, what is scored is kept" in capsys.readouterr().err
 
 
+def test_two_runs_into_one_folder_and_a_dataset_that_grows_meanwhile_are_told(
+    files, truth, tmp_path, capsys, monkeypatch
+):
+    words = ["score", str(files.root), str(truth), "--out", str(tmp_path / "score")]
+    (tmp_path / "score").mkdir()
+    with open(tmp_path / "score" / module.KEPT, "ab") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert main(words) == 1
+    assert "another `verso score` writes" in capsys.readouterr().err and len([*(tmp_path / "score").iterdir()]) == 1
+    words[1], real = str(shutil.copytree(files.root, tmp_path / "grows")), module._answers
+    last = max((tmp_path / "grows" / "manifest" / "_commits").iterdir())
+    aside = last.rename(tmp_path / last.name)
+
+    def answers(ranges, kept):
+        yield from real(ranges, kept)
+        if aside.exists():
+            aside.rename(last)
+
+    monkeypatch.setattr(module, "_answers", answers)
+    assert main(words) == 1
+    assert "(2 scenes before, 4 now): score it again" in capsys.readouterr().err
+    assert not (tmp_path / "score" / "items.parquet").exists() and main(words) == 0
+
+
 def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp_path, capsys):
     near = write_truth(files, tmp_path / "near", lambda depth_m, _: depth_m + 0.001 * (depth_m > 0))
     far = write_truth(files, tmp_path / "far", lambda depth_m, n: depth_m + (0.004 + 0.0001 * n) * (depth_m > 0))
@@ -254,6 +283,46 @@ def require_groups_that_add_up(summary):
         for key in ("value", "coverage", "worst"):
             total = sum(part[key] * part["items"] for part in parts)
             assert not parts or total / whole["items"] == pytest.approx(whole[key])
+
+
+def test_the_numbers_of_the_page_follow_from_the_items_by_the_queries_under_them(
+    files, truth, tmp_path, capsys, monkeypatch
+):
+    folder = shutil.copytree(truth, tmp_path / "part")
+    missing, torn, holes, off = sorted((folder / "depth").iterdir())[:4]
+    missing.unlink()
+    cut(torn, 500)
+    np.save(holes, np.load(holes) * (np.arange(160) % 3 > 0))
+    np.save(off, np.load(off) + 0.02)
+    for path in [*folder.glob("rgb/*")][::3]:
+        cut(path, 40)
+    assert score(capsys, files.root, folder, "--out", tmp_path / "score")[0] == 1
+    monkeypatch.chdir(tmp_path / "score")
+    summary, table = json.loads(Path("summary.json").read_text()), pq.read_table("items.parquet")
+    seen = pa.array([None, *np.linspace(0.3, 0.9, table.num_rows - 1).round(1)])  # here all objects are seen whole
+    table = table.set_column(table.column_names.index("visible_fraction"), "visible_fraction", seen)
+    pq.write_table(table, "items.parquet")
+    summary |= summarise(table)
+    page = page_of(summary, items_of(table), [])
+    queries = [html.unescape(text) for text in re.findall(r"<pre><code>(.*?)</code></pre>", page, re.DOTALL)]
+    counts, headlines, others, categories, visible = (duckdb.sql(sql).to_arrow_table().to_pylist() for sql in queries)
+    assert sum(row["items"] for row in counts if row["status"] == "refused") == summary["refused"] == 4
+    whole = {row["metric"]: row for row in headlines + others}
+    shown = {name: figure for name, figure in summary["metrics"].items() if figure["items"]}
+    assert whole.keys() == shown.keys() and {row["metric"] for row in headlines} == shown.keys() & {*HEADLINES}
+    pairs = [(whole[name], figure) for name, figure in shown.items()]
+    for kind, rows in {"category": categories, "visible_fraction": visible}.items():
+        assert {row["part"] for row in rows} == summary["by"][kind].keys() and len(summary["by"][kind]) > 1
+        pairs += [(row, summary["by"][kind][row["part"]][row["metric"]]) for row in rows]
+    for row, figure in pairs:
+        for key in ("value", "coverage", "worst", "items"):
+            assert row[key] == pytest.approx(figure[key], rel=1e-9, abs=1e-9), (row, key)
+    rows = [row for row in pq.read_table("items.parquet").to_pylist() if row["kind"] == "depth"]  # and by hand
+    errors_m = [row["farthest_m"] if row["depth_mae_m"] is None else row["depth_mae_m"] for row in rows]
+    assert [row["status"] for row in rows].count("ok") == PAIRS - 2
+    assert whole["depth_mae_m"]["value"] == pytest.approx(np.mean(errors_m)) and 2.0 < np.mean(errors_m) < 5.0
+    covered = sum(1.0 - row["depth_holes"] for row in rows if row["status"] == "ok") / PAIRS
+    assert whole["depth_mae_m"]["coverage"] == pytest.approx(covered) and 0.6 < covered < 0.75
 
 
 def test_who_does_not_predict_comes_last_and_no_verdict_is_given(files, truth, tmp_path, capsys):
@@ -312,7 +381,7 @@ def test_a_leaderboard_has_every_run_and_compares_none_that_leaves_something_out
     assert {row["run"] for row in rows if row["category"]} == set(answer["runs"])
     assert score(capsys, "merge", files.root, near, far, "--out", tmp_path / "two")[0] == 0
     summary = far / "score" / "summary.json"
-    summary.write_text(summary.read_text().replace('"verso_score": 2', '"verso_score": 1'))
+    summary.write_text(summary.read_text().replace('"verso_score": 3', '"verso_score": 2'))
     assert main(["score", "merge", str(files.root), str(near), str(far), "--out", str(tmp_path / "old")]) == 2
     assert "rules of another version" in capsys.readouterr().err
 
