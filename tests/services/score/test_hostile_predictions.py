@@ -20,8 +20,9 @@ from services.score.predictions import find_predictions
 from services.score.run import _table
 from services.score.summary import summarise
 from tests.datasets import make_dataset
-from tests.mutations import mutated_bytes
-from tests.workers.door.mutants import CHANGES, bomb, number, repeat, word
+from tests.mutations import mutated_bytes, places
+from tests.workers.door.mutants import CHANGES, VALUES, bomb, number, repeat, word
+from tests.workers.door.oracles import glb
 from workers.pool import Limits, run_pool
 
 MOST_CPU_S, MOST_MIB = 2.0, 1024
@@ -44,11 +45,24 @@ def header(dice, data):
     return data.replace(old, new, 1)
 
 
+def value(dice, data):
+    """One value of a binary glTF's tree replaced: `tree` also multiplies what it has multiplied, to gigabytes."""
+    try:
+        length = struct.unpack_from("<I", data, 12)[0]
+        root = json.loads(data[20 : 20 + length])
+        holder, key = dice.choice([*places(root)])
+        holder[key] = dice.choice(VALUES)
+        return glb(root, data[28 + length :])
+    except (struct.error, ValueError, IndexError, RecursionError):
+        return mutated_bytes(dice, data)
+
+
 ARRAY = (word, values, values, header, header, number)
 FORMATS = {
     **{f"depth .{kind}": changes for kind, changes in {"png": (word, bomb), "npy": ARRAY}.items()},
     "rgb .png": (word, bomb),
-    **{f"shape .{kind}": CHANGES[kind] for kind in ("ply", "obj", "glb")},
+    **{f"shape .{kind}": CHANGES[kind] for kind in ("ply", "obj")},
+    "shape .glb": (word, value, value, value),
     "shape .npz": (word, values),
     "volume .npy": ARRAY,
     "pose .csv": (number, number, repeat),
