@@ -9,7 +9,7 @@ import copy
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -227,7 +227,7 @@ class Dataset:
             scenes = range(records[0].span.start, records[0].span.stop)
             self._kept[scenes] = self._open_range(records)
         opened = self._kept[scenes]
-        return tuple(pairs_of(opened.rows, opened.files, pc.field("scene_id") == scene_id))
+        return tuple(pairs_of(opened.rows.of_scene(scene_id), opened.files))
 
     def _open_range(self, records: Records) -> "_Range":
         rows = RangeRows.of(lambda table: range_rows(self._store, records, table))
@@ -247,6 +247,11 @@ class RangeRows:
         """`rows` returns the scenes' rows of a table."""
         tables = {name: rows(name) for name in PAIR_TABLES}
         return cls(pair_table(tables), rows("objects"), tables["assets"])
+
+    def of_scene(self, scene_id: int) -> "RangeRows":
+        """The same with the pairs of one scene, which stand together: a filter would copy them, which takes 1 ms."""
+        at = np.flatnonzero(self.pairs.column("scene_id").to_numpy() == scene_id)
+        return replace(self, pairs=self.pairs.slice(int(at[0]) if len(at) else 0, len(at)))
 
     @property
     def nbytes(self) -> int:

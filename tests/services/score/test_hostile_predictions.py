@@ -1,0 +1,167 @@
+"""Mutants of every prediction format: each is scored or refused in a line, within two seconds and a gigabyte, in silence."""
+
+import io
+import json
+import random
+import shutil
+import struct
+import time
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.errors import InputError
+from services.dataset.dataset import open_dataset
+from services.score.items import Asked, score_pair
+from services.score.predictions import find_predictions
+from services.score.run import _table
+from services.score.summary import summarise
+from tests.datasets import make_dataset
+from tests.mutations import mutated_bytes, places
+from tests.workers.door.mutants import CHANGES, VALUES, bomb, number, repeat, word
+from tests.workers.door.oracles import glb
+from workers.pool import Limits, run_pool
+
+MOST_CPU_S, MOST_MIB = 2.0, 1024
+"""Of one mutant, read and scored."""
+
+FLOATS = [float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 1e-320, 1e200, -1.0, 0.0]
+
+
+def values(dice, data):
+    """Some of the doubles behind a header replaced by extremes."""
+    for at in dice.choices(range(128, max(len(data) - 8, 129), 8), k=3):
+        data = data[:at] + struct.pack("<d", dice.choice(FLOATS)) + data[at + 8 :]
+    return data
+
+
+def header(dice, data):
+    """Another shape, type or order in the header of an array."""
+    new = dice.choice([b"1" * 18, b"-1", b"0", b"(1,)", b"4294967296", b"None", b"'", b"(" * 60])
+    old = dice.choice([b"120", b"160", b"'<f8'", b"<f8", b"False", b"shape", b"}"])
+    return data.replace(old, new, 1)
+
+
+def value(dice, data):
+    """One value of a binary glTF's tree replaced: `tree` also multiplies what it has multiplied, to gigabytes."""
+    try:
+        length = struct.unpack_from("<I", data, 12)[0]
+        root = json.loads(data[20 : 20 + length])
+        holder, key = dice.choice([*places(root)])
+        holder[key] = dice.choice(VALUES)
+        return glb(root, data[28 + length :])
+    except (struct.error, ValueError, IndexError, RecursionError):
+        return mutated_bytes(dice, data)
+
+
+ARRAY = (word, values, values, header, header, number)
+FORMATS = {
+    **{f"depth .{kind}": changes for kind, changes in {"png": (word, bomb), "npy": ARRAY}.items()},
+    "rgb .png": (word, bomb),
+    **{f"shape .{kind}": CHANGES[kind] for kind in ("ply", "obj")},
+    "shape .glb": (word, value, value, value),
+    "shape .npz": (word, values),
+    "volume .npy": ARRAY,
+    "pose .csv": (number, number, repeat),
+}
+"""What is done to each format, beside `mutated_bytes`."""
+
+
+@cache
+def pair_of(root):
+    """(the first pair of the dataset, its job, what is true of it by format)."""
+    dataset = open_dataset(root)
+    pair = next(iter(dataset.pairs()))
+    depth, mesh = pair.mirror.depth(), pair.mesh(3, welded=True)
+    T_obj_world = np.linalg.inv(pair.T_world[3])
+    vertices = np.asarray(mesh.vertices) @ T_obj_world[:3, :3].T + T_obj_world[:3, 3]
+    mesh = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    T = np.linalg.inv(pair.mirror.T_world_cam) @ pair.T_world[3]
+    R, t = (" ".join(map(str, part.ravel())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
+
+    def packed(save, array):
+        file = io.BytesIO()
+        save(file, array)
+        return file.getvalue()
+
+    truth = {
+        "depth .png": cv2.imencode(".png", depth)[1].tobytes(),
+        "depth .npy": packed(np.save, depth / pair.mirror.depth_units_per_m),
+        "rgb .png": cv2.imencode(".png", pair.mirror.rgb()[..., ::-1])[1].tobytes(),
+        "shape .npz": packed(lambda file, points: np.savez(file, points=points), vertices),
+        "volume .npy": packed(np.save, pair.samples()["volume_distance"].astype(np.float64)),
+        "pose .csv": f"scene_id,im_id,obj_id,R,t\n{pair.scene_id},{pair.mirror.pose_id},3,{R},{t}\n".encode(),
+        **{f"shape .{kind}": _bytes(mesh.export(file_type=kind)) for kind in ("ply", "obj", "glb")},
+    }
+    return pair, dataset.job, truth
+
+
+def _bytes(data):
+    return data.encode() if isinstance(data, str) else data
+
+
+def mutant(data, kind, index):
+    """One to three changes of the bytes, the same for the same number."""
+    dice = random.Random(f"{kind} {index}")
+    for _ in range(dice.randint(1, 3)):
+        if len(data) > 1_000_000:  # changes that repeat would repeat what is repeated
+            break
+        data = dice.choice([*FORMATS[kind], mutated_bytes])(dice, data or b"\0")[:8_000_000]
+    return data
+
+
+def score_mutant(item):
+    """Statuses and reasons of what a folder with one mutant has, and processor seconds, as JSON."""
+    root, kind, folder = item
+    pair, job, _ = pair_of(root)
+    start = time.process_time()
+    try:
+        given = find_predictions(folder)
+    except InputError as error:  # of a table of poses without a row
+        return json.dumps([[], [str(error)], 0.0]).encode()
+    rows = score_pair(pair, folder, given.names, Asked((kind.partition(" ")[0],), samples=300), job)
+    seconds = time.process_time() - start
+    summarise(_table(rows))
+    reasons = [row["reason"] for row in rows if row["status"] == "refused"] + [why for _, why in given.strays]
+    return json.dumps([[row["status"] for row in rows], reasons, seconds]).encode()
+
+
+def write_mutants(root, kind, count, folder):
+    """What is asked of `score_mutant`, one after the other; making a mutant may take more memory than reading it."""
+    pair, _, truth = pair_of(root)
+    modality, suffix = kind.split(" ")
+    name = "poses.csv" if modality == "pose" else f"{modality}/{pair.mirror.pose_id:05d}{suffix}"
+    for index in range(count):
+        (folder / str(index) / name).parent.mkdir(parents=True)
+        (folder / str(index) / name).write_bytes(mutant(truth[kind], kind, index))
+        yield root, kind, folder / str(index)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """One scene with samples of its shape."""
+    targets = {"shape": ["volume"], "points": 500}
+    return str(make_dataset(tmp_path_factory.mktemp("hostile"), scenes=1, categories=["box"], targets=targets)[0].root)
+
+
+@pytest.mark.parametrize("count", [30, pytest.param(1000, marks=(pytest.mark.slow, pytest.mark.timeout(3000)))])
+@pytest.mark.parametrize("kind", FORMATS)
+def test_mutants_are_scored_or_refused_in_a_line_and_nothing_else(root, kind, count, tmp_path, capfd):
+    ends, seconds = {"ok": 0, "refused": 0, "missing": 0}, []
+    items = write_mutants(root, kind, count, tmp_path)
+    limits = Limits(memory_mb=MOST_MIB, cpu_s=30.0)
+    for (_, _, folder), answer in run_pool(score_mutant, items, limits=limits, processes=2, quiet=False):
+        assert isinstance(answer, bytes), (folder, answer)
+        statuses, reasons, cpu_s = json.loads(answer)
+        assert cpu_s < MOST_CPU_S, (folder, cpu_s)
+        assert all(reason and reason.isprintable() and len(reason) < 700 for reason in reasons), (folder, reasons)
+        assert "refused" not in statuses or reasons
+        for status in statuses:
+            ends[status] += 1
+        seconds.append(cpu_s)
+        shutil.rmtree(folder)
+    assert len(seconds) == count and ends["ok"] + ends["missing"] < count
+    assert capfd.readouterr().err == ""
