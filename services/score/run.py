@@ -319,7 +319,7 @@ def describe_refused(path: Path, most: int = 10) -> list[str]:
     if len(splits) == 1 and others - splits and splits <= {*SPLITS}:
         lines.append(f"all that is predicted is of one split: score that alone with --split {splits.pop()}")
     if outside := sum(row["status"] == "outside" for row in rows):
-        lines.append(f"{plural(outside, 'prediction')} of other splits not scored")
+        lines.append(f"{plural(outside, 'prediction')} of other splits or levels not scored")
     missing = defaultdict[str, list[str]](list)
     for row in rows:
         if row["status"] == "missing":

@@ -60,7 +60,7 @@ def require_calm(drop: Drop, outcome: Outcome, fallen: Sequence[int], moving: bo
         return
     coms = [_com(start, T) for start, T in zip(drop.starts, outcome.poses, strict=True)]
     if lost := outcome.lost or [number for number in fallen if _is_low(drop, coms[number][2])]:
-        raise _left_table(drop, lost, outcome.poses, outcome.seconds, fallen)
+        raise _left_table(drop, lost, outcome.poses, outcome.seconds, fallen, put_away=bool(outcome.lost))
     if not moving:
         raise SettleError("not_at_rest", _what_moves(drop.physics, drop.starts[fallen[outcome.moves[0]]], outcome))
 
@@ -92,17 +92,22 @@ def _com(start: ObjectStart, T: Pose) -> list[float]:
 
 
 def _left_table(
-    drop: Drop, lost: Sequence[int], poses: Sequence[Pose], seconds: float, fallen: Iterable[int]
+    drop: Drop,
+    lost: Sequence[int],
+    poses: Sequence[Pose],
+    seconds: float,
+    fallen: Iterable[int],
+    put_away: bool = False,
 ) -> LostError:
+    """put_away: the pose of the first of `lost` is where it was put, and not where it left."""
     start = drop.starts[lost[0]]
     x, y, z = _com(start, poses[lost[0]])
     whose, advice = "", "narrow start.offset_m or use larger tables"
     if not drop.single:
         whose = f" of region {start.region_id}"
         advice = "fewer objects_per_scene, a narrower start.offset_m or larger tables"
-    message = (
-        f"after {seconds:.2f} s the centre of mass{whose} was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off the table's top"
-    )
+    at = "had left" if put_away else f"was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off"
+    message = f"after {seconds:.2f} s the centre of mass{whose} {at} the table's top"
     return LostError("left_table", f"{message}: {advice}", lost, poses, fallen)
 
 
