@@ -1,35 +1,35 @@
-"""Predicts the benchmark's test split by simple means, scores that as `verso score` does, and prints the table by level.
+"""Predicts the benchmark's levels by simple means, scores that as `verso score --level` does, and prints the table.
 
 PYTHONPATH=. .venv/bin/python deploy/examples/baselines.py data/benchmark --out data/baselines [--only NAME]
 
-docs/benchmark.md has the rules. Writes OUT/NAME/exact and OUT/NAME/noisy, folders of predictions each with its score, and
-OUT/benchmark.csv. Networks are trained where PyTorch is installed, else left out. The same command makes the same numbers.
+docs/benchmark.md has the rules. Writes OUT/NAME/exact and OUT/NAME/noisy, predictions with their scores by level, and
+OUT/benchmark.csv of all that OUT has. Networks are trained where PyTorch is installed, else left out. The same command makes the
+same numbers.
 """
 
 import argparse
 import csv
 import dataclasses
 import importlib.util
+import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final
 
+import guesses
 import mirror_depth
 import numpy as np
 import occupancy
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import trimesh
+from guesses import Prediction, Predictor, mesh_of, regions_of
 from mirror_depth import pairs_of_split
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from schemas.dataset.codec import read_matrix
 from schemas.dataset.layout import PixelKind
 from schemas.errors import InputError, VersoError, plural
 from schemas.job.job import Job
@@ -40,13 +40,13 @@ from services.dataset.dataset import Dataset, open_dataset
 from services.dataset.pair import Pair
 from services.dataset.view import Files
 from services.job.record import require_job
-from services.score.items import Asked
+from services.score.items import LEVELS, Asked
+from services.score.leaderboard import compare_all
 from services.score.predictions import find_predictions
-from services.score.run import score_dataset
-from services.score.summary import summarise
+from services.score.run import ITEMS_FILE, score_dataset
+from services.score.summary import items_of, summarise
 from workers.assets.winding import winding_numbers
 from workers.geometry.pixels import dequantise_depth, quantise_depth
-from workers.geometry.projection import forward_project
 from workers.scene.chance import SceneChance
 from workers.scene.sensor import sense_depth, sense_rgb
 from workers.store.images import encode_png
@@ -70,123 +70,39 @@ METRICS: Final = {
     "pose_add_m": "ADD, mm",
     "pose_rotation_deg": "turn, °",
 }
-"""Of the columns of items.parquet, those in the table, and what it calls them."""
+"""Of the columns of items.parquet, those of benchmark.csv, and what the table calls them."""
 
-COLUMNS: Final = ("name", "job", "scenes", "level", "metric", "value", "low", "high", "items", "seconds")
+FIRST: Final = ("depth_auc_50mm", "shape_chamfer_l1_m", "volume_iou")
+SHOWN: Final = (
+    *FIRST[:1],
+    "depth_auc_50mm_hidden",
+    "depth_within_10mm",
+    "depth_mae_m",
+    "depth_holes",
+    "rgb_ncc",
+    *FIRST[1:],
+)
+"""Those of the table, of which the first have their intervals there."""
+
+COLUMNS: Final = ("name", "job", "scenes", "level", "metric", "value", "low", "high", "items", "seconds", "plate")
 """Of benchmark.csv. job: how its digest begins; scenes: of the dataset; items: how many count; seconds: of a core, for a scene's
-prediction."""
+prediction; plate: whether that is surely `better` or `worse` than the flat plate (services/score/leaderboard.py)."""
 
-NOISY: Final = 3
-"""The level whose input views are noisy; below it a level is 1 for a scene of one object, else 2."""
+NOISY: Final = "3"
+"""The level whose input views are noisy."""
+
+OF_MASKS: Final = ("nearest training shape",)
+"""Baselines that look at masks alone, which noise does not change: they have no such level."""
+
+PLATE: Final = "flat plate"
+TOLD_APART: Final = ("depth_auc_50mm", "depth_auc_50mm_hidden")
+"""What baselines are told apart from the plate by."""
 
 DEPTH_NOISE, RGB_NOISE = DepthNoise(), SensorEffects(rgb_noise=RgbNoise())
 """What level 3 has between the scene and the input view."""
 
 SILHOUETTE_PX: Final = 64
 """Side of the window in which masks are compared: an object of 0.25 m has 53 pixels at 2.5 m."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """What is said of a pair, nothing where nothing is said.
-
-    depth_m [H, W], metres, 0 in holes, and rgb [H, W, 3] of the mirror view. By region: shapes in the object's frame, metres,
-    values [M] at its stored volume points, poses [4, 4], object to mirror camera.
-    """
-
-    depth_m: NDArray | None = None
-    rgb: NDArray[np.uint8] | None = None
-    shapes: Mapping[int, trimesh.Trimesh] = field(default_factory=dict)
-    volumes: Mapping[int, NDArray] = field(default_factory=dict)
-    poses: Mapping[int, NDArray] = field(default_factory=dict)
-
-
-Predictor = Callable[[Pair], Prediction]
-
-
-def regions_of(pair: Pair) -> list[int]:
-    """The ids of a pair's objects."""
-    return [region for region in sorted(pair.T_world) if region >= REGION_FIRST_OBJECT]
-
-
-def mesh_of(pair: Pair, region: int) -> trimesh.Trimesh:
-    """An object's closed surface in its own frame."""
-    return pair.mesh(region, welded=True).apply_transform(np.linalg.inv(pair.T_world[region]))
-
-
-# ---------------------------------------------------------------------------------------------------- baselines
-
-
-def tell_truth(pair: Pair) -> Prediction:
-    """What is stored of the mirror view."""
-    mirror, regions = pair.mirror, regions_of(pair)
-    assert mirror is not None
-    return Prediction(
-        depth_m=mirror.depth() / mirror.depth_units_per_m,
-        rgb=mirror.rgb(),
-        shapes={region: mesh_of(pair, region) for region in regions},
-        volumes={region: pair.samples(region)["volume_distance"] for region in regions},
-        poses={region: read_matrix(mirror.regions[region]["T_cam_obj"]) for region in regions},
-    )
-
-
-def copy_input(pair: Pair) -> Prediction:
-    """The input view, as if the mirror camera stood there."""
-    return Prediction(pair.input.depth() / pair.input.depth_units_per_m, pair.input.rgb())
-
-
-def project_input(pair: Pair) -> Prediction:
-    """The points of the input view in the mirror view, one pixel each."""
-    view, mirror = pair.input, pair.mirror
-    assert mirror is not None
-    projected = forward_project(view.depth(), view.camera, mirror.camera, 1, view.depth_units_per_m)
-    colours = np.concatenate([view.rgb().reshape(-1, 3), np.zeros((1, 3), np.uint8)])  # -1 is a hole
-    return Prediction(projected.depth_m, colours[projected.source])
-
-
-def project_and_fill(pair: Pair) -> Prediction:
-    """The same, a hole with what the nearest pixel that is none has."""
-    projected = project_input(pair)
-    assert projected.depth_m is not None and projected.rgb is not None
-    filled = nearest_pixels(projected.depth_m)
-    return Prediction(projected.depth_m[filled], projected.rgb[filled])
-
-
-def nearest_pixels(depth_m: NDArray) -> tuple[NDArray, NDArray]:
-    """(row, column), each [H, W], of the nearest pixel that has depth."""
-    rows, columns = ndimage.distance_transform_edt(depth_m == 0, return_distances=False, return_indices=True)
-    return rows, columns
-
-
-def stand_plate(pair: Pair) -> Prediction:
-    """A plate across the optical axis for each object, at the median depth of its seen points; a pixel has the nearest one's."""
-    return spread(pair, lambda points: points * (np.median(points[:, 2]) / points[:, 2:]))
-
-
-def turn_half(pair: Pair) -> Prediction:
-    """The seen points of each object turned by half a turn (mirror_depth.py); a pixel has the nearest one's depth."""
-    assert pair.mirror is not None
-    up = pair.mirror.T_world_cam[2, :3]
-    return spread(pair, lambda points: mirror_depth.half_turn(points, up))
-
-
-def spread(pair: Pair, guess: Callable[[NDArray], NDArray]) -> Prediction:
-    """The nearest depth of what is guessed of each object from its seen points, both [N, 3] in the mirror camera's frame."""
-    view, mirror = pair.input, pair.mirror
-    assert mirror is not None
-    T, depth_m = np.linalg.inv(mirror.T_world_cam) @ view.T_world_cam, np.full(mirror.depth().shape, np.inf)
-    seen_m, segment = view.depth_m(), view.segment()
-    for region in regions_of(pair):
-        points = mirror_depth.unproject(view, seen_m, segment == region)
-        if len(points):
-            points = guess(mirror_depth.transform(T, points))
-            at = np.stack(mirror_depth.pixels_of(mirror, points))
-            here = (at >= 0).all(axis=0) & (at < np.array(depth_m.shape)[:, None]).all(axis=0)
-            np.minimum.at(depth_m, tuple(at[:, here]), points[here, 2])
-    if not np.isfinite(depth_m).any():  # no object is seen
-        return project_and_fill(pair)
-    depth_m[np.isinf(depth_m)] = 0.0
-    return Prediction(depth_m[nearest_pixels(depth_m)])
 
 
 def find_shapes(dataset: Dataset) -> Predictor:
@@ -285,12 +201,12 @@ def fix_numbers() -> None:
 
 
 BASELINES: Final[Mapping[str, Callable[[Dataset], Predictor]]] = {
-    "truth": lambda dataset: tell_truth,
-    "input copied": lambda dataset: copy_input,
-    "projected": lambda dataset: project_input,
-    "projected and filled": lambda dataset: project_and_fill,
-    "flat plate": lambda dataset: stand_plate,
-    "half turn": lambda dataset: turn_half,
+    "truth": lambda dataset: guesses.tell_truth,
+    "projected": lambda dataset: guesses.project_input,
+    "projected and filled": lambda dataset: guesses.project_and_fill,
+    "flat plate": lambda dataset: guesses.stand_plate,
+    "half turn": lambda dataset: guesses.turn_half,
+    "symmetry": lambda dataset: guesses.complete_by_symmetry,
     "nearest training shape": find_shapes,
     "mirror-depth network": train_depth,
     "occupancy network": train_volume,
@@ -369,48 +285,74 @@ def sense_input(pair: Pair, job: Job) -> Pair:
     return dataclasses.replace(pair, views={**pair.views, "input": changed})
 
 
-def score(dataset: Dataset, folder: Path) -> pa.Table:
-    """The items of predictions, as `verso score` writes them."""
+def folder_of(out: Path, name: str, level: str) -> Path:
+    """Of the predictions of a level."""
+    return out / name.replace(" ", "_") / ("noisy" if level == NOISY else "exact")
+
+
+def score(dataset: Dataset, folder: Path, level: str) -> pa.Table:
+    """The items of a level, as `verso score --level` writes them. Raises InputError where one is missing."""
     given, store = find_predictions(folder), open_store(dataset.place)
-    return pq.read_table(score_dataset(store, given, Asked(given.kinds, split="test"), folder / "score"))
+    asked = Asked(given.kinds, split=LEVELS[level][0], level=level)
+    table = items_of(pq.read_table(score_dataset(store, given, asked, folder / f"score{level}")))
+    if count := sum(status == "missing" for status in table["status"].to_pylist()):
+        raise InputError(
+            f"{folder} misses {plural(count, 'item')} of level {level}: predict every one, if only as empty"
+        )
+    return table
 
 
 def run(name: str, dataset: Dataset, out: Path) -> list[dict[str, Any]]:
     """The lines of benchmark.csv of a baseline, whose predictions are made first, or of predictions of one's own in OUT/NAME."""
     head = {"name": name, "job": require_job(open_store(dataset.place)).digest[:12], "scenes": dataset.job.scenes}
     predict, rows = BASELINES[name](dataset) if name in BASELINES else None, list[dict[str, Any]]()
-    for sensor in ("exact", "noisy"):
-        folder, levels, seconds = out / name.replace(" ", "_") / sensor, dict[int, int](), 0.0
-        if predict is not None:
+    levels = [level for level in LEVELS if level != NOISY or name not in OF_MASKS]
+    seconds = {level: list[float]() for level in levels}
+    for level in levels if predict is not None else ():
+        split, has = LEVELS[level]
+        folder = folder_of(out, name, level)
+        if level in ("1", NOISY):
             (folder / "poses.csv").unlink(missing_ok=True)
-        for pair in pairs_of_split(dataset, "test"):
-            levels[pair.scene_id] = NOISY if sensor == "noisy" else 1 if len(regions_of(pair)) == 1 else 2
-            if predict is not None:
-                seen = sense_input(pair, dataset.job) if sensor == "noisy" else pair
+        for pair in pairs_of_split(dataset, split):
+            if has(len(regions_of(pair))):
+                given = sense_input(pair, dataset.job) if level == NOISY else pair
                 begun = time.process_time()
-                said = predict(seen)
-                seconds += time.process_time() - begun
+                said = predict(given)
+                seconds[level].append(time.process_time() - begun)
                 write(folder, pair, said)
-        each_s = f"{seconds / max(len(levels), 1):.2g}" if predict is not None else ""
-        rows += [{**head, **row, "seconds": each_s} for row in rows_of(score(dataset, folder), levels, folder)]
-    return rows
-
-
-def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterator[dict[str, Any]]:
-    """Level, metric and figure, for each; levels: by scene id. Raises InputError where items are missing."""
-    for level in sorted(set(levels.values())):
-        chosen = pa.array([scene for scene in levels if levels[scene] == level], pa.int64())
-        items = table.filter(pc.is_in(table["scene_id"], chosen))
-        if count := pc.sum(pc.equal(items["status"], "missing")).as_py():
-            raise InputError(
-                f"{folder} misses {plural(count, 'item')} of test scenes: predict every one, if only as empty"
-            )
-        figures = summarise(items)["metrics"]
-        for metric in (name for name in METRICS if name in figures and figures[name]["items"]):
+    for level in levels:
+        items = score(dataset, folder_of(out, name, level), level)
+        figures = summarise(items)["metrics"] if items.num_rows else {}
+        each_s = f"{np.mean(seconds[level]):.2g}" if seconds[level] else ""
+        for metric in (metric for metric in METRICS if metric in figures and figures[metric]["items"]):
             # Five digits are more than an interval leaves meaning to
             values = {key: figures[metric][key] for key in ("value", "low", "high", "items")}
             words = {key: "" if value is None else f"{value:.5g}" for key, value in values.items()}
-            yield {"level": level, "metric": metric, **words}
+            rows.append({**head, "level": level, "metric": metric, **words, "seconds": each_s, "plate": ""})
+    (out / name.replace(" ", "_") / "rows.json").write_text(json.dumps(rows))
+    return rows
+
+
+def tell_apart(rows: Sequence[dict[str, Any]], out: Path) -> None:
+    """Says in rows of `TOLD_APART` whether each is surely better or worse than the plate's, by the items that OUT has."""
+    for level in LEVELS:
+        names = dict.fromkeys(row["name"] for row in rows if row["level"] == level and row["metric"] in TOLD_APART)
+        if PLATE not in names:
+            continue
+        items = {
+            name: items_of(pq.read_table(folder_of(out, name, level) / f"score{level}" / ITEMS_FILE)) for name in names
+        }
+        verdicts = compare_all(items, {name: summarise(items[name]) for name in names}, TOLD_APART)
+        words = {
+            (*({verdict["a"], verdict["b"]} - {PLATE}), verdict["metric"]): "worse"
+            if verdict["better"] == PLATE
+            else "better"
+            for verdict in verdicts
+            if PLATE in (verdict["a"], verdict["b"]) and verdict["better"]
+        }
+        for row in rows:
+            if row["level"] == level and row["metric"] in TOLD_APART:
+                row["plate"] = words.get((row["name"], row["metric"]), "")
 
 
 # ---------------------------------------------------------------------------------------------------- table
@@ -418,7 +360,7 @@ def rows_of(table: pa.Table, levels: Mapping[int, int], folder: Path) -> Iterato
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     """The lines of benchmark.csv as Markdown: a value and, in brackets, its interval; lengths in millimetres; and the seconds."""
-    there = [metric for metric in METRICS if any(row["metric"] == metric for row in rows)]
+    there = [metric for metric in SHOWN if any(row["metric"] == metric for row in rows)]
     lines = [["", "level", *(METRICS[metric] for metric in there), "s"]]
     lines.append(["---"] * len(lines[0]))
     groups = dict[tuple[str, str], dict[str, Mapping[str, Any]]]()
@@ -431,11 +373,12 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def cell(metric: str, row: Mapping[str, Any]) -> str:
-    """`3.1 (2.9–3.4)`; the value alone where there is no interval, or none to speak of."""
+    """`3.1 (2.9–3.4) +`, better than the plate: with the interval of `FIRST` where there is one to speak of; else the value."""
     scale = 1e3 if metric.endswith("_m") else 1.0
     value, low, high = (scale * float(row[key] or "nan") for key in ("value", "low", "high"))
     words = [f"{figure:.0f}" if abs(figure) >= 1e3 else f"{figure:.3g}" for figure in (value, low, high)]
-    return f"{words[0]} ({words[1]}–{words[2]})" if low < high else words[0]
+    mark = {"better": " +", "worse": " -"}.get(row["plate"], "")
+    return f"{words[0]} ({words[1]}–{words[2]}){mark}" if metric in FIRST and low < high else words[0] + mark
 
 
 def read_options() -> argparse.Namespace:
@@ -451,13 +394,15 @@ def main() -> None:
     """Every baseline that can be made here: predict, score, print."""
     options = read_options()
     dataset = open_dataset(options.place)
-    rows: list[dict[str, Any]] = []
     for name in options.only or BASELINES:
         if name in NETWORKS and importlib.util.find_spec("torch") is None:
             print(f"{name}: left out, PyTorch is not installed")
             continue
-        rows += run(name, dataset, options.out)
-        print(f"{name}: {rows[-1]['seconds']} s a scene", flush=True)
+        print(f"{name}: {run(name, dataset, options.out)[-1]['seconds']} s a scene", flush=True)
+    ours = [options.out / name.replace(" ", "_") / "rows.json" for name in BASELINES]
+    others = sorted({*options.out.glob("*/rows.json")} - {*ours})
+    rows = [row for path in (*ours, *others) if path.is_file() for row in json.loads(path.read_text())]
+    tell_apart(rows, options.out)
     with (options.out / "benchmark.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()

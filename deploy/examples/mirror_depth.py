@@ -6,7 +6,6 @@ view, the two cameras and the planes of table top and floor goes into it: the mi
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -15,13 +14,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
+from schemas.job.assets import Split
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from services.dataset.dataset import Dataset
 from services.dataset.pair import Pair
 from services.dataset.view import Pixels, View
 from workers.geometry import camera
-
-Split = Literal["train", "val", "test"]
 
 
 def pairs_of_split(dataset: Dataset, split: Split, splits: Mapping[str, str] | None = None) -> Iterator[Pair]:

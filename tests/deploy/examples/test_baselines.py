@@ -5,12 +5,16 @@ import re
 from pathlib import Path
 
 import baselines
+import guesses
 import numpy as np
 import pytest
+import split_by_distance
+import trimesh
 
 from services.dataset.dataset import open_dataset
 from services.job.job_file import load_job
 from services.job.record import record_job
+from services.score.items import LEVELS
 from tests.datasets import make_dataset, run_here
 from workers.capture.results import open_sources
 
@@ -26,15 +30,15 @@ ROUNDING = 1e-6
 
 @pytest.fixture(scope="module")
 def benchmark(tmp_path_factory):
-    """Four scenes of the benchmark itself: one that mixes the splits, one to train on, one and two objects to test on."""
+    """Four scenes of the benchmark itself: one to train on, one and two objects to test on, two of categories never seen."""
     folder = tmp_path_factory.mktemp("benchmark")
-    return open_dataset(run_here(load_job(JOB, ["first_scene=214", "scenes=4"]), folder, JOB.parent)[0].root)
+    return open_dataset(run_here(load_job(JOB, ["first_scene=270", "scenes=4"]), folder, JOB.parent)[0].root)
 
 
 @pytest.mark.minute
 def test_truth_scores_full_marks_at_every_level_of_the_benchmark(benchmark, tmp_path):
     rows = baselines.run("truth", benchmark, tmp_path)
-    assert {row["level"] for row in rows} == {1, 2, 3}
+    assert {row["level"] for row in rows} == {*LEVELS}
     for row in rows:
         value = float(row["value"])
         assert row["metric"] in FULL_MARKS | NONE | {"rgb_psnr_db"} and int(row["items"]) > 0
@@ -78,16 +82,16 @@ def test_baselines_without_a_network_repeat_and_rank_as_they_must(small, tmp_pat
         del row["seconds"]
     assert [row for row in rows if row["name"] in some] == again
     value = {(row["name"], row["level"], row["metric"]): float(row["value"]) for row in rows}
-    for level in (1, 3):
-        depth = [value[name, level, "depth_within_2mm"] for name in ("truth", "projected and filled", "input copied")]
+    for level in ("1", "3"):
+        depth = [value[name, level, "depth_within_2mm"] for name in ("truth", "projected and filled", "projected")]
         assert depth == sorted(depth, reverse=True) and depth[0] == 1.0 > depth[1] > depth[2]
-        for name in ("flat plate", "half turn"):  # no guess from the wrong side is better
+        for name in ("flat plate", "half turn", "symmetry"):  # no guess from the wrong side is better
             assert value[name, level, "depth_auc_50mm"] > value["projected and filled", level, "depth_auc_50mm"]
         assert value["projected", level, "depth_holes"] > 0.1 > value["projected and filled", level, "depth_holes"] == 0
-        assert 0.0 < value["nearest training shape", level, "shape_iou"] < 1.0
-    assert value["projected", 3, "depth_within_2mm"] < value["projected", 1, "depth_within_2mm"]
+    assert 0.0 < value["nearest training shape", "1", "shape_iou"] < 1.0
+    assert value["projected", "3", "depth_within_2mm"] < value["projected", "1", "depth_within_2mm"]
     for pair in small.pairs():
-        found = baselines.project_input(pair)
+        found = guesses.project_input(pair)
         assert np.array_equal(np.rint(found.depth_m * pair.mirror.depth_units_per_m), pair.projected.depth())
         assert np.array_equal(found.rgb, pair.projected.rgb())
 
@@ -97,13 +101,35 @@ def test_the_page_s_table_is_that_of_its_rows_which_are_of_this_job():
     with (ROOT / "docs/benchmark.csv").open(newline="") as file:
         reader = csv.DictReader(file)
         rows = list(reader)
-    assert tuple(reader.fieldnames) == baselines.COLUMNS and {row["name"] for row in rows} >= set(baselines.BASELINES)
+    assert tuple(reader.fieldnames) == baselines.COLUMNS and {row["name"] for row in rows} >= set(
+        baselines.BASELINES
+    ) - {"truth"}
     job = load_job(JOB)
     digest = record_job(job, open_sources(job, JOB.parent).digest, JOB.parent).digest[:12]
     for row in rows:
-        assert (row["job"], int(row["scenes"])) == (digest, job.scenes) and int(row["level"]) in (1, 2, 3), row
+        assert (row["job"], int(row["scenes"])) == (digest, job.scenes) and row["level"] in LEVELS, row
         assert row["metric"] in baselines.METRICS and float(row["low"]) <= float(row["value"]) <= float(row["high"]), (
             row
         )
     assert baselines.table_of([row for row in rows if row["name"] != "truth"]) in page
     assert digest in page and len(re.findall(r"\b[0-9a-f]{64}\b", page)) == 2
+
+
+def test_no_shapes_of_two_splits_are_alike_and_the_check_measures_it(few, tmp_path, capsys):
+    balls = [trimesh.creation.icosphere(4, radius) for radius in (0.1, 0.102)]
+    a, b = (split_by_distance.sample(ball.vertices, ball.faces) for ball in balls)
+    assert split_by_distance.chamfer_mm(a, b) == pytest.approx(2.0, abs=0.05)  # 0.02 of it from the faces' middles
+    places = np.random.default_rng(1).uniform(0.0, 10.0, (60, 2))
+    apart_mm = np.linalg.norm(places[:, None] - places, axis=2)
+    splits = np.array(split_by_distance.make_split(apart_mm, 1.0, range(60)))
+    assert all((splits == name).sum() > 1 for name in split_by_distance.SHARES)
+    named = splits != ""
+    others = named[:, None] & named & (splits[:, None] != splits)
+    assert apart_mm[others].min() >= 1.0 and (apart_mm[~np.eye(60, dtype=bool)] < 1.0).sum() > 20
+    table = tmp_path / "nearest.csv"
+    assert split_by_distance.check(few.root, 0.0, table) and not split_by_distance.check(few.root, 1000.0, None)
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert (
+        rows and {row["split"] for row in rows} == {"test"} and "mm to the nearest of train" in capsys.readouterr().out
+    )
