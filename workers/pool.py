@@ -5,6 +5,7 @@ item after the other through a pipe. An answer is bytes and never a pickle, beca
 """
 
 import errno
+import fcntl
 import gc
 import json
 import multiprocessing
@@ -18,7 +19,7 @@ import traceback
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from math import ceil, inf
 from multiprocessing.connection import Connection, wait
@@ -26,11 +27,39 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, Literal, NoReturn, TypeVar
 
-from schemas.errors import MachineError
+from schemas.errors import InUseError, MachineError, OutputError
 
 Item = TypeVar("Item")
 
 # ---------------------------------------------------------------------------------------------------- answers on disk
+
+
+@contextmanager
+def alone_in(folder: Path, lock: str, name: str, wait: bool = False) -> Iterator[None]:
+    """Within the block no other process has this file `lock` of a folder, which is made. name: of the command that writes there.
+
+    Raises InUseError where another has it, or waits, and OutputError where the folder cannot be written.
+    """
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = open(folder / lock, "ab")  # noqa: SIM115 - closed below
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError as error:
+            raise InUseError(f"another `{name}` writes {folder}: wait for it, or choose another --out") from error
+        try:
+            yield
+        except BaseException:
+            if is_new and not os.path.getsize(file.name):  # nothing stays of what was not begun
+                with suppress(OSError):
+                    os.unlink(file.name)
+                    folder.rmdir()
+            raise
+
 
 _HEAD = b"\n@"
 """Begins each record, so that the next one is found behind a torn one."""

@@ -72,17 +72,10 @@ METRICS: Final = {
 }
 """Of the columns of items.parquet, those of benchmark.csv, and what the table calls them."""
 
+SHOWN: Final = ("depth_auc_50mm", "depth_auc_50mm_hidden", "depth_within_10mm", "depth_mae_m", "depth_holes", "rgb_ncc",
+    "shape_chamfer_l1_m", "volume_iou")  # fmt: skip
 FIRST: Final = ("depth_auc_50mm", "shape_chamfer_l1_m", "volume_iou")
-SHOWN: Final = (
-    *FIRST[:1],
-    "depth_auc_50mm_hidden",
-    "depth_within_10mm",
-    "depth_mae_m",
-    "depth_holes",
-    "rgb_ncc",
-    *FIRST[1:],
-)
-"""Those of the table, of which the first have their intervals there."""
+"""Those of the table, and of these the first of each kind, which have their intervals there."""
 
 COLUMNS: Final = ("name", "job", "scenes", "level", "metric", "value", "low", "high", "items", "seconds", "plate")
 """Of benchmark.csv. job: how its digest begins; scenes: of the dataset; items: how many count; seconds: of a core, for a scene's
@@ -343,13 +336,11 @@ def tell_apart(rows: Sequence[dict[str, Any]], out: Path) -> None:
             name: items_of(pq.read_table(folder_of(out, name, level) / f"score{level}" / ITEMS_FILE)) for name in names
         }
         verdicts = compare_all(items, {name: summarise(items[name]) for name in names}, TOLD_APART)
-        words = {
-            (*({verdict["a"], verdict["b"]} - {PLATE}), verdict["metric"]): "worse"
-            if verdict["better"] == PLATE
-            else "better"
-            for verdict in verdicts
-            if PLATE in (verdict["a"], verdict["b"]) and verdict["better"]
-        }
+        words = dict[tuple[str, str], str]()
+        for verdict in verdicts:
+            a, b, better = verdict["a"], verdict["b"], verdict["better"]
+            if better and PLATE in (a, b):
+                words[b if a == PLATE else a, verdict["metric"]] = "worse" if better == PLATE else "better"
         for row in rows:
             if row["level"] == level and row["metric"] in TOLD_APART:
                 row["plate"] = words.get((row["name"], row["metric"]), "")

@@ -31,7 +31,9 @@ class Pairs:
 
     def __init__(self, place: str, kinds: list[str]) -> None:
         self.dataset, self.kinds = open_dataset(place), kinds
-        self.ids = [pair.pose_id for pair, _ in zip(self.dataset.pairs(), range(PAIRS), strict=False)]
+        first = [pair for pair, _ in zip(self.dataset.pairs(), range(PAIRS), strict=False) if pair.mirror]
+        self.ids = [pair.pose_id for pair in first]
+        self.paths = [[Path(place) / pair.mirror.images[kind] for kind in kinds] for pair in first if pair.mirror]
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -51,11 +53,6 @@ class Pairs:
             image.astype(np.float32) * STEP - np.float32(1.0) if kind == "normals" else image
             for kind, image in zip(self.kinds, ordered, strict=True)
         ]
-
-    def find_paths(self) -> None:
-        """Looks the files up, which is no part of what is measured."""
-        views = [self.dataset.pair(pose_id).mirror for pose_id in self.ids]
-        self.paths = [[Path(self.dataset.place) / view.images[kind] for kind in self.kinds] for view in views if view]
 
 
 def core_ms(read: Callable[[int], Any], number: int) -> float:
@@ -86,7 +83,6 @@ def main() -> None:
     parser.add_argument("--kinds", default="rgb,depth,region,normals,albedo")
     options = parser.parse_args()
     pairs = Pairs(options.place, options.kinds.split(","))
-    pairs.find_paths()
     cv2.setNumThreads(1)
     times = [(core_ms(pairs.__getitem__, n), core_ms(pairs.by_hand, n)) for n in range(len(pairs)) for _ in range(3)]
     ours, hand = (statistics.median(column) for column in zip(*times, strict=True))

@@ -26,6 +26,7 @@ from schemas.job.assets import CATEGORIES, TABLE, ProceduralSource, instance_id
 from schemas.scene.shape import Mesh
 from services.dataset.dataset import open_dataset
 from services.job.job_file import load_job
+from services.score.shape import draw_points
 from workers.assets.builtin.make import make_asset
 from workers.geometry.distance import distance_to_mesh
 
@@ -43,8 +44,7 @@ Sampled = tuple[NDArray[np.float64], Mesh]
 def sample(vertices: NDArray, faces: NDArray) -> Sampled:
     """Points drawn uniformly on a surface, the same each time."""
     mesh = Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32))
-    points = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), POINTS, seed=1)[0]
-    return np.asarray(points), mesh
+    return draw_points(mesh, np.random.default_rng(1), POINTS)[0], mesh
 
 
 def chamfer_mm(a: Sampled, b: Sampled) -> float:

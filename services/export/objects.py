@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_matrix
-from schemas.job.assets import SPLITS
 from services.export.formats import ObjectWriter, encode_json, encode_npz, sample_mesh
 from services.export.source import SIDES, ExportPair, ExportScene
 from workers.geometry.camera import unproject
@@ -32,6 +31,8 @@ MARGIN: Final = 1.05
 """Side of a crop by the size at which the sphere about the object's box is seen."""
 IMAGES: Final = "img_choy2016"
 _QUALITY = 95
+_SPLITS = ("train", "val", "test")
+"""Which loaders look for, with or without objects."""
 
 NO_SAMPLES: Final = "no samples of the shape's surface and volume are stored"
 STRICTER: Final = "the scene shows an object of a stricter split too"
@@ -91,7 +92,7 @@ class OccNet(ObjectWriter):
                 self.folder.put(f"{path}/{IMAGES}/cameras.npz", encode_npz(arrays))
         categories = sorted({path.partition("/")[0] for path in self.kept["listed"]})
         for category in categories:
-            for split in ("train", "val", "test"):  # which loaders of this format look for
+            for split in _SPLITS:
                 self.folder.append(f"{category}/{split}.lst", b"")
         # JSON is YAML
         self.folder.put("metadata.yaml", encode_json({name: {"id": name, "name": name} for name in categories}))
@@ -219,7 +220,7 @@ class Pcn(ObjectWriter):
         listed: dict[str, dict[str, list[str]]] = {}
         for key, count in self.register.counts():
             category, split, instance_id = key.split("/")
-            listed.setdefault(category, {name: [] for name in SPLITS})[split].append(instance_id)
+            listed.setdefault(category, {name: [] for name in _SPLITS}).setdefault(split, []).append(instance_id)
             folder = f"{split}/partial/{category}/{instance_id}"
             for number in range(count, RENDERINGS if split == "train" else count):
                 data = (self.folder.root / folder / f"{number % count:02d}.pcd").read_bytes()

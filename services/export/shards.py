@@ -22,6 +22,7 @@ from schemas.dataset.codec import Row
 from schemas.dataset.layout import ARTICLE, PixelKind, stored_images, stored_roles
 from schemas.dataset.tables import OF_TARGETS, SCHEMAS
 from schemas.errors import plural
+from schemas.job.assets import SPLITS
 from schemas.job.job import Job
 from schemas.scene.view import MODALITIES, ROLES, Role
 from services.export.formats import OF_SCENE, ShardedWriter, encode_npz
@@ -108,7 +109,7 @@ class _Tar:
         self._tar.close()
 
 
-SPLITS: Final = {"train": "train", "val": "validation", "test": "test", "unseen": "unseen"}
+SPLIT_NAMES: Final = {split: split for split in SPLITS} | {"val": "validation"}
 """Ours, and Hugging Face's name for it."""
 ROW_GROUP: Final = 16
 """Pairs in a row group: some ten megabytes, which is what a reader holds."""
@@ -136,8 +137,8 @@ class HuggingFace(ShardedWriter):
 
     def take(self, scene: ExportScene, pair: ExportPair) -> str:
         """Writes the row of a pair."""
-        self.shard(SPLITS[scene.split]).add(row_of(self._schema, scene, pair))
-        self.count("rows", SPLITS[scene.split])
+        self.shard(SPLIT_NAMES[scene.split]).add(row_of(self._schema, scene, pair))
+        self.count("rows", SPLIT_NAMES[scene.split])
         return ""
 
     def end_scene(self, scene: ExportScene) -> None:
@@ -189,7 +190,7 @@ def _type_of(kind: PixelKind) -> pa.DataType:
 def row_of(schema: pa.Schema, scene: ExportScene, pair: ExportPair) -> Row:
     """The row of a pair."""
     row: Row = {name: scene.row[name] for name in OF_SCENE}
-    row |= {"split": SPLITS[scene.split], "pose_id": pair.pose_id, "objects": list(pair.objects)}
+    row |= {"split": SPLIT_NAMES[scene.split], "pose_id": pair.pose_id, "objects": list(pair.objects)}
     for name in schema.names:
         role, _, kind = name.partition("_")
         if kind == "view":

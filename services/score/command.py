@@ -28,7 +28,7 @@ from services.read.verdict import explain_damage
 from services.run.progress import finish
 from services.score.items import LEVELS, Asked
 from services.score.predictions import find_predictions
-from services.score.run import alone_in, describe_refused, score_dataset
+from services.score.run import KEPT, describe_refused, score_dataset
 from services.score.summary import (
     COUNTS_SQL,
     HEADLINES,
@@ -40,6 +40,7 @@ from services.score.summary import (
     summarise,
     values_of,
 )
+from workers.pool import alone_in
 from workers.store.local import open_store
 
 SUMMARY_FILE, PAGE_FILE = "summary.json", "index.html"
@@ -63,7 +64,7 @@ def main(options: argparse.Namespace) -> int:
     given = find_predictions(options.predictions)
     asked = _asked(given.kinds, options, align=options.align, flip=options.flip)
     target = options.score or options.predictions / "score"
-    with explain_damage(store), alone_in(target):
+    with explain_damage(store), alone_in(target, KEPT, "verso score"):
         digest = (read_success(store) or {}).get("digest")  # before: it may be extended meanwhile
         path = score_dataset(store, given, asked, target)
         table = pq.read_table(path)

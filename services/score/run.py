@@ -11,7 +11,7 @@ import platform
 import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from operator import attrgetter
@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.errors import InputError, InUseError, MachineError, OutputError, RunError, VersoError, needs_making, plural
+from schemas.errors import InputError, MachineError, RunError, VersoError, needs_making, plural
 from schemas.job.assets import SPLITS
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
@@ -49,7 +49,6 @@ KEPT: Final = "_kept.answers"
 
 MOST_MIB, MOST_CPU_S = 4096, 60.0
 """Limits of scoring a pose: of memory, and of processor seconds. What a stranger predicts may be made to take any of both."""
-
 
 FACTS: Final = pa.schema(
     [
@@ -202,36 +201,6 @@ def _answers(ranges: Sequence[_Range], kept: Path) -> "Iterator[tuple[_Range, by
     yield from run_pool(
         _score_range, ranges, key=attrgetter("key"), kept=kept_answers, limits=limits, processes=cores, quiet=False
     )
-
-
-@contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Within the block no other process scores into this folder, which is made; away from Unix any may.
-
-    Raises InUseError where one does, OutputError where the folder cannot be written.
-    """
-    is_new = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = open(folder / KEPT, "ab")  # noqa: SIM115 - closed below
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
-    with file:
-        try:
-            with suppress(ImportError):
-                import fcntl
-
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InUseError(f"another `verso score` writes {folder}: wait for it, or choose another --out") from error
-        try:
-            yield
-        except BaseException:
-            if is_new and not os.path.getsize(file.name):  # nothing stays of a score that was not begun
-                with suppress(OSError):
-                    os.unlink(file.name)
-                    folder.rmdir()
-            raise
 
 
 def _score_range(item: _Range) -> bytes:

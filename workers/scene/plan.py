@@ -11,7 +11,7 @@ import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError, ViewError
-from schemas.job.assets import NO_SPLIT, SPLITS
+from schemas.job.assets import SPLITS
 from schemas.job.job import Job
 from schemas.job.physics import Start
 from schemas.job.views import Cameras
@@ -56,7 +56,7 @@ def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[
     until it is of the first one's. Raises StartError where none of `MOST_DRAWS` is.
     """
     objects, split = list[InstanceRef](), job.assets.split
-    fit = set(SPLITS if split.named else (*SPLITS, NO_SPLIT))
+    fit = {*SPLITS}
     for number in range(count_objects(job, chance)):
         categories, instances = (chance.object_stream(name, number) for name in (Stream.CATEGORY, Stream.OBJECT))
         category = _draw_category(job, categories)
@@ -69,7 +69,8 @@ def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[
             wanted = f"none of {MOST_DRAWS} instances that were drawn, the last of {category}, is of {', '.join(sorted(fit))}"
             raise StartError("no_split", f"{wanted}: name more instances in assets.split.named")
         objects.append(ref)
-        fit &= {split.of(ref.instance_id)} if split.named else fit
+        if split.named:
+            fit = {split.of(ref.instance_id)}
     return objects, choose_table(catalogue, chance.stream(Stream.TABLE))
 
 

@@ -15,7 +15,7 @@ from schemas.job.job import Job
 from schemas.job.views import Images, Targets
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Material, Mesh, Part, Shape
-from schemas.scene.view import FULL, LAYERS, Camera, PixelKind
+from schemas.scene.view import FULL, LAYERS, MODALITIES, Camera, PixelKind
 from workers.geometry.camera import NEAR_M, project, unproject
 from workers.geometry.colour import SRGB_STEPS, decode_srgb
 from workers.geometry.frames import invert, transform
@@ -62,14 +62,14 @@ def draw_targets(
     """
     drawn: dict[PixelKind, NDArray] = {}
     objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
-    of_seen = [name for name in OF_NEAREST if effects.runs(name) and (sight is not None or name != "covisible")]
+    of_seen = [name for name in OF_NEAREST if effects.runs(name) and (sight or MODALITIES[name].of_input)]
     if of_seen:
         with watch.stage("targets"):
             shown = things if effects.runs("normals") or effects.runs("albedo") else objects
-            seen = Seen(shown, camera, region, drawn=job.captures is None)
+            seen = Seen(shown, camera, region, job.captures is None, sight)
         for name in of_seen:
             with watch.stage("targets", name):
-                drawn[name] = sight.draw(seen) if name == "covisible" and sight else _OF_SEEN[name](seen, job.targets)
+                drawn[name] = _OF_SEEN[name](seen, job.targets)
     if any(effects.runs(name) for name in OF_ALL):
         with watch.stage("targets"):
             triangles = triangles_of(objects, camera)
@@ -86,11 +86,18 @@ def draw_targets(
 class Seen:
     """What is seen at each pixel of a mask [H, W]: face [H, W] int32 of `triangles`, -1 for none, and z [H, W], metres.
 
-    `drawn`: whether the mask is of these things, and not of a photograph.
+    `drawn`: whether the mask is of these things, and not of a photograph. `sight`: what the pair's input camera sees.
     """
 
-    def __init__(self, things: Sequence[Placed], camera: Camera, region: NDArray[np.uint8], drawn: bool) -> None:
-        self.things, self.camera = things, camera
+    def __init__(
+        self,
+        things: Sequence[Placed],
+        camera: Camera,
+        region: NDArray[np.uint8],
+        drawn: bool,
+        sight: "Sight | None" = None,
+    ) -> None:
+        self.things, self.camera, self.sight = things, camera, sight
         self.triangles = triangles_of(things, camera)
         self.face, self.z = nearest_faces(self.triangles, region, drawn)
 
@@ -209,23 +216,6 @@ class Sight:
         self.things, self.camera = things, camera
         self._casters: dict[int, Caster] = {}
 
-    def draw(self, seen: Seen) -> NDArray[np.uint8]:
-        """[H, W]: 255 where the input camera sees the point of an object that the pixel shows; from the same side of its face."""
-        image, k = np.zeros(seen.face.shape, np.uint8), self.camera.intrinsics
-        pixels = np.flatnonzero(np.append(seen.triangles.region, np.uint8(0))[seen.face] >= REGION_FIRST_OBJECT)
-        T_here_there = invert(seen.camera.T_world_cam) @ self.camera.T_world_cam
-        normals, offsets = (plane[seen.face.reshape(-1)[pixels]] for plane in seen.triangles.planes)
-        pixels = pixels[(normals @ T_here_there[:3, 3] - offsets) * -offsets > 0.0]
-        rows_columns = np.divmod(pixels, seen.camera.intrinsics.width)
-        points = unproject(*rows_columns, seen.z.reshape(-1)[pixels], seen.camera.intrinsics)
-        points = transform(invert(T_here_there), points)
-        ahead = points[:, 2] > NEAR_M
-        pixels, points = pixels[ahead], points[ahead]
-        u, v = project(points, k)
-        inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
-        image.reshape(-1)[pixels[inside]] = np.where(self.is_hidden(points[inside]), 0, 255)
-        return image
-
     def is_hidden(self, points: Array) -> NDArray[np.bool_]:
         """[N]: whether anything is between the input camera and points [N, 3], in its frame, metres, beyond the near plane."""
         hidden = np.zeros(len(points), np.bool_)
@@ -246,6 +236,26 @@ class Sight:
             vertices = transform(T_cam_world @ thing.T_world_shape, thing.shape.vertices)
             self._casters[number] = Caster(Mesh(vertices, thing.shape.faces))
         return self._casters[number]
+
+
+def draw_covisible(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
+    """[H, W]: 255 where the input camera sees the point of an object that the pixel shows; from the same side of its face."""
+    sight = seen.sight
+    assert sight is not None
+    image, k = np.zeros(seen.face.shape, np.uint8), sight.camera.intrinsics
+    pixels = np.flatnonzero(np.append(seen.triangles.region, np.uint8(0))[seen.face] >= REGION_FIRST_OBJECT)
+    T_here_there = invert(seen.camera.T_world_cam) @ sight.camera.T_world_cam
+    normals, offsets = (plane[seen.face.reshape(-1)[pixels]] for plane in seen.triangles.planes)
+    pixels = pixels[(normals @ T_here_there[:3, 3] - offsets) * -offsets > 0.0]
+    rows_columns = np.divmod(pixels, seen.camera.intrinsics.width)
+    points = unproject(*rows_columns, seen.z.reshape(-1)[pixels], seen.camera.intrinsics)
+    points = transform(invert(T_here_there), points)
+    ahead = points[:, 2] > NEAR_M
+    pixels, points = pixels[ahead], points[ahead]
+    u, v = project(points, k)
+    inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
+    image.reshape(-1)[pixels[inside]] = np.where(sight.is_hidden(points[inside]), 0, 255)
+    return image
 
 
 def whole_silhouettes(triangles: Triangles, surfaces: Surfaces, regions: Sequence[int]) -> NDArray[np.uint8]:
@@ -292,6 +302,7 @@ _OF_SEEN: Mapping[str, Callable[[Seen, Targets], NDArray]] = {
     "normals": draw_normals,
     "coordinates": draw_coordinates,
     "albedo": draw_albedo,
+    "covisible": draw_covisible,
 }
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 def test_a_pair_and_opencv_by_hand_have_the_same_pixels_and_both_are_timed(few, monkeypatch, capsys):
     pairs = load_pairs.Pairs(few.root, ["rgb", "depth", "region"])
-    pairs.find_paths()
     for number in range(len(pairs)):
         for ours, theirs in zip(pairs[number], pairs.by_hand(number), strict=True):
             assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs)

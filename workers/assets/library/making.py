@@ -4,13 +4,12 @@ A folder whose layout is known (ShapeNetCore, pybullet_data) or that is large is
 are asked for.
 """
 
-import fcntl
 import hashlib
 import importlib.util
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache
@@ -18,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from schemas.environment import cache_folder
-from schemas.errors import AssetSourceError, InUseError, OutputError, plain_line
+from schemas.errors import AssetSourceError, OutputError, plain_line
 from schemas.job.assets import BUILT_IN, TABLE, MeshLimits, UpAxis
 from workers.assets.library.collection import (
     SUFFIXES,
@@ -43,7 +42,7 @@ from workers.assets.library.table import (
     with_guess,
     write_table,
 )
-from workers.pool import Answers
+from workers.pool import Answers, alone_in
 from workers.source import code_digest
 
 MOST_READ = 5000
@@ -143,28 +142,9 @@ def locate_folder(name: str, job_folder: Path) -> Path:
         raise AssetSourceError(f"{name}: there is no such user, or no home folder") from error
 
 
-@contextmanager
-def locked(folder: Path, wait: bool) -> Iterator[None]:
+def locked(folder: Path, wait: bool) -> AbstractContextManager[None]:
     """Within the block no other process makes the library in this folder. Raises InUseError, or waits."""
-    is_new = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError as error:
-        raise InUseError(f"another `verso init` writes {folder}: wait for it, or choose another --out") from error
-    except BaseException:
-        if is_new:  # nothing stays of a library that was not made
-            with suppress(OSError):
-                (folder / ".lock").unlink()
-                folder.rmdir()
-        raise
-    finally:
-        os.close(handle)
+    return alone_in(folder, ".lock", "verso init", wait)
 
 
 def make_library(source: Path, out: Path | None, making: Making, watch: Watch = ignore) -> Library:
