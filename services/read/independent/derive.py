@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from services.read.independent.cameras import sensor_of
 from services.read.independent.rays import Array, Row
 
 ROUNDING = 1e-9
@@ -35,6 +36,11 @@ MOST_BROKEN_TIES = 0.25
 """Share of tied pixels that may show another point: rounding breaks some 4 %, another rule more than half."""
 
 FLOOR, TABLE, FIRST_OBJECT = 1, 2, 3
+
+
+def name_of(row: Row) -> str:
+    """The name of a view within its pair, of a row of `views` or `objects`: its role, of a camera by name `around_003`."""
+    return row["role"] if row["number"] is None else f"{row['role']}_{row['number']:03d}"
 
 
 def beside(job: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -60,7 +66,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class StoredPair:
-    """The job's keys, the rows of one pair (views by role), and a function that reads a file by its path."""
+    """The job's keys, the rows of one pair (views by name), and a function that reads a file by its path."""
 
     job: Mapping[str, Any]
     scene: Row
@@ -70,7 +76,7 @@ class StoredPair:
     stored: Mapping[str, Sequence[Kind]]
     """By role, what the job stores of a view."""
     images: dict[tuple[str, str], NDArray] = field(default_factory=dict)
-    """Decoded images by role and kind of pixel."""
+    """Decoded images by the view's name and kind of pixel."""
     shapes: dict[str, Any] = field(default_factory=dict)
     """Shapes that were read, by path; `floor`, which is in no file, where it is known."""
     findings: list[Any] = field(default_factory=list)
@@ -84,10 +90,26 @@ class StoredPair:
         return self.job.get("captures") is not None
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
-        """The pinhole camera of every view: the job's, of captures the photograph's."""
-        sensor = self.job["cameras"]["sensor"]
-        return {name: self.views["input"][name] for name in sensor} if self.is_captured else sensor
+    def is_studio(self) -> bool:
+        """Whether the object stands alone: there is no table and no floor, and nothing holds it."""
+        return bool(self.job.get("scene") == "studio")
+
+    @property
+    def named(self) -> dict[str, Mapping[str, Any]]:
+        """The job's further cameras by name."""
+        return {entry["name"]: entry for entry in self.job["cameras"].get("more", ())}
+
+    def labels(self, view: Row) -> dict[int, Row]:
+        """The rows of `objects` of a view, by region."""
+        return {row["region_id"]: row for row in self.objects if name_of(row) == name_of(view)}
+
+    def sensor(self, view: Row) -> Mapping[str, Any]:
+        """The pinhole camera of a view: the job's, of captures the photograph's; nothing where a table of poses may say it."""
+        sensor: Mapping[str, Any] = self.job["cameras"]["sensor"]
+        if self.is_captured:
+            return {name: self.views["input"][name] for name in sensor}
+        entry = self.named.get(view["role"])
+        return sensor if entry is None else sensor_of(entry, sensor)
 
     @property
     def targets(self) -> Mapping[str, Any]:
@@ -121,7 +143,8 @@ class StoredPair:
         own = own_region(kind)
         word = self.kinds(view["role"])[kind].word
         region = patch_of or own
-        suffix = f"obj{region - FIRST_OBJECT}" if region and len(self.regions) > 1 else ""
+        suffix = "" if view["number"] is None else f"_{view['number']:03d}"
+        suffix += f"obj{region - FIRST_OBJECT}" if region and len(self.regions) > 1 else ""
         return f"{view['category']}/{'patches/' if patch_of else ''}{word}{number:05d}{suffix}.png"
 
 
@@ -132,10 +155,10 @@ def own_region(kind: str) -> int | None:
 
 def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
     """Decode the view's images; type, size, and every file's size and digest in its row."""
-    role, size = view["role"], (view["height"], view["width"])
-    for name, kind in pair.kinds(role).items():
+    size = (view["height"], view["width"])
+    for name, kind in pair.kinds(view["role"]).items():
         path = pair.path(view, name)
-        image = pair.images[role, name] = _decode(pair.read(path))
+        image = pair.images[name_of(view), name] = _decode(pair.read(path))
         shape = size if kind.channels == 1 else (*size, kind.channels)
         if image.dtype != np.dtype(kind.dtype) or image.shape != shape:
             yield f"{path}: is {image.dtype} {image.shape}, and must be {kind.dtype} {shape}"
@@ -147,14 +170,14 @@ def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
     """Ids, intrinsics in both conventions, a rigid pose, and its angles."""
-    pairs, sensor, parent = pair.job["pairs_per_scene"], pair.sensor, view["parent_id"]
+    pairs, sensor, parent = pair.job["pairs_per_scene"], pair.sensor(view), view["parent_id"]
     first = 2 * pairs * pair.scene["scene_id"]
     if parent not in range(first, first + 2 * pairs, 2) or view["pose_id"] != parent + (view["role"] == "mirror"):
         yield f"ids {view['pose_id']} and {parent} do not follow from scene {pair.scene['scene_id']}"
     units = pair.job["images"]["depth_units_per_m"]
-    derived = {"cx_opencv": sensor["cx"] - 0.5, "cy_opencv": sensor["cy"] - 0.5, "depth_units_per_m": units}
-    for name, value in {**sensor, **derived}.items():
-        if view[name] != value:
+    derived = {"cx_opencv": view["cx"] - 0.5, "cy_opencv": view["cy"] - 0.5, "depth_units_per_m": units}
+    for name, value in {**derived, **sensor}.items():
+        if abs(view[name] - value) > 1e-12 * abs(value):
             yield f"{name} is {view[name]}, the {'input view' if pair.is_captured else 'job'} gives {value}"
     T = matrix(view, "T_world_cam")
     R, axis = T[:3, :3], T[:3, 2]
@@ -170,7 +193,7 @@ def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
     """Depth is z in units within the stored range, none where nothing was hit; floor pixels lie at height 0."""
-    depth, region = pair.images[view["role"], "depth"], pair.images[view["role"], "region"]
+    depth, region = pair.images[name_of(view), "depth"], pair.images[name_of(view), "region"]
     units, (low, high) = view["depth_units_per_m"], pair.job["images"]["depth_range_m"]
     some = depth[depth > 0]
     if len(some) and not (low * units - 0.5 <= some.min() and some.max() <= high * units + 0.5):
@@ -188,13 +211,20 @@ def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
     """Regions, pixel counts, boxes, object poses and image coordinates."""
-    region, scene = pair.images[view["role"], "region"], pair.scene
+    region, labels = pair.images[name_of(view), "region"], pair.labels(view)
     poses = {body["region_id"]: matrix(body, "T_world_obj") for body in pair.bodies}
-    poses[TABLE] = matrix(scene, "T_world_table")
-    labels = {row["region_id"]: row for row in pair.objects if row["role"] == view["role"]}
+    if not pair.is_studio:
+        poses[TABLE] = matrix(pair.scene, "T_world_table")
     if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses}:
         yield f"regions are {sorted(labels)} in objects, {sorted(poses)} in scenes, {np.unique(region)} in the mask"
         return
+    rgb = pair.images.get((name_of(view), "rgb"), region)
+    if (
+        rgb.ndim == 3
+        and rgb.shape[2] == 4
+        and ((rgb[..., 3] == 0) & (region > 0) | (rgb[..., 3] == 255) & (region == 0)).any()
+    ):
+        yield "alpha is 0 where the mask shows something, or 255 where it does not"
     if view["object_pixels"] != np.count_nonzero(region >= FIRST_OBJECT):
         yield f"object_pixels {view['object_pixels']} is not the number of pixels of objects"
     for number, label in labels.items():
@@ -220,10 +250,15 @@ def _shows_origin(view: Row, label: Row, T_cam_obj: Array) -> bool:
 
 
 def check_patches(pair: StoredPair, view: Row) -> Iterator[str]:
-    """Each patch is the crop centred on an object's (u, v), and is left out where it would leave the image."""
+    """Each patch is the crop centred on an object's (u, v), and is left out where it would leave the image.
+
+    Views of further cameras have none.
+    """
     role, size = view["role"], pair.job["images"]["patch"]
-    seen_from = "mirror" if role == "projected" else role
-    labels = [row for row in pair.objects if row["role"] == seen_from and row["region_id"] >= FIRST_OBJECT]
+    seen_from = pair.views["mirror" if role == "projected" else name_of(view)]
+    labels = [
+        row for region, row in pair.labels(seen_from).items() if region >= FIRST_OBJECT and role not in pair.named
+    ]
     stored = {file["path"] for file in view["files"]}
     expected = {pair.path(view, kind) for kind in pair.kinds(role)}
     for label in labels:
@@ -235,7 +270,7 @@ def check_patches(pair: StoredPair, view: Row) -> Iterator[str]:
         for kind in (kind for kind in pair.kinds(role) if own_region(kind) in (None, label["region_id"])):
             path = pair.path(view, kind, label["region_id"])
             expected.add(path)
-            crop = pair.images[role, kind][top:bottom, left:right]
+            crop = pair.images[name_of(view), kind][top:bottom, left:right]
             if path in stored and not np.array_equal(_decode(pair.read(path)), crop):
                 yield f"{path} is not the crop about ({label['u']}, {label['v']})"
     if different := expected ^ stored:
@@ -275,9 +310,11 @@ def check_projection(pair: StoredPair) -> Iterator[str]:
 
 
 def _decode(data: bytes) -> NDArray:
-    """[H, W] or [H, W, 3] RGB; empty where the bytes are no image."""
+    """[H, W], [H, W, 3] RGB or [H, W, 4] RGBA; empty where the bytes are no image."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    return np.zeros(0) if image is None else image[..., ::-1] if image.ndim == 3 else image
+    if image is None or image.ndim < 3:
+        return np.zeros(0) if image is None else image
+    return image[..., [2, 1, 0, 3][: image.shape[2]]]
 
 
 def matrix(row: Row, name: str) -> Array:
@@ -307,7 +344,8 @@ SHARE = 0.01
 def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
     """What the forces of a scene's contacts do not explain, a sentence each."""
     bodies = scene["bodies"]
-    if not bodies or job.get("captures") is not None or not job["physics"]["exact_rest"]:
+    falls = job.get("captures") is None and job.get("scene") != "studio"
+    if not bodies or not falls or not job["physics"]["exact_rest"]:
         return
     friction = job["physics"]["friction"] ** 2
     for body in bodies:

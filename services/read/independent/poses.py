@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from services.read.independent import derive
+from services.read.independent.cameras import Subject, beside_transform, check_stands, orbits_of
 from services.read.independent.derive import (
     FIRST_OBJECT,
     ROUNDING,
@@ -21,9 +22,10 @@ from services.read.independent.derive import (
     StoredPair,
     distance,
     matrix,
+    name_of,
     unproject,
 )
-from services.read.independent.targets import check_targets
+from services.read.independent.targets import check_targets, things_of
 
 FIT, FIT_SLACK, MIRROR_FIT = 0.06, 1.05, 1.5
 """What `fit` stands for: the share of the picture that objects cover, at most but for the last step of the search; T_z by d_z."""
@@ -42,7 +44,11 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
         seen = np.count_nonzero(pair.images["input", "region"] >= FIRST_OBJECT) / pair.images["input", "region"].size
         off = 0.0 if seen <= FIT_SLACK * share else math.inf
     else:
-        off = distance((T_in[:3, 3] + radius * axis)[:2], np.zeros(2))
+        least_m, most_m = radius if isinstance(radius, list) else [radius] * 2
+        level = float(axis[:2] @ axis[:2])
+        along_m = float(np.clip(-T_in[:2, 3] @ axis[:2] / level, least_m, most_m)) if level > ROUNDING else least_m
+        # The table's top has some height above the world's origin, a studio's object has its middle there.
+        off = float(np.abs((T_in[:3, 3] + along_m * axis)[: 3 if pair.is_studio else 2]).max())
     if off > ROUNDING or abs(T_in[2, 0]) > ROUNDING:
         yield "the input camera does not look at the table's centre from cameras.orbit.radius_m without roll"
     if not low - ROUNDING <= -axis[2] <= high + ROUNDING:
@@ -62,7 +68,7 @@ def check_board(pair: StoredPair) -> Iterator[str]:
 
 
 def check_poses(pair: StoredPair) -> Iterator[str]:
-    """d_z, and from it and the input camera the aligned and the mirror camera."""
+    """d_z, and from it and the input camera the aligned and the mirror camera, and those that a job fixes to either."""
     cameras, T_in = pair.job["cameras"], matrix(pair.views["input"], "T_world_cam")
     d_z = _derive_d_z(pair)
     for role, view in pair.views.items():
@@ -74,9 +80,44 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
     T_z = cameras["mirror"]["T_z_m"]
     other_side = _derive_rolled_mirror if pair.is_captured else _derive_mirror
     expected["mirror"] = expected["projected"] = other_side(T_in, d_z, MIRROR_FIT * d_z if T_z == "fit" else T_z)
+    fixed = {f"{name}_000": entry for name, entry in pair.named.items() if entry["beside"]}
+    expected |= {key: expected.get(entry["beside"], T_in) @ beside_transform(entry) for key, entry in fixed.items()}
     for role, T in expected.items():
         if role in pair.views and not (off := distance(matrix(pair.views[role], "T_world_cam"), T)) <= ROUNDING:
             yield f"T_world_cam of {role} is off by {off:.3g} from its definition"
+
+
+def check_named(pair: StoredPair) -> Iterator[str]:
+    """The cameras that a job names: how many a scene's first pair has, and where they stand, but for those of a table."""
+    is_first = pair.views["input"]["pose_id"] == 2 * pair.job["pairs_per_scene"] * pair.scene["scene_id"]
+    subject = None
+    for name, entry in pair.named.items():
+        views = sorted((view for view in pair.views.values() if view["role"] == name), key=lambda view: view["number"])
+        standing = is_first and not entry["beside"]
+        count = len(views) if entry["poses"] else sum(orbit["count"] for orbit in orbits_of(entry)) if standing else 0
+        count = 1 if entry["beside"] else count
+        if [view["number"] for view in views] != list(range(count)) or bool(views) != (standing or count == 1):
+            yield f"has {len(views)} views of camera {name}, and must have {count}, numbered from 0"
+        elif standing and not entry["poses"]:
+            try:
+                subject = subject or _subject(pair)
+            except FileNotFoundError as error:
+                pair.absent.append(str(error))
+                return
+            T = np.array([matrix(view, "T_world_cam") for view in views])
+            T_first = matrix(pair.views["input"], "T_world_cam")
+            yield from (f"camera {name} {fault}" for fault in check_stands(entry, T, subject, views[0], T_first))
+
+
+def _subject(pair: StoredPair) -> Subject:
+    """What named cameras are placed about. Raises FileNotFoundError without a shape's file."""
+    world = {region: (shape.points.reshape(-1, 3), T) for region, shape, T in things_of(pair)}
+    at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
+    objects = [region for region in world if region >= FIRST_OBJECT]
+    side_m = max(float(np.ptp(world[region][0], axis=0).max()) for region in objects)
+    return Subject(
+        np.concatenate([at[region] for region in objects]), side_m, float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
+    )
 
 
 def _derive_d_z(pair: StoredPair) -> float:
@@ -128,6 +169,8 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
         lines.append("projected images are not derived: images.projection.splat or hidden_point_removal is on")
     elif projection["enabled"] and sensor["distortion"]:
         lines.append("colours of projected images are not derived: sensor.distortion is on")
+    if tables := [entry["name"] for entry in job["cameras"]["more"] if entry["poses"]]:
+        lines.append(f"poses of {', '.join(tables)} are not derived: a table of poses has them")
     if sensor["depth_noise"]:
         lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
     if views := job.get("targets", {}).get("views"):
@@ -147,8 +190,8 @@ def check_pair(pair: StoredPair) -> list[str]:
     cameras, projection = pair.job["cameras"], pair.job["images"]["projection"]
     switches = {**derive.beside(pair.job), "mirror": cameras["mirror"], "projected": projection}
     expected = {"input", *(role for role, branch in switches.items() if branch["enabled"])}
-    if set(pair.views) != expected:
-        return [f"scene {pair.scene['scene_id']}: has views {sorted(pair.views)}, and must have {sorted(expected)}"]
+    if (there := {name for name, view in pair.views.items() if view["role"] not in pair.named}) != expected:
+        return [f"scene {pair.scene['scene_id']}: has views {sorted(there)}, and must have {sorted(expected)}"]
     faults = [fault for view in pair.views.values() for fault in derive.check_images(pair, view)]
     if faults:
         return faults
@@ -160,13 +203,14 @@ def check_pair(pair: StoredPair) -> list[str]:
         elif _has_plain_points(pair.job):
             own += derive.check_projection(pair)
         faults += [f"pose {view['pose_id']} ({role}): {fault}" for fault in own]
-    own = [*check_poses(pair), *(check_board if pair.is_captured else check_orbit)(pair)]
+    own = [*check_poses(pair), *(check_board if pair.is_captured else check_orbit)(pair), *check_named(pair)]
     return faults + [f"pair {pair.views['input']['pose_id']}: {fault}" for fault in own]
 
 
 def check_merged(read: Callable[[str], bytes], views: Sequence[Row], objects: Sequence[Row]) -> Iterator[str]:
     """camPoses.csv and objects.dat (input and mirror cameras) and cameras.csv, line by line against rows of the tables."""
     poses, seen = ([row for row in rows if row["role"] in ("input", "mirror")] for rows in (views, objects))
+    views = [{**row, "role": name_of(row)} for row in views]
     labels = ("pose_id", "category", "instance_id", "region_id", "u", "v")
     for path, header, columns, key, rows in (
         ("camPoses.csv", ["id", "parent_id", *_ELEMENTS], ("pose_id", "parent_id"), ("pose_id",), poses),
@@ -182,10 +226,11 @@ def check_merged(read: Callable[[str], bytes], views: Sequence[Row], objects: Se
             yield f"{path}: cannot be read: {error}"
 
 
-def _rank(role: str) -> int:
-    """Where lines of this role come among those of one pose: cameras that the article does not have come last."""
+def _rank(name: str) -> tuple[int, str, int]:
+    """Where lines of views of this name come among those of one pose: cameras that the article does not have come last."""
     order = ("input", "aligned", "mirror", "projected")
-    return order.index(role) if role in order else len(order)
+    role, _, number = name.partition("_")
+    return (order.index(name), "", 0) if name in order else (len(order), role, int(number))
 
 
 def _check_lines(
