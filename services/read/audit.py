@@ -23,8 +23,8 @@ from schemas.scene.shape import Shape
 from schemas.scene.view import MODALITIES, Camera, View
 from services.job.record import read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
-from services.read.independent.derive import Kind, StoredPair, check_forces
-from services.read.independent.poses import check_merged, check_pair, list_underived
+from services.read.independent.derive import Kind, StoredPair
+from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform

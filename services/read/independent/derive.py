@@ -1,4 +1,4 @@
-"""Cameras, labels, projection and forces of stored scenes by the definitions of Staszak and Belter 2024.
+"""Cameras, labels and projection of stored scenes, and their shapes, by the definitions of Staszak and Belter 2024.
 
 Matrices are [4, 4] float64, `T_a_b` takes frame b to frame a, metres; camera frames are optical (x right, y down, z
 forward). A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
@@ -7,7 +7,7 @@ forward). A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.read.independent.cameras import sensor_of
-from services.read.independent.rays import Array, Row
+from services.read.independent.rays import Array, Faces, Row, bare_faces, place_shapes, read_shape
 
 ROUNDING = 1e-9
 """Largest difference of poses, distances and angles (metres, radians) between two orders of the same arithmetic."""
@@ -34,6 +34,9 @@ TIE_M = 1e-12
 
 MOST_BROKEN_TIES = 0.25
 """Share of tied pixels that may show another point: rounding breaks some 4 %, another rule more than half."""
+
+FLOOR_M = 1e4
+"""Half the side of a floor, or of a capture's board, which are in no file: planes, whose colour is not judged."""
 
 FLOOR, TABLE, FIRST_OBJECT = 1, 2, 3
 
@@ -146,6 +149,40 @@ class StoredPair:
         suffix = "" if view["number"] is None else f"_{view['number']:03d}"
         suffix += f"obj{region - FIRST_OBJECT}" if region and len(self.regions) > 1 else ""
         return f"{view['category']}/{'patches/' if patch_of else ''}{word}{number:05d}{suffix}.png"
+
+
+def faces_of(pair: StoredPair, view: Row) -> Faces:
+    """Floor, table and objects, or board and object, in the camera's frame. Raises FileNotFoundError without a shape's file.
+
+    Targets of a capture are of the stored corners, and not of those before rounding.
+    """
+    T_cam_world = np.asarray(np.linalg.inv(matrix(view, "T_world_cam")), np.float64)
+    plane = TABLE if pair.is_captured else FLOOR
+    placed = [] if pair.is_studio else [(plane, pair.shapes.get("floor") or _plane(), T_cam_world)]
+    return place_shapes(placed + [(region, shape, T_cam_world @ T) for region, shape, T in things_of(pair)])
+
+
+def things_of(pair: StoredPair) -> list[tuple[int, Faces, Array]]:
+    """The table, where there is one, and the objects: (region, shape, pose [4, 4] in the world). Raises as `faces_of`."""
+    scene, things = pair.scene, list[tuple[int, Faces, Array]]()
+    table = {"region_id": TABLE, "category": "table", "instance_id": scene["table_id"]}
+    on_table = not pair.is_captured and not pair.is_studio
+    for body in (*([table] if on_table else []), *pair.bodies):
+        path = f"assets/{body['category']}/{body['instance_id']}.glb"
+        if path not in pair.shapes:
+            shape = read_shape(pair.read(path))
+            rounding_m = shape.rounding_m * (not pair.is_captured)
+            pair.shapes[path] = replace(shape, rounding_m=rounding_m)
+        T_world = matrix(scene, "T_world_table") if body is table else matrix(body, "T_world_obj")
+        things.append((body["region_id"], pair.shapes[path], T_world))
+    return things
+
+
+def _plane() -> Faces:
+    """A floor or a board, without a colour."""
+    corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    points = corners[[[0, 1, 2], [0, 2, 3]]]
+    return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
 
 
 def own_region(kind: str) -> int | None:
@@ -333,60 +370,3 @@ def unproject(view: Row, depth: NDArray) -> tuple[Array, NDArray[np.int64]]:
     z = depth[rows, columns] / view["depth_units_per_m"]
     x, y = (columns + 0.5 - view["cx"]) / view["fx"] * z, (rows + 0.5 - view["cy"]) / view["fy"] * z
     return np.stack([x, y, z, np.ones_like(z)]), rows * view["width"] + columns
-
-
-GRAVITY_M_S2 = 9.81
-
-SHARE = 0.01
-"""Of a weight, or of a weight at the lever of the farthest contact: what may be without balance."""
-
-
-def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
-    """What the forces of a scene's contacts do not explain, a sentence each."""
-    bodies = scene["bodies"]
-    falls = job.get("captures") is None and job.get("scene") != "studio"
-    if not bodies or not falls or not job["physics"]["exact_rest"]:
-        return
-    friction = job["physics"]["friction"] ** 2
-    for body in bodies:
-        for fault in _check_body(body, friction):
-            yield f"scene {scene['scene_id']}, region {body['region_id']}: {fault}"
-    yield from (f"scene {scene['scene_id']}: {fault}" for fault in _check_reactions(bodies))
-
-
-def _check_body(body: Row, friction: float) -> Iterator[str]:
-    contacts = body["contacts"]
-    if not contacts:
-        yield "nothing holds it"
-        return
-    force, normal, point = (np.array([contact[name] for contact in contacts]) for name in ("force", "normal", "point"))
-    weight, lever = body["mass_kg"] * GRAVITY_M_S2, point - np.array(body["com"])
-    left = np.linalg.norm(force.sum(axis=0) - [0.0, 0.0, weight]) / weight
-    turning = np.linalg.norm(np.cross(lever, force).sum(axis=0)) / (weight * np.linalg.norm(lever, axis=1).max())
-    if not left <= SHARE:
-        yield f"its contact forces leave {left:.1%} of its weight over"
-    if not turning <= SHARE:
-        yield f"its contact forces turn it, by {turning:.1%} of its weight at the lever of its farthest contact"
-    if not np.allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-9):
-        yield "a normal of a contact has not the length 1"
-    pressed = (force * normal).sum(axis=1)
-    slipping = np.linalg.norm(force - pressed[:, None] * normal, axis=1)
-    if (pressed < -ROUNDING * weight).any():
-        yield "a contact pulls"
-    if (slipping > friction * pressed + ROUNDING * weight).any():
-        yield f"a contact needs more than its friction of {friction:g}"
-
-
-def _check_reactions(bodies: list[Row]) -> Iterator[str]:
-    """Two bodies press one another with one force at one point."""
-    forces = dict[tuple[int, int], Array]()
-    for body in bodies:
-        for contact in body["contacts"]:
-            if contact["with_region"] != TABLE:
-                pair = (body["region_id"], contact["with_region"])
-                total = forces.setdefault(pair, np.zeros(3))
-                total += contact["force"]
-    for (one, other), force in forces.items():
-        back = forces.get((other, one), np.zeros(3))
-        if not np.allclose(force, -back, rtol=1e-9, atol=1e-9):
-            yield f"region {one} presses region {other} with another force than that region it"

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from services.read.independent.derive import (
     FIRST_OBJECT,
     FLOOR,
-    TABLE,
     Array,
     Kind,
     Row,
     StoredPair,
+    faces_of,
     matrix,
     name_of,
 )
@@ -28,12 +28,9 @@ from services.read.independent.rays import (
     BEHIND_M,
     Faces,
     Hits,
-    bare_faces,
     cast,
     choices,
     on_edges,
-    place_shapes,
-    read_shape,
     seen_by,
 )
 
@@ -52,9 +49,6 @@ MOST_UNSURE = 12
 
 ENOUGH_WRONG = 40
 """After so many wrong pixels of an image, all others without the exact answer count as wrong."""
-
-FLOOR_M = 1e4
-"""Half the side of a floor, or of a capture's board, which are in no file: planes, whose colour is not judged."""
 
 
 @dataclass(frozen=True)
@@ -93,40 +87,6 @@ def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
         if one.wrong:
             at = f"pixel {one.first} is the first, the worst away from edges is {one.worst:.3g} {one.unit}"
             yield f"{one.target}: {one.wrong} of {one.pixels} pixels are not what the shapes show: {at}"
-
-
-def faces_of(pair: StoredPair, view: Row) -> Faces:
-    """Floor, table and objects, or board and object, in the camera's frame. Raises FileNotFoundError without a shape's file.
-
-    Targets of a capture are of the stored corners, and not of those before rounding.
-    """
-    T_cam_world = np.asarray(np.linalg.inv(matrix(view, "T_world_cam")), np.float64)
-    plane = TABLE if pair.is_captured else FLOOR
-    placed = [] if pair.is_studio else [(plane, pair.shapes.get("floor") or _plane(), T_cam_world)]
-    return place_shapes(placed + [(region, shape, T_cam_world @ T) for region, shape, T in things_of(pair)])
-
-
-def things_of(pair: StoredPair) -> list[tuple[int, Faces, Array]]:
-    """The table, where there is one, and the objects: (region, shape, pose [4, 4] in the world). Raises as `faces_of`."""
-    scene, things = pair.scene, list[tuple[int, Faces, Array]]()
-    table = {"region_id": TABLE, "category": "table", "instance_id": scene["table_id"]}
-    on_table = not pair.is_captured and not pair.is_studio
-    for body in (*([table] if on_table else []), *pair.bodies):
-        path = f"assets/{body['category']}/{body['instance_id']}.glb"
-        if path not in pair.shapes:
-            shape = read_shape(pair.read(path))
-            rounding_m = shape.rounding_m * (not pair.is_captured)
-            pair.shapes[path] = replace(shape, rounding_m=rounding_m)
-        T_world = matrix(scene, "T_world_table") if body is table else matrix(body, "T_world_obj")
-        things.append((body["region_id"], pair.shapes[path], T_world))
-    return things
-
-
-def _plane() -> Faces:
-    """A floor or a board, without a colour."""
-    corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    points = corners[[[0, 1, 2], [0, 2, 3]]]
-    return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
 
 
 def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
