@@ -355,6 +355,20 @@ def distort(u: Array, v: Array, lens: Distortion, k: Intrinsics) -> tuple[Array,
     return x.reshape(u.shape), y.reshape(v.shape)
 
 
+def spread_colours(rgb: NDArray[np.uint8], region: NDArray[np.uint8]) -> None:
+    """Give each pixel of rgb [H, W, 3] that shows nothing (region [H, W] is 0) the colour of the nearest that does, in place."""
+    if not region.any() or region.all():
+        return
+    _, nearest = cv2.distanceTransformWithLabels(
+        (region == 0).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    shown = np.flatnonzero(region)
+    at = np.zeros(int(nearest.max()) + 1, np.int64)
+    at[nearest.reshape(-1)[shown]] = shown
+    beside = region == 0
+    rgb[beside] = rgb.reshape(-1, 3)[at[nearest[beside]]]
+
+
 def undistort(u: Array, v: Array, lens: Distortion, k: Intrinsics) -> tuple[Array, Array]:
     """The inverse of `distort`: pinhole coordinates of (u, v) through the lens; nan where the lens maps nothing to."""
     x, y = rays_of_pixels(np.stack([u.ravel(), v.ravel()], axis=1), k, opencv_lens(lens)).T

@@ -128,7 +128,7 @@ def render_view(
         depth = quantise_depth(buffer.depth_m, job.images)
     further = draw_targets(scene.posed.things, camera, buffer.region, job, scene.effects, stopwatch, sight)
     alpha = further.pop("alpha", None)
-    rgb = buffer.rgb if alpha is None or buffer.rgb is None else with_alpha(buffer.rgb, buffer.region, alpha)
+    rgb = buffer.rgb if alpha is None or buffer.rgb is None else with_alpha(buffer.rgb, alpha)
     return View(role, pose_id, parent_id, camera, rgb, depth, buffer.region, labels, further, number)
 
 

@@ -32,20 +32,9 @@ def cover_pixels(triangles: Triangles, region: NDArray[np.uint8]) -> NDArray[np.
     return np.where(inner > 0, np.uint8(255), alpha).astype(np.uint8)
 
 
-def with_alpha(rgb: NDArray[np.uint8], region: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[H, W, 4]: colour with straight alpha. A pixel whose centre shows nothing has the colour of the nearest that does."""
-    colour = rgb.copy()
-    beside = (alpha > 0) & (region == 0)
-    if beside.any() and (region > 0).any():
-        _, nearest = cv2.distanceTransformWithLabels(
-            (region == 0).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        shown = np.flatnonzero(region)
-        at = np.zeros(int(nearest.max()) + 1, np.int64)
-        at[nearest.reshape(-1)[shown]] = shown
-        colour[beside] = rgb.reshape(-1, 3)[at[nearest[beside]]]
-    colour[alpha == 0] = 0
-    return np.dstack([colour, alpha])
+def with_alpha(rgb: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """[H, W, 4]: colour [H, W, 3], which goes on beyond the mask, with straight alpha; 0 where nothing is covered."""
+    return np.dstack([np.where(alpha[..., None] > 0, rgb, np.uint8(0)), alpha])
 
 
 @compiled_for("u1[:,::1]")

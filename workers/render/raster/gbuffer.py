@@ -35,7 +35,7 @@ from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, Appearance
 from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_plane_depth, fourth_channel
+from workers.geometry.pixels import fill_plane_depth, fourth_channel, spread_colours
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import (
@@ -194,6 +194,8 @@ class Renderer:
         if ground is not None:
             fill_plane_depth(depth_m, region, REGION_FLOOR, ground, view.k)
         if rgb is not None:
+            if effects.runs("alpha"):  # else edges are blended with a background that is not there
+                spread_colours(rgb, region)
             self._refine(rgb, region, things, view, render.samples)
             rgb.setflags(write=False)
         self._scene_size = len(things)
