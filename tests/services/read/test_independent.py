@@ -305,7 +305,7 @@ WRONG_NAMED: dict[str, tuple[object, str, Callable[[Any], object], dict[str, Any
     "fit": (
         cameras._Placed,
         "fit_m",
-        lambda f: lambda placed, share, k: f(placed, share, k.model_copy(update={"fx": k.fy})),
+        lambda f: lambda placed, share, k, ends: f(placed, share, k.model_copy(update={"fx": k.fy}), ends),
         {},
         "camera hammersley stands",
     ),
