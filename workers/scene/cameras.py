@@ -79,13 +79,12 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
     """The plan with input cameras that frame its objects, where the orbit says so, in the directions that were drawn.
 
     poses: `T_world_obj` [4, 4] of each object.
-    Raises ViewError `not_framed` where a camera stands nearer to an object than the object is large, or where the objects do
-    not fit into the picture and the range of depth.
+    Raises ViewError `not_framed` where a camera at a given distance stands nearer to an object than the object is large, or where
+    the objects do not fit into the picture and the range of depth.
     """
-    placed = list(zip(plan.objects, poses, strict=True))
-    cameras = plan.input_cameras
-    if job.cameras.orbit.share is not None:
-        cameras = tuple(_frame(job, camera, placed, job.cameras.orbit.share) for camera in cameras)
+    placed, cameras = list(zip(plan.objects, poses, strict=True)), plan.input_cameras
+    if (share := job.cameras.orbit.share) is not None:
+        return replace(plan, input_cameras=tuple(_frame(job, camera, placed, share) for camera in cameras))
     for start, T in placed:
         box = start.asset.shape.bounds
         size, middle = float(np.linalg.norm(box[1] - box[0])), transform(T, box.mean(axis=0)[None, :])[0]
@@ -95,7 +94,7 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
                 f"{start.asset.instance_id} is {size:.3g} m across, and the input camera stands {near:.3g} m from its middle: "
                 "set cameras.orbit.radius_m: fit, or make the object smaller",
             )
-    return replace(plan, input_cameras=cameras)
+    return plan
 
 
 def _frame(job: Job, camera: Camera, placed: Sequence[tuple[ObjectStart, Pose]], share: float) -> Camera:
