@@ -34,6 +34,7 @@ from schemas.dataset.layout import (
 )
 from schemas.errors import CorruptError, plain_line
 from schemas.job.cameras import CAMERA_NAME
+from schemas.scene.view import MODALITIES
 from workers.store.store import Stage
 
 Rows = Mapping[str, Sequence[Mapping[str, Any]]]
@@ -128,6 +129,7 @@ _MEMBER = re.compile(
 )
 _LABEL = re.compile(r"(?P<pose>\d{5}|[1-9]\d{5,})\.json", re.ASCII)
 _CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
+_WORDS = {modality.word.rstrip("_") for modality in MODALITIES.values()}
 
 
 def member_of(path: str) -> tuple[str, str]:
@@ -293,6 +295,8 @@ class _Archive:
 
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:
     match = pattern.fullmatch(name)
-    if match is None or match["content"] not in _CONTENTS:
+    if match is None or match["content"].removesuffix(f"_{match['name']}_") not in (
+        _WORDS if match["name"] else _CONTENTS
+    ):
         raise ValueError(f"{name!r} is not the name of an image")
     return match
