@@ -13,6 +13,7 @@ all with depth; `image`, all. The scene's floor and table are not in `seen` and 
 and they would drown it.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,7 +35,7 @@ from services.dataset.pair import Pair, carry
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
 from services.score.pose import INVERTED, box_of, check_distance, correlation, score_pose, score_volume, symmetries_of
-from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
+from services.score.predictions import Key, file_in, read_array, read_image, read_pose, read_shape
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
@@ -157,7 +158,7 @@ def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folde
             where = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
             raise InputError(f"the id is there {len(names)} times: {where}")
         with as_refusal(f"{kind} {names[0]}"):
-            prediction = folder / kind / names[0] if kind != "pose" else names[0]
+            prediction = file_in(folder, f"{kind}/{names[0]}") if kind != "pose" else names[0]
             scorer = _READERS[kind](prediction, region, prepared, truth, asked)
             scores, note = scorer() if kind == "depth" or not asked.check else ({}, None)
     except VersoError as error:
@@ -377,7 +378,7 @@ def _read_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked
     view = truth.pair.input if asked.frame == "input" else truth.view
     T_true = read_matrix(view.regions[region]["T_cam_obj"])
     T = read_pose(text)
-    off_m, away_m = float(np.linalg.norm(T[:3, 3])), float(np.linalg.norm(T_true[:3, 3]))
+    off_m, away_m = math.hypot(*T[:3, 3]), math.hypot(*T_true[:3, 3])  # which does not overflow
     if not 1e-2 < off_m / away_m < 1e2:
         raise InputError(f"t is {off_m / away_m:.4g} times as far as the object: BOP's csv has millimetres")
     return lambda: (score_pose(T, T_true, prepared.vertices, symmetries_of(prepared), view.K), None)
