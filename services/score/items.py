@@ -82,19 +82,27 @@ class Asked:
 
     kinds: tuple[str, ...]
     frame: PredictedFrame = "object"
-    samples: int = 10_000
-    """Points drawn on a surface."""
-    seed: int = 0
-    align: Alignment = "none"
     split: Split | Literal["all"] = "all"
     """Which scenes are scored: all, or those whose objects all are of instances of one split."""
     level: str = "all"
     """Which of them: those of a level of `LEVELS`, whose split `split` is then."""
     volume: Volume = "auto"
+    samples: int = 10_000
+    """Points drawn on a surface."""
+    seed: int = 0
+    align: Alignment = "none"
     check: bool = False
     """Whether predictions are read and held against units, sizes and places alone, and not scored but for holes."""
     flip: bool = False
     """Whether FLIP is among the metrics of RGB: it takes 0.7 s an image of 640 x 480."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError where a level is not of the split that is named beside it."""
+        if self.level != "all":
+            split = LEVELS[self.level][0]
+            if self.split not in ("all", split):
+                raise InputError(f"level {self.level} is of the split {split}: leave --split {self.split} out")
+            object.__setattr__(self, "split", split)
 
 
 def column(kind: str, name: str) -> str:
