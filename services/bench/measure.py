@@ -23,9 +23,10 @@ from workers.assets.catalogue import open_catalogue
 from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import FLAT, Renderer
-from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
 from workers.scene.make_scene import Scene, make_scene
 from workers.shard.run_shard import run_ranges
+from workers.stopwatch import Stopwatch
 from workers.store.commit import committed_files, read_record
 from workers.store.file_system import OpenTree
 from workers.store.images import decode_png, encode_png

@@ -21,6 +21,7 @@ from cachetools import LRUCache
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import view_name
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError, InputError, SceneError, command_line, needs_making
 from schemas.job.assets import NO_SPLIT, SPLITS, SplitShares
@@ -239,6 +240,8 @@ class RangeRows:
     """The rows of some scenes: `pair_table`, and those of `objects` and `assets`."""
 
     pairs: pa.Table
+    more: pa.Table
+    """Those of `views` of named cameras."""
     objects: pa.Table
     assets: pa.Table
 
@@ -246,7 +249,8 @@ class RangeRows:
     def of(cls, rows: Callable[[str], pa.Table]) -> "RangeRows":
         """`rows` returns the scenes' rows of a table."""
         tables = {name: rows(name) for name in PAIR_TABLES}
-        return cls(pair_table(tables), rows("objects"), tables["assets"])
+        more = tables["views"].filter(pc.field("number").is_valid())
+        return cls(pair_table(tables), more, rows("objects"), tables["assets"])
 
     def of_scene(self, scene_id: int) -> "RangeRows":
         """The same with the pairs of one scene, which stand together: a filter would copy them, which takes 1 ms."""
@@ -256,7 +260,7 @@ class RangeRows:
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
-        return int(self.pairs.nbytes + self.objects.nbytes + self.assets.nbytes)
+        return int(self.pairs.nbytes + self.more.nbytes + self.objects.nbytes + self.assets.nbytes)
 
 
 @dataclass(frozen=True)
@@ -279,9 +283,12 @@ def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) 
         defaultdict[tuple[int, str], list[Row]](list),
     )
     for row in chosen.to_pylist():
-        labels[row["pose_id"], row["role"]].append(row | {"asset": assets[row["instance_id"]]})
+        name = view_name(row["role"], row["number"])
+        labels[row["pose_id"], name].append(row | {"asset": assets[row["instance_id"]]})
     for number in np.argsort(table.column("parent_id").to_numpy()):
-        yield read_pair(table.slice(number, 1).to_pylist()[0], labels, files)
+        row = table.slice(number, 1).to_pylist()[0]
+        further = rows.more.filter(pc.field("parent_id") == row["parent_id"]).to_pylist() if len(rows.more) else ()
+        yield read_pair(row, labels, files, further)
 
 
 def make_scene(
@@ -295,8 +302,9 @@ def make_scene(
     """
     with needs_making("verso.make_scene"):
         from workers.capture.results import open_sources
-        from workers.scene.context import Stopwatch, open_worker
+        from workers.scene.context import open_worker
         from workers.shard.run_shard import run_scene
+        from workers.stopwatch import Stopwatch
 
     parsed, folder = _parse(job, changes)
     catalogue = open_sources(parsed, folder)

@@ -25,6 +25,7 @@ from schemas.dataset.layout import (
     README_FILE,
     merged_table_path,
     stored_roles,
+    view_name,
 )
 from schemas.dataset.shard import Fingerprint
 from schemas.dataset.tables import SCHEMAS
@@ -32,7 +33,7 @@ from schemas.errors import CorruptError
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
 from schemas.job.job import Job
-from schemas.scene.view import ROLES
+from schemas.scene.view import ROLES, Role
 from services.job.record import JobRecord
 from workers.store.commit import is_sealed, seal
 from workers.store.manifest import PARQUET_OPTIONS, TableDigest, row_keys
@@ -197,10 +198,20 @@ def cam_pose_lines(views: pa.Table) -> bytes:
 
 
 def camera_lines(views: pa.Table) -> bytes:
-    """One line for each camera, by pose id and then in the order input, aligned, mirror, projected."""
-    poses, roles = (views.column(name).to_pylist() for name in ("pose_id", "role"))
-    order = sorted(range(len(views)), key=lambda row: (poses[row], ROLES.index(roles[row])))
-    return _lines(views.take(pa.array(order, pa.int64())), [*_CAMERA_COLUMNS, "T_world_cam"], ",")
+    """One line for each camera, by pose id and then in the order input, aligned, mirror, projected, and named cameras.
+
+    The role of a named camera is its view's name, such as `around_003`.
+    """
+    poses, roles, numbers = (views.column(name).to_pylist() for name in ("pose_id", "role", "number"))
+    order = sorted(range(len(views)), key=lambda row: (poses[row], *_place(roles[row], numbers[row])))
+    names = pa.array(list(map(view_name, roles, numbers)), pa.string())
+    named = views.set_column(views.column_names.index("role"), "role", names)
+    return _lines(named.take(pa.array(order, pa.int64())), [*_CAMERA_COLUMNS, "T_world_cam"], ",")
+
+
+def _place(role: Role, number: int | None) -> tuple[int, str, int]:
+    """Where a view stands among those of its pose."""
+    return (ROLES.index(role), "", 0) if number is None else (len(ROLES), role, number)
 
 
 def object_lines(objects: pa.Table) -> bytes:

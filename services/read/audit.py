@@ -32,10 +32,11 @@ from workers.geometry.raycast import edge_distance_px
 from workers.physics.hold import release_again
 from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.rows import record_scene
+from workers.stopwatch import Stopwatch
 from workers.store.commit import committed_files
 from workers.store.store import Store
 

@@ -30,9 +30,10 @@ from services.read.independent.targets import Finding
 from tests.judge.piles import catalogue_of
 from workers.assets.glb import asset_glb
 from workers.capture.make_capture import run_capture
-from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.rows import record_scene
+from workers.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ a command's start, and a coordinator of built-in shapes needs none of it.
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ from schemas.job.assets import (
 )
 from schemas.job.job import differing_keys
 from schemas.scene.shape import Asset
+from workers.assets.poses import PoseFile
 from workers.geometry.frames import add_up
 
 if TYPE_CHECKING:
@@ -72,6 +73,8 @@ class Catalogue:
     digest: str
     captures: tuple[CaptureListing, ...] = ()
     """Folders of captures, in order; the digest covers their files too."""
+    poses: Mapping[str, PoseFile] = field(default_factory=dict)
+    """Tables of camera poses by the name of their camera; the digest covers them too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""

@@ -39,8 +39,9 @@ from workers.door.meshes.mesh import is_solid
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import translation
 from workers.scene.chance import SceneChance
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.plan import choose_assets
+from workers.stopwatch import Stopwatch
 from workers.store.file_system import temporary_folder
 
 BOARD = "board"

@@ -12,9 +12,9 @@ import workers.geometry.camera as camera
 import workers.geometry.pixels as pixels
 import workers.geometry.projection as projection
 import workers.render.pathtraced as pathtraced
+import workers.scene.cameras as cameras
 import workers.scene.labels as labels
 import workers.scene.pairs as pairs
-import workers.scene.plan as plan
 from schemas.dataset.shard import Fingerprint
 from schemas.scene.view import Camera, Intrinsics
 from services.read.audit import describe_independent, verify_independently
@@ -24,8 +24,8 @@ from tests.datasets import faults_of, make_dataset, run_here
 from workers.capture import make_capture, rows
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
-from workers.scene.targets import draw_targets
 from workers.shard.fingerprint import take_fingerprint
+from workers.targets.targets import draw_targets
 
 HEALTHY = {
     "defaults": {},
@@ -150,13 +150,13 @@ def transposed(original: Callable) -> Callable:
 
 
 WRONG = {
-    "mirrored phi": (pairs.mirror_pose, lambda _: turned_mirror(-1.0), "T_world_cam of mirror is off"),
+    "mirrored phi": (cameras.mirror_pose, lambda _: turned_mirror(-1.0), "T_world_cam of mirror is off"),
     "nearest for percentile": (
         pairs.front_distance,
         lambda f: lambda z, own, mirror: f(z, own, mirror.model_copy(update={"percentile": 0.0})),
         "the object's input depth gives",
     ),
-    "offset": (pairs.place_beside, other_offset, "T_world_cam of aligned is off by 0.1"),
+    "offset": (cameras.place_beside, other_offset, "T_world_cam of aligned is off by 0.1"),
     "orbit": (
         camera.orbit_pose,
         lambda f: lambda centre, inclination, yaw, radius: f(centre, inclination, yaw, 0.99 * radius),
@@ -201,7 +201,7 @@ def test_a_wrong_formula_passes_plain_verify_and_not_the_second_derivation(tmp_p
 
 
 def test_a_framed_object_that_covers_more_than_was_asked_for_is_found(tmp_path, plant):
-    plant(plan._frame, lambda *given, right=plan._frame: right(*given[:-1], 1.2 * given[-1]))
+    plant(cameras._frame, lambda *given, right=cameras._frame: right(*given[:-1], 1.2 * given[-1]))
     store, _ = make_dataset(tmp_path, scenes=1, **HEALTHY["framed"])
     assert faults_of(store) == []
     (fault,) = verify_independently(store, 1, lambda _: None).faults
@@ -211,7 +211,7 @@ def test_a_framed_object_that_covers_more_than_was_asked_for_is_found(tmp_path, 
 @pytest.mark.parametrize("wrong", [lambda _: turned_mirror(1.0), farther_mirror], ids=["without roll", "T_z"])
 def test_a_wrong_mirror_camera_of_a_rolled_photograph_is_found(plant, tmp_path, monkeypatch, wrong):
     use_exact_captures(monkeypatch)
-    plant(pairs.mirror_pose, wrong(pairs.mirror_pose))
+    plant(cameras.mirror_pose, wrong(cameras.mirror_pose))
     store, _ = run_here(captures_job(scenes=1), tmp_path)
     assert faults_of(store) == []
     faults = verify_independently(store, 1, lambda _: None).faults
