@@ -27,6 +27,7 @@ from schemas.dataset.layout import (
     Content,
     file_pose_id,
     image_path,
+    images_of,
     is_shape,
     patch_path,
     tar_path,
@@ -291,8 +292,13 @@ class _Archive:
         self._sha256.update(data)
 
 
+def _contents_of(name: str) -> list[Content]:
+    """The words in the names of a named camera's images."""
+    return [image.content for image in images_of(name)]
+
+
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:
     match = pattern.fullmatch(name)
-    if match is None or match["content"] not in _CONTENTS:
+    if match is None or match["content"] not in (_contents_of(match["name"]) if match["name"] else _CONTENTS):
         raise ValueError(f"{name!r} is not the name of an image")
     return match
