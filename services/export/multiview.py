@@ -2,8 +2,8 @@
 
 The first three show an object alone: RGBA, whose alpha is that of a studio scene, else the pixels of the object. They have the
 views of cameras of `cameras.more` that stand by themselves (rings, spheres, poses), of a job without such those of its pairs.
-Their frame has the world's axes, z up, the middle of the object's box as its origin, and a unit in which the longest side of that
-box is `SIDE`; cameras look along -z with y up (OpenGL), as Blender has them.
+Their frame has the world's axes, z up, the middle of the object's box along these as its origin, and a unit in which the longest
+side of that box is `SIDE`; cameras look along -z with y up (OpenGL), as Blender has them.
 
 `stereo` is the layout of Middlebury 2014, which RAFT-Stereo and its successors read: a folder for each rectified pair of views.
 """
@@ -26,8 +26,9 @@ from schemas.job.cameras import More
 from schemas.job.job import Job
 from services.export.formats import LeftOut, Writer, encode_json, encode_npy, encode_npz
 from services.export.graphics import OPENGL_FROM_OPTICAL
+from services.export.objects import NO_SHAPE
 from services.export.source import ExportPair, ExportScene
-from workers.geometry.frames import invert
+from workers.geometry.frames import invert, transform
 from workers.store.images import encode_png
 
 NOT_SQUARE: Final = (
@@ -39,12 +40,16 @@ Seen = tuple[ExportPair, str]
 
 
 class Subject(NamedTuple):
-    """The object that a folder is of: the folder's name, its region, the layout's unit by metres, and its pose [4, 4]."""
+    """The object that a folder is of: its region, the layout's unit by metres, and where the world has its frame's origin [3].
 
-    name: str
+    `points` [V, 3] and `faces` are its shape in that frame and unit.
+    """
+
     region_id: int
     unit: float
-    T_world_obj: Array
+    origin: Array
+    points: Array
+    faces: NDArray[np.int32]
 
 
 class MultiView(Writer):
@@ -53,8 +58,6 @@ class MultiView(Writer):
     FRESH: ClassVar = {"objects": {}, "views": [], "fov_deg": []}
     SIDE: ClassVar[float]
     """Of the object's box, its longest, in the layout's unit."""
-    FOLDER: ClassVar[str] = ""
-    """What the folders of objects lie in, within their split's."""
     LIST: ClassVar[str]
     """The file that lists the folders of a split."""
 
@@ -76,12 +79,14 @@ class MultiView(Writer):
         reason = next(filter(None, colourless), "") or next((NOT_SQUARE for view in views if not is_square(view)), "")
         if reason:
             return [(pair.pose_id, reason) for pair in scene.pairs]
-        for region_id, (category, instance_id) in scene.instances.items():
-            several = f"-{region_id}" if len(scene.instances) > 1 else ""
-            name = f"{category}-{scene.scene_id:06d}{several}"
-            unit = self.SIDE / max(scene.assets[instance_id]["extents_m"])
-            self._subject = Subject(name, region_id, unit, read_world_poses(scene.row)[region_id])
-            self.write(scene, f"{scene.split}/{self.FOLDER}{name}", views)
+        placed = ((region_id, self._place(scene, region_id)) for region_id in scene.instances)
+        subjects = {region_id: subject for region_id, subject in placed if subject is not None}
+        if len(subjects) < len(scene.instances):
+            return [(pair.pose_id, NO_SHAPE) for pair in scene.pairs]
+        for region_id, self._subject in subjects.items():
+            several = f"-{region_id}" if len(subjects) > 1 else ""
+            name = f"{scene.instances[region_id][0]}-{scene.scene_id:06d}{several}"
+            self.write(scene, name, views)
             self.register.add(scene.split, name)
             self.count("objects", scene.split)
         self.kept["views"] = sorted({*self.kept["views"], len(views)})
@@ -89,8 +94,17 @@ class MultiView(Writer):
         self.kept["fov_deg"] = sorted({*self.kept["fov_deg"], *fovs})
         return []
 
-    def write(self, scene: ExportScene, folder: str, views: list[Seen]) -> None:
-        """Writes the object's folder."""
+    def _place(self, scene: ExportScene, region_id: int) -> Subject | None:
+        """An object in the layout's frame; None where its shape is not to be had."""
+        if (shape := self.shapes.load(scene, scene.instances[region_id][1])) is None:
+            return None
+        points = transform(read_world_poses(scene.row)[region_id], shape.vertices)
+        low, high = points.min(axis=0), points.max(axis=0)
+        unit, origin = self.SIDE / float((high - low).max()), 0.5 * (low + high)
+        return Subject(region_id, unit, origin, unit * (points - origin), shape.faces)
+
+    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
+        """Writes the folder of an object."""
         raise NotImplementedError
 
     def colour(self, view: Seen) -> bytes:
@@ -102,7 +116,7 @@ class MultiView(Writer):
         """[4, 4] camera to the object's frame, OpenGL."""
         pair, name = view
         T = read_matrix(pair.views[name]["T_world_cam"]) @ OPENGL_FROM_OPTICAL
-        T[:3, 3] = self._subject.unit * (T[:3, 3] - self._subject.T_world_obj[:3, 3])
+        T[:3, 3] = self._subject.unit * (T[:3, 3] - self._subject.origin)
         return T
 
     def depth(self, view: Seen) -> NDArray[np.float64]:
@@ -113,14 +127,14 @@ class MultiView(Writer):
         unit = self._subject.unit / pair.views[name]["depth_units_per_m"]
         return np.where(region == self._subject.region_id, unit * depth, 0.0)
 
-    def list_of(self, names: list[str]) -> bytes:
+    def list_of(self, split: str, names: list[str]) -> bytes:
         """What lists the folders of a split."""
         raise NotImplementedError
 
     def finish(self) -> None:
         """Writes the list of each split."""
         for split, _ in self.register.counts():
-            self.folder.put(f"{split}/{self.LIST}", self.list_of([name for _, name in self.register.of(split)]))
+            self.folder.put(f"{split}/{self.LIST}", self.list_of(split, [name for _, name in self.register.of(split)]))
 
     def describe(self) -> dict[str, Any]:
         """Objects by split, and the conventions."""
@@ -151,13 +165,14 @@ class Zero123(MultiView):
     SIDE: ClassVar = 1.0
     LIST: ClassVar = "valid_paths.json"
 
-    def write(self, scene: ExportScene, folder: str, views: list[Seen]) -> None:
+    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
         """Writes pictures and poses."""
+        folder = f"{scene.split}/{name}"
         for number, view in enumerate(views):
             self.folder.put(f"{folder}/{number:03d}.png", self.colour(view))
             self.folder.put(f"{folder}/{number:03d}.npy", encode_npy(invert(self.pose(view))[:3]))
 
-    def list_of(self, names: list[str]) -> bytes:
+    def list_of(self, split: str, names: list[str]) -> bytes:
         """The names."""
         return encode_json(names)
 
@@ -171,13 +186,13 @@ class InstantMesh(MultiView):
 
     NEEDS: ClassVar = {"views": ("normals",)}
     SIDE: ClassVar = 2.0
-    FOLDER: ClassVar = "rendering_random_32views/"
     LIST: ClassVar = "filtered_obj_name.json"
     DEPTH: ClassVar = 6.0
     """The depth of 255."""
 
-    def write(self, scene: ExportScene, folder: str, views: list[Seen]) -> None:
+    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
         """Writes pictures, normals and depth, and the poses."""
+        folder = f"{scene.split}/rendering_random_32views/{name}"
         for number, view in enumerate(views):
             depth = np.rint(np.clip(self.depth(view) * (255.0 / self.DEPTH), 0.0, 255.0)).astype(np.uint8)
             self.folder.put(f"{folder}/{number:03d}.png", self.colour(view))
@@ -196,7 +211,7 @@ class InstantMesh(MultiView):
         colours = np.where(seen[..., None], np.rint(127.5 * (normals + 1.0)), 0.0)
         return np.concatenate([colours, 255.0 * seen[..., None]], axis=2).astype(np.uint8)
 
-    def list_of(self, names: list[str]) -> bytes:
+    def list_of(self, split: str, names: list[str]) -> bytes:
         """The names, as objects that are good."""
         return encode_json({"good_objs": names})
 
@@ -209,21 +224,17 @@ class InstantMesh(MultiView):
 class Trellis(MultiView):
     """Writes renders/<name> of all views and renders_cond/<name> of input views, each with transforms.json, and metadata.csv."""
 
-    FRESH: ClassVar = {**MultiView.FRESH, "meshes": 0}
     SIDE: ClassVar = 1.0
-    FOLDER: ClassVar = "renders/"
     LIST: ClassVar = "metadata.csv"
 
-    def write(self, scene: ExportScene, folder: str, views: list[Seen]) -> None:
-        """Writes both folders, and the mesh where the shape is to be had."""
-        self._write_views(folder, views, deep=True)
-        name, region_id, unit, T_world_obj = self._subject
-        inputs = [(pair, "input") for pair in scene.pairs]
-        self._write_views(f"{scene.split}/renders_cond/{name}", [view for view in inputs if self._is_seen(view)])
-        if (shape := self.shapes.load(scene, scene.instances[region_id][1])) is not None:
-            mesh = trimesh.Trimesh(unit * shape.vertices @ T_world_obj[:3, :3].T, shape.faces, process=False)
-            self.folder.put(f"{folder}/mesh.ply", export_ply(mesh))
-            self.kept["meshes"] += 1
+    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
+        """Writes both folders, and the mesh."""
+        self._write_views(f"{scene.split}/renders/{name}", views, deep=True)
+        inputs = ((pair, "input") for pair in scene.pairs)
+        if conditions := list(filter(self._is_seen, inputs)):
+            self._write_views(f"{scene.split}/renders_cond/{name}", conditions)
+        mesh = trimesh.Trimesh(self._subject.points, self._subject.faces, process=False)
+        self.folder.put(f"{scene.split}/renders/{name}/mesh.ply", export_ply(mesh))
 
     def _is_seen(self, view: Seen) -> bool:
         """Whether a loader, which cuts the object out, finds it in a view."""
@@ -232,7 +243,6 @@ class Trellis(MultiView):
         return label is not None and label["pixels"] > 0 and not pair.lacks_colour(name) and is_square(view)
 
     def _write_views(self, folder: str, views: list[Seen], deep: bool = False) -> None:
-        unit, T_world_obj = self._subject.unit, self._subject.T_world_obj
         frames = []
         for number, view in enumerate(views):
             T = self.pose(view)
@@ -250,22 +260,24 @@ class Trellis(MultiView):
                 )
             frames.append(frame)
         box = [[-0.5] * 3, [0.5] * 3]
-        tree = {"aabb": box, "scale": unit, "offset": (-unit * T_world_obj[:3, 3]).tolist(), "frames": frames}
+        unit, origin = self._subject.unit, self._subject.origin
+        tree = {"aabb": box, "scale": unit, "offset": (-unit * origin).tolist(), "frames": frames}
         self.folder.put(f"{folder}/transforms.json", encode_json(tree))
 
-    def list_of(self, names: list[str]) -> bytes:
+    def list_of(self, split: str, names: list[str]) -> bytes:
         """A row for each name; what is not known of it yet is False and 0."""
         table = io.StringIO()
         rows = csv.writer(table, lineterminator="\n")
         rows.writerow(["sha256", "aesthetic_score", "rendered", "cond_rendered", "voxelized", "num_voxels"])
-        rows.writerows([name, 0.0, True, True, False, 0] for name in names)
+        for name in names:
+            has_condition = (self.folder.root / split / "renders_cond" / name).exists()
+            rows.writerow([name, 0.0, True, has_condition, False, 0])
         return table.getvalue().encode()
 
     def describe(self) -> dict[str, Any]:
-        """What all have, the meshes, and the encodings."""
+        """What all have, and the encodings."""
         return {
             **super().describe(),
-            "meshes": self.kept["meshes"],
             "poses": "camera to object, OpenGL axes",
             "depth": "16 bits of z between min and max of its frame, 65535 behind the object",
         }

@@ -108,7 +108,7 @@ def load_nerf(root):
 
 
 LAYOUTS = {"zero123": (load_zero123, 1.0), "instantmesh": (load_instantmesh, 2.0), "trellis": (load_trellis, 1.0)}
-LAYOUTS["nerf"] = (load_nerf, 2.0)  # metres: the size that the job asks for
+LAYOUTS["nerf"] = (load_nerf, None)  # metres, in the world
 COUNT = 6
 FOCALS = [100.0 / 96.0] * 4 + [0.5 / math.tan(math.radians(30.0))] * 2
 """In widths, of the ring and of the sphere of the fixture."""
@@ -133,15 +133,21 @@ def read(studio, tmp_path_factory):
 
 
 def mesh_of(studio, scene_id, side):
-    """The row of a scene, and its object in a layout's frame: turned as it stands, its box's longest side `side`."""
+    """(row of a scene, its object turned as it stands, the ends of the object's box in the world, metres).
+
+    In a layout's frame the box is in the middle and `side` long; without a side the mesh is in the world too.
+    """
     (row,) = (row for row in source_rows(studio.root, "scenes") if row["scene_id"] == scene_id)
     path = studio.root / "assets" / row["category"] / f"{row['instance_id']}.glb"
     mesh = trimesh.load_scene(path, process=False).to_mesh()
-    mesh.apply_scale(side / mesh.extents.max())
     T = np.reshape(row["T_world_obj"], (4, 4))
-    assert not T[:3, 3].any() and not np.allclose(T, np.eye(4)), "turned about the middle of its box"
+    assert not np.allclose(T, np.eye(4))
     mesh.apply_transform(T)
-    return row, mesh
+    bounds = mesh.bounds.copy()
+    if side is not None:
+        mesh.apply_translation(-bounds.mean(axis=0))
+        mesh.apply_scale(side / mesh.extents.max())
+    return row, mesh, bounds
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -150,7 +156,7 @@ def test_the_object_is_drawn_where_each_layouts_cameras_see_it(name, read, studi
     side = LAYOUTS[name][1]
     assert sorted(read[name]) == [0, 1, 2]
     for scene_id, shots in read[name].items():
-        _, mesh = mesh_of(studio, scene_id, side)
+        _, mesh, _ = mesh_of(studio, scene_id, side)
         assert len(shots) == COUNT
         for shot in shots:
             rows, columns = np.nonzero(shot.rgba[..., 3] >= 128)
@@ -160,26 +166,27 @@ def test_the_object_is_drawn_where_each_layouts_cameras_see_it(name, read, studi
             assert np.linalg.det(shot.T[:3, :3]) == pytest.approx(1.0)
 
 
-def test_distances_are_in_units_of_the_objects_longest_side(read, studio):
-    """It is 2 m."""
-    centre = {
-        row["scene_id"]: np.reshape(row["T_world_obj"], (4, 4))[:3, 3] for row in source_rows(studio.root, "scenes")
-    }
+def test_distances_are_in_units_of_the_longest_side_from_the_middle_of_the_box(read, studio):
     rows = [row for row in source_rows(studio.root, "views") if row["role"] in ("around", "near")]
     for name, (_, side) in LAYOUTS.items():
         for scene_id, shots in read[name].items():
+            _, mesh, bounds = mesh_of(studio, scene_id, side)
+            origin, unit = (
+                bounds.mean(axis=0) - mesh.bounds.mean(axis=0),
+                mesh.extents.max() / np.ptp(bounds, axis=0).max(),
+            )
             stored = sorted(
                 (row["role"], row["number"], row["T_world_cam"]) for row in rows if row["scene_id"] == scene_id
             )
             for shot, (*_, T) in zip(shots, stored, strict=True):
-                place = np.reshape(T, (4, 4))[:3, 3] - centre[scene_id]
-                np.testing.assert_allclose(shot.T[:3, 3], place * side / 2.0, atol=1e-9)
+                place = np.reshape(T, (4, 4))[:3, 3]
+                np.testing.assert_allclose(shot.T[:3, 3], unit * (place - origin), atol=1e-9)
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("instantmesh", 0.6 * STEP), ("trellis", 2e-4)])
 def test_depth_lies_on_the_object(name, tolerance, read, studio):
     for scene_id, shots in read[name].items():
-        _, mesh = mesh_of(studio, scene_id, LAYOUTS[name][1])
+        _, mesh, _ = mesh_of(studio, scene_id, LAYOUTS[name][1])
         for shot in shots:
             points, _ = shot.points()
             assert len(points) > 300
@@ -206,10 +213,10 @@ def test_normals_point_out_of_the_object_in_the_worlds_axes(read):
 
 
 def test_trellis_has_input_views_as_conditions_and_the_mesh_in_its_cube(studio, tmp_path):
-    assert export_to(studio, tmp_path / "new", "trellis").manifest["meshes"] == 3
+    assert export_to(studio, tmp_path / "new", "trellis").manifest["scenes"] == 3
     for root in (path for path in (tmp_path / "new").iterdir() if path.is_dir()):
         for name, (shot,) in load_trellis(root, "renders_cond"):
-            row, mesh = mesh_of(studio, int(name.rpartition("-")[2]), 1.0)
+            row, mesh, bounds = mesh_of(studio, int(name.rpartition("-")[2]), 1.0)
             stored = trimesh.load_mesh(root / "renders" / name / "mesh.ply", process=False)
             np.testing.assert_allclose(stored.bounds, mesh.bounds, atol=1e-6)
             assert len(stored.faces) == len(mesh.faces)
@@ -217,7 +224,8 @@ def test_trellis_has_input_views_as_conditions_and_the_mesh_in_its_cube(studio, 
             for frame in tree["frames"]:
                 radius, ends = np.linalg.norm(np.array(frame["transform_matrix"])[:3, 3]), frame["depth"]
                 assert [ends["min"], ends["max"]] == pytest.approx([radius - math.sqrt(0.75), radius + math.sqrt(0.75)])
-            assert (tree["scale"], tree["aabb"]) == (pytest.approx(0.5), [[-0.5] * 3, [0.5] * 3])
+            assert tree["aabb"] == [[-0.5] * 3, [0.5] * 3]
+            np.testing.assert_allclose(tree["scale"] * bounds + tree["offset"], mesh.bounds, atol=1e-9)
             stored = read_picture(studio.root / row["category"] / f"RGB{2 * row['scene_id']:05d}.png")
             np.testing.assert_array_equal(shot.rgba, stored)
 
