@@ -103,7 +103,8 @@ def make_further(scene: SettledScene, pair: Pair, number: int) -> Iterator[View]
     for named in (*standing, *place_fixed(job, cameras)):
         with scene.stopwatch.effect("further_views"):
             exact = render_view(scene, named.name, number, named.camera, sight, named.number)
-            yield sense(scene, exact, number)
+            view = sense(scene, exact, number)
+        yield view
 
 
 def render_view(
