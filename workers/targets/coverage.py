@@ -78,30 +78,32 @@ def _cover(
     height, width = covered.shape
     lines = len(offsets)
     for number in range(len(faces)):
+        # From the highest corner in the image to the lowest: an edge is then the same for both faces that share it.
         a, b, c = faces[number, 0], faces[number, 1], faces[number, 2]
-        low = min(uv[a, 1], uv[b, 1], uv[c, 1])
-        high = max(uv[a, 1], uv[b, 1], uv[c, 1])
-        if not (low < height and high > 0.0):
-            continue
+        if uv[b, 1] < uv[a, 1]:
+            a, b = b, a
+        if uv[c, 1] < uv[b, 1]:
+            b, c = c, b
+            if uv[b, 1] < uv[a, 1]:
+                a, b = b, a
+        low, middle, high = uv[a, 1], uv[b, 1], uv[c, 1]
         left, right = min(uv[a, 0], uv[b, 0], uv[c, 0]), max(uv[a, 0], uv[b, 0], uv[c, 0])
-        if not (left < width and right > 0.0):
+        if not (low < height and high > 0.0 and left < width and right > 0.0):
             continue
+        whole = (uv[c, 0] - uv[a, 0]) / (high - low) if high > low else 0.0
+        upper = (uv[b, 0] - uv[a, 0]) / (middle - low) if middle > low else 0.0
+        lower = (uv[c, 0] - uv[b, 0]) / (high - middle) if high > middle else 0.0
         first, last = max(int(np.ceil(low * lines - 0.5)), 0), min(int(np.ceil(high * lines - 0.5)), height * lines)
         for row in range(first // lines, (last + lines - 1) // lines):
             if following[row, max(int(left), 0)] > right:
                 continue
             for line in range(max(first, row * lines), min(last, (row + 1) * lines)):
-                k, y, begin, end = line - row * lines, (line + 0.5) / lines, np.inf, -np.inf
-                for i, j in ((a, b), (b, c), (c, a)):
-                    if uv[i, 1] > uv[j, 1]:
-                        i, j = j, i
-                    if uv[i, 1] <= y < uv[j, 1]:
-                        x = uv[i, 0] + (y - uv[i, 1]) * ((uv[j, 0] - uv[i, 0]) / (uv[j, 1] - uv[i, 1]))
-                        begin, end = min(begin, x), max(end, x)
-                if begin >= end:
-                    continue
-                begin, end = max(begin, 0.0), min(end, width + 1.0)
-                column = following[row, min(max(int(np.ceil(begin - offsets[k])), 0), width)]
+                k, y = line - row * lines, (line + 0.5) / lines
+                begin = uv[a, 0] + (y - low) * whole
+                end = uv[a, 0] + (y - low) * upper if y < middle else uv[b, 0] + (y - middle) * lower
+                if begin > end:
+                    begin, end = end, begin
+                column = following[row, min(max(int(np.ceil(max(begin, 0.0) - offsets[k])), 0), width)]
                 while column < width and column + offsets[k] < end:
                     covered[row, column] |= np.uint64(1) << np.uint64(k)
                     column = following[row, column + 1]
