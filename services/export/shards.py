@@ -289,9 +289,9 @@ configs:
 
 # {name}
 
-View-dependent RGB-D pairs for reconstructing objects from a single view: an input view of an object on a table, and the mirror
-view from the other side. Made by Verso after {ARTICLE}. A row is a pair. Splits are by object: no object of `test` or
-`validation` is seen in `train`.
+Views with depth for reconstructing objects from a single view. A row is a pair: an input view of an object, and what the job has
+of the mirror view from the other side and of views of further cameras. Made by Verso after {ARTICLE}.
+Splits are by object: no object of `test` or `validation` is seen in `train`.
 
 {counts}
 Licences of the shapes: {", ".join(licences) or "none"}.
