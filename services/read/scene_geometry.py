@@ -129,7 +129,7 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
     placed: list[tuple[str, int, list[Named]]] = []
     if record.job.captures is not None:
         placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [("board", _board(stored, row))]))
-    else:
+    elif REGION_TABLE in names:
         placed.append(("floor", REGION_FLOOR, _floor(record, row["scene_id"])))
     for region_id, of in names.items():
         # Two objects may be of one instance: only the region id tells them apart.
