@@ -182,6 +182,9 @@ def test_an_object_alone_is_seen_from_farther_away_with_the_named_cameras_and_it
     assert radius_m == pytest.approx(1.0, abs=1e-5)
     (packed,) = json.loads(pack_spaces([space]))
     assert len(packed["cameras"]) == 20 and packed["far"] > 1.5 * radius_m
+    card = studio.read("DATASET.md").decode()
+    assert "| views of further cameras | around (14), over (5), right (1) |\n" in card and "Alpha is" in card
+    assert "tables, weight" not in card and "each alone on nothing" in card
     (stored,) = studio.root.glob("assets/mug/*.glb")
     kept = stored.read_bytes()
     stored.unlink()
