@@ -54,7 +54,7 @@ def hand_over(scene: Scene, job: Job, parent: Path) -> Path:
         urdf = URDF.format(name=name, com=com, mass=asset.mass.mass_kg, i=np.diag(asset.mass.inertia).tolist())
         (folder / f"{name}.urdf").write_text(urdf)
     mesh_of_part(scene.posed.things[0].shape.parts[0]).export(folder / "floor.glb")
-    sensor, lights = job.cameras.sensor, scene.posed.appearance.lights
+    sensor, lights = scene.plan.input_cameras[0].intrinsics, scene.posed.appearance.lights
     described = {
         "T_world_table": table.T_world_table.tolist(),
         "T_world_obj": start.T_world_obj.tolist(),

@@ -1,5 +1,7 @@
 """Alpha: the share of each pixel that a scene without ground covers, of the same faces as its mask. Pure."""
 
+from typing import cast
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -7,6 +9,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from workers.geometry.camera import project
 from workers.geometry.jit import compiled_for
+from workers.geometry.pixels import is_inner
 from workers.targets.surfaces import Triangles
 
 SAMPLES = 64
@@ -14,38 +17,46 @@ SAMPLES = 64
 known to a hundredth of a pixel."""
 
 _OFFSETS = np.modf((np.arange(SAMPLES) + 0.5) * 0.6180339887498949)[0]
+_SHARES = np.rint(np.arange(SAMPLES + 1) * (255.0 / SAMPLES)).astype(np.uint8)
 
 
 def cover_pixels(triangles: Triangles, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """[H, W] uint8: the share of each pixel that the faces cover, as 255; region [H, W] is the mask of the same view.
 
-    Never 0 where the mask shows something, and never 255 where it does not: its sample is the pixel's centre. Among pixels that
-    all show something no share is computed.
+    Never 0 where the mask shows something, and never 255 where it does not: its sample is the pixel's centre. A pixel that, with
+    all eight beside it, shows something is covered; of no such pixel a share is computed.
     """
-    shown = (region > 0).astype(np.uint8)
-    inner: NDArray = cv2.erode(shown, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inner = is_inner(region)
     u, v = project(triangles.mesh.vertices, triangles.intrinsics)
     covered = np.zeros(region.shape, np.uint64)
-    _cover(np.stack([u, v], axis=1), triangles.mesh.faces, _next_open(inner), _OFFSETS, covered)
-    alpha = np.rint(np.bitwise_count(covered) * (255.0 / SAMPLES)).astype(np.uint8)
-    alpha = np.where(shown > 0, np.maximum(alpha, 1), np.minimum(alpha, 254))
-    return np.where(inner > 0, np.uint8(255), alpha).astype(np.uint8)
+    _cover(np.stack([u, v], axis=1), triangles.mesh.faces, _next_open(inner.view(np.uint8)), _OFFSETS, covered)
+    alpha = _SHARES[np.bitwise_count(covered)]
+    alpha = np.where(region > 0, np.maximum(alpha, np.uint8(1)), np.minimum(alpha, np.uint8(254)))
+    alpha[inner] = 255
+    return alpha
 
 
 def with_alpha(rgb: NDArray[np.uint8], region: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """[H, W, 4]: colour with straight alpha. A pixel whose centre shows nothing has the colour of the nearest that does."""
-    colour = rgb.copy()
-    beside = (alpha > 0) & (region == 0)
-    if beside.any() and (region > 0).any():
-        _, nearest = cv2.distanceTransformWithLabels(
-            (region == 0).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        shown = np.flatnonzero(region)
-        at = np.zeros(int(nearest.max()) + 1, np.int64)
-        at[nearest.reshape(-1)[shown]] = shown
-        colour[beside] = rgb.reshape(-1, 3)[at[nearest[beside]]]
-    colour[alpha == 0] = 0
-    return np.dstack([colour, alpha])
+    image = cast(NDArray[np.uint8], cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
+    image[:, :, 3] = alpha
+    pixels = image.view(np.uint32)[:, :, 0]
+    pixels[alpha == 0] = 0
+    rows, columns = np.nonzero((alpha > 0) & (region == 0))
+    if len(rows) and (region > 0).any():
+        # Of the part about these pixels alone; every one that shows something has a number of its own there.
+        part = slice(max(rows.min() - 2, 0), rows.max() + 3), slice(max(columns.min() - 2, 0), columns.max() + 3)
+        shown, seen = region[part] > 0, pixels[part]
+        if shown.any():
+            _, nearest = cv2.distanceTransformWithLabels(
+                (~shown).view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+            )
+            colours = np.zeros(int(nearest.max()) + 1, np.uint32)
+            colours[nearest[shown]] = seen[shown]
+            beside = rows - part[0].start, columns - part[1].start
+            near = colours[nearest[beside]].view(np.uint8).reshape(-1, 4)
+            image[rows, columns, :3] = near[:, :3]
+    return image
 
 
 @compiled_for("u1[:,::1]")
@@ -67,30 +78,32 @@ def _cover(
     height, width = covered.shape
     lines = len(offsets)
     for number in range(len(faces)):
+        # From the highest corner in the image to the lowest: an edge is then the same for both faces that share it.
         a, b, c = faces[number, 0], faces[number, 1], faces[number, 2]
-        low = min(uv[a, 1], uv[b, 1], uv[c, 1])
-        high = max(uv[a, 1], uv[b, 1], uv[c, 1])
-        if not (low < height and high > 0.0):
-            continue
+        if uv[b, 1] < uv[a, 1]:
+            a, b = b, a
+        if uv[c, 1] < uv[b, 1]:
+            b, c = c, b
+            if uv[b, 1] < uv[a, 1]:
+                a, b = b, a
+        low, middle, high = uv[a, 1], uv[b, 1], uv[c, 1]
         left, right = min(uv[a, 0], uv[b, 0], uv[c, 0]), max(uv[a, 0], uv[b, 0], uv[c, 0])
-        if not (left < width and right > 0.0):
+        if not (low < height and high > 0.0 and left < width and right > 0.0):
             continue
+        whole = (uv[c, 0] - uv[a, 0]) / (high - low) if high > low else 0.0
+        upper = (uv[b, 0] - uv[a, 0]) / (middle - low) if middle > low else 0.0
+        lower = (uv[c, 0] - uv[b, 0]) / (high - middle) if high > middle else 0.0
         first, last = max(int(np.ceil(low * lines - 0.5)), 0), min(int(np.ceil(high * lines - 0.5)), height * lines)
-        for line in range(first, last):
-            row, k = line // lines, line % lines
+        for row in range(first // lines, (last + lines - 1) // lines):
             if following[row, max(int(left), 0)] > right:
                 continue
-            y, begin, end = (line + 0.5) / lines, np.inf, -np.inf
-            for i, j in ((a, b), (b, c), (c, a)):
-                if uv[i, 1] > uv[j, 1]:
-                    i, j = j, i
-                if uv[i, 1] <= y < uv[j, 1]:
-                    x = uv[i, 0] + (y - uv[i, 1]) * ((uv[j, 0] - uv[i, 0]) / (uv[j, 1] - uv[i, 1]))
-                    begin, end = min(begin, x), max(end, x)
-            if begin >= end:
-                continue
-            begin, end = max(begin, 0.0), min(end, width + 1.0)
-            column = following[row, min(max(int(np.ceil(begin - offsets[k])), 0), width)]
-            while column < width and column + offsets[k] < end:
-                covered[row, column] |= np.uint64(1) << np.uint64(k)
-                column = following[row, column + 1]
+            for line in range(max(first, row * lines), min(last, (row + 1) * lines)):
+                k, y = line - row * lines, (line + 0.5) / lines
+                begin = uv[a, 0] + (y - low) * whole
+                end = uv[a, 0] + (y - low) * upper if y < middle else uv[b, 0] + (y - middle) * lower
+                if begin > end:
+                    begin, end = end, begin
+                column = following[row, min(max(int(np.ceil(max(begin, 0.0) - offsets[k])), 0), width)]
+                while column < width and column + offsets[k] < end:
+                    covered[row, column] |= np.uint64(1) << np.uint64(k)
+                    column = following[row, column + 1]

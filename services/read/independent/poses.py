@@ -42,9 +42,13 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
         seen = np.count_nonzero(pair.images["input", "region"] >= FIRST_OBJECT) / pair.images["input", "region"].size
         off = 0.0 if seen <= FIT_SLACK * share else math.inf
     else:
-        off = distance((T_in[:3, 3] + radius * axis)[:2], np.zeros(2))
-    if off > ROUNDING or abs(T_in[2, 0]) > ROUNDING:
-        yield "the input camera does not look at the table's centre from cameras.orbit.radius_m without roll"
+        # The point looked at, where it is nearest to the vertical line through the centre, or as near as the radius allows.
+        nearest = -(T_in[:2, 3] @ axis[:2]) / max(float(axis[:2] @ axis[:2]), 1e-300)
+        target = (T_in[:3, 3] + np.clip(nearest, *np.broadcast_to(radius, 2)) * axis)[:2]
+        off = distance(target, np.clip(target, *orbit["aim_m"]))
+    rolled = abs(math.degrees(math.atan2(-T_in[2, 0], -T_in[2, 1])))
+    if off > ROUNDING or rolled > max(map(abs, orbit["roll_deg"])) + 1e-9:
+        yield "the input camera does not look at the table's centre, or beside it, from cameras.orbit.radius_m, with its roll"
     if not low - ROUNDING <= -axis[2] <= high + ROUNDING:
         yield "the input camera's inclination is outside cameras.orbit.inclination_rad"
 
@@ -72,7 +76,11 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
         role: T_in @ _transform(np.eye(3), beside["offset_m"]) for role, beside in derive.beside(pair.job).items()
     }
     T_z = cameras["mirror"]["T_z_m"]
-    other_side = _derive_rolled_mirror if pair.is_captured else _derive_mirror
+    if isinstance(T_z, list) and "mirror" in pair.views:  # drawn: what there is, as far as it is in the range
+        there = matrix(pair.views["mirror"], "T_world_cam")
+        T_z = float(np.clip((T_in[:3, 3] + d_z * T_in[:3, 2] - there[:3, 3]) @ there[:3, 2], *T_z))
+    rolls = pair.is_captured or any(cameras["orbit"]["roll_deg"])
+    other_side = _derive_rolled_mirror if rolls else _derive_mirror
     expected["mirror"] = expected["projected"] = other_side(T_in, d_z, MIRROR_FIT * d_z if T_z == "fit" else T_z)
     for role, T in expected.items():
         if role in pair.views and not (off := distance(matrix(pair.views[role], "T_world_cam"), T)) <= ROUNDING:
