@@ -155,7 +155,7 @@ class Catalogue:
         if isinstance(settings, ProceduralSource):
             from workers.assets.builtin.make import make_asset
 
-            return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
+            return make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
         from workers.assets.library.shapes import load_shape
 
         assert library is not None
