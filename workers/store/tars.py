@@ -296,6 +296,8 @@ class _Archive:
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:
     match = pattern.fullmatch(name)
     named = match is not None and match["name"] is not None
-    if match is None or (match["content"].partition("_")[0] not in _WORDS if named else match["content"] not in _CONTENTS):
+    if match is None or (
+        match["content"].partition("_")[0] not in _WORDS if named else match["content"] not in _CONTENTS
+    ):
         raise ValueError(f"{name!r} is not the name of an image")
     return match
