@@ -92,13 +92,14 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
     """The plan with input cameras that frame its objects, where the orbit says so, in the directions that were drawn.
 
     poses: `T_world_obj` [4, 4] of each object.
-    Raises ViewError `not_framed` where a camera stands nearer to an object than the object is large, or where the objects do
-    not fit into the picture and the range of depth.
+    Raises ViewError `not_framed` where a camera at a given distance stands nearer to an object than the object is large, or
+    where the objects do not fit into the picture and the range of depth.
     """
     placed = list(zip(plan.objects, poses, strict=True))
     cameras = plan.input_cameras
     if job.cameras.orbit.share is not None:
-        cameras = tuple(_frame(job, plan, camera, placed, job.cameras.orbit.share) for camera in cameras)
+        framed = (_frame(job, plan, camera, placed, job.cameras.orbit.share) for camera in cameras)
+        return replace(plan, input_cameras=tuple(framed))
     for start, T in placed:
         box = start.asset.shape.bounds
         size, middle = float(np.linalg.norm(box[1] - box[0])), transform(T, box.mean(axis=0)[None, :])[0]
@@ -108,7 +109,7 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
                 f"{start.asset.instance_id} is {size:.3g} m across, and the input camera stands {near:.3g} m from its middle: "
                 "set cameras.orbit.radius_m: fit, or make the object smaller",
             )
-    return replace(plan, input_cameras=cameras)
+    return plan
 
 
 def _centre_of(plan: ScenePlan) -> Array:
