@@ -107,8 +107,12 @@ def load_nerf(root):
         yield f"-{path.parent.name}", [Shot(*each) for each in zip(files, poses, focals, strict=True)]
 
 
-LAYOUTS = {"zero123": (load_zero123, 1.0), "instantmesh": (load_instantmesh, 2.0), "trellis": (load_trellis, 1.0)}
-LAYOUTS["nerf"] = (load_nerf, None)  # metres, in the world
+LAYOUTS: dict[str, tuple[Callable, float | None]] = {
+    "zero123": (load_zero123, 1.0),
+    "instantmesh": (load_instantmesh, 2.0),
+    "trellis": (load_trellis, 1.0),
+    "nerf": (load_nerf, None),  # metres, in the world
+}
 COUNT = 6
 FOCALS = [100.0 / 96.0] * 4 + [0.5 / math.tan(math.radians(30.0))] * 2
 """In widths, of the ring and of the sphere of the fixture."""
