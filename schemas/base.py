@@ -37,13 +37,14 @@ class Counts(NamedTuple):
     high: int
 
 
-def _ordered(value: Range) -> Range:
+def ordered(value: Range) -> Range:
+    """The interval. Raises ValueError where its ends are not in order."""
     if not value.low <= value.high:
         raise ValueError(f"the range [{value.low}, {value.high}] is empty: write the smaller number first")
     return value
 
 
-Interval = Annotated[Range, AfterValidator(_ordered)]
+Interval = Annotated[Range, AfterValidator(ordered)]
 """A `Range` whose ends are in order."""
 
 

@@ -44,7 +44,7 @@ from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.chance import SceneChance
-from workers.scene.context import Stopwatch
+from workers.stopwatch import Stopwatch
 
 SMALL_CAPTURES: dict[str, Any] = {
     "name": "captures",

@@ -16,9 +16,10 @@ from services.merge.tables import write_card
 from services.read.verify import verify
 from services.run.range_planner import plan_spans
 from workers.capture.results import open_sources
-from workers.scene.context import Stopwatch, open_worker
+from workers.scene.context import open_worker
 from workers.shard.fingerprint import take_fingerprint
 from workers.shard.run_shard import run_scene
+from workers.stopwatch import Stopwatch
 from workers.store.attempt import begin_attempt
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore

@@ -168,6 +168,7 @@ def _view(scene_id: int, category: str, pose_id: int, role: str, files: list[dic
     filled, hidden = (0.5, 0.4) if role == "projected" else (None, None)
     return (
         {"pose_id": pose_id + 1 if role == "mirror" else pose_id, "parent_id": pose_id, "role": role}
+        | {"number": None}
         | {"scene_id": scene_id, "category": category, "T_world_cam": matrix_of(scene_id, 3, len(role))}
         | {"inclination_rad": 0.8, "yaw_rad": 1.0 / 3.0, "width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
         | {"cx": 320.0, "cy": 240.0, "cx_opencv": 319.5, "cy_opencv": 239.5, "depth_units_per_m": 5000.0, "d_z_m": 2.4}
@@ -179,7 +180,7 @@ def _view(scene_id: int, category: str, pose_id: int, role: str, files: list[dic
 
 def _object(view: dict, region: int, category: str, instance: str) -> dict[str, object]:
     return (
-        {name: view[name] for name in ("pose_id", "role", "scene_id")}
+        {name: view[name] for name in ("pose_id", "role", "number", "scene_id")}
         | {"region_id": region, "category": category, "instance_id": instance, "u": 300 + region, "v": -1}
         | {"T_cam_obj": matrix_of(view["scene_id"], 4, region), "bbox_xywh": [1, 2, 3, 4], "pixels": 500}
         | {"visible_fraction": 0.9, "patch_object_fraction": None if region == 2 else 0.3}

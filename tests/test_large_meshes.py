@@ -15,8 +15,9 @@ from workers.assets.builtin.solid import circle, lathe
 from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb
 from workers.render.raster.gbuffer import shared_renderer
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.make_scene import make_scene
+from workers.stopwatch import Stopwatch
 
 FACETS = 1000
 

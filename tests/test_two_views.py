@@ -29,8 +29,9 @@ from schemas.scene.view import Pair
 from services.job.job_file import load_job
 from workers.assets.catalogue import open_catalogue
 from workers.render.raster.gbuffer import shared_renderer
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.make_scene import make_scene
+from workers.stopwatch import Stopwatch
 
 JOB = load_job(Path(__file__).resolve().parents[1] / "deploy" / "jobs" / "tabletop.yaml")
 MEDIAN_MM = 0.1

@@ -1,5 +1,6 @@
 """Columns of the manifest tables from the models of a scene, and the models back from a row."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -69,11 +70,16 @@ def body_columns(start: ObjectStart, rest: Settled) -> Row:
         "object_scale": start.asset.scale,
         "T_world_obj": matrix_column(rest.T_world_obj),
         "redraws": start.redraws,
-        **{name: getattr(rest, name) for name in (*LARGEST, *SMALLEST)},
+        **{name: _known(getattr(rest, name)) for name in (*LARGEST, *SMALLEST)},
         "mass_kg": start.asset.mass.mass_kg,
         "com": (rest.T_world_obj[:3, :3] @ start.asset.mass.com + rest.T_world_obj[:3, 3]).tolist(),
         "contacts": [contact_columns(contact) for contact in rest.contacts],
     }
+
+
+def _known(figure: float | None) -> float | None:
+    """None for nan: a figure of rest that an object does not have which nothing carries."""
+    return None if figure is None or math.isnan(figure) else figure
 
 
 def contact_columns(contact: ContactForce) -> Row:
@@ -88,12 +94,16 @@ def columns_of_bodies(bodies: Sequence[Mapping[str, Any]]) -> Row:
     return {
         **{name: bodies[0][name] for name in FIRST},
         **{name: max(known[name], default=None) for name in LARGEST},
-        **{name: min(known[name]) for name in SMALLEST},
+        **{name: min(known[name], default=None) for name in SMALLEST},
     }
 
 
 def read_world_poses(scene: Mapping[str, Any]) -> dict[int, Pose]:
-    """[4, 4] pose of the table and of every object in the world, by region id in order; a capture has one object."""
+    """[4, 4] pose of the table and of every object in the world, by region id in order; a capture has one object.
+
+    There is no table in a studio scene.
+    """
     bodies = scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT, "T_world_obj": scene["T_world_obj"]}]
     objects = {body["region_id"]: read_matrix(body["T_world_obj"]) for body in bodies}
-    return {REGION_TABLE: read_matrix(scene["T_world_table"]), **objects}
+    table = {} if scene["T_world_table"] is None else {REGION_TABLE: read_matrix(scene["T_world_table"])}
+    return table | objects

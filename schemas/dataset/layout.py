@@ -3,11 +3,13 @@
 import re
 import urllib.parse
 from dataclasses import dataclass
+from functools import lru_cache
 from operator import attrgetter
 
+from schemas.job.cameras import CAMERA_NAME
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import MODALITIES, ROLES, VIEW_ROLES, PixelKind, Role
+from schemas.scene.view import MODALITIES, ROLES, VIEW_ROLES, Modality, PixelKind, Role, ViewRole
 
 JOB_FILE = "job.yaml"
 README_FILE = "DATASET.md"
@@ -70,13 +72,29 @@ IMAGES = tuple(
 """(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
 
 
+@lru_cache
+def images_of(role: Role) -> tuple[Image, ...]:
+    """The images that a view of this role may have: of a pair's, or of a camera that a job names."""
+    if role in VIEW_ROLES:
+        return tuple(image for image in IMAGES if image.role == role)
+    named = ViewRole(role, named=True)
+    words = ((modality.word_of(named), modality.name) for modality in MODALITIES.values())
+    return tuple(Image(word, role, name) for word, name in words if word is not None)
+
+
+def view_name(role: Role, number: int | None) -> str:
+    """How a view is called within its pair: by its role, of a named camera with its number, `around_003`."""
+    return role if number is None else f"{role}_{number:03d}"
+
+
 _UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\\]|(?:^|/)\.{0,2}(?:/|\Z)")
 """A letter that no path may have, or a part that is empty, `.` or `..`."""
 _CATEGORY = re.compile(r"[^\W_][^\s\x00-,./:-@\[-^`{-\xa9]*")
 """A letter or digit of any script, then anything but blanks and ASCII's signs other than - and _."""
+_NAMED = rf"(?:{'|'.join(sorted({modality.word.rstrip('_') for modality in MODALITIES.values()}))})_{CAMERA_NAME}_"
 _IMAGE = re.compile(
-    rf"{_CATEGORY.pattern}/(?:patches/)?(?:{'|'.join(sorted({image.content for image in IMAGES}))})([0-9]{{5,19}})"
-    r"(?:obj[0-9]{1,4})?\.png"
+    rf"{_CATEGORY.pattern}/(?:patches/)?(?:{'|'.join(sorted({image.content for image in IMAGES}))}|{_NAMED})([0-9]{{5,19}})"
+    r"(?:_[0-9]{3})?(?:obj[0-9]{1,4})?\.png"
 )
 _SHAPE = re.compile(rf"{ASSETS}/{_CATEGORY.pattern}/[^/]+\.(?:glb|npz)")
 _MERGED = re.compile(rf"{MANIFEST}/[a-z]+/category=[^/]+/part-[0-9]{{5,}}\.parquet")
@@ -103,7 +121,14 @@ def stored_roles(job: Job) -> tuple[Role, ...]:
 
 def stored_images(role: Role, job: Job) -> tuple[Image, ...]:
     """The images of one view that the job asks for."""
-    return tuple(image for image in IMAGES if image.role == role and is_stored(image.pixels, job))
+    return tuple(image for image in images_of(role) if is_stored(image.pixels, job))
+
+
+def stored_shape(modality: Modality, height: int, width: int, job: Job) -> tuple[int, ...]:
+    """The shape of the array of a stored image of this size: RGB has alpha where the background is clear."""
+    if modality.name == "rgb" and job.has_alpha:
+        return height, width, 4
+    return modality.shape(height, width)
 
 
 def patch_index(region_id: int, objects: int) -> int | None:
@@ -121,9 +146,14 @@ def file_pose_id(role: Role, parent_id: int) -> int:
     return parent_id + 1 if role == "mirror" else parent_id
 
 
-def image_path(category: str, content: Content, pose_id: int, object_index: int | None = None) -> str:
-    """`mug/RGB00000.png`; of an object's own image, with several objects, `mug/amodal00000obj1.png`."""
-    suffix = "" if object_index is None else f"obj{object_index}"
+def image_path(
+    category: str, content: Content, pose_id: int, object_index: int | None = None, number: int | None = None
+) -> str:
+    """`mug/RGB00000.png`; of an object's own image, with several objects, `mug/amodal00000obj1.png`.
+
+    Of view 3 of a named camera `mug/RGB_around_00000_003.png`.
+    """
+    suffix = ("" if number is None else f"_{number:03d}") + ("" if object_index is None else f"obj{object_index}")
     return f"{category}/{content}{pose_id:05d}{suffix}.png"
 
 

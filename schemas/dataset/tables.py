@@ -5,9 +5,9 @@ captures have, workers/capture/rows.py).
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import pyarrow as pa
 
@@ -25,8 +25,8 @@ TABLES: dict[str, str] = {
 
 SORT_KEYS: dict[str, tuple[str, ...]] = {
     "scenes": ("scene_id",),
-    "views": ("pose_id", "role"),
-    "objects": ("pose_id", "role", "region_id"),
+    "views": ("pose_id", "role", "number"),
+    "objects": ("pose_id", "role", "number", "region_id"),
     "assets": ("instance_id",),
     "failures": ("scene_id",),
     "timings": ("scene_id",),
@@ -44,7 +44,7 @@ FRAMES = {
     "source": "the frame of the file that the shape came from",
 }
 
-Of = Literal["both", "scenes", "captures", "targets"]
+Of = Literal["both", "scenes", "rest", "captures", "targets", "more"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Column:
     null: bool = False
     """Whether the value may be missing where the column applies."""
     of: Of = "both"
-    """The kind of dataset that has it, null in others; a table without any value `targets` has the digest of one without them."""
+    """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more`, of jobs with `cameras.more`. A table
+    without any value of a column has the digest of one without the column."""
 
     @property
     def nullable(self) -> bool:
@@ -77,7 +78,9 @@ _SHARED = {
     "source": "Kind of source of the shape: procedural, library, or of a capture.",
     "scene_id": "The scene, or the capture; ids count from the job's first_scene.",
     "pose_id": "The view's pose: even of input, aligned and projected views, odd of mirror views.",
-    "role": "Which view of its pair: input, aligned (the depth camera), mirror, or projected.",
+    "role": "Which view of its pair: input, aligned (the depth camera), mirror, or projected; or the name of a camera of "
+    "`cameras.more`.",
+    "number": "Number among the views of its role in the scene, from 0; null in the views that every pair has.",
     "region": "The value of its pixels in segment images: 2 the table, 3 and up the objects.",
     "patch": "Share of the patch that shows its object; null where there is no patch.",
     "scale": "Factor from the source's coordinates to metres.",
@@ -108,24 +111,24 @@ scene_id | int64 | id | - | {scene_id}
 category | string | - | - | {category}
 instance_id | string | - | - | {instance}
 source | string | - | - | {source}
-table_id | string | - | - | The table's shape: the key of `assets`.
+table_id | string? | - | - | The table's shape: the key of `assets`; null in a studio scene.
 object_scale | double | 1 | - | {scale}
 T_world_obj | double[16] | m | world, object | Pose of the first object at rest.
-T_world_table | double[16] | m | world, object | Pose of the table.
-pose | string, scenes | - | - | How the objects started: upright, tumbled or placed.
+T_world_table | double[16]? | m | world, object | Pose of the table; null in a studio scene.
+pose | string, scenes | - | - | How the objects started: upright, tumbled, placed or as_given.
 redraws | int64 | count | - | How often the start position was drawn again before one was valid.
 effects | list of string | - | - | Names of the effects that ran.
 skipped | list of struct | - | - | Effects that did not run.
 skipped[].effect | string | - | - | Name of the effect.
 skipped[].why | string | - | - | Why it was not needed, and by which proof.
-penetration_mm | double, scenes | mm | - | {overlap}
-hover_gap_mm | double, scenes | mm | - | {gap}
-support_margin_mm | double, scenes | mm | - | {margin}
-residual_speed_mm_s | double, scenes | mm/s | - | {drift}
-recheck_move_mm | double?, scenes | mm | - | {move}
-recheck_turn_deg | double?, scenes | deg | - | {turn}
-equilibrium_residual | double, scenes | 1 | - | {balance}
-settle_s | double, scenes | s | - | Simulated time until rest; the longest of all objects.
+penetration_mm | double, rest | mm | - | {overlap}
+hover_gap_mm | double, rest | mm | - | {gap}
+support_margin_mm | double, rest | mm | - | {margin}
+residual_speed_mm_s | double, rest | mm/s | - | {drift}
+recheck_move_mm | double?, rest | mm | - | {move}
+recheck_turn_deg | double?, rest | deg | - | {turn}
+equilibrium_residual | double, rest | 1 | - | {balance}
+settle_s | double, rest | s | - | Simulated time until rest; the longest of all objects.
 raycast_checked | bool | - | - | Whether every view was checked against the ray caster.
 settings_digest | string | - | - | SHA-256 of the settings and sources that shape a scene.
 bodies | list of struct, scenes | - | - | Every object; above stand names and pose of the first, the worst figures of all.
@@ -136,13 +139,13 @@ bodies[].source | string | - | - | {source}
 bodies[].object_scale | double | 1 | - | {scale}
 bodies[].T_world_obj | double[16] | m | world, object | Pose at rest.
 bodies[].redraws | int64 | count | - | How often its start position was drawn again.
-bodies[].penetration_mm | double | mm | - | {overlap}
-bodies[].hover_gap_mm | double | mm | - | {gap}
-bodies[].support_margin_mm | double | mm | - | {margin}
-bodies[].residual_speed_mm_s | double | mm/s | - | {drift}
+bodies[].penetration_mm | double? | mm | - | {overlap}
+bodies[].hover_gap_mm | double? | mm | - | {gap}
+bodies[].support_margin_mm | double? | mm | - | {margin}
+bodies[].residual_speed_mm_s | double? | mm/s | - | {drift}
 bodies[].recheck_move_mm | double? | mm | - | {move}
 bodies[].recheck_turn_deg | double? | deg | - | {turn}
-bodies[].equilibrium_residual | double | 1 | - | {balance}
+bodies[].equilibrium_residual | double? | 1 | - | {balance}
 bodies[].mass_kg | double | kg | - | Mass, from volume (or surface, where open) and density.
 bodies[].com | double[3] | m | world | Centre of mass at rest.
 bodies[].contacts | list of struct | - | - | Contacts that carry it; their forces balance the weight.
@@ -185,6 +188,7 @@ capture.depth_median_mm | double? | mm | - | {depth_median}
 pose_id | int64 | id | - | {pose_id}
 parent_id | int64 | id | - | The pair: the pose id of its input view.
 role | string | - | - | {role}
+number | int64?, more | id | - | {number}
 scene_id | int64 | id | - | {scene_id}
 category | string | - | - | {category}
 T_world_cam | double[16] | m | world, camera | Pose of the camera.
@@ -227,6 +231,7 @@ capture.sources | list of int64? | id | - | Of mirror views: numbers of the phot
     "objects": """
 pose_id | int64 | id | - | {pose_id}
 role | string | - | - | {role}
+number | int64?, more | id | - | {number}
 region_id | int64 | id | - | {region}
 scene_id | int64 | id | - | {scene_id}
 category | string | - | - | {category}
@@ -339,11 +344,27 @@ SCHEMAS: dict[str, pa.Schema] = {
 }
 """The Arrow schema of each table, of scenes and of captures alike."""
 
-NOT_OF_CAPTURES = tuple(column.path for column in COLUMNS["scenes"] if column.of == "scenes")
+NOT_OF_CAPTURES = tuple(column.path for column in COLUMNS["scenes"] if column.of in ("scenes", "rest"))
 """Columns of `scenes` that a capture cannot have, since nothing was simulated to rest: null there."""
 
-ALWAYS_OF_SCENES = tuple(column.path for column in COLUMNS["scenes"] if column.of == "scenes" and not column.null)
-"""Those of them that every simulated scene has."""
+ALWAYS_OF: dict[str, tuple[str, ...]] = {
+    kind: tuple(column.path for column in COLUMNS["scenes"] if column.of == kind and not column.null)
+    for kind in ("scenes", "rest")
+}
+"""Those of them that every simulated scene has, and that every scene on a table has."""
+
+
+def misplaced_columns(scene: Mapping[str, Any]) -> str:
+    """Columns that a row of `scenes` lacks, or that a capture, or a scene without a table, has; empty where none is wrong."""
+    captured, alone = scene["capture"] is not None, scene["table_id"] is None
+    for kind, absent, place in (
+        ("scenes", captured, "a capture"),
+        ("rest", captured or alone, "a scene without a table"),
+    ):
+        if wrong := [name for name in ALWAYS_OF[kind] if (scene[name] is None) != absent]:
+            return f"{', '.join(wrong)}: {f'there in {place}' if absent else 'missing'}"
+    return ""
+
 
 OF_TARGETS = {
     table: frozenset(column.path for column in columns if column.of == "targets") for table, columns in COLUMNS.items()

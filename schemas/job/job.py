@@ -17,9 +17,10 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator, model_va
 
 from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight, with_defaults
 from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknown, offered_by, with_categories
+from schemas.job.cameras import Cameras
 from schemas.job.captures import Captures, with_capture_keys
 from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
-from schemas.job.views import Cameras, Images, Render, SensorEffects, Targets
+from schemas.job.views import Images, Render, SensorEffects, Studio, Targets
 
 RangeSize = Annotated[int, Field(ge=1, le=100_000)]
 """A worker keeps the rows of a whole range, some kilobytes a scene."""
@@ -81,6 +82,10 @@ PATH_S = 1.0
 """Processor time of each path through every pixel of a pair's three images: 16 paths take 5.6 s an image."""
 
 
+VIEW_S = 0.03
+"""Processor time of a further view (measured at 512 x 512 with normals)."""
+
+
 PresetName = Literal["fast", "balanced", "exact"]
 JobKind = Literal["singles", "piles", "meshes", "captures"]
 Keys = Mapping[str, Any]
@@ -131,6 +136,21 @@ def with_preset(tree: Keys) -> dict[str, Any]:
     return with_defaults(tree, next((keys for name, keys in PRESETS[kind_of(tree)].items() if name == preset), {}))
 
 
+STUDIO: Keys = {
+    "start.pose": "as_given",
+    "cameras.orbit.radius_m": "25%",
+    "cameras.mirror.enabled": False,
+    "cameras.depth.enabled": False,
+    "images.projection.enabled": False,
+}
+"""Defaults of a job of studio scenes."""
+
+
+def with_studio_keys(tree: Keys) -> dict[str, Any]:
+    """A copy of a job's keys, of studio scenes with their defaults where the job does not give them."""
+    return with_defaults(tree, STUDIO if tree.get("scene") == "studio" else {})
+
+
 MOST_SCENE_IDS = 10**10
 """Ids of scenes have ten digits in the names of ranges, which sort like numbers."""
 
@@ -173,8 +193,12 @@ class Job(Frozen):
     """How an object begins."""
     physics: Physics = Physics()
     """How objects come to rest."""
+    scene: Literal["tabletop", "studio"] = "tabletop"
+    """tabletop: objects at rest on a table; studio: one object alone, on nothing, with the look of `studio`."""
+    studio: Studio = Studio()
+    """Scale, light and background of `scene: studio`."""
     cameras: Cameras = Cameras()
-    """Every camera of a pair."""
+    """Every camera of a scene."""
     images: Images = Images()
     """Encodings, patches and projection."""
     render: Render = Render()
@@ -195,7 +219,9 @@ class Job(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _fill(cls, value: object) -> object:
-        return with_categories(with_capture_keys(with_preset(value))) if isinstance(value, dict) else value
+        if not isinstance(value, dict):
+            return value
+        return with_categories(with_capture_keys(with_preset(with_studio_keys(value))))
 
     @field_validator("categories", mode="before")
     @classmethod
@@ -227,16 +253,24 @@ class Job(Frozen):
     def _agrees(self) -> "Job":
         if self.captures is not None and (unfit := _unfit_for_captures(self, self.captures)):
             raise ValueError(unfit)
+        if unfit := _unfit_for_scene(self):
+            raise ValueError(unfit)
         if self.images.projection.enabled and not self.cameras.mirror.enabled:
             remedy = "what is projected is what the mirror camera would see; set images.projection.enabled: false too"
             raise ValueError(f"images.projection.enabled is true and cameras.mirror.enabled is false: {remedy}")
-        if "covisible" in self.targets.views and not (self.cameras.mirror.enabled or self.cameras.depth.enabled):
-            remedy = "it says of other views what the input camera sees; set cameras.mirror.enabled or leave it out"
+        others = self.cameras.mirror.enabled or self.cameras.depth.enabled or self.cameras.more
+        if "covisible" in self.targets.views and not others:
+            remedy = "it says of other views what the input camera sees; name some in cameras.more, or leave it out"
             raise ValueError(f"targets.views asks for covisible, and there is no view beside the input's: {remedy}")
         if self.sensor.changes_rgb and not self.render.rgb:
             remedy = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
             raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {remedy}")
         return self
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether RGB is stored with alpha."""
+        return self.scene == "studio" and self.studio.background == "transparent"
 
     @property
     def drawn(self) -> Render:
@@ -253,13 +287,35 @@ class Job(Frozen):
         further = PILED_S if self.start.arrange == "pile" else FALLING_S
         traced = PATH_S * self.render.path_samples if self.render.tier == "pathtraced" else 0.0
         pairs, most_objects = self.pairs_per_scene, self.objects_per_scene.high
-        scene_s = SCENE_S * pairs + further * (most_objects - 1) + traced * pairs
+        views = sum((entry.count or 1) * (pairs if entry.beside else 1) for entry in self.cameras.more)
+        scene_s = SCENE_S * pairs + further * (most_objects - 1) + traced * pairs + (VIEW_S + traced / 3) * views
         return max(1, min(MOST, int(RANGE_S / scene_s), math.ceil(self.scenes / FEWEST_RANGES)))
 
     @property
     def stop_scene(self) -> int:
         """One past the last scene id."""
         return self.first_scene + self.scenes
+
+
+def _unfit_for_scene(job: Job) -> str | None:
+    """The key that the job's kind of scene cannot have, with the remedy; None where all fit."""
+    if job.scene == "tabletop":
+        if job.start.pose == "as_given":
+            return "start.pose is as_given, and on a table an object may not rest so: use upright, tumbled or placed"
+        if job.studio != Studio():
+            return "studio has keys, and scene is tabletop: set scene: studio, or leave them out"
+        return None
+    if job.objects_per_scene != ONE_OBJECT:
+        return "scene is studio, and objects_per_scene is not 1: a studio scene shows one object"
+    if job.start.pose == "placed":
+        return "scene is studio, and start.pose is placed: use as_given, upright or tumbled, nothing is set down"
+    if job.start.arrange == "pile":
+        return "scene is studio, and start.arrange is pile: leave it out"
+    if job.studio.background == "transparent" and job.sensor.changes_rgb:
+        return "sensor asks for an effect on RGB, which alpha cannot follow: set studio.background to a colour, such as [1, 1, 1]"
+    if job.render.tier == "pathtraced":
+        return "scene is studio, and render.tier is pathtraced: use raster or flat"
+    return None
 
 
 def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
@@ -272,6 +328,10 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
         )
     if not folders and captures.simulate.views > job.pairs_per_scene:
         return f"captures.simulate.views is {captures.simulate.views}, and pairs_per_scene is {job.pairs_per_scene}: raise that"
+    if job.scene != "tabletop":
+        return f"scene is {job.scene}: leave it out, a capture's object lies on its board"
+    if job.cameras.more:
+        return "cameras.more names cameras: leave it out, a capture has the views that were taken"
     if job.cameras.depth.enabled:
         return "cameras.depth.enabled is true: leave it out, depth of a capture is registered to its colour camera"
     if job.objects_per_scene != ONE_OBJECT:
@@ -286,7 +346,7 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
     return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"
 
 
-PATHS = frozenset({"assets.objects.folder", "assets.tables.folder", "captures.folders"})
+PATHS = frozenset({"assets.objects.folder", "assets.tables.folder", "captures.folders", "cameras.more.poses"})
 """Keys that name places, where the same files may lie elsewhere."""
 
 NOT_OF_A_DATASET = PATHS | {"scenes", "run", "preset"}

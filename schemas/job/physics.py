@@ -33,8 +33,9 @@ ObjectCount = Annotated[
 class Start(Frozen):
     """How an object begins."""
 
-    pose: Literal["upright", "tumbled", "placed"] = "upright"
-    """upright: uniform yaw; tumbled: uniform rotation; placed: set down at rest, no drop unless it would tip."""
+    pose: Literal["upright", "tumbled", "placed", "as_given"] = "upright"
+    """upright: uniform yaw; tumbled: uniform rotation; placed: set down at rest, no drop unless it would tip; as_given: as its
+    file has it, for `scene: studio`."""
     offset_m: Interval = Range(-0.25, 0.25)
     """Offset from the centre of the table top, along x and y."""
     arrange: Literal["spread", "pile"] = "spread"

@@ -1,118 +1,13 @@
-"""The branches of a job that shape its images: `cameras`, `images`, `render`, `sensor` and `targets`.
+"""The branches of a job that shape its images: `images`, `render`, `sensor` and `targets`.
 
 Targets are what networks are trained on beside the images of the article, by view and by shape.
 """
 
-import math
-import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from schemas.base import Frozen, Interval, NonNegative, Positive, PositiveInt, Range, Share
-
-Focal = Annotated[float, Field(ge=1e-3, le=1e6)]
-Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
-Reach = Annotated[float, Field(gt=0, le=1e3)]
-Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
-"""Bounds far beyond any camera, within which float32 on the GPU does not overflow."""
-
-
-FIT_SHARE = 0.06
-"""What `fit` stands for: a round thing then is a quarter of the picture wide."""
-
-
-def _read_share(text: str) -> str:
-    if text != "fit" and not (re.fullmatch(r"\d+(\.\d+)? ?%", text) and 0.0 < float(text.rstrip("% ")) <= 50.0):
-        raise ValueError("write metres, fit, or a share of the picture, such as 6%, up to 50%")
-    return text
-
-
-def _kind(value: object) -> str:
-    return "[fit]" if isinstance(value, str) else "[metres]"
-
-
-Framed = Annotated[
-    Annotated[Reach, Tag("[metres]")] | Annotated[str, AfterValidator(_read_share), Tag("[fit]")], Discriminator(_kind)
-]
-Behind = Annotated[Annotated[Reach, Tag("[metres]")] | Annotated[Literal["fit"], Tag("[fit]")], Discriminator(_kind)]
-
-
-class Orbit(Frozen):
-    """Where input cameras stand: spherical coordinates about the centre of the table top [A], or of the objects at rest."""
-
-    inclination_rad: Interval = Range(0.7, 0.9)
-    """Angle of the optical axis below the horizontal."""
-    yaw_rad: Interval = Range(-math.pi, math.pi)
-    """Direction from the table to the camera."""
-    radius_m: Framed = 2.5
-    """Distance from the centre of the table top. `6%`, or `fit` for the same: as near to the middle of the objects at rest as
-    they cover that share of the picture, none is cut off, and all are in the range of depth."""
-
-    @property
-    def share(self) -> float | None:
-        """The share of the picture that objects are to cover; None where the distance is given."""
-        if isinstance(self.radius_m, str):
-            return FIT_SHARE if self.radius_m == "fit" else float(self.radius_m.rstrip("% ")) / 100.0
-        return None
-
-
-class Sensor(Frozen):
-    """A pinhole camera. cx, cy count from the image's left and upper edge: pixel centres lie at +0.5 [A, D]."""
-
-    width: Annotated[int, Field(ge=1, le=4096)] = 640
-    """Pixels."""
-    height: Annotated[int, Field(ge=1, le=4096)] = 480
-    """Pixels."""
-    fx: Focal = 525.0
-    """Focal length, pixels."""
-    fy: Focal = 525.0
-    """Focal length, pixels."""
-    cx: Principal = 320.0
-    """Principal point, pixels from the left edge."""
-    cy: Principal = 240.0
-    """Principal point, pixels from the upper edge."""
-
-
-class DepthCamera(Frozen):
-    """The depth camera's place in the RGB camera's optical axes, metres; same rotation [A]."""
-
-    enabled: bool = True
-    """Whether there are aligned views."""
-    offset_m: tuple[Offset, Offset, Offset] = (-0.051, 0.001, -0.001)
-    """Translation in the RGB camera's optical axes."""
-
-
-MIRROR_FIT = 1.5
-"""T_z by d_z where it is `fit`: what is beyond the pivot lies lower in the mirror view, and tall things are still seen whole."""
-
-
-class Mirror(Frozen):
-    """The camera on the other side [A, C]."""
-
-    enabled: bool = True
-    """Whether there are mirror views; without them camPoses.csv has the even ids alone."""
-    T_z_m: Behind = 1.3
-    """Distance of the mirror camera from its pivot, the point it looks at. `fit`: 1.5 d_z."""
-    percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
-    """d_z, the distance to the object's front, is this percentile of its stored input depth; 0: the nearest."""
-
-    def distance_m(self, d_z_m: float) -> float:
-        """T_z, metres, for a pivot d_z_m ahead of the input camera."""
-        return MIRROR_FIT * d_z_m if isinstance(self.T_z_m, str) else self.T_z_m
-
-
-class Cameras(Frozen):
-    """Every camera of a pair."""
-
-    orbit: Orbit = Orbit()
-    """Where input cameras stand."""
-    sensor: Sensor = Sensor()
-    """The pinhole camera of every view."""
-    depth: DepthCamera = DepthCamera()
-    """The depth camera that is not aligned with the RGB camera."""
-    mirror: Mirror = Mirror()
-    """The camera on the other side."""
 
 
 class Patch(Frozen):
@@ -186,6 +81,19 @@ class Render(Frozen):
     """Paths through each pixel, for tier pathtraced; rounded up to a grid of nearly equal sides."""
     path_bounces: Annotated[int, Field(ge=1, le=64)] = 8
     """Most scatterings and glass crossings of a path, for tier pathtraced."""
+
+
+class Studio(Frozen):
+    """How an object stands for itself, with `scene: studio`: on nothing, so that there is no table, fall, floor or shadow."""
+
+    scale: Literal["metric", "unit_sphere", "unit_cube"] = "metric"
+    """metric: its own size; unit_sphere: within a sphere of radius `size_m`; unit_cube: its box's longest side is `size_m`."""
+    size_m: Annotated[float, Field(ge=1e-3, le=100)] = 1.0
+    """Of `unit_sphere` and `unit_cube`."""
+    light: Literal["even", "three_point", "environment"] = "even"
+    """even: from everywhere, no highlights; three_point: key, fill and rim; environment: a bright sky over a ground."""
+    background: Literal["transparent"] | tuple[Share, Share, Share] = "transparent"
+    """transparent: RGB has alpha, the share of each pixel that the object covers; or one sRGB colour, [1, 1, 1] for white."""
 
 
 class DepthNoise(Frozen):

@@ -7,7 +7,7 @@ from typing import Literal
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import Appearance, Asset, Hull, Mesh, Shape
-from schemas.scene.view import Camera
+from schemas.scene.view import Camera, NamedCamera
 
 EffectKind = Literal["asked", "no_op", "approximation"]
 """asked: a switch of the job. no_op: where the scene does not call for it, leaving it out changes no byte. approximation:
@@ -64,6 +64,14 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
+class Ground:
+    """What carries the objects of a scene: a table, on a floor."""
+
+    table: Table
+    floor: Shape
+
+
+@dataclass(frozen=True, eq=False)
 class ObjectStart:
     """The start of one object: its pose `T_world_obj` [4, 4] at release, and the number of positions rejected before it.
 
@@ -85,16 +93,35 @@ class ScenePlan:
 
     scene_id: int
     category: str
-    table: Table
-    floor: Shape
+    ground: Ground | None
+    """None in a studio scene."""
     objects: tuple[ObjectStart, ...]
     input_cameras: tuple[Camera, ...]
     """One for each pair, RGB camera."""
     appearance: Appearance
+    more: tuple[NamedCamera, ...] = ()
+    """Further cameras that stand by themselves; known where the objects rest."""
+
+    @property
+    def table(self) -> Table:
+        """The table. Raises ValueError in a studio scene, as `floor`."""
+        return self._on_ground.table
+
+    @property
+    def floor(self) -> Shape:
+        """The floor's shape, at z = 0."""
+        return self._on_ground.floor
+
+    @property
+    def _on_ground(self) -> Ground:
+        if self.ground is None:
+            raise ValueError("a studio scene has no table and no floor")
+        return self.ground
 
 
-SupportedBy = Literal["flat_top", "mesh", "placed"]
-"""The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest."""
+SupportedBy = Literal["flat_top", "mesh", "placed", "nothing"]
+"""The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest; nothing
+in a studio scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +145,8 @@ class Settled:
     inside the hull of the contacts that hold it up; equilibrium_residual: share of the weight, or of weight times size, that
     contact forces cannot balance; contacts: those that carry it, whose forces are the proof of that; residual_speed_mm_s:
     drift of the farthest point over the simulation's last window, or its speed where that ended with objects in motion, as those
-    that `spun` on about the vertical; recheck_move_mm and recheck_turn_deg: motion when released again (None where it was not).
+    that `spun` on about the vertical; all of these are nan of an object that nothing carries.
+    recheck_move_mm and recheck_turn_deg: motion when released again (None where it was not).
     """
 
     T_world_obj: Pose

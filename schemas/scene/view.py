@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Frozen, Pose
-from schemas.job.views import MOST_LAYERS, Patch, Sensor, ViewTarget
+from schemas.job.cameras import Sensor
+from schemas.job.views import MOST_LAYERS, Patch, ViewTarget
 
 Role = str
 """The name of a view's place in its pair."""
@@ -24,6 +25,8 @@ class ViewRole:
     """The effect that it is made by, where it can be left out."""
     beside: bool = False
     """Drawn by a camera that stands beside the input camera, at its branch's `offset_m`; it shares the input's pose id."""
+    named: bool = False
+    """Drawn by a camera of `cameras.more`, and not of a pair: its name is the entry's."""
     projected: bool = False
     """Carried over from the input view into the mirror camera, not drawn: it has no regions and no labels."""
 
@@ -85,6 +88,8 @@ class Modality:
         """The word in the file's name (`RGB`, `RGBaligned`, `depthAligned`); None where such a view has no such image."""
         if (role.projected and not self.projected) or (role.name == "input" and not self.of_input):
             return None
+        if role.named:
+            return f"{self.word.rstrip('_')}_{role.name}_"
         suffix = role.name if role.beside or role.projected else ""
         return self.word + (suffix if self.word.isupper() else suffix.capitalize())
 
@@ -138,8 +143,8 @@ class Intrinsics(Frozen):
 
     @staticmethod
     def of(sensor: Sensor) -> "Intrinsics":
-        """The intrinsics that a job's sensor describes."""
-        return Intrinsics(**sensor.model_dump())
+        """The intrinsics that a job's sensor describes; of its ranges the middle."""
+        return Intrinsics(**sensor.fixed().model_dump())
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +158,15 @@ class Camera:
     def position(self) -> Array:
         """[3] float64, world, metres."""
         return self.T_world_cam[:3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class NamedCamera:
+    """One camera of an entry of the job's `cameras.more`, by the entry's name and its number in it, from 0."""
+
+    name: str
+    number: int
+    camera: Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +205,7 @@ class ObjectLabel:
 class View:
     """One camera's images as they are stored, and its labels (none for a projected view).
 
-    rgb [H, W, 3] uint8, or None where the job asks for no colour; depth [H, W] uint16 in units of
+    rgb [H, W, 3] uint8 (with alpha [H, W, 4]), or None where the job asks for no colour; depth [H, W] uint16 in units of
     `Images.depth_units_per_m`; region [H, W] uint8, or None where the images were projected and not rendered. `pose_id` is
     the view's own; `parent_id` the input pose's.
     """
@@ -206,6 +220,8 @@ class View:
     labels: tuple[ObjectLabel, ...]
     further: Mapping[PixelKind, NDArray] = field(default_factory=dict)
     """Images of the other modalities."""
+    number: int | None = None
+    """Its number among the views of its role, of a camera of `cameras.more`."""
 
     @property
     def images(self) -> Mapping[PixelKind, NDArray]:

@@ -23,9 +23,10 @@ from workers.assets.catalogue import open_catalogue
 from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import FLAT, Renderer
-from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
 from workers.scene.make_scene import Scene, make_scene
 from workers.shard.run_shard import run_ranges
+from workers.stopwatch import Stopwatch
 from workers.store.commit import committed_files, read_record
 from workers.store.file_system import OpenTree
 from workers.store.images import decode_png, encode_png
@@ -145,7 +146,7 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
     Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
     # The flat tier has no shadows, and a path tracer is no rival of pyrender.
-    looks = LOOKS if job.render.tier == "raster" else ["plain"]
+    looks = LOOKS if job.render.tier == "raster" and job.scene == "tabletop" else ["plain"]
     laps: dict[str, list[Lap]] = {look: [] for look in looks}
     ours: list[Lap] = []
     floor: list[Lap] = []
@@ -206,7 +207,7 @@ def _draw(renderer: Renderer, scenes: Sequence[Scene]) -> tuple[float, float, fl
     """
     upload, wall, cpu = 0.0, 0.0, 0.0
     for scene in scenes:
-        cameras = [view.camera for pair in scene.pairs for view in pair.views if view.role != "projected"]
+        cameras = [view.camera for _, view in scene.views() if view.role != "projected"]
         things, appearance = scene.posed.things, scene.posed.appearance
         begun = time.perf_counter()
         renderer.draw(things, appearance, cameras[0], FLAT)

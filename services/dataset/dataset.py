@@ -21,6 +21,7 @@ from cachetools import LRUCache
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import view_name
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CorruptError, InputError, SceneError, command_line, needs_making
 from schemas.job.assets import NO_SPLIT, SPLITS, SplitShares
@@ -139,8 +140,6 @@ def _structs(table: pa.Table, key: str, values: pa.ChunkedArray) -> pa.ChunkedAr
 KEPT_BYTES = 256 << 20
 """Rows of ranges that are kept for reading pairs in any order; the last range whatever its size."""
 
-Records = Sequence[CommitRecord]
-
 
 def open_dataset(place: str | Path) -> "Dataset":
     """The dataset in a folder, or in a bucket such as s3://bucket/path; finished or being made, scenes or captures.
@@ -160,7 +159,9 @@ class Dataset:
         self.place = store.name
         self.job: Job = record.job
         """The job that made it, every default filled in."""
-        self._kept: LRUCache[range, _Range] = LRUCache(KEPT_BYTES, lambda kept: min(kept.rows.nbytes, KEPT_BYTES))
+        self._kept: LRUCache[range, tuple[RangeRows, RangeFiles]] = LRUCache(
+            KEPT_BYTES, lambda kept: min(kept[0].nbytes, KEPT_BYTES)
+        )
         """The last ranges that were asked for a scene, by their scenes."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
@@ -206,8 +207,7 @@ class Dataset:
     def _pairs(self, where: pc.Expression | None, part: tuple[int, int]) -> Iterator[Pair]:
         for number, records in enumerate(iter_committed(self._store)):
             if number % part[1] == part[0]:
-                opened = self._open_range(records)
-                yield from pairs_of(opened.rows, opened.files, where)
+                yield from pairs_of(*self._open_range(records), where)
 
     def pair(self, pose_id: int) -> Pair:
         """The pair with this id of its input view or of its mirror view. Raises InputError where it is not stored."""
@@ -226,12 +226,12 @@ class Dataset:
             records = find_records(self._store, scene_id)
             scenes = range(records[0].span.start, records[0].span.stop)
             self._kept[scenes] = self._open_range(records)
-        opened = self._kept[scenes]
-        return tuple(pairs_of(opened.rows.of_scene(scene_id), opened.files))
+        rows, files = self._kept[scenes]
+        return tuple(pairs_of(rows.of_scene(scene_id), files))
 
-    def _open_range(self, records: Records) -> "_Range":
-        rows = RangeRows.of(lambda table: range_rows(self._store, records, table))
-        return _Range(rows, RangeFiles(self._files, records))
+    def _open_range(self, records: Sequence[CommitRecord]) -> "tuple[RangeRows, RangeFiles]":
+        """The rows and files of a committed range."""
+        return RangeRows.of(lambda table: range_rows(self._store, records, table)), RangeFiles(self._files, records)
 
 
 @dataclass(frozen=True)
@@ -239,6 +239,8 @@ class RangeRows:
     """The rows of some scenes: `pair_table`, and those of `objects` and `assets`."""
 
     pairs: pa.Table
+    more: pa.Table
+    """Those of `views` of named cameras."""
     objects: pa.Table
     assets: pa.Table
 
@@ -246,7 +248,8 @@ class RangeRows:
     def of(cls, rows: Callable[[str], pa.Table]) -> "RangeRows":
         """`rows` returns the scenes' rows of a table."""
         tables = {name: rows(name) for name in PAIR_TABLES}
-        return cls(pair_table(tables), rows("objects"), tables["assets"])
+        more = tables["views"].filter(pc.field("number").is_valid())
+        return cls(pair_table(tables), more, rows("objects"), tables["assets"])
 
     def of_scene(self, scene_id: int) -> "RangeRows":
         """The same with the pairs of one scene, which stand together: a filter would copy them, which takes 1 ms."""
@@ -256,15 +259,7 @@ class RangeRows:
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
-        return int(self.pairs.nbytes + self.objects.nbytes + self.assets.nbytes)
-
-
-@dataclass(frozen=True)
-class _Range:
-    """A committed range: its rows and files."""
-
-    rows: RangeRows
-    files: RangeFiles
+        return int(self.pairs.nbytes + self.more.nbytes + self.objects.nbytes + self.assets.nbytes)
 
 
 def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) -> Iterator[Pair]:
@@ -279,9 +274,12 @@ def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) 
         defaultdict[tuple[int, str], list[Row]](list),
     )
     for row in chosen.to_pylist():
-        labels[row["pose_id"], row["role"]].append(row | {"asset": assets[row["instance_id"]]})
+        name = view_name(row["role"], row["number"])
+        labels[row["pose_id"], name].append(row | {"asset": assets[row["instance_id"]]})
     for number in np.argsort(table.column("parent_id").to_numpy()):
-        yield read_pair(table.slice(number, 1).to_pylist()[0], labels, files)
+        row = table.slice(number, 1).to_pylist()[0]
+        further = rows.more.filter(pc.field("parent_id") == row["parent_id"]).to_pylist() if len(rows.more) else ()
+        yield read_pair(row, labels, files, further)
 
 
 def make_scene(
@@ -295,8 +293,9 @@ def make_scene(
     """
     with needs_making("verso.make_scene"):
         from workers.capture.results import open_sources
-        from workers.scene.context import Stopwatch, open_worker
+        from workers.scene.context import open_worker
         from workers.shard.run_shard import run_scene
+        from workers.stopwatch import Stopwatch
 
     parsed, folder = _parse(job, changes)
     catalogue = open_sources(parsed, folder)

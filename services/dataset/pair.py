@@ -3,7 +3,7 @@
 Correspondence is where the pixels of one view lie in another, and whether they are seen there, from the stored images of both.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_world_poses
+from schemas.dataset.layout import view_name
 from schemas.errors import InputError
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import ROLES, Role
+from schemas.scene.view import ROLES
 from services.dataset.view import Files, Frame, Pixels, View, pick, read_mesh, read_view
+from services.dataset.views import Views
 from workers.geometry.camera import project, unproject
 from workers.geometry.frames import invert, transform
 
@@ -120,8 +122,9 @@ class Pair:
     instance_id: str
     scene: Mapping[str, Any] = field(repr=False)
     asset: Mapping[str, Any] = field(repr=False)
-    views: Mapping[Role, View] = field(repr=False)
-    """Every view there is, by role; those of the article have names of their own below."""
+    views: Views = field(repr=False)
+    """Every view there is, by role; those of the article have names of their own below. `views["around", 3]` and
+    `views("around")` are of a camera that the job names, with the first pair of each scene."""
     _files: Files = field(repr=False)
 
     @property
@@ -232,8 +235,11 @@ class Pair:
         return partial, transform(T_frame_cam @ T_cam_world @ self.T_world[region], whole)
 
 
-def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files) -> Pair:
-    """The pair of a row of `pair_table`; `labels`: rows of `objects`, with that of `assets`, by (pose id, role)."""
+def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: Files, further: Sequence[Row] = ()) -> Pair:
+    """The pair of a row of `pair_table`; `labels`: rows of `objects`, with that of `assets`, by (pose id, name of the view).
+
+    further: rows of `views` of named cameras.
+    """
     scene = MappingProxyType({name: value for name, value in row.items() if name not in (*ROLES, "asset", "parent_id")})
     return Pair(
         pose_id=row["parent_id"],
@@ -242,8 +248,9 @@ def read_pair(row: Row, labels: Mapping[tuple[int, str], list[Row]], files: File
         instance_id=row["instance_id"],
         scene=scene,
         asset=MappingProxyType(row["asset"] or {}),
-        views=MappingProxyType(
+        views=Views(
             {role: read_view(row[role], labels, scene, files) for role in ROLES if row[role] is not None}
+            | {view_name(more["role"], more["number"]): read_view(more, labels, scene, files) for more in further}
         ),
         _files=files,
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_camera, read_label, read_matrix
-from schemas.dataset.layout import PixelKind, file_pose_id, patch_index
+from schemas.dataset.layout import PixelKind, file_pose_id, patch_index, view_name
 from schemas.errors import InputError
 from schemas.job.views import Patch
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
@@ -131,8 +131,17 @@ class Pixels:
         return decode_png(self._files.image(path), path)
 
     def rgb(self) -> NDArray[np.uint8]:
-        """[H, W, 3] uint8 sRGB."""
-        return self.image("rgb")
+        """[H, W, 3] uint8 sRGB; where alpha is stored, colours that it does not darken."""
+        return self.image("rgb")[:, :, :3]
+
+    def alpha(self) -> NDArray[np.uint8]:
+        """[H, W] uint8: the share of each pixel that is covered, as 255. Raises InputError where none is stored."""
+        pixels = self.image("rgb")
+        if pixels.shape[2] < 4:
+            raise InputError(
+                "this view's RGB has no alpha: a job of scene studio stores it with studio.background transparent"
+            )
+        return pixels[:, :, 3]
 
     def depth(self) -> NDArray[np.uint16]:
         """[H, W] uint16: z along the optical axis as it is stored, in units of 1 / `depth_units_per_m`; 0 where unknown."""
@@ -258,6 +267,8 @@ class View(Pixels):
     """One view of a pair: its camera, its labels, its images. Every column of its row of `views` is in `row`."""
 
     role: Role
+    number: int | None
+    """Of a named camera's view, among those of its role; else None."""
     pose_id: int
     d_z_m: float
     visible_fraction: float | None
@@ -291,7 +302,8 @@ class View(Pixels):
 def read_view(row: Row, labels: Mapping[tuple[int, str], list[Row]], scene: Mapping[str, Any], files: Files) -> View:
     """The view of a row of `views`; the projected view has the labels of the mirror view. `labels` as for `read_pair`."""
     labelled: Role = "mirror" if row["role"] == "projected" else row["role"]
-    own = labels.get((file_pose_id(labelled, row["parent_id"]), labelled), ())
+    number = row.get("number")
+    own = labels.get((file_pose_id(labelled, row["parent_id"]), view_name(labelled, number)), ())
     return View(
         camera=read_camera(row),
         depth_units_per_m=row["depth_units_per_m"],
@@ -300,6 +312,7 @@ def read_view(row: Row, labels: Mapping[tuple[int, str], list[Row]], scene: Mapp
         _scene=scene,
         _files=files,
         role=row["role"],
+        number=number,
         pose_id=row["pose_id"],
         d_z_m=row["d_z_m"],
         visible_fraction=row["visible_fraction"],

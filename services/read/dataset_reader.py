@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby
 from operator import itemgetter
 from types import MappingProxyType
@@ -25,17 +25,18 @@ from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import (
     COMMITS,
-    IMAGES,
     MANIFEST,
     STAGING,
     SUCCESS_FILE,
     Content,
     PixelKind,
     image_path,
+    images_of,
     is_shape,
     patch_path,
     range_name,
     range_table_path,
+    view_name,
 )
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError, command_line
@@ -68,11 +69,11 @@ class StoredRange:
         return next((row for row in self.rows["scenes"] if row["scene_id"] == scene_id), None)
 
     def pairs(self, scene_id: int) -> Iterator[tuple[dict[str, Row], list[Row]]]:
-        """(rows of `views` by role, rows of `objects`) of each pair of a scene, by pose id."""
+        """(rows of `views` by name, rows of `objects`) of each pair of a scene, by pose id."""
         views = [row for row in self.rows["views"] if row["scene_id"] == scene_id]
         objects = [row for row in self.rows["objects"] if row["scene_id"] == scene_id]
         for parent in sorted({row["parent_id"] for row in views}):
-            pair = {row["role"]: row for row in views if row["parent_id"] == parent}
+            pair = {view_name(row["role"], row["number"]): row for row in views if row["parent_id"] == parent}
             ids = {row["pose_id"] for row in pair.values()}
             yield pair, [row for row in objects if row["pose_id"] in ids]
 
@@ -212,19 +213,21 @@ def _check_samples(arrays: Mapping[str, NDArray]) -> None:
 
 
 def region_names(scene: Mapping[str, Any]) -> dict[int, tuple[str, str]]:
-    """(category, instance id) of the table and of every object, by region id, of a row of `scenes`."""
+    """(category, instance id) of the table, where there is one, and of every object, by region id, of a row of `scenes`."""
     bodies = scene["bodies"] or [{**scene, "region_id": REGION_FIRST_OBJECT}]
     objects = {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
-    return {REGION_TABLE: (TABLE, scene["table_id"]), **objects}
+    table = {} if scene["table_id"] is None else {REGION_TABLE: (TABLE, scene["table_id"])}
+    return table | objects
 
 
 def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:
     """The paths of a view's images that are stored, by kind; `amodal0`, `amodal1` of one that each of several objects has."""
     listed, named = {file["path"] for file in row["files"]}, dict[PixelKind, str]()
     for kind, content in _contents(row):
-        named[kind] = image_path(row["category"], content, row["pose_id"])
+        path_of = partial(image_path, row["category"], content, row["pose_id"], number=row.get("number"))
+        named[kind] = path_of()
         if MODALITIES[kind].each:
-            each = (image_path(row["category"], content, row["pose_id"], n) for n in itertools.count())
+            each = (path_of(n) for n in itertools.count())
             named |= {f"{kind}{n}": path for n, path in enumerate(itertools.takewhile(listed.__contains__, each))}
     return _those(named, listed)
 
@@ -237,7 +240,7 @@ def patch_paths(row: Mapping[str, Any], index: int | None) -> Mapping[PixelKind,
 
 def _contents(row: Mapping[str, Any]) -> Iterator[tuple[PixelKind, Content]]:
     """Kinds of images that a view may have, with the word in their names."""
-    return ((image.pixels, image.content) for image in IMAGES if image.role == row["role"])
+    return ((image.pixels, image.content) for image in images_of(row["role"]))
 
 
 def _those(named: Mapping[PixelKind, str], listed: Collection[str]) -> Mapping[PixelKind, str]:

@@ -19,9 +19,10 @@ from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, committed_reader, decode_samples, file_reader, find_scene
 from workers.capture.results import open_sources
-from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
 from workers.shard.run_shard import run_scene
+from workers.stopwatch import Stopwatch
 from workers.store.images import decode_png
 from workers.store.manifest import files_of_rows, table_of_rows
 from workers.store.store import Store

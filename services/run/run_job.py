@@ -292,8 +292,9 @@ def measure_scene(job: Job, catalogue: Catalogue) -> tuple[float, float] | str |
 
     Where none can be made, why the last could not; None where that is a bug. Scenes that fail count with their time.
     """
-    from workers.scene.context import Stopwatch, open_worker  # load GL and PyBullet
+    from workers.scene.context import open_worker  # load GL and PyBullet
     from workers.shard.run_shard import run_scene
+    from workers.stopwatch import Stopwatch
 
     context = open_worker(job, catalogue)
     took, sizes, why = [], [], None

@@ -37,9 +37,10 @@ from services.study.truths import (
     seen_by_other,
 )
 from workers.geometry.pixels import dequantise_depth
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.make_scene import Scene, render_scene
 from workers.scene.rows import record_scene
+from workers.stopwatch import Stopwatch
 
 KEPT = 12
 """Casts kept of a scene, some 0.3 MB each: the last ones used. Every setting uses the input camera's; the mirror camera moves

@@ -35,9 +35,10 @@ from workers.capture.score import read_whole_truth, score_capture
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import motion_between, transform
 from workers.physics.settle import Rest
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.make_scene import Laid, lay_scene, plan_with_effects
 from workers.shard.run_shard import describe
+from workers.stopwatch import Stopwatch
 
 Answer = dict[str, Any]
 

@@ -24,8 +24,9 @@ from services.study.model import OWN, Proof, Row, Setting, Study, Targets, apply
 from services.study.table import AT_REST, PARTS, Part, Table, figures_of, part_of, split_settings, unit_name
 from workers.assets.catalogue import open_catalogue
 from workers.pool import Answers, Ended, Pool
-from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
 from workers.shard.run_shard import run_scene
+from workers.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)

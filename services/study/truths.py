@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import InputError
 from schemas.job.views import Render
-from schemas.scene.scene import Placed
+from schemas.scene.scene import Ground, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
@@ -240,7 +240,7 @@ def converged_colour(context: WorkerContext, scene: Scene, crop: Crop, paths: in
     # As the path-traced tier draws it: the flat tier has another floor and other lights.
     chance = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
     floor, appearance = draw_appearance(chance, "pathtraced")
-    plan = replace(scene.plan, floor=floor, appearance=appearance)
+    plan = replace(scene.plan, ground=Ground(scene.plan.table, floor), appearance=appearance)
     things = [
         Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
         for thing in scene.posed.things

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from schemas.job.views import ViewTarget
-from tests.effects.scenes import ABOVE_THE_HORIZON, Setting, with_holes, without_textures
+from tests.effects.scenes import ABOVE_THE_HORIZON, Setting, merged, with_holes, without_textures
 
 TARGETS: tuple[str, ...] = get_args(ViewTarget)
 
@@ -46,6 +46,10 @@ TRACED = {"render": {"tier": "pathtraced", "path_samples": 1}, "categories": ["j
 
 WITHOUT_MIRROR = {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}}
 
+STUDIO: dict[str, Any] = {"scene": "studio"}
+FRAMED: dict[str, Any] = {"cameras": {"orbit": {"radius_m": 1.0}}}
+AROUND: dict[str, Any] = {"cameras": {"more": [{"name": "around", "ring": {"count": 3}}]}}
+
 ASKED: dict[str, Case] = {
     "depth_camera": _asked({}, {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled is false"),
     "mirror": _asked({}, WITHOUT_MIRROR, "cameras.mirror.enabled is false"),
@@ -69,7 +73,16 @@ ASKED: dict[str, Case] = {
     "raycast_check": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
     "release_again": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
     **{name: _target(name) for name in TARGETS},
+    "further_views": _asked({**STUDIO, **merged(FRAMED, AROUND)}, {**STUDIO, **FRAMED}, "cameras.more is empty"),
+    "alpha": _asked(
+        {**STUDIO, **FRAMED},
+        {**STUDIO, **FRAMED, "studio": {"background": [0.0, 0.0, 0.0]}},
+        "studio.background is a colour",
+    ),
 }
+
+OF_OTHERS = {*TARGETS, "further_views", "alpha"}
+"""Effects that the receipt of a job does not name which has nothing of their kind."""
 
 NO_OPS: dict[str, Case] = {
     "floor": Case(Setting({}), Setting(ABOVE_THE_HORIZON), "outside of every view"),

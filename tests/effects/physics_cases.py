@@ -2,14 +2,15 @@
 
 from dataclasses import replace
 
-from schemas.scene.scene import ScenePlan
+from schemas.scene.scene import Ground, ScenePlan
 from tests.effects.cases import Case
 from tests.effects.scenes import Setting
 
 
 def on_a_bumpy_table(plan: ScenePlan) -> ScenePlan:
     """The same table, said to have no convex level top."""
-    return replace(plan, table=replace(plan.table, top=replace(plan.table.top, convex=False)))
+    table = replace(plan.table, top=replace(plan.table.top, convex=False))
+    return replace(plan, ground=Ground(table, plan.floor))
 
 
 PLACED = Setting({"start": {"pose": "placed"}})

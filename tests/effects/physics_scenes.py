@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import cache
 
 from schemas.base import Pose
-from schemas.scene.scene import EffectPlan, ScenePlan, Settled
+from schemas.scene.scene import EffectPlan, Ground, ScenePlan, Settled
 from services.read.audit import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop
@@ -27,7 +27,8 @@ def _drawn() -> Facts:
 def facts_with(*cases: Drop) -> Facts:
     """A scene of the default physics with these objects, on the first one's table."""
     objects = tuple(dataclasses.replace(case.start, region_id=3 + k) for k, case in enumerate(cases))
-    plan: ScenePlan = dataclasses.replace(_drawn().plan, objects=objects, table=cases[0].table)
+    ground = Ground(cases[0].table, _drawn().plan.floor)
+    plan: ScenePlan = dataclasses.replace(_drawn().plan, objects=objects, ground=ground)
     return dataclasses.replace(_drawn(), plan=plan)
 
 

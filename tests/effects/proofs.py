@@ -184,7 +184,7 @@ PROOFS: dict[str, Proof] = {
     **{f"sensor_{name}": one_sensor_less(name) for name in ALL_SENSORS},
     "raycast_check": Proof(CHECKED, only_with(lambda made: "raycast" in made.stopwatch.seconds)),
     "release_again": Proof(CHECKED, only_with(lambda made: made.scene.settled[0].recheck_move_mm is not None)),
-    **{name: switched(name) for name in TARGETS},
+    **{name: switched(name) for name in (*TARGETS, "further_views", "alpha")},
     "floor": Proof(NO_OPS["floor"].needs, sees(REGION_FLOOR)),
     "table": Proof(NO_OPS["table"].needs, sees(REGION_TABLE)),
     "textures": Proof(NO_OPS["textures"].needs, same_as(Setting({}, without_textures))),

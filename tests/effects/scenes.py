@@ -11,17 +11,18 @@ import numpy as np
 
 import workers.scene.make_scene
 from schemas.job.job import Job, settings_digest
-from schemas.scene.scene import ScenePlan
+from schemas.scene.scene import Ground, ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.job_file import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.chance import SceneChance
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.plan import plan_scene
 from workers.scene.rows import record_scene
+from workers.stopwatch import Stopwatch
 
 SMALL: dict[str, Any] = {
     "name": "effects",
@@ -143,4 +144,4 @@ def _each_part(plan: ScenePlan, change: Callable[[Part], Part]) -> ScenePlan:
     objects = tuple(
         replace(start, asset=replace(start.asset, shape=_of_parts(start.asset.shape, change))) for start in plan.objects
     )
-    return replace(plan, floor=_of_parts(plan.floor, change), table=table, objects=objects)
+    return replace(plan, ground=Ground(table, _of_parts(plan.floor, change)), objects=objects)

@@ -4,7 +4,7 @@ import importlib.util
 
 import pytest
 
-from tests.effects.cases import ASKED, NO_OPS, TARGETS, Case
+from tests.effects.cases import ASKED, NO_OPS, OF_OTHERS, Case
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.scenes import Setting, facts_of, make
 from workers.scene.effects import EFFECTS, names_of_kind, plan_effects, write_receipt
@@ -70,7 +70,7 @@ def test_an_effect_that_was_called_for_late_moves_from_skipped_to_ran():
     assert ran[:2] == ["dynamics", "table_mesh"]
     assert "table_mesh" not in {one["effect"] for one in skipped}
     told = {*ran, *(one["effect"] for one in skipped)}
-    assert {effect.name for effect in EFFECTS} - told == set(TARGETS)  # none is asked for
+    assert {effect.name for effect in EFFECTS} - told == OF_OTHERS
 
 
 def test_every_effect_that_ran_is_timed_within_a_stage_that_was_timed():

@@ -18,8 +18,8 @@ from tests.effects.random_physics import needed, random_physics
 from tests.effects.scenes import Setting, facts_of, make, with_holes, without_textures
 from workers.geometry.raycast import cast_view
 from workers.physics.settle import settle_scene
+from workers.scene.cameras import place_beside, place_mirror_camera
 from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects
-from workers.scene.pairs import place_beside, place_mirror_camera
 
 pytestmark = pytest.mark.minute
 

@@ -23,7 +23,8 @@ from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.pixels import quantise_depth
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.render.raster.gbuffer import Renderer
-from workers.scene.pairs import object_distance, place_mirror_camera
+from workers.scene.cameras import place_mirror_camera
+from workers.scene.pairs import object_distance
 from workers.scene.ray_check import EDGE_PX, check_against_rays
 
 JOB = Job(name="t")

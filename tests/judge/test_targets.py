@@ -21,9 +21,11 @@ from tests.judge.targets import context_of, judge_scene, pairs_of, stored_pairs
 from workers.capture import make_capture
 from workers.geometry.frames import translation
 from workers.geometry.mesh import corner_weights
-from workers.scene import painting, pairs, rows, surfaces, targets
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene import pairs, rows
+from workers.scene.context import WorkerContext
 from workers.scene.make_scene import Laid, lay_scene, render_scene
+from workers.stopwatch import Stopwatch
+from workers.targets import painting, surfaces, targets
 
 EVERY = {"views": ["normals", "coordinates", "albedo", "covisible", "amodal", "layers"]}
 NEAR = {

@@ -24,8 +24,8 @@ from tests.judge.targets import context_of
 from workers.geometry.frames import invert, transform
 from workers.render.pathtraced import Tracer
 from workers.render.tiers import require_mitsuba
-from workers.scene.context import Stopwatch
 from workers.scene.make_scene import Scene, make_scene
+from workers.stopwatch import Stopwatch
 
 STRIDE = 13
 """Prime, so that pixels of every column come up."""

@@ -23,8 +23,9 @@ def render(scenes: int) -> list[NDArray]:
     """Every image of some scenes of the default job, as it comes from the renderer, and their textures."""
     from schemas.job.job import Job
     from workers.assets.catalogue import open_catalogue
-    from workers.scene.context import Stopwatch, open_worker
+    from workers.scene.context import open_worker
     from workers.scene.make_scene import make_scene
+    from workers.stopwatch import Stopwatch
 
     job = Job(name="digests", seed=11, scenes=scenes)
     context = open_worker(job, open_catalogue(job.assets, Path(), tuple(job.categories)))

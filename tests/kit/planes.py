@@ -6,7 +6,7 @@ from schemas.job.views import Images
 from schemas.scene.view import Camera, Intrinsics, Role, View
 from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.pixels import quantise_depth
-from workers.scene.pairs import mirror_pose
+from workers.scene.cameras import mirror_pose
 
 K = Intrinsics(width=160, height=120, fx=131.0, fy=131.0, cx=80.0, cy=60.0)
 IMAGES = Images()

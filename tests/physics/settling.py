@@ -9,7 +9,7 @@ import numpy as np
 from schemas.base import Pose, frozen_array
 from schemas.job.job import Job
 from schemas.job.physics import Physics
-from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, Table
+from schemas.scene.scene import EffectPlan, Ground, ObjectStart, ScenePlan, Settled, Table
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box, table
 from workers.geometry.hull import convex_hull
@@ -36,7 +36,7 @@ def _drawn() -> ScenePlan:
 
 def scene_of(starts: Sequence[ObjectStart], on: Table) -> ScenePlan:
     """A scene of these objects over this table."""
-    return dataclasses.replace(_drawn(), table=on, objects=tuple(starts))
+    return dataclasses.replace(_drawn(), ground=Ground(on, _drawn().floor), objects=tuple(starts))
 
 
 def effects_of(starts: Sequence[ObjectStart], on: Table, physics: Physics) -> EffectPlan:

@@ -7,8 +7,8 @@ and offset. So a process makes each texture once and hands the same array to the
 
 import functools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import cv2
@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
-from schemas.job.views import Tier
+from schemas.job.views import Studio, Tier
 from schemas.scene.shape import Appearance, Light, Material, Part, Shape
 from workers.assets.builtin.materials import Plane, Texture, stretched
+from workers.geometry.colour import decode_srgb
 
 FLOOR_HALF_M = 30.0
 """Half the floor's side. The lowest ray of an input camera (0.7 rad less half the field of view) meets the floor some
@@ -74,6 +75,38 @@ def _two_lights(rng: np.random.Generator) -> Appearance:
     )
 
 
+def _direction(azimuth: float, elevation: float) -> Array:
+    level = math.cos(elevation)
+    return frozen_array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
+
+
+STUDIO_LIGHTS: Mapping[str, Appearance] = {
+    "even": Appearance((0.95,) * 3, (Light(_direction(0.0, 0.5), (0.0,) * 3),), (0.0,) * 3, (0.45,) * 3, sheen=0.15),
+    "three_point": Appearance(
+        (0.25,) * 3,
+        (
+            Light(_direction(0.8, 0.6), (0.55, 0.54, 0.52)),
+            Light(_direction(-0.9, 0.3), (0.22, 0.23, 0.24)),
+            Light(_direction(math.pi, 0.9), (0.3,) * 3),
+        ),
+        (0.0,) * 3,
+        below=(0.2,) * 3,
+    ),
+    "environment": Appearance(
+        (0.85, 0.88, 0.92), (Light(_direction(0.0, 0.5), (0.0,) * 3),), (0.0,) * 3, (0.38, 0.36, 0.33), sheen=0.3
+    ),
+}
+"""The light of studio scenes, fixed in the world. Nothing of it casts a shadow."""
+
+
+def studio_light(studio: Studio) -> Appearance:
+    """Light and background of a studio scene; behind a transparent one is black."""
+    if studio.background == "transparent":
+        return STUDIO_LIGHTS[studio.light]
+    red, green, blue = (float(x) for x in decode_srgb(np.rint(255.0 * np.array(studio.background)).astype(np.uint8)))
+    return replace(STUDIO_LIGHTS[studio.light], background=(red, green, blue))
+
+
 def _studio(rng: np.random.Generator) -> Appearance:
     """A key light 40 to 80 degrees above the horizon, up to two fill lights, and a sky and ground of other tints."""
     azimuth, elevation = rng.uniform(-math.pi, math.pi), rng.uniform(0.7, 1.4)
@@ -99,11 +132,6 @@ def _studio(rng: np.random.Generator) -> Appearance:
 def _tint(level: float, warmth: float) -> tuple[float, float, float]:
     """Linear RGB with this level of green, redder where warmth is positive and bluer where it is negative."""
     return (level * (1.0 + warmth), level, level * (1.0 - 1.5 * warmth))
-
-
-def _direction(azimuth: float, elevation: float) -> Array:
-    level = math.cos(elevation)
-    return frozen_array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
 
 
 TEXTURE_PX = 512

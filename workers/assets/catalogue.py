@@ -7,8 +7,8 @@ a command's start, and a coordinator of built-in shapes needs none of it.
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ from schemas.job.assets import (
 )
 from schemas.job.job import differing_keys
 from schemas.scene.shape import Asset
+from workers.assets.poses import PoseFile
 from workers.geometry.frames import add_up
 
 if TYPE_CHECKING:
@@ -72,6 +73,8 @@ class Catalogue:
     digest: str
     captures: tuple[CaptureListing, ...] = ()
     """Folders of captures, in order; the digest covers their files too."""
+    poses: Mapping[str, PoseFile] = field(default_factory=dict)
+    """Tables of camera poses by the name of their camera; the digest covers them too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""
@@ -134,8 +137,8 @@ class Catalogue:
         ]
 
     def describe_doubts(self) -> list[str]:
-        """One line for each folder with files that stand on another axis than was decided."""
-        lines = []
+        """Lines on each folder with files that stand on another axis than was decided, or that have no colour."""
+        lines = [f"{library.source}: {message}" for library in self.libraries() for message in library.plain]
         for library in self.libraries():
             if not library.doubts:
                 continue
@@ -152,7 +155,7 @@ class Catalogue:
         if isinstance(settings, ProceduralSource):
             from workers.assets.builtin.make import make_asset
 
-            return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
+            return make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
         from workers.assets.library.shapes import load_shape
 
         assert library is not None

@@ -27,8 +27,8 @@ from schemas.capture import (
 from schemas.dataset.codec import Row, camera_columns
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CaptureError, OutputError, ViewError, command_line
+from schemas.job.cameras import Mirror
 from schemas.job.captures import Captures
-from schemas.job.views import Mirror
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.folder import (
@@ -65,8 +65,9 @@ from workers.capture.surface.object_mask import Ground, down_to_board, silhouett
 from workers.capture.surface.posed_view import PosedView, distort_mask
 from workers.capture.surface.synthesize import Source, choose_sources, color_depth, prepare_source, synthesize_view
 from workers.capture.surface.tsdf import fit_depth
-from workers.scene.context import Stopwatch
-from workers.scene.pairs import front_distance, place_mirror_camera
+from workers.scene.cameras import place_mirror_camera
+from workers.scene.pairs import front_distance
+from workers.stopwatch import Stopwatch
 from workers.store.images import encode_mask, encode_png
 
 _CAMERA = ("T_world_cam", "width", "height", "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv")

@@ -30,7 +30,7 @@ from workers.capture.surface.object_mask import ObjectRegion, down_to_board, fin
 from workers.capture.surface.posed_view import PosedView, pose_view
 from workers.geometry.frames import invert
 from workers.geometry.mesh import face_areas
-from workers.scene.context import Stopwatch
+from workers.stopwatch import Stopwatch
 
 FEW_POINTS = 500
 """The user is told of a cloud with fewer."""

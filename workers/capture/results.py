@@ -24,6 +24,7 @@ from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
+from workers.assets.poses import open_poses
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
 from workers.capture.truth import TRUTH
 from workers.door.meshes.ply import Element, encode_ply, parse_ply
@@ -164,6 +165,9 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
+    if poses := open_poses(job, job_folder):
+        whole = "\n".join([catalogue.digest, *(file.sha256 for file in poses.values())])
+        catalogue = replace(catalogue, poses=poses, digest=hashlib.sha256(whole.encode()).hexdigest())
     if job.captures is None or not job.captures.folders:
         return catalogue
     listings, folders = [], job.captures.folders

@@ -20,12 +20,14 @@ from schemas.scene.view import Camera, Pair, Role, View
 from workers.assets.glb import asset_glb
 from workers.capture.process import residual_columns
 from workers.geometry.pixels import quantise_depth
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.cameras import place_mirror_camera
+from workers.scene.context import WorkerContext
 from workers.scene.labels import CountPixels, derive_projected, label_things, projection_shares
-from workers.scene.pairs import object_distance, place_mirror_camera
+from workers.scene.pairs import object_distance
 from workers.scene.rows import asset_row, encode_view, object_rows, view_row
-from workers.scene.targets import draw_targets
+from workers.stopwatch import Stopwatch
 from workers.store.images import encode_png
+from workers.targets.targets import draw_targets
 
 
 def capture_regions(camera: Camera, board: Board, mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

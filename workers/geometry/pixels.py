@@ -379,3 +379,10 @@ def _draw(points: Array, focal: tuple[float, float, float, float], lens: Array, 
             pixels[n, 0] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cx
             pixels[n, 1] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
     return pixels
+
+
+def is_inner(region: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """[H, W]: the pixels that, with all eight beside them, show something; region [H, W]. None at the image's edge does."""
+    shown = (region > 0).astype(np.uint8)
+    inner: NDArray = cv2.erode(shown, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return inner > 0

@@ -28,6 +28,9 @@ class Stream(IntEnum):
     HELD_OUT = 15
     LOST = 16
     SENSOR = 17
+    ORBIT = 18
+    MORE = 19
+    MIRROR = 20
 
 
 _SENSORS = {"depth_noise": Stream.SENSOR_DEPTH, "rgb_noise": Stream.SENSOR_RGB, "exposure": Stream.SENSOR_EXPOSURE}

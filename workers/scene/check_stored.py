@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.dataset.codec import Row, columns_of_bodies, read_camera, read_label, read_world_poses
-from schemas.dataset.layout import file_pose_id, image_path, patch_index, stored_images
-from schemas.dataset.tables import ALWAYS_OF_SCENES
+from schemas.dataset.layout import file_pose_id, image_path, patch_index, stored_images, stored_shape, view_name
+from schemas.dataset.tables import misplaced_columns
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan
 from schemas.scene.shape import REGION_FIRST_OBJECT
@@ -15,8 +15,10 @@ from schemas.scene.view import MODALITIES, Role, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
+from workers.scene.cameras import draw_mirror_share, place_beside, place_fixed, place_mirror_camera
+from workers.scene.chance import SceneChance
 from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
-from workers.scene.pairs import object_distance, place_beside, place_mirror_camera
+from workers.scene.pairs import object_distance
 from workers.scene.rows import amodal_columns, image_boxes
 
 ROUNDING = 1e-12
@@ -27,12 +29,10 @@ ReadImage = Callable[[str], NDArray]
 
 def check_stored_scene(scene: Row) -> list[str]:
     """Columns of `scenes` that disagree with its bodies, or are absent, a sentence each; a capture has no bodies."""
-    where, captured = f"scene {scene['scene_id']}", _is_captured(scene)
-    wrong = [name for name in ALWAYS_OF_SCENES if (scene[name] is None) != captured]
-    if wrong:
-        what = "are there in a capture" if captured else "are missing"
-        return [f"{where}: {', '.join(wrong)} {what}"]
-    if captured:
+    where = f"scene {scene['scene_id']}"
+    if fault := misplaced_columns(scene):
+        return [f"{where}: {fault}"]
+    if _is_captured(scene):
         return []
     bodies = scene["bodies"]
     expected = columns_of_bodies(bodies)
@@ -50,7 +50,7 @@ def check_stored_scene(scene: Row) -> list[str]:
 def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], scene: Row, read: ReadImage) -> list[str]:
     """Labels of one pair that do not follow from its images and rows, a sentence each.
 
-    `views` holds the pair's rows by role, `objects` its rows of that table, `read` returns an image by its path.
+    `views` holds the pair's rows by name, `objects` its rows of that table, `read` returns an image by its path.
     """
     faults: list[str] = []
     stored = {role: _read_view(row, job, objects, read, faults) for role, row in views.items()}
@@ -73,15 +73,15 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
 def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faults: list[str]) -> View:
     """A stored view; images of a wrong size or type are added to the faults."""
     role: Role = row["role"]
-    rows = [label for label in objects if (label["pose_id"], label["role"]) == (row["pose_id"], role)]
+    rows = _rows_of((row["pose_id"], role, row["number"]), objects)
     count = sum(label["region_id"] >= REGION_FIRST_OBJECT for label in rows)
     images: dict[str, NDArray] = {}
     for image in stored_images(role, job):
         modality, pose_id = MODALITIES[image.pixels], file_pose_id(role, row["parent_id"])
         numbers = [patch_index(REGION_FIRST_OBJECT + n, count) for n in range(count)] if modality.each else [None]
-        paths = [image_path(row["category"], image.content, pose_id, number) for number in numbers]
+        paths = [image_path(row["category"], image.content, pose_id, number, row["number"]) for number in numbers]
         planes = [read(path) for path in paths]
-        shape = modality.shape(row["height"], row["width"])
+        shape = stored_shape(modality, row["height"], row["width"], job)
         wrong = [n for n, pixels in enumerate(planes) if pixels.shape != shape or pixels.dtype != modality.dtype]
         for n in wrong:
             wanted = f"is {planes[n].dtype} {planes[n].shape}, and must be {modality.dtype} {shape}"
@@ -91,13 +91,18 @@ def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faul
     camera, ids = read_camera(row), (row["pose_id"], row["parent_id"])
     rgb, depth, region = (images.pop(name, None) for name in ("rgb", "depth", "region"))
     assert depth is not None
-    return View(role, *ids, camera, rgb, depth, region, labels, images)
+    return View(role, *ids, camera, rgb, depth, region, labels, images, row["number"])
+
+
+def _rows_of(view: tuple[int, Role, int | None], objects: Sequence[Row]) -> list[Row]:
+    """The rows of `objects` of a view, by its pose id, role and number."""
+    return [row for row in objects if (row["pose_id"], row["role"], row["number"]) == view]
 
 
 def _check_amodal(view: View, objects: Sequence[Row]) -> Iterator[str]:
     """Extents of silhouettes that are not those of their images; each holds the pixels that the mask shows of its object."""
     masks = view.further.get("amodal", ())
-    rows = {row["region_id"]: row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)}
+    rows = {row["region_id"]: row for row in _rows_of((view.pose_id, view.role, view.number), objects)}
     for region_id, mask in enumerate(masks, start=REGION_FIRST_OBJECT):
         expected = amodal_columns(mask)
         stored = {name: rows[region_id][name] for name in expected}
@@ -110,7 +115,7 @@ def _differs(a: ArrayLike, b: ArrayLike) -> bool:
 
 
 def _named(view: View) -> str:
-    return f"pose {view.pose_id} ({view.role})"
+    return f"pose {view.pose_id} ({view_name(view.role, view.number)})"
 
 
 def _check_labels(job: Job, view: View, objects: Sequence[Row], scene: Row) -> Iterator[str]:
@@ -121,7 +126,7 @@ def _check_labels(job: Job, view: View, objects: Sequence[Row], scene: Row) -> I
         regions = [label.region_id for label in view.labels]
         yield f"{_named(view)}: objects has the regions {regions}, scenes {list(T_world)}"
         return
-    rows = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
+    rows = _rows_of((view.pose_id, view.role, view.number), objects)
     shares = {row["region_id"]: row["patch_object_fraction"] for row in rows}
     extents = measure_regions(view.region)
     for label in view.labels:
@@ -186,8 +191,12 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
     first = stored["input"]
     assert first.region is not None
     d_z = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
-    mirror = place_mirror_camera(first.camera, d_z, job.cameras.mirror)
+    pair = first.parent_id // 2 % job.pairs_per_scene
+    share = draw_mirror_share(SceneChance(job.seed, views["input"]["scene_id"]), job.cameras.mirror, pair)
+    mirror = place_mirror_camera(first.camera, d_z, job.cameras.mirror, share)
     poses = {**place_beside(first.camera, job), "mirror": mirror, "projected": mirror}
+    fixed = place_fixed(job, {"input": first.camera, "mirror": mirror})
+    poses |= {view_name(named.name, named.number): named.camera for named in fixed}
     for role, camera in poses.items():
         if role in stored and _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
             yield f"{_named(stored[role])}: T_world_cam does not follow from the input pose and d_z"

@@ -23,8 +23,8 @@ from schemas.scene.view import VIEW_ROLES, Camera, Role
 from workers.geometry.camera import is_outside_views
 from workers.geometry.colour import has_holes
 from workers.physics.effects import ONLY_LATE, PREDICATES
+from workers.scene.cameras import place_beside, place_mirror_camera
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.pairs import place_beside, place_mirror_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +64,13 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
         raise ValueError(f"switches of the job, which cannot be forced: {', '.join(sorted(asked))}")
     reasons = {effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}
     for name in names_of_kind("no_op"):
-        reasons[name] = None if reasons[name] is None else f"{reasons[name]}; proof: exact, forced it changes no byte"
+        reason = reasons[name]
+        if reason is not None and not reason.startswith(STUDIO):  # where there is nothing to force
+            reasons[name] = f"{reason}; proof: exact, forced it changes no byte"
     # Not in the receipt of a job without them, which is then as it was before there were any.
     unasked = set(get_args(ViewTarget)) if not facts.job.targets.views else set()
+    unasked |= {"further_views"} if not facts.job.cameras.more and not _is_studio(facts) else set()
+    unasked |= {"alpha"} if not _is_studio(facts) else set()
     return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
 
 
@@ -114,6 +118,19 @@ def _first_of(*reasons: Reason) -> Reason:
     return lambda facts: next((why for reason in reasons if (why := reason(facts)) is not None), None)
 
 
+STUDIO = "scene is studio"
+
+
+def _is_studio(facts: Facts) -> bool:
+    """Whether the object stands alone, on nothing."""
+    return facts.job.scene == "studio"
+
+
+def _on_ground(why_not: str, reason: Reason | None = None) -> Reason:
+    """An effect that a studio scene has no use for; of others it is skipped for `reason`."""
+    return lambda facts: f"{STUDIO}: {why_not}" if _is_studio(facts) else reason(facts) if reason else None
+
+
 def _stored(part: Role | PixelKind) -> Reason:
     """An effect that makes a view, or the colour of every view."""
     return _where(lambda facts: is_stored(part, facts.job), f"{SWITCHES[part]} is false")
@@ -149,12 +166,23 @@ _HIDDEN_POINTS = _where(
 _SAMPLES = _where(lambda facts: facts.job.render.samples > 1, "render.samples is 1")
 _RAYCAST = _where(lambda facts: facts.raycast_checked, "not in the share check.raycast_share")
 
+_UNSHADED = _on_ground("its light has no shadows")
+_CLEAR = _where(
+    lambda facts: not facts.job.has_alpha,
+    "studio.background is transparent: alpha has the edges",
+)
+_ALPHA = _first_of(
+    _stored("rgb"),
+    _where(lambda facts: facts.job.has_alpha, "studio.background is a colour"),
+)
+
 # ------------------------------------------------------------------------------------------- exact no-ops
 
 
 def _parts(facts: Facts) -> Iterator[Part]:
     plan = facts.plan
-    for shape in (plan.floor, plan.table.asset.shape, *(start.asset.shape for start in plan.objects)):
+    ground = () if plan.ground is None else (plan.floor, plan.table.asset.shape)
+    for shape in (*ground, *(start.asset.shape for start in plan.objects)):
         yield from shape.parts
 
 
@@ -183,19 +211,20 @@ def _table(facts: Facts) -> str | None:
 
 def _outside(facts: Facts, points: Array) -> str | None:
     """Whether no view sees anything of the convex hull of points [N, 3], world."""
-    if facts.job.cameras.orbit.share is not None:
+    if facts.job.cameras.orbit.share is not None or facts.job.cameras.more:
         return None  # where the cameras stand follows from where the objects come to rest
     unseen = all(is_outside_views(points, cameras) for cameras in _views(facts))
     return "outside of every view" if unseen else None
 
 
 def _views(facts: Facts) -> Iterator[tuple[Camera, ...]]:
-    """Every camera of the scene; of the mirror camera, whose d_z is not known yet, the two ends of where it may be."""
+    """Every camera of the scene; of the mirror camera, whose d_z is not known yet, the ends of where it may be."""
     job = facts.job
     for camera in facts.plan.input_cameras:
         yield (camera,)
         yield from ((near,) for near in place_beside(camera, job).values())
-        yield tuple(place_mirror_camera(camera, d_z, job.cameras.mirror) for d_z in job.images.depth_range_m)
+        ends = itertools.product(job.images.depth_range_m, (0.0, 1.0))
+        yield tuple(place_mirror_camera(camera, d_z, job.cameras.mirror, share) for d_z, share in ends)
 
 
 _NOISY_DEPTH = _where(
@@ -227,7 +256,11 @@ def _of_physics(name: str) -> Effect:
     """An effect of physics, whose predicate looks at objects, table and settings alone."""
     kind: EffectKind = "asked" if name == "restitution" else "approximation"
     predicate = PREDICATES[name]
-    return Effect(name, kind, lambda f: predicate(f.plan.objects, f.plan.table, f.job.physics), "physics")
+
+    def skipped_because(facts: Facts) -> str | None:
+        return predicate(facts.plan.objects, facts.plan.table, facts.job.physics)
+
+    return Effect(name, kind, _on_ground("nothing falls or rests", skipped_because), "physics")
 
 
 PHYSICS_EFFECTS: tuple[Effect, ...] = tuple(_of_physics(name) for name in PREDICATES)
@@ -244,22 +277,30 @@ TABLE: tuple[Effect, ...] = (
     Effect("splat", "asked", _first_of(_PROJECTION, _SPLAT), "projection"),
     Effect("hidden_point_removal", "asked", _first_of(_PROJECTION, _HIDDEN_POINTS), "projection"),
     Effect("rgb", "asked", _stored("rgb"), "render", _always),
-    Effect("shadows", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render", _of_tier("raster")),
-    Effect("ambient_occlusion", "asked", _tier("raster"), "render", _of_tier("raster")),
+    Effect(
+        "shadows",
+        "asked",
+        _first_of(_stored("rgb"), _UNSHADED, _NOT_TRACED, _tier("raster")),
+        "render",
+        _of_tier("raster"),
+    ),
+    Effect("ambient_occlusion", "asked", _first_of(_UNSHADED, _tier("raster")), "render", _of_tier("raster")),
     Effect("antialiasing", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render"),
-    Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "render"),
+    Effect("samples", "asked", _first_of(_tier("raster"), _CLEAR, _SAMPLES), "render"),
     Effect("global_illumination", "asked", _tier("pathtraced"), "render", _of_tier("pathtraced")),
     Effect("glass", "asked", _first_of(_tier("pathtraced"), _GLASS), "render", _of_tier("pathtraced")),
     *(Effect(name, "asked", _target(name), "targets") for name in get_args(ViewTarget)),
     *(Effect(f"sensor_{name}", "asked", _sensor(name), "sensor") for name in SensorEffects.model_fields),
     Effect("raycast_check", "asked", _RAYCAST, "raycast"),
-    Effect("release_again", "asked", _RAYCAST, "recheck"),
-    Effect("floor", "no_op", _floor, "render", _always),
-    Effect("table", "no_op", _table, "render", _always),
+    Effect("release_again", "asked", _on_ground("nothing rests", _RAYCAST), "recheck"),
+    Effect("further_views", "asked", _where(lambda facts: facts.job.cameras.more, "cameras.more is empty"), "render"),
+    Effect("alpha", "asked", _ALPHA, "targets"),
+    Effect("floor", "no_op", _on_ground("there is no floor", _floor), "render", _always),
+    Effect("table", "no_op", _on_ground("there is no table", _table), "render", _always),
     Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "render", _always),
     # Tier flat has no such pass that could be forced, and the path tracer has it in its materials.
     Effect("transparency", "no_op", _first_of(_tier("raster", "pathtraced"), _HOLES), "render", _always),
-    Effect("light_maps", "no_op", _tier("raster"), "render", _of_tier("raster")),
+    Effect("light_maps", "no_op", _first_of(_UNSHADED, _tier("raster")), "render", _of_tier("raster")),
     Effect("exact_agreement", "no_op", _first_of(_stored("mirror"), _NOISY_DEPTH), "check"),
     *(Effect(name, "asked", None, "simulate", _simulated(name)) for name in CAPTURE_EFFECTS),
 )

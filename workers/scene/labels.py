@@ -35,7 +35,7 @@ def label_regions(
     count_unoccluded: CountPixels,
 ) -> tuple[ObjectLabel, ...]:
     """Labels of the table and of every object in a mask [H, W], in order of region id."""
-    names = {REGION_TABLE: ("table", plan.table.asset.instance_id)}
+    names = {} if plan.ground is None else {REGION_TABLE: ("table", plan.table.asset.instance_id)}
     names.update({start.region_id: (start.asset.category, start.asset.instance_id) for start in plan.objects})
     things = [thing for thing in posed.things if thing.region_id in names]
     return label_things(things, names, camera, region, count_unoccluded)
@@ -176,9 +176,9 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
 
 
 def patch_object_fraction(view: View, label: ObjectLabel, patch: Patch) -> float | None:
-    """Share of an object's patch that is the object; None where there is no patch."""
+    """Share of an object's patch that is the object; None where there is no patch, as in views of named cameras."""
     box = crop_box(label, view.camera, patch)
-    if box is None or view.region is None:
+    if box is None or view.region is None or view.number is not None:
         return None
     region = view.region[box]
     return float(np.count_nonzero(region == label.region_id) / region.size)

@@ -1,21 +1,30 @@
 """One scene from its id to what is written: the list of steps."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from schemas.base import frozen_array
 from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settled
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
-from schemas.scene.view import Pair
+from schemas.scene.view import Pair, View
 from workers.physics.settle import Rest, recheck_scene, settle_scene
+from workers.scene.cameras import frame_cameras, place_more
 from workers.scene.chance import SceneChance
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene, plan_effects
-from workers.scene.pairs import SettledScene, make_pair
-from workers.scene.plan import frame_cameras, plan_scene, pouring_of
+from workers.scene.pairs import SettledScene, make_further, make_pair
+from workers.scene.plan import plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
+from workers.scene.studio import stand_alone
+from workers.stopwatch import Stopwatch
+
+
+def no_further(pair: Pair, number: int) -> Iterator[View]:
+    """No views of named cameras."""
+    yield from ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +38,14 @@ class Scene:
     effects: EffectPlan
     called: Mapping[str, str]
     """Effects that the plan left out and that ran after all, and why."""
+    further: Callable[[Pair, int], Iterator[View]] = no_further
+    """Draws the views of named cameras with a pair, by its number: one after another, since there may be a thousand."""
+
+    def views(self) -> Iterator[tuple[Pair, View]]:
+        """Every view with its pair: those of all pairs, each pair's before those of named cameras."""
+        for number, pair in enumerate(self.pairs):
+            yield from ((pair, view) for view in pair.views)
+            yield from ((pair, view) for view in self.further(pair, number))
 
     @property
     def raycast_checked(self) -> bool:
@@ -64,6 +81,9 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
     """Plan and settle: all before the renderer. Raises SceneError."""
     job = context.job
     plan, effects = plan_with_effects(context, scene_id, stopwatch)
+    if job.scene == "studio":
+        rest = Rest(plan.objects, stand_alone(plan))
+        return Laid(place_cameras(context, plan, rest), effects, rest)
     with stopwatch.stage("physics", "dynamics" if effects.runs("dynamics") else None):
         pouring = pouring_of(job.start, SceneChance(job.seed, scene_id), plan)
         rest = settle_scene(plan, job.physics, effects, pouring)
@@ -71,7 +91,15 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
     if effects.runs("release_again"):
         with stopwatch.stage("recheck", "release_again"):
             rest = recheck_scene(plan, rest, job.physics, effects)
-    return Laid(frame_cameras(job, plan, [each.T_world_obj for each in rest.settled]), effects, rest)
+    return Laid(place_cameras(context, plan, rest), effects, rest)
+
+
+def place_cameras(context: WorkerContext, plan: ScenePlan, rest: Rest) -> ScenePlan:
+    """The plan with the cameras that follow from where its objects rest. Raises ViewError."""
+    poses = [each.T_world_obj for each in rest.settled]
+    plan = frame_cameras(context.job, plan, poses)
+    chance = SceneChance(context.job.seed, plan.scene_id)
+    return replace(plan, more=tuple(place_more(context.job, chance, plan, poses, context.catalogue.poses)))
 
 
 def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Scene:
@@ -86,15 +114,17 @@ def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Sc
     with stopwatch.stage("check"):
         for pair in pairs:
             check_pair(pair, job.check)
-    return Scene(plan, rest.settled, posed, pairs, effects, rest.called)
+    return Scene(plan, rest.settled, posed, pairs, effects, rest.called, partial(make_further, scene))
 
 
-def pose_scene(plan: ScenePlan, settled: tuple[Settled, ...]) -> PosedScene:
+def pose_scene(plan: ScenePlan, settled: Sequence[Settled]) -> PosedScene:
     """Floor, table and objects where they rest, in order of region id."""
     objects = tuple(
         Placed(start.region_id, start.asset.shape, rest.T_world_obj)
         for start, rest in zip(plan.objects, settled, strict=True)
     )
-    table = Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table)
-    floor = Placed(REGION_FLOOR, plan.floor, frozen_array(np.eye(4)))
-    return PosedScene((floor, table, *objects), plan.appearance)
+    things = objects
+    if plan.ground is not None:
+        table = Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table)
+        things = (Placed(REGION_FLOOR, plan.floor, frozen_array(np.eye(4))), table, *objects)
+    return PosedScene(things, plan.appearance)

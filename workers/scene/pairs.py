@@ -1,61 +1,32 @@
 """One pair of a settled scene: cameras that follow from the input camera, views as they are stored, and how they agree."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array, Pose, frozen_array
-from schemas.dataset.layout import file_pose_id, input_pose_id, is_stored
+from schemas.base import Array
+from schemas.dataset.layout import file_pose_id, input_pose_id
 from schemas.errors import ViewError
-from schemas.job.job import Job
-from schemas.job.views import Images, Mirror
+from schemas.job.cameras import Mirror
+from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, PosedScene, ScenePlan
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
-from workers.geometry.frames import UP, half_turn, pose, translation
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.render.pathtraced import draw_view
+from workers.scene.cameras import draw_mirror_share, place_beside, place_fixed, place_mirror_camera
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
 from workers.scene.ray_check import check_against_rays
 from workers.scene.sensor import sense_view
-from workers.scene.targets import Sight, draw_targets
-
-
-def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
-    """The cameras that the job has beside the input camera, of which the article has one, the depth camera.
-
-    T_world_beside = T_world_input Trans(t), t along the input camera's optical axes, same rotation [D].
-    """
-    offsets = {
-        role.name: attrgetter(f"{role.branch}.offset_m")(job)
-        for role in VIEW_ROLES.values()
-        if role.beside and is_stored(role.name, job)
-    }
-    return {
-        name: Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*offset_m)))
-        for name, offset_m in offsets.items()
-    }
-
-
-def place_mirror_camera(camera: Camera, d_z_m: float, mirror: Mirror) -> Camera:
-    """The camera on the other side of the object."""
-    return Camera(camera.intrinsics, frozen_array(mirror_pose(camera.T_world_cam, d_z_m, mirror.distance_m(d_z_m))))
-
-
-def mirror_pose(T_world_cam: Pose, d_z_m: float, T_z_m: float = 1.3, up: Array = UP) -> Pose:
-    """Camera on the other side: half a turn about `up` through the pivot d_z_m ahead, and T_z_m away from it.
-
-    [4, 4] float64, camera to world, optical frame, any roll. The pivot is the point of the optical axis in the plane
-    of the object's front surface. Equals the product of transforms of Staszak and Belter 2024 at zero roll.
-    """
-    pivot = T_world_cam[:3, 3] + d_z_m * T_world_cam[:3, 2]
-    R = half_turn(up) @ T_world_cam[:3, :3]
-    return pose(R, pivot - T_z_m * R[:, 2])
+from workers.stopwatch import Stopwatch
+from workers.targets.coverage import with_alpha
+from workers.targets.targets import Sight, draw_targets
 
 
 def object_distance(depth: NDArray[np.uint16], region: NDArray[np.uint8], images: Images, mirror: Mirror) -> float:
@@ -104,7 +75,8 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     if not effects.runs("mirror"):
         return pair
     with stopwatch.effect("mirror"):
-        mirror_camera = place_mirror_camera(camera, pair.d_z_m, job.cameras.mirror)
+        share = draw_mirror_share(scene.chance, job.cameras.mirror, number)
+        mirror_camera = place_mirror_camera(camera, pair.d_z_m, job.cameras.mirror, share)
         exact_mirror = render_view(scene, "mirror", number, mirror_camera, sight)
         mirror = sense(scene, exact_mirror, number)
     with stopwatch.stage("check"):
@@ -122,16 +94,32 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     return replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
 
 
-def render_view(scene: SettledScene, role: Role, number: int, camera: Camera, sight: Sight | None = None) -> View:
+def make_further(scene: SettledScene, pair: Pair, number: int) -> Iterator[View]:
+    """The views of the cameras that the job names, one after another: those of the scene with its first pair."""
+    job, sight = scene.context.job, Sight(scene.posed.things, pair.input.camera)
+    cameras = {view.role: view.camera for view in pair.views}
+    if not scene.effects.runs("further_views"):
+        return
+    standing = scene.plan.more if number == 0 else ()
+    for named in (*standing, *place_fixed(job, cameras)):
+        with scene.stopwatch.effect("further_views"):
+            exact = render_view(scene, named.name, number, named.camera, sight, named.number)
+            view = sense(scene, exact, number)
+        yield view
+
+
+def render_view(
+    scene: SettledScene, role: Role, pair: int, camera: Camera, sight: Sight | None = None, number: int | None = None
+) -> View:
     """One rendered view: exact images in their stored encodings, and labels of the table and of every object.
 
-    `sight`: what the pair's input camera sees, for the views of others.
+    `sight`: what the pair's input camera sees, for the views of others; `number`: of a view of a named camera.
     """
     job, renderer, stopwatch = scene.context.job, scene.context.renderer, scene.stopwatch
-    parent_id = input_pose_id(scene.plan.scene_id, number, job.pairs_per_scene)
+    parent_id = input_pose_id(scene.plan.scene_id, pair, job.pairs_per_scene)
     pose_id = file_pose_id(role, parent_id)
     with stopwatch.stage("render"):
-        rng = partial(scene.chance.stream, Stream.PATHS, pose_id, parent_id, ROLES.index(role))
+        rng = partial(scene.chance.stream, Stream.PATHS, pose_id, parent_id, *place_of(role, number))
         buffer = draw_view(renderer, scene.posed.things, scene.posed.appearance, camera, job.render, rng, scene.effects)
     if scene.effects.runs("raycast_check"):
         with stopwatch.stage("raycast", "raycast_check"):
@@ -141,7 +129,14 @@ def render_view(scene: SettledScene, role: Role, number: int, camera: Camera, si
         labels = label_regions(scene.plan, scene.posed, camera, buffer.region, count)
         depth = quantise_depth(buffer.depth_m, job.images)
     further = draw_targets(scene.posed.things, camera, buffer.region, job, scene.effects, stopwatch, sight)
-    return View(role, pose_id, parent_id, camera, buffer.rgb, depth, buffer.region, labels, further)
+    alpha = further.pop("alpha", None)
+    rgb = buffer.rgb if alpha is None or buffer.rgb is None else with_alpha(buffer.rgb, buffer.region, alpha)
+    return View(role, pose_id, parent_id, camera, rgb, depth, buffer.region, labels, further, number)
+
+
+def place_of(role: Role, number: int | None) -> tuple[int, ...]:
+    """The numbers of a view's own streams of chance within its pair."""
+    return (ROLES.index(role),) if number is None else (len(ROLES), crc32(role.encode()), number)
 
 
 def sense(scene: SettledScene, exact: View, number: int) -> View:
@@ -149,8 +144,8 @@ def sense(scene: SettledScene, exact: View, number: int) -> View:
     job, ran = scene.context.job, [name for name in scene.effects.ran if name.startswith("sensor_")]
     if not ran:
         return exact
-    role = ROLES.index(exact.role)
+    within = place_of(exact.role, exact.number)
     with scene.stopwatch.stage("sensor", ran[0] if len(ran) == 1 else None):
         return sense_view(
-            job.sensor, job.images, exact, lambda name: scene.chance.sensor_stream(name, number, role), scene.effects
+            job.sensor, job.images, exact, lambda name: scene.chance.sensor_stream(name, number, *within), scene.effects
         )

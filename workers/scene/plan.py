@@ -10,24 +10,21 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
-from schemas.errors import StartError, ViewError
+from schemas.errors import StartError
 from schemas.job.assets import SPLITS
 from schemas.job.job import Job
 from schemas.job.physics import Start
-from schemas.job.views import Cameras
-from schemas.scene.scene import ObjectStart, ScenePlan, Table
+from schemas.scene.scene import Ground, ObjectStart, ScenePlan, Table
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
-from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
-from workers.geometry.camera import NEAR_M, orbit_pose, project
-from workers.geometry.frames import UP, invert, pose, rotation_about, transform, translation, uniform_rotation
+from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
-from workers.geometry.zbuffer import count_covered
 from workers.physics.pour import Pouring, points_of
 from workers.physics.support import columns_apart, place_table, sample_elevation, support_height, support_margin
+from workers.scene.cameras import draw_camera
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.pairs import place_beside
+from workers.scene.studio import draw_studio
 
 MOST_REDRAWS = 20
 """Of a position that is not over the table or has no room, and of an object that was lost: hardly a scene needs five."""
@@ -46,6 +43,8 @@ def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan
     """Everything about a scene that chance decides. Raises MeshError where an asset is unfit, StartError as `draw_scene`."""
     objects, table = choose_assets(job, catalogue, chance)
     assets = [load_asset(catalogue, ref) for ref in objects]
+    if job.scene == "studio":
+        return draw_studio(job, chance, assets[0])
     return draw_scene(job, chance, load_asset(catalogue, table), *assets)
 
 
@@ -96,7 +95,7 @@ def _draw_category(job: Job, rng: np.random.Generator) -> str:
 def draw_scene(job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset) -> ScenePlan:
     """Starts, cameras and look of a scene with these assets. Raises StartError where no start is valid."""
     table = place_table(table_asset)
-    rng = chance.stream(Stream.CAMERA)
+    rng, further = chance.stream(Stream.CAMERA), chance.stream(Stream.ORBIT)
     centre = np.array([0.0, 0.0, table.top.height_m])
     floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), job.render.tier)
     objects: tuple[ObjectStart, ...] = ()
@@ -105,10 +104,9 @@ def draw_scene(job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset
     return ScenePlan(
         scene_id=chance.scene_id,
         category=assets[0].category,
-        table=table,
-        floor=floor,
+        ground=Ground(table, floor),
         objects=objects,
-        input_cameras=tuple(draw_camera(rng, job.cameras, centre) for _ in range(job.pairs_per_scene)),
+        input_cameras=tuple(draw_camera(rng, further, job.cameras, centre) for _ in range(job.pairs_per_scene)),
         appearance=appearance,
     )
 
@@ -209,86 +207,3 @@ def stands_on(T_world_obj: Pose, hull: Hull, com: Array, table: Mesh) -> bool:
     gap_m = points[:, 2] - sample_elevation(points[:, :2], table)
     contacts = points[np.isfinite(gap_m) & (np.abs(gap_m) <= CONTACT_M)]
     return support_margin(contacts[:, :2], transform(T_world_obj, com[None, :])[0, :2]) > 0.0
-
-
-def draw_camera(rng: np.random.Generator, cameras: Cameras, centre: Array) -> Camera:
-    """An input camera on the job's orbit about the centre of the table top."""
-    inclination = rng.uniform(cameras.orbit.inclination_rad.low, cameras.orbit.inclination_rad.high)
-    yaw = rng.uniform(cameras.orbit.yaw_rad.low, cameras.orbit.yaw_rad.high)
-    radius = cameras.orbit.radius_m
-    T = orbit_pose(centre, inclination, yaw, 1.0 if isinstance(radius, str) else radius)
-    return Camera(Intrinsics.of(cameras.sensor), frozen_array(T))
-
-
-INSIDE = 0.95
-"""Share of the picture's width and height, about its middle, that framed objects lie in, and their least distance times the
-least depth that is stored."""
-
-SEARCHED, STEPS = 40, 4
-"""Doublings, and then halvings, of a distance; corrections of one by the pixels that objects cover."""
-
-
-def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan:
-    """The plan with input cameras that frame its objects, where the orbit says so, in the directions that were drawn.
-
-    poses: `T_world_obj` [4, 4] of each object.
-    Raises ViewError `not_framed` where a camera stands nearer to an object than the object is large, or where the objects do
-    not fit into the picture and the range of depth.
-    """
-    placed = list(zip(plan.objects, poses, strict=True))
-    cameras = plan.input_cameras
-    if job.cameras.orbit.share is not None:
-        cameras = tuple(_frame(job, camera, placed, job.cameras.orbit.share) for camera in cameras)
-    for start, T in placed:
-        box = start.asset.shape.bounds
-        size, middle = float(np.linalg.norm(box[1] - box[0])), transform(T, box.mean(axis=0)[None, :])[0]
-        if (near := min(float(np.linalg.norm(camera.position - middle)) for camera in cameras)) < size:
-            raise ViewError(
-                "not_framed",
-                f"{start.asset.instance_id} is {size:.3g} m across, and the input camera stands {near:.3g} m from its middle: "
-                "set cameras.orbit.radius_m: fit, or make the object smaller",
-            )
-    return replace(plan, input_cameras=cameras)
-
-
-def _frame(job: Job, camera: Camera, placed: Sequence[tuple[ObjectStart, Pose]], share: float) -> Camera:
-    """The camera as near to the middle of the objects as `share`, the picture's edges and the range of depth allow."""
-    points = np.concatenate([transform(T, start.hull.vertices) for start, T in placed])
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    middle, size, k = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower)), camera.intrinsics
-    nearest_m, farthest_m = max(NEAR_M, job.images.depth_range_m.low) / INSIDE, job.images.depth_range_m.high
-    edges = 0.5 * np.array([k.width, k.height])
-
-    def at(radius_m: float) -> Camera:
-        T = camera.T_world_cam.copy()
-        T[:3, 3] = middle - radius_m * T[:3, 2]
-        return replace(camera, T_world_cam=frozen_array(T))
-
-    def is_inside(radius_m: float) -> bool:
-        for view in (at(radius_m), *place_beside(at(radius_m), job).values()):
-            seen = transform(invert(view.T_world_cam), points)
-            if (
-                seen[:, 2].min() <= nearest_m
-                or (np.abs(np.stack(project(seen, k), axis=1) - edges) > INSIDE * edges).any()
-            ):
-                return False
-        return True
-
-    least_m = next((size * 2.0**n for n in range(SEARCHED) if is_inside(size * 2.0**n)), math.inf)
-    step_m = 0.5 * least_m
-    for _ in range(SEARCHED if least_m < math.inf else 0):
-        least_m -= step_m if is_inside(least_m - step_m) else 0.0
-        step_m *= 0.5
-    radius_m = max(least_m, 0.5 * size * math.sqrt(k.fx * k.fy * math.pi / (share * k.width * k.height)))
-    for _ in range(STEPS if radius_m < math.inf else 0):
-        T_cam_world = invert(at(radius_m).T_world_cam)
-        counts = [count_covered(start.asset.shape, T_cam_world @ T, k) for start, T in placed]
-        covered = sum(4 * k.width * k.height if count is None else count for count in counts) / (k.width * k.height)
-        radius_m = max(least_m, radius_m * math.sqrt(covered / share))
-    if not radius_m + 0.5 * size <= farthest_m:
-        raise ViewError(
-            "not_framed",
-            f"the objects are {size:.3g} m across together: the camera that frames them does not see them within "
-            f"images.depth_range_m, {nearest_m * INSIDE:g} to {farthest_m:g} m: use smaller ones, or widen that",
-        )
-    return at(radius_m)

@@ -9,7 +9,7 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
-from schemas.dataset.layout import IMAGES, asset_path, image_path, patch_index, patch_path, samples_path
+from schemas.dataset.layout import asset_path, image_path, images_of, patch_index, patch_path, samples_path
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.views import Images, Patch, Targets
@@ -20,12 +20,13 @@ from workers.assets.glb import asset_glb
 from workers.assets.samples import draw_samples, encode_samples
 from workers.geometry.camera import inclination, yaw
 from workers.geometry.pixels import measure_regions
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.effects import write_receipt
 from workers.scene.labels import patch_object_fraction
 from workers.scene.make_scene import Scene
-from workers.scene.targets import coordinate_scale
+from workers.stopwatch import Stopwatch
 from workers.store.images import encode_png
+from workers.targets.targets import coordinate_scale
 
 Box = tuple[int | slice, ...]
 """Which part of an image: rows and columns, or all; of one that each object has, the object's number first."""
@@ -45,18 +46,22 @@ def image_boxes(
 ) -> Iterator[tuple[str, PixelKind, Box]]:
     """Path, kind of pixels and part of each image that the view holds and of its patches.
 
-    objects: the labels that have patches. `category` is the scene's.
+    objects: the labels that have patches, where the view is one of a pair. `category` is the scene's.
     """
     boxes = [(patch_index(label.region_id, len(objects)), crop_box(label, view.camera, patch)) for label in objects]
     there = view.images
-    for image in IMAGES:
-        if image.role != view.role or image.pixels not in there:
+    for image in images_of(view.role):
+        if image.pixels not in there:
             continue
         each = MODALITIES[image.pixels].each
         for n, (index, _) in enumerate(boxes if each else [(None, None)]):
-            yield image_path(category, image.content, view.pose_id, index), image.pixels, (n,) if each else ()
+            yield (
+                image_path(category, image.content, view.pose_id, index, view.number),
+                image.pixels,
+                (n,) if each else (),
+            )
         for n, (index, box) in enumerate(boxes):
-            if box is not None:
+            if box is not None and view.number is None:
                 path = patch_path(category, image.content, view.pose_id, index)
                 yield path, image.pixels, (n, *box) if each else box
 
@@ -75,28 +80,25 @@ ASSET_COLUMNS = ("instance_id", "category", "source", "licence", "path", "sha256
 def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> SceneOutput:
     """Files and rows of a finished scene, without its timings."""
     files: list[EncodedFile] = []
-    views: list[Row] = []
+    views, objects = list[Row](), list[Row]()
+    for pair, view in scene.views():
+        with watch.stage("encode"):
+            encoded = encode_view(view, pair, context.job.images)
+            files += encoded
+            views.append(view_row(scene.plan.scene_id, pair, view, encoded, context.job))
+            objects += object_rows(scene.plan.scene_id, view, context.job, scene.posed.things)
     with watch.stage("encode"):
-        for pair in scene.pairs:
-            for view in pair.views:
-                encoded = encode_view(view, pair, context.job.images)
-                files += encoded
-                views.append(view_row(scene.plan.scene_id, pair, view, encoded, context.job))
-        every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
+        table = () if scene.plan.ground is None else (scene.plan.table.asset,)
+        every = (*table, *(start.asset for start in scene.plan.objects))
         assets = list({asset.instance_id: asset for asset in every}.values())
         files += [shape_file(asset) for asset in assets if asset.shareable]
     # Of objects alone: a table takes as long and as much room, and no network is trained to complete it.
-    sampled = [NO_SAMPLES, *sample_assets(assets[1:], context.job.targets, watch)]
+    sampled = [NO_SAMPLES] * len(table) + [*sample_assets(assets[len(table) :], context.job.targets, watch)]
     files += [samples.file for samples in sampled if samples.file is not None]
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,
-        "objects": [
-            row
-            for pair in scene.pairs
-            for view in pair.views
-            for row in object_rows(scene.plan.scene_id, view, context.job, scene.posed.things)
-        ],
+        "objects": objects,
         "assets": [asset_row(asset, context.job, samples) for asset, samples in zip(assets, sampled, strict=True)],
         "failures": [],
     }
@@ -167,16 +169,17 @@ def file_columns(file: EncodedFile) -> Row:
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
     """The row of `scenes`: names of the first object, and the worst figures of all objects."""
     ran, skipped = write_receipt(scene.effects, scene.called)
+    table = None if scene.plan.ground is None else scene.plan.table
     bodies = [body_columns(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
     return {
         "scene_id": scene.plan.scene_id,
-        "table_id": scene.plan.table.asset.instance_id,
-        "T_world_table": matrix_column(scene.plan.table.T_world_table),
+        "table_id": None if table is None else table.asset.instance_id,
+        "T_world_table": None if table is None else matrix_column(table.T_world_table),
         "pose": context.job.start.pose,
         "effects": ran,
         "skipped": skipped,
         **columns_of_bodies(bodies),
-        "settle_s": max(rest.settle_s for rest in scene.settled),
+        "settle_s": None if table is None else max(rest.settle_s for rest in scene.settled),
         "raycast_checked": scene.raycast_checked,
         "settings_digest": context.settings_digest,
         "bodies": bodies,
@@ -193,6 +196,7 @@ def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile]
         "pose_id": view.pose_id,
         "parent_id": view.parent_id,
         "role": view.role,
+        "number": view.number,
         "scene_id": scene_id,
         "category": labels[0].category,
         **camera_columns(view.camera),
@@ -208,7 +212,9 @@ def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile]
         else {"median_mm": agreement.median_mm, "share": agreement.share},
         "projected_filled_share": pair.filled_share if projected else None,
         "projected_hidden_share": pair.hidden_share if projected else None,
-        "patch_object_fraction": None if projected else patch_object_fraction(view, labels[0], job.images.patch),
+        "patch_object_fraction": None
+        if projected or view.number is not None
+        else patch_object_fraction(view, labels[0], job.images.patch),
         "capture": None,
     }
 
@@ -220,6 +226,7 @@ def object_rows(scene_id: int, view: View, job: Job, things: Sequence[Placed]) -
         {
             "pose_id": view.pose_id,
             "role": view.role,
+            "number": view.number,
             "scene_id": scene_id,
             **label_columns(label),
             "patch_object_fraction": None

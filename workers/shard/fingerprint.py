@@ -20,10 +20,11 @@ from workers.geometry.frames import pose, rotation_about
 from workers.physics.bullet import bullet_file, open_world
 from workers.physics.rigid_body import Body
 from workers.render.raster.gbuffer import Renderer
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.make_scene import make_scene
 from workers.scene.rows import record_scene
 from workers.source import code_digest
+from workers.stopwatch import Stopwatch
 
 CANARY = Job(name="canary", seed=7, scenes=1)
 """Changed with the schema version only: a new canary makes every stored fingerprint foreign."""

@@ -13,9 +13,9 @@ from schemas.scene.view import Camera
 from workers.assets.catalogue import Catalogue
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform, translation
+from workers.scene.cameras import frame_cameras, place_mirror_camera
 from workers.scene.chance import SceneChance
-from workers.scene.pairs import place_mirror_camera
-from workers.scene.plan import frame_cameras, plan_scene
+from workers.scene.plan import plan_scene
 
 SAMPLED = 8
 """Scenes that are planned at most. The first that can be framed is enough: one with bad luck is a row in `failures`."""
@@ -32,7 +32,7 @@ def require_framed(job: Job, catalogue: Catalogue) -> None:
     for scene_id in range(job.first_scene, job.first_scene + min(SAMPLED, job.scenes)):
         try:
             plan = plan_scene(job, catalogue, SceneChance(job.seed, scene_id))
-            poses = [_set_down(start, plan.table) for start in plan.objects]
+            poses = [_set_down(start, plan.table) if plan.ground else start.T_world_obj for start in plan.objects]
             plan = frame_cameras(job, plan, poses)
             placed = zip(plan.objects, poses, strict=True)
             unseen = [_unseen(job, *pair, camera) for pair, camera in product(placed, plan.input_cameras)]
@@ -60,7 +60,7 @@ def _unseen(job: Job, start: ObjectStart, T_world_obj: Pose, camera: Camera) -> 
         opposite = place_mirror_camera(camera, front_m, job.cameras.mirror)
         sides["cameras.mirror.T_z_m"] = ("mirror", opposite, job.cameras.mirror.T_z_m)
     for key, (role, seen_by, given) in sides.items():
-        value = given if isinstance(given, str) else f"{given:g}"
+        value = f"{given:g}" if isinstance(given, float) else given
         local, (near, far), k = (
             transform(invert(seen_by.T_world_cam), points),
             job.images.depth_range_m,

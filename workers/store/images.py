@@ -13,7 +13,7 @@ from zlib_ng import zlib_ng
 from schemas.errors import CorruptError
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-"""[H, W, 3] uint8 RGB, [H, W, 3] uint16, [H, W] uint8 or [H, W] uint16."""
+"""[H, W, 3] uint8 RGB, [H, W, 4] uint8 with alpha, [H, W, 3] uint16, [H, W] uint8 or [H, W] uint16."""
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHUNK = struct.Struct(">I4s")
@@ -21,6 +21,8 @@ _END = b"\0\0\0\0IEND\xaeB`\x82"
 """The last chunk of every PNG."""
 _RGB_16 = bytes([16, 2])
 """Bits of a channel and the kind of colour in the header of a PNG of 3 x 16 bits."""
+_KINDS = {1: 0, 3: 2, 4: 6}
+"""PNG's kind of colour by number of channels."""
 _UP = 2
 """The PNG filter of a row: bytes are differences from the row above."""
 _FPNG_SIDE = 65_535
@@ -37,8 +39,8 @@ def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     (OpenCV's encoder at its level 1 11 ms and 212 KiB, at 9 420 ms and 158 KiB). ISA-L is as fast as fpng, but once in some
     thousand images makes other bytes of the same pixels; tests/kit/encoded_digests.py compares 100,000 images.
     """
-    colored = pixels.ndim == 3 and pixels.shape[2] == 3
-    if not (colored or pixels.ndim == 2) or pixels.dtype not in (np.uint8, np.uint16):
+    colored, clear = (pixels.ndim == 3 and pixels.shape[2] == channels for channels in (3, 4))
+    if not (colored or pixels.ndim == 2 or clear) or pixels.dtype not in (np.uint8, np.uint16)[: 2 - clear]:
         raise ValueError(f"an image of shape {pixels.shape} and type {pixels.dtype} has no encoding here")
     if 0 in pixels.shape:
         raise ValueError(f"an image of shape {pixels.shape} has no pixels")
@@ -62,7 +64,7 @@ def encode_mask(mask: NDArray[np.bool_]) -> bytes:
 def _deflated(pixels: NDArray, sub: bool, level: int) -> bytes:
     """PNG bytes by zlib-ng, of rows as they are or, with `sub`, as differences from pixel to pixel."""
     height, width = pixels.shape[:2]
-    head = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, 2 if pixels.ndim == 3 else 0, 0, 0, 0)
+    head = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, _KINDS[pixels[0, 0].size], 0, 0, 0)
     body = zlib_ng.compress(_filtered_rows(pixels, sub).reshape(-1), level)
     return b"".join((_SIGNATURE, *_chunk(b"IHDR", head), *_chunk(b"IDAT", body), *_chunk(b"IEND", b"")))
 
@@ -109,11 +111,12 @@ def decode_png(data: bytes, name: str = "an image") -> Pixels:
 
 
 def _decode_plain(data: bytes, body: bytes) -> Pixels | None:
-    """The pixels of a grey or RGB PNG whose rows have no filter or that of fpng, `up`, as written here; None of others."""
+    """The pixels of a grey, RGB or RGBA PNG whose rows have no filter or that of fpng, `up`, as written here; None of others."""
     width, height, bits, kind, *_, interlaced = struct.unpack_from(">IIBBBBB", data, len(_SIGNATURE) + _CHUNK.size)
-    if bits not in (8, 16) or kind not in (0, 2) or interlaced:
+    channels = next((number for number, code in _KINDS.items() if code == kind), 0)
+    if bits not in (8, 16) or not channels or interlaced:
         return None
-    row = 1 + width * (3 if kind else 1) * bits // 8
+    row = 1 + width * channels * bits // 8
     try:
         raw = zlib_ng.decompressobj().decompress(body, height * row + 1)
     except zlib_ng.error:  # type: ignore[misc]
@@ -130,7 +133,7 @@ def _decode_plain(data: bytes, body: bytes) -> Pixels | None:
     if bits == 16 and sys.byteorder == "little":  # high byte first; at six times the speed of `astype`
         samples.view(np.uint16).byteswap(inplace=True)
     pixels = samples.view(np.uint16) if bits == 16 else samples
-    return pixels.reshape((height, width, 3) if kind else (height, width))
+    return pixels.reshape((height, width) if channels == 1 else (height, width, channels))
 
 
 def _read_chunks(data: bytes, name: str) -> Iterator[tuple[bytes, bytes]]:

@@ -23,12 +23,12 @@ import pyarrow.parquet as pq
 from schemas.dataset.commit import FileEntry, Outcome
 from schemas.dataset.layout import asset_path, is_glb, is_plain_path
 from schemas.dataset.tables import (
-    ALWAYS_OF_SCENES,
     DETERMINISTIC_TABLES,
     SCHEMAS,
     SHAPE_FILE_COLUMNS,
     SORT_KEYS,
     TABLES,
+    misplaced_columns,
 )
 from schemas.errors import CorruptError, plain_line
 from schemas.scene.scene import SceneOutput
@@ -78,8 +78,8 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
         if row.keys() != names:
             wrong = sorted(names.symmetric_difference(row.keys()))
             raise ValueError(f"{table}: a row has other columns than the schema: {', '.join(wrong)}")
-        if table == "scenes" and row["capture"] is None and (absent := [n for n in ALWAYS_OF_SCENES if row[n] is None]):
-            raise ValueError(f"scenes.{absent[0]} is missing in scene {row['scene_id']}")
+        if table == "scenes" and (fault := misplaced_columns(row)):
+            raise ValueError(f"scene {row['scene_id']}: scenes.{fault}")
     arrays = []
     for field in schema:
         try:

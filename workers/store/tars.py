@@ -22,8 +22,19 @@ from typing import IO, Any, cast
 import pyarrow as pa
 
 from schemas.dataset.commit import FileEntry, Span
-from schemas.dataset.layout import IMAGES, Content, file_pose_id, image_path, is_shape, patch_path, tar_path
+from schemas.dataset.layout import (
+    IMAGES,
+    Content,
+    file_pose_id,
+    image_path,
+    is_shape,
+    patch_path,
+    tar_path,
+    view_name,
+)
 from schemas.errors import CorruptError, plain_line
+from schemas.job.cameras import CAMERA_NAME
+from schemas.scene.view import MODALITIES
 from workers.store.store import Stage
 
 Rows = Mapping[str, Sequence[Mapping[str, Any]]]
@@ -52,7 +63,7 @@ def pose_labels(rows: Rows) -> dict[tuple[str, int], dict[str, Any]]:
     assets = {row["instance_id"]: row for row in rows["assets"]}
     objects = defaultdict(list)
     for row in rows["objects"]:
-        objects[row["pose_id"], row["role"]].append(row)
+        objects[row["pose_id"], view_name(row["role"], row["number"])].append(row)
     labels: dict[tuple[str, int], dict[str, Any]] = {}
     for view in rows["views"]:
         scene, pose_id = scenes.get(view["scene_id"]), file_pose_id(view["role"], view["parent_id"])
@@ -60,8 +71,9 @@ def pose_labels(rows: Rows) -> dict[tuple[str, int], dict[str, Any]]:
             continue
         key = (view["category"], pose_id)
         label = labels.setdefault(key, {"pose_id": pose_id, "views": {}, **_of_scene(scene, assets)})
-        seen = sorted(objects[view["pose_id"], view["role"]], key=lambda row: row["region_id"])
-        label["views"][view["role"]] = {
+        name = view_name(view["role"], view["number"])
+        seen = sorted(objects[view["pose_id"], name], key=lambda row: row["region_id"])
+        label["views"][name] = {
             **{name: value for name, value in view.items() if name not in NOT_OF_A_VIEW},
             "objects": [{name: value for name, value in row.items() if name not in NOT_OF_AN_OBJECT} for row in seen],
         }
@@ -108,13 +120,15 @@ def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
         yield from _leaves(inner, f"{path}.{key}".lstrip("."))
 
 
+_CONTENT = rf"(?P<content>[A-Za-z]+(?:\d+_[A-Za-z]*)?|[A-Za-z]+\d*_(?P<name>{CAMERA_NAME})_)"
 _PATH = re.compile(
-    r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+(?:\d+_[A-Za-z]*)?)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"
+    rf"(?P<category>[^/]+)/(?P<patch>patches/)?{_CONTENT}(?P<pose>\d{{5,}})(?:_(?P<number>\d{{3}}))?(?:obj(?P<object>\d+))?\.png"
 )
 _MEMBER = re.compile(
-    r"(?P<pose>\d{5}|[1-9]\d{5,})\.(?P<content>[A-Za-z]+(?:\d+_[A-Za-z]*)?)(?P<patch>\.patch)?(?:\.obj(?P<object>0|[1-9]\d*))?\.png"
+    rf"(?P<pose>\d{{5}}|[1-9]\d{{5,}})\.{_CONTENT}(?P<number>\d{{3}})?(?P<patch>\.patch)?(?:\.obj(?P<object>0|[1-9]\d*))?\.png"
 )
 _LABEL = re.compile(r"(?P<pose>\d{5}|[1-9]\d{5,})\.json", re.ASCII)
+_WORDS = frozenset(modality.word.rstrip("_") for modality in MODALITIES.values())
 _CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
 
 
@@ -122,7 +136,8 @@ def member_of(path: str) -> tuple[str, str]:
     """(category, member name) of an image. Raises ValueError where the path is not an image's."""
     parts = _match(_PATH, path)
     index = "" if parts["object"] is None else f".obj{parts['object']}"
-    return parts["category"], f"{parts['pose']}.{parts['content']}{'.patch' if parts['patch'] else ''}{index}.png"
+    content = parts["content"] + (parts["number"] or "")
+    return parts["category"], f"{parts['pose']}.{content}{'.patch' if parts['patch'] else ''}{index}.png"
 
 
 def path_of(category: str, member: str) -> str:
@@ -130,13 +145,20 @@ def path_of(category: str, member: str) -> str:
     parts = _match(_MEMBER, member)
     index = None if parts["object"] is None else int(parts["object"])
     name, pose_id = cast(Content, parts["content"]), int(parts["pose"])
-    return (patch_path if parts["patch"] else image_path)(category, name, pose_id, index)
+    if parts["patch"]:
+        return patch_path(category, name, pose_id, index)
+    return image_path(category, name, pose_id, index, None if parts["number"] is None else int(parts["number"]))
 
 
-def member_order(path: str) -> tuple[int, int, bool, int]:
-    """Sorts the images of a scene: by pose, then in the order of the article's figure 1, each before its patches."""
+def member_order(path: str) -> tuple[int, int, str, int, bool, int]:
+    """Sorts the images of a scene: by pose, then in the order of the article's figure 1, each before its patches.
+
+    Those of named cameras come last, by the word in their names and their number.
+    """
     parts = _match(_PATH, path)
-    return int(parts["pose"]), _CONTENTS.index(parts["content"]), bool(parts["patch"]), int(parts["object"] or 0)
+    content, named = parts["content"], parts["name"] is not None
+    place = (len(_CONTENTS), content) if named else (_CONTENTS.index(content), "")
+    return int(parts["pose"]), *place, int(parts["number"] or 0), bool(parts["patch"]), int(parts["object"] or 0)
 
 
 def label_member(pose_id: int) -> str:
@@ -273,6 +295,9 @@ class _Archive:
 
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:
     match = pattern.fullmatch(name)
-    if match is None or match["content"] not in _CONTENTS:
+    named = match is not None and match["name"] is not None
+    if match is None or (
+        match["content"].partition("_")[0] not in _WORDS if named else match["content"] not in _CONTENTS
+    ):
         raise ValueError(f"{name!r} is not the name of an image")
     return match

@@ -71,7 +71,10 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     ("start: {offset_m: 3}", ["start.offset_m: 3: must be two numbers: [low, high]"]),
     ("start: {offset_m: [3]}", ["start.offset_m.1: is missing"]),
     ("start: {offset_m: [1, 2, 3]}", ["start.offset_m: [1, 2, 3]: must have at most 2 of them"]),
-    ("start: {pose: uprigth}", ["start.pose: 'uprigth': did you mean 'upright'? must be 'upright', 'tumbled' or"]),
+    (
+        "start: {pose: uprigth}",
+        ["start.pose: 'uprigth': did you mean 'upright'? must be 'upright', 'tumbled', 'placed' or"],
+    ),
     ("cameras: {depth: {offset_m: [0, 0, x]}}", ["cameras.depth.offset_m.2: 'x'"]),
     *(
         (
@@ -119,7 +122,7 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
     (
         "cameras: {mirror: {enabled: false}, depth: {enabled: false}}\nimages: {projection: {enabled: false}}\n"
         "targets: {views: [covisible]}",
-        ["asks for covisible", "set cameras.mirror.enabled or leave it out"],
+        ["asks for covisible", "name some in cameras.more, or leave it out"],
     ),
     (
         "captures: {}\ncameras: {depth: {enabled: false}}\ntargets: {views: [covisible]}",

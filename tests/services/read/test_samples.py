@@ -21,7 +21,7 @@ from tests.datasets import faults_of, make_dataset, run_here
 from tests.services.export.exported import export_to
 from tests.services.read.conftest import TINY, spoil
 from workers.assets.samples import encode_samples
-from workers.scene.context import Stopwatch
+from workers.stopwatch import Stopwatch
 from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png, encode_png
 from workers.store.local import LocalStore

@@ -34,8 +34,8 @@ from tests.kit.shapes import box, shape_of
 from workers.geometry.camera import look_at, project
 from workers.geometry.frames import invert, rotation_about, transform
 from workers.geometry.raycast import cast_view
-from workers.scene.context import Stopwatch
 from workers.scene.make_scene import make_scene
+from workers.stopwatch import Stopwatch
 
 UNITS = 5000.0
 WIDTH, HEIGHT, F = 160, 120, 500.0

@@ -13,8 +13,9 @@ from services.study.measure import QUICK_S, answer_for, measure_rest, own_rest
 from services.study.model import REFERENCES, Setting
 from services.study.table import pose_error
 from workers.assets.catalogue import open_catalogue
-from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.context import WorkerContext
 from workers.scene.make_scene import Laid, lay_scene
+from workers.stopwatch import Stopwatch
 
 
 def setting(name: str, **changes: object) -> Setting:

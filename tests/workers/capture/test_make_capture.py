@@ -47,7 +47,8 @@ from workers.geometry.camera import look_at
 from workers.geometry.frames import invert
 from workers.geometry.projection import Bounds, Seen, compare_covisible
 from workers.render.raster.gbuffer import shared_renderer
-from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
+from workers.stopwatch import Stopwatch
 from workers.store.images import decode_png
 from workers.store.manifest import check_files, table_of_rows
 

@@ -41,7 +41,7 @@ from workers.capture.surface.tsdf import (
 )
 from workers.geometry.camera import look_at
 from workers.geometry.distance import distance_to_mesh
-from workers.scene.context import Stopwatch
+from workers.stopwatch import Stopwatch
 
 NOTHING = Thing(sphere=None, boxes=[])
 

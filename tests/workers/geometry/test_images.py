@@ -43,7 +43,7 @@ from workers.geometry.projection import (
     forward_project,
     sample_inverse_depth,
 )
-from workers.scene.pairs import mirror_pose
+from workers.scene.cameras import mirror_pose
 
 
 def rays(k: Intrinsics) -> np.ndarray:

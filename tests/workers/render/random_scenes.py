@@ -21,7 +21,7 @@ from workers.assets.catalogue import Catalogue, choose_object, choose_table, loa
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import UP, invert, pose, rotation_about, transform, uniform_rotation
-from workers.scene.pairs import mirror_pose
+from workers.scene.cameras import mirror_pose
 
 VGA = Intrinsics(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 FLOOR_HALF_M = 30.0

@@ -45,7 +45,7 @@ def nudged(T):
 def test_a_healthy_pair_has_no_faults_and_a_scene_that_lacks_what_captures_alone_may_is_told(told, stored):
     assert told() == ""
     (fault,) = check_stored_scene(stored[1] | {"bodies": None})
-    assert fault.endswith("bodies are missing")
+    assert fault.endswith("bodies: missing")
 
 
 def test_a_wrong_column_of_a_scene_a_label_or_a_view_is_told(told):

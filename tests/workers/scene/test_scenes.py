@@ -16,8 +16,9 @@ from schemas.job.views import Images, Patch
 from schemas.scene.view import Camera, Intrinsics, ObjectLabel, Pair, View
 from tests.effects.scenes import Made, Setting, make
 from tests.workers.render.random_scenes import built_in_assets
-from workers.scene.context import Stopwatch, open_worker
+from workers.scene.context import open_worker
 from workers.scene.rows import encode_view, image_boxes, object_labels, timing_row
+from workers.stopwatch import Stopwatch
 from workers.store.images import decode_png
 from workers.store.manifest import table_of_rows
 

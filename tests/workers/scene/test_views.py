@@ -24,8 +24,8 @@ from workers.geometry.camera import inclination, look_at, orbit_pose, unproject
 from workers.geometry.frames import UP, half_turn, invert, pose, rotation_about, transform, translation
 from workers.geometry.pixels import Extent, distort
 from workers.geometry.raycast import cast_view, edge_distance_px
+from workers.scene.cameras import mirror_pose
 from workers.scene.chance import SceneChance
-from workers.scene.context import Stopwatch
 from workers.scene.labels import (
     carry_depth,
     compare_views,
@@ -39,10 +39,11 @@ from workers.scene.labels import (
     projection_shares,
 )
 from workers.scene.make_scene import pose_scene
-from workers.scene.pairs import mirror_pose, object_distance
+from workers.scene.pairs import object_distance
 from workers.scene.plan import draw_scene
 from workers.scene.ray_check import STEEPEST_COS, check_against_rays, check_pair
-from workers.scene.targets import Sight, draw_targets
+from workers.stopwatch import Stopwatch
+from workers.targets.targets import Sight, draw_targets
 
 JOB = Job(name="t")
 X_AXIS, Y_AXIS, Z_AXIS = np.eye(3)

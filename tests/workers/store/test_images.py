@@ -60,7 +60,13 @@ def test_colour_of_any_length_layout_and_encoder_reads_back_with_red_first():
 
 
 def test_what_has_no_encoding_is_refused_and_an_encoder_that_stops_early_is_noticed(monkeypatch):
-    for shape, kind in (((4, 4, 4), np.uint8), ((4, 4), np.float32), ((4, 4, 2), np.uint16), ((0, 4), np.uint8)):
+    for shape, kind in (
+        ((4, 4, 4), np.uint16),
+        ((4, 4, 5), np.uint8),
+        ((4, 4), np.float32),
+        ((4, 4, 2), np.uint16),
+        ((0, 4), np.uint8),
+    ):
         with pytest.raises(ValueError, match="image of shape"):
             encode_png(np.zeros(shape, kind), 1)
     pixels = NOISE[:64].reshape(8, 8, 3)

@@ -40,7 +40,7 @@ def test_a_row_that_breaks_the_schema_is_refused_by_column_and_numpys_values_are
     body = rows_of("scenes")[0]["bodies"][0]
     for table, change, message in (
         ("scenes", {"colour": "red"}, "other columns than the schema: colour"),
-        ("scenes", {"settle_s": None}, "scenes.settle_s is missing in scene"),
+        ("scenes", {"settle_s": None}, "scene 3: scenes.settle_s"),
         ("scenes", {"settle_s": float("nan")}, "scenes.settle_s is not finite: nan"),
         ("scenes", {"T_world_obj": [float("inf")] * 16}, "scenes.T_world_obj is not finite: inf"),
         ("scenes", {"T_world_obj": [0.0] * 15}, "scenes.T_world_obj: .*16"),

@@ -22,8 +22,9 @@ from workers.geometry.frames import invert, transform
 from workers.geometry.mesh import corner_weights, mix
 from workers.geometry.pixels import quantise_depth
 from workers.geometry.raycast import Caster
-from workers.scene.context import Stopwatch
-from workers.scene.painting import (
+from workers.stopwatch import Stopwatch
+from workers.targets.coverage import cover_pixels
+from workers.targets.painting import (
     CODES,
     Skin,
     paint_albedo,
@@ -32,7 +33,7 @@ from workers.scene.painting import (
     paint_points,
     paint_silhouettes,
 )
-from workers.scene.surfaces import Surfaces, Triangles, all_surfaces, nearest_faces, triangles_of
+from workers.targets.surfaces import Surfaces, Triangles, all_surfaces, nearest_faces, triangles_of
 
 WHITE = Material()
 """Has the texture of a part without one."""
@@ -56,7 +57,7 @@ def draw_targets(
     watch: Stopwatch,
     sight: "Sight | None" = None,
 ) -> dict[PixelKind, NDArray]:
-    """The image targets that the plan has of a view with the mask `region` [H, W], by modality.
+    """The image targets that the plan has of a view with the mask `region` [H, W], by modality; with a clear background `alpha`.
 
     `sight`: what the pair's input camera sees; None for the input view itself.
     """
@@ -70,6 +71,9 @@ def draw_targets(
         for name in of_seen:
             with watch.stage("targets", name):
                 drawn[name] = _OF_SEEN[name](seen, job.targets)
+    if effects.runs("alpha"):
+        with watch.stage("targets", "alpha"):
+            drawn["alpha"] = cover_pixels(seen.triangles if of_seen else triangles_of(objects, camera), region)
     if any(effects.runs(name) for name in OF_ALL):
         with watch.stage("targets"):
             triangles = triangles_of(objects, camera)
